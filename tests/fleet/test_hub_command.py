@@ -75,7 +75,7 @@ def test_no_server(
     url = f"nats://127.0.0.1:{free_ports(1)[0]}"
     status, told = refused(capsys, url, "--parquet", str(tmp_path / "hub"))
     assert status == 1
-    assert told.startswith(f"multidrop: no server of NATS answers at {url}: ")
+    assert told.startswith(f"multidrop: no NATS server answers at {url}: ")
     assert told.count("\n") == 1
 
 

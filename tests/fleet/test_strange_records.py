@@ -52,11 +52,11 @@ STRANGE: dict[str, tuple[str, str, bytes, str]] = {
     "nothing in it": ("lease_0", "gw-1", b"{}", "it has no 'session'"),
     "a text for a number": (
         *("own_1", "line-1", json.dumps({**OWNER, "session": "1"}).encode()),
-        "its 'session' is not a number",
+        "its 'session' is not a whole number",
     ),
     "true for a number": (
         *("lease_1", "gw-1", json.dumps({**LEASE, "session": True}).encode()),
-        "its 'session' is not a number",
+        "its 'session' is not a whole number",
     ),
     "a number for a text": (
         *("lease_1", "gw-1", json.dumps({**LEASE, "nonce": 7}).encode()),

@@ -53,7 +53,7 @@ FILES_TOUCHING_THE_SYSTEM = {
 
 CLIENTS = {  # rooms that use public names alone, and the commands that import them
     "gateway": {"cli/serve.py"},
-    "fleet": {"cli/fleet.py", "cli/hub.py"},
+    "fleet": {"cli/fleet.py", "cli/fleet_rights.py", "cli/hub.py", "cli/support/nats.py"},
 }
 IMPORT_OF_A_TEST = re.compile(r"\b(import|from)\b.*\btest_")
 

@@ -12,8 +12,10 @@ from collections.abc import Awaitable, Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from multidrop.cli.fleet_rights import write_rights
 from multidrop.cli.support.arguments import add_json_argument
 from multidrop.cli.support.extras import require_extra
+from multidrop.cli.support.nats import add_nats_arguments, nats_options
 from multidrop.cli.support.output import logging_to, print_text, warn
 from multidrop.cli.support.signals import on_end_signals
 from multidrop.cli.support.values import aligned
@@ -27,12 +29,19 @@ DRAIN_S = 30.0
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("action", metavar="ACTION", choices=ACTIONS, help=", ".join(ACTIONS))
-    parser.add_argument("what", metavar="NAME", nargs="?", help="a gateway's name; PLANT.toml for init")
+    parser.add_argument(
+        "what", metavar="NAME", nargs="?", help="a gateway's name; PLANT.toml for init; for rights all names"
+    )
     parser.add_argument(
         "--nats", metavar="URLS", help=f"servers, with commas; else MULTIDROP_NATS, or {URLS}"
     )
     parser.add_argument("--folder", metavar="DIR", type=Path, help="where a gateway keeps its spool and lock")
     parser.add_argument("--keep", metavar="SIZE", default="10 GB", help="most that the spool takes: 10 GB")
+    add_nats_arguments(parser)
+    parser.add_argument(
+        "--cert", metavar="FILE", type=Path, help="with rights: a server's certificate, there"
+    )
+    parser.add_argument("--key", metavar="FILE", type=Path, help="with rights: its key, there")
     add_json_argument(parser)
 
 
@@ -57,7 +66,8 @@ async def _with_paths(
 ) -> int:
     from multidrop.fleet.servers import paths_of
 
-    paths = paths_of(_urls(arguments))
+    urls = _urls(arguments)
+    paths = paths_of(urls, nats_options(arguments, urls))
     try:
         return await work(paths)
     finally:
@@ -79,7 +89,8 @@ async def _init(arguments: argparse.Namespace) -> int:
 
     async def work(paths: list[ServerPath]) -> int:
         made = await set_up(paths)
-        client = await connect(_urls(arguments))
+        urls = _urls(arguments)
+        client = await connect(urls, **nats_options(arguments, urls))
         await create_stream(client, replicas=made["replicas"])
         await client.close()
         if records is not None:
@@ -107,7 +118,9 @@ async def _serve(arguments: argparse.Namespace) -> int:
 
     name = _name(arguments, "serve gw-1")
     folder = arguments.folder or _state_folder() / name
-    gateway = FleetGateway(name, _urls(arguments), folder, spool_bytes=parse_size(arguments.keep))
+    urls = _urls(arguments)
+    options = nats_options(arguments, urls)
+    gateway = FleetGateway(name, urls, folder, options=options, spool_bytes=parse_size(arguments.keep))
     on_end_signals(gateway.end)
     await gateway.run(lambda: print_text(f"ready {name}", flush=True))
     return 0
@@ -235,7 +248,12 @@ async def _lines(arguments: argparse.Namespace) -> int:
     return await _with_paths(arguments, work)
 
 
+async def _rights(arguments: argparse.Namespace) -> int:
+    return write_rights(arguments, _urls(arguments))
+
+
 ACTIONS: dict[str, Callable[[argparse.Namespace], Any]] = {
+    "rights": _rights,
     "init": _init,
     "serve": _serve,
     "drain": _drain,

@@ -6,12 +6,12 @@ import argparse
 import asyncio
 import json
 import logging
-import ssl
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from multidrop.cli.support.arguments import add_json_argument, duration
 from multidrop.cli.support.extras import require_extra
+from multidrop.cli.support.nats import add_nats_arguments, nats_options
 from multidrop.cli.support.output import logging_to, print_text, warn
 
 if TYPE_CHECKING:
@@ -29,8 +29,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--every", metavar="S", type=duration, default=EVERY_S, help="seconds of samples in a commit (10)"
     )
     parser.add_argument("--once", action="store_true", help="end when all is kept that is there now")
-    parser.add_argument("--credentials", metavar="FILE", type=Path, help="credentials of NATS (.creds)")
-    parser.add_argument("--ca", metavar="FILE", type=Path, help="certificate that the servers' are signed by")
+    add_nats_arguments(parser)
     add_json_argument(parser)
 
 
@@ -39,12 +38,7 @@ def run(arguments: argparse.Namespace) -> int:
         require_extra(library, "fleet", "hub")
     if arguments.postgres:
         require_extra("psycopg", "postgres", "hub")
-    options: dict[str, Any] = {"name": "multidrop hub"}
-    if arguments.credentials:
-        arguments.credentials.open().close()  # a wrong name is told at once
-        options["user_credentials"] = str(arguments.credentials)
-    if arguments.ca:
-        options["tls"] = ssl.create_default_context(cafile=arguments.ca)
+    options = {"name": "multidrop hub", **nats_options(arguments, arguments.servers)}
     sink = _sink(arguments)
     try:
         with logging_to(warn, "multidrop.fleet", logging.INFO):

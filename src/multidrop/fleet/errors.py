@@ -11,6 +11,14 @@ class TooOld(FleetError):
     """A server that may give one lease to two gateways."""
 
 
+class NotAdmitted(FleetError):
+    """A server that does not believe us, or that we do not believe."""
+
+
+class NoRight(FleetError):
+    """A request that these credentials do not allow: it was certainly not carried out."""
+
+
 class Unsure(FleetError):
     """A request without an answer in time: it may have been carried out, or still be."""
 

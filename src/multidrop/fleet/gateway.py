@@ -14,18 +14,21 @@ from nats.aio.msg import Msg
 
 from multidrop import Mastership
 from multidrop.fleet import names
-from multidrop.fleet.errors import FleetError
+from multidrop.fleet.errors import FleetError, NoRight
 from multidrop.fleet.fleet_lines import FleetLines
 from multidrop.fleet.forwarder import Forwarder
 from multidrop.fleet.lease import LifeLock
 from multidrop.fleet.lease_rules import SECOND, USUAL
 from multidrop.fleet.member import Member
+from multidrop.fleet.record_shapes import misshapen
 from multidrop.fleet.samples_stream import connect
 from multidrop.fleet.servers import ServerPath, paths_of
 from multidrop.fleet.setup import check_buckets, open_all
 from multidrop.fleet.spool import Spool
 
 SPOOL_BYTES = 10_000_000_000
+STATE = {"state": str, "lines": int, "margin_s": float, "troubles": dict, "spool": dict}
+SPOOL = {"bytes": int, "lost": int}
 FORWARD_S = 3.0  # for what is left at the end; the rest is forwarded after the next start
 ENDING_S = 0.05
 
@@ -77,6 +80,7 @@ class FleetGateway:
         forwarding = asyncio.create_task(self.forwarder.run())
         try:
             await self.paths[0].subscribe(names.gateway_subject(self.name, "*"), self._answer)
+            await self.paths[0].check_subscription(names.gateway_subject(self.name, "*"))
             self.lines.poller.on_batch(self.spool.append)
             with self.lines.poller:
                 member = asyncio.create_task(self.member.run())
@@ -155,9 +159,16 @@ async def ask_gateway(path: ServerPath, gateway: str, wanted: str) -> dict[str, 
     """Return a gateway's answer to "state" or "drain". Raises FleetError where it gives none."""
     try:
         message = await path.request(names.gateway_subject(gateway, wanted))
+    except NoRight:
+        raise
     except FleetError:
         raise FleetError(
             f"no gateway called {gateway} answers; `multidrop fleet status` lists them"
         ) from None
-    found: dict[str, Any] = json.loads(message.data)
+    try:
+        found: dict[str, Any] = json.loads(message.data)
+    except (ValueError, RecursionError):
+        found = {}
+    if mistake := misshapen(found, STATE) or misshapen(found["spool"], SPOOL):
+        raise FleetError(f"what {gateway} answers is no state of a gateway: {mistake}")
     return found

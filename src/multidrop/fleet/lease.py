@@ -145,7 +145,11 @@ class Lease:
 
     async def begin(self) -> None:
         """Begin a session, as soon as every one before it is over."""
+        told = ""
         while not await self.try_to_begin():
+            if self.trouble != told:
+                _log.warning("%s does not poll: %s", self.name, self.trouble)
+            told = self.trouble
             await asyncio.sleep(JOIN_S)
 
     async def try_to_begin(self) -> bool:

@@ -35,6 +35,16 @@ def command_subject(line: str) -> str:
     return f"cmd.{line}"
 
 
+def do_subject(gateway: str, run: str) -> str:
+    """Return the subject on which one run of a gateway's process is told to do what it has offered."""
+    return f"do.{gateway}.{run}"
+
+
+def stop_subject(line: str) -> str:
+    """Return the subject on which a line's master takes stops."""
+    return f"stop.{line}"
+
+
 def gateway_subject(gateway: str, wanted: str) -> str:
     """Return the subject of a request about a gateway itself: "state", "drain", or "*" for all it takes."""
     return f"gateway.{gateway}.{wanted}"

@@ -7,12 +7,9 @@ from typing import Any
 from multidrop.fleet import names
 from multidrop.fleet.buckets import Bucket, Follower
 from multidrop.fleet.lease_bucket import LeaseBucket
-from multidrop.fleet.lease_rules import USUAL
-from multidrop.fleet.observer import Observer
+from multidrop.fleet.observer import BELIEVING, Observer
 from multidrop.fleet.ownership import owner_of
 from multidrop.fleet.servers import ServerPath
-
-AT_ONCE = USUAL._replace(lease=0, guard=0)  # who only looks believes every end of a session at once
 
 
 async def read_fleet(path: ServerPath) -> dict[str, Any]:
@@ -20,7 +17,7 @@ async def read_fleet(path: ServerPath) -> dict[str, Any]:
 
     A gateway that died a moment ago is still there, until another one has ended its session.
     """
-    observer = Observer("", [LeaseBucket(bucket, lambda: path, "") for bucket in names.LEASES], AT_ONCE)
+    observer = Observer("", [LeaseBucket(bucket, lambda: path, "") for bucket in names.LEASES], BELIEVING)
     for number in range(len(names.LEASES)):
         await observer.look(number)
     plant = Follower(Bucket(names.PLANT, lambda: path))

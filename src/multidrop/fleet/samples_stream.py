@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 from nats.aio.client import Client
 from nats.errors import Error, NoRespondersError
 
+from multidrop.fleet.refusals import failure_to_connect
 from multidrop.fleet.servers import OLDEST
 
 STREAM = "samples"
@@ -89,7 +90,7 @@ async def connect(servers: list[str], **options: Any) -> Client:
         last = client.last_error or failure
         with suppress(Exception):  # of a client that is half connected
             await client.close()
-        raise StreamError(f"no server of NATS answers at {', '.join(servers)}: {_text(last)}") from failure
+        raise StreamError(str(failure_to_connect(", ".join(servers), last))) from failure
     version = client.connected_server_version
     if (version.major, version.minor) < OLDEST:
         await client.close()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from typing import Any
@@ -12,14 +13,19 @@ from nats.aio.client import Client
 from nats.aio.msg import Msg
 from nats.errors import Error as NatsError
 
-from multidrop.fleet.errors import FleetError, TooOld, Unsure
+from multidrop.fleet.errors import FleetError, NotAdmitted, TooOld, Unsure
 from multidrop.fleet.lease_rules import PATHS
+from multidrop.fleet.refusals import Denials, failure_to_connect
 
 OLDEST = (2, 12)  # 2.9.10 grants one revision to several claimants (nats-server issue 4320)
 CONNECT_S = 1.0
 ANSWER_S = 1.0  # for a request; a lease is renewed twice a second
 PONG_S = 0.7  # a server that takes longer is left for another one
 KEEP_S = 1.0  # between looks at a connection
+# With 0 for attempts, nats-py knocks at a port where nobody listens until our own time-out.
+ONE_TRY = {"allow_reconnect": False, "max_reconnect_attempts": 1, "reconnect_time_wait": 0.05}
+
+_log = logging.getLogger("multidrop.fleet")
 
 
 class ServerPath:
@@ -30,6 +36,8 @@ class ServerPath:
         self.url = ""  # where it is
         self._options = options or {}
         self._client: Client | None = None
+        self._denials = Denials()
+        self._trouble = ""  # that was told
         self._leaving: set[asyncio.Task[None]] = set()
         self._subscriptions: dict[str, Callable[[Msg], Any]] = {}
 
@@ -58,16 +66,24 @@ class ServerPath:
             except TooOld:
                 raise
             except FleetError as failure:
-                failures.append(str(failure))
+                failures.append(failure)
             else:
                 return
-        raise FleetError("; ".join(failures))
+        refusals = [failure for failure in failures if isinstance(failure, NotAdmitted)]
+        raise refusals[0] if refusals else FleetError("; ".join(map(str, failures)))
 
     async def keep(self) -> None:
         """Come home, or go elsewhere from a server that does not answer; for ever."""
         while True:
-            with suppress(FleetError):
+            try:
                 await self.look_after()
+                self._trouble = ""
+            except NotAdmitted as failure:
+                if self._trouble != str(failure):
+                    _log.warning("%s", failure)
+                self._trouble = str(failure)
+            except FleetError:
+                pass
             await asyncio.sleep(KEEP_S)
 
     async def look_after(self) -> None:
@@ -87,11 +103,12 @@ class ServerPath:
         return True
 
     async def _move(self, url: str) -> None:
-        client = await connect(url, self._options)
+        denials = Denials()
+        client = await connect(url, self._options, denials)
         for subject, called in self._subscriptions.items():
             await client.subscribe(subject, cb=called)
         self._leave()
-        self._client, self.url = client, url
+        self._client, self.url, self._denials = client, url, denials
 
     def _leave(self) -> None:
         if self._client is not None:
@@ -106,6 +123,14 @@ class ServerPath:
         if self._client is not None:
             await self._client.subscribe(subject, cb=called)
 
+    async def check_subscription(self, subject: str) -> None:
+        """Raise NoRight where these credentials do not allow to hear what was subscribed to."""
+        client = self._connected()
+        with suppress(NatsError, OSError, TimeoutError):
+            await client.flush()  # this ping may leave before what waits to be sent, the next one does not
+            await client.flush()
+        self._denials.check_subscription(subject)
+
     async def request(
         self,
         subject: str,
@@ -113,13 +138,17 @@ class ServerPath:
         headers: dict[str, str] | None = None,
         answer_s: float = ANSWER_S,
     ) -> Msg:
-        """Return the answer. Raises Unsure where none comes in time, FleetError where nobody was asked."""
+        """Return the answer.
+
+        Raises Unsure where none comes in time, NoRight where it may not be asked, FleetError where none was.
+        """
         client = self._connected()
         try:
             return await client.request(subject, data, answer_s, headers=headers)
         except nats.errors.NoRespondersError:
             raise FleetError(f"nobody answers {subject} at {self.url}") from None
         except (NatsError, OSError, TimeoutError) as failure:
+            self._denials.check_request(subject, self._options.get("inbox_prefix", "_INBOX"))
             raise Unsure(f"{self.url} gave no answer to {subject}: {failure}") from None
 
     async def collect(self, subject: str, data: bytes, is_last: Callable[[Msg], bool]) -> list[Msg]:
@@ -140,6 +169,7 @@ class ServerPath:
                 with suppress(NatsError, OSError):
                     await subscription.unsubscribe()
         except (NatsError, OSError, TimeoutError) as failure:
+            self._denials.check_request(subject, self._options.get("inbox_prefix", "_INBOX"))
             raise Unsure(f"{self.url} gave no whole answer to {subject}: {failure}") from None
 
     def _connected(self) -> Client:
@@ -153,15 +183,18 @@ class ServerPath:
         await asyncio.gather(*self._leaving)
 
 
-async def connect(url: str, options: Mapping[str, Any]) -> Client:
+async def connect(url: str, options: Mapping[str, Any], denials: Denials | None = None) -> Client:
     """Return a connection to this very server. Raises FleetError, in one sentence."""
     refusals: list[Exception] = []
+    told = denials or Denials()
 
     async def note(failure: Exception) -> None:
-        refusals.append(failure)
+        if not client.is_connected:
+            refusals.append(failure)
+        await told.note(failure)
 
     client = Client()
-    settings = {"allow_reconnect": False, "max_reconnect_attempts": 0, "connect_timeout": CONNECT_S}
+    settings = {**ONE_TRY, "connect_timeout": CONNECT_S}
     try:
         await asyncio.wait_for(client.connect(url, error_cb=note, **{**options, **settings}), 2 * CONNECT_S)
     except asyncio.CancelledError:
@@ -169,8 +202,7 @@ async def connect(url: str, options: Mapping[str, Any]) -> Client:
         raise
     except (NatsError, OSError, TimeoutError, ValueError) as failure:
         _cut(client)
-        why = str(refusals[-1] if refusals else failure) or type(failure).__name__
-        raise FleetError(f"no NATS server answers at {url}: {why}") from None
+        raise failure_to_connect(url, refusals[-1] if refusals else failure) from None
     found = client.connected_server_version
     if (found.major, found.minor) < OLDEST:
         await _close(client)

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import asyncio
+import logging
+import time
 from collections.abc import Mapping, Sequence
+from datetime import datetime
 from functools import partial
 from typing import Any
 
 from multidrop.fleet import names
 from multidrop.fleet.buckets import NONE_YET, ServerError, ask, bucket_settings
-from multidrop.fleet.errors import Conflict, FleetError, TooOld, Unsure
+from multidrop.fleet.errors import Conflict, FleetError, NoRight, TooOld, Unsure
 from multidrop.fleet.leaders import bring_leaders_home
 from multidrop.fleet.lease_bucket import LeaseBucket
 from multidrop.fleet.servers import ServerPath
@@ -19,6 +22,9 @@ ROUNDS = 40  # 2.9.10 fails in the first few of them
 CLAIMANTS = 6
 MOST_REPLICAS = 3
 WAIT_S = 10.0  # an election takes 4 to 9 s
+CLOCKS_APART_S = 10.0
+
+_log = logging.getLogger("multidrop.fleet")
 
 
 async def set_up(paths: Sequence[ServerPath]) -> dict[str, Any]:
@@ -49,15 +55,28 @@ async def check_buckets(path: ServerPath) -> None:
     """Raise FleetError where there is no fleet in these servers yet, or no quorum."""
     for bucket in names.BUCKETS:
         try:
-            await ask(path, f"STREAM.INFO.KV_{bucket}")
+            info = await ask(path, f"STREAM.INFO.KV_{bucket}")
         except ServerError as failure:
             if failure.is_missing:
                 raise FleetError(
                     f"{path.url} has no bucket {bucket}: run `multidrop fleet init` first"
                 ) from None
             raise
+        except NoRight:
+            raise
         except FleetError as failure:
             raise no_quorum(path, failure) from None
+    check_clock(path, info["ts"])
+
+
+def check_clock(path: ServerPath, server_time: str) -> None:
+    """Warn where this machine's clock and the server's are far apart: leases do not mind, samples do."""
+    apart = time.time() - datetime.fromisoformat(server_time).timestamp()
+    if abs(apart) > CLOCKS_APART_S:
+        _log.warning(
+            "this machine's clock is %.0f s %s that of %s: set it, for samples have its time",
+            *(abs(apart), "ahead of" if apart > 0 else "behind", path.url),
+        )
 
 
 def no_quorum(path: ServerPath, failure: Exception) -> FleetError:
@@ -76,6 +95,8 @@ async def _create(path: ServerPath, settings: Mapping[str, Any]) -> None:
         except ServerError as failure:
             if not failure.is_missing:
                 raise
+        except NoRight:
+            raise
         except FleetError as failure:
             if asyncio.get_running_loop().time() > ends:
                 raise no_quorum(path, failure) from None
@@ -89,6 +110,8 @@ async def _create(path: ServerPath, settings: Mapping[str, Any]) -> None:
             if asyncio.get_running_loop().time() > ends:
                 raise
             await asyncio.sleep(0.2)  # no leader yet, or it is under way
+        except NoRight:
+            raise
         except FleetError as failure:
             if asyncio.get_running_loop().time() > ends:
                 raise no_quorum(path, failure) from None

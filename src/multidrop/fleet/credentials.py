@@ -1,0 +1,74 @@
+"""Credentials: who a connection says it is, and which servers it believes.
+
+A key is an Ed25519 pair (an "nkey"). Its secret half is a file of its user alone; servers have the public
+half, which is no secret. A user's answers go to an inbox named by it, which nobody else may listen to.
+"""
+
+from __future__ import annotations
+
+import os
+import ssl
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+SEED = "SU"  # the first letters of a user's secret key
+CREDS = "-----BEGIN NATS USER JWT-----"
+
+
+def new_seed() -> str:
+    """Return a user's new secret key."""
+    import nkeys
+
+    return bytes(nkeys.encode_seed(os.urandom(32), nkeys.PREFIX_BYTE_USER)).decode()
+
+
+def public_key(seed: str) -> str:
+    """Return the public key of a secret one. Raises ValueError for what is none."""
+    import nkeys
+
+    try:
+        pair = nkeys.from_seed(bytearray(seed.encode()))
+    except (nkeys.NkeysError, ValueError) as failure:
+        raise ValueError(f"this is no secret key of a NATS user: {type(failure).__name__}") from None
+    return bytes(pair.public_key).decode()
+
+
+def inbox_of(public: str) -> str:
+    """Return where a user's answers go."""
+    return f"_INBOX_{public}"
+
+
+def connect_options(
+    urls: Sequence[str], credentials: Path | None = None, ca: Path | None = None
+) -> dict[str, Any]:
+    """Return the options of a connection to these servers.
+
+    `credentials` is a user's secret key, or a .creds file; `ca` the certificate that the servers' are signed
+    by. With it, or with tls:// in a URL, nothing is said before TLS has begun. Raises OSError or ValueError
+    for a file that is none.
+    """
+    options: dict[str, Any] = {}
+    if ca is not None or any(url.startswith("tls://") for url in urls):
+        options |= {"tls": _context(ca), "tls_handshake_first": True}
+    return options | _user(credentials) if credentials is not None else options
+
+
+def _user(credentials: Path) -> dict[str, Any]:
+    text = credentials.read_text("utf-8", "replace").strip()
+    if CREDS in text:
+        return {"user_credentials": str(credentials)}
+    if not text.startswith(SEED):
+        raise ValueError(f"{credentials} has no credentials: name a key of `fleet rights`, or a .creds file")
+    try:
+        public = public_key(text)
+    except ValueError:
+        raise ValueError(f"{credentials} is damaged: it is no key that `fleet rights` wrote") from None
+    return {"nkeys_seed_str": text, "inbox_prefix": inbox_of(public)}
+
+
+def _context(ca: Path | None) -> ssl.SSLContext:
+    try:
+        return ssl.create_default_context(cafile=ca)
+    except ssl.SSLError:
+        raise ValueError(f"{ca} has no certificate: it must be a PEM file") from None

@@ -1,0 +1,70 @@
+"""Refusals: what a NATS server does not allow, in one sentence each."""
+
+from __future__ import annotations
+
+import logging
+import re
+
+from multidrop.fleet.errors import FleetError, NoRight, NotAdmitted
+
+MOST_DENIALS = 1000
+REFUSALS = (  # what a failure says, and what that means at this address
+    (
+        "authorization violation",
+        "{} admits nobody who says this, or nothing, of himself: see --credentials",
+    ),
+    (
+        "certificate_verify_failed",
+        "the certificate of {} cannot be believed ({why}); --ca names the one that it is signed by",
+    ),
+    (
+        "[ssl",
+        "{} does not begin with TLS, which these options demand: set `handshake_first: true` in its tls "
+        "block, or name it with nats:// and no --ca",
+    ),
+    ("empty response", "{} does not begin in the clear: name it with tls://, and --ca"),
+)
+_DENIAL = re.compile(r"permissions violation for (publish|subscription) to \"([^\"]+)\"", re.IGNORECASE)
+
+_log = logging.getLogger("multidrop.fleet")
+
+
+def failure_to_connect(url: str, failure: BaseException) -> FleetError:
+    """Return the sentence for a connection that did not come about."""
+    text = str(failure).removeprefix("nats: ")
+    if not text:
+        text = "it said nothing in time; one that begins with TLS is named with tls://"
+    for sign, sentence in REFUSALS:
+        if sign in text.lower():
+            why = text.partition("failed: ")[2].partition(" (_ssl")[0]
+            return NotAdmitted(sentence.format(url, why=why))
+    return FleetError(f"no NATS server answers at {url}: {text}")
+
+
+class Denials:
+    """The subjects that one connection may not use, as its server said; each is told once."""
+
+    def __init__(self) -> None:
+        self._said: dict[tuple[str, str], str] = {}
+
+    async def note(self, failure: Exception) -> None:
+        """Take what a server says of its own accord."""
+        found = _DENIAL.search(str(failure))
+        if not found or len(self._said) >= MOST_DENIALS:
+            return
+        kind, subject = found[1].lower(), found[2].lower()  # the client gives them so
+        if (kind, subject) not in self._said:
+            verb = "publish" if kind == "publish" else "listen"
+            self._said[kind, subject] = f"these credentials do not allow to {verb} to {subject}"
+            _log.warning("%s", self._said[kind, subject])
+
+    def check_request(self, subject: str, inbox: str) -> None:
+        """Raise NoRight where a request could not be sent, or its answer not be heard."""
+        for (kind, denied), sentence in self._said.items():
+            if denied == subject.lower() if kind == "publish" else denied.startswith(inbox.lower()):
+                raise NoRight(sentence)
+
+    def check_subscription(self, subject: str) -> None:
+        """Raise NoRight where this may not be listened to."""
+        if sentence := self._said.get(("subscription", subject.lower())):
+            raise NoRight(sentence)

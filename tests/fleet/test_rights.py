@@ -1,0 +1,226 @@
+"""Rights in a fleet's servers, by the configuration that `fleet rights` writes: what is refused, and to whom.
+
+Each attempt is made twice: at a server with the rights as written, which must refuse it, and at one whose
+users may do everything, which must not. So an attempt that could not be refused is no proof.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import pytest
+from peers import require_module
+
+require_module("nats")
+require_module("nkeys")
+
+from nats.aio.client import Client  # noqa: E402
+from secured_clusters import SecuredCluster, secured_cluster  # noqa: E402
+
+from multidrop.fleet.credentials import inbox_of, public_key  # noqa: E402
+from multidrop.fleet.rights import OTHERS, rights_of  # noqa: E402
+
+GATEWAYS = ("gw-a", "gw-b")
+USERS = (*GATEWAYS, *OTHERS)
+STREAMS = ("samples", "KV_lease_0", "KV_own_0", "KV_plant")
+DEEDS = ("DELETE", "PURGE", "UPDATE", "MSG.DELETE", "SNAPSHOT", "PEER.REMOVE")
+CONSUMERS = ("CONSUMER.CREATE.{}", "CONSUMER.CREATE.{}.c.>", "CONSUMER.DURABLE.CREATE.{}.c")
+COMMANDS = ("cmd.line-1", "stop.line-1", "do.gw-b.run")
+PATIENCE_S = 30.0
+
+FORBIDDEN = {  # what each user must not publish, besides what nobody must
+    "gw-a": (
+        *("samples.gw-b.log", "samples.gw-c.log", "samples.gw-a"),
+        *("$KV.lease_0.gw-b.gw-b", "$KV.lease_1.gw-b.gw-c", "$KV.lease_2.gw-a.gw-b", "$KV.lease_0.gw-b"),
+        *("$KV.own_0.line-1.gw-a", "$KV.plant.line-1", "$KV.contest.key.gw-a"),
+        *("$JS.API.STREAM.CREATE.samples", "$JS.API.STREAM.CREATE.KV_more"),
+        *("$JS.API.DIRECT.GET.samples", "$JS.API.STREAM.MSG.GET.KV_plant"),
+        *("$JS.API.STREAM.LEADER.STEPDOWN.samples", "$JS.API.META.LEADER.STEPDOWN"),
+        *COMMANDS,
+        *("gateway.gw-b.drain", "gateway.gw-b.state", "gateway.gw-a.drain"),
+    ),
+    "hub": (
+        *("samples.gw-a.log", "$KV.lease_0.gw-a.hub", "$KV.own_0.line-1", "$KV.plant.line-1"),
+        *("$JS.API.DIRECT.GET.KV_plant", "$JS.API.STREAM.MSG.GET.samples"),
+        *COMMANDS,
+        *("gateway.gw-a.drain", "gateway.gw-a.state"),
+    ),
+    "viewer": (
+        *("samples.gw-a.log", "$KV.lease_0.gw-a.viewer", "$KV.own_0.line-1", "$KV.plant.line-1"),
+        *("$JS.API.DIRECT.GET.samples", "$JS.API.STREAM.LEADER.STEPDOWN.KV_lease_0"),
+        *COMMANDS,
+        "gateway.gw-a.drain",
+    ),
+    "commander": (
+        *("samples.gw-a.log", "$KV.lease_0.gw-a.gw-a", "$KV.own_0.line-1", "$KV.plant.line-1"),
+        *("$JS.API.DIRECT.GET.samples", "$JS.API.STREAM.LEADER.STEPDOWN.KV_lease_0"),
+        "gateway.gw-a.drain",
+    ),
+    "operator": (
+        *("samples.gw-a.log", "$KV.lease_0.gw-a.gw-a", "$KV.lease_0.gw-a.operator", "$KV.own_0.line-1"),
+        *("$JS.API.STREAM.CREATE.KV_more", "$JS.API.DIRECT.GET.samples"),
+        *COMMANDS,
+    ),
+}
+NOBODY = (
+    *(f"$JS.API.STREAM.{deed}.{stream}" for deed in DEEDS for stream in STREAMS),
+    *(f"$JS.API.{made.format(stream)}" for made in CONSUMERS for stream in STREAMS),
+    *(
+        "$JS.API.ACCOUNT.PURGE.multidrop",
+        "$JS.API.SERVER.REMOVE",
+        "$SYS.REQ.SERVER.PING",
+        "$JS.API.STREAM.NAMES",
+    ),
+)
+LISTENED = (
+    *(">", "*", "samples.>", "samples.gw-a.*", "$KV.>", "$KV.lease_0.>", "$JS.API.>", "$JS.ACK.>", "$SYS.>"),
+    *("_INBOX.>", "gateway.>", "gateway.*.*", "do.>", "do.*.*"),
+    *("gateway.gw-b.*", "do.gw-b.*"),
+)
+
+
+class Attempt(NamedTuple):
+    user: str
+    deed: str  # "publish" or "subscribe"
+    subject: str  # {name} stands for the inbox of that user
+
+
+def attempts() -> Iterator[Attempt]:
+    for user, subjects in FORBIDDEN.items():
+        others = [name for name in USERS if name != user]
+        for subject in (*subjects, *NOBODY, *(f"{{{name}}}.x" for name in others)):
+            yield Attempt(user, "publish", subject)
+        for subject in (*LISTENED, *(f"{{{name}}}.>" for name in others)):
+            yield Attempt(user, "subscribe", subject)
+        if user not in GATEWAYS:
+            for subject in ("cmd.*", "stop.*", "cmd.>", "stop.>", "cmd.line-1", "gateway.gw-a.state"):
+                yield Attempt(user, "subscribe", subject)
+
+
+async def refused(servers: SecuredCluster) -> set[Attempt]:
+    """Make all attempts, and return those that the server refuses."""
+    inboxes = {user: inbox_of(public_key(servers.key(user).read_text().strip())) for user in USERS}
+    found: set[Attempt] = set()
+    for user in FORBIDDEN:
+        told: list[str] = []
+
+        async def note(failure: Exception, told: list[str] = told) -> None:
+            told.append(str(failure).lower())
+
+        client = Client()
+        await client.connect(servers.urls[0], **servers.options(user), error_cb=note, allow_reconnect=False)
+        mine = {attempt: _subject(attempt, inboxes) for attempt in attempts() if attempt.user == user}
+        for attempt, subject in mine.items():
+            if attempt.deed == "publish":
+                await client.publish(subject, b"{}")
+            else:
+                await client.subscribe(subject)
+        for _ in range(2):  # the first ping may leave before what waits to be sent
+            await client.flush()
+        await client.close()
+        for attempt, subject in mine.items():
+            word = "publish" if attempt.deed == "publish" else "subscription"
+            if any(f'violation for {word} to "{subject.lower()}"' in text for text in told):
+                found.add(attempt)
+    return found
+
+
+def _subject(attempt: Attempt, inboxes: dict[str, str]) -> str:
+    return attempt.subject.format(**inboxes) if "{" in attempt.subject else attempt.subject
+
+
+@pytest.fixture(scope="module")
+def as_written(tmp_path_factory: pytest.TempPathFactory) -> Iterator[SecuredCluster]:
+    with secured_cluster(tmp_path_factory.mktemp("nats"), 1, GATEWAYS) as running:
+        yield running
+
+
+@pytest.fixture(scope="module")
+def refusals(as_written: SecuredCluster) -> set[Attempt]:
+    return asyncio.run(asyncio.wait_for(refused(as_written), PATIENCE_S))
+
+
+@pytest.fixture(scope="module")
+def refusals_where_all_is_allowed(tmp_path_factory: pytest.TempPathFactory) -> set[Attempt]:
+    def widened(rights: str) -> str:
+        return re.sub(r"allow: \[.*\]", 'allow: [">"]', rights)
+
+    with secured_cluster(tmp_path_factory.mktemp("wide"), 1, GATEWAYS, widened) as running:
+        return asyncio.run(asyncio.wait_for(refused(running), PATIENCE_S))
+
+
+@pytest.mark.parametrize("user", FORBIDDEN)
+def test_what_is_not_ones_right_is_refused(
+    user: str, refusals: set[Attempt], refusals_where_all_is_allowed: set[Attempt]
+) -> None:
+    wanted = {attempt for attempt in attempts() if attempt.user == user}
+    assert len(wanted) > 60
+    assert wanted - refusals == set()
+    assert refusals_where_all_is_allowed == set()
+
+
+def test_who_says_nothing_of_himself_is_not_admitted(as_written: SecuredCluster) -> None:
+    async def main() -> None:
+        options = as_written.options("hub")
+        everybody: list[dict[str, Any]] = [{}, {"user": "operator", "password": ""}, {"token": "x"}]
+        tls = {"tls": options["tls"], "tls_handshake_first": True}
+        for user in everybody:
+            with pytest.raises(Exception, match="Authorization Violation"):
+                await Client().connect(
+                    as_written.urls[0], allow_reconnect=False, error_cb=_ignore, **tls, **user
+                )
+
+    asyncio.run(asyncio.wait_for(main(), PATIENCE_S))
+
+
+async def _ignore(_: Exception) -> None:
+    pass
+
+
+@pytest.mark.parametrize(
+    ("names", "sentence"),
+    [
+        (["gw.1"], "the gateway's name 'gw.1' may have letters"),
+        (["gw-1", "gw-1"], "'gw-1' is there twice"),
+        (["hub"], "'hub' is there twice"),
+    ],
+)
+def test_names_that_rights_cannot_be_given_to(names: list[str], sentence: str) -> None:
+    with pytest.raises(ValueError, match=re.escape(sentence)):
+        rights_of(names)
+
+
+def test_secrets_are_in_no_file_for_all_and_for_no_other_eyes(as_written: SecuredCluster) -> None:
+    keys = as_written.folder / "keys"
+    assert {path.name for path in keys.iterdir()} == {*(f"{user}.key" for user in USERS), "routes"}
+    assert [oct(path.stat().st_mode & 0o777) for path in (keys, *keys.iterdir())] == ["0o700", *["0o600"] * 7]
+    assert oct((as_written.folder / "n1.conf").stat().st_mode & 0o777) == "0o600"
+    public = (as_written.folder / "rights.conf").read_text()
+    for path in keys.iterdir():
+        assert path.read_text().strip() not in public
+
+
+def test_a_gateway_that_comes_changes_no_key(tmp_path: Path) -> None:
+    from multidrop.fleet.server_files import write_files
+
+    urls = ["nats://a:4222", "nats://b:4222"]
+
+    def text(name: str) -> str:
+        return (tmp_path / name).read_text()
+
+    write_files(tmp_path, ["gw-1"], urls, None)
+    before = {name: text(name) for name in ("keys/gw-1.key", "keys/hub.key", "n1.conf", "n2.conf")}
+    write_files(tmp_path, ["gw-1", "gw-2"], urls, None)
+    assert {name: text(name) for name in before} == before
+    assert text("keys/gw-2.key") != text("keys/gw-1.key")
+    write_files(tmp_path, ["gw-2"], urls, None)
+    assert public_key(text("keys/gw-1.key").strip()) not in text("rights.conf")
+    (tmp_path / "keys/hub.key").write_text("SUNKEN")
+    before = {str(path): path.read_text() for path in tmp_path.rglob("*") if path.is_file()}
+    with pytest.raises(ValueError, match=r"hub\.key is damaged: remove it, and its user gets another key"):
+        write_files(tmp_path, ["gw-3"], urls, None)
+    assert {str(path): path.read_text() for path in tmp_path.rglob("*") if path.is_file()} == before

@@ -1,0 +1,125 @@
+"""NATS servers with the very configuration that `fleet rights` writes, with TLS, in a temporary folder."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import subprocess
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing, contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+from nats_clusters import ATTEMPTS, PATIENCE_S, READY_S, Cluster, Node, server_program
+from peers import require_program
+
+from multidrop.fleet.credentials import connect_options
+from multidrop.fleet.server_files import ROUTE_PORTS, TlsFiles, write_files
+
+GATEWAYS = ("gw-a", "gw-b", "gw-c")
+Change = Callable[[str], str]  # of rights.conf
+
+
+def _as_written(rights: str) -> str:
+    return rights
+
+
+def certificates(folder: Path, host: str = "127.0.0.1") -> TlsFiles:
+    """Make a certificate authority, and a certificate for this address that it has signed."""
+    openssl = require_program("openssl")
+    folder.mkdir(parents=True, exist_ok=True)
+    own = ["req", "-x509", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:P-256", "-nodes", "-days", "2"]
+    names = f"subjectAltName=IP:{host}"
+    for words in (
+        [*own, "-subj", "/CN=fleet", "-keyout", "ca-key.pem", "-out", "ca.pem"],
+        [
+            *(*own, "-subj", "/CN=server", "-addext", names, "-CA", "ca.pem", "-CAkey", "ca-key.pem"),
+            *("-keyout", "server-key.pem", "-out", "server.pem"),
+        ],
+    ):
+        subprocess.run([openssl, *words], cwd=folder, check=True, capture_output=True, timeout=PATIENCE_S)
+    return TlsFiles(folder / "server.pem", folder / "server-key.pem", folder / "ca.pem")
+
+
+def ports_with_routes(number: int) -> list[int]:
+    """Return free ports whose ports of routes are free too."""
+    found: list[int] = []
+    while len(found) < number:
+        with closing(socket.socket()) as one, closing(socket.socket()) as other:
+            one.bind(("127.0.0.1", 0))
+            port = int(one.getsockname()[1])
+            with suppress(OSError, OverflowError):
+                other.bind(("127.0.0.1", port + ROUTE_PORTS))
+                found.append(port)
+    return found
+
+
+class SecuredNode(Node):
+    """One server's process, with a file that was written for it."""
+
+    def __init__(self, folder: Path, name: str, port: int, monitor: int) -> None:
+        self.name, self.port, self.monitor = name, port, monitor
+        self._log = folder / f"{name}.log"
+        self._command = [server_program(), "-c", str(folder / f"{name}.conf"), "-m", str(monitor)]
+        self.start()
+
+    @property
+    def url(self) -> str:
+        return f"tls://127.0.0.1:{self.port}"
+
+
+class SecuredCluster(Cluster):
+    """Servers, and the keys of all users."""
+
+    def __init__(
+        self, folder: Path, number: int, gateways: Sequence[str], change: Change = _as_written
+    ) -> None:
+        ports, monitors = ports_with_routes(number), ports_with_routes(number)
+        self.folder = folder
+        self._gateways = gateways
+        self.tls = certificates(folder / "tls")
+        urls = [f"tls://127.0.0.1:{port}" for port in ports]
+        write_files(folder, gateways, urls, self.tls, folder)
+        rights = folder / "rights.conf"
+        rights.write_text(change(rights.read_text()))
+        self.nodes = [SecuredNode(folder, f"n{at + 1}", ports[at], monitors[at]) for at in range(number)]
+
+    def key(self, user: str) -> Path:
+        return self.folder / "keys" / f"{user}.key"
+
+    def take_rights_of(self, gateway: str) -> None:
+        """Write rights without this gateway's, and let the servers read them."""
+        left = [name for name in self._gateways if name != gateway]
+        write_files(self.folder, left, self.urls, self.tls, self.folder)
+        for node in self.nodes:
+            node.process.send_signal(signal.SIGHUP)
+
+    def options(self, user: str) -> dict[str, Any]:
+        """Return the options of a connection as this user."""
+        return connect_options(self.urls, self.key(user), self.tls.ca)
+
+    def environment(self, user: str) -> dict[str, str]:
+        """Return the environment of a command of this user."""
+        return {
+            **os.environ,
+            "MULTIDROP_NATS": ",".join(self.urls),
+            "MULTIDROP_NATS_CREDENTIALS": str(self.key(user)),
+            "MULTIDROP_NATS_CA": str(self.tls.ca),
+        }
+
+
+@contextmanager
+def secured_cluster(
+    folder: Path, number: int = 3, gateways: Sequence[str] = GATEWAYS, change: Change = _as_written
+) -> Iterator[SecuredCluster]:
+    for attempt in range(ATTEMPTS):  # another program may have taken a port that was free just now
+        running = SecuredCluster(folder / str(attempt), number, gateways, change)
+        if running.is_ready_within(READY_S) or attempt == ATTEMPTS - 1:
+            break
+        running.close()
+    try:
+        running.wait()
+        yield running
+    finally:
+        running.close()
