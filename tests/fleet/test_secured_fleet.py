@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import ssl
-import subprocess
-import sys
-import time
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -20,9 +19,18 @@ require_module("nkeys")
 require_module("pyarrow")
 
 from secured_clusters import GATEWAYS, SecuredCluster, certificates, secured_cluster  # noqa: E402
-from serial_hall import SerialHall  # noqa: E402
+from secured_fleets import PATIENCE_S, multidrop, secured_fleet, until  # noqa: E402
 
-PATIENCE_S = 60.0
+from multidrop.fleet import names  # noqa: E402
+from multidrop.fleet.errors import Conflict  # noqa: E402
+from multidrop.fleet.lease_bucket import LeaseBucket  # noqa: E402
+from multidrop.fleet.servers import paths_of  # noqa: E402
+
+AN_HOUR_AHEAD = """
+import time
+seconds, ns = time.time, time.time_ns
+time.time, time.time_ns = lambda: seconds() + 3600, lambda: ns() + 3600 * 10**9
+"""
 LINE = """
 [[line]]
 name = "hall-1"
@@ -32,18 +40,6 @@ name = "pump-1"
 model = "innovert-ibd"
 address = 1
 """
-
-
-def multidrop(servers: SecuredCluster, user: str, *words: str) -> subprocess.CompletedProcess[str]:
-    """Run a command as this user."""
-    return subprocess.run(
-        [sys.executable, "-m", "multidrop", *words],
-        env=servers.environment(user),
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=PATIENCE_S,
-    )
 
 
 @pytest.fixture(scope="module")
@@ -185,96 +181,136 @@ def test_a_context_for_tls_believes_this_authority_alone(servers: SecuredCluster
 # ---- a whole fleet ----
 
 
-class SecuredFleet:
-    """Gateways as processes, each with its own key, and a hall of lines that sees what they send."""
-
-    def __init__(self, folder: Path, servers: SecuredCluster) -> None:
-        self.servers, self.folder = servers, folder
-        self.hall = SerialHall(6)
-        self.running: dict[str, subprocess.Popen[bytes]] = {}
-        (folder / "plant.toml").write_text(self.hall.plant())
-
-    def start(self, name: str) -> None:
-        words = ["fleet", "serve", name, "--folder", str(self.folder / name)]
-        with (self.folder / f"{name}.log").open("ab") as log:
-            self.running[name] = subprocess.Popen(
-                [sys.executable, "-m", "multidrop", *words],
-                env=self.servers.environment(name),
-                stdout=log,
-                stderr=log,
-            )
-
-    def log(self, name: str) -> str:
-        return (self.folder / f"{name}.log").read_text()
-
-    def close(self) -> None:
-        for process in self.running.values():
-            process.kill()
-            process.wait()
-        self.hall.close()
-
-
-def until(condition: Callable[[], bool], what: str) -> None:
-    ends = time.monotonic() + PATIENCE_S
-    while not condition():
-        assert time.monotonic() < ends, what
-        time.sleep(0.1)
-
-
 @pytest.mark.long
 def test_all_works_with_the_rights_as_written(tmp_path: Path) -> None:
     """Cold start, a dead gateway's lines, a drain, the hub, and no denial in anybody's log."""
-    with secured_cluster(tmp_path / "nats") as servers:
-        fleet = SecuredFleet(tmp_path, servers)
-        try:
-            made = multidrop(servers, "operator", "fleet", "init", str(tmp_path / "plant.toml"))
-            assert (made.returncode, made.stderr) == (0, "")
-            for name in GATEWAYS:
-                fleet.start(name)
-            until(lambda: fleet.hall.are_polled(0.5), "all lines are polled")
-
-            def status(user: str) -> dict[str, dict[str, dict[str, object]]]:
-                found: dict[str, dict[str, dict[str, object]]] = json.loads(
-                    multidrop(servers, user, "fleet", "status", "--json").stdout
-                )
-                return found
-
-            until(lambda: all(one["lines"] for one in status("viewer")["gateways"].values()), "shares")
-            assert set(status("commander")["gateways"]) == set(GATEWAYS)
-            fleet.running["gw-a"].kill()
-            until(lambda: set(status("viewer")["gateways"]) == {"gw-b", "gw-c"}, "its end")
-            until(lambda: fleet.hall.are_polled(0.5), "all lines are polled again")
-            drained = multidrop(servers, "operator", "fleet", "drain", "gw-b")
-            assert (drained.returncode, drained.stderr) == (0, "")
-            until(lambda: fleet.hall.are_polled(0.5), "all lines are polled by one")
-            fleet.running["gw-c"].terminate()
-            fleet.running["gw-c"].wait(PATIENCE_S)
-            words = ["--parquet", str(tmp_path / "hub"), "--once", "--json"]
-            kept = json.loads(multidrop(servers, "hub", "hub", *servers.urls, *words).stdout)
-            assert kept["rows"] > 100
-            assert kept["alarms"] == 0
-            for name in GATEWAYS:
-                assert "do not allow" not in fleet.log(name)
-                assert "Traceback" not in fleet.log(name)
-        finally:
-            fleet.close()
+    with secured_fleet(tmp_path) as fleet:
+        fleet.wait_for_polling()
+        until(lambda: all(one["lines"] for one in fleet.status()["gateways"].values()), "shares")
+        assert set(fleet.status("commander")["gateways"]) == set(GATEWAYS)
+        fleet.running["gw-a"].kill()
+        until(lambda: set(fleet.status()["gateways"]) == {"gw-b", "gw-c"}, "its end")
+        fleet.wait_for_polling()
+        drained = multidrop(fleet.servers, "operator", "fleet", "drain", "gw-b")
+        assert (drained.returncode, drained.stderr) == (0, "")
+        fleet.wait_for_polling()
+        fleet.running["gw-c"].terminate()
+        fleet.running["gw-c"].wait(PATIENCE_S)
+        words = ["--parquet", str(tmp_path / "hub"), "--once", "--json"]
+        kept = json.loads(multidrop(fleet.servers, "hub", "hub", *fleet.servers.urls, *words).stdout)
+        assert kept["rows"] > 100
+        assert kept["alarms"] == 0
+        assert fleet.hall.overlaps() == 0
+        for name in GATEWAYS:
+            assert "do not allow" not in fleet.log(name)
+            assert "Traceback" not in fleet.log(name)
 
 
 @pytest.mark.long
 def test_a_key_that_is_taken_away_is_told_of_and_its_lines_go_on(tmp_path: Path) -> None:
     """The servers read their rights again, and end the connections of who has none any more."""
-    with secured_cluster(tmp_path / "nats", 1, ("gw-a", "gw-b")) as servers:
-        fleet = SecuredFleet(tmp_path, servers)
-        try:
-            multidrop(servers, "operator", "fleet", "init", str(tmp_path / "plant.toml"))
-            for name in ("gw-a", "gw-b"):
-                fleet.start(name)
-            until(lambda: fleet.hall.are_polled(0.5), "all lines are polled")
-            servers.take_rights_of("gw-a")
-            until(lambda: "admits nobody who says this" in fleet.log("gw-a"), "the sentence")
-            until(lambda: "no line is polled" in fleet.log("gw-a"), "silence")
-            until(lambda: fleet.hall.are_polled(0.5), "the other one polls all lines")
-            assert fleet.running["gw-a"].poll() is None  # and tries again
-            assert fleet.log("gw-a").count("admits nobody") < 10  # each connection says it once
-        finally:
-            fleet.close()
+    with secured_fleet(tmp_path, 1, ("gw-a", "gw-b")) as fleet:
+        fleet.wait_for_polling()
+        fleet.servers.take_rights_of("gw-a")
+        until(lambda: "admits nobody who says this" in fleet.log("gw-a"), "the sentence")
+        until(lambda: "no line is polled" in fleet.log("gw-a"), "silence")
+        fleet.wait_for_polling()
+        assert fleet.running["gw-a"].poll() is None  # and tries again
+        assert fleet.log("gw-a").count("admits nobody") < 10  # each connection says it once
+
+
+@pytest.mark.long
+def test_a_gateway_in_wrong_hands_makes_no_two_others_send(tmp_path: Path) -> None:
+    """Somebody with the key of gw-c ends the others' sessions again and again: lines are silent, no more.
+
+    The others go on for as long as their lease holds; who takes over waits for that, whatever is written.
+    """
+    with secured_fleet(tmp_path, 1) as fleet:
+        fleet.wait_for_polling()
+        fleet.running["gw-c"].kill()
+        until(lambda: set(fleet.status()["gateways"]) == {"gw-a", "gw-b"}, "its end")
+        fleet.wait_for_polling()
+
+        async def end_all() -> None:
+            path = paths_of(fleet.servers.urls, fleet.servers.options("gw-c"))[0]
+            await path.open()
+            for name in ("gw-a", "gw-b", "gw-a"):
+                for at in names.LEASES:
+                    bucket = LeaseBucket(at, lambda: path, "gw-c")
+                    record = await bucket.get(name)
+                    while True:
+                        with suppress(Conflict):
+                            await bucket.put(name, {**record.value, "ended": True}, record.revision)
+                            break
+                        record = await bucket.get(name)
+                await asyncio.sleep(5.0)
+            await path.close()
+
+        asyncio.run(asyncio.wait_for(end_all(), PATIENCE_S))
+        assert "was ended by another" in fleet.log("gw-a")
+        assert "was ended by another" in fleet.log("gw-b")
+        fleet.wait_for_polling()
+        assert fleet.hall.overlaps() == 0
+
+
+# ---- bad surroundings ----
+
+
+@pytest.mark.long
+def test_clocks_an_hour_apart_are_told_of_and_change_nothing(tmp_path: Path) -> None:
+    """One of two gateways is an hour ahead; each takes over what the other leaves."""
+    (tmp_path / "ahead").mkdir()
+    (tmp_path / "ahead" / "sitecustomize.py").write_text(AN_HOUR_AHEAD)
+    ahead = {"gw-a": {"PYTHONPATH": str(tmp_path / "ahead")}, "gw-b": {}}
+    with secured_fleet(tmp_path, 1, ("gw-a", "gw-b"), ahead) as fleet:
+        until(lambda: "this machine's clock is 3600 s ahead of that of tls://" in fleet.log("gw-a"), "a word")
+
+        def are_two() -> bool:
+            return [one["lines"] > 0 for one in fleet.status()["gateways"].values()] == [True, True]
+
+        until(are_two, "both")
+        for name in ("gw-b", "gw-a"):
+            fleet.running[name].kill()
+            until(lambda name=name: name not in fleet.status()["gateways"], "its end")  # type: ignore[misc]
+            fleet.wait_for_polling()
+            fleet.start(name, **ahead[name])
+            until(
+                lambda: [bool(one["lines"]) for one in fleet.status()["gateways"].values()] == [1, 1], "both"
+            )
+        assert "this machine's clock" not in fleet.log("gw-b")
+        assert fleet.hall.overlaps() == 0
+
+
+@pytest.mark.long
+def test_two_gateways_of_one_name_on_two_machines(tmp_path: Path) -> None:
+    """The second one has another folder, as on another machine: it waits, says so, and goes on alone."""
+    with secured_fleet(tmp_path, 1, ("gw-a",)) as fleet:
+        fleet.wait_for_polling()
+        fleet.start("gw-a", "second")
+        sentence = "gw-a does not poll: a gateway called gw-a is registered on"
+        until(lambda: sentence in fleet.log("second"), "the sentence")
+        assert fleet.status()["gateways"]["gw-a"]["session"] == 1
+        fleet.running["gw-a"].kill()
+        until(lambda: fleet.status()["gateways"].get("gw-a", {}).get("session") == 2, "the second one")
+        fleet.wait_for_polling()
+        assert fleet.log("second").count(sentence) == 1
+        assert fleet.hall.overlaps() == 0
+
+
+@pytest.mark.long
+def test_without_a_quorum_each_command_is_one_sentence(tmp_path: Path) -> None:
+    with secured_fleet(tmp_path, 3, ("gw-a",)) as fleet:
+        fleet.wait_for_polling()
+        fleet.running["gw-a"].terminate()
+        fleet.running["gw-a"].wait(PATIENCE_S)
+        for node in fleet.servers.nodes[1:]:
+            node.kill()
+        kept = str(tmp_path / "gw-a")
+        for user, words in (
+            ("viewer", ["status"]),
+            ("operator", ["drain", "gw-a"]),
+            ("gw-a", ["serve", "gw-a", "--folder", kept]),
+        ):
+            assert "have no quorum: more than half of them must run" in told(
+                fleet.servers, user, "fleet", *words
+            )

@@ -6,6 +6,7 @@ import asyncio
 import re
 import time
 from pathlib import Path
+from typing import Any
 
 import pytest
 from nats_clusters import Cluster, cluster, free_ports, old_server_program
@@ -13,7 +14,7 @@ from nats_clusters import Cluster, cluster, free_ports, old_server_program
 from multidrop.fleet import lease_bucket, servers, setup
 from multidrop.fleet.buckets import ask
 from multidrop.fleet.errors import FleetError
-from multidrop.fleet.servers import paths_of
+from multidrop.fleet.servers import ServerPath, paths_of
 
 
 async def _init(urls: list[str]) -> dict[str, object]:
@@ -94,6 +95,46 @@ def test_no_quorum_is_one_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPat
             node.kill()
         with pytest.raises(FleetError, match="have no quorum: more than half of them must run"):
             asyncio.run(_init(three.urls))
+
+
+def test_a_bucket_without_a_leader_is_no_quorum(fleet: Cluster, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A server that is alone answers some seconds after the others' death, and names no leader."""
+    told = setup.ask
+
+    async def without_leader(path: ServerPath, subject: str) -> dict[str, Any]:
+        info = await told(path, subject)
+        info["cluster"].pop("leader", None)
+        return info
+
+    monkeypatch.setattr(setup, "ask", without_leader)
+    monkeypatch.setattr(setup, "LEADER_S", 0.2)
+    with pytest.raises(FleetError, match=r"have no quorum: .*the bucket lease_0 has no leader"):
+        asyncio.run(_check(fleet))
+
+
+@pytest.mark.parametrize(("ahead_s", "words"), [(3600, "is 3600 s ahead of"), (-3600, "is 3600 s behind")])
+def test_a_clock_an_hour_away_is_told_of(
+    fleet: Cluster,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+    ahead_s: float,
+    words: str,
+) -> None:
+    asyncio.run(_check(fleet))
+    assert caplog.messages == []
+    real = time.time
+    monkeypatch.setattr(setup.time, "time", lambda: real() + ahead_s)
+    asyncio.run(_check(fleet))
+    [said] = caplog.messages
+    assert words in said
+    assert said.endswith("set it, for samples have its time")
+
+
+async def _check(fleet: Cluster) -> None:
+    path = paths_of(fleet.urls)[0]
+    await path.open()
+    await setup.check_buckets(path)
+    await path.close()
 
 
 def test_a_path_goes_elsewhere_and_comes_home(tmp_path: Path) -> None:

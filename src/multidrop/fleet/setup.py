@@ -22,6 +22,7 @@ ROUNDS = 40  # 2.9.10 fails in the first few of them
 CLAIMANTS = 6
 MOST_REPLICAS = 3
 WAIT_S = 10.0  # an election takes 4 to 9 s
+LEADER_S = 2.0
 CLOCKS_APART_S = 10.0
 
 _log = logging.getLogger("multidrop.fleet")
@@ -55,7 +56,7 @@ async def check_buckets(path: ServerPath) -> None:
     """Raise FleetError where there is no fleet in these servers yet, or no quorum."""
     for bucket in names.BUCKETS:
         try:
-            info = await ask(path, f"STREAM.INFO.KV_{bucket}")
+            info = await _led(path, bucket)
         except ServerError as failure:
             if failure.is_missing:
                 raise FleetError(
@@ -67,6 +68,18 @@ async def check_buckets(path: ServerPath) -> None:
         except FleetError as failure:
             raise no_quorum(path, failure) from None
     check_clock(path, info["ts"])
+
+
+async def _led(path: ServerPath, bucket: str) -> dict[str, Any]:
+    """Return what a bucket is, once it has a leader; that is on its way home for a moment."""
+    ends = asyncio.get_running_loop().time() + LEADER_S
+    while True:
+        info = await ask(path, f"STREAM.INFO.KV_{bucket}")
+        if info.get("cluster", {"leader": path.server_name}).get("leader"):
+            return info
+        if asyncio.get_running_loop().time() > ends:
+            raise Unsure(f"the bucket {bucket} has no leader")
+        await asyncio.sleep(0.1)
 
 
 def check_clock(path: ServerPath, server_time: str) -> None:

@@ -1,0 +1,95 @@
+"""A whole fleet with rights: gateways as processes, each with its own key, and lines that judge them."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from secured_clusters import GATEWAYS, SecuredCluster, secured_cluster
+from serial_hall import SerialHall
+
+PATIENCE_S = 60.0
+
+
+def multidrop(servers: SecuredCluster, user: str, *words: str) -> subprocess.CompletedProcess[str]:
+    """Run a command as this user."""
+    return subprocess.run(
+        [sys.executable, "-m", "multidrop", *words],
+        env=servers.environment(user),
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=PATIENCE_S,
+    )
+
+
+def until(condition: Callable[[], bool], what: str) -> None:
+    ends = time.monotonic() + PATIENCE_S
+    while not condition():
+        assert time.monotonic() < ends, what
+        time.sleep(0.1)
+
+
+class SecuredFleet:
+    """Gateways on six lines; each keeps what it has in the folder of its name."""
+
+    def __init__(self, folder: Path, servers: SecuredCluster) -> None:
+        self.servers = servers
+        self.hall = SerialHall(6)
+        self.running: dict[str, subprocess.Popen[bytes]] = {}
+        self._folder = folder
+        (folder / "plant.toml").write_text(self.hall.plant())
+        made = multidrop(servers, "operator", "fleet", "init", str(folder / "plant.toml"))
+        assert made.returncode == 0, made.stderr
+
+    def start(self, name: str, kept: str = "", **environment: str) -> None:
+        """Start a gateway; `kept` names another folder than that of its name."""
+        kept = kept or name
+        words = ["fleet", "serve", name, "--folder", str(self._folder / kept)]
+        with (self._folder / f"{kept}.log").open("ab") as log:
+            self.running[kept] = subprocess.Popen(
+                [sys.executable, "-m", "multidrop", *words],
+                env={**self.servers.environment(name), **environment},
+                stdout=log,
+                stderr=log,
+            )
+
+    def log(self, kept: str) -> str:
+        return (self._folder / f"{kept}.log").read_text()
+
+    def status(self, user: str = "viewer") -> dict[str, Any]:
+        found: dict[str, Any] = json.loads(multidrop(self.servers, user, "fleet", "status", "--json").stdout)
+        return found
+
+    def wait_for_polling(self) -> None:
+        until(lambda: self.hall.are_polled(0.5), "all lines are polled")
+
+    def close(self) -> None:
+        for process in self.running.values():
+            process.kill()
+            process.wait()
+        self.hall.close()
+
+
+@contextmanager
+def secured_fleet(
+    folder: Path,
+    number: int = 3,
+    gateways: Sequence[str] = GATEWAYS,
+    environments: Mapping[str, Mapping[str, str]] | None = None,
+) -> Iterator[SecuredFleet]:
+    """Begin a fleet on so many servers, with all gateways started."""
+    with secured_cluster(folder / "nats", number, gateways) as servers:
+        fleet = SecuredFleet(folder, servers)
+        try:
+            for name in gateways:
+                fleet.start(name, **(environments or {}).get(name, {}))
+            yield fleet
+        finally:
+            fleet.close()
