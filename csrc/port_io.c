@@ -1,6 +1,6 @@
 /* One port on the engine's thread: reading, writing and switching, until there is nothing to do but wait. */
 #define _GNU_SOURCE
-#include "engine.h"
+#include "mastership.h"
 
 #include <errno.h>
 #include <unistd.h>
@@ -62,7 +62,7 @@ static int may_send(struct md_port *port)
     if (!port->is_unheard || line->exchange->insists)
         return 1;
     port->is_unheard = 0;
-    return !md_listen_begin(line, md_now_ns());
+    return !md_listen_begin(line, md_now_ns(), port->mastership->guard_ns);
 }
 
 /* Write; 1: the port took something, or there is something else to do. The request leaves when it is written;

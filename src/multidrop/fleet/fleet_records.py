@@ -13,9 +13,11 @@ from multidrop.fleet.buckets import Bucket, Follower, Record
 from multidrop.fleet.errors import FleetError
 from multidrop.fleet.lease_rules import Terms
 from multidrop.fleet.observer import Observer
+from multidrop.fleet.ownership import owner_of
 from multidrop.fleet.servers import ServerPath
 
-FOLLOW_S = 0.2
+FOLLOW_S = 0.2  # between looks at a bucket
+LEASES_S = 0.1  # the same of leases: how long a dead gateway's lines stay silent begins with it
 
 
 class FleetRecords:
@@ -27,6 +29,7 @@ class FleetRecords:
         self.observer = Observer(me, [Bucket(bucket, path) for bucket in names.LEASES], terms)
         self.owners = {bucket: Follower(Bucket(bucket, path)) for bucket in names.OWNERS}
         self.plant = Follower(Bucket(names.PLANT, path))
+        self.lines: tuple[str, ...] = ()  # of the plant, by name
         self._on_change = on_change
         self._read: set[str] = set()  # buckets that were read at least once
 
@@ -39,23 +42,38 @@ class FleetRecords:
         """Return the record of a line's master."""
         return self.owners[names.owner_bucket(line)].records.get(line)
 
-    def lines(self) -> list[str]:
-        """Return the lines of the plant."""
-        return [
-            name for name, record in self.plant.records.items() if record.value and "line" in record.value
-        ]
+    def is_in_plant(self, line: str) -> bool:
+        record = self.plant.records.get(line)
+        return bool(record and record.value and "line" in record.value)
+
+    def owned_by(self, gateway: str, session: int) -> set[str]:
+        """Return the lines whose records name this session."""
+        me = (gateway, session)
+        return {
+            line
+            for follower in self.owners.values()
+            for line, record in follower.records.items()
+            if owner_of(record) == me
+        }
 
     def works(self) -> list[Coroutine[Any, Any, None]]:
         """Return what reads them for ever, a coroutine for each bucket, so that none waits for another."""
-        looks: dict[str, Callable[[], Awaitable[Any]]] = {names.PLANT: self.plant.look}
-        looks |= {name: partial(self.observer.look, path) for path, name in enumerate(names.LEASES)}
-        looks |= {name: follower.look for name, follower in self.owners.items()}
-        return [self._follow(name, look) for name, look in looks.items()]
+        works = [self._follow(names.PLANT, self._look_at_plant, FOLLOW_S)]
+        works += [self._follow(name, owners.look, FOLLOW_S) for name, owners in self.owners.items()]
+        for path, name in enumerate(names.LEASES):
+            works.append(self._follow(name, partial(self.observer.look, path), LEASES_S))
+        return works
 
-    async def _follow(self, name: str, look: Callable[[], Awaitable[Any]]) -> None:
+    async def _look_at_plant(self) -> bool:
+        changed = await self.plant.look()
+        if changed:
+            self.lines = tuple(sorted(filter(self.is_in_plant, self.plant.records)))
+        return bool(changed)
+
+    async def _follow(self, name: str, look: Callable[[], Awaitable[Any]], every_s: float) -> None:
         while True:
             with suppress(FleetError):
                 if await look() or name not in self._read:
                     self._on_change()
                 self._read.add(name)
-            await asyncio.sleep(FOLLOW_S)
+            await asyncio.sleep(every_s)
