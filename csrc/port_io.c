@@ -1,9 +1,7 @@
 /* One port on the engine's thread: reading, writing and switching, until there is nothing to do but wait. */
 #define _GNU_SOURCE
+#include "descriptor.h"
 #include "engine.h"
-
-#include <errno.h>
-#include <unistd.h>
 
 enum {
     WORTH_BLINDNESS = 200000, /* ns; a shorter wait is not worth the system calls to look away */
@@ -35,7 +33,7 @@ static int is_transient(int error)
 int64_t md_port_receive(struct md_port *port)
 {
     uint8_t bytes[1024];
-    ssize_t got = read(port->fd, bytes, sizeof bytes);
+    ssize_t got = md_descriptor_read(port->fd, bytes, sizeof bytes);
     int64_t now_ns = md_now_ns();
     port->is_empty = got < (ssize_t)sizeof bytes;
     if (got > 0) {

@@ -5,37 +5,11 @@
  * Nothing here waits: the thread looks when the last bit must have left. Then a UART that tells so has the
  * last word (TIOCSERGETLSR); where none does, nothing may be queued, and a character more is waited for. */
 #define _GNU_SOURCE
+#include "descriptor.h"
 #include "engine.h"
-
-#include <errno.h>
-#include <sys/ioctl.h>
-#include <unistd.h>
-#ifdef __linux__ /* others have no RS-485 mode */
-#include <linux/serial.h>
-#endif
 
 static const int64_t LOOK_AGAIN_NS = 200000;
 static const int64_t MOST_HELD_NS = 100000000; /* behind its time: the port is broken, no request leaves */
-
-static int ask_driver(int fd)
-{
-#ifdef __linux__
-    struct serial_rs485 mode;
-    if (ioctl(fd, TIOCGRS485, &mode))
-        return -errno;
-    if (!(mode.flags & (SER_RS485_RTS_ON_SEND | SER_RS485_RTS_AFTER_SEND))) /* else as it was set up */
-        mode.flags |= SER_RS485_RTS_ON_SEND;
-    mode.flags |= SER_RS485_ENABLED;
-    if (ioctl(fd, TIOCSRS485, &mode) || ioctl(fd, TIOCGRS485, &mode))
-        return -errno;
-    return mode.flags & SER_RS485_ENABLED ? 0 : -EOPNOTSUPP;
-#else
-    (void)fd;
-    return -EOPNOTSUPP;
-#endif
-}
-
-/* ---- RTS ---- */
 
 static int is_by_rts(const struct md_rs485 *rs485)
 {
@@ -44,21 +18,8 @@ static int is_by_rts(const struct md_rs485 *rs485)
 
 static int steer(struct md_port *port, int is_sending)
 {
-    int rts = TIOCM_RTS, is_up = is_sending == (port->rs485.mode == MD_RS485_RTS_UP);
     port->rs485.is_sending = is_sending;
-    return ioctl(port->fd, is_up ? TIOCMBIS : TIOCMBIC, &rts) ? -errno : 0;
-}
-
-/* Return 1 where the UART says that its last bit has left, 0 where not, -errno where it does not tell. */
-static int is_shifted_out(int fd)
-{
-#ifdef TIOCSERGETLSR
-    unsigned state = 0;
-    return ioctl(fd, TIOCSERGETLSR, &state) ? -errno : (state & TIOCSER_TEMT) != 0;
-#else
-    (void)fd;
-    return -ENOTTY;
-#endif
+    return md_descriptor_set_rts(port->fd, is_sending == (port->rs485.mode == MD_RS485_RTS_UP));
 }
 
 /* Return 1 when the last bit has left; else say when to look again. */
@@ -67,9 +28,8 @@ static int is_out(struct md_port *port, int64_t now_ns)
     struct md_rs485 *rs485 = &port->rs485;
     rs485->look_ns = now_ns + LOOK_AGAIN_NS;
     if (rs485->tells_end)
-        return is_shifted_out(port->fd) != 0;
-    int queued = 0;
-    if (ioctl(port->fd, TIOCOUTQ, &queued) == 0 && queued) {
+        return md_descriptor_is_shifted_out(port->fd) != 0;
+    if (md_descriptor_is_queued(port->fd)) {
         rs485->empty_ns = 0;
         return 0;
     }
@@ -84,9 +44,9 @@ int md_rs485_begin(struct md_port *port, int mode)
     int failure = 0;
     port->rs485 = (struct md_rs485){.mode = mode};
     if (mode == MD_RS485_KERNEL)
-        failure = ask_driver(port->fd);
+        failure = md_descriptor_take_rs485(port->fd);
     else if (is_by_rts(&port->rs485)) {
-        port->rs485.tells_end = is_shifted_out(port->fd) >= 0;
+        port->rs485.tells_end = md_descriptor_is_shifted_out(port->fd) >= 0;
         failure = steer(port, 0);
         if (!failure && mode == MD_RS485_RTS_DOWN) /* else it would fall with the port, and send for ever */
             failure = md_port_keep_rts(port->fd);
@@ -100,13 +60,13 @@ ssize_t md_rs485_write(struct md_port *port, const uint8_t *bytes, size_t len)
 {
     struct md_rs485 *rs485 = &port->rs485;
     if (!is_by_rts(rs485))
-        return write(port->fd, bytes, len);
+        return md_descriptor_write(port->fd, bytes, len);
     int was_sending = rs485->is_sending, failure = was_sending ? 0 : steer(port, 1);
     if (failure) {
         errno = -failure;
         return -1;
     }
-    ssize_t written = write(port->fd, bytes, len);
+    ssize_t written = md_descriptor_write(port->fd, bytes, len);
     int error = errno;
     if (written > 0) {
         rs485->character_ns = port->turn.line.exchange->character_ns; /* its exchange may end before */

@@ -30,10 +30,16 @@ struct md_row_queue {
     uint32_t calls;             /* bits that are set */
 };
 
+#if defined __APPLE__ || defined _WIN32 /* no condition there takes times of CLOCK_MONOTONIC */
+#define RELATIVE_TIMES 1
+#else
+#define RELATIVE_TIMES 0
+#endif
+
 /* Make a condition with time-outs by CLOCK_MONOTONIC. */
 static void init_condition(pthread_cond_t *condition)
 {
-#ifdef __APPLE__
+#if RELATIVE_TIMES
     pthread_cond_init(condition, NULL);
 #else
     pthread_condattr_t monotonic;
@@ -46,7 +52,7 @@ static void init_condition(pthread_cond_t *condition)
 
 static int wait_until(pthread_cond_t *condition, pthread_mutex_t *mutex, int64_t until_ns)
 {
-#ifdef __APPLE__
+#if RELATIVE_TIMES
     int64_t left = later(until_ns - md_now_ns(), 0);
     struct timespec span = timespec_of(left);
     return pthread_cond_timedwait_relative_np(condition, mutex, &span);

@@ -74,8 +74,12 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     items[:] = [*dealt, *others]
 
 
-def pytest_collection_finish() -> None:
-    """Spare every collection of garbage, and every child of a fork, all that pytest keeps to the end."""
+@pytest.fixture(scope="module", autouse=True)
+def _frozen() -> None:
+    """Spare every collection of garbage, and every child of a fork, what is kept to the end.
+
+    That is what pytest collected, and what the files before this one imported.
+    """
     gc.collect()
     gc.freeze()
 

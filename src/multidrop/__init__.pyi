@@ -10,6 +10,7 @@ from multidrop.control.outcome import Seen as Seen
 from multidrop.control.outcome import Stopped as Stopped
 from multidrop.control.ramp import ramp as ramp
 from multidrop.control.ramp import start_staggered as start_staggered
+from multidrop.control.time_limit import written_before as written_before
 from multidrop.core import Echo as Echo
 from multidrop.core import Framing as Framing
 from multidrop.core import Mastership as Mastership
@@ -64,6 +65,8 @@ from multidrop.errors import PortLost as PortLost
 from multidrop.errors import Refused as Refused
 from multidrop.errors import Unconfirmed as Unconfirmed
 from multidrop.errors import Unsupported as Unsupported
+from multidrop.exposition import MetricFamily as MetricFamily
+from multidrop.exposition import expose_metrics as expose_metrics
 from multidrop.family_file.loader import FamilyError as FamilyError
 from multidrop.family_file.loader import load_family as load_family
 from multidrop.history.buckets import Buckets as Buckets

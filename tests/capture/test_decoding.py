@@ -108,6 +108,7 @@ def test_a_request_without_a_reply_is_a_miss_with_its_reason(tmp_path: Path) -> 
     ]
 
 
+@pytest.mark.long
 def test_more_names_than_a_batch_can_hold_are_more_batches(tmp_path: Path) -> None:
     """Every register of one table, and then some of another."""
     ends = {3: 65500, 4: 10_000}

@@ -157,6 +157,7 @@ def test_a_capture_of_all_variants_says_what_was_recorded(mixed: Mixed) -> None:
     assert samples == {polled.drive.name for polled in mixed.drives}
 
 
+@pytest.mark.long
 def test_wireshark_reads_what_was_recorded(mixed: Mixed) -> None:
     """Each value of an RTU drive: who was asked for what and when, and the registers in the reply."""
     packets = tshark(mixed.capture)

@@ -361,6 +361,7 @@ def test_on_a_terminal_the_newest_values_stand_in_a_table(plant: Path) -> None:
         assert b"\x1b[3F\x1b[J" in terminal.written  # the table and its head, over themselves
 
 
+@pytest.mark.long
 def test_a_table_is_cut_to_its_terminal(plant: Path) -> None:
     with on_terminal("poll", plant, "--seconds", "1", size=(40, 2)) as terminal:
         terminal.wait_for("... and 3 drives more")

@@ -480,6 +480,7 @@ def test_what_it_shows_is_recorded(plant: Path, tmp_path: Path) -> None:
         assert terminal.process.wait(timeout=60) == 2
 
 
+@pytest.mark.long
 def test_where_no_port_opens_nothing_is_recorded(tmp_path: Path) -> None:
     plant, out = tmp_path / "hall.toml", tmp_path / "seen.arrows"
     plant.write_text(
@@ -516,6 +517,7 @@ def test_where_the_cursor_cannot_go_back_it_scrolls(plant: Path) -> None:
         assert terminal.process.wait(timeout=60) == 0
 
 
+@pytest.mark.long
 def test_a_terminal_that_is_too_small_is_one_sentence(plant: Path) -> None:
     with on_terminal("monitor", plant, size=(40, 10)) as terminal:
         terminal.wait_for("too small: it has 40 x 10")

@@ -173,6 +173,7 @@ def frames(pair: tuple[FrameSpan, ...]) -> tuple[str, ...]:
     return tuple(span.raw.hex(" ").upper() for span in pair)
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_every_exchange_that_is_not_next_to_damage_is_heard() -> None:
     damage = Damage()

@@ -7,6 +7,7 @@ from contextlib import contextmanager
 from typing import Any
 
 import pytest
+from examples import usually
 from lines import line, plant, polled, until
 from motors import MAKE, ReceivedRequests
 
@@ -14,7 +15,7 @@ from multidrop import Bus, InvtCHE, NoReply, Poller, Refused
 from multidrop.control import records
 from multidrop.sim import MotorDrive, Simulator, Wire, simulated
 
-every_family = pytest.mark.parametrize("model", MAKE)
+every_family = pytest.mark.parametrize("model", usually(*MAKE))
 GOODRIVE = 0x010A  # what another of INVT's series says it is, where a CHE says 0101H
 
 

@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from typing import Any
 
 import pytest
-from examples import in_turn
+from examples import in_turn, usually
 from lines import until
 from motors import MAKE, ReceivedRequests
 
@@ -21,7 +21,7 @@ from multidrop.errors import NoReply, NotDone, Refused, Unconfirmed
 from multidrop.sim import MotorDrive, Simulator, Wire, simulated
 from multidrop.transport import exchange as exchanges
 
-every_family = pytest.mark.parametrize("model", MAKE)
+every_family = pytest.mark.parametrize("model", usually(*MAKE))
 GOODRIVE = 0x010A
 PATIENCE = 0.3  # s, with a machine that has much else to do
 

@@ -94,12 +94,17 @@ def test_stop_on_exit_is_over_when_the_bus_is_closed() -> None:
 
 CELL = LedgerCell("/dev/ttyUSB0", 1, "delixi-modbus", "frequency")
 
+# It pauses: two that never do would keep SQLite's lock from each other for longer than it waits.
 ENTRANT = """
-import sys
+import sys, time
 from multidrop.control.eeprom_ledger import LedgerCell, Ledger
 ledger = Ledger(sys.argv[1], budget=100)
 cell = LedgerCell("/dev/ttyUSB0", 1, "delixi-modbus", "frequency")
-print(sum(not ledger.enter(cell, 1e9 + at, 0.0) for at in range(80)))
+entered = 0
+for at in range(80):
+    entered += not ledger.enter(cell, 1e9 + at, 0.0)
+    time.sleep(0.003)
+print(entered)
 """
 
 

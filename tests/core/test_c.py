@@ -44,7 +44,7 @@ def test_the_time_of_day_is_asked_for_again_and_again(build: Callable[..., None]
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="others wait by poll")
 @pytest.mark.parametrize(
-    "sanitizers", usually(["-fsanitize=thread"], [*SANITIZERS]), ids=["threads", "memory"]
+    "sanitizers", usually([*SANITIZERS], ["-fsanitize=thread"]), ids=["memory", "threads"]
 )
 def test_ports_come_and_go_on_threads_of_their_own(build: Callable[..., None], sanitizers: list[str]) -> None:
     core = [path.stem for path in (ROOT / "csrc").glob("*.c") if path.stem != "waiter_poll"]

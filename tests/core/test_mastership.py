@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gc
 import os
 import signal
 import subprocess
@@ -191,4 +190,3 @@ def test_a_child_of_a_fork_is_no_master() -> None:
 
 def test_it_is_a_public_name() -> None:
     assert multidrop.Mastership is Mastership
-    gc.collect()

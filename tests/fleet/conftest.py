@@ -21,9 +21,9 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             item.add_marker(pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning"))
 
 
-@pytest.fixture(autouse=True)
+@pytest.fixture(scope="module", autouse=True)
 def _gathered() -> Iterator[None]:
-    """Gather it here, and not in the test of another room that is next."""
+    """Gather it here, and not in a file of another room that is next."""
     yield
     gc.collect()
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import argparse
+import asyncio
 import importlib.util
 import json
 from collections.abc import Callable
@@ -11,6 +13,7 @@ from typing import Any
 
 import pytest
 from commands import Run
+from examples import usually
 from nats_clusters import Cluster, cluster, free_ports, old_server_program
 from peers import require_module
 
@@ -53,7 +56,18 @@ def _own_state(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
 
 
-@pytest.mark.parametrize("words", [["init"], ["status"], ["lines"], ["drain", "gw-1"], ["serve", "gw-1"]])
+@pytest.mark.parametrize(
+    "words",
+    usually(
+        ["status"],
+        ["stop", "pump-1"],
+        ["init"],
+        ["lines"],
+        ["drain", "gw-1"],
+        ["serve", "gw-1"],
+        ["write", "pump-1", "frequency", "20", "--yes"],
+    ),
+)
 def test_no_server(run: Run, nobody: str, words: list[str]) -> None:
     said = one_sentence(run("fleet", *words, "--nats", nobody))
     assert f"no NATS server answers at {nobody}" in said
@@ -95,6 +109,29 @@ def test_a_family_in_python_is_not_sent_to_gateways(run: Run, nobody: str, tmp_p
     assert "is a Python file, and gateways run none that comes over the network" in said
 
 
+LISTS = {
+    '[fleet.may]\nwrite = ["pump-hall-1.output_current"]': "output_current is never written",
+    '[fleet.may]\nwrite = ["pump-hall-1.speed"]': "has no register 'speed'",
+    '[fleet.may]\nwrite = ["frequency"]': "write: 'frequency' is not right; write write = [",
+    '[fleet.may]\nwrite = "pump-hall-1.frequency"': "write = 'pump-hall-1.frequency' is not right",
+    '[fleet.may]\nverbs = ["pump-hall-1.stop"]': "has no verb 'stop' that a list allows",
+    '[fleet.may]\nverbs = ["fan.start"]': "verbs: there is no drive 'fan'",
+    '[fleet.may]\nverb = ["pump-hall-1.start"]': "verb",
+    '[fleet.can]\nverbs = ["pump-hall-1.start"]': "can",
+    "fleet = 7": "fleet = 7 is not right",
+}
+
+
+@pytest.mark.parametrize("lists", LISTS)
+def test_a_list_with_a_mistake(run: Run, nobody: str, tmp_path: Path, lists: str) -> None:
+    path = plant(tmp_path)
+    text = path.read_text()
+    path.write_text(f"{lists}\n{text}" if "=" in lists.splitlines()[0] else f"{text}\n{lists}\n")
+    status, _, said = run("fleet", "init", path, "--nats", nobody)
+    assert status == 2
+    assert LISTS[lists] in said
+
+
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
@@ -103,6 +140,15 @@ def test_a_family_in_python_is_not_sent_to_gateways(run: Run, nobody: str, tmp_p
         (["serve", "gw.1"], "the gateway's name 'gw.1' may have letters"),
         (["status", "--nats", "127.0.0.1"], "127.0.0.1 is no address of a NATS server"),
         (["dance"], "invalid choice: 'dance'"),
+        (["status", "gw-1", "gw-2"], "status takes one name, and was given gw-2 too"),
+        (["write", "pump-1", "frequency"], "write takes DRIVE REGISTER VALUE: `multidrop fleet write DRIVE"),
+        (["start"], "start takes DRIVE: `multidrop fleet start DRIVE`"),
+        (["start", "pump-1", "pump-2"], "start takes DRIVE"),
+        (["start", "pump-1", "--direction", "up"], "invalid choice: 'up'"),
+        (["set-frequency", "pump-1", "fast"], "HZ = fast is no number; write 25"),
+        (["stop"], "stop takes either drives or --all"),
+        (["stop", "pump-1", "--all"], "stop takes either drives or --all"),
+        (["stop", "pump-1", "--by", "\x1b[31m"], "is not 1 to 200 printable characters"),
     ],
 )
 def test_a_mistaken_call(run: Run, words: list[str], sentence: str) -> None:
@@ -144,3 +190,28 @@ def test_what_is_made_and_shown(run: Run, nats: Cluster, tmp_path: Path) -> None
     assert "1 lines, 1 without a master" in out
     said = one_sentence(run("fleet", "drain", "gw-9", *servers))
     assert "no gateway called gw-9 answers; `multidrop fleet status` lists them" in said
+
+
+def test_an_interruption_says_what_it_leaves_open(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from multidrop.cli import fleet_commands
+
+    class Endless:
+        async def __aenter__(self) -> Endless:
+            return self
+
+        async def __aexit__(self, *error: object) -> None:
+            """Nothing was opened."""
+
+        async def stop(self, *what: object, **more: object) -> None:
+            task = asyncio.current_task()
+            assert task is not None
+            task.cancel()  # as Ctrl-C does
+            await asyncio.sleep(60)
+
+    monkeypatch.setattr(fleet_commands, "_asker", lambda *given: Endless())
+    arguments = argparse.Namespace(what="pump-1", words=[], all=False, line=None, json=False)
+    with pytest.raises(asyncio.CancelledError):
+        asyncio.run(fleet_commands._stop(arguments, [], Path()))  # type: ignore[arg-type]
+    assert "the stop of pump-1: it is not known whether it was sent" in capsys.readouterr().err

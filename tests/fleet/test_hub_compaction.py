@@ -151,6 +151,7 @@ def test_a_reader_of_merged_files_is_told_or_has_every_row_once(sink: ParquetSin
     assert all(text.endswith(sentence) for _, text in told)
 
 
+@pytest.mark.long
 def test_files_are_no_larger_than_may_be(
     sink: ParquetSink, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

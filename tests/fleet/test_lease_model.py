@@ -193,7 +193,13 @@ def test_no_two_masters_in_any_interleaving_of_a_longer_lease() -> None:
     assert states > 500_000
 
 
-@pytest.mark.parametrize("mutation", MUTATIONS)
+LARGE = ("deadline from the acknowledgement", "guard shorter than the timer's lateness", "needs 1, ends 2")
+
+
+@pytest.mark.parametrize(
+    "mutation",
+    [pytest.param(name, marks=pytest.mark.long if name in LARGE else ()) for name in MUTATIONS],
+)
 def test_each_mutation_has_two_masters(mutation: str) -> None:
     _, wrong = MUTATIONS[mutation].search(most=500_000)
     assert wrong is not None

@@ -114,12 +114,12 @@ async def gateways(cluster: Cluster, *members: str) -> AsyncIterator[Gateways]:
 def test_each_takes_its_share_and_a_dead_ones_lines_are_taken_over(fleet: Cluster) -> None:
     async def main() -> None:
         async with gateways(fleet, "a", "b", "c") as running:
-            assert all(5 <= len(lines) <= 11 for lines in running.taken().values())
+            await until(lambda: all(5 <= len(lines) <= 11 for lines in running.taken().values()), "shares")
             lost = running.members["b"].polled.keys()
             assert lost
             await running.die("b")
             seconds = await until(running.all_are_polled, "takeover")
-            assert 2.0 < seconds < 5.0
+            assert 2.0 < seconds < 20.0  # three on an idle machine
             again = await running.join("b")
             assert not again.polled
             await until(lambda: len(again.polled) >= 5 and running.all_are_polled(), "it comes back")

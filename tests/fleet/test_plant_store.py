@@ -118,3 +118,18 @@ def test_lines_that_are_as_before_keep_their_revision() -> None:
         assert await store(bucket, first) == {"new": 1, "changed": 1, "removed": 0, "kept": 1}
 
     asyncio.run(main())
+
+
+def test_a_line_s_record_has_its_own_lists_alone(tmp_path: Path) -> None:
+    path = tmp_path / "plant.toml"
+    path.write_text(PLANT)
+    _, before = read_plant(path)
+    lists = 'write = ["fan.frequency"]\nverbs = ["other.start", "fan.start", "other.reset_fault"]'
+    path.write_text(f"{PLANT}\n[fleet.may]\n{lists}\n")
+    plant, records = read_plant(path)
+    assert len(plant.lines) == 2
+    assert records["hall-1"]["may"] == {"write": ["fan.frequency"], "verbs": ["fan.start"]}
+    assert records["hall-2"]["may"] == {"verbs": ["other.reset_fault", "other.start"]}
+    assert all("may" not in record for record in before.values())
+    path.write_text(f'{PLANT}\n[fleet.may]\nverbs = ["other.start"]\n')
+    assert read_plant(path)[1]["hall-1"] == before["hall-1"]  # and so it is polled on

@@ -18,6 +18,7 @@ from typing import Any
 import pytest
 import spool_filler
 from disks import full_at, read_only_directory
+from examples import usually
 from lines import until
 from spooled import exchanges_in, numbered, rows_in, rows_of
 
@@ -170,8 +171,8 @@ def test_nothing_has_its_name_before_it_is_on_the_disk(folder: Path, monkeypatch
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kills", [2, pytest.param(30, marks=pytest.mark.long)])
-def test_kills_at_any_moment(folder: Path, kills: int) -> None:
+@pytest.mark.parametrize(("kills", "longest_s"), usually((2, 0.1), (30, 0.6)))
+def test_kills_at_any_moment(folder: Path, kills: int, longest_s: float) -> None:
     """Each run has numbers of its own; what it was told is there, in order, without a hole, once."""
     dice = random.Random(kills)
     support = Path(spool_filler.__file__).parent
@@ -182,7 +183,7 @@ def test_kills_at_any_moment(folder: Path, kills: int) -> None:
         with subprocess.Popen(words, stdout=subprocess.PIPE, text=True, env=here) as child:
             assert child.stdout is not None
             least = [int(child.stdout.readline()) for _ in range(2)][1]  # none yet, and the first that are
-            time.sleep(dice.uniform(0, 0.6))
+            time.sleep(dice.uniform(0, longest_s))
             child.kill()
             said = child.stdout.read().split("\n")[:-1]
         told.append(int(said[-1]) if said else least)

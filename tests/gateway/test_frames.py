@@ -40,7 +40,7 @@ def test_a_hundred_viewers_share_one_frame(frames: Frames, clock: Clock, made: l
         viewers = [asyncio.create_task(frames.after(first.n)) for _ in range(100)]
         await asyncio.sleep(0)
         assert frames.viewers == 100
-        clock.now += 0.125
+        clock.now += 0.25
         frames.note_news()
         found = await asyncio.gather(*viewers)
         assert {id(one) for one in found} == {id(found[0])}
@@ -52,7 +52,7 @@ def test_a_hundred_viewers_share_one_frame(frames: Frames, clock: Clock, made: l
     assert made == [1, 2]
 
 
-def test_ten_frames_a_second_at_most(frames: Frames, clock: Clock, made: list[int]) -> None:
+def test_five_frames_a_second_at_most(frames: Frames, clock: Clock, made: list[int]) -> None:
     async def watch() -> None:
         seen = -1
         for _ in range(1000):  # 10 s of news every 10 ms
@@ -68,7 +68,7 @@ def test_ten_frames_a_second_at_most(frames: Frames, clock: Clock, made: list[in
                 await asyncio.gather(viewer, return_exceptions=True)
 
     asyncio.run(watch())
-    assert 90 <= len(made) <= 101
+    assert 45 <= len(made) <= 51
 
 
 def test_news_that_come_too_soon_are_not_forgotten(frames: Frames, clock: Clock) -> None:
@@ -81,7 +81,7 @@ def test_news_that_come_too_soon_are_not_forgotten(frames: Frames, clock: Clock)
         viewer = asyncio.create_task(frames.after(first.n))
         await asyncio.sleep(0)
         assert not viewer.done()
-        clock.now += 0.125
+        clock.now += 0.25
         second = await viewer
         assert second is not None
         assert second.n == 2
@@ -101,7 +101,7 @@ def test_a_viewer_who_comes_late_gets_the_newest_and_no_other(frames: Frames, cl
         first = await frames.after(-1)
         assert first is not None
         for _ in range(50):  # it does not ask meanwhile
-            clock.now += 0.125
+            clock.now += 0.25
             frames.note_news()
             await frames.after(-1)
         late = await frames.after(first.n)

@@ -17,7 +17,7 @@ from peers import require_module
 from simulated_pumps import free_ports, simulated_pumps, write_plant
 
 LINES = (8, 8, 8, 7)  # drives on each
-LEAST = {"frames": 200, "scrapes": 5, "queries": 5, "messages": 200, "reads": 100, "reads of others": 100}
+LEAST = {"frames": 100, "scrapes": 5, "queries": 5, "messages": 200, "reads": 100, "reads of others": 100}
 
 
 @pytest.mark.long

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from examples import usually
 from histories import DAY, METADATA, NOON, SECOND, check_buckets, random_rows, record, rows_in
 
 from multidrop import read
@@ -125,10 +126,12 @@ class Breaker:
         return call
 
 
-def test_broken_off_before_each_step(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+# A segment takes 10 steps: those that are always tried, 11 apart, are other ones in each, and of a merge.
+@pytest.mark.parametrize("apart", usually(11, 1))
+def test_broken_off_before_each_step(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, apart: int) -> None:
     rows = segments()
     expected = [row for some in rows for row in some]
-    for calls in range(200):
+    for calls in range(0, 200, apart):
         folder = tmp_path / str(calls)
         record(folder, rows)
         breaker = Breaker(calls)

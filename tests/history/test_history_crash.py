@@ -13,6 +13,7 @@ from pathlib import Path
 
 import history_recorder
 import pytest
+from examples import usually
 from histories import NOON
 from history_recorder import RUN, STEP
 
@@ -64,7 +65,7 @@ def total_of_tens(history: History, runs: int) -> int:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kills", [15, pytest.param(200, marks=pytest.mark.long)])
+@pytest.mark.parametrize("kills", usually(3, 15, 200))
 def test_kills_at_any_moment(tmp_path: Path, kills: int) -> None:
     dice = random.Random(kills)
     written: dict[str, int] = {}

@@ -16,6 +16,8 @@ from gateways import served
 from lines import until as until_here
 from watching import LIVE, STALE, cell, until
 
+pytestmark = pytest.mark.long  # Chromium is started for each file
+
 
 def test_a_polled_plant_is_shown_and_stopped(page: Any, tmp_path: Path) -> None:
     with served(tmp_path, '[serve.may]\nstop = "anyone"\n') as gateway:
@@ -77,7 +79,6 @@ def test_a_killed_gateway_is_told(page: Any) -> None:
         process.stdout.close()
 
 
-@pytest.mark.long
 def test_a_viewer_at_8_kb_a_second_falls_no_further_behind(page: Any, tmp_path: Path) -> None:
     """`python -m bench.questions.page` measures how old what it sees is."""
     with served(tmp_path, "", *(f"drive-{n}" for n in range(1, 13))) as gateway:

@@ -14,6 +14,7 @@ from contextlib import contextmanager, suppress
 from itertools import pairwise
 
 import pytest
+from examples import usually
 from lines import HOST_LATE, PATIENCE, line, plant, polled, rows_of, until
 from toy import Toy
 
@@ -31,7 +32,7 @@ S = 1_000_000_000
 CURRENT, STATUS = Toy.registers["output_current"], Toy.registers["status"]
 LONGEST = 256 * 10 / 9600  # s, of a frame
 NOT_MASTER, OTHER_MASTER = "not sent: not master", "not sent: another master"
-paces = pytest.mark.parametrize("every", [None, 0.02], ids=["as fast as it goes", "on a grid"])
+paces = pytest.mark.parametrize("every", usually(0.02, None), ids=["on a grid", "as fast as it goes"])
 
 
 class Quick(Toy):

@@ -23,6 +23,11 @@ def test_it_polls_and_records(tmp_path: Path) -> None:
     assert ran.returncode == 0, ran.stderr
     rows = pyarrow.ipc.open_stream(tmp_path / "run.arrows").read_all().num_rows
     assert rows > 5
+
+
+@pytest.mark.long
+@pytest.mark.slow
+def test_it_records_as_text(tmp_path: Path) -> None:
     ran = multidrop("demo", "--seconds", "1", "--out", "run.csv", folder=tmp_path)
     assert ran.returncode == 0, ran.stderr
     assert len((tmp_path / "run.csv").read_text().splitlines()) > 5

@@ -617,6 +617,7 @@ def test_metadata_that_is_nested_too_deeply_is_a_sentence(run: Run, tmp_path: Pa
 # ---- the commands ----
 
 
+@pytest.mark.usefixtures("_unpainted")
 def test_plot_and_report_need_nothing_but_the_file(run: Run, ramp: Path, tmp_path: Path) -> None:
     here = tmp_path / "ramp.arrows"
     here.write_bytes(ramp.read_bytes())

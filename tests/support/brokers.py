@@ -11,7 +11,7 @@ import subprocess
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from dataclasses import replace
 from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
@@ -27,6 +27,7 @@ from multidrop.gateway.parts import Inside
 from multidrop.gateway.rights import Caller, May
 
 PATIENCE_S = 30.0  # for an event that comes at once on an idle machine
+TRIALS = 5
 
 
 def free_port() -> int:
@@ -35,13 +36,21 @@ def free_port() -> int:
         return int(one.getsockname()[1])
 
 
+class EndedAtOnce(Exception):
+    """A broker that did not stay long enough to listen."""
+
+
 class Broker:
     """A broker's process on a port of its own."""
 
     def __init__(self, command: Callable[[int], Sequence[str]]) -> None:
-        self.port = free_port()
         self._command = command
-        self.start()
+        for _ in range(TRIALS):
+            self.port = free_port()
+            with suppress(EndedAtOnce):  # somebody else may have taken the port since it was free
+                self.start()
+                return
+        raise EndedAtOnce(f"the broker ended at once on {TRIALS} ports")
 
     @property
     def address(self) -> str:
@@ -56,7 +65,8 @@ class Broker:
             with closing(socket.socket()) as one:
                 if one.connect_ex(("127.0.0.1", self.port)) == 0:
                     return
-            assert self.process.poll() is None, "the broker ended at once"
+            if self.process.poll() is not None:
+                raise EndedAtOnce("the broker ended at once")
             assert time.monotonic() < ends, "the broker does not listen"
             time.sleep(0.02)
 
@@ -85,7 +95,7 @@ def nats(folder: Path, program: str) -> Iterator[Broker]:
 
     def command(port: int) -> list[str]:
         (folder / "nats.conf").write_text(
-            f'server_name: one\nport: {free_port()}\nhost: "127.0.0.1"\n'
+            f'server_name: one\nport: -1\nhost: "127.0.0.1"\n'
             f'jetstream {{ store_dir: "{folder}/nats" }}\nmqtt {{ host: "127.0.0.1", port: {port} }}\n'
         )
         return [program, "-c", str(folder / "nats.conf")]

@@ -39,10 +39,11 @@ patient = pytest.mark.usefixtures("_patient")  # drives are waited for as long a
 
 def until(met: Callable[[], Any], patience: float = PATIENCE) -> None:
     """Wait for a condition; the test fails when it is not met at last."""
-    end = monotonic() + patience
+    end, pause_s = monotonic() + patience, 0.002
     while not met():
         assert monotonic() < end, f"not met within {patience:g} s"
-        sleep(0.005)
+        sleep(pause_s)
+        pause_s = min(1.2 * pause_s, 0.04)  # to look may cost more than what is waited for
 
 
 class Faulty(Wire):

@@ -62,7 +62,7 @@ def _import_nodes(node: ast.AST, for_types: bool) -> Iterator[tuple[ast.Import |
     for child in ast.iter_child_nodes(node):
         if isinstance(child, ast.Import | ast.ImportFrom):
             yield child, for_types
-        elif isinstance(child, ast.If) and "TYPE_CHECKING" in ast.unparse(child.test):
+        elif isinstance(child, ast.If) and "TYPE_CHECKING" in ast.dump(child.test):
             for part in child.body:
                 yield from _import_nodes(ast.Module([part], []), True)
             for part in child.orelse:

@@ -42,6 +42,7 @@ def test_a_master_that_stood_still_sends_nothing_and_is_killed() -> None:
     assert all(each.is_killed for each in found)
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_a_master_that_goes_on_sends_nothing() -> None:
     """Without the kernel's timer, for it is hours away: only the look at the clock holds it back."""

@@ -29,6 +29,7 @@ from multidrop.errors import Unconfirmed
 from multidrop.transport.bridge import MOST_AGE, MOST_STALL_MS, Bridge, hand_on_nothing_late
 from multidrop.transport.exchange import WRITE_TIMEOUT
 from multidrop.transport.rfc2217 import MOST_CHUNKS, MOST_RECEIVED, RFC2217Port, Telnet
+from multidrop.transport.socket_port import SocketPort
 
 SERVER = Path(__file__).parents[1] / "support" / "servers" / "network_server.py"
 IAC, SB, SE = rfc2217.IAC, rfc2217.SB, rfc2217.SE
@@ -383,3 +384,10 @@ def test_every_connection_is_told_to_hand_on_nothing_late() -> None:
         with pytest.raises(ConnectionResetError):
             far.recv(1)
         far.close()
+
+
+def test_a_port_that_was_never_opened_is_closed_without_a_word() -> None:
+    """Python 3.13 prints what goes wrong when such a port is thrown away."""
+    port = SocketPort()
+    port.close()
+    assert not port.is_open

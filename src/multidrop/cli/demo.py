@@ -10,7 +10,7 @@ from tempfile import TemporaryDirectory
 
 from multidrop.cli.monitor.command import is_possible, watch
 from multidrop.cli.poll.command import add_polling_arguments, conclude, follow
-from multidrop.cli.support.demo_plant import DRIVES, plant_file, simulator, start_motors
+from multidrop.cli.support.demo_plant import DRIVES, demo_port, plant_file, simulator, start_motors
 from multidrop.cli.support.files import refuse_overwriting
 from multidrop.plant.loader import load_plant
 from multidrop.recording import open_reader
@@ -32,10 +32,10 @@ def run(arguments: argparse.Namespace) -> int:
     _make_room(arguments.out)
     with TemporaryDirectory(prefix="multidrop-") as directory:
         path = Path(directory) / "demo.toml"
-        path.write_text(plant_file(Path(directory) / "mixed", POLLED))
+        path.write_text(plant_file(demo_port(Path(directory)), POLLED))
         with simulator(path, Path(directory)):
             plant = load_plant(path)
-            start_motors(plant.lines[0])
+            start_motors(plant.lines[0], Path(directory) / "wear.sqlite")
             if _can_be_watched(arguments):
                 return conclude(plant, watch(plant, out=arguments.out, seconds=arguments.seconds), arguments)
             return follow(plant, arguments)

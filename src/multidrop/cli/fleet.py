@@ -9,16 +9,26 @@ import logging
 import os
 import time
 from collections.abc import Awaitable, Callable
+from contextlib import AsyncExitStack
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from multidrop.cli import fleet_commands
 from multidrop.cli.fleet_rights import write_rights
 from multidrop.cli.support.arguments import add_json_argument
 from multidrop.cli.support.extras import require_extra
+from multidrop.cli.support.fleet_tables import (
+    count_sentence,
+    free_lines,
+    gateway_table,
+    line_table,
+    move_table,
+    trouble_sentences,
+)
 from multidrop.cli.support.nats import add_nats_arguments, nats_options
 from multidrop.cli.support.output import logging_to, print_text, warn
 from multidrop.cli.support.signals import on_end_signals
-from multidrop.cli.support.values import aligned
 
 if TYPE_CHECKING:
     from multidrop.fleet.servers import ServerPath
@@ -28,7 +38,9 @@ DRAIN_S = 30.0
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("action", metavar="ACTION", choices=ACTIONS, help=", ".join(ACTIONS))
+    parser.add_argument(
+        "action", metavar="ACTION", choices=[*ACTIONS, "demo"], help=", ".join([*ACTIONS, "demo"])
+    )
     parser.add_argument(
         "what", metavar="NAME", nargs="?", help="a gateway's name; PLANT.toml for init; for rights all names"
     )
@@ -42,12 +54,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--cert", metavar="FILE", type=Path, help="with rights: a server's certificate, there"
     )
     parser.add_argument("--key", metavar="FILE", type=Path, help="with rights: its key, there")
+    parser.add_argument("--metrics", metavar="HOST:PORT", help="answer GET /metrics there, with serve")
+    fleet_commands.add_command_arguments(parser)
     add_json_argument(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
+    fleet_commands.check_words(arguments)
     for library in ("nats", "pyarrow"):
         require_extra(library, "fleet", "fleet")
+    if arguments.action == "demo":
+        from multidrop.cli.fleet_demo.command import run_demo
+
+        return run_demo()
     with logging_to(warn, "multidrop.fleet", logging.INFO if arguments.action == "serve" else logging.ERROR):
         return int(asyncio.run(ACTIONS[arguments.action](arguments)))
 
@@ -113,16 +132,27 @@ async def _init(arguments: argparse.Namespace) -> int:
 
 
 async def _serve(arguments: argparse.Namespace) -> int:
+    from importlib.metadata import version
+
     from multidrop.fleet.gateway import FleetGateway
+    from multidrop.fleet.gateway_metrics import families_of
+    from multidrop.fleet.metrics_port import listen, serving
     from multidrop.recording.retention import parse_size
 
     name = _name(arguments, "serve gw-1")
+    listener = listen(arguments.metrics) if arguments.metrics else None
     folder = arguments.folder or _state_folder() / name
     urls = _urls(arguments)
     options = nats_options(arguments, urls)
     gateway = FleetGateway(name, urls, folder, options=options, spool_bytes=parse_size(arguments.keep))
     on_end_signals(gateway.end)
-    await gateway.run(lambda: print_text(f"ready {name}", flush=True))
+    async with AsyncExitStack() as stack:
+        if listener:
+            release = version("multidrop")
+            await stack.enter_async_context(serving(listener, lambda: families_of(gateway.state(), release)))
+            host, port, *_ = listener.getsockname()
+            print_text(f"metrics http://{host}:{port}/metrics", flush=True)
+        await gateway.run(lambda: print_text(f"ready {name}", flush=True))
     return 0
 
 
@@ -165,27 +195,16 @@ async def _drain(arguments: argparse.Namespace) -> int:
 
 
 async def _seen(paths: list[ServerPath]) -> dict[str, Any]:
-    """Return gateways and lines as the records have them, and what the gateways say themselves."""
-    from multidrop.fleet.errors import FleetError
-    from multidrop.fleet.gateway import ask_gateway
-    from multidrop.fleet.overview import read_fleet
+    """Return gateways, lines and moves as the records have them, and what the gateways say themselves."""
+    from multidrop.fleet.overview import FleetView
     from multidrop.fleet.setup import check_buckets, open_all
 
     await open_all(paths)
     path = next(one for one in paths if one.is_open)
     await check_buckets(path)
-    found = await read_fleet(path)
-
-    async def ask(name: str) -> dict[str, Any] | None:
-        try:
-            return await ask_gateway(path, name, "state")
-        except FleetError:
-            return None
-
-    said = await asyncio.gather(*(ask(name) for name in found["gateways"]))
-    for gateway, state in zip(found["gateways"].values(), said, strict=True):
-        gateway["says"] = state
-    return found
+    view = FleetView(path)
+    await view.look()
+    return view.fleet()
 
 
 async def _status(arguments: argparse.Namespace) -> int:
@@ -194,55 +213,18 @@ async def _status(arguments: argparse.Namespace) -> int:
         if arguments.json:
             print_text(json.dumps(found, indent=2))
             return 0
-        head = ("GATEWAY", "HOST", "SESSION", "SINCE", "STATE", "LINES", "MARGIN", "BEHIND", "LOST")
-        rows = [_gateway_row(name, gateway) for name, gateway in found["gateways"].items()]
-        print_text("\n".join(aligned([head, *rows], "<<><<>>>>")))
-        free = [name for name, line in found["lines"].items() if not line["master"]]
-        print_text(f"\n{len(found['lines'])} lines, {len(free)} without a master")
-        for name, gateway in found["gateways"].items():
-            for line, why in ((gateway["says"] or {}).get("troubles") or {}).items():
-                print_text(f"{name}: line {line}: {why}")
-        return 1 if free else 0
+        print_text("\n".join([*gateway_table(found), "", count_sentence(found), *trouble_sentences(found)]))
+        if found["moves"]:
+            print_text("\n".join(["", "last moves:", *move_table(found["moves"])]))
+        return 1 if free_lines(found) else 0
 
     return await _with_paths(arguments, work)
-
-
-def _gateway_row(name: str, gateway: dict[str, Any]) -> tuple[str, ...]:
-    says = gateway["says"]
-    since = time.strftime("%Y-%m-%d %H:%M:%S", time.gmtime(gateway["began_ms"] / 1000))
-    head = (name, gateway["host"], str(gateway["session"]), since)
-    if says is None:
-        return (*head, "no answer", str(gateway["lines"]), "-", "-", "-")
-    behind = says["spool"]["behind"]
-    return (
-        *head,
-        says["state"],
-        str(gateway["lines"]),
-        f"{says['margin_s']:.1f} s",
-        "-" if behind is None else str(behind),
-        str(says["spool"]["lost"]),
-    )
 
 
 async def _lines(arguments: argparse.Namespace) -> int:
     async def work(paths: list[ServerPath]) -> int:
         lines = (await _seen(paths))["lines"]
-        if arguments.json:
-            print_text(json.dumps(lines, indent=2))
-            return 0
-        head = ("LINE", "PORT", "MASTER", "SINCE")
-        rows = [
-            (
-                name,
-                line["port"],
-                line["master"] or "none",
-                time.strftime("%Y-%m-%d %H:%M:%S", time.gmtime(line["since_ms"] / 1000))
-                if line["master"]
-                else "",
-            )
-            for name, line in lines.items()
-        ]
-        print_text("\n".join(aligned([head, *rows], "<<<<")))
+        print_text(json.dumps(lines, indent=2) if arguments.json else "\n".join(line_table(lines)))
         return 0
 
     return await _with_paths(arguments, work)
@@ -252,6 +234,20 @@ async def _rights(arguments: argparse.Namespace) -> int:
     return write_rights(arguments, _urls(arguments))
 
 
+async def _watch(arguments: argparse.Namespace) -> int:
+    from multidrop.cli.fleet_watch import watch
+
+    return await _with_paths(arguments, partial(watch, is_json=arguments.json))
+
+
+# ---- commands to drives ----
+
+
+async def _command(arguments: argparse.Namespace) -> int:
+    action = fleet_commands.ACTIONS[arguments.action]
+    return await action(arguments, _urls(arguments), _state_folder())
+
+
 ACTIONS: dict[str, Callable[[argparse.Namespace], Any]] = {
     "rights": _rights,
     "init": _init,
@@ -259,4 +255,6 @@ ACTIONS: dict[str, Callable[[argparse.Namespace], Any]] = {
     "drain": _drain,
     "status": _status,
     "lines": _lines,
+    "watch": _watch,
+    **dict.fromkeys(fleet_commands.ACTIONS, _command),
 }

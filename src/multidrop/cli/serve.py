@@ -19,7 +19,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
-from multidrop.cli.support.demo_plant import DRIVES, plant_file, simulator, start_motors
+from multidrop.cli.support.demo_plant import DRIVES, demo_port, plant_file, simulator, start_motors
 from multidrop.cli.support.extras import require_extra
 from multidrop.cli.support.output import print_text, warn
 from multidrop.cli.support.plants import add_port_option, plant_of
@@ -79,10 +79,10 @@ def serve_demo(*, is_shown: bool = True, log: str = "text") -> int:
     with TemporaryDirectory(prefix="multidrop-") as directory:
         folder = Path(directory)
         path = folder / "demo.toml"
-        path.write_text(plant_file(folder / "mixed", _demo_registers()))
+        path.write_text(plant_file(demo_port(folder), _demo_registers()))
         with simulator(path, folder), _logging(log, logging.WARNING):
             plant = load_plant(path)
-            start_motors(plant.lines[0])
+            start_motors(plant.lines[0], folder / "wear.sqlite")
 
             def on_ready(port: int) -> None:
                 url = f"http://localhost:{port}/"
@@ -142,7 +142,8 @@ def _serve(
 
     async def live() -> None:
         on_end_signals(gateway.end)
-        asyncio.get_running_loop().add_signal_handler(signal.SIGHUP, gateway.reload.begin)
+        if sys.platform != "win32":  # it has no such signal: there the page's button reloads
+            asyncio.get_running_loop().add_signal_handler(signal.SIGHUP, gateway.reload.begin)
         await gateway.run(lambda: on_ready(gateway.port))
 
     asyncio.run(live())

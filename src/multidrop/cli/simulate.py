@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 from pathlib import Path
 from urllib.parse import urlsplit
 
@@ -15,19 +16,24 @@ from multidrop.sim.faults import HELP, Faults
 
 ANY_TCP = "tcp://127.0.0.1:0"  # for a line on another machine: any free port of this one
 LOOPBACK = ("127.0.0.1", "localhost")
+NO_TERMINALS = (
+    "this system has no pseudo-terminals for --ports DIR: give each line a port such as "
+    "socket://127.0.0.1:5020, and leave --ports out"
+)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "plant",
         metavar="PLANT.toml",
-        help="the drives; each line's port is ignored, but for tcp:// of this machine",
+        help="the drives; each line's port is ignored, but for tcp:// of this machine, and its socket:// "
+        "without --ports",
     )
     parser.add_argument(
         "--ports",
         metavar="DIR",
         type=Path,
-        help="where a link to each line's port is put; needed where a line is not on tcp://",
+        help="where a link to each line's port is put; needed where a line has neither of these ports",
     )
     parser.add_argument("--unpaced", action="store_true", help="answer at once, not at the pace of a wire")
     parser.add_argument("--faults", metavar="FILE", help="what befalls the bytes, as said below")
@@ -39,7 +45,9 @@ def run(arguments: argparse.Namespace) -> int:
     plant = load_plant(arguments.plant)
     faults = load_faults(arguments.faults) if arguments.faults else Faults()
     directory: Path | None = arguments.ports
-    if directory is None and (serial := [line.name for line in plant.lines if not speaks_tcp(line.port)]):
+    if directory is not None and not hasattr(os, "openpty"):
+        raise ValueError(NO_TERMINALS)
+    if directory is None and (serial := [line.name for line in plant.lines if not _has_place(line.port)]):
         raise ValueError(f"line {serial[0]} gets a pseudo-terminal: name a directory for it with --ports DIR")
     if directory is not None and directory.exists() and not directory.is_dir():
         raise ValueError(f"{directory} is a file: name a directory with --ports, which is made if need be")
@@ -54,6 +62,16 @@ def run(arguments: argparse.Namespace) -> int:
     return 0
 
 
+def _has_place(port: str) -> bool:
+    """Return True where a line needs no directory: it is simulated on TCP, at a port of this machine."""
+    return speaks_tcp(port) or _is_here(port)
+
+
+def _is_here(port: str) -> bool:
+    url = urlsplit(port)
+    return url.scheme == "socket" and url.hostname in LOOPBACK and bool(url.port)
+
+
 def _drives(line: PlantLine) -> list[SimulatedDrive]:
     return [simulated(polled.drive) for polled in line.drives]
 
@@ -63,7 +81,8 @@ def _port(line: PlantLine, directory: Path | None) -> str:
     if speaks_tcp(line.port):
         url = urlsplit(line.port)
         return line.port if url.hostname in LOOPBACK and url.port else ANY_TCP
-    assert directory is not None
+    if directory is None:
+        return line.port
     link = directory / line.name
     if link.parent != directory:
         raise ValueError(f"line {line.name!r} has a / in its name, which the link to its port cannot have")

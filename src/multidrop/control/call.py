@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager
+from math import inf
 
 from multidrop.control.outcome import Outcome
 from multidrop.core import Permit
@@ -23,17 +24,20 @@ class Call:
     Nothing of it is written once a stop was called, nor when it is late by more than `expiry` seconds.
     It is late by all the time since it began that its own steps do not account for: what a read takes at
     most by the drive's document, and the waits of its script. So a process that was held up sends nothing.
+    `limit_ns`, a time of CLOCK_MONOTONIC, may leave it less than `expiry`.
     """
 
-    def __init__(self, drive: Drive, permit: Permit, expiry: float, verb: str = "") -> None:
+    def __init__(
+        self, drive: Drive, permit: Permit, expiry: float, verb: str = "", limit_ns: float = inf
+    ) -> None:
         self.drive = drive
         self.permit = permit
-        self.expiry = expiry
         self.verb = verb
         self.sent = ""  # the latest write that may have left
         self.is_confirmed = False  # that one
         self.unverified: Outcome | None = None  # of that one, if nothing was read of the drive after it
         self._due_ns = clock.now_ns()
+        self.expiry = max(0.0, min(expiry, (limit_ns - self._due_ns) / 1e9))
 
     def anew(self) -> Call:
         """Return the same as if it was called now; stops called since the first one end it all the same."""

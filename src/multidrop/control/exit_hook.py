@@ -10,6 +10,7 @@ import atexit
 import logging
 import os
 import signal
+import sys
 import threading
 import time
 from collections.abc import Callable
@@ -24,6 +25,14 @@ _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 IMPATIENT = 3  # signals within a second, after which nothing is waited for
 HANDLING_S = 0.05  # the longest that a signal waits to be handled
 CUT_SHORT = b"multidrop: the stops were cut short by a third signal: motors may still be turning\n"
+
+
+def _send(number: int, ident: int) -> None:
+    """Send the signal to the main thread. On Windows it is that one's wherever it is raised."""
+    if sys.platform == "win32":
+        signal.raise_signal(number)
+    else:
+        signal.pthread_kill(ident, number)
 
 
 class LastAct:
@@ -152,7 +161,7 @@ class ExitHook:
             if not all(act.is_over for act in [*self._acts]):
                 return
             self._has_passed = True
-        signal.pthread_kill(ident, held)
+        _send(held, ident)
 
     def _pass_on(self, number: int) -> None:
         self._let_go()

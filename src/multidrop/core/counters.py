@@ -31,11 +31,12 @@ class Counters(NamedTuple):
 
 
 DELAY_BUCKETS: int = lib.MD_DELAY_BUCKETS
+_EDGES_NS = tuple(int(lib.md_delay_edge(bucket)) for bucket in range(DELAY_BUCKETS + 1))
 
 
 def delay_edge(bucket: int) -> int:
     """Return the least response delay of a bucket, in ns; it ends where the next one begins."""
-    return int(lib.md_delay_edge(bucket))
+    return _EDGES_NS[bucket]
 
 
 def read_counters(drive: Any, timeout_ns: int, unasked: Counter[Status]) -> Counters:

@@ -156,10 +156,16 @@ class Bucket:
 
 
 class Follower:
-    """The records of a bucket, by key, as far as they were read."""
+    """The records of a bucket, by key, as far as they were read.
 
-    def __init__(self, bucket: Bucket) -> None:
+    `on_take` is called with each record that is newer than the one known, which comes first.
+    """
+
+    def __init__(
+        self, bucket: Bucket, on_take: Callable[[Record | None, Record], object] = lambda *_: None
+    ) -> None:
         self.bucket = bucket
+        self._on_take = on_take
         self.records: dict[str, Record] = {}
         self._after = 0
 
@@ -180,6 +186,7 @@ class Follower:
         if before is not None and before.revision >= record.revision:
             return False
         self.records[record.key] = record
+        self._on_take(before, record)
         return True
 
 

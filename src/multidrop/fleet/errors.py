@@ -16,7 +16,15 @@ class NotAdmitted(FleetError):
 
 
 class NoRight(FleetError):
-    """A request that these credentials do not allow: it was certainly not carried out."""
+    """A request that these credentials do not allow, or whose answer they do not allow to hear."""
+
+
+class NotDelivered(FleetError):
+    """A request that reached nobody, for certain."""
+
+
+class NobodyThere(NotDelivered):
+    """A request of which the server says that nobody takes it."""
 
 
 class Unsure(FleetError):

@@ -13,6 +13,7 @@ from multidrop.fleet.buckets import Bucket, Follower, Record
 from multidrop.fleet.errors import FleetError
 from multidrop.fleet.lease_bucket import LeaseBucket
 from multidrop.fleet.lease_rules import Terms
+from multidrop.fleet.moves import Moves
 from multidrop.fleet.observer import Observer
 from multidrop.fleet.servers import ServerPath
 
@@ -26,10 +27,19 @@ class FleetRecords:
         self, me: str, path: Callable[[], ServerPath], terms: Terms, on_change: Callable[[], object]
     ) -> None:
         self.observer = Observer(me, [LeaseBucket(bucket, path, me) for bucket in names.LEASES], terms)
-        self.owners = {bucket: Follower(Bucket(bucket, path)) for bucket in names.OWNERS}
+        self.moves = Moves()
+        self.owners = {
+            bucket: Follower(Bucket(bucket, path), partial(self._note_move, bucket))
+            for bucket in names.OWNERS
+        }
         self.plant = Follower(Bucket(names.PLANT, path))
         self._on_change = on_change
         self._read: set[str] = set()  # buckets that were read at least once
+        self._looks: dict[str, Callable[[], Awaitable[Any]]] = {
+            names.PLANT: self.plant.look,
+            **{name: partial(self.observer.look, at) for at, name in enumerate(names.LEASES)},
+            **{name: follower.look for name, follower in self.owners.items()},
+        }
 
     @property
     def are_complete(self) -> bool:
@@ -46,17 +56,27 @@ class FleetRecords:
             name for name, record in self.plant.records.items() if record.value and "line" in record.value
         ]
 
+    async def look(self) -> None:
+        """Read once what has changed in each bucket. Raises FleetError where that fails."""
+        done = await asyncio.gather(*map(self._look, self._looks), return_exceptions=True)
+        for failure in done:
+            if failure is not None:
+                raise failure
+
     def works(self) -> list[Coroutine[Any, Any, None]]:
         """Return what reads them for ever, a coroutine for each bucket, so that none waits for another."""
-        looks: dict[str, Callable[[], Awaitable[Any]]] = {names.PLANT: self.plant.look}
-        looks |= {name: partial(self.observer.look, path) for path, name in enumerate(names.LEASES)}
-        looks |= {name: follower.look for name, follower in self.owners.items()}
-        return [self._follow(name, look) for name, look in looks.items()]
+        return [self._follow(name) for name in self._looks]
 
-    async def _follow(self, name: str, look: Callable[[], Awaitable[Any]]) -> None:
+    async def _follow(self, name: str) -> None:
         while True:
             with suppress(FleetError):
-                if await look() or name not in self._read:
-                    self._on_change()
-                self._read.add(name)
+                await self._look(name)
             await asyncio.sleep(FOLLOW_S)
+
+    async def _look(self, name: str) -> None:
+        if await self._looks[name]() or name not in self._read:
+            self._on_change()
+        self._read.add(name)
+
+    def _note_move(self, bucket: str, before: Record | None, record: Record) -> None:
+        self.moves.note(before, record, is_first_look=bucket not in self._read)

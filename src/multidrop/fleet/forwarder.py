@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import time
 from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
@@ -65,6 +66,20 @@ class Forwarder:
 
     def state(self) -> ForwarderState:
         return ForwarderState(self._sent, self._last, self._trouble)
+
+    def lag_s(self) -> float | None:
+        """Return the age (s, by the system's clock) of the oldest message that the stream has not got.
+
+        0 where it has all; None where it was not asked yet, or the message is gone.
+        """
+        if self._last is None:
+            return None
+        stored = self._spool.following(self._last)
+        if stored is None:
+            return 0.0
+        with suppress(OSError):  # removed just now
+            return max(0.0, time.time() - stored.path.stat().st_mtime)
+        return None
 
     async def run(self) -> None:
         """Forward until cancelled; whatever goes wrong is told once, and tried again."""

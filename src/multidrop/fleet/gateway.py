@@ -14,12 +14,16 @@ from nats.aio.msg import Msg
 
 from multidrop import Mastership
 from multidrop.fleet import names
+from multidrop.fleet.command_log import CommandLog
+from multidrop.fleet.command_subjects import CommandedLines, CommandSubjects
 from multidrop.fleet.errors import FleetError, NoRight
 from multidrop.fleet.fleet_lines import FleetLines
 from multidrop.fleet.forwarder import Forwarder
+from multidrop.fleet.held_lines import HeldLines
 from multidrop.fleet.lease import LifeLock
 from multidrop.fleet.lease_rules import SECOND, USUAL
 from multidrop.fleet.member import Member
+from multidrop.fleet.moves import TOLD
 from multidrop.fleet.record_shapes import misshapen
 from multidrop.fleet.samples_stream import connect
 from multidrop.fleet.servers import ServerPath, paths_of
@@ -36,7 +40,7 @@ _log = logging.getLogger("multidrop.fleet")
 
 
 class FleetGateway:
-    """A gateway of this name; what it keeps is in `folder`: its lock, its spool, its audit log.
+    """A gateway of this name; what it keeps is in `folder`: its lock, its spool and its logs.
 
     Raises ValueError for a name that no subject can have, FleetError where another process runs with it.
     """
@@ -60,7 +64,11 @@ class FleetGateway:
         self.mastership = Mastership(guard_s=USUAL.guard / SECOND)
         self.spool = Spool(folder / "spool", name, most=spool_bytes)
         self.lines = FleetLines(self.mastership, folder)
-        self.member = Member(name, self.paths, self.lines, self.mastership, lock=self.lock)
+        held = HeldLines(self.lines.poller, self._may_command)
+        self.log = CommandLog(folder / "commands.jsonl")
+        self.commands = CommandSubjects(name, self.paths, held, self.log)
+        commanded = CommandedLines(self.lines, self.commands)
+        self.member = Member(name, self.paths, commanded, self.mastership, lock=self.lock)
         self.forwarder: Forwarder | None = None
         self._end = asyncio.Event()
 
@@ -81,6 +89,7 @@ class FleetGateway:
         try:
             await self.paths[0].subscribe(names.gateway_subject(self.name, "*"), self._answer)
             await self.paths[0].check_subscription(names.gateway_subject(self.name, "*"))
+            await self.commands.begin()
             self.lines.poller.on_batch(self.spool.append)
             with self.lines.poller:
                 member = asyncio.create_task(self.member.run())
@@ -119,7 +128,11 @@ class FleetGateway:
         self.lines.poller.close()
         self.mastership.end()
         self.spool.close()
+        self.log.close()
         self.lock.close()
+
+    def _may_command(self, line: str) -> bool:
+        return self.member.may_command(line)
 
     # ---- what others ask ----
 
@@ -146,9 +159,14 @@ class FleetGateway:
             "moves": member.keeper.moves,
             "troubles": dict(sorted(member.keeper.troubles.items())),
             "trouble": member.lease.trouble,
+            "last_moves": [move.as_json() for move in member.records.moves.newest(TOLD)],
             "spool": {
                 "bytes": spool.stored,
+                "rows": spool.written,
+                "waiting": spool.waiting,
                 "lost": spool.lost,
+                "sent": forwarder.sent if forwarder else 0,
+                "lag_s": self.forwarder.lag_s() if self.forwarder else None,
                 "behind": None if last is None else max(0, spool.newest - last),
                 "trouble": spool.trouble or (forwarder.trouble if forwarder else None),
             },

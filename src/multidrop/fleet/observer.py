@@ -91,6 +91,12 @@ class Observer:
             return False
         return not is_ended_by_another(record) or self._is_stale(path, record, now)
 
+    def unseen_s(self, gateway: str) -> float:
+        """Return for how long (s) no renewal was seen that counts: the second latest of the paths."""
+        seen = [watched[gateway].since for watched in self._watched if gateway in watched]
+        latest = sorted(seen, reverse=True)[: self.terms.needed]
+        return (self._clock() - latest[-1]) / lease_rules.SECOND if latest else 0.0
+
     # ---- dead gateways ----
 
     def dead(self) -> dict[str, dict[int, Record]]:

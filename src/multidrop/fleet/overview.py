@@ -1,54 +1,109 @@
-"""Overview: the fleet as its records have it."""
+"""Overview: a fleet as its records have it, and as its gateways answer."""
 
 from __future__ import annotations
 
+import asyncio
+from collections.abc import Mapping
+from contextlib import suppress
+from types import NoneType
 from typing import Any
 
-from multidrop.fleet import names
-from multidrop.fleet.buckets import Bucket, Follower
-from multidrop.fleet.lease_bucket import LeaseBucket
-from multidrop.fleet.observer import BELIEVING, Observer
+from multidrop.fleet.errors import FleetError
+from multidrop.fleet.fleet_records import FleetRecords
+from multidrop.fleet.gateway import ask_gateway
+from multidrop.fleet.moves import move_of
+from multidrop.fleet.observer import BELIEVING
 from multidrop.fleet.ownership import owner_of
 from multidrop.fleet.servers import ServerPath
 
+MOVES_SHOWN = 20
+_SHOWN: Mapping[tuple[str, ...], tuple[type, ...]] = {
+    ("state",): (str,),
+    ("margin_s",): (int, float),
+    ("troubles",): (dict,),
+    ("trouble",): (str,),
+    ("spool", "bytes"): (int,),
+    ("spool", "lost"): (int,),
+    ("spool", "behind"): (int, NoneType),
+    ("spool", "lag_s"): (int, float, NoneType),
+    ("spool", "trouble"): (str, NoneType),
+}
 
-async def read_fleet(path: ServerPath) -> dict[str, Any]:
-    """Return gateways with a session that nobody ended, and lines with their masters.
 
-    A gateway that died a moment ago is still there, until another one has ended its session.
-    """
-    observer = Observer("", [LeaseBucket(bucket, lambda: path, "") for bucket in names.LEASES], BELIEVING)
-    for number in range(len(names.LEASES)):
-        await observer.look(number)
-    plant = Follower(Bucket(names.PLANT, lambda: path))
-    await plant.look()
-    owners = [Follower(Bucket(bucket, lambda: path)) for bucket in names.OWNERS]
-    for follower in owners:
-        await follower.look()
-    records = {line: record for follower in owners for line, record in follower.records.items()}
-    sessions = observer.sessions()
-    lines: dict[str, Any] = {}
-    for name, description in sorted(plant.records.items()):
-        if description.value is None:
-            continue
-        record = records.get(name)
-        gateway, session = owner_of(record)
-        is_held = bool(gateway) and gateway in sessions and not observer.is_over(gateway, session)
-        lines[name] = {
-            "port": description.value["line"].get("port", ""),
-            "revision": description.revision,
-            "master": gateway if is_held else None,
-            "session": session if is_held else None,
-            "since_ms": record.value["since"] if record and record.value and is_held else None,
+class FleetView:
+    """A fleet over one path; each `look` reads what has changed since, and asks every gateway."""
+
+    def __init__(self, path: ServerPath) -> None:
+        self._path = path
+        self._records = FleetRecords("", lambda: path, BELIEVING, lambda: None)
+        self._says: dict[str, dict[str, Any] | None] = {}
+
+    async def look(self) -> None:
+        """Read the records and ask the gateways. Raises FleetError where no server gives the records."""
+        await self._records.look()
+        present = list(self._records.observer.sessions())
+        said = await asyncio.gather(*map(self._ask, present))
+        self._says = dict(zip(present, said, strict=True))
+        for state in filter(None, said):
+            with suppress(KeyError, TypeError, ValueError):  # of another version than this
+                self._records.moves.add(map(move_of, state.pop("last_moves")))
+
+    async def _ask(self, gateway: str) -> dict[str, Any] | None:
+        try:
+            state = await ask_gateway(self._path, gateway, "state")
+        except (FleetError, ValueError):
+            return None
+        return state if is_state(state) else None
+
+    def fleet(self) -> dict[str, Any]:
+        """Return gateways with a session that nobody ended, lines with their masters, and the last moves.
+
+        A gateway that died a moment ago is still there, until another one has ended its session; `says` is
+        None where it does not answer, and `unseen_s` tells for how long (s) this view saw no renewal.
+        """
+        lines, sessions = self._lines(), self._records.observer.sessions()
+        gateways = {
+            name: {
+                "host": value["host"],
+                "session": value["session"],
+                "began_ms": value["began"],
+                "draining": value["draining"],
+                "lines": sum(line["master"] == name for line in lines.values()),
+                "unseen_s": round(self._records.observer.unseen_s(name), 3),
+                "says": self._says.get(name),
+            }
+            for name, value in sessions.items()
         }
-    gateways = {
-        name: {
-            "host": value["host"],
-            "session": value["session"],
-            "began_ms": value["began"],
-            "draining": value["draining"],
-            "lines": sum(line["master"] == name for line in lines.values()),
-        }
-        for name, value in sessions.items()
-    }
-    return {"gateways": gateways, "lines": lines}
+        moves = [move.as_json() for move in self._records.moves.newest(MOVES_SHOWN)]
+        return {"gateways": gateways, "lines": lines, "moves": moves}
+
+    def _lines(self) -> dict[str, Any]:
+        observer, plant = self._records.observer, self._records.plant.records
+        sessions = observer.sessions()
+        found: dict[str, Any] = {}
+        for name in sorted(self._records.lines()):
+            record = self._records.owner(name)
+            gateway, session = owner_of(record)
+            is_held = gateway in sessions and not observer.is_over(gateway, session)
+            found[name] = {
+                "port": plant[name].value["line"].get("port", ""),
+                "revision": plant[name].revision,
+                "master": gateway if is_held else None,
+                "session": session if is_held else None,
+                "since_ms": record.value["since"] if record and record.value and is_held else None,
+            }
+        return found
+
+
+def is_state(told: Any) -> bool:
+    """Say whether an answer has all that is shown of a gateway: another version may give something else."""
+    try:
+        return all(isinstance(_found(told, keys), kinds) for keys, kinds in _SHOWN.items())
+    except (KeyError, TypeError):
+        return False
+
+
+def _found(told: Any, keys: tuple[str, ...]) -> Any:
+    for key in keys:
+        told = told[key]
+    return told

@@ -9,16 +9,23 @@ from __future__ import annotations
 import asyncio
 import json
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from multidrop import Plant, PlantLine, load_plant
+from multidrop import Key, Plant, PlantError, PlantLine, TomlPlace, load_plant
 from multidrop.fleet import names
 from multidrop.fleet.buckets import Bucket, Follower, Record
+from multidrop.fleet.drive_commands import verbs_of
 
 AT_ONCE = 64
 SOCKETS = ("socket://", "tcp://")
+
+_FLEET = {"may": Key(dict, "[fleet.may], a table")}
+_MAY = {
+    "write": Key(list, 'write = ["pump-1.frequency_setpoint"]'),
+    "verbs": Key(list, 'verbs = ["pump-1.start"]'),
+}
 
 
 def read_plant(path: Path) -> tuple[Plant, dict[str, Any]]:
@@ -36,10 +43,44 @@ def read_plant(path: Path) -> tuple[Plant, dict[str, Any]]:
                 f"{path}: line {line.name} is at {line.port}: a fleet polls socket:// and tcp:// ports, "
                 "which every gateway reaches and can close at once, and no others"
             )
-    return plant, {table["name"]: _description(table, path.parent) for table in document["line"]}
+    may = _lists(document.get("fleet", {}), plant)
+    return plant, {table["name"]: _description(table, path.parent, may) for table in document["line"]}
 
 
-def _description(table: Mapping[str, Any], folder: Path) -> dict[str, Any]:
+def _lists(table: Any, plant: Plant) -> dict[str, list[str]]:
+    """Return the lists of [fleet.may]: registers and verbs that may be commanded through the fleet."""
+    place = TomlPlace(plant.path, ("[fleet]",))
+    may = place.check(table, _FLEET).get("may", {})
+    inner = place.of_file(plant.path, "[fleet.may]")
+    found = {
+        key: [entry for entry in entries if inner.attempt(_check_listed, key, entry, plant)]
+        for key, entries in inner.check(may, _MAY).items()
+    }
+    if place.config_errors:
+        raise PlantError(tuple(place.config_errors))
+    return found
+
+
+def _check_listed(key: str, entry: object, plant: Plant) -> bool:
+    """Check that an entry is a register that can be written, or a verb that its drive has."""
+    name, dot, rest = entry.rpartition(".") if isinstance(entry, str) else ("", "", "")
+    if not dot:
+        raise ValueError(f"{key}: {entry!r} is not right; write {_MAY[key].example}")
+    try:
+        _, drive = plant.find_drive(name)
+    except ValueError as unknown:
+        raise ValueError(f"{key}: {str(unknown).replace(f'{plant.path} has', 'there is')}") from None
+    if key == "write":
+        register = drive.register(rest)
+        if register.never or not register.writable:
+            raise ValueError(f"{key}: {entry} is never written: {register.never or 'it can only be read'}")
+    elif rest not in verbs_of(drive):
+        known = ", ".join(verbs_of(drive)) or "none"
+        raise ValueError(f"{key}: {name} has no verb {rest!r} that a list allows; it has {known}")
+    return True
+
+
+def _description(table: Mapping[str, Any], folder: Path, may: Mapping[str, Sequence[str]]) -> dict[str, Any]:
     files: dict[str, str] = {}
     for model in {drive["model"] for drive in table["drive"]}:
         if ".py" in model:
@@ -49,7 +90,13 @@ def _description(table: Mapping[str, Any], folder: Path) -> dict[str, Any]:
             )
         if model.endswith(".toml"):
             files |= _family_files(folder, model)
-    return {"line": dict(table), "files": files}
+    drives = {drive["name"] for drive in table["drive"]}
+    own = {
+        key: sorted(entry for entry in entries if entry.rpartition(".")[0] in drives)
+        for key, entries in may.items()
+    }
+    lists = {key: entries for key, entries in own.items() if entries}
+    return {"line": dict(table), "files": files} | ({"may": lists} if lists else {})
 
 
 def _family_files(folder: Path, model: str) -> dict[str, str]:

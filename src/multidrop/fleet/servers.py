@@ -11,9 +11,10 @@ from typing import Any
 import nats
 from nats.aio.client import Client
 from nats.aio.msg import Msg
+from nats.aio.subscription import Subscription
 from nats.errors import Error as NatsError
 
-from multidrop.fleet.errors import FleetError, NotAdmitted, TooOld, Unsure
+from multidrop.fleet.errors import FleetError, NobodyThere, NotAdmitted, NotDelivered, TooOld, Unsure
 from multidrop.fleet.lease_rules import PATHS
 from multidrop.fleet.refusals import Denials, failure_to_connect
 
@@ -39,7 +40,9 @@ class ServerPath:
         self._denials = Denials()
         self._trouble = ""  # that was told
         self._leaving: set[asyncio.Task[None]] = set()
-        self._subscriptions: dict[str, Callable[[Msg], Any]] = {}
+        self._wanted: dict[str, Callable[[Msg], Any]] = {}  # by subject
+        self._standing: dict[str, Subscription] = {}  # at the present server
+        self._changing = asyncio.Lock()
 
     @property
     def is_open(self) -> bool:
@@ -105,10 +108,15 @@ class ServerPath:
     async def _move(self, url: str) -> None:
         denials = Denials()
         client = await connect(url, self._options, denials)
-        for subject, called in self._subscriptions.items():
-            await client.subscribe(subject, cb=called)
-        self._leave()
-        self._client, self.url, self._denials = client, url, denials
+        async with self._changing:
+            standing: dict[str, Subscription] = {}
+            try:
+                await self._bring(client, standing)
+            except (NatsError, OSError) as failure:
+                await _close(client)
+                raise FleetError(f"{url} was lost again at once: {failure}") from None
+            self._leave()
+            self._client, self.url, self._standing, self._denials = client, url, standing, denials
 
     def _leave(self) -> None:
         if self._client is not None:
@@ -119,9 +127,28 @@ class ServerPath:
 
     async def subscribe(self, subject: str, called: Callable[[Msg], Any]) -> None:
         """Call a coroutine function with each message, wherever this path moves."""
-        self._subscriptions[subject] = called
-        if self._client is not None:
-            await self._client.subscribe(subject, cb=called)
+        self._wanted[subject] = called
+        await self._follow_wanted()
+
+    async def unsubscribe(self, subject: str) -> None:
+        """Take no more messages; nothing happens where none were taken."""
+        self._wanted.pop(subject, None)
+        await self._follow_wanted()
+
+    async def _follow_wanted(self) -> None:
+        async with self._changing:
+            if self._client is not None:
+                with suppress(NatsError, OSError):  # it is left soon, and all is brought to the next server
+                    await self._bring(self._client, self._standing)
+
+    async def _bring(self, client: Client, standing: dict[str, Subscription]) -> None:
+        """Subscribe to all that is wanted there now, and to nothing else."""
+        while standing.keys() != self._wanted.keys():
+            for subject in self._wanted.keys() - standing.keys():
+                if called := self._wanted.get(subject):  # it may be unwanted by now
+                    standing[subject] = await client.subscribe(subject, cb=called)
+            for subject in standing.keys() - self._wanted.keys():
+                await standing.pop(subject).unsubscribe()
 
     async def check_subscription(self, subject: str) -> None:
         """Raise NoRight where these credentials do not allow to hear what was subscribed to."""
@@ -140,13 +167,14 @@ class ServerPath:
     ) -> Msg:
         """Return the answer.
 
-        Raises Unsure where none comes in time, NoRight where it may not be asked, FleetError where none was.
+        Raises Unsure where none comes in time, NoRight where it may not be asked or heard, and NotDelivered
+        where nobody was asked, for certain: that is NobodyThere where the server says so.
         """
         client = self._connected()
         try:
             return await client.request(subject, data, answer_s, headers=headers)
         except nats.errors.NoRespondersError:
-            raise FleetError(f"nobody answers {subject} at {self.url}") from None
+            raise NobodyThere(f"nobody answers {subject} at {self.url}") from None
         except (NatsError, OSError, TimeoutError) as failure:
             self._denials.check_request(subject, self._options.get("inbox_prefix", "_INBOX"))
             raise Unsure(f"{self.url} gave no answer to {subject}: {failure}") from None
@@ -174,7 +202,7 @@ class ServerPath:
 
     def _connected(self) -> Client:
         if self._client is None or not self._client.is_connected:
-            raise FleetError(f"no connection to {self.urls[0]}")
+            raise NotDelivered(f"no connection to {self.urls[0]}")
         return self._client
 
     async def close(self) -> None:
@@ -222,7 +250,15 @@ async def _close(client: Client) -> None:
 
 
 def _cut(client: Client) -> None:
-    """Close the socket: nats-py leaves it open where it is cancelled, or the server does not answer."""
+    """Close the socket, and end what hears messages.
+
+    nats-py leaves both where it is cancelled, or the server is gone; what became of its reading is not asked.
+    """
+    for subscription in client._subs.values():
+        subscription._stop_processing()
+    reading = client._reading_task
+    if reading is not None and reading.done() and not reading.cancelled():
+        reading.exception()
     writer = getattr(client._transport, "_io_writer", None)
     if writer is not None and writer.transport is not None:
         writer.transport.abort()

@@ -1,4 +1,4 @@
-"""Frames: what all viewers see, made once for all of them, ten times a second at most.
+"""Frames: what all viewers see, made once for all of them, five times a second at most.
 
 A viewer asks for the next frame when it has the last one: nothing queues for one that is slow.
 """
@@ -17,7 +17,7 @@ from multidrop.gateway.hub import FAULT, SILENT, Hub
 from multidrop.gateway.kept_rows import Known
 from multidrop.gateway.lately import Lately
 
-LEAST_S = 0.1  # between two frames, on the whole
+LEAST_S = 0.2  # between two frames, on the whole: the page draws no faster
 EARLY_S = 0.02  # by which one may come sooner after one that was late
 WAIT_S = 20.0  # for which a viewer waits for a frame
 MOST_VIEWERS = 200  # that wait at the same time

@@ -8,11 +8,11 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from typing import NamedTuple
 
-from multidrop import LineStatistics
-from multidrop.gateway.exposition import Family, Sample
+from multidrop import LineStatistics, MetricFamily
 from multidrop.gateway.frames import lost_of
 from multidrop.gateway.hub import FAULT, RUNS, SILENT, STANDS, UNKNOWN, Hub
 
+Sample = tuple[str, Mapping[str, str], float]  # the name's suffix, labels, value
 STATES = (RUNS, STANDS, FAULT, SILENT, UNKNOWN)
 
 
@@ -27,23 +27,27 @@ class Figures(NamedTuple):
     parts: Mapping[str, Mapping[str, float]]  # figures of each, by name
 
 
-def families_of(hub: Hub, statistics: Mapping[str, LineStatistics], figures: Figures) -> Iterator[Family]:
+def families_of(
+    hub: Hub, statistics: Mapping[str, LineStatistics], figures: Figures
+) -> Iterator[MetricFamily]:
     """Yield all there is to be scraped."""
-    yield Family("multidrop_build", "info", "The version.", [("_info", {"version": figures.version}, 1)])
-    yield Family(
+    yield MetricFamily(
+        "multidrop_build", "info", "The version.", [("_info", {"version": figures.version}, 1)]
+    )
+    yield MetricFamily(
         "multidrop_value", "gauge", "Newest values of polled registers, in their unit.", _values(hub)
     )
-    yield Family("multidrop_drive_state", "stateset", "State of each drive.", _states(hub))
-    yield Family(
+    yield MetricFamily("multidrop_drive_state", "stateset", "State of each drive.", _states(hub))
+    yield MetricFamily(
         "multidrop_line_up", "gauge", "1 while a line's port is there, 0 while it is lost.", _ups(hub)
     )
     yield from _line_families(statistics)
     yield from _drive_families(statistics)
     yield _count("multidrop_rows_dropped", "Rows that nobody took in time.", figures.dropped)
     yield _count("multidrop_frames", "Frames made for viewers.", figures.frames)
-    yield Family("multidrop_viewers", "gauge", "Viewers that wait.", [("", {}, figures.viewers)])
+    yield MetricFamily("multidrop_viewers", "gauge", "Viewers that wait.", [("", {}, figures.viewers)])
     failures = [("_total", {"part": name}, float(n)) for name, n in figures.failures.items()]
-    yield Family("multidrop_part_failures", "counter", "Failures of each part.", failures)
+    yield MetricFamily("multidrop_part_failures", "counter", "Failures of each part.", failures)
     yield from _part_families(figures.parts)
 
 
@@ -73,7 +77,7 @@ def _ups(hub: Hub) -> Iterator[Sample]:
         yield "", {"line": line.name}, float(lost_of(hub, line.name) is None)
 
 
-def _line_families(statistics: Mapping[str, LineStatistics]) -> Iterator[Family]:
+def _line_families(statistics: Mapping[str, LineStatistics]) -> Iterator[MetricFamily]:
     counters: dict[str, tuple[str, Callable[[LineStatistics], float]]] = {
         "multidrop_line_exchanges": ("Requests that left.", lambda line: line.exchanges),
         "multidrop_line_samples": ("Values that came.", lambda line: line.samples),
@@ -84,10 +88,10 @@ def _line_families(statistics: Mapping[str, LineStatistics]) -> Iterator[Family]
     }
     for name, (text, count) in counters.items():
         samples = [("_total", {"line": line}, count(found)) for line, found in statistics.items()]
-        yield Family(name, "counter", text, samples)
+        yield MetricFamily(name, "counter", text, samples)
 
 
-def _drive_families(statistics: Mapping[str, LineStatistics]) -> Iterator[Family]:
+def _drive_families(statistics: Mapping[str, LineStatistics]) -> Iterator[MetricFamily]:
     drives = [
         ({"line": line, "drive": name}, drive)
         for line, found in statistics.items()
@@ -98,26 +102,26 @@ def _drive_families(statistics: Mapping[str, LineStatistics]) -> Iterator[Family
         for labels, drive in drives
         for reason, n in drive.misses.items()
     ]
-    yield Family("multidrop_misses", "counter", "Values that are missing, by reason.", misses)
+    yield MetricFamily("multidrop_misses", "counter", "Values that are missing, by reason.", misses)
     delays: list[Sample] = []
     for labels, drive in drives:
         found = drive.delays
         for quantile, value in (("0.5", found.p50), ("0.9", found.p90), ("0.99", found.p99)):
             delays.append(("", {**labels, "quantile": quantile}, value))
         delays.append(("_count", labels, float(found.replies)))
-    yield Family(
+    yield MetricFamily(
         "multidrop_response_delay_seconds", "summary", "From a request's end to its reply's begin.", delays
     )
 
 
-def _part_families(parts: Mapping[str, Mapping[str, float]]) -> Iterator[Family]:
+def _part_families(parts: Mapping[str, Mapping[str, float]]) -> Iterator[MetricFamily]:
     for part, found in parts.items():
         for name, value in found.items():
             base, is_count = name.removesuffix("_total"), name.endswith("_total")
             kind, suffix = ("counter", "_total") if is_count else ("gauge", "")
             text = base.replace("_", " ").capitalize() + f" of {part}."
-            yield Family(f"multidrop_{part}_{base}", kind, text, [(suffix, {}, float(value))])
+            yield MetricFamily(f"multidrop_{part}_{base}", kind, text, [(suffix, {}, float(value))])
 
 
-def _count(name: str, text: str, value: float) -> Family:
-    return Family(name, "counter", text, [("_total", {}, value)])
+def _count(name: str, text: str, value: float) -> MetricFamily:
+    return MetricFamily(name, "counter", text, [("_total", {}, value)])

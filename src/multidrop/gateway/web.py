@@ -15,17 +15,10 @@ from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp
 
-from multidrop import Refused
+from multidrop import Refused, expose_metrics
 from multidrop.gateway.audit import MOST_RECORDS, newest_records
 from multidrop.gateway.commands import Told
 from multidrop.gateway.describe import describe
-from multidrop.gateway.exposition import (
-    OPEN_METRICS,
-    OPEN_METRICS_TYPE,
-    PLAIN_TYPE,
-    open_metrics,
-    plain_text,
-)
 from multidrop.gateway.guard import COOKIE, Denied, Guard, Needed
 from multidrop.gateway.metrics import families_of
 from multidrop.gateway.request_fields import body_of, caller_of, number_in, text_in
@@ -174,9 +167,7 @@ class _Pages:
     async def metrics(self, request: Request) -> Response:
         gateway = self._gateway
         families = families_of(gateway.hub, gateway.lately.newest, figures_of(gateway))
-        is_open = OPEN_METRICS in request.headers.get("accept", "")
-        kind = OPEN_METRICS_TYPE if is_open else PLAIN_TYPE
-        text = open_metrics(families) if is_open else plain_text(families)
+        kind, text = expose_metrics(families, request.headers.get("accept", ""))
         return PlainTextResponse(text, headers={"content-type": kind, "vary": "accept"})
 
     async def audit(self, request: Request) -> Response:

@@ -154,7 +154,10 @@ def _write(database: Any, query: str, path: Path, metadata: dict[str, Any] | Non
 
 
 def _on_disk(path: Path) -> None:
-    file = os.open(path, os.O_RDONLY)
+    is_windows = sys.platform == "win32"
+    if is_windows and path.is_dir():  # it keeps a folder's entries by itself, and opens none
+        return
+    file = os.open(path, os.O_RDWR if is_windows else os.O_RDONLY)
     try:
         os.fsync(file)
     finally:

@@ -41,6 +41,7 @@ def load_plant(path: Path | str) -> Plant:
 _PLANT = {
     "line": Key(list, "[[line]], in two brackets, with its name, port and drives", needed=True),
     "serve": Key(dict, "[serve], a table that `multidrop serve` reads"),
+    "fleet": Key(dict, "[fleet], a table that `multidrop fleet init` reads"),
 }
 
 _LINE = {

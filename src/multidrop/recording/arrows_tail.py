@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import struct
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
@@ -77,7 +78,12 @@ class ArrowsTail:
         return self._decoder.columns(place.message.header, self._body(place.message), place.names)
 
     def _body(self, message: IpcMessage) -> memoryview:
-        return memoryview(os.pread(self._file.fileno(), message.end - message.body, message.body))
+        length, place = message.end - message.body, message.body
+        if sys.platform != "win32":
+            return memoryview(os.pread(self._file.fileno(), length, place))
+        with self.path.open("rb") as file:  # Windows keeps the name of a file that is open
+            file.seek(place)
+            return memoryview(file.read(length))
 
     def close(self) -> None:
         self._file.close()

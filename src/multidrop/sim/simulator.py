@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import heapq
 import math
-import os
 import select
 import selectors
 import signal
+import socket
 import threading
 from collections.abc import Callable, Sequence
 from time import monotonic
@@ -49,8 +49,8 @@ class Simulator:
     def open(self) -> None:
         """Open every wire's port, or none; then the paths are known."""
         self._selector = selectors.DefaultSelector()
-        self._interrupted, self.wakeup = os.pipe()
-        os.set_blocking(self.wakeup, False)
+        self._interrupted, self._interrupter = socket.socketpair()
+        self._interrupter.setblocking(False)
         self._selector.register(self._interrupted, selectors.EVENT_READ, None)
         try:
             for number, wire in enumerate(self.wires):
@@ -64,12 +64,17 @@ class Simulator:
         for wire in self.wires:
             wire.close()
         self._selector.close()
-        os.close(self._interrupted)
-        os.close(self.wakeup)
+        self._interrupted.close()
+        self._interrupter.close()
 
     def interrupt(self) -> None:
         """Make `run` return; from any thread."""
-        os.write(self.wakeup, b"!")
+        self._interrupter.send(b"!")
+
+    @property
+    def wakeup(self) -> int:
+        """A descriptor to which a byte is written to make `run` return."""
+        return self._interrupter.fileno()
 
     def run(self) -> None:
         """Run the wires until interrupted. Blocks."""
@@ -93,7 +98,10 @@ class Simulator:
         the millisecond.
         """
         limit = max(0.0, self._wakes[0][0] - monotonic()) if self._wakes else None
-        select.select([self._selector], [], [], limit)
+        if isinstance(self._selector, selectors.SelectSelector):
+            self._selector.select(limit)
+        else:
+            select.select([self._selector], [], [], limit)
 
     def _receive(self, number: int) -> None:
         wire = self.wires[number]

@@ -33,6 +33,8 @@ _STAMPED = sys.platform == "linux"
 _KIND = socket.SOCK_SEQPACKET if _STAMPED else socket.SOCK_STREAM
 _SO_TIMESTAMPNS = 35  # asm-generic/socket.h; also the type of what it adds, a struct timespec
 _TIMESPEC = struct.Struct("@ll")
+_LINGER = "hh" if sys.platform == "win32" else "ii"  # struct linger
+_TCP_MAXRTMS = 14  # mstcpip.h
 
 
 def set_up(port: serial.SerialBase, settings: tuple[int, str]) -> None:
@@ -47,12 +49,25 @@ def set_up(port: serial.SerialBase, settings: tuple[int, str]) -> None:
 def hand_on_nothing_late(connection: socket.socket) -> None:
     """Make the kernel cut a connection that stalls, and discard unsent bytes when it is closed.
 
-    Those bytes may start a motor, also after this process has died.
+    Those bytes may start a motor, also after this process has died. Windows before 11 may not know the
+    time-out, and then gives a connection up when its retransmissions end.
     """
     connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-    connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+    connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack(_LINGER, 1, 0))
     if hasattr(socket, "TCP_USER_TIMEOUT"):
         connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, MOST_STALL_MS)
+    elif sys.platform == "win32":
+        with suppress(OSError):
+            connection.setsockopt(socket.IPPROTO_TCP, _TCP_MAXRTMS, MOST_STALL_MS)
+
+
+def _pair() -> tuple[socket.socket, socket.socket]:
+    if hasattr(socket, "AF_UNIX"):
+        return socket.socketpair(socket.AF_UNIX, _KIND)
+    pair = socket.socketpair()  # by TCP, which would gather small pieces
+    for end in pair:
+        end.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+    return pair
 
 
 class Bridge:
@@ -65,7 +80,7 @@ class Bridge:
     def __init__(self, port: serial.SerialBase) -> None:
         self._port = port
         self._port.timeout = 0.01
-        self._ours, self.theirs = socket.socketpair(socket.AF_UNIX, _KIND)
+        self._ours, self.theirs = _pair()
         if _STAMPED:
             self._ours.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
         self._ours.settimeout(LOOK_EVERY)

@@ -37,6 +37,8 @@ from multidrop.transport.mixed_up import mixed_up
 from multidrop.transport.opening import (
     check_fencible,
     connection_of,
+    descriptor_of,
+    device_of,
     identity_of,
     is_bridged,
     reason_of,
@@ -193,15 +195,15 @@ class Line:
     def _drive(self, port: serial.SerialBase) -> Port:
         """Give the core a descriptor of this port."""
         if type(port).read is serial.Serial.read:
-            fd = port.fileno()
-            opened = Port(fd, must_take(os.ttyname(fd)), mastership=self.mastership)
-            return self._switched(opened, os.ttyname(fd))
+            device = device_of(port)
+            opened = Port(descriptor_of(port), must_take(device), mastership=self.mastership)
+            return self._switched(opened, device)
         if connection := connection_of(port):
             hand_on_nothing_late(connection)
-        if not is_bridged(port):
-            os.set_blocking(port.fileno(), False)
+        if connection and not is_bridged(port):
+            connection.setblocking(False)
             ids = _TRANSACTIONS[self.ids] if self.is_tcp else Transactions.NONE
-            return Port(port.fileno(), _NO_SETTINGS, transactions=ids, mastership=self.mastership)
+            return Port(connection.fileno(), _NO_SETTINGS, transactions=ids, mastership=self.mastership)
         if self._settings:
             set_up(port, self._settings)
         self._bridge = Bridge(port)

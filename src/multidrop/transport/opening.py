@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import errno
 import os
+import re
 import socket
+import sys
 from typing import cast
 from urllib.parse import SplitResult, urlsplit
 
@@ -26,6 +28,10 @@ _REASONS = {
     errno.ECONNREFUSED: "nothing listens there",
 }
 
+# pyserial keeps an error of Windows in its text alone: could not open port 'COM5': PermissionError(13, ...)
+_WINDOWS_ERROR = re.compile(r"Error\((\d+), ")
+_WINDOWS_REASONS = {errno.EACCES: _REASONS[errno.EBUSY]}  # a COM port is had by one program, whoever asks
+
 
 def reason_of(failure: BaseException) -> str:
     """Return the cause in words: pyserial hides the system's error in its own, or behind it."""
@@ -35,6 +41,9 @@ def reason_of(failure: BaseException) -> str:
         code = error.args[0] if error and error.args else None
         if isinstance(code, int):
             return _REASONS.get(code) or os.strerror(code)
+    if windows := _WINDOWS_ERROR.search(str(failure)):
+        code = int(windows[1])
+        return _WINDOWS_REASONS.get(code) or _REASONS.get(code) or os.strerror(code)
     return str(failure)
 
 
@@ -100,11 +109,23 @@ def connection_of(port: serial.SerialBase | None) -> socket.socket | None:
     return getattr(port, "_socket", None)
 
 
+def descriptor_of(port: serial.SerialBase) -> int:
+    """Return what the core reads from and writes to: a descriptor, or on Windows a handle."""
+    return int(getattr(port, "_port_handle", None) or port.fileno())
+
+
+def device_of(port: serial.SerialBase) -> str:
+    """Return the device behind an open port: /dev/ttyUSB0, or on Windows COM5."""
+    if sys.platform == "win32":
+        return port_identity.com_name(str(port.port))
+    return os.ttyname(port.fileno())
+
+
 def identity_of(port: serial.SerialBase, name: str) -> str:
     """Return the identity of an open port, however its name is spelt (see port_identity)."""
     if connection := connection_of(port):
         return port_identity.of_connection(connection)
     try:
-        return port_identity.of_device(os.ttyname(port.fileno()))
+        return port_identity.of_device(device_of(port))
     except (OSError, ValueError, AttributeError):  # it has no device, as loop:// has none
         return port_identity.of_name(name)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 import socket
+import sys
 from pathlib import Path
 from urllib.parse import urlsplit
 
@@ -14,8 +15,15 @@ BY_ID = Path("/dev/serial/by-id")  # links that udev makes, with each adapter's 
 _PEER = re.compile(r"(\[[^\]]+\]|[\w.-]+):\d+")
 
 
+def com_name(name: str) -> str:
+    r"""Return a COM port's name as Windows lists it: of com5 and \\.\COM5 alike COM5."""
+    return name.removeprefix("\\\\.\\").upper()
+
+
 def of_device(path: str) -> str:
     """Return the link by the adapter's serial number, or where there is none the path with links followed."""
+    if sys.platform == "win32":
+        return com_name(path)
     device = os.path.realpath(path)
     try:
         links = sorted(BY_ID.iterdir())

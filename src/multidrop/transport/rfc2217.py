@@ -8,6 +8,9 @@ from __future__ import annotations
 
 import os
 import queue
+import select
+import socket
+import sys
 from collections.abc import Iterator
 from contextlib import suppress
 from typing import Any
@@ -74,6 +77,13 @@ class Telnet:
             yield kind, option
 
 
+def _send_at_once(connection: socket.socket, data: bytes) -> int:
+    """Return how much the network took. socket.send() alone would wait for as long as the time-out."""
+    if sys.platform != "win32":
+        return os.write(connection.fileno(), data)
+    return connection.send(data) if select.select([], [connection], [], 0)[1] else 0
+
+
 class RFC2217Port(rfc2217.Serial):
     """A serial port on a network; `port` is rfc2217://host:port."""
 
@@ -119,8 +129,7 @@ class RFC2217Port(rfc2217.Serial):
         if not self.is_open or not self._write_lock.acquire(timeout=LOCK_TIME):
             raise serial.SerialException("the network takes nothing")
         try:
-            # socket.send() would wait for as long as the socket's time-out
-            if os.write(self._socket.fileno(), data) < len(data):
+            if _send_at_once(self._socket, data) < len(data):
                 raise serial.SerialException("the network takes nothing more")
         except OSError as failure:
             raise serial.SerialException(f"the connection failed: {failure}") from failure

@@ -31,9 +31,10 @@ class SimulatedPort:
 
     def __init__(self, identity: str, directory: Path) -> None:
         self._ledger = ledger_of(identity, directory)
-        self._holder = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+        self._holder: socket.socket | None = None
         self._forget_writes()
         if _HAS_NAMES:
+            self._holder = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
             with suppress(OSError):  # another simulator's, on a port of the same name
                 self._holder.bind(_name(identity))
 
@@ -42,7 +43,8 @@ class SimulatedPort:
             self._ledger.unlink(missing_ok=True)
 
     def close(self) -> None:
-        self._holder.close()
+        if self._holder is not None:
+            self._holder.close()
         self._forget_writes()
 
 

@@ -11,7 +11,7 @@ from serial.urlhandler.protocol_socket import Serial
 class SocketPort(Serial):
     """pyserial's port behind socket://, whose own `close` sleeps for 300 ms."""
 
-    _socket: socket.socket | None
+    _socket: socket.socket | None = None
 
     def close(self) -> None:
         """End the connection, so that the far end is free for another one at once."""

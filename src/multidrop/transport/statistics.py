@@ -6,10 +6,13 @@ two readings, and taking one costs the line nothing.
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from operator import add, sub
+from itertools import accumulate
+from operator import sub
+from typing import Any
 
 from multidrop.core import DELAY_BUCKETS, EXCEPTION_STATUS, STATUSES, Counters, Status, delay_edge
 from multidrop.transport import clock
@@ -131,7 +134,7 @@ class Statistics:
     @property
     def delays(self) -> Delays:
         counters = self.counters
-        p50, p90, p99 = (_quantile(counters, part) for part in (0.5, 0.9, 0.99))
+        p50, p90, p99 = _quantiles(counters, (0.5, 0.9, 0.99))
         return Delays(counters.delays.total(), p50, p90, p99, counters.longest_ns / 1e9)
 
     @property
@@ -213,11 +216,19 @@ class LineMeter:
 
 
 def _sum(counters_by_drive: Iterable[Counters]) -> Counters:
-    found = Counters()
-    for counters in counters_by_drive:
-        longest = max(found.longest_ns, counters.longest_ns)
-        timeout = max(found.timeout_ns, counters.timeout_ns)
-        found = Counters._make(map(add, found, counters))._replace(longest_ns=longest, timeout_ns=timeout)
+    drives = [Counters(), *counters_by_drive]
+    totals = Counters._make(_total(column) for column in zip(*drives, strict=True))
+    longest = max(counters.longest_ns for counters in drives)
+    return totals._replace(longest_ns=longest, timeout_ns=max(counters.timeout_ns for counters in drives))
+
+
+def _total(column: Sequence[Any]) -> Any:
+    """Return the sum of numbers, or of counts by their keys."""
+    if not isinstance(column[0], Counter):
+        return sum(column)
+    found: Counter[Any] = Counter()
+    for counts in filter(None, column):
+        found.update(counts)
     return found
 
 
@@ -229,14 +240,15 @@ def _difference(now: Counters, earlier: Counters) -> Counters:
     return found._replace(longest_ns=longest, timeout_ns=now.timeout_ns)
 
 
-def _quantile(counters: Counters, part: float) -> float:
-    """Return the middle of the bucket in which the quantile lies, in s."""
-    wanted = part * counters.delays.total()
-    seen = 0
-    for bucket, count in sorted(counters.delays.items()):
-        seen += count
-        if seen >= wanted:
-            least = delay_edge(bucket)
-            most = counters.longest_ns if bucket == DELAY_BUCKETS - 1 else delay_edge(bucket + 1)
-            return min((least + most) / 2, counters.longest_ns) / 1e9
-    return 0.0
+def _quantiles(counters: Counters, parts: Iterable[float]) -> list[float]:
+    """Return the middle of the bucket in which each quantile lies, in s; 0.0 where there are no replies."""
+    buckets = sorted(counters.delays)
+    seen = list(accumulate(counters.delays[bucket] for bucket in buckets))
+    if not seen:
+        return [0.0 for _ in parts]
+    return [_middle(counters, buckets[bisect_left(seen, part * seen[-1])]) for part in parts]
+
+
+def _middle(counters: Counters, bucket: int) -> float:
+    most = counters.longest_ns if bucket == DELAY_BUCKETS - 1 else delay_edge(bucket + 1)
+    return min((delay_edge(bucket) + most) / 2, counters.longest_ns) / 1e9

@@ -2,35 +2,36 @@
 
 from __future__ import annotations
 
-import os
+import socket
 from contextlib import suppress
 
 
 class WakeUp:
-    """A descriptor that is readable from `set` to `clear`."""
+    """A descriptor that is readable from `set` to `clear`: of a socket, since Windows waits for no other."""
 
     def __init__(self) -> None:
-        self._reader, self._writer = os.pipe()
-        os.set_blocking(self._reader, False)
-        os.set_blocking(self._writer, False)
+        self._reader, self._writer = socket.socketpair()
+        self._reader.setblocking(False)
+        self._writer.setblocking(False)
+        self._number = self._reader.fileno()
         self._closed = False
 
     def fileno(self) -> int:
-        return self._reader
+        return self._number
 
     def set(self) -> None:
         if not self._closed:
             with suppress(BlockingIOError):
-                os.write(self._writer, b"\0")
+                self._writer.send(b"\0")
 
     def clear(self) -> None:
         if not self._closed:
             with suppress(BlockingIOError):
-                while os.read(self._reader, 64):
+                while self._reader.recv(64):
                     pass
 
     def close(self) -> None:
         if not self._closed:
             self._closed = True
-            os.close(self._reader)
-            os.close(self._writer)
+            self._reader.close()
+            self._writer.close()

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import os
 import signal
+import socket
 import subprocess
 import sys
 import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Any
 
 from multidrop.bus import Bus
 from multidrop.cli import main
@@ -30,7 +32,15 @@ DRIVES = (  # name, model, framing
 OPTIONS = {"maximum_frequency": 50}
 
 
-def plant_file(port: Path, registers: Sequence[str]) -> str:
+def demo_port(folder: Path) -> str:
+    """Return the simulated line's port: a link to a pseudo-terminal, or TCP where a system has none."""
+    if hasattr(os, "openpty"):
+        return str(folder / "mixed")
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        return f"socket://127.0.0.1:{free.getsockname()[1]}"
+
+
+def plant_file(port: str, registers: Sequence[str]) -> str:
     """Return the text of a plant file; of each drive these registers are polled, as far as it has them."""
     tables = [f'[[line]]\nname = "mixed"\nport = "{port}"\n']
     for address, (name, model, framing) in enumerate(DRIVES, 1):
@@ -44,9 +54,9 @@ def plant_file(port: Path, registers: Sequence[str]) -> str:
     return "\n".join(tables)
 
 
-def start_motors(line: PlantLine) -> None:
+def start_motors(line: PlantLine, ledger: Path) -> None:
     """Start every simulated motor, each at another frequency."""
-    with Bus(line.port, ledger=Path(line.port).with_name("wear.sqlite")) as bus:
+    with Bus(line.port, ledger=ledger) as bus:
         for number, polled in enumerate(line.drives):
             drive = bus.attach(polled.drive)
             # On a busy machine a simulated drive may answer too late: the demo goes on without its motor.
@@ -58,10 +68,15 @@ def start_motors(line: PlantLine) -> None:
 @contextmanager
 def simulator(plant: Path, ports: Path) -> Iterator[None]:
     """Simulate in another process, which ends with this one: the two sides do not share an interpreter."""
-    words = [sys.executable, "-m", __name__, str(plant), "--ports", str(ports)]
+    words = [sys.executable, "-m", __name__, str(plant)]
+    if hasattr(os, "openpty"):
+        words += ["--ports", str(ports)]
     pipe = subprocess.PIPE
-    # A session of its own keeps Ctrl-C from it: it must outlive the polling.
-    with subprocess.Popen(words, stdin=pipe, stdout=pipe, text=True, start_new_session=True) as process:
+    # A session of its own keeps Ctrl-C from it, and on Windows a group: it must outlive the polling.
+    apart: dict[str, Any] = {"start_new_session": True}
+    if sys.platform == "win32":
+        apart = {"creationflags": subprocess.CREATE_NEW_PROCESS_GROUP}
+    with subprocess.Popen(words, stdin=pipe, stdout=pipe, text=True, **apart) as process:
         assert process.stdin is not None
         assert process.stdout is not None
         try:

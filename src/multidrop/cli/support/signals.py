@@ -7,6 +7,7 @@ is under way is finished and recorded, and the second one interrupts.
 from __future__ import annotations
 
 import signal
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from types import FrameType
@@ -58,9 +59,13 @@ def on_end_signals(end: Callable[[], object]) -> None:
     loop = asyncio.get_running_loop()
 
     def first(number: signal.Signals) -> None:
-        loop.remove_signal_handler(number)
+        if sys.platform != "win32":
+            loop.remove_signal_handler(number)
         signal.signal(number, signal.default_int_handler)
         end()
 
     for number in (signal.SIGINT, signal.SIGTERM):
-        loop.add_signal_handler(number, first, number)
+        if sys.platform == "win32":  # whose loops handle none
+            signal.signal(number, lambda came, frame: loop.call_soon_threadsafe(first, signal.Signals(came)))
+        else:
+            loop.add_signal_handler(number, first, number)

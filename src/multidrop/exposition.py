@@ -16,8 +16,8 @@ Labels = Mapping[str, str]
 Sample = tuple[str, Labels, float]  # the name's suffix, labels, value
 
 
-class Family(NamedTuple):
-    """Samples of one name."""
+class MetricFamily(NamedTuple):
+    """Samples of one name, for scrapers such as Prometheus."""
 
     name: str
     kind: str  # "gauge", "counter", "summary", "info" or "stateset"
@@ -25,12 +25,19 @@ class Family(NamedTuple):
     samples: Iterable[Sample]
 
 
-def open_metrics(families: Iterable[Family]) -> str:
+def expose_metrics(families: Iterable[MetricFamily], accept: str) -> tuple[str, str]:
+    """Return content type and text, in the form that the header `Accept` of the request asks for."""
+    if OPEN_METRICS in accept:
+        return OPEN_METRICS_TYPE, open_metrics(families)
+    return PLAIN_TYPE, plain_text(families)
+
+
+def open_metrics(families: Iterable[MetricFamily]) -> str:
     """Return OpenMetrics 1.0, with its end mark."""
     return "".join(_written(one, one.name, one.kind) for one in families) + "# EOF\n"
 
 
-def plain_text(families: Iterable[Family]) -> str:
+def plain_text(families: Iterable[MetricFamily]) -> str:
     """Return version 0.0.4 of Prometheus' text format: other names of families, and the same samples."""
     return "".join(
         _written(one, one.name + NAMED_WITH_SUFFIX.get(one.kind, ""), PLAIN_KINDS.get(one.kind, one.kind))
@@ -38,7 +45,7 @@ def plain_text(families: Iterable[Family]) -> str:
     )
 
 
-def _written(family: Family, name: str, kind: str) -> str:
+def _written(family: MetricFamily, name: str, kind: str) -> str:
     lines = [f"# TYPE {name} {kind}\n# HELP {name} {family.text}\n"]
     for suffix, labels, value in family.samples:
         if isfinite(value):

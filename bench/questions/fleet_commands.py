@@ -1,0 +1,54 @@
+"""Is a command of a fleet carried out twice, or its asker told wrongly, whatever is killed or stands still?
+
+Three gateways and three NATS nodes are killed (SIGKILL) and stopped (SIGSTOP, gateways for up to 3.5 s) at
+random moments, while askers write a setpoint after the other to the simulated drives of their lines; of their
+messages some are doubled, at once or seconds later, and some are late; every 20th command is a stop. The
+drives' own lists of writes are the judge. Ends with 1 where a command was carried out twice, its asker was
+told wrongly, or one that was carried out is not in its gateway's log.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import sys
+import tempfile
+from pathlib import Path
+
+from bench.support import tables
+
+ROOT = Path(__file__).parents[2]
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--commands", type=int, default=600)
+    parser.add_argument("--lines", type=int, default=12)
+    parser.add_argument(
+        "--seconds", type=float, help="for all of them; a tenth of a second for each if not given"
+    )
+    parser.add_argument("--seed", type=int, default=1)
+    arguments = parser.parse_args()
+    sys.path.insert(0, str(ROOT / "tests" / "support"))
+    from command_drills import command_drill
+
+    tables.heading("Is a command carried out twice, or its asker told wrongly, whatever is killed?")
+    seconds = arguments.seconds or arguments.commands / 10
+    with tempfile.TemporaryDirectory() as folder, command_drill(Path(folder), arguments.lines) as drill:
+        found = asyncio.run(drill.ask(arguments.commands, seconds, arguments.seed))
+    for title, counts in (("told", found.told), ("asked", found.ways), ("attack", found.deeds)):
+        tables.show((title, "times"), sorted(counts.items()))
+        print()
+    rows = [
+        ("carried out twice", found.twice),
+        ("told wrongly", found.wrongly),
+        ("told unknown, and carried out", found.unknown_sent),
+        ("carried out, and in no gateway's log", found.unnoted),
+        ("oldest when its drive had it, s since its offer came", f"{found.oldest_s:.2f}"),
+    ]
+    tables.show(("judged by the drives", ""), rows)
+    return 1 if found.twice or found.wrongly or found.unnoted else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

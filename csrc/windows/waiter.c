@@ -1,0 +1,75 @@
+/* Waits for many handles at once: in an alertable wait, in which completion routines run, for a timer and for
+ * the wake-up. */
+#include "file.h"
+
+#include <stdlib.h>
+
+#ifndef CREATE_WAITABLE_TIMER_HIGH_RESOLUTION
+#define CREATE_WAITABLE_TIMER_HIGH_RESOLUTION 2
+#endif
+
+enum { WAKEUP, TIMER, OBJECTS };
+
+struct md_waiter {
+    HANDLE objects[OBJECTS];
+};
+
+/* The other kind of timer, before Windows 10 1803, keeps time to 1 to 16 ms. */
+static HANDLE new_timer(void)
+{
+    HANDLE timer =
+        CreateWaitableTimerExW(NULL, NULL, CREATE_WAITABLE_TIMER_HIGH_RESOLUTION, TIMER_ALL_ACCESS);
+    return timer ? timer : CreateWaitableTimerW(NULL, FALSE, NULL);
+}
+
+struct md_waiter *md_waiter_new(void)
+{
+    struct md_waiter *waiter = calloc(1, sizeof *waiter);
+    if (waiter && (waiter->objects[TIMER] = new_timer()) != NULL)
+        return waiter;
+    free(waiter);
+    return NULL;
+}
+
+void md_waiter_free(struct md_waiter *waiter)
+{
+    CloseHandle(waiter->objects[TIMER]);
+    free(waiter);
+}
+
+/* The wake-up is nobody's. */
+int md_waiter_add(struct md_waiter *waiter, int fd, void *whose)
+{
+    if (whose)
+        return md_file_add(fd, whose);
+    waiter->objects[WAKEUP] = handle_of(fd);
+    return 0;
+}
+
+void md_waiter_change(struct md_waiter *waiter, int fd, void *whose, int watched)
+{
+    (void)waiter, (void)whose;
+    md_file_watch(fd, watched);
+}
+
+void md_waiter_remove(struct md_waiter *waiter, int fd)
+{
+    (void)waiter;
+    md_file_remove(fd);
+}
+
+int md_waiter_wait(struct md_waiter *waiter, void **ready, int room, int64_t timeout_ns)
+{
+    LARGE_INTEGER span = {.QuadPart = -(timeout_ns + 99) / 100}; /* negative: from now on */
+    int n = md_files_ready(ready, room - 1);
+    DWORD count = timeout_ns < 0 ? TIMER : OBJECTS, most = timeout_ns && !n ? INFINITE : 0, ended;
+    if (timeout_ns > 0 && !n)
+        SetWaitableTimer(waiter->objects[TIMER], &span, 0, NULL, NULL, FALSE);
+    do {
+        ended = WaitForMultipleObjectsEx(count, waiter->objects, FALSE, most, TRUE);
+        n += md_files_ready(ready + n, room - 1 - n);
+    } while (ended == WAIT_IO_COMPLETION && !n && most); /* what completed was a write */
+    if (ended == WAIT_OBJECT_0 + WAKEUP)
+        ready[n++] = NULL;
+    return n;
+}

@@ -1,0 +1,95 @@
+"""`multidrop fleet watch`: the fleet live on a terminal, or a line of JSON a second."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from typing import TYPE_CHECKING, Any
+
+from multidrop.cli.support.extras import require_extra
+from multidrop.cli.support.output import print_text
+from multidrop.cli.support.signals import on_end_signals
+
+if TYPE_CHECKING:
+    from multidrop.fleet.overview import FleetView
+    from multidrop.fleet.servers import ServerPath
+
+EVERY_S = 1.0
+
+
+async def watch(paths: list[ServerPath], *, is_json: bool) -> int:
+    """Show the fleet until Ctrl-C; servers that are away meanwhile are told with the age of what is shown."""
+    from multidrop.fleet.overview import FleetView
+    from multidrop.fleet.setup import check_buckets, open_all
+
+    if not is_json:
+        require_extra("rich", "monitor", "fleet watch")
+        if not sys.stdout.isatty():
+            raise ValueError("`multidrop fleet watch` needs a terminal; with --json it works without one")
+    await open_all(paths)
+    path = next(one for one in paths if one.is_open)
+    await check_buckets(path)
+    over = asyncio.Event()
+    on_end_signals(over.set)
+    keeping = asyncio.create_task(path.keep())
+    try:
+        with _lines() if is_json else drawing() as show:
+            await follow(FleetView(path), show, over)
+    finally:
+        keeping.cancel()
+        await asyncio.gather(keeping, return_exceptions=True)
+    return 0
+
+
+async def follow(view: FleetView, show: Callable[[dict[str, Any]], object], over: asyncio.Event) -> None:
+    """Look once a second, and show what was found with its age, until it is over."""
+    looked_s: float | None = None
+    while not over.is_set():
+        begun = time.monotonic()
+        trouble = None
+        try:
+            await view.look()
+            looked_s = time.monotonic()
+        except OSError as failure:
+            trouble = str(failure)
+        now = time.monotonic()
+        age = None if looked_s is None else round(now - looked_s, 3)
+        show({"at_ms": time.time_ns() // 1_000_000, "age_s": age, "trouble": trouble, **view.fleet()})
+        with suppress(TimeoutError):
+            await asyncio.wait_for(over.wait(), max(0.0, begun + EVERY_S - now))
+
+
+@contextmanager
+def _lines() -> Iterator[Callable[[dict[str, Any]], None]]:
+    yield lambda told: print_text(json.dumps(told), flush=True)
+
+
+@contextmanager
+def drawing(head: str = "multidrop fleet watch") -> Iterator[Callable[[dict[str, Any]], None]]:
+    """Give a function that draws a fleet on the whole terminal, or without cursor control below the last."""
+    from rich.console import Console
+    from rich.control import Control
+    from rich.text import Text
+
+    from multidrop.cli.support.fleet_screen import picture
+
+    console = Console()
+
+    def drawn(told: dict[str, Any]) -> Any:
+        lines = picture(told, (console.width, console.height), head)
+        return Text("\n", no_wrap=True, end="").join(lines)
+
+    if console.is_dumb_terminal:
+        yield lambda told: console.print(drawn(told))
+        return
+    with console.screen(hide_cursor=True) as screen:
+
+        def draw(told: dict[str, Any]) -> None:
+            console.control(Control.home())  # else rich draws below the last picture
+            screen.update(drawn(told))
+
+        yield draw

@@ -1,0 +1,84 @@
+"""The picture of a fleet, as lines of text for a width and a height.
+
+Everything that matters is in words as well as in colours. What is old is dim, and its age is told.
+"""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+from rich.text import Text
+
+from multidrop.cli.support.fleet_tables import (
+    Told,
+    count_sentence,
+    gateway_table,
+    line_table,
+    move_table,
+    trouble_sentences,
+)
+from multidrop.printable import printable
+
+OLD_S = 3.0  # an older look is not shown as the present
+NOTES = 4  # lines of what happened, and of troubles
+MOVES = 8  # rows of the moves with their head, where lines need the room
+
+
+def picture(told: Told, size: tuple[int, int], head: str) -> list[Text]:
+    """Draw gateways, lines and moves of what `fleet watch --json` prints; "notes" stand at the foot."""
+    width, height = size
+    is_old = told["age_s"] is None or told["age_s"] > OLD_S
+    top = [_title(told, head, width), _warning(told, width)]
+    foot = [Text(_cut(note, width)) for note in (*told.get("notes", ())[-NOTES:], "Ctrl-C ends it")]
+    room = max(0, height - len(top) - len(foot))
+    body = [_row(text, width, is_old) for text in _body(told, room)[:room]]
+    return [*top, *body, *[Text()] * (room - len(body)), *foot][:height]
+
+
+def _body(told: Told, room: int) -> list[str]:
+    """Return gateways whole, and of moves and lines as many as there is room for."""
+    begin = [*gateway_table(told), "", count_sentence(told), *trouble_sentences(told)[:NOTES], ""]
+    room -= len(begin)
+    lines = line_table(dict(sorted(told["lines"].items(), key=_urgency)))
+    moves = ["", "last moves:", *move_table(told["moves"])]
+    moves = moves[: max(MOVES, room - len(lines))]
+    return [*begin, *_fitting(lines, room - len(moves)), *moves]
+
+
+def _fitting(lines: list[str], room: int) -> list[str]:
+    if len(lines) <= room:
+        return lines
+    kept = max(1, room - 1)  # the head is one of them
+    return [*lines[:kept], f"and {len(lines) - kept} more lines"]
+
+
+def _urgency(line: tuple[str, Told]) -> tuple[bool, str]:
+    """Order the lines without a master before the others."""
+    return line[1]["master"] is not None, line[0]
+
+
+def _title(told: Told, head: str, width: int) -> Text:
+    clock = time.strftime("%H:%M:%S UTC ", time.gmtime(told["at_ms"] / 1000))
+    text = f" {head}"[: max(0, width - len(clock))]
+    return Text((text.ljust(width - len(clock)) + clock)[:width], style="reverse")
+
+
+def _warning(told: Told, width: int) -> Text:
+    if not told["trouble"]:
+        return Text()
+    age = "nothing was read yet" if told["age_s"] is None else f"this is {told['age_s']:.0f} s old"
+    return Text(_cut(f"{age}: {told['trouble']}", width), style="bold red")
+
+
+def _row(text: str, width: int, is_old: bool) -> Text:
+    style: Any = "dim" if is_old else ""
+    if "no answer" in text or "  none" in text:
+        style = "bold red"
+    elif text.startswith(("GATEWAY ", "LINE ", "last moves")):
+        style = "bold underline"
+    return Text(_cut(text, width), style=style)
+
+
+def _cut(text: str, width: int) -> str:
+    return printable(text)[: width - 1]

@@ -1,0 +1,106 @@
+"""A fleet as lines of text: its gateways, its lines and its last moves."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+from multidrop.cli.support.values import Row, aligned
+
+Told = Mapping[str, Any]  # as `--json` prints it
+GATEWAYS = (
+    "GATEWAY",
+    "HOST",
+    "SESSION",
+    "SINCE",
+    "STATE",
+    "LINES",
+    "MARGIN",
+    "SPOOL",
+    "BEHIND",
+    "LAG",
+    "LOST",
+)
+LINES = ("LINE", "PORT", "MASTER", "SINCE")
+UNITS = ("B", "kB", "MB", "GB", "TB")
+
+
+def moment(ms: int) -> str:
+    """Return a time (ms since 1970) as UTC; "?" for a number that no calendar has."""
+    try:
+        return time.strftime("%Y-%m-%d %H:%M:%S", time.gmtime(ms // 1000))
+    except (OverflowError, ValueError, OSError):
+        return "?"
+
+
+def gateway_table(fleet: Told) -> list[str]:
+    rows = [_gateway_row(name, gateway) for name, gateway in fleet["gateways"].items()]
+    return aligned([GATEWAYS, *rows], "<<><<>>>>>>")
+
+
+def _gateway_row(name: str, gateway: Told) -> Row:
+    says = gateway["says"]
+    head = (name, gateway["host"], str(gateway["session"]), moment(gateway["began_ms"]))
+    if says is None:
+        return (*head, "no answer", str(gateway["lines"]), "-", "-", "-", "-", "-")
+    spool = says["spool"]
+    return (
+        *head,
+        says["state"],
+        str(gateway["lines"]),
+        f"{says['margin_s']:.1f} s",
+        size(spool["bytes"]),
+        "-" if spool["behind"] is None else str(spool["behind"]),
+        "-" if spool["lag_s"] is None else f"{spool['lag_s']:.1f} s",
+        str(spool["lost"]),
+    )
+
+
+def size(number: float) -> str:
+    """Return a number of bytes in the unit that leaves three digits at most."""
+    for unit in UNITS[:-1]:
+        if number < 1000:
+            return f"{number:.0f} {unit}" if number >= 10 or unit == "B" else f"{number:.1f} {unit}"
+        number /= 1000
+    return f"{number:.0f} {UNITS[-1]}"
+
+
+def line_table(lines: Mapping[str, Told]) -> list[str]:
+    return aligned([LINES, *(_line_row(name, line) for name, line in lines.items())], "<<<<")
+
+
+def _line_row(name: str, line: Told) -> Row:
+    return name, line["port"], line["master"] or "none", moment(line["since_ms"]) if line["master"] else ""
+
+
+def free_lines(fleet: Told) -> list[str]:
+    """Return the lines without a master."""
+    return [name for name, line in fleet["lines"].items() if not line["master"]]
+
+
+def count_sentence(fleet: Told) -> str:
+    return f"{len(fleet['lines'])} lines, {len(free_lines(fleet))} without a master"
+
+
+def move_table(moves: Iterable[Told]) -> list[str]:
+    """Return a line for each move: when, which line, from whom, to whom."""
+    rows = [(moment(move["at_ms"]), move["line"], *_from_to(move)) for move in moves]
+    return aligned(rows, "<<<<")
+
+
+def _from_to(move: Told) -> tuple[str, str]:
+    before = "" if move["from"] is None else f"from {move['from'] or 'nobody'}"
+    return before, f"to {move['to'] or 'nobody'}"
+
+
+def trouble_sentences(fleet: Told) -> list[str]:
+    """Return what gateways say that is not well with them."""
+    found = []
+    for name, gateway in fleet["gateways"].items():
+        says = gateway["says"] or {}
+        found += [f"{name}: line {line}: {why}" for line, why in (says.get("troubles") or {}).items()]
+        found += [
+            f"{name}: {why}" for why in (says.get("trouble"), says.get("spool", {}).get("trouble")) if why
+        ]
+    return found

@@ -1,0 +1,104 @@
+"""Command subjects: what a gateway hears of commands on NATS, on all of its paths, and answers.
+
+A line's subjects are heard while the line is polled, so that a server itself says where nobody is its master.
+Each message comes once on each path: the desks know copies by the asker's id. Nothing goes through a stream.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import logging
+import secrets
+from collections.abc import Awaitable, Callable, Coroutine, Sequence
+from contextlib import suppress
+from functools import partial
+from typing import Any
+
+from nats.aio.msg import Msg
+
+from multidrop.fleet import names
+from multidrop.fleet.command_desk import CommandDesk
+from multidrop.fleet.command_log import CommandLog
+from multidrop.fleet.command_words import CommandAnswer, Offered, encode
+from multidrop.fleet.fleet_lines import FleetLines
+from multidrop.fleet.held_lines import HeldLines
+from multidrop.fleet.servers import ServerPath
+from multidrop.fleet.stop_desk import StopDesk
+
+_log = logging.getLogger("multidrop.fleet")
+Heard = Callable[[bytes], Awaitable[Offered | CommandAnswer | None]]
+
+
+class CommandSubjects:
+    """The desks of one run of a gateway, and the lines that they are open for."""
+
+    def __init__(self, gateway: str, paths: Sequence[ServerPath], lines: HeldLines, log: CommandLog) -> None:
+        self._paths = paths
+        self._lines = lines
+        self.desk = CommandDesk(gateway, names.do_subject(gateway, secrets.token_hex(8)), lines, log)
+        self._stops = StopDesk(gateway, lines, self.desk.offers, log)
+        self._tasks: set[asyncio.Task[None]] = set()
+
+    async def begin(self) -> None:
+        """Hear the tokens of this run's offers."""
+        await self._hear(self.desk.subject, self.desk.do)
+
+    def open(self, line: str, description: Any) -> None:
+        """Take commands for a line from now on."""
+        self._lines.open(line, description)
+        self._begin(self._hear(names.command_subject(line), partial(self._offer, line)))
+        self._begin(self._hear(names.stop_subject(line), partial(self._stops.stop, line)))
+
+    def shut(self, line: str) -> None:
+        """Take none any more, and carry out nothing that was offered."""
+        self._lines.shut(line)
+        self._begin(self._deafen(names.command_subject(line), names.stop_subject(line)))
+
+    async def _offer(self, line: str, data: bytes) -> Offered | CommandAnswer | None:
+        return self.desk.offer(line, data)
+
+    async def _hear(self, subject: str, heard: Heard) -> None:
+        async def take(message: Msg) -> None:
+            self._begin(_answer(message, heard))  # none waits for another
+
+        await asyncio.gather(*(path.subscribe(subject, take) for path in self._paths))
+
+    async def _deafen(self, *subjects: str) -> None:
+        await asyncio.gather(*(path.unsubscribe(one) for path in self._paths for one in subjects))
+
+    def _begin(self, work: Coroutine[Any, Any, None]) -> None:
+        task = asyncio.create_task(work)
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
+
+
+async def _answer(message: Msg, heard: Heard) -> None:
+    try:
+        answer = await heard(message.data)
+    except Exception:
+        _log.exception("a message to %s", message.subject)
+        return
+    if answer is None:
+        return
+    data = json.dumps(answer.as_json()).encode() if isinstance(answer, CommandAnswer) else encode(answer)
+    with suppress(Exception):  # whoever asked may have gone
+        await message.respond(data)
+
+
+class CommandedLines:
+    """Lines that are open to commands as long as they are polled."""
+
+    def __init__(self, lines: FleetLines, subjects: CommandSubjects) -> None:
+        self._lines = lines
+        self._subjects = subjects
+
+    async def take(self, line: str, description: Any) -> None:
+        """Open the line, poll it and take commands. Raises OSError or ValueError where that fails."""
+        await self._lines.take(line, description)
+        self._subjects.open(line, description)
+
+    async def let_go(self, line: str) -> None:
+        """Take no commands any more, poll the line no more, and close it."""
+        self._subjects.shut(line)
+        await self._lines.let_go(line)

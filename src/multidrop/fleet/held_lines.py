@@ -1,0 +1,69 @@
+"""Held lines: those that a gateway polls and so takes commands for, and what their lists allow."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any, Protocol
+
+from multidrop import Bus, Drive
+
+LISTS = ("write", "verbs")  # of [fleet.may]
+
+
+class PolledBuses(Protocol):
+    """The part of a Poller that commands need."""
+
+    def bus(self, line: str) -> Bus: ...
+
+
+class HeldLine:
+    """A line from when it was taken until it is let go: one that is taken again is another."""
+
+    def __init__(self, name: str, bus: Bus, may: Mapping[str, frozenset[str]]) -> None:
+        self.name = name
+        self.bus = bus
+        self.may = may
+
+    @property
+    def drives(self) -> dict[str, Drive]:
+        return {drive.name: drive for drive in self.bus.drives}
+
+    def drive(self, name: str) -> Drive:
+        """Return the drive of this name. Raises ValueError."""
+        drives = self.drives
+        if name not in drives:
+            raise ValueError(f"line {self.name} has no drive {name!r}; it has {', '.join(drives) or 'none'}")
+        return drives[name]
+
+
+class HeldLines:
+    """The lines that are open to commands; `may_command` says whether we are a line's master now."""
+
+    def __init__(self, buses: PolledBuses, may_command: Callable[[str], bool]) -> None:
+        self._buses = buses
+        self._may_command = may_command
+        self._held: dict[str, HeldLine] = {}
+
+    def open(self, line: str, description: Mapping[str, Any]) -> None:
+        """Take commands for a line that is polled from now on."""
+        self._held[line] = HeldLine(line, self._buses.bus(line), lists_of(description))
+
+    def shut(self, line: str) -> None:
+        """Take none any more."""
+        self._held.pop(line, None)
+
+    def mine(self, line: str) -> HeldLine | None:
+        """Return the line if we are its master now."""
+        held = self._held.get(line)
+        return held if held is not None and self._may_command(line) else None
+
+
+def lists_of(description: Mapping[str, Any]) -> dict[str, frozenset[str]]:
+    """Return the lists of a line's record; empty for what is none, so that nothing is allowed."""
+    may = description.get("may")
+    given = may if isinstance(may, dict) else {}
+    return {key: _entries(given.get(key)) for key in LISTS}
+
+
+def _entries(given: object) -> frozenset[str]:
+    return frozenset(one for one in given if isinstance(one, str)) if isinstance(given, list) else frozenset()

@@ -1,0 +1,82 @@
+"""Moves: the newest changes of mastership, as the records of lines told them. Pure."""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Iterable
+from typing import Any, NamedTuple
+
+from multidrop.fleet.buckets import Record
+from multidrop.fleet.ownership import NOBODY, owner_of
+
+MOST = 100
+TOLD = 20  # by a gateway that is asked for its state
+
+
+class Move(NamedTuple):
+    """A line that went from one gateway to another; "" is nobody, None a master that was not seen."""
+
+    line: str
+    revision: int  # of the line's record: the same move has the same one, whoever saw it
+    at_ms: int  # UTC, by the clock of the gateway that wrote it: for people alone
+    before: str | None
+    after: str
+
+    def as_json(self) -> dict[str, Any]:
+        """Return it as a gateway tells it and `--json` prints it."""
+        return {
+            "line": self.line,
+            "revision": self.revision,
+            "at_ms": self.at_ms,
+            "from": self.before,
+            "to": self.after,
+        }
+
+
+def move_of(told: Any) -> Move:
+    """Return the move that another gateway told. Raises KeyError, TypeError or ValueError for none."""
+    before = told["from"]
+    return Move(
+        str(told["line"]),
+        int(told["revision"]),
+        int(told["at_ms"]),
+        None if before is None else str(before),
+        str(told["to"]),
+    )
+
+
+class Moves:
+    """The newest moves; a line that was given away and then taken has moved once."""
+
+    def __init__(self, most: int = MOST) -> None:
+        self._most = most
+        self._moves: dict[tuple[str, int], Move] = {}
+        self._given_away: dict[str, Move] = {}  # by line: nobody has taken it yet
+
+    def note(self, before: Record | None, record: Record, *, is_first_look: bool) -> None:
+        """Note a line's new record; the records of a first look do not say who was master before."""
+        if not record.value:
+            return
+        after, _ = owner_of(record)
+        master = None if before is None and is_first_look else owner_of(before)[0]
+        move = Move(record.key, record.revision, int(record.value.get("since", 0)), master, after)
+        if after == NOBODY:
+            self._given_away[move.line] = move
+        elif given := self._given_away.pop(move.line, None):
+            self._moves.pop((given.line, given.revision), None)
+            move = move._replace(before=given.before)
+        self.add([move])
+
+    def add(self, moves: Iterable[Move]) -> None:
+        """Add moves that others saw; of two that are one the one that knows more is kept."""
+        for move in moves:
+            key = (move.line, move.revision)
+            known = self._moves.get(key)
+            if known is None or known.before is None:
+                self._moves[key] = move
+        if len(self._moves) > 4 * self._most:
+            self._moves = {(move.line, move.revision): move for move in self.newest(self._most)}
+
+    def newest(self, number: int) -> list[Move]:
+        """Return so many moves at most, the newest first."""
+        return heapq.nlargest(number, self._moves.values(), key=lambda move: (move.at_ms, move.revision))

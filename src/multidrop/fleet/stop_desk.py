@@ -1,0 +1,116 @@
+"""Stop desk: stops drives at once, for anybody who asks the line's present master.
+
+A stop needs neither an offer nor a list: to stop twice does no harm, and to wait may. It goes to the present
+master all the same, for nobody else may send on the line. It is sent first, and noted afterwards.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Callable, Mapping
+from functools import partial
+from typing import Any
+
+from multidrop import Bus, written_by
+from multidrop.fleet.command_desk import HOLD_S, WAY
+from multidrop.fleet.command_log import CommandLog
+from multidrop.fleet.command_words import CommandAnswer, CommandOutcome, StopRequest, read_stop, worst
+from multidrop.fleet.drive_commands import answers_of_stops, stop_drive
+from multidrop.fleet.held_lines import HeldLine, HeldLines
+from multidrop.fleet.offers import Offers
+from multidrop.fleet.own_thread import in_own_thread
+
+REMEMBERED = 1000  # stops, of which the oldest are forgotten
+CALLED = "a stop was called"
+
+_log = logging.getLogger("multidrop.fleet")
+Answers = dict[str, CommandAnswer]
+
+
+class StopDesk:
+    """Stops on the lines that this gateway holds; each ends what was offered before it."""
+
+    def __init__(self, gateway: str, lines: HeldLines, offers: Offers, log: CommandLog) -> None:
+        self.gateway = gateway
+        self._lines = lines
+        self._offers = offers
+        self._log = log
+        self._stops: dict[tuple[str, str], asyncio.Task[CommandAnswer]] = {}  # by line and id
+        self._notes: set[asyncio.Task[None]] = set()
+
+    async def stop(self, line: str, data: bytes) -> CommandAnswer | None:
+        """Stop drives of a line now; None where we are not its master and must keep silent.
+
+        A copy of the message gets the answer of the same stop; another message is another stop.
+        """
+        held = self._lines.mine(line)
+        if held is None:
+            return None
+        try:
+            request = read_stop(data)
+        except ValueError as mistake:
+            return CommandAnswer(CommandOutcome.REFUSED, f"no stop was sent: {mistake}", self.gateway)
+        key = (line, request.id)
+        if key not in self._stops:
+            self._stops[key] = asyncio.create_task(self._stop(held, request))
+            while len(self._stops) > REMEMBERED:
+                del self._stops[next(iter(self._stops))]
+        task = self._stops[key]
+        await asyncio.wait({task}, timeout=HOLD_S)
+        if not task.done():
+            return CommandAnswer(CommandOutcome.UNDER_WAY, f"line {line}: a stop is under way", self.gateway)
+        return task.result()
+
+    async def _stop(self, held: HeldLine, request: StopRequest) -> CommandAnswer:
+        """Begin the stops of all drives side by side, each in a thread of its own."""
+        self._offers.void(held.name, request.drives, CALLED)
+        drives = held.drives
+        names = list(drives) if request.drives is None else list(dict.fromkeys(request.drives))
+        waited = [
+            in_own_thread(partial(_stopped_by, request.by, work)) for work in _works(held.bus, drives, names)
+        ]
+        _log.warning("stop of %s, asked for by %s", ", ".join(names), request.by)
+        record = {"id": request.id, "line": held.name, "what": "stop", "drives": names, "by": request.by}
+        self._note({"step": "begun", **record, "gateway": self.gateway})
+        there = f"line {held.name} has no such drive; it has {', '.join(drives) or 'none'}"
+        missing = CommandAnswer(CommandOutcome.REFUSED, f"no stop was sent: {there}")
+        found: Answers = {name: missing for name in names if name not in drives}
+        for answers in await asyncio.gather(*waited):
+            found |= answers
+        text = "; ".join(answer.text for answer in found.values()) or f"line {held.name} has no drives"
+        answer = CommandAnswer(worst(list(found.values())), text, self.gateway, drives=found)
+        self._note({"step": "over", **record, **answer.as_json()})
+        return answer
+
+    def _note(self, record: Mapping[str, Any]) -> None:
+        """Note it, in the order of the calls, whoever waits for the stop."""
+        task = asyncio.create_task(self._write(record))
+        self._notes.add(task)
+        task.add_done_callback(self._notes.discard)
+
+    async def _write(self, record: Mapping[str, Any]) -> None:
+        try:
+            await self._log.note(record)
+        except OSError as failure:
+            _log.warning("a stop is not in the log of commands: %s", failure)
+
+
+def _works(bus: Bus, drives: Mapping[str, Any], names: list[str]) -> list[Callable[[], Answers]]:
+    """Return what stops them: the line as a whole where all of its drives are meant."""
+    if drives and drives.keys() <= set(names):
+        return [partial(_stop_line, bus)]
+    return [partial(stop_drive, drives[name]) for name in names if name in drives]
+
+
+def _stopped_by(by: str, work: Callable[[], Answers]) -> Answers:
+    with written_by(by, WAY):
+        return work()
+
+
+def _stop_line(bus: Bus) -> Answers:
+    try:
+        return answers_of_stops(bus.stop_all())
+    except Exception as failure:  # whatever it is: everybody must see it
+        text = f"it is not known whether the stop was sent: {type(failure).__name__}: {failure}"
+        return {drive.name: CommandAnswer(CommandOutcome.UNKNOWN, text) for drive in bus.drives}

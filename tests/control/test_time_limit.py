@@ -1,0 +1,92 @@
+"""Nothing of what is called within a time limit is sent after it, but a stop."""
+
+from __future__ import annotations
+
+from contextlib import AbstractContextManager
+from math import inf
+from typing import Any
+
+import pytest
+from simulated_bus import SimulatedBus, one
+
+from multidrop.control.time_limit import written_before
+from multidrop.drives import InvtCHE
+from multidrop.errors import Expired, Overtaken
+
+
+@pytest.fixture
+def line(monkeypatch: pytest.MonkeyPatch) -> SimulatedBus:
+    found, _, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
+    found.bus.drives[0].set_frequency(10)  # its identity is known from then on
+    return found
+
+
+def within(line: SimulatedBus, seconds: float) -> AbstractContextManager[None]:
+    until_ns = (line.seconds + seconds) * 1e9
+    return written_before(lambda: until_ns)
+
+
+def written(line: SimulatedBus) -> list[str]:
+    return [text for request, text in line.frames if request.function in (5, 6, 15, 16)]
+
+
+def test_what_is_called_in_time_is_sent(line: SimulatedBus) -> None:
+    before = len(written(line))
+    with within(line, 0.5):
+        line.sleep(0.4)
+        line.bus.drives[0].set_frequency(20)
+    assert len(written(line)) == before + 1
+
+
+@pytest.mark.parametrize("seconds", [0, 0.5, 0.9])
+def test_what_is_held_up_after_the_call_is_not_sent(line: SimulatedBus, seconds: float) -> None:
+    """The bus alone would send it: it has a second from the call on."""
+    before = len(written(line))
+    with within(line, seconds):
+        line.sleep(0.45)
+        line.queue_time = 0.5
+        with pytest.raises(Expired):
+            line.bus.drives[0].set_frequency(20)
+    assert len(written(line)) == before
+
+
+def test_an_inner_limit_is_never_longer_and_ends_with_its_block(line: SimulatedBus) -> None:
+    with within(line, 0.2), within(line, 60):
+        line.sleep(0.3)
+        with pytest.raises(Expired):
+            line.bus.drives[0].set_frequency(20)
+    line.bus.drives[0].set_frequency(20)
+
+
+def test_a_bus_s_own_expiry_counts_where_it_is_shorter(line: SimulatedBus) -> None:
+    line.queue_time = 1.5
+    with within(line, 60), pytest.raises(Expired):
+        line.bus.drives[0].set_frequency(20)
+
+
+def test_a_stop_is_sent_whenever_it_is(line: SimulatedBus) -> None:
+    before = len(written(line))
+    with within(line, 0):
+        line.sleep(5)
+        line.bus.drives[0].stop()
+    assert len(written(line)) > before
+
+
+def test_the_limit_is_asked_for_when_a_stop_would_end_the_call(line: SimulatedBus) -> None:
+    """Whoever notes a stop before it is called, and looks at the note in `limit`, misses none."""
+    drive = line.bus.drives[0]
+    before = len(written(line))
+
+    def limit() -> float:
+        drive.stop()  # at the latest moment
+        return inf
+
+    with written_before(limit), pytest.raises(Overtaken):
+        drive.set_frequency(20)
+    assert written(line)[before:] == written(line)[-1:]  # the stop
+
+
+@pytest.mark.parametrize("limit", [0.5, True, "1", None])
+def test_what_is_no_function_is_refused(limit: Any) -> None:
+    with pytest.raises(TypeError, match=r"is no function that returns a time"), written_before(limit):
+        pass

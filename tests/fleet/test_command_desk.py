@@ -1,0 +1,337 @@
+"""Commands at the gateway: each is sent once, in time, by the present master, or not at all."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from command_desks import LINE, Desks, desks
+from peers import require_module
+
+from multidrop import read_audit
+
+require_module("nats")
+
+from multidrop.fleet.command_desk import MOST_WRITES  # noqa: E402
+from multidrop.fleet.command_words import (  # noqa: E402
+    CommandAnswer,
+    CommandOutcome,
+    Offered,
+    read_answer,
+    read_offer,
+)
+
+DONE, REFUSED, NOT_SENT, UNKNOWN = (
+    CommandOutcome.DONE,
+    CommandOutcome.REFUSED,
+    CommandOutcome.NOT_SENT,
+    CommandOutcome.UNKNOWN,
+)
+SETPOINT = "frequency"
+
+
+@pytest.fixture
+def desk(tmp_path: Path) -> Iterator[Desks]:
+    with desks(tmp_path) as made:
+        yield made
+
+
+def setpoints(desk: Desks) -> list[int]:
+    return [raw for name, raw in desk.writes if name == SETPOINT]
+
+
+def test_a_command_is_offered_then_done_and_noted_before_and_after(desk: Desks, tmp_path: Path) -> None:
+    token = desk.offered(20.0)
+    assert desk.writes == []  # an offer sends nothing
+    answer = asyncio.run(desk.do(token))
+    assert answer.outcome is DONE
+    assert answer.held == "20.00 Hz"
+    assert setpoints(desk) == [2000]
+    begun, over = desk.notes
+    assert (begun["step"], begun["by"], begun["what"]) == ("begun", "anna", "pump: frequency = 20.00 Hz")
+    assert (over["step"], over["outcome"], over["id"]) == ("over", "done", begun["id"])
+    [frame] = read_audit(tmp_path / "audit.jsonl")
+    assert (frame["by"], frame["way"]) == ("anna", "fleet")
+
+
+def test_a_doubled_do_is_carried_out_once_and_gets_the_same_answer(desk: Desks) -> None:
+    token = desk.offered()
+
+    async def twice() -> list[CommandAnswer]:
+        together = await asyncio.gather(*(desk.do(token) for _ in range(5)))
+        desk.clock.pass_s(100)
+        return [*together, await desk.do(token)]
+
+    answers = asyncio.run(twice())
+    assert {(answer.outcome, answer.text) for answer in answers} == {(DONE, answers[0].text)}
+    assert setpoints(desk) == [2000]
+
+
+def test_copies_of_a_request_are_one_offer(desk: Desks) -> None:
+    same = {"id": "one", "register": SETPOINT, "value": 20.0}
+    assert desk.offered(**same) == desk.offered(**same)
+    assert desk.offered(**same) != desk.offered(**(same | {"id": "two"}))
+
+
+@pytest.mark.parametrize(("seconds", "outcome"), [(0.5, DONE), (1.0, NOT_SENT), (60.0, NOT_SENT)])
+def test_a_late_do_is_not_sent(desk: Desks, seconds: float, outcome: CommandOutcome) -> None:
+    token = desk.offered()
+    desk.clock.pass_s(seconds)
+    answer = asyncio.run(desk.do(token))
+    assert answer.outcome is outcome
+    assert len(setpoints(desk)) == (outcome is DONE)
+    assert ("s have passed since the offer" in answer.text) == (outcome is NOT_SENT)
+
+
+def test_what_is_held_up_on_its_way_to_the_drive_is_not_sent(desk: Desks) -> None:
+    """The library has the rest of the second, and no more."""
+    token = desk.offered()
+    offer = desk.desk.offers.find(token)
+    assert offer is not None
+    work = offer.prepared.work
+
+    def held_up() -> CommandAnswer:
+        time.sleep(0.2)
+        return work()
+
+    offer.prepared = offer.prepared._replace(work=held_up)
+    desk.clock.pass_s(0.95)
+    answer = asyncio.run(desk.do(token))
+    assert answer.outcome is NOT_SENT
+    assert "did not come within" in answer.text
+    assert desk.writes == []
+
+
+def while_noted(desk: Desks, deed: Callable[[], object]) -> CommandAnswer:
+    """Do it while a command's first record is written: the last moment before it is sent."""
+
+    def before(record: dict[str, Any]) -> None:
+        if record["step"] == "begun":
+            deed()
+
+    token = desk.offered()
+    desk.log.before = before
+    return asyncio.run(desk.do(token))
+
+
+def let_go_and_take(desk: Desks) -> None:
+    desk.lines.shut(LINE)
+    desk.take()
+
+
+MEANWHILE: dict[str, Callable[[Desks], object]] = {
+    "a second passes": lambda desk: desk.clock.pass_s(1.0),
+    "another is master": lambda desk: setattr(desk, "is_master", False),
+    "the line is let go": lambda desk: desk.lines.shut(LINE),
+    "it is taken again": let_go_and_take,
+    "a stop is called": lambda desk: desk.desk.offers.void(LINE, ["pump"], "a stop was called"),
+}
+
+
+@pytest.mark.parametrize("deed", MEANWHILE)
+@pytest.mark.parametrize("is_late", [False, True])
+def test_what_comes_between_keeps_it_from_being_sent(desk: Desks, deed: str, is_late: bool) -> None:
+    """Between the offer and the word to do it, and between that word and the sending."""
+    if is_late:
+        answer = while_noted(desk, lambda: MEANWHILE[deed](desk))
+    else:
+        token = desk.offered()
+        MEANWHILE[deed](desk)
+        answer = asyncio.run(desk.do(token))
+    assert answer.outcome is NOT_SENT
+    assert desk.writes == []
+
+
+def test_a_stop_of_another_drive_ends_nothing(desk: Desks) -> None:
+    token = desk.offered()
+    desk.desk.offers.void(LINE, ["fan"], "a stop was called")
+    desk.desk.offers.void("hall-2", None, "a stop was called")
+    assert asyncio.run(desk.do(token)).outcome is DONE
+
+
+def test_a_restarted_master_knows_no_token_of_before(desk: Desks, tmp_path: Path) -> None:
+    token = desk.offered()
+    with desks(tmp_path) as after:
+        assert asyncio.run(after.do(token)).outcome is UNKNOWN
+        assert after.writes == []
+    assert asyncio.run(desk.do(f"{token}x")).outcome is UNKNOWN
+    assert desk.writes == []
+
+
+def test_who_is_not_the_master_keeps_silent(desk: Desks) -> None:
+    """Another gateway may be the master, and the first answer counts."""
+    desk.is_master = False
+    assert desk.ask(register=SETPOINT, value=20.0) is None
+    assert asyncio.run(desk.stop()) is None
+    desk.is_master = True
+    assert isinstance(desk.ask(register=SETPOINT, value=20.0), Offered)
+
+
+def test_who_asks_what_became_of_it_first_ends_it(desk: Desks) -> None:
+    token = desk.offered()
+
+    async def main() -> list[CommandAnswer]:
+        asked = await desk.desk.do(json.dumps({"ask": token}).encode())
+        return [asked, await desk.do(token)]
+
+    assert [answer.outcome for answer in asyncio.run(main())] == [NOT_SENT, NOT_SENT]
+    assert desk.writes == []
+
+
+def test_without_a_list_a_stop_alone_is_done(tmp_path: Path) -> None:
+    with desks(tmp_path, {}) as desk:
+        for what in ({"register": SETPOINT, "value": 20.0}, {"verb": "start"}, {"verb": "emergency_stop"}):
+            answer = desk.ask(**what)
+            assert isinstance(answer, CommandAnswer)
+            assert answer.outcome is REFUSED
+            assert "is not in the plant's list" in answer.text
+        assert desk.writes == []
+        stopped = asyncio.run(desk.stop())
+        assert stopped is not None
+        assert stopped.outcome is DONE
+        assert [name for name, _ in desk.writes] == ["control"]
+
+
+@pytest.mark.parametrize("may", ["all", [], {"write": "pump.frequency"}, {"write": [["pump.frequency"]]}])
+def test_a_damaged_list_allows_nothing(tmp_path: Path, may: Any) -> None:
+    with desks(tmp_path, may) as desk:
+        answer = desk.ask(register=SETPOINT, value=20.0)
+        assert isinstance(answer, CommandAnswer)
+        assert answer.outcome is REFUSED
+
+
+def test_a_start_runs_the_motor_and_a_stop_stops_it(desk: Desks) -> None:
+    async def main() -> list[CommandOutcome]:
+        found = [(await desk.do(desk.offered(20.0))).outcome]
+        found.append((await desk.do(desk.offered(verb="start", options={"direction": "forward"}))).outcome)
+        stopped = await desk.stop(drives=None)
+        assert stopped is not None
+        return [*found, stopped.outcome]
+
+    assert asyncio.run(main()) == [DONE, DONE, DONE]
+    assert {"begun", "over"} == {note["step"] for note in desk.notes if note["what"] == "stop"}
+
+
+def test_a_stop_ends_what_was_offered_before_and_copies_of_it_are_one(desk: Desks) -> None:
+    token = desk.offered()
+
+    async def main() -> CommandAnswer:
+        copies = await asyncio.gather(*(desk.stop(id="one") for _ in range(3)))
+        assert len({copy.text for copy in copies if copy}) == 1
+        return await desk.do(token)
+
+    answer = asyncio.run(main())
+    assert answer.outcome is NOT_SENT
+    assert "a stop was called" in answer.text
+    assert len([name for name, _ in desk.writes if name == "control"]) == 1
+    assert setpoints(desk) == []
+
+
+def full_disk(record: Any) -> None:
+    raise OSError(28, "No space left on device")
+
+
+def test_a_full_disk_keeps_a_command_back_and_no_stop(desk: Desks) -> None:
+    token = desk.offered()
+    desk.log.before = full_disk
+    answer = asyncio.run(desk.do(token))
+    assert answer.outcome is NOT_SENT
+    assert "the log of commands cannot be written" in answer.text
+    assert desk.writes == []
+    stopped = asyncio.run(desk.stop())
+    assert stopped is not None
+    assert stopped.outcome is DONE
+
+
+def test_many_at_once_are_bounded(desk: Desks) -> None:
+    async def main() -> list[CommandOutcome]:
+        tokens = [desk.offered(20.0 + number) for number in range(MOST_WRITES + 3)]
+        answers = await asyncio.gather(*(desk.do(token) for token in tokens))
+        return [answer.outcome for answer in answers]
+
+    outcomes = asyncio.run(main())
+    assert outcomes.count(NOT_SENT) >= 3
+    assert len(setpoints(desk)) == len(outcomes) - outcomes.count(NOT_SENT) > 0
+
+
+HOSTILE = [
+    b"",
+    b"\xff\xfe",
+    b"null",
+    b"[]",
+    b"[" * 100_000,
+    b'{"id": "a"}',
+    b'{"a": 1e999}',
+    b"x" * 70_000,
+    *(
+        json.dumps(
+            {"id": "a", "by": "b", "drive": "pump", "register": SETPOINT, "value": 1.0} | wrong
+        ).encode()
+        for wrong in (
+            {"id": 7},
+            {"id": ""},
+            {"id": "a" * 201},
+            {"by": "\x1b[31m"},
+            {"by": None},
+            {"by": " "},
+            {"drive": ["pump"]},
+            {"drive": "pump.frequency"},
+            {"drive": "PUMP"},
+            {"register": {}},
+            {"register": "control", "value": 1},
+            {"register": "__class__"},
+            {"value": True},
+            {"value": None},
+            {"value": float("nan")},
+            {"value": float("inf")},
+            {"value": 10**400},
+            {"value": "ten"},
+            {"value": -1},
+            {"value": 1e9},
+            {"verb": "start"},
+            {"register": "", "verb": "stop"},
+            {"register": "", "verb": "__init__"},
+            {"register": "", "verb": "set_frequency", "options": {"hz": 20}},
+            {"register": "", "verb": "start", "options": {"direction": "up"}},
+            {"register": "", "verb": "start", "options": {"direction": []}},
+            {"register": "", "verb": "start", "options": {"seconds": 1}},
+            {"register": "", "verb": "start", "options": [1]},
+        )
+    ),
+]
+
+
+@pytest.mark.parametrize("data", HOSTILE, ids=range(len(HOSTILE)))
+def test_hostile_words_are_refused_in_one_sentence(desk: Desks, data: bytes) -> None:
+    answer = desk.desk.offer(LINE, data)
+    assert isinstance(answer, CommandAnswer)
+    assert answer.outcome is REFUSED
+    assert answer.text.isprintable()
+    told = asyncio.run(desk.desk.do(data))
+    assert told.outcome in (REFUSED, UNKNOWN)
+    assert desk.writes == []
+
+
+@pytest.mark.parametrize("drives", [[], "pump", {"pump": 1}, [7], ["pump"] * 1001, 0])
+def test_a_stop_of_no_drives_is_refused(desk: Desks, drives: Any) -> None:
+    answer = asyncio.run(desk.stop(drives=drives))
+    assert answer is not None
+    assert answer.outcome is REFUSED
+
+
+def test_a_stop_of_an_unknown_drive_says_so_and_stops_the_others(desk: Desks) -> None:
+    answer = asyncio.run(desk.stop(drives=["pump", "fan"]))
+    assert answer is not None
+    assert answer.outcome is REFUSED
+    assert {name: one.outcome for name, one in answer.drives.items()} == {"pump": DONE, "fan": REFUSED}
+
+
+@pytest.mark.parametrize("data", [b"", b"[]", b'{"outcome": "maybe", "text": ""}', b'{"outcome": "done"}'])
+def test_an_asker_believes_no_answer_that_is_none(data: bytes) -> None:
+    with pytest.raises(ValueError, match=r"is not|is no text"):
+        read_answer(data) if data.startswith((b"{", b"[")) else read_offer(data)

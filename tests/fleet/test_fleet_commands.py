@@ -1,0 +1,271 @@
+"""Askers: what they are told is certain where it says so, and a command is sent once whatever is answered."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from collections.abc import Awaitable, Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+from unittest.mock import patch
+
+import pytest
+from peers import require_module
+
+require_module("nats")
+
+from multidrop.fleet import fleet_commands as asker_module  # noqa: E402
+from multidrop.fleet.buckets import Record  # noqa: E402
+from multidrop.fleet.command_log import read_command_log  # noqa: E402
+from multidrop.fleet.command_words import CommandAnswer, CommandOutcome  # noqa: E402
+from multidrop.fleet.errors import FleetError, NobodyThere, NotDelivered, Unsure  # noqa: E402
+from multidrop.fleet.fleet_commands import FleetCommands  # noqa: E402
+
+DONE, NOT_SENT, UNKNOWN = CommandOutcome.DONE, CommandOutcome.NOT_SENT, CommandOutcome.UNKNOWN
+OFFER = {"token": "t", "subject": "do.gw-1.run", "text": "pump-1: frequency = 20.00 Hz", "gateway": "gw-1"}
+PLANT = {"hall-1": ["pump-1", "pump-2"], "hall-2": ["fan-1"]}
+Given = BaseException | Mapping[str, Any] | bytes
+
+
+def answer(outcome: str, text: str = "as it is") -> dict[str, str]:
+    return {"outcome": outcome, "text": text}
+
+
+class Said:
+    """A message that came back."""
+
+    def __init__(self, data: bytes) -> None:
+        self.data = data
+
+
+class ScriptedPath:
+    """A path with answers by what is asked: "cmd", "do", "ask" or "stop"; the last one stays."""
+
+    is_open = True
+
+    def __init__(self, **answers: Sequence[Given]) -> None:
+        self.answers = {kind: list(given) for kind, given in answers.items()}
+        self.asked: list[str] = []
+
+    async def request(self, subject: str, data: bytes) -> Said:
+        kind = subject.partition(".")[0]
+        if kind == "do":
+            kind = next(iter(json.loads(data)))
+        self.asked.append(kind)
+        given = self.answers[kind]
+        found = given.pop(0) if len(given) > 1 else given[0]
+        if isinstance(found, BaseException):
+            raise found
+        return Said(found if isinstance(found, bytes) else json.dumps(found).encode())
+
+    async def close(self) -> None:
+        """There is nothing to close."""
+
+
+class Plant:
+    """The plant's bucket, as far as it can be read."""
+
+    def __init__(self, failure: FleetError | None = None) -> None:
+        self._failure = failure
+        self.records = {
+            line: Record(line, 1, {"line": {"drive": [{"name": name} for name in drives]}})
+            for line, drives in PLANT.items()
+            if failure is None
+        }
+
+    async def look(self) -> None:
+        if self._failure:
+            raise self._failure
+
+
+def asked(
+    folder: Path,
+    path: ScriptedPath,
+    what: Callable[[FleetCommands], Awaitable[CommandAnswer]],
+    plant: Plant | None = None,
+) -> CommandAnswer:
+    """Return what an asker was told who has this one path."""
+
+    async def main() -> CommandAnswer:
+        asker = FleetCommands(["nats://nobody"], by="anna", log=folder / "asked.jsonl")
+        asker._paths = [path]  # type: ignore[list-item]
+        asker._plant = plant or Plant()  # type: ignore[assignment]
+        try:
+            return await what(asker)
+        finally:
+            await asker.close()
+
+    with patch.object(asker_module, "AGAIN_S", 0.0), patch.object(asker_module, "LOST_S", 0.01):
+        return asyncio.run(main())
+
+
+def write(asker: FleetCommands) -> Awaitable[CommandAnswer]:
+    return asker.write("pump-1", "frequency", 20.0)
+
+
+NOBODY, LOST, CUT = NobodyThere("nobody"), Unsure("no answer"), NotDelivered("no connection")
+ANY = FleetError("no right")  # which does not say that nobody was asked
+UNDER_WAY, TAKEN_BACK, IT_IS_DONE = answer("under way"), answer("not sent"), answer("done")
+
+WRITES: dict[
+    str, tuple[ScriptedPath, CommandOutcome, int]
+] = {  # what is answered, what is told, how often it is sent
+    "done": (ScriptedPath(cmd=[OFFER], do=[IT_IS_DONE]), DONE, 1),
+    "no master": (ScriptedPath(cmd=[NOBODY]), NOT_SENT, 0),
+    "no connection": (ScriptedPath(cmd=[CUT]), NOT_SENT, 0),
+    "a silent master": (ScriptedPath(cmd=[LOST]), NOT_SENT, 0),
+    "a refusal": (ScriptedPath(cmd=[answer("refused")]), CommandOutcome.REFUSED, 0),
+    "words of nobody's": (ScriptedPath(cmd=[b"\xff"]), NOT_SENT, 0),
+    "the master is gone": (ScriptedPath(cmd=[OFFER], do=[NOBODY]), NOT_SENT, 1),
+    "cut before it left": (ScriptedPath(cmd=[OFFER], do=[CUT]), NOT_SENT, 1),
+    "the answer is lost, and then found": (
+        ScriptedPath(cmd=[OFFER], do=[LOST], ask=[LOST, IT_IS_DONE]),
+        DONE,
+        1,
+    ),
+    "the do is lost": (ScriptedPath(cmd=[OFFER], do=[LOST], ask=[TAKEN_BACK]), NOT_SENT, 1),
+    "it takes long": (
+        ScriptedPath(cmd=[OFFER], do=[UNDER_WAY], ask=[UNDER_WAY, UNDER_WAY, IT_IS_DONE]),
+        DONE,
+        1,
+    ),
+    "the master dies at it": (ScriptedPath(cmd=[OFFER], do=[UNDER_WAY], ask=[NOBODY]), UNKNOWN, 1),
+    "any other failure": (ScriptedPath(cmd=[OFFER], do=[ANY], ask=[ANY, IT_IS_DONE]), DONE, 1),
+    "any other failure of all": (ScriptedPath(cmd=[OFFER], do=[ANY], ask=[ANY]), UNKNOWN, 1),
+    "no right to ask": (ScriptedPath(cmd=[ANY]), NOT_SENT, 0),
+    "all is lost": (ScriptedPath(cmd=[OFFER], do=[LOST], ask=[LOST]), UNKNOWN, 1),
+    "an answer of nobody's": (ScriptedPath(cmd=[OFFER], do=[b"[]"], ask=[IT_IS_DONE]), DONE, 1),
+}
+
+
+@pytest.mark.parametrize("case", WRITES)
+def test_a_command_is_sent_once_and_its_outcome_is_as_certain_as_it_is(tmp_path: Path, case: str) -> None:
+    path, outcome, sent = WRITES[case]
+    told = asked(tmp_path, path, write)
+    assert told.outcome is outcome
+    assert told.text
+    assert path.asked.count("do") == sent
+    first, last = read_command_log(tmp_path / "asked.jsonl")
+    assert (first["step"], first["by"]) == ("asked", "anna")
+    assert (last["step"], last["outcome"]) == ("over", outcome.value)
+
+
+def stop(asker: FleetCommands) -> Awaitable[CommandAnswer]:
+    return asker.stop(["pump-1"])
+
+
+STOPS: dict[str, tuple[ScriptedPath, CommandOutcome, str]] = {
+    "stopped": (ScriptedPath(stop=[IT_IS_DONE]), DONE, "as it is"),
+    "at length": (ScriptedPath(stop=[UNDER_WAY, UNDER_WAY, IT_IS_DONE]), DONE, "as it is"),
+    "no master": (
+        ScriptedPath(stop=[NOBODY]),
+        NOT_SENT,
+        "the stop of pump-1 was NOT sent: no gateway is master of line hall-1; use the hard-wired stop",
+    ),
+    "no server": (
+        ScriptedPath(stop=[CUT]),
+        NOT_SENT,
+        "the stop of pump-1 was NOT sent: no connection; use the hard-wired stop",
+    ),
+    "an answer that is lost": (ScriptedPath(stop=[LOST, IT_IS_DONE]), DONE, "as it is"),
+    "a master that dies, and the next one": (
+        ScriptedPath(stop=[UNDER_WAY, NOBODY, IT_IS_DONE]),
+        DONE,
+        "as it is",
+    ),
+    "silence": (
+        ScriptedPath(stop=[LOST]),
+        UNKNOWN,
+        "it is not known whether the stop of pump-1 was sent: its gateway gives no answer any more; "
+        "use the hard-wired stop",
+    ),
+    "any failure": (ScriptedPath(stop=[ANY]), UNKNOWN, "it is not known whether the stop"),
+    "silence, then nobody": (ScriptedPath(stop=[LOST, NOBODY]), UNKNOWN, "it is not known whether the stop"),
+}
+
+
+@pytest.mark.parametrize("case", STOPS)
+def test_a_stop_is_sent_until_somebody_answers_and_told_at_once_where_nobody_can(
+    tmp_path: Path, case: str
+) -> None:
+    path, outcome, text = STOPS[case]
+    told = asked(tmp_path, path, stop)
+    assert told.outcome is outcome
+    assert told.text.startswith(text)
+
+
+def test_a_full_disk_keeps_a_command_back_and_no_stop(tmp_path: Path) -> None:
+    def full(*record: Any) -> None:
+        raise OSError(28, "No space left on device")
+
+    path = ScriptedPath(cmd=[OFFER], do=[IT_IS_DONE], stop=[IT_IS_DONE])
+    with patch("multidrop.fleet.command_log.CommandLog._add", full):
+        told = asked(tmp_path, path, write)
+        assert told.outcome is NOT_SENT
+        assert "asked.jsonl cannot be written" in told.text
+        assert asked(tmp_path, path, stop).outcome is DONE
+    assert path.asked == ["stop"]
+
+
+def test_a_person_agreed_to_what_is_done_and_to_nothing_else(tmp_path: Path) -> None:
+    path = ScriptedPath(cmd=[OFFER], do=[IT_IS_DONE])
+
+    async def agreed(asker: FleetCommands) -> CommandAnswer:
+        request = asker.request("pump-1", register="frequency", value=20.0)
+        return await asker.carry_out(request, "pump-1: frequency = 2.00 Hz")
+
+    told = asked(tmp_path, path, agreed)
+    assert told.outcome is NOT_SENT
+    assert "the plant has changed, and it would be pump-1: frequency = 20.00 Hz now" in told.text
+    assert path.asked == ["cmd"]
+
+
+def test_all_lines_are_stopped_and_the_worst_is_told(tmp_path: Path) -> None:
+    path = ScriptedPath(stop=[{**IT_IS_DONE, "drives": {"pump-1": IT_IS_DONE}}, NOBODY])
+    told = asked(tmp_path, path, lambda asker: asker.stop())
+    assert told.outcome is NOT_SENT
+    assert "the stop of all drives of line hall-2 was NOT sent" in told.text
+    assert told.drives["pump-1"].outcome is DONE
+
+
+def test_drives_of_one_line_are_one_stop(tmp_path: Path) -> None:
+    path = ScriptedPath(stop=[IT_IS_DONE])
+    asked(tmp_path, path, lambda asker: asker.stop(["pump-1", "fan-1", "pump-2"]))
+    assert path.asked == ["stop", "stop"]
+
+
+@pytest.mark.parametrize("what", [write, lambda asker: asker.stop(["pump-1"])])
+def test_a_plant_that_cannot_be_read(tmp_path: Path, what: Any) -> None:
+    with pytest.raises(FleetError, match="no server"):
+        asked(tmp_path, ScriptedPath(), what, Plant(FleetError("no server")))
+
+
+def test_a_plant_that_was_read_before_will_do(tmp_path: Path) -> None:
+    plant = Plant()
+    plant._failure = FleetError("no server")
+    path = ScriptedPath(cmd=[OFFER], do=[IT_IS_DONE], stop=[IT_IS_DONE])
+    assert asked(tmp_path, path, write, plant).outcome is DONE
+    assert asked(tmp_path, path, stop, plant).outcome is DONE
+
+
+def test_a_stop_needs_no_plant_where_its_line_is_named(tmp_path: Path) -> None:
+    path = ScriptedPath(stop=[IT_IS_DONE])
+    plant = Plant(FleetError("no server"))
+    told = asked(tmp_path, path, lambda asker: asker.stop(["pump-1"], line="hall-1"), plant)
+    assert told.outcome is DONE
+    with pytest.raises(
+        FleetError, match="the stop was NOT sent; use the hard-wired stop: the fleet's plant cannot"
+    ):
+        asked(tmp_path, path, stop, plant)
+
+
+@pytest.mark.parametrize("what", ["write", "stop"])
+def test_a_drive_that_the_plant_has_not(tmp_path: Path, what: str) -> None:
+    path = ScriptedPath()
+    calls: dict[str, Callable[[FleetCommands], Awaitable[CommandAnswer]]] = {
+        "write": lambda asker: asker.write("pump1", "frequency", 20.0),
+        "stop": lambda asker: asker.stop(["pump1"]),
+    }
+    with pytest.raises(ValueError, match=r"has no drive 'pump1'; did you mean pump-\d or pump-\d\?"):
+        asked(tmp_path, path, calls[what])
+    assert path.asked == []

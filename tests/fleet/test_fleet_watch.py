@@ -1,0 +1,198 @@
+"""`fleet watch`: what is old is never shown as the present, and every size has its picture."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+from typing import Any
+
+import pytest
+from commands import Run
+from nats_clusters import Cluster
+from peers import require_module
+from terminals import on_terminal
+
+require_module("nats")
+require_module("rich")
+
+from multidrop.cli import fleet_watch  # noqa: E402
+from multidrop.cli.support.fleet_screen import picture  # noqa: E402
+from multidrop.cli.support.fleet_tables import moment, move_table, size  # noqa: E402
+from multidrop.fleet.overview import is_state  # noqa: E402
+
+SPOOL = {"bytes": 81234, "lost": 0, "behind": 2, "lag_s": 1.5, "trouble": None}
+SAYS = {"state": "working", "margin_s": 1.94, "troubles": {}, "trouble": "", "spool": SPOOL}
+GATEWAY = {"host": "pc-1", "session": 3, "began_ms": 0, "draining": False, "lines": 6, "unseen_s": 0.1}
+MOVE: dict[str, Any] = {"line": "line-1", "revision": 9, "at_ms": 3_723_000, "from": "gw-1", "to": "gw-2"}
+
+
+def line(master: str | None) -> dict[str, Any]:
+    return {"port": "socket://h:1", "revision": 1, "master": master, "session": 3, "since_ms": 0}
+
+
+def told(age_s: float | None = 0.0, trouble: str | None = None, lines: int = 3) -> dict[str, Any]:
+    return {
+        "at_ms": 0,
+        "age_s": age_s,
+        "trouble": trouble,
+        "gateways": {"gw-1": GATEWAY | {"says": SAYS}, "gw-2": GATEWAY | {"says": None}},
+        "lines": {f"line-{at}": line("gw-1" if at else None) for at in range(lines)},
+        "moves": [MOVE] * 20,
+    }
+
+
+def drawn(told: dict[str, Any], width: int = 120, height: int = 40) -> str:
+    lines = picture(told, (width, height), "multidrop fleet watch")
+    assert len(lines) == height
+    assert all(len(one.plain) <= width for one in lines)
+    return "\n".join(one.plain for one in lines)
+
+
+def test_what_is_shown() -> None:
+    text = drawn(told())
+    assert re.search(r"gw-1 +pc-1 +3 +1970-01-01 00:00:00 +working +6 +1\.9 s +81 kB +2 +1\.5 s +0\n", text)
+    assert re.search(r"gw-2 +pc-1 .*no answer +6 +- +- +- +- +-\n", text)
+    assert "3 lines, 1 without a master" in text
+    assert text.index("line-0  socket://h:1  none") < text.index("line-1  socket://h:1  gw-1")
+    assert "1970-01-01 01:02:03  line-1  from gw-1  to gw-2" in text
+
+
+@pytest.mark.parametrize("height", range(1, 60))
+def test_each_size_has_its_picture(height: int) -> None:
+    for width in (20, 80, 200):
+        drawn(told(trouble="no server", lines=500), width, height)
+
+
+def test_lines_that_do_not_fit_are_counted_and_the_masterless_come_first() -> None:
+    text = drawn(told(lines=500))
+    shown = len(re.findall(r"^line-\d+ ", text, re.MULTILINE))
+    assert f"and {500 - shown} more lines" in text
+    assert "line-0  " in text
+    assert text.count("from gw-1") >= 6
+
+
+def test_what_is_old_is_dim_and_its_age_is_told() -> None:
+    found = told(12.0, "no connection to nats://a:4222")
+    assert "this is 12 s old: no connection to nats://a:4222" in drawn(found)
+    lines = picture(found, (120, 40), "")
+    assert {str(one.style) for one in lines if one.plain.startswith("gw-1")} == {"dim"}
+    assert {str(one.style) for one in picture(told(), (120, 40), "") if one.plain.startswith("gw-1")} == {""}
+
+
+def test_a_name_commands_no_terminal() -> None:
+    found = told()
+    found["gateways"]["gw-1"]["host"] = "\x1b[2J"
+    assert "\x1b" not in drawn(found)
+
+
+def test_moves_whose_beginning_nobody_saw() -> None:
+    moves = [MOVE | {"from": None}, MOVE | {"from": ""}, MOVE | {"to": ""}]
+    assert [re.sub(" +", " ", row)[27:] for row in move_table(moves)] == [
+        "to gw-2",
+        "from nobody to gw-2",
+        "from gw-1 to nobody",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("number", "text"),
+    [(0, "0 B"), (999, "999 B"), (1000, "1.0 kB"), (81234, "81 kB"), (5e9, "5.0 GB"), (3e15, "3000 TB")],
+)
+def test_sizes(number: float, text: str) -> None:
+    assert size(number) == text
+
+
+class FailingView:
+    """Gives a fleet, and no answer from the second look on."""
+
+    looks = 0
+
+    async def look(self) -> None:
+        self.looks += 1
+        if self.looks > 1:
+            raise OSError("no server")
+
+    def fleet(self) -> dict[str, Any]:
+        return {"gateways": {}, "lines": {}, "moves": []}
+
+
+def test_a_look_that_fails_is_told_with_the_age_of_what_is_shown(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(fleet_watch, "EVERY_S", 0.02)
+    shown: list[dict[str, Any]] = []
+
+    async def main() -> None:
+        over = asyncio.Event()
+
+        def show(told: dict[str, Any]) -> None:
+            shown.append(told)
+            if len(shown) == 3:
+                over.set()
+
+        await fleet_watch.follow(FailingView(), show, over)  # type: ignore[arg-type]
+
+    asyncio.run(main())
+    assert [one["trouble"] for one in shown] == [None, "no server", "no server"]
+    assert shown[0]["age_s"] < shown[1]["age_s"] < shown[2]["age_s"]
+
+
+def test_without_a_terminal_it_says_what_works(run: Run) -> None:
+    status, out, err = run("fleet", "watch")
+    assert (status, out) == (2, "")
+    assert "`multidrop fleet watch` needs a terminal; with --json it works without one" in err
+
+
+@pytest.mark.long
+def test_a_line_a_second_until_it_is_interrupted(fleet: Cluster) -> None:
+    command = [sys.executable, "-m", "multidrop", "fleet", "watch", "--json"]
+    environment = {**os.environ, "MULTIDROP_NATS": ",".join(fleet.urls)}
+    with subprocess.Popen(
+        command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stdout is not None
+        assert process.stderr is not None
+        found = [json.loads(process.stdout.readline()) for _ in range(3)]
+        process.send_signal(signal.SIGINT)
+        assert process.wait(30) == 0
+        assert process.stderr.read() == ""
+    assert [one["trouble"] for one in found] == [None] * 3
+    assert found[0]["at_ms"] + 900 <= found[1]["at_ms"]
+
+
+@pytest.mark.long
+def test_on_a_terminal_it_draws_until_it_is_interrupted(fleet: Cluster) -> None:
+    with on_terminal("fleet", "watch", MULTIDROP_NATS=",".join(fleet.urls)) as terminal:
+        terminal.wait_for("0 lines, 0 without a master")
+        terminal.process.send_signal(signal.SIGINT)
+        assert terminal.process.wait(30) == 0
+        terminal.written = os.read(terminal.fd, 65536)
+        assert b"\x1b[?25h" in terminal.written  # the cursor
+        assert b"Traceback" not in terminal.written
+
+
+STATE = SAYS | {"lines": 6, "last_moves": []}
+
+
+@pytest.mark.parametrize(
+    ("told", "is_one"),
+    [
+        (STATE, True),
+        (STATE | {"spool": SPOOL | {"behind": None, "lag_s": None}}, True),
+        (STATE | {"margin_s": "2 s"}, False),
+        (STATE | {"spool": {}}, False),
+        (STATE | {"spool": None}, False),
+        ({}, False),
+        ([], False),
+        ("working", False),
+    ],
+)
+def test_an_answer_that_lacks_something_is_none(told: Any, is_one: bool) -> None:
+    assert is_state(told) is is_one
+
+
+def test_a_time_that_no_calendar_has() -> None:
+    assert moment(10**30) == "?"

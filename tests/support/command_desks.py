@@ -1,0 +1,106 @@
+"""A gateway's desks in a test: a simulated drive on a line, and a clock that the test sets."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from itertools import count
+from pathlib import Path
+from typing import Any
+
+from fleets import HandClock
+
+from multidrop import YD1000, Bus
+from multidrop.fleet.command_desk import CommandDesk
+from multidrop.fleet.command_log import CommandLog, read_command_log
+from multidrop.fleet.command_words import CommandAnswer, CommandOutcome, Offered
+from multidrop.fleet.held_lines import HeldLines
+from multidrop.fleet.stop_desk import StopDesk
+from multidrop.sim import SimulatedDrive, Simulator, Wire, simulated
+
+LINE = "hall-1"
+MAY = {"write": ["pump.frequency"], "verbs": ["pump.start"]}
+_ids = count(1)
+
+
+class FailingLog(CommandLog):
+    """A log on a disk that does what the test says before each record."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(path)
+        self.before: Any = lambda record: None
+
+    async def note(self, record: Mapping[str, Any]) -> None:
+        self.before(record)
+        await super().note(record)
+
+
+class Desks:
+    """One gateway's, with one line that it is master of as long as `is_master`."""
+
+    def __init__(self, bus: Bus, sim: SimulatedDrive, folder: Path, may: Mapping[str, Any]) -> None:
+        self.sim = sim
+        self._bus = bus
+        self.is_master = True
+        self.clock = HandClock()
+        self.path = folder / "commands.jsonl"
+        self.log = FailingLog(self.path)
+        self.lines = HeldLines(self, lambda line: self.is_master)
+        self.desk = CommandDesk("gw-1", "do.gw-1.run", self.lines, self.log, self.clock)
+        self.stops = StopDesk("gw-1", self.lines, self.desk.offers, self.log)
+        self.may = may
+        self.take()
+
+    def bus(self, line: str) -> Bus:
+        return self._bus
+
+    def take(self) -> None:
+        self.lines.open(LINE, {"may": self.may})
+
+    @property
+    def writes(self) -> list[tuple[str, int]]:
+        """The writes that the drive took, so far."""
+        return [(one.name, one.raw) for one in self.sim.counters.writes]
+
+    @property
+    def notes(self) -> list[dict[str, Any]]:
+        return list(read_command_log(self.path)) if self.path.exists() else []
+
+    def ask(self, **what: Any) -> Offered | CommandAnswer | None:
+        what = {"id": f"id-{next(_ids)}", "by": "anna", "drive": "pump", **what}
+        return self.desk.offer(LINE, json.dumps(what).encode())
+
+    def offered(self, hz: float = 20.0, **what: Any) -> str:
+        """Return the token of an offer: to write the setpoint if nothing else is said."""
+        answer = self.ask(**(what or {"register": "frequency", "value": hz}))
+        assert isinstance(answer, Offered), answer
+        return answer.token
+
+    async def do(self, token: str) -> CommandAnswer:
+        answer = await self.desk.do(json.dumps({"do": token}).encode())
+        while answer.outcome is CommandOutcome.UNDER_WAY:
+            answer = await self.desk.do(json.dumps({"ask": token}).encode())
+        return answer
+
+    async def stop(self, **what: Any) -> CommandAnswer | None:
+        data = json.dumps({"id": f"id-{next(_ids)}", "by": "anna", "drives": ["pump"], **what}).encode()
+        answer = await self.stops.stop(LINE, data)
+        while answer is not None and answer.outcome is CommandOutcome.UNDER_WAY:
+            answer = await self.stops.stop(LINE, data)
+        await asyncio.gather(*self.stops._notes)
+        return answer
+
+
+@contextmanager
+def desks(folder: Path, may: Mapping[str, Any] = MAY) -> Iterator[Desks]:
+    sim = simulated(YD1000(address=1, name="pump"))
+    audit = folder / "audit.jsonl"
+    with Simulator([Wire([sim], unpaced=True)]) as line, Bus(line.wires[0].path, audit=audit) as bus:
+        bus.attach(YD1000(address=1, name="pump"))
+        made = Desks(bus, sim, folder, may)
+        try:
+            yield made
+        finally:
+            made.log.close()

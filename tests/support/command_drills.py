@@ -1,0 +1,299 @@
+"""A drill of commands: a fleet of processes that are killed and stopped, judged by what the drives saw.
+
+Each line has one simulated drive and one asker, which writes another setpoint each time. So the drive's own
+list of writes says how often each command was carried out, and nobody's log has to be believed.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import NamedTuple
+
+from nats_clusters import Cluster, cluster
+
+from multidrop import YD1000
+from multidrop.fleet.command_log import read_command_log
+from multidrop.fleet.command_words import CommandAnswer, CommandOutcome, Offered
+from multidrop.fleet.errors import FleetError
+from multidrop.fleet.fleet_commands import FleetCommands
+from multidrop.sim import SimulatedDrive, Simulator, Wire, simulated
+
+GATEWAYS = ("gw-a", "gw-b", "gw-c")
+PATIENCE_S = 60.0
+HIGHEST = 4999  # raw counts of the setpoint, each of which one drive gets once
+STOP_EVERY = 20  # commands of a drive
+SENT = (CommandOutcome.DONE, CommandOutcome.FAILED)
+UNSENT = (CommandOutcome.NOT_SENT, CommandOutcome.REFUSED)
+
+
+class Asked(NamedTuple):
+    """One command: the setpoint that it writes (None: a stop), how it was asked for, and what was told."""
+
+    drive: str
+    raw: int | None
+    way: str
+    offered_s: float  # monotonic, when the offer came
+    told: CommandOutcome
+    sent: int  # how often its drive got it
+
+
+class Verdict(NamedTuple):
+    """A comparison of what the drives saw with what the askers were told."""
+
+    told: Counter[str]
+    ways: Counter[str]
+    deeds: Counter[str]
+    twice: int
+    wrongly: int
+    unknown_sent: int
+    unnoted: int  # carried out, and not in a gateway's log
+    oldest_s: float  # from when the offer came until the drive had the write
+
+
+class RoughCommands(FleetCommands):
+    """An asker whose messages are doubled and late, as a network or a program's mistake makes them."""
+
+    def __init__(self, urls: Sequence[str], log: Path, dice: random.Random) -> None:
+        super().__init__(urls, by="drill", log=log)
+        self._dice = dice
+        self.way = "plain"
+        self.offered_s = 0.0
+        self._copies: set[asyncio.Task[None]] = set()
+
+    async def _do(self, offered: Offered) -> CommandAnswer:
+        way = self._dice.choices(("plain", "doubled", "doubled later", "late"), (6, 2, 1, 1))[0]
+        self.way, self.offered_s = way, time.monotonic()
+        if way == "late":
+            await asyncio.sleep(self._dice.uniform(0.8, 1.6))
+        if way == "doubled":
+            for _ in range(3):
+                self._copy(offered, 0.0)
+        if way == "doubled later":
+            self._copy(offered, self._dice.uniform(0.0, 3.0))
+        return await super()._do(offered)
+
+    def _copy(self, offered: Offered, seconds: float) -> None:
+        async def send() -> None:
+            await asyncio.sleep(seconds)
+            with suppress(FleetError):
+                await self._path().request(offered.subject, json.dumps({"do": offered.token}).encode())
+
+        task = asyncio.create_task(send())
+        self._copies.add(task)
+        task.add_done_callback(self._copies.discard)
+
+    async def settle(self) -> None:
+        await asyncio.gather(*self._copies)
+
+
+class CommandDrill:
+    """Three gateways, three NATS nodes, and lines with a drive each."""
+
+    def __init__(
+        self, folder: Path, nats: Cluster, simulator: Simulator, sims: dict[str, SimulatedDrive]
+    ) -> None:
+        self.folder, self.nats, self.sims = folder, nats, sims
+        self._simulator = simulator
+        self._environment = {
+            **os.environ,
+            "MULTIDROP_NATS": ",".join(nats.urls),
+            "XDG_STATE_HOME": str(folder / "state"),
+        }
+        self.gateways: dict[str, subprocess.Popen[str]] = {}
+        (folder / "plant.toml").write_text(self._plant())
+        made = self.run("init", str(folder / "plant.toml"))
+        assert made.returncode == 0, made.stderr
+        for name in GATEWAYS:
+            self.start(name)
+
+    def _plant(self) -> str:
+        lines = [
+            f'[[line]]\nname = "line-{name}"\nport = "{wire.path}"\n'
+            f'[[line.drive]]\nname = "{name}"\nmodel = "yd1000"\naddress = 1\n'
+            'poll = ["output_frequency"]\nevery = "1 s"\n'
+            for name, wire in zip(self.sims, self._simulator.wires, strict=True)
+        ]
+        listed = ", ".join(f'"{name}.frequency"' for name in self.sims)
+        return "\n".join([*lines, f"[fleet.may]\nwrite = [{listed}]\n"])
+
+    def run(self, *words: str) -> subprocess.CompletedProcess[str]:
+        """Run `multidrop fleet` with these words."""
+        command = [sys.executable, "-m", "multidrop", "fleet", *words]
+        return subprocess.run(
+            command, env=self._environment, capture_output=True, text=True, check=False, timeout=PATIENCE_S
+        )
+
+    def start(self, name: str) -> None:
+        with (self.folder / f"{name}.log").open("a") as log:
+            self.gateways[name] = subprocess.Popen(
+                [sys.executable, "-m", "multidrop", "fleet", "serve", name],
+                env=self._environment,
+                stdout=subprocess.DEVNULL,
+                stderr=log,
+                text=True,
+            )
+
+    def close(self) -> None:
+        for running in self.gateways.values():
+            with suppress(ProcessLookupError):
+                running.send_signal(signal.SIGCONT)
+            running.kill()
+            running.wait()
+
+    # ---- what the drives saw ----
+
+    def setpoints(self, drive: str) -> Counter[int]:
+        return Counter(one.raw for one in list(self.sims[drive].counters.writes) if one.name == "frequency")
+
+    def stops(self, drive: str) -> int:
+        return sum(one.name == "control" for one in list(self.sims[drive].counters.writes))
+
+    def written_s(self, drive: str, raw: int) -> float:
+        writes = list(self.sims[drive].counters.writes)
+        return next(one.time for one in writes if (one.name, one.raw) == ("frequency", raw))
+
+    # ---- askers ----
+
+    async def ask(self, commands: int, seconds: float, seed: int = 1, *, is_attacked: bool = True) -> Verdict:
+        """Ask for so many commands in so many seconds, attack meanwhile, and judge."""
+        dice = random.Random(seed)
+        await self.await_masters()
+        askers = [self._asker(drive, commands, seconds, dice.random()) for drive in self.sims]
+        attack = asyncio.create_task(self._attack(random.Random(seed), is_attacked=is_attacked))
+        try:
+            asked = [one for some in await asyncio.gather(*askers) for one in some]
+        finally:
+            attack.cancel()
+            deeds = (await asyncio.gather(attack, return_exceptions=True))[0]
+        await asyncio.sleep(3.0)  # whatever is late comes meanwhile
+        assert isinstance(deeds, Counter), deeds
+        return self._judge(asked, deeds)
+
+    async def await_masters(self) -> None:
+        """Wait until each line has a master that answers."""
+        ends = time.monotonic() + PATIENCE_S
+        async with FleetCommands(self.nats.urls, by="drill", log=self.folder / "ready.jsonl") as asker:
+            for drive in self.sims:
+                while True:
+                    found = await asker.preview(asker.request(drive, register="frequency", value=0.01))
+                    if isinstance(found, Offered):
+                        break
+                    assert time.monotonic() < ends, found.text
+                    await asyncio.sleep(0.1)
+
+    async def _asker(self, drive: str, commands: int, seconds: float, seed: float) -> list[Asked]:
+        dice = random.Random(seed)
+        number = -(-commands // len(self.sims))
+        assert number < HIGHEST
+        found = []
+        async with RoughCommands(self.nats.urls, self.folder / f"{drive}.asked.jsonl", dice) as asker:
+            for raw in range(1, number + 1):
+                if raw % STOP_EVERY == 0:
+                    found.append(await self._stop(asker, drive))
+                else:
+                    asker.way = "no offer"
+                    answer = await asker.write(drive, "frequency", raw / 100)
+                    found.append(Asked(drive, raw, asker.way, asker.offered_s, answer.outcome, 0))
+                await asyncio.sleep(dice.uniform(0, 2 * seconds / number))
+            await asker.settle()
+        return found
+
+    async def _stop(self, asker: FleetCommands, drive: str) -> Asked:
+        before = self.stops(drive)
+        answer = await asker.stop([drive])
+        return Asked(drive, None, "stop", 0.0, answer.outcome, self.stops(drive) - before)
+
+    def _judge(self, asked: Sequence[Asked], deeds: Counter[str]) -> Verdict:
+        seen = {drive: self.setpoints(drive) for drive in self.sims}
+        noted = {
+            (note["drive"], note["what"])
+            for path in self.folder.glob("state/multidrop/fleet/*/commands.jsonl")
+            for note in read_command_log(path)
+            if note["step"] == "begun" and "drive" in note
+        }
+        twice = wrongly = unknown_sent = unnoted = 0
+        oldest = 0.0
+        for one in asked:
+            if one.raw is None:  # a stop may be sent again and again
+                wrongly += (one.told in SENT and not one.sent) or (one.told in UNSENT and bool(one.sent))
+                continue
+            sent = seen[one.drive][one.raw]
+            twice += sent > 1
+            wrongly += (one.told in SENT and not sent) or (one.told in UNSENT and bool(sent))
+            unknown_sent += one.told is CommandOutcome.UNKNOWN and bool(sent)
+            if sent:
+                oldest = max(oldest, self.written_s(one.drive, one.raw) - one.offered_s)
+                unnoted += (one.drive, f"{one.drive}: frequency = {one.raw / 100:.2f} Hz") not in noted
+        told = Counter(("stop: " if one.raw is None else "") + one.told.value for one in asked)
+        ways = Counter(one.way for one in asked)
+        return Verdict(told, ways, deeds, twice, wrongly, unknown_sent, unnoted, oldest)
+
+    # ---- attacks ----
+
+    async def _attack(self, dice: random.Random, *, is_attacked: bool) -> Counter[str]:
+        done: Counter[str] = Counter()
+        deeds: dict[str, Callable[[random.Random], object]] = {
+            "gateway killed": self._kill_gateway,
+            "gateway stopped": self._stop_gateway,
+            "node killed": self._kill_node,
+            "node stopped": self._stop_node,
+        }
+        try:
+            while True:
+                if is_attacked:
+                    [deed] = dice.choices(list(deeds), (4, 4, 1, 1))
+                    done[deed] += 1
+                    await asyncio.to_thread(deeds[deed], dice)
+                await asyncio.sleep(dice.uniform(2.0, 10.0))
+                for name, running in self.gateways.items():
+                    if running.poll() is not None:
+                        self.start(name)
+        except asyncio.CancelledError:
+            return done
+
+    def _kill_gateway(self, dice: random.Random) -> None:
+        victim = self.gateways[dice.choice(GATEWAYS)]
+        victim.kill()
+        victim.wait()
+
+    def _stop_gateway(self, dice: random.Random) -> None:
+        """Let it stand still; one that does so for longer than its lease is killed by the kernel."""
+        victim = self.gateways[dice.choice(GATEWAYS)]
+        victim.send_signal(signal.SIGSTOP)
+        time.sleep(dice.choice((dice.uniform(0.05, 1.5), dice.uniform(0.5, 3.5))))
+        victim.send_signal(signal.SIGCONT)
+
+    def _kill_node(self, dice: random.Random) -> None:
+        victim = dice.choice(self.nats.nodes)
+        victim.kill()
+        time.sleep(dice.uniform(0.1, 2.0))
+        victim.start()
+
+    def _stop_node(self, dice: random.Random) -> None:
+        victim = dice.choice(self.nats.nodes)
+        victim.pause()
+        time.sleep(dice.uniform(0.1, 2.0))
+        victim.go_on()
+
+
+@contextmanager
+def command_drill(folder: Path, lines: int = 12) -> Iterator[CommandDrill]:
+    sims = {f"drive-{at}": simulated(YD1000(address=1, name=f"drive-{at}")) for at in range(lines)}
+    wires = [Wire([sim], name=name, port="socket://127.0.0.1:0", unpaced=True) for name, sim in sims.items()]
+    with cluster(folder / "nats") as nats, Simulator(wires) as simulator:
+        drill = CommandDrill(folder, nats, simulator, sims)
+        try:
+            yield drill
+        finally:
+            drill.close()
