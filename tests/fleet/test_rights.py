@@ -24,6 +24,8 @@ from nats.aio.client import Client  # noqa: E402
 from secured_clusters import SecuredCluster, secured_cluster  # noqa: E402
 
 from multidrop.fleet.credentials import inbox_of, public_key  # noqa: E402
+from multidrop.fleet.errors import MayNotSend, NoRight  # noqa: E402
+from multidrop.fleet.refusals import Denials  # noqa: E402
 from multidrop.fleet.rights import OTHERS, rights_of  # noqa: E402
 
 GATEWAYS = ("gw-a", "gw-b")
@@ -279,3 +281,18 @@ def test_a_mistaken_call_writes_nothing(run: Run, tmp_path: Path, words: list[st
     [line] = err.splitlines()
     assert sentence in line
     assert not (tmp_path / "nats").exists()
+
+
+def test_a_denial_of_this_very_request_alone_says_that_it_reached_nobody() -> None:
+    """Rights may be given while a connection stands: an older denial says nothing of a later silence."""
+    denials = Denials()
+    denied = Exception('nats: permissions violation for publish to "stop.line-1"')
+    asyncio.run(denials.note(denied))
+    before = denials.of_request("stop.Line-1")
+    denials.check_request("stop.Line-1", "_INBOX", before)
+    asyncio.run(denials.note(denied))
+    with pytest.raises(MayNotSend, match=r"these credentials do not allow to publish to stop\.Line-1"):
+        denials.check_request("stop.Line-1", "_INBOX", before)
+    asyncio.run(denials.note(Exception('nats: permissions violation for subscription to "_inbox.x.*"')))
+    with pytest.raises(NoRight, match=r"do not allow to listen to _inbox\.x"):
+        denials.check_request("stop.line-2", "_INBOX", 0)
