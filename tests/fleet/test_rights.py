@@ -23,7 +23,7 @@ require_module("nkeys")
 from nats.aio.client import Client  # noqa: E402
 from secured_clusters import SecuredCluster, secured_cluster  # noqa: E402
 
-from multidrop.fleet.credentials import inbox_of, public_key  # noqa: E402
+from multidrop.fleet.credentials import connect_options, inbox_of, public_key  # noqa: E402
 from multidrop.fleet.errors import MayNotSend, NoRight  # noqa: E402
 from multidrop.fleet.refusals import Denials  # noqa: E402
 from multidrop.fleet.rights import OTHERS, rights_of  # noqa: E402
@@ -296,3 +296,11 @@ def test_a_denial_of_this_very_request_alone_says_that_it_reached_nobody() -> No
     asyncio.run(denials.note(Exception('nats: permissions violation for subscription to "_inbox.x.*"')))
     with pytest.raises(NoRight, match=r"do not allow to listen to _inbox\.x"):
         denials.check_request("stop.line-2", "_INBOX", 0)
+
+
+def test_a_creds_file_of_nats_is_taken_as_it_is(tmp_path: Path) -> None:
+    path = tmp_path / "gw-1.creds"
+    path.write_text("-----BEGIN NATS USER JWT-----\ney\n------END NATS USER JWT------\n")
+    assert connect_options(["nats://a"], path) == {"user_credentials": str(path)}
+    assert connect_options(["nats://a"]) == {}
+    assert connect_options(["tls://a"])["tls_handshake_first"]
