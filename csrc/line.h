@@ -93,8 +93,9 @@ void md_line_abandon(struct md_line *line, int result, int error);
 /* ---- listen.c: is there another master? ---- */
 
 /* Listen before the request that is ready to leave, for the time that the longest frame and the drive's
- * time-out take. Return 0 where that makes no sense: a network has no frames of others. */
-int md_listen_begin(struct md_line *line, int64_t now_ns);
+ * time-out take, and for the guard at least; on a network, which has no frames of others, for that alone.
+ * Return 0 where there is nothing to wait for. */
+int md_listen_begin(struct md_line *line, int64_t now_ns, int64_t guard_ns);
 void md_listen_put_back(struct md_line *line); /* an exchange that waits for it, as if it had never begun */
 /* cdef: end */
 

@@ -24,12 +24,14 @@ int64_t md_boottime_ns(void)
     return now.tv_sec * MD_SECOND_NS + now.tv_nsec;
 }
 
-struct md_mastership *md_mastership_new(void)
+struct md_mastership *md_mastership_new(int64_t guard_ns)
 {
     struct md_mastership *mastership = calloc(1, sizeof *mastership);
     struct sigevent kill = {.sigev_notify = SIGEV_SIGNAL, .sigev_signo = SIGKILL};
-    if (mastership && timer_create(CLOCK_BOOTTIME, &kill, &mastership->timer) == 0)
+    if (mastership && timer_create(CLOCK_BOOTTIME, &kill, &mastership->timer) == 0) {
+        mastership->guard_ns = guard_ns;
         return mastership;
+    }
     free(mastership);
     return NULL;
 }
@@ -54,8 +56,9 @@ int64_t md_boottime_ns(void)
     return MD_NEVER; /* later than any deadline: nothing is sent */
 }
 
-struct md_mastership *md_mastership_new(void)
+struct md_mastership *md_mastership_new(int64_t guard_ns)
 {
+    (void)guard_ns;
     errno = ENOSYS;
     return NULL;
 }

@@ -6,6 +6,7 @@
 
 struct md_mastership {
     int64_t until_ns;         /* of CLOCK_BOOTTIME; read and written atomically; 0: it does not hold */
+    int64_t guard_ns;         /* from the end of one master to the beginning of the next */
     struct md_engine *engine; /* that looks at it; NULL: none does yet */
 #ifdef __linux__
     timer_t timer;

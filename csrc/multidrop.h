@@ -261,7 +261,8 @@ struct md_engine *md_engine_start(void); /* the thread for every line of the pro
 struct md_port *md_port_open(struct md_engine *engine, int fd, int must_take, int transactions,
                              unsigned room);
 /* Send only while the mastership holds, which must outlive the port: looked at right before each write(2).
- * Where it has not held since the last request, and before the first one, the line is listened to. */
+ * Where it has not held since the last request, and before the first one, the line is listened to, for the
+ * mastership's guard at least; a stop is not held up. */
 void md_port_fence(struct md_port *port, struct md_mastership *mastership);
 /* Say who switches between sending and receiving, before anything is sent; return 0 or -errno. */
 int md_port_rs485(struct md_port *port, int mode);
@@ -301,8 +302,9 @@ void md_port_carry_out(struct md_port *port, const struct md_exchange *exchange,
 /* ---- mastership.c: return NULL or -1 and set errno on failure; else a time, or a flag ---- */
 
 int64_t md_boottime_ns(void); /* CLOCK_BOOTTIME, of which are the times below */
-/* Make one that does not hold yet; ENOSYS where the kernel has no such timer. */
-struct md_mastership *md_mastership_new(void);
+/* Make one that does not hold yet; ENOSYS where the kernel has no such timer. A line is listened to for
+ * `guard_ns` at least. */
+struct md_mastership *md_mastership_new(int64_t guard_ns);
 void md_mastership_free(struct md_mastership *mastership); /* after all ports that have it */
 /* Hold until then. Where it is not extended by `kill_ns`, the kernel kills this process. */
 int md_mastership_extend(struct md_mastership *mastership, int64_t until_ns, int64_t kill_ns);

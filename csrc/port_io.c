@@ -1,7 +1,7 @@
 /* One port on the engine's thread: reading, writing and switching, until there is nothing to do but wait. */
 #define _GNU_SOURCE
 #include "descriptor.h"
-#include "engine.h"
+#include "mastership.h"
 
 enum {
     WORTH_BLINDNESS = 200000, /* ns; a shorter wait is not worth the system calls to look away */
@@ -60,7 +60,7 @@ static int may_send(struct md_port *port)
     if (!port->is_unheard || line->exchange->insists)
         return 1;
     port->is_unheard = 0;
-    return !md_listen_begin(line, md_now_ns());
+    return !md_listen_begin(line, md_now_ns(), port->mastership->guard_ns);
 }
 
 /* Write; 1: the port took something, or there is something else to do. The request leaves when it is written;

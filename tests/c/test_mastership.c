@@ -148,6 +148,18 @@ static void check_listens_first(void)
     assert(found.sent_ns - found.begun_ns < 30 * MS);
 }
 
+/* A master before us may send for so long. */
+static void check_guard_comes_first(void)
+{
+    md_mastership_end(mastership);
+    check_unsent(&reading);
+    mastership->guard_ns = 200 * MS;
+    extend(1000);
+    struct md_completion found = carry_out(&reading);
+    assert(found.sent_ns - found.begun_ns >= 200 * MS && atomic_load(&written) == REQUEST);
+    mastership->guard_ns = 0;
+}
+
 static void check_deadline(void)
 {
     extend(1000);
@@ -246,7 +258,7 @@ int main(void)
     alarm(60);
     make();
     check_costs_nothing_without_one();
-    mastership = md_mastership_new();
+    mastership = md_mastership_new(0);
     assert(mastership);
     md_port_fence(port, mastership);
     check_unsent(&reading); /* it was never extended */
@@ -254,6 +266,7 @@ int main(void)
     extend(1000);
     check_sent(&stop);
     check_listens_first();
+    check_guard_comes_first();
     check_deadline();
     check_rest_is_held_back();
     check_other_master();

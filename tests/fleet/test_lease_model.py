@@ -23,7 +23,7 @@ def killed_at(until: int, terms: Terms) -> int:
 class PathState(NamedTuple):
     """One path: the record, messages under way, and what both sides know. Times are ages in ticks."""
 
-    is_ended: bool = False
+    ended: int | None = None  # since when nobody can renew it any more
     request: int | None = None  # a renewal on its way to the server, by when it was sent
     ack: int | None = None  # its acknowledgement on its way back
     renewed: int | None = 0  # the newest renewal that the holder counts
@@ -33,7 +33,10 @@ class PathState(NamedTuple):
 
 @dataclass(frozen=True)
 class Model:
-    """A holder whose process may stand still at any point, a taker, and a network that delays and loses."""
+    """A holder whose process may stand still at any point, a taker, and a network that delays and loses.
+
+    The taker writes once enough paths have been ended for as long as the guard.
+    """
 
     terms: Terms
     paths: int = 3
@@ -41,6 +44,7 @@ class Model:
     has_cas: bool = True
     has_timer: bool = True
     waits: bool = True
+    listens: bool = True  # for the guard
     lateness: int = 0  # of the timer
 
     # ---- one path ----
@@ -54,18 +58,20 @@ class Model:
             yield path._replace(ack=None)  # lost
         if path.request is not None:
             yield path._replace(request=None)  # lost, or refused on an ended path
-            if not path.is_ended:
+            if path.ended is None:
                 seen = None if path.seen is None else (False, path.seen[1])
                 ending = None if path.ending is None else False
                 yield path._replace(request=None, ack=path.request, seen=seen, ending=ending)
-        if path.is_ended:
+        if path.ended is not None:
             return
         yield path._replace(seen=(True, 0) if path.seen is None or not path.seen[0] else path.seen)
         if path.seen and path.ending is None and self.may_end(path.seen):
             yield path._replace(ending=path.seen[0])
         if path.ending is not None:
             is_done = path.ending or not self.has_cas
-            yield path._replace(ending=None, is_ended=is_done, seen=None if is_done else path.seen)
+            yield path._replace(
+                ending=None, ended=0 if is_done else None, seen=None if is_done else path.seen
+            )
 
     def may_end(self, seen: tuple[bool, int]) -> bool:
         return not self.waits or lease_rules.is_stale(SeenRevision(1, -seen[1]), 0, self.terms)
@@ -82,7 +88,8 @@ class Model:
             request=older(path.request, oldest),
             ack=older(path.ack, oldest),
             renewed=older(path.renewed, oldest),
-            seen=path.seen and (path.seen[0], min(path.seen[1] + 1, terms.patience)),
+            seen=path.seen and (path.seen[0], min(path.seen[1] + 1, terms.lease)),
+            ended=older(path.ended, terms.guard),
         )
 
     def normal(self, path: PathState) -> PathState:
@@ -92,7 +99,7 @@ class Model:
         seen = (
             path.seen if path.seen and path.seen[0] else None
         )  # what it watches is no more: it cannot end it
-        request = None if path.is_ended else path.request
+        request = path.request if path.ended is None else None
         return path._replace(seen=seen, request=request, ending=path.ending or None)
 
     # ---- all of them ----
@@ -120,11 +127,16 @@ class Model:
                     known.add(after)
                     following.append(after)
                     paths = tuple(table.paths[number] for number in after[1:])
-                    if after[0] and lease_rules.is_over(sum(path.is_ended for path in paths), self.terms):
+                    if after[0] and self.taker_may_write(paths):
                         return len(known), paths
             layer = following
             assert most is None or len(known) < most, "not found early"
         return len(known), None
+
+    def taker_may_write(self, paths: tuple[PathState, ...]) -> bool:
+        guard = self.terms.guard if self.listens else 0
+        over = sum(path.ended is not None and path.ended >= guard for path in paths)
+        return lease_rules.is_over(over, self.terms)
 
     def steps(self, state: tuple[int, ...], table: _PathTable) -> Iterator[tuple[int, ...]]:
         has_looked, *numbers = state
@@ -174,12 +186,14 @@ MUTATIONS = {
     "takeover without CAS": Model(ONE_PATH, paths=1, has_cas=False),
     "no timer": Model(SMALL, has_timer=False),
     "no wait": Model(SMALL, waits=False),
+    "no guard": Model(SMALL, listens=False),
     "guard shorter than the timer's lateness": Model(SMALL, lateness=3),
     "needs 1, ends 2": Model(SMALL._replace(needed=1)),
     "needs 2, ends 1": Model(SMALL._replace(ended=1)),
 }
 
 
+@pytest.mark.long
 def test_no_two_masters_in_any_interleaving() -> None:
     states, wrong = Model(SMALL).search()
     assert wrong is None

@@ -180,6 +180,23 @@ def test_a_line_is_listened_to_before_its_first_request(mastership: Mastership, 
         assert time.monotonic() - begun >= LONGEST + Slow.response_timeout
 
 
+@pytest.mark.parametrize("port", ["pty", "tcp://127.0.0.1:0"])
+def test_nothing_is_sent_while_the_master_before_may_still_be_there(port: str) -> None:
+    """The guard is longer than the longest frame and the time-out, which are listened to on ptys alone."""
+    mastership = Mastership(guard_s=1.0)
+    try:
+        hold(mastership)
+        with lines(None, port) as (_, (hall, _)):
+            begun = time.monotonic_ns()
+            with Poller(plant(hall), mastership=mastership) as poller:
+                rows: list[Row] = []
+                until(lambda: rows.extend(rows_of(poller)) or any(row.status == "ok" for row in rows))
+                assert min(row.monotonic_ns for row in rows if row.status == "ok") - begun >= S
+                assert poller.summary()["lines"]["hall"]["foreign_bytes"] == 0
+    finally:
+        mastership.end()
+
+
 @paces
 def test_another_master_is_told_and_polling_begins_when_it_is_silent(
     mastership: Mastership, every: float | None

@@ -48,7 +48,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--nats", metavar="URLS", help=f"servers, with commas; else MULTIDROP_NATS, or {URLS}"
     )
     parser.add_argument(
-        "--folder", metavar="DIR", type=Path, help="where a gateway keeps what it has; rights' files"
+        "--folder", metavar="DIR", type=Path, help="where a gateway keeps things, or rights go"
     )
     parser.add_argument("--keep", metavar="SIZE", default="10 GB", help="most that the spool takes: 10 GB")
     add_nats_arguments(parser)

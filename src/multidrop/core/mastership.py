@@ -24,7 +24,8 @@ class Mastership:
     before the first `extend`. Ports that have it look at the clock right before each write: a request that is
     too late is not sent, a stop neither. Where this process stands still and its deadline is over by half of
     `guard_s`, in s, the kernel kills it with SIGKILL, so that nothing is sent when it goes on. Who takes its
-    lines over waits for `guard_s` after the deadline. Any thread may call these.
+    lines over sends nothing for `guard_s` after the deadline: each line is listened to for so long at least
+    before its first request, a stop alone goes at once. Any thread may call these.
 
     Raises NotImplementedError where the system is not Linux, and ValueError for a guard that is no time.
     """
@@ -35,7 +36,7 @@ class Mastership:
         if not 0 < guard_s <= MOST_GUARD_S:
             raise ValueError(f"guard_s = {guard_s!r} must be above 0 and at most {MOST_GUARD_S:g}, in s")
         self.guard_s = float(guard_s)
-        c = lib.md_mastership_new()
+        c = lib.md_mastership_new(round(self.guard_s * 1e9))
         if c == ffi.NULL and ffi.errno == errno.ENOSYS:
             raise NotImplementedError(
                 "a mastership needs Linux, whose kernel can end a process that stands still"

@@ -15,9 +15,11 @@ from multidrop.fleet.lease_bucket import LeaseBucket
 from multidrop.fleet.lease_rules import Terms
 from multidrop.fleet.moves import Moves
 from multidrop.fleet.observer import Observer
+from multidrop.fleet.ownership import owner_of
 from multidrop.fleet.servers import ServerPath
 
-FOLLOW_S = 0.2
+FOLLOW_S = 0.2  # between looks at a bucket
+LEASES_S = 0.1  # the same of leases: how long a dead gateway's lines stay silent begins with it
 
 
 class FleetRecords:
@@ -33,10 +35,11 @@ class FleetRecords:
             for bucket in names.OWNERS
         }
         self.plant = Follower(Bucket(names.PLANT, path))
+        self.lines: tuple[str, ...] = ()  # of the plant, by name
         self._on_change = on_change
         self._read: set[str] = set()  # buckets that were read at least once
         self._looks: dict[str, Callable[[], Awaitable[Any]]] = {
-            names.PLANT: self.plant.look,
+            names.PLANT: self._look_at_plant,
             **{name: partial(self.observer.look, at) for at, name in enumerate(names.LEASES)},
             **{name: follower.look for name, follower in self.owners.items()},
         }
@@ -50,11 +53,19 @@ class FleetRecords:
         """Return the record of a line's master."""
         return self.owners[names.owner_bucket(line)].records.get(line)
 
-    def lines(self) -> list[str]:
-        """Return the lines of the plant."""
-        return [
-            name for name, record in self.plant.records.items() if record.value and "line" in record.value
-        ]
+    def is_in_plant(self, line: str) -> bool:
+        record = self.plant.records.get(line)
+        return bool(record and record.value and "line" in record.value)
+
+    def owned_by(self, gateway: str, session: int) -> set[str]:
+        """Return the lines whose records name this session."""
+        me = (gateway, session)
+        return {
+            line
+            for follower in self.owners.values()
+            for line, record in follower.records.items()
+            if owner_of(record) == me
+        }
 
     async def look(self) -> None:
         """Read once what has changed in each bucket. Raises FleetError where that fails."""
@@ -71,12 +82,18 @@ class FleetRecords:
         while True:
             with suppress(FleetError):
                 await self._look(name)
-            await asyncio.sleep(FOLLOW_S)
+            await asyncio.sleep(LEASES_S if name in names.LEASES else FOLLOW_S)
 
     async def _look(self, name: str) -> None:
         if await self._looks[name]() or name not in self._read:
             self._on_change()
         self._read.add(name)
+
+    async def _look_at_plant(self) -> bool:
+        changed = await self.plant.look()
+        if changed:
+            self.lines = tuple(sorted(filter(self.is_in_plant, self.plant.records)))
+        return bool(changed)
 
     def _note_move(self, bucket: str, before: Record | None, record: Record) -> None:
         self.moves.note(before, record, is_first_look=bucket not in self._read)

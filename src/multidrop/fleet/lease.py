@@ -114,7 +114,7 @@ class Lease:
         self._buckets = buckets
         self._mastership = mastership
         self._lock = lock
-        self._clock = clock
+        self.clock = clock
         self._note = note
         self._nonce = uuid.uuid4().hex
         self._watched: list[SeenRevision | None] = [None] * len(buckets)
@@ -124,12 +124,12 @@ class Lease:
 
     @property
     def is_valid(self) -> bool:
-        return bool(self.session) and lease_rules.may_send(self._clock(), self.until)
+        return bool(self.session) and lease_rules.may_send(self.clock(), self.until)
 
     @property
     def left_s(self) -> float:
         """Return for how long (s) it may still send; negative: since when it may not."""
-        return (self.until - self._clock()) / SECOND
+        return (self.until - self.clock()) / SECOND
 
     @property
     def best(self) -> int:
@@ -191,7 +191,7 @@ class Lease:
             return True
         if value and self._lock is not None and self._lock.proves_death(value):
             return True
-        now = self._clock()
+        now = self.clock()
         watched = self._watched[path] = lease_rules.watch(self._watched[path], record.revision, now)
         return lease_rules.is_stale(watched, now, self.terms)
 
@@ -201,7 +201,7 @@ class Lease:
         return f"a gateway called {self.name} is registered on {host}; waiting until its lease has run out"
 
     async def _take(self, path: int, record: Record) -> None:
-        sent = self._clock()
+        sent = self.clock()
         try:
             revision = await self._buckets[path].put(self.name, self._value(), record.revision)
         except (Conflict, FleetError):
@@ -227,15 +227,15 @@ class Lease:
     async def renew(self, path: int) -> None:
         """Renew one path, for ever; one task for each, so that none waits for another."""
         while True:
-            begun = self._clock()
+            begun = self.clock()
             if self.session:
                 await self.renew_once(path)
-            rest = RENEW_S - (self._clock() - begun) / SECOND
+            rest = RENEW_S - (self.clock() - begun) / SECOND
             await asyncio.sleep(max(rest, RENEW_S / 5))
 
     async def renew_once(self, path: int) -> None:
         """Renew one path. What is counted is the moment before the request was sent."""
-        held, nonce, sent = self.held[path], self._nonce, self._clock()
+        held, nonce, sent = self.held[path], self._nonce, self.clock()
         if held is None:
             if path not in self._ended:
                 await self._take_late(path)
@@ -278,7 +278,7 @@ class Lease:
 
     def _extend(self) -> None:
         until = lease_rules.deadline([held.sent if held else None for held in self.held], self.terms)
-        if until > self.until and lease_rules.may_send(self._clock(), until):
+        if until > self.until and lease_rules.may_send(self.clock(), until):
             self.until = until
             self._mastership.extend(until)
 

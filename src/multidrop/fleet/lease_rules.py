@@ -3,8 +3,11 @@
 A session stands in one record on each of three paths. The holder renews all three; whoever takes over ends
 them. `needed` and `ended` are more than half of the paths each: the two sets share a path, and its server
 decides. The holder counts from the moment before it sent a renewal. An observer counts from the moment at
-which it first saw a revision, by its own clock, and ends that very revision. So no clocks of two machines are
-compared. An ended path stays ended for this session, whatever comes.
+which it first saw a revision, by its own clock, and ends that very revision after the time of a lease. So no
+clocks of two machines are compared. An ended path stays ended for this session, whatever comes.
+
+Once a session is over its lines are claimed and opened at once. The guard begins then: the engine listens for
+so long at least before the first request on a line (csrc/listen.c).
 tests/fleet/test_lease_model.py tries all interleavings with these functions.
 """
 
@@ -22,14 +25,9 @@ class Terms(NamedTuple):
     """The terms of a lease; all of a fleet's gateways have the same. Times in ns."""
 
     lease: int = 2_500_000_000
-    guard: int = 700_000_000  # between the holder's last moment and the taker's first
+    guard: int = 700_000_000  # from the end of a session to the first request of the next master
     needed: int = 2  # paths that the holder must have renewed
     ended: int = 2  # paths that a taker must have ended
-
-    @property
-    def patience(self) -> int:
-        """The time for which an observer watches one revision before it may end it."""
-        return self.lease + self.guard
 
 
 USUAL = Terms()
@@ -62,8 +60,8 @@ def watch(before: SeenRevision | None, revision: int, now: int) -> SeenRevision:
 
 
 def is_stale(watched: SeenRevision, now: int, terms: Terms) -> bool:
-    """Say whether this very revision may be ended: it was not renewed for lease and guard."""
-    return now - watched.since >= terms.patience
+    """Say whether this very revision may be ended: it was not renewed for the time of a lease."""
+    return now - watched.since >= terms.lease
 
 
 def is_over(ended: int, terms: Terms) -> bool:

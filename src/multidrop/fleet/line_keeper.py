@@ -1,4 +1,4 @@
-"""Line keeper: the work on a gateway's lines. Each is claimed, polled, let go and given away, one at a time.
+"""Line keeper: the work on a gateway's lines, one thing at a time on each: claim, poll, let go, give away.
 
 A line is polled only while its record names us and our present session, and while the lease is valid. Half a
 second before it runs out all lines are let go.
@@ -49,6 +49,7 @@ class LineKeeper:
     ) -> None:
         self.lines = lines
         self.polled: dict[str, int] = {}  # lines, with the revision of their description
+        self._polled_since: dict[str, int] = {}  # CLOCK_BOOTTIME, ns
         self.troubles: dict[str, str] = {}  # lines that could not be taken, and why
         self.moves = 0
         self.releasing: set[str] = set()  # ours, and to be given away
@@ -76,6 +77,15 @@ class LineKeeper:
     def is_mine(self, line: str) -> bool:
         return owner_of(self._records.owner(line)) == (self._lease.name, self._lease.session)
 
+    def _owned(self) -> set[str]:
+        return self._records.owned_by(self._lease.name, self._lease.session)
+
+    def may_command(self, line: str) -> bool:
+        """Say whether this is the line's master now, and the guard of the one before is over."""
+        if not (self._lease.is_valid and self.is_mine(line) and line in self.polled):
+            return False
+        return self._lease.clock() - self._polled_since[line] >= self._lease.terms.guard
+
     async def fail(self) -> None:
         """Wait until a line could not be let go, and raise what was wrong: the process must end."""
         await self._has_failed.wait()
@@ -95,8 +105,8 @@ class LineKeeper:
         valid = self.may_poll
         mine = {
             line: self._records.plant.records[line].revision
-            for line in self._records.lines()
-            if valid and line not in self.releasing and self.is_mine(line)
+            for line in (self._owned() if valid else ())
+            if line not in self.releasing and self._records.is_in_plant(line)
         }
         now = time.monotonic()
         for line, revision in list(self.polled.items()):
@@ -167,6 +177,7 @@ class LineKeeper:
             else:
                 self.troubles.pop(line, None)
                 self.polled[line] = record.revision
+                self._polled_since[line] = self._lease.clock()
 
     async def _let_go(self, line: str) -> None:
         await self.lines.let_go(line)

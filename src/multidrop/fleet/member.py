@@ -32,13 +32,13 @@ from multidrop.fleet.lease import Lease, LifeLock, MayPoll
 from multidrop.fleet.lease_bucket import LeaseBucket
 from multidrop.fleet.lease_rules import SECOND, USUAL, Terms
 from multidrop.fleet.line_keeper import LineKeeper, Lines
-from multidrop.fleet.ownership import decide, owner_of
+from multidrop.fleet.ownership import decide
 from multidrop.fleet.servers import ServerPath
 
 _log = logging.getLogger("multidrop.fleet")
 
 GUARD_LOOK_S = 0.02
-STEP_S = 0.1
+STEP_S = 0.05
 SETTLE_S = 3.0
 HOME_S = 1.0
 CANCEL_S = 0.2
@@ -72,7 +72,8 @@ class Member:
         self.lease = Lease(name, own, mastership, lock=lock, terms=terms, note=self._note)
         self.records = FleetRecords(name, self.best, terms, self._mark_dirty)
         self.keeper = LineKeeper(lines, self.lease, self.records, self._mark_dirty)
-        self.wanted: dict[str, str] = {}
+        self.wanted: dict[str, str] = {}  # each line's gateway, by the balance
+        self._share: set[str] = set()  # the lines that should be ours
         self._balance = Balance()
         self._balanced: tuple[Any, ...] = ()
         self._settled_at = 0
@@ -97,7 +98,7 @@ class Member:
 
     @property
     def _is_settled(self) -> bool:
-        return self.lease._clock() >= self._settled_at
+        return self.lease.clock() >= self._settled_at
 
     def _path(self, number: int) -> ServerPath:
         return self.paths[number]
@@ -119,8 +120,8 @@ class Member:
         return self.records.owner(line)
 
     def may_command(self, line: str) -> bool:
-        """Say whether this is the line's master now."""
-        return self.lease.is_valid and self.keeper.is_mine(line) and line in self.polled
+        """Say whether this is the line's master now, and alone there."""
+        return self.keeper.may_command(line)
 
     def _note(self) -> dict[str, Any]:
         return {"draining": self.is_draining, "lines": len(self.polled), "margin_ms": self._margin_ms()}
@@ -161,7 +162,7 @@ class Member:
         while True:
             if not self.lease.session:
                 await self.lease.begin()
-                self._settled_at = self.lease._clock() + int(SETTLE_S * SECOND)
+                self._settled_at = self.lease.clock() + int(SETTLE_S * SECOND)
                 self._is_dirty = True
                 _log.info("%s: session %d began", self.name, self.lease.session)
             elif self.lease.is_over:
@@ -220,31 +221,27 @@ class Member:
         )
         if not self.is_draining and self.lease.session:
             gateways = tuple(sorted((*gateways, self.name)))
-        lines = tuple(sorted(self.records.lines()))
+        lines = self.records.lines
         if (gateways, lines) == self._balanced:
             return
         loop = asyncio.get_running_loop()
         self.wanted = await loop.run_in_executor(None, self._balance.assign, lines, gateways)
+        self._share = {line for line, gateway in self.wanted.items() if gateway == self.name}
         self._balanced, self._is_dirty = (gateways, lines), True
 
     def _claim_and_release(self) -> None:
         me = (self.name, self.lease.session)
-        lines = {*self.wanted, *self.records.lines()}
+        owned = self.records.owned_by(*me)
         step = decide(
             me,
-            lines,
+            self._share | owned,
             self.wanted,
             self.record,
             self.records.observer.is_over,
             is_settled=self._is_settled,
             is_draining=self.is_draining,
         )
-        self.keeper.releasing = step.releases | {
-            line
-            for follower in self.records.owners.values()
-            for line, record in follower.records.items()
-            if line not in lines and owner_of(record) == me
-        }
+        self.keeper.releasing = step.releases | {line for line in owned if not self.records.is_in_plant(line)}
         self.keeper.claim(step.claims)
 
 

@@ -1,0 +1,106 @@
+"""The work on a gateway's lines, on records in memory."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+from fleets import Hall, HandClock, MemoryBucket, NotedLines, NotedMastership
+from peers import require_module
+
+require_module("nats")
+
+from multidrop.fleet import names  # noqa: E402
+from multidrop.fleet.buckets import Follower, Record  # noqa: E402
+from multidrop.fleet.fleet_records import FleetRecords  # noqa: E402
+from multidrop.fleet.lease import Lease  # noqa: E402
+from multidrop.fleet.lease_rules import SECOND, USUAL  # noqa: E402
+from multidrop.fleet.line_keeper import LineKeeper  # noqa: E402
+from multidrop.fleet.ownership import owner_of  # noqa: E402
+
+
+async def until(condition: Callable[[], bool]) -> None:
+    for _ in range(1000):
+        if condition():
+            return
+        await asyncio.sleep(0)
+    raise AssertionError("it does not come")
+
+
+class Trial:
+    """A gateway with a lease and one line of the plant."""
+
+    def __init__(self) -> None:
+        self.clock = HandClock()
+        self.mastership = NotedMastership(self.clock)
+        self.lines = NotedLines("a", self.mastership, Hall())
+        leases: list[Any] = [MemoryBucket(name) for name in names.LEASES]
+        self.lease = Lease("a", leases, self.mastership, clock=self.clock)
+        nowhere: Any = None
+        self.records = FleetRecords("a", lambda: nowhere, USUAL, lambda: None)
+        for name in names.OWNERS:
+            bucket: Any = MemoryBucket(name)
+            self.records.owners[name] = Follower(bucket)
+        self.records.plant.take(Record("hall", 1, {"line": {"name": "hall"}}))
+        self.keeper = LineKeeper(self.lines, self.lease, self.records, lambda: None)
+
+    async def claim(self) -> None:
+        assert await self.lease.try_to_begin()
+        self.keeper.claim({"hall": 0})
+        await until(lambda: "hall" in self.keeper.polled and not self.keeper._at_work)
+
+
+def test_a_claimed_line_is_polled_and_takes_commands_when_the_guard_is_over() -> None:
+    async def main() -> None:
+        trial = Trial()
+        await trial.claim()
+        assert trial.lines.taken == {"hall"}
+        assert not trial.keeper.may_command("hall")
+        trial.clock.pass_s(USUAL.guard / SECOND - 0.001)
+        assert not trial.keeper.may_command("hall")
+        trial.clock.pass_s(0.001)
+        assert trial.keeper.may_command("hall")
+        trial.clock.pass_s(USUAL.lease / SECOND)
+        assert not trial.keeper.may_command("hall")
+
+    asyncio.run(main())
+
+
+def test_a_line_is_let_go_before_it_is_given_away() -> None:
+    async def main() -> None:
+        trial = Trial()
+        await trial.claim()
+        trial.keeper.releasing = {"hall"}
+        trial.keeper.reconcile()
+        assert owner_of(trial.records.owner("hall")) == ("a", 1)
+        await until(lambda: trial.keeper.is_silent)
+        assert trial.lines.taken == set()
+        assert owner_of(trial.records.owner("hall")) == ("a", 1)
+        trial.keeper.reconcile()
+        await until(lambda: trial.keeper.is_silent)
+        assert owner_of(trial.records.owner("hall")) == ("", 0)
+
+    asyncio.run(main())
+
+
+def test_a_line_that_is_not_closed_for_certain_ends_the_gateway() -> None:
+    """Its session is not ended: the others wait for as long as if it had died."""
+
+    async def main() -> None:
+        trial = Trial()
+        await trial.claim()
+
+        async def fail(line: str) -> None:
+            raise RuntimeError("the port is stuck")
+
+        trial.lines.let_go = fail  # type: ignore[method-assign]
+        failing = asyncio.create_task(trial.keeper.fail())
+        with pytest.raises(RuntimeError, match="the port is stuck"):
+            await asyncio.wait_for(trial.keeper.let_all_go(), 10)
+        with pytest.raises(RuntimeError, match="the port is stuck"):
+            await asyncio.wait_for(failing, 10)
+        assert trial.keeper.polled
+
+    asyncio.run(main())
