@@ -7,12 +7,14 @@ users may do everything, which must not. So an attempt that could not be refused
 from __future__ import annotations
 
 import asyncio
+import json
 import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import pytest
+from commands import Run
 from peers import require_module
 
 require_module("nats")
@@ -21,7 +23,9 @@ require_module("nkeys")
 from nats.aio.client import Client  # noqa: E402
 from secured_clusters import SecuredCluster, secured_cluster  # noqa: E402
 
-from multidrop.fleet.credentials import inbox_of, public_key  # noqa: E402
+from multidrop.fleet.credentials import connect_options, inbox_of, public_key  # noqa: E402
+from multidrop.fleet.errors import MayNotSend, NoRight  # noqa: E402
+from multidrop.fleet.refusals import Denials  # noqa: E402
 from multidrop.fleet.rights import OTHERS, rights_of  # noqa: E402
 
 GATEWAYS = ("gw-a", "gw-b")
@@ -224,3 +228,79 @@ def test_a_gateway_that_comes_changes_no_key(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"hub\.key is damaged: remove it, and its user gets another key"):
         write_files(tmp_path, ["gw-3"], urls, None)
     assert {str(path): path.read_text() for path in tmp_path.rglob("*") if path.is_file()} == before
+
+
+# ---- the command ----
+
+
+def test_the_command_shows_no_secret(run: Run, tmp_path: Path) -> None:
+    words = [
+        "fleet",
+        "rights",
+        "gw-1,gw-2",
+        "--nats",
+        "tls://a:4222,tls://b:4222",
+        "--folder",
+        tmp_path / "nats",
+    ]
+    files = ["--ca", "/etc/nats/ca.pem", "--cert", "/etc/nats/own.pem", "--key", "/etc/nats/own.key"]
+    status, out, err = run(*words, *files)
+    assert (status, err) == (0, "")
+    assert "copy rights.conf to each server" in out
+    _, told, _ = run(*words, *files, "--json")
+    assert len(json.loads(told)) == 6 + 1 + 2 + 1
+    for path in (tmp_path / "nats" / "keys").iterdir():
+        assert path.read_text().strip() not in out + told
+    text = (tmp_path / "nats" / "n2.conf").read_text()
+    assert 'listen: "b:4222"' in text
+    assert 'listen: "b:6222"' in text
+    assert text.count('cert_file: "/etc/nats/own.pem", key_file: "/etc/nats/own.key"') == 2
+
+
+def test_without_tls_there_is_a_warning(run: Run, tmp_path: Path) -> None:
+    status, _, err = run("fleet", "rights", "gw-1", "--nats", "nats://a:4222", "--folder", tmp_path)
+    assert (status, len(err.splitlines())) == (0, 1)
+    assert "without TLS the network reads samples and commands too" in err
+    assert "tls" not in (tmp_path / "n1.conf").read_text()
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        ([], "name all gateways, such as `multidrop fleet rights gw-1,gw-2,gw-3`"),
+        (["gw-1,gw.2"], "the gateway's name 'gw.2' may have letters"),
+        (["gw-1,operator"], "'operator' is there twice"),
+        (["gw-1", "--ca", "ca.pem"], "TLS needs all of --ca, --cert and --key: paths on the servers"),
+        (["gw-1", "--nats", "nats://a:64000"], "nats://a:64000 is no address of a NATS server"),
+        (["gw-1", "--nats", "nats://a:port"], "nats://a:port is no address of a NATS server"),
+    ],
+)
+def test_a_mistaken_call_writes_nothing(run: Run, tmp_path: Path, words: list[str], sentence: str) -> None:
+    status, out, err = run("fleet", "rights", *words, "--folder", tmp_path / "nats")
+    assert (status, out) == (2, "")
+    [line] = err.splitlines()
+    assert sentence in line
+    assert not (tmp_path / "nats").exists()
+
+
+def test_a_denial_of_this_very_request_alone_says_that_it_reached_nobody() -> None:
+    """Rights may be given while a connection stands: an older denial says nothing of a later silence."""
+    denials = Denials()
+    denied = Exception('nats: permissions violation for publish to "stop.line-1"')
+    asyncio.run(denials.note(denied))
+    before = denials.of_request("stop.Line-1")
+    denials.check_request("stop.Line-1", "_INBOX", before)
+    asyncio.run(denials.note(denied))
+    with pytest.raises(MayNotSend, match=r"these credentials do not allow to publish to stop\.Line-1"):
+        denials.check_request("stop.Line-1", "_INBOX", before)
+    asyncio.run(denials.note(Exception('nats: permissions violation for subscription to "_inbox.x.*"')))
+    with pytest.raises(NoRight, match=r"do not allow to listen to _inbox\.x"):
+        denials.check_request("stop.line-2", "_INBOX", 0)
+
+
+def test_a_creds_file_of_nats_is_taken_as_it_is(tmp_path: Path) -> None:
+    path = tmp_path / "gw-1.creds"
+    path.write_text("-----BEGIN NATS USER JWT-----\ney\n------END NATS USER JWT------\n")
+    assert connect_options(["nats://a"], path) == {"user_credentials": str(path)}
+    assert connect_options(["nats://a"]) == {}
+    assert connect_options(["tls://a"])["tls_handshake_first"]

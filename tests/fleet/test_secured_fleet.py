@@ -63,6 +63,7 @@ def told(servers: SecuredCluster, user: str, *words: str) -> str:
 
 
 NO_RIGHT = "these credentials do not allow to "
+NOT_SENT = f"the stop of drive-line-0 was NOT sent: {NO_RIGHT}publish to stop.line-0"
 NOT_THEIRS = [
     ("viewer", ["fleet", "init"], NO_RIGHT + "publish to $JS.API.STREAM.INFO.KV_contest"),
     ("hub", ["fleet", "status"], NO_RIGHT + "publish to $JS.API.STREAM.INFO.KV_lease_0"),
@@ -188,6 +189,11 @@ def test_all_works_with_the_rights_as_written(tmp_path: Path) -> None:
         fleet.wait_for_polling()
         until(lambda: all(one["lines"] for one in fleet.status()["gateways"].values()), "shares")
         assert set(fleet.status("commander")["gateways"]) == set(GATEWAYS)
+        for user, told in (("commander", "drive-line-0"), ("viewer", NOT_SENT)):
+            said = multidrop(fleet.servers, user, "fleet", "stop", "drive-line-0")
+            assert told in said.stdout + said.stderr
+            assert ("do not allow" in said.stdout + said.stderr) is (user == "viewer"), said
+        assert "drive-line-0" in "".join(path.read_text() for path in tmp_path.glob("gw-*/commands.jsonl"))
         fleet.running["gw-a"].kill()
         until(lambda: set(fleet.status()["gateways"]) == {"gw-b", "gw-c"}, "its end")
         fleet.wait_for_polling()

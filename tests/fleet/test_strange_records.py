@@ -16,9 +16,13 @@ from peers import require_module
 
 require_module("nats")
 
+from nats.aio.msg import Msg  # noqa: E402
+
 from multidrop.fleet import member as member_module  # noqa: E402
 from multidrop.fleet import names  # noqa: E402
 from multidrop.fleet.buckets import Bucket, ServerError  # noqa: E402
+from multidrop.fleet.errors import FleetError  # noqa: E402
+from multidrop.fleet.gateway import ask_gateway  # noqa: E402
 from multidrop.fleet.lease import boottime_ns  # noqa: E402
 from multidrop.fleet.lease_bucket import LeaseBucket  # noqa: E402
 from multidrop.fleet.member import Member  # noqa: E402
@@ -207,6 +211,32 @@ def test_no_gateway_ends_by_strange_records(one: Cluster, monkeypatch: pytest.Mo
         await asyncio.gather(task, return_exceptions=True)
         for other in paths:
             await other.close()
+
+    asyncio.run(_with_path(one, work))
+
+
+STATE = {"state": "working", "lines": 1, "margin_s": 2.0, "troubles": {}, "spool": {"bytes": 0, "lost": 0}}
+
+
+@pytest.mark.parametrize(
+    ("answer", "mistake"),
+    [
+        (b"{", "it has no 'state'"),
+        (b"[[[]]]", "it is no table"),
+        (b"[" * 500_000, "it has no 'state'"),
+        (json.dumps({**STATE, "lines": "1"}).encode(), "its 'lines' is not a whole number"),
+        (json.dumps({**STATE, "margin_s": None}).encode(), "its 'margin_s' is not a number"),
+        (json.dumps({**STATE, "spool": {"bytes": 0}}).encode(), "it has no 'lost'"),
+    ],
+)
+def test_an_answer_that_is_no_state_is_one_sentence(one: Cluster, answer: bytes, mistake: str) -> None:
+    async def work(path: ServerPath) -> None:
+        async def lie(message: Msg) -> None:
+            await message.respond(answer)
+
+        await path.subscribe("gateway.liar.*", lie)
+        with pytest.raises(FleetError, match=f"what liar answers is no state of a gateway: {mistake}"):
+            await ask_gateway(path, "liar", "state")
 
     asyncio.run(_with_path(one, work))
 

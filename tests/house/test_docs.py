@@ -66,6 +66,7 @@ NOT_RUN = {
     "multidrop fleet": "needs servers: tests/fleet/test_drills.py and test_fleet_command.py run it",
     "export MULTIDROP_NATS": "names servers: tests/support/fleet_drills.py does it",
     "multidrop hub nats://": "needs servers: tests/fleet/test_hub_command.py runs it",
+    "multidrop hub tls://": "needs servers: tests/fleet/test_secured_fleet.py runs it",
     "systemctl": "is another program: tests/gateway/test_serve.py sends the same signal",
     "curl": "is another program: tests/gateway/test_gateway_stops.py sends the same",
     "multidrop doctor": "is about a real adapter: tests/cli/test_doctor.py",

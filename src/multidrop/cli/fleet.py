@@ -47,7 +47,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--nats", metavar="URLS", help=f"servers, with commas; else MULTIDROP_NATS, or {URLS}"
     )
-    parser.add_argument("--folder", metavar="DIR", type=Path, help="where a gateway keeps its spool and lock")
+    parser.add_argument(
+        "--folder", metavar="DIR", type=Path, help="where a gateway keeps things, or rights go"
+    )
     parser.add_argument("--keep", metavar="SIZE", default="10 GB", help="most that the spool takes: 10 GB")
     add_nats_arguments(parser)
     parser.add_argument(

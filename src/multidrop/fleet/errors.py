@@ -23,6 +23,10 @@ class NotDelivered(FleetError):
     """A request that reached nobody, for certain."""
 
 
+class MayNotSend(NoRight, NotDelivered):
+    """A request that the server did not pass on, for want of rights."""
+
+
 class NobodyThere(NotDelivered):
     """A request of which the server says that nobody takes it."""
 

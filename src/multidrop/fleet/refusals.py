@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import logging
 import re
+from collections import Counter
 
-from multidrop.fleet.errors import FleetError, NoRight, NotAdmitted
+from multidrop.fleet.errors import FleetError, MayNotSend, NoRight, NotAdmitted
 
 MOST_DENIALS = 1000
 REFUSALS = (  # what a failure says, and what that means at this address
@@ -45,26 +46,41 @@ class Denials:
     """The subjects that one connection may not use, as its server said; each is told once."""
 
     def __init__(self) -> None:
-        self._said: dict[tuple[str, str], str] = {}
+        self._said: Counter[tuple[str, str]] = Counter()  # how often, by kind and subject
 
     async def note(self, failure: Exception) -> None:
         """Take what a server says of its own accord."""
         found = _DENIAL.search(str(failure))
-        if not found or len(self._said) >= MOST_DENIALS:
+        if not found:
             return
         kind, subject = found[1].lower(), found[2].lower()  # the client gives them so
         if (kind, subject) not in self._said:
-            verb = "publish" if kind == "publish" else "listen"
-            self._said[kind, subject] = f"these credentials do not allow to {verb} to {subject}"
-            _log.warning("%s", self._said[kind, subject])
+            if len(self._said) >= MOST_DENIALS:
+                return
+            _log.warning("%s", _sentence(kind, subject))
+        self._said[kind, subject] += 1
 
-    def check_request(self, subject: str, inbox: str) -> None:
-        """Raise NoRight where a request could not be sent, or its answer not be heard."""
-        for (kind, denied), sentence in self._said.items():
-            if denied == subject.lower() if kind == "publish" else denied.startswith(inbox.lower()):
-                raise NoRight(sentence)
+    def of_request(self, subject: str) -> int:
+        """Return how often a request to this subject was denied."""
+        return self._said["publish", subject.lower()]
+
+    def check_request(self, subject: str, inbox: str, before: int) -> None:
+        """Raise what a request without an answer fails by, where that is a want of rights.
+
+        `before` is how often it was denied before it was sent. MayNotSend says that it reached nobody,
+        NoRight that nothing can be heard in this inbox.
+        """
+        if self.of_request(subject) > before:
+            raise MayNotSend(_sentence("publish", subject))
+        for kind, denied in self._said:
+            if kind == "subscription" and denied.startswith(inbox.lower()):
+                raise NoRight(_sentence(kind, denied))
 
     def check_subscription(self, subject: str) -> None:
         """Raise NoRight where this may not be listened to."""
-        if sentence := self._said.get(("subscription", subject.lower())):
-            raise NoRight(sentence)
+        if self._said["subscription", subject.lower()]:
+            raise NoRight(_sentence("subscription", subject))
+
+
+def _sentence(kind: str, subject: str) -> str:
+    return f"these credentials do not allow to {'publish' if kind == 'publish' else 'listen'} to {subject}"

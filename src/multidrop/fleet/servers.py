@@ -170,18 +170,20 @@ class ServerPath:
         Raises Unsure where none comes in time, NoRight where it may not be asked or heard, and NotDelivered
         where nobody was asked, for certain: that is NobodyThere where the server says so.
         """
-        client = self._connected()
+        client, denials = self._connected(), self._denials
+        before = denials.of_request(subject)
         try:
             return await client.request(subject, data, answer_s, headers=headers)
         except nats.errors.NoRespondersError:
             raise NobodyThere(f"nobody answers {subject} at {self.url}") from None
         except (NatsError, OSError, TimeoutError) as failure:
-            self._denials.check_request(subject, self._options.get("inbox_prefix", "_INBOX"))
+            denials.check_request(subject, self._options.get("inbox_prefix", "_INBOX"), before)
             raise Unsure(f"{self.url} gave no answer to {subject}: {failure}") from None
 
     async def collect(self, subject: str, data: bytes, is_last: Callable[[Msg], bool]) -> list[Msg]:
         """Return all answers up to one that says that it is the last. Raises Unsure as `request` does."""
-        client = self._connected()
+        client, denials = self._connected(), self._denials
+        before = denials.of_request(subject)
         found: list[Msg] = []
         try:
             inbox = client.new_inbox()
@@ -197,7 +199,7 @@ class ServerPath:
                 with suppress(NatsError, OSError):
                     await subscription.unsubscribe()
         except (NatsError, OSError, TimeoutError) as failure:
-            self._denials.check_request(subject, self._options.get("inbox_prefix", "_INBOX"))
+            denials.check_request(subject, self._options.get("inbox_prefix", "_INBOX"), before)
             raise Unsure(f"{self.url} gave no whole answer to {subject}: {failure}") from None
 
     def _connected(self) -> Client:
