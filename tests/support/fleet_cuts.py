@@ -18,7 +18,7 @@ NODES = 3
 
 
 class Cuts:
-    """What is cut in a drill; all of it heals after 1 to 8 s."""
+    """Cuts of a drill's cables; all of them heal after 1 to 8 s."""
 
     def __init__(self, drill: FleetDrill) -> None:
         self.drill = drill

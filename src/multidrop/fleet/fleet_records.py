@@ -29,7 +29,7 @@ class FleetRecords:
         self.observer = Observer(me, [Bucket(bucket, path) for bucket in names.LEASES], terms)
         self.owners = {bucket: Follower(Bucket(bucket, path)) for bucket in names.OWNERS}
         self.plant = Follower(Bucket(names.PLANT, path))
-        self.lines: tuple[str, ...] = ()  # of the plant, by name
+        self._lines: tuple[str, ...] = ()
         self._on_change = on_change
         self._read: set[str] = set()  # buckets that were read at least once
 
@@ -41,6 +41,10 @@ class FleetRecords:
     def owner(self, line: str) -> Record | None:
         """Return the record of a line's master."""
         return self.owners[names.owner_bucket(line)].records.get(line)
+
+    def lines(self) -> tuple[str, ...]:
+        """Return the lines of the plant, by name; the same tuple while none came or went."""
+        return self._lines
 
     def is_in_plant(self, line: str) -> bool:
         record = self.plant.records.get(line)
@@ -67,7 +71,7 @@ class FleetRecords:
     async def _look_at_plant(self) -> bool:
         changed = await self.plant.look()
         if changed:
-            self.lines = tuple(sorted(filter(self.is_in_plant, self.plant.records)))
+            self._lines = tuple(sorted(filter(self.is_in_plant, self.plant.records)))
         return bool(changed)
 
     async def _follow(self, name: str, look: Callable[[], Awaitable[Any]], every_s: float) -> None:

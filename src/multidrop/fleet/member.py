@@ -220,7 +220,7 @@ class Member:
         )
         if not self.is_draining and self.lease.session:
             gateways = tuple(sorted((*gateways, self.name)))
-        lines = self.records.lines
+        lines = self.records.lines()
         if (gateways, lines) == self._balanced:
             return
         loop = asyncio.get_running_loop()
