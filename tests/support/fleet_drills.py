@@ -104,7 +104,17 @@ class FleetDrill:
             )
 
         self.wait(is_shared, "each gateway has lines")
-        time.sleep(2.5)  # paths and leaders come home
+        self.wait(self.are_leaders_home, "each node leads one bucket of the leases")
+        time.sleep(2.5)  # paths come home
+
+    def are_leaders_home(self) -> bool:
+        """Say whether each node leads one bucket of each group: else one deed does what two would do."""
+        leads = [node.leads() for node in self.nats.nodes]
+        return all(
+            sum(f"KV_{bucket}" in found for bucket in group) == 1
+            for found in leads
+            for group in (names.LEASES, names.OWNERS)
+        )
 
     def wait(self, condition: Callable[[], bool], what: str) -> float:
         begun = time.monotonic()

@@ -32,11 +32,11 @@ class FleetRecords:
         self._lines: tuple[str, ...] = ()
         self._on_change = on_change
         self._read: set[str] = set()  # buckets that were read at least once
+        self._is_complete = asyncio.Event()
 
-    @property
-    def are_complete(self) -> bool:
-        """Say whether each bucket was read once."""
-        return len(self._read) == len(names.BUCKETS)
+    async def complete(self) -> None:
+        """Wait until each bucket was read once."""
+        await self._is_complete.wait()
 
     def owner(self, line: str) -> Record | None:
         """Return the record of a line's master."""
@@ -80,4 +80,6 @@ class FleetRecords:
                 if await look() or name not in self._read:
                     self._on_change()
                 self._read.add(name)
+                if len(self._read) == len(names.BUCKETS):
+                    self._is_complete.set()
             await asyncio.sleep(every_s)
