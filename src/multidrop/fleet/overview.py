@@ -81,7 +81,7 @@ class FleetView:
         observer, plant = self._records.observer, self._records.plant.records
         sessions = observer.sessions()
         found: dict[str, Any] = {}
-        for name in self._records.lines:
+        for name in self._records.lines():
             record = self._records.owner(name)
             gateway, session = owner_of(record)
             is_held = gateway in sessions and not observer.is_over(gateway, session)
