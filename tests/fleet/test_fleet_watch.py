@@ -24,6 +24,7 @@ from multidrop.cli import fleet_watch  # noqa: E402
 from multidrop.cli.support.fleet_screen import picture  # noqa: E402
 from multidrop.cli.support.fleet_tables import moment, move_table, size  # noqa: E402
 from multidrop.fleet.overview import is_state  # noqa: E402
+from multidrop.fleet.watching import FleetWatch  # noqa: E402
 
 SPOOL = {"bytes": 81234, "lost": 0, "behind": 2, "lag_s": 1.5, "trouble": None}
 SAYS = {"state": "working", "margin_s": 1.94, "troubles": {}, "trouble": "", "spool": SPOOL}
@@ -133,7 +134,7 @@ def test_a_look_that_fails_is_told_with_the_age_of_what_is_shown(monkeypatch: py
             if len(shown) == 3:
                 over.set()
 
-        await fleet_watch.follow(FailingView(), show, over)  # type: ignore[arg-type]
+        await fleet_watch.follow(FleetWatch(FailingView()), show, over)  # type: ignore[arg-type]
 
     asyncio.run(main())
     assert [one["trouble"] for one in shown] == [None, "no server", "no server"]

@@ -15,6 +15,7 @@ from multidrop.fleet.moves import move_of
 from multidrop.fleet.observer import BELIEVING
 from multidrop.fleet.ownership import owner_of
 from multidrop.fleet.servers import ServerPath
+from multidrop.fleet.setup import check_buckets
 
 MOVES_SHOWN = 20
 _SHOWN: Mapping[tuple[str, ...], tuple[type, ...]] = {
@@ -37,9 +38,19 @@ class FleetView:
         self._path = path
         self._records = FleetRecords("", lambda: path, BELIEVING, lambda: None)
         self._says: dict[str, dict[str, Any] | None] = {}
+        self._is_checked = False
+
+    async def check(self) -> None:
+        """Raise FleetError where there is no fleet in these servers, or no quorum."""
+        await check_buckets(self._path)
+        self._is_checked = True
 
     async def look(self) -> None:
         """Read the records and ask the gateways. Raises FleetError where no server gives the records."""
+        if not self._path.is_open:
+            raise FleetError(f"no NATS server is reached at {', '.join(self._path.urls)}")
+        if not self._is_checked:
+            await self.check()
         await self._records.look()
         present = list(self._records.observer.sessions())
         said = await asyncio.gather(*map(self._ask, present))
