@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import json
 import sys
 from pathlib import Path
 from typing import Any
@@ -118,6 +119,26 @@ def test_the_gateway_tells_of_a_real_fleet_and_of_none(fleet: Cluster, tmp_path:
             404,
             "no fleet is looked at; add [serve.fleet] to the plant file",
         )
+
+
+@pytest.mark.long
+def test_a_viewers_key_is_enough(tmp_path: Path) -> None:
+    require_module("nkeys")
+    from secured_clusters import secured_cluster
+    from secured_fleets import multidrop
+
+    plant = written(tmp_path, port="socket://127.0.0.1:4001")
+    with secured_cluster(tmp_path / "nats", 1) as servers:
+        made = multidrop(servers, "operator", "fleet", "init", str(plant.path))
+        assert made.returncode == 0, made.stderr
+        table = (
+            f'nats = ["{servers.urls[0]}"]\ncredentials = "{servers.key("viewer")}"\nca = "{servers.tls.ca}"'
+        )
+        with served(tmp_path, f"[serve.fleet]\n{table}\n") as gateway:
+            until(lambda: gateway.get("/api/fleet").json["lines"].keys() == {"hall"})
+            assert gateway.get("/health").json["parts"] == {"fleet": "ok"}
+        watched = multidrop(servers, "viewer", "fleet", "status", "--json")
+        assert json.loads(watched.stdout)["lines"]["hall"]["master"] is None
 
 
 def test_servers_that_are_not_there_are_told(tmp_path: Path) -> None:

@@ -18,16 +18,10 @@ from multidrop.fleet.servers import ServerPath
 from multidrop.fleet.setup import check_buckets
 
 MOVES_SHOWN = 20
-_SHOWN: Mapping[tuple[str, ...], tuple[type, ...]] = {
-    ("state",): (str,),
-    ("margin_s",): (int, float),
-    ("troubles",): (dict,),
-    ("trouble",): (str,),
-    ("spool", "bytes"): (int,),
-    ("spool", "lost"): (int,),
-    ("spool", "behind"): (int, NoneType),
-    ("spool", "lag_s"): (int, float, NoneType),
-    ("spool", "trouble"): (str, NoneType),
+_MAY_BE_NONE: Mapping[str, tuple[type, ...]] = {  # of the spool in a gateway's answer
+    "behind": (int, NoneType),
+    "lag_s": (int, float, NoneType),
+    "trouble": (str, NoneType),
 }
 
 
@@ -62,9 +56,9 @@ class FleetView:
     async def _ask(self, gateway: str) -> dict[str, Any] | None:
         try:
             state = await ask_gateway(self._path, gateway, "state")
-        except (FleetError, ValueError):
+        except FleetError:
             return None
-        return state if is_state(state) else None
+        return state if is_shown(state) else None
 
     def fleet(self) -> dict[str, Any]:
         """Return gateways with a session that nobody ended, lines with their masters, and the last moves.
@@ -106,15 +100,9 @@ class FleetView:
         return found
 
 
-def is_state(told: Any) -> bool:
-    """Say whether an answer has all that is shown of a gateway: another version may give something else."""
-    try:
-        return all(isinstance(_found(told, keys), kinds) for keys, kinds in _SHOWN.items())
-    except (KeyError, TypeError):
-        return False
-
-
-def _found(told: Any, keys: tuple[str, ...]) -> Any:
-    for key in keys:
-        told = told[key]
-    return told
+def is_shown(state: Mapping[str, Any]) -> bool:
+    """Say whether a gateway's answer has the rest that is shown of it: another version may lack some."""
+    spool = state["spool"]
+    return isinstance(state.get("trouble"), str) and all(
+        name in spool and isinstance(spool[name], kinds) for name, kinds in _MAY_BE_NONE.items()
+    )

@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import asyncio
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol
 
 if TYPE_CHECKING:
     from multidrop.fleet.servers import ServerPath
@@ -19,9 +20,11 @@ OLD_S = 5.0  # an older look is not well
 
 @dataclass(frozen=True)
 class FleetSettings:
-    """The table `[serve.fleet]`: the servers of the fleet, all of them."""
+    """The table `[serve.fleet]`: the servers of the fleet, and files as for `fleet watch`."""
 
     nats: tuple[str, ...] = (EXAMPLE,)
+    credentials: str = ""
+    ca: str = ""
 
     def __post_init__(self) -> None:
         wrong = [
@@ -67,11 +70,22 @@ class FleetPart:
         return self._watch.told()
 
 
-def build(settings: FleetSettings, inside: object) -> FleetPart:
-    """Return the part. Nothing is connected before it runs. Raises ImportError without NATS' client."""
+class HasFolder(Protocol):
+    """The gateway, as this part sees it."""
+
+    folder: Path  # to which files' names are relative
+
+
+def build(settings: FleetSettings, inside: HasFolder) -> FleetPart:
+    """Return the part. Nothing is connected before it runs.
+
+    Raises ImportError without NATS' client, OSError or ValueError for files that are none.
+    """
+    from multidrop.fleet.credentials import connect_options
     from multidrop.fleet.overview import FleetView
     from multidrop.fleet.servers import ServerPath
     from multidrop.fleet.watching import FleetWatch
 
-    path = ServerPath(settings.nats)
+    credentials, ca = (inside.folder / name if name else None for name in (settings.credentials, settings.ca))
+    path = ServerPath(settings.nats, connect_options(settings.nats, credentials, ca))
     return FleetPart(path, FleetWatch(FleetView(path)))

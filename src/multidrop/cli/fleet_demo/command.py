@@ -18,6 +18,7 @@ from multidrop.cli.fleet_demo.nats_nodes import server_program, start_nodes
 from multidrop.cli.fleet_demo.numbered_lines import DRIVES, drive_name, plant_file
 from multidrop.cli.fleet_demo.vanishing_folder import vanishing_folder
 from multidrop.cli.fleet_watch import drawing, follow
+from multidrop.cli.support.nats import CA, CREDENTIALS
 from multidrop.cli.support.output import print_text
 from multidrop.cli.support.signals import on_end_signals
 
@@ -77,7 +78,8 @@ def run_demo() -> int:
     program = server_program(OLDEST)
     stage = Stage()
     with vanishing_folder() as folder, ExitStack() as stack:
-        children = Children(folder, {"XDG_STATE_HOME": str(folder / "state"), "MULTIDROP_NATS": ""})
+        none = dict.fromkeys((CREDENTIALS, CA), "")  # of a fleet that the user may have
+        children = Children(folder, {"XDG_STATE_HOME": str(folder / "state"), **none})
         stack.callback(children.close)
         demo = Demo(folder, children, stage)
         demo.begin(program)
