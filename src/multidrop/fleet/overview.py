@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import Container, Mapping
 from contextlib import suppress
 from types import NoneType
 from typing import Any
@@ -66,14 +67,16 @@ class FleetView:
         A gateway that died a moment ago is still there, until another one has ended its session; `says` is
         None where it does not answer, and `unseen_s` tells for how long (s) this view saw no renewal.
         """
-        lines, sessions = self._lines(), self._records.observer.sessions()
+        sessions = self._records.observer.sessions()
+        lines = self._lines(sessions)
+        masters = Counter(line["master"] for line in lines.values())
         gateways = {
             name: {
                 "host": value["host"],
                 "session": value["session"],
                 "began_ms": value["began"],
                 "draining": value["draining"],
-                "lines": sum(line["master"] == name for line in lines.values()),
+                "lines": masters[name],
                 "unseen_s": round(self._records.observer.unseen_s(name), 3),
                 "says": self._says.get(name),
             }
@@ -82,20 +85,22 @@ class FleetView:
         moves = [move.as_json() for move in self._records.moves.newest(MOVES_SHOWN)]
         return {"gateways": gateways, "lines": lines, "moves": moves}
 
-    def _lines(self) -> dict[str, Any]:
+    def _lines(self, sessions: Container[str]) -> dict[str, Any]:
         observer, plant = self._records.observer, self._records.plant.records
-        sessions = observer.sessions()
+        held: dict[tuple[str, int], bool] = {}  # by owner: there are thousands of lines
         found: dict[str, Any] = {}
         for name in sorted(self._records.lines()):
             record = self._records.owner(name)
-            gateway, session = owner_of(record)
-            is_held = gateway in sessions and not observer.is_over(gateway, session)
+            owner = owner_of(record)
+            if owner not in held:
+                held[owner] = owner[0] in sessions and not observer.is_over(*owner)
+            gateway, session = owner if held[owner] else (None, None)
             found[name] = {
                 "port": plant[name].value["line"].get("port", ""),
                 "revision": plant[name].revision,
-                "master": gateway if is_held else None,
-                "session": session if is_held else None,
-                "since_ms": record.value["since"] if record and record.value and is_held else None,
+                "master": gateway,
+                "session": session,
+                "since_ms": record.value["since"] if record and record.value and gateway else None,
             }
         return found
 
