@@ -18,6 +18,7 @@ VIEWS = (
     "#/faults",
     "#/lines",
     "#/log",
+    "#/fleet",
     "settings",
     "stop",
     "reload",
