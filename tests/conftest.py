@@ -33,6 +33,7 @@ settings.load_profile("any machine")
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
+@pytest.hookimpl(optionalhook=True)  # of xdist
 def pytest_xdist_auto_num_workers() -> int:
     """Two for each processor and one: many tests wait for a line; 12 at most, for each collects all."""
     return min(2 * len(os.sched_getaffinity(0)) + 1, 12)
