@@ -11,6 +11,7 @@ from docutils import nodes
 from docutils.parsers.rst import Directive
 
 from multidrop.cli import COMMANDS, main
+from multidrop.cli.fleet import ACTIONS as FLEET
 from multidrop.drives import MODELS
 from multidrop.drives.registry import SHIPPED
 
@@ -40,7 +41,7 @@ class Sections(Directive):
     def run(self) -> list[nodes.Node]:
         found: list[nodes.Node] = []
         for name in self.names():
-            section = nodes.section(ids=[f"{self.name}-{name}"], names=[])
+            section = nodes.section(ids=[f"{self.name}-{name}".replace(" ", "-")], names=[])
             section += nodes.title("", "", nodes.literal("", self.title(name)))
             section += nodes.literal_block("", printed(*self.words(name)), language="text")
             self.state.document.note_explicit_target(section)
@@ -61,13 +62,13 @@ class Help(Sections):
     """Each command's own help."""
 
     def names(self) -> list[str]:
-        return list(COMMANDS)
+        return [*COMMANDS, *(f"fleet {action}" for action in FLEET)]
 
     def title(self, name: str) -> str:
         return f"multidrop {name}"
 
     def words(self, name: str) -> list[str]:
-        return [name, "--help"]
+        return [*name.split(), "--help"]
 
 
 class Models(Sections):

@@ -14,6 +14,7 @@ import pytest
 from commands import TOY, Run
 
 from multidrop.cli import COMMANDS, main
+from multidrop.cli.fleet import ACTIONS as FLEET
 from multidrop.cli.support.signals import noting_signals
 from multidrop.drive import Advice, Refused, carry_out
 from multidrop.drives import MODELS, ErmanERG220, InnovertIBD, InvtCHE
@@ -30,12 +31,12 @@ def test_no_command_is_a_mistake_that_gets_the_help(run: Run) -> None:
     assert run()[0] == 2
 
 
-@pytest.mark.parametrize("name", COMMANDS)
+@pytest.mark.parametrize("name", [*COMMANDS, *(f"fleet {action}" for action in FLEET)])
 def test_every_command_has_help_within_80_columns(
     run: Run, name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("COLUMNS", "80")
-    status, out, err = run(name, "--help")
+    status, out, err = run(*name.split(), "--help")
     assert (status, err) == (0, "")
     assert out.startswith(f"usage: multidrop {name} ")
     assert max(map(len, out.splitlines())) <= 80

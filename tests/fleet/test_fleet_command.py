@@ -75,8 +75,8 @@ def test_no_server(run: Run, nobody: str, words: list[str]) -> None:
 
 def test_servers_without_a_fleet(run: Run, tmp_path: Path) -> None:
     with cluster(tmp_path / "one", 1) as one:
-        for action in ("status", "serve"):
-            said = one_sentence(run("fleet", action, "gw-1", "--nats", one.urls[0]))
+        for words in (["status"], ["serve", "gw-1"]):
+            said = one_sentence(run("fleet", *words, "--nats", one.urls[0]))
             assert "has no bucket lease_0: run `multidrop fleet init` first" in said
 
 
@@ -135,15 +135,16 @@ def test_a_list_with_a_mistake(run: Run, nobody: str, tmp_path: Path, lists: str
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
-        (["serve"], "name a gateway, such as `multidrop fleet serve gw-1`"),
-        (["drain"], "name a gateway, such as `multidrop fleet drain gw-1`"),
+        (["serve"], "are required: NAME; see `multidrop fleet serve --help`"),
+        (["drain"], "are required: NAME; see `multidrop fleet drain --help`"),
         (["serve", "gw.1"], "the gateway's name 'gw.1' may have letters"),
         (["status", "--nats", "127.0.0.1"], "127.0.0.1 is no address of a NATS server"),
-        (["dance"], "invalid choice: 'dance'"),
-        (["status", "gw-1", "gw-2"], "status takes one name, and was given gw-2 too"),
-        (["write", "pump-1", "frequency"], "write takes DRIVE REGISTER VALUE: `multidrop fleet write DRIVE"),
-        (["start"], "start takes DRIVE: `multidrop fleet start DRIVE`"),
-        (["start", "pump-1", "pump-2"], "start takes DRIVE"),
+        (["dance"], "there is no action 'dance'; did you mean drain?"),
+        (["status", "gw-1"], "unrecognized arguments: gw-1; see `multidrop fleet status --help`"),
+        (["write", "pump-1", "frequency"], "are required: VALUE; see `multidrop fleet write --help`"),
+        (["start"], "are required: DRIVE"),
+        (["start", "pump-1", "pump-2"], "unrecognized arguments: pump-2"),
+        (["start", "pump-1", "--all"], "unrecognized arguments: --all"),
         (["start", "pump-1", "--direction", "up"], "invalid choice: 'up'"),
         (["set-frequency", "pump-1", "fast"], "HZ = fast is no number; write 25"),
         (["stop"], "stop takes either drives or --all"),
@@ -195,7 +196,7 @@ def test_what_is_made_and_shown(run: Run, nats: Cluster, tmp_path: Path) -> None
 def test_an_interruption_says_what_it_leaves_open(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from multidrop.cli import fleet_commands
+    from multidrop.cli.fleet import commands
 
     class Endless:
         async def __aenter__(self) -> Endless:
@@ -210,8 +211,8 @@ def test_an_interruption_says_what_it_leaves_open(
             task.cancel()  # as Ctrl-C does
             await asyncio.sleep(60)
 
-    monkeypatch.setattr(fleet_commands, "_asker", lambda *given: Endless())
-    arguments = argparse.Namespace(what="pump-1", words=[], all=False, line=None, json=False)
+    monkeypatch.setattr(commands, "_asker", lambda *given: Endless())
+    arguments = argparse.Namespace(drives=["pump-1"], all=False, line=None, json=False)
     with pytest.raises(asyncio.CancelledError):
-        asyncio.run(fleet_commands._stop(arguments, [], Path()))  # type: ignore[arg-type]
+        asyncio.run(commands._stop(arguments))
     assert "the stop of pump-1: it is not known whether it was sent" in capsys.readouterr().err

@@ -19,8 +19,8 @@ from terminals import on_terminal
 require_module("nats")
 require_module("pyarrow")
 
-from multidrop.cli.fleet_demo import nats_nodes  # noqa: E402
-from multidrop.cli.fleet_demo.judgement import (  # noqa: E402
+from multidrop.cli.fleet.demo import nats_nodes  # noqa: E402
+from multidrop.cli.fleet.demo.judgement import (  # noqa: E402
     Answers,
     Judgement,
     KeptRow,
@@ -29,7 +29,7 @@ from multidrop.cli.fleet_demo.judgement import (  # noqa: E402
     judge_drive,
     silence_s,
 )
-from multidrop.cli.fleet_demo.numbered_lines import NUMBERED, NumberedDrive, plant_file  # noqa: E402
+from multidrop.cli.fleet.demo.numbered_lines import NUMBERED, NumberedDrive, plant_file  # noqa: E402
 from multidrop.drives import InnovertIBD  # noqa: E402
 from multidrop.plant.loader import load_plant  # noqa: E402
 

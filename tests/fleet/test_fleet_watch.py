@@ -20,7 +20,7 @@ from terminals import on_terminal
 require_module("nats")
 require_module("rich")
 
-from multidrop.cli import fleet_watch  # noqa: E402
+from multidrop.cli.fleet import watch as fleet_watch  # noqa: E402
 from multidrop.cli.support.fleet_screen import picture  # noqa: E402
 from multidrop.cli.support.fleet_tables import moment, move_table, size  # noqa: E402
 from multidrop.fleet.overview import is_shown  # noqa: E402

@@ -267,7 +267,7 @@ def test_without_tls_there_is_a_warning(run: Run, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
-        ([], "name all gateways, such as `multidrop fleet rights gw-1,gw-2,gw-3`"),
+        ([], "are required: NAMES; see `multidrop fleet rights --help`"),
         (["gw-1,gw.2"], "the gateway's name 'gw.2' may have letters"),
         (["gw-1,operator"], "'operator' is there twice"),
         (["gw-1", "--ca", "ca.pem"], "TLS needs all of --ca, --cert and --key: paths on the servers"),

@@ -275,9 +275,12 @@ def test_a_command_that_is_mentioned_is_a_command(mentioned: str, monkeypatch: p
     if words[0].startswith("--"):
         return
     assert words[0] in COMMANDS
-    is_typed_so = words[1:] and not words[1].startswith("--")
+    module = importlib.import_module(f"multidrop.cli.{COMMANDS[words[0]][0]}")
+    arguments = words[1:]
+    if hasattr(module, "ACTIONS") and arguments:
+        module = importlib.import_module(f"{module.__name__}.{module.ACTIONS[arguments.pop(0)][0]}")
+    is_typed_so = arguments and not arguments[0].startswith("--")
     if is_typed_so:
-        module = importlib.import_module(f"multidrop.cli.{COMMANDS[words[0]][0]}")
         monkeypatch.setattr(module, "run", lambda arguments: 0)
         assert main(words) == 0
 

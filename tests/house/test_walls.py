@@ -54,11 +54,9 @@ FILES_TOUCHING_THE_SYSTEM = {
 CLIENTS = {  # rooms that use public names alone, and the commands that import them
     "gateway": {"cli/serve.py"},
     "fleet": {
-        "cli/fleet.py",
-        "cli/fleet_commands.py",
-        "cli/fleet_demo/command.py",
-        "cli/fleet_rights.py",
-        "cli/fleet_watch.py",
+        *(f"cli/fleet/{name}.py" for name in ("commands", "connection", "drain", "init", "look")),
+        *(f"cli/fleet/{name}.py" for name in ("rights", "serve", "watch")),
+        "cli/fleet/demo/command.py",
         "cli/hub.py",
         "cli/support/nats.py",
     },

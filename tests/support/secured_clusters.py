@@ -60,6 +60,7 @@ class SecuredNode(Node):
 
     def __init__(self, folder: Path, name: str, port: int, monitor: int) -> None:
         self.name, self.port, self.monitor = name, port, monitor
+        self.place, self.host = None, "127.0.0.1"
         self._log = folder / f"{name}.log"
         self._command = [server_program(), "-c", str(folder / f"{name}.conf"), "-m", str(monitor)]
         self.start()

@@ -11,7 +11,7 @@ import importlib
 import logging
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from typing import Any, NoReturn
 
@@ -52,15 +52,30 @@ COMMANDS = {  # name: module in this package, and help
     "convert": ("convert", "turn one recording into another format"),
 }
 
-_LIST = "\n".join(f"  {name:<16}{text}" for name, (_, text) in COMMANDS.items())
+
+def _listed(table: Mapping[str, tuple[str, str]]) -> str:
+    return "\n".join(f"  {name:<16}{text}" for name, (_, text) in table.items())
+
+
 HELP = f"""usage: multidrop COMMAND [arguments]
 
 Poll every drive on an RS-485 line as fast as the wire allows.
 
-{_LIST}
+{_listed(COMMANDS)}
 
 `multidrop COMMAND --help` says what a command takes; --json prints for programs.
 Exit status: 0 done, 1 the line or a drive failed or a rule forbade it, 2 mistaken call.
+"""
+
+
+def _help_of(prog: str, text: str, actions: Mapping[str, tuple[str, str]]) -> str:
+    return f"""usage: {prog} ACTION [arguments]
+
+{text[0].upper()}{text[1:]}.
+
+{_listed(actions)}
+
+`{prog} ACTION --help` says what it takes.
 """
 
 
@@ -110,14 +125,27 @@ def _guarded(command: str, words: list[str]) -> int:
     return status
 
 
+def _found(kind: str, name: str, table: Mapping[str, tuple[str, str]], prog: str) -> tuple[str, str]:
+    if name not in table:
+        near = difflib.get_close_matches(name, table, n=1)
+        hint = f"did you mean {near[0]}?" if near else f"see `{prog} --help`"
+        raise ValueError(f"there is no {kind} {name!r}; {hint}")
+    return table[name]
+
+
 def _run(command: str, words: list[str]) -> int:
-    if command not in COMMANDS:
-        near = difflib.get_close_matches(command, COMMANDS, n=1)
-        hint = f"did you mean {near[0]}?" if near else "see `multidrop --help`"
-        raise ValueError(f"there is no command {command!r}; {hint}")
-    name, text = COMMANDS[command]
+    prog = f"multidrop {command}"
+    name, text = _found("command", command, COMMANDS, "multidrop")
     module: Any = importlib.import_module(f"multidrop.cli.{name}")
-    parser = _Parser(prog=f"multidrop {command}", description=text.capitalize() + ".", allow_abbrev=False)
+    if hasattr(module, "ACTIONS"):
+        if not words or words[0] in ("-h", "--help"):
+            print(_help_of(prog, text, module.ACTIONS), end="")
+            return DONE if words else MISTAKE
+        command, *words = words
+        name, text = _found("action", command, module.ACTIONS, prog)
+        module = importlib.import_module(f"{module.__name__}.{name}")
+        prog = f"{prog} {command}"
+    parser = _Parser(prog=prog, description=text[0].upper() + text[1:] + ".", allow_abbrev=False)
     parser.set_defaults(command=command)
     module.add_arguments(parser)
     try:

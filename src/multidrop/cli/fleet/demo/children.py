@@ -8,7 +8,7 @@ import sys
 from collections.abc import Mapping
 from pathlib import Path
 
-from multidrop.cli.fleet_demo import dying_child
+from multidrop.cli.fleet.demo import dying_child
 
 PATIENCE_S = 10.0  # for a child that was asked to end
 

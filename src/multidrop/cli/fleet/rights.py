@@ -7,6 +7,7 @@ import json
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from multidrop.cli.fleet.connection import add_server_arguments, require_fleet, urls_of
 from multidrop.cli.support.extras import require_extra
 from multidrop.cli.support.output import print_text, warn
 
@@ -16,15 +17,24 @@ if TYPE_CHECKING:
 FOLDER = Path("nats")
 
 
-def write_rights(arguments: argparse.Namespace, urls: list[str]) -> int:
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("gateways", metavar="NAMES", help="all gateways, with commas: gw-1,gw-2,gw-3")
+    parser.add_argument("--folder", metavar="DIR", type=Path, default=FOLDER, help=f"where they go: {FOLDER}")
+    parser.add_argument("--cert", metavar="FILE", type=Path, help="a server's certificate, there")
+    parser.add_argument("--key", metavar="FILE", type=Path, help="its key, there")
+    add_server_arguments(parser)
+
+
+def run(arguments: argparse.Namespace) -> int:
     """Write the files, and say what is to be done with them; no secret is shown."""
+    require_fleet()
     require_extra("nkeys", "fleet", "fleet rights")
     from multidrop.fleet.server_files import write_files
 
-    gateways = [name.strip() for name in (arguments.what or "").split(",") if name.strip()]
+    gateways = [name.strip() for name in arguments.gateways.split(",") if name.strip()]
     if not gateways:
         raise ValueError("name all gateways, such as `multidrop fleet rights gw-1,gw-2,gw-3`")
-    folder = arguments.folder or FOLDER
+    folder, urls = arguments.folder, urls_of(arguments)
     tls = _tls(arguments)
     written = write_files(folder, gateways, urls, tls)
     if arguments.json:

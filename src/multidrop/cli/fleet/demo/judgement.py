@@ -12,7 +12,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from multidrop.cli.fleet_demo.numbered_lines import NUMBERED
+from multidrop.cli.fleet.demo.numbered_lines import NUMBERED
 
 NOT_SENT = "not sent"  # statuses of requests that no drive has seen begin so
 _MESSAGE = re.compile(r"(\d+)-(\d+)\.arrows")

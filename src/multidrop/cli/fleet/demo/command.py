@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import asyncio
 import json
 import sys
@@ -12,12 +13,13 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from multidrop.cli.fleet_demo.children import Children, await_line
-from multidrop.cli.fleet_demo.judgement import Judgement, Kill, judge
-from multidrop.cli.fleet_demo.nats_nodes import server_program, start_nodes
-from multidrop.cli.fleet_demo.numbered_lines import DRIVES, drive_name, plant_file
-from multidrop.cli.fleet_demo.vanishing_folder import vanishing_folder
-from multidrop.cli.fleet_watch import drawing, follow
+from multidrop.cli.fleet.connection import require_fleet
+from multidrop.cli.fleet.demo.children import Children, await_line
+from multidrop.cli.fleet.demo.judgement import Judgement, Kill, judge
+from multidrop.cli.fleet.demo.nats_nodes import server_program, start_nodes
+from multidrop.cli.fleet.demo.numbered_lines import DRIVES, drive_name, plant_file
+from multidrop.cli.fleet.demo.vanishing_folder import vanishing_folder
+from multidrop.cli.fleet.watch import drawing, follow
 from multidrop.cli.support.nats import CA, CREDENTIALS
 from multidrop.cli.support.output import print_text
 from multidrop.cli.support.signals import on_end_signals
@@ -71,8 +73,13 @@ class Stage:
             raise OSError(f"{what} not within {PATIENCE_S:.0f} s: the demo has failed") from None
 
 
-def run_demo() -> int:
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    pass
+
+
+def run(arguments: argparse.Namespace) -> int:
     """Show it all; 0 where every answer of the drives was found again."""
+    require_fleet()
     from multidrop.fleet.servers import OLDEST
 
     program = server_program(OLDEST)

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import argparse
 import asyncio
 import json
 import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
+from multidrop.cli.fleet.connection import add_server_arguments, run_with_paths
 from multidrop.cli.support.extras import require_extra
 from multidrop.cli.support.output import print_text
 from multidrop.cli.support.signals import on_end_signals
@@ -19,6 +22,14 @@ if TYPE_CHECKING:
     from multidrop.fleet.watching import FleetWatch
 
 EVERY_S = 1.0
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    add_server_arguments(parser)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    return run_with_paths(arguments, partial(watch, is_json=arguments.json))
 
 
 async def watch(paths: list[ServerPath], *, is_json: bool) -> int:

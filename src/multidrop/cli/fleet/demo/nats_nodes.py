@@ -14,7 +14,7 @@ from contextlib import suppress
 from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
 
-from multidrop.cli.fleet_demo.children import Children
+from multidrop.cli.fleet.demo.children import Children
 
 NODES = ("n1", "n2", "n3")
 ATTEMPTS = 3  # another program may take a port that was free just now

@@ -1,0 +1,142 @@
+"""Commands to drives through a fleet: `multidrop fleet write`, `start`, `stop` and the other verbs."""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import getpass
+import json
+import os
+import socket
+import sys
+from collections.abc import Iterator
+from contextlib import AsyncExitStack, contextmanager, suppress
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from multidrop.cli.fleet.connection import add_server_arguments, run_action, state_folder, urls_of
+from multidrop.cli.support.confirm import confirm
+from multidrop.cli.support.nats import nats_options
+from multidrop.cli.support.output import print_text, warn
+
+if TYPE_CHECKING:
+    from multidrop.fleet.command_words import CommandAnswer
+    from multidrop.fleet.fleet_commands import FleetCommands
+
+_DIRECTIONS = ("forward", "reverse")
+_DIRECTED = ("start", "jog")
+_STOPPING = ("stop", "coast", "emergency-stop")  # these ask nobody
+_FURTHER = {"write": ("REGISTER", "VALUE"), "set-frequency": ("HZ",)}  # arguments behind the drive
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    action = parser.get_default("command")
+    if action == "stop":
+        parser.add_argument("drives", metavar="DRIVE", nargs="*", help="by its name in the plant")
+        parser.add_argument("--all", action="store_true", help="all drives of the plant, or of --line")
+        parser.add_argument("--line", help="the drives' line; then the plant is not looked up")
+    else:
+        parser.add_argument("drive", metavar="DRIVE", help="by its name in the plant")
+    for word in _FURTHER.get(action, ()):
+        parser.add_argument(word.lower(), metavar=word)
+    if action in _DIRECTED:
+        parser.add_argument("--direction", choices=_DIRECTIONS, help="as in force if not given")
+    if action not in _STOPPING:
+        parser.add_argument("--yes", action="store_true", help="do not ask; needed where no terminal is")
+    parser.add_argument("--by", metavar="NAME", help="whom the logs name; else USER@HOST")
+    parser.add_argument(
+        "--audit", metavar="FILE", type=Path, help="where this machine notes what was asked for"
+    )
+    add_server_arguments(parser)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    work = _stop if arguments.command == "stop" else _command
+    return run_action(partial(work, arguments))
+
+
+def _asker(arguments: argparse.Namespace) -> FleetCommands:
+    from multidrop.fleet.fleet_commands import FleetCommands
+
+    by = arguments.by or f"{_user()}@{socket.gethostname()}"
+    if not by.isprintable() or len(by) > 200:
+        raise ValueError(f"--by {by!r} is not 1 to 200 printable characters")
+    log, urls = arguments.audit or state_folder() / "commands.jsonl", urls_of(arguments)
+    return FleetCommands(urls, by=by, log=log, options=nats_options(arguments, urls))
+
+
+def _user() -> str:
+    with suppress(OSError, KeyError):  # an id without a name, as in a container
+        return getpass.getuser()
+    return str(os.getuid())
+
+
+def _what(arguments: argparse.Namespace) -> dict[str, Any]:
+    """Return what is wanted of the drive. Raises ValueError for a frequency that is none."""
+    action = arguments.command
+    if action == "write":
+        return {"register": arguments.register, "value": arguments.value}
+    options: dict[str, Any] = {}
+    if action == "set-frequency":
+        try:
+            options["hz"] = float(arguments.hz)
+        except ValueError:
+            raise ValueError(f"HZ = {arguments.hz} is no number; write 25") from None
+    elif getattr(arguments, "direction", None):
+        options["direction"] = arguments.direction
+    return {"verb": action.replace("-", "_"), "options": options}
+
+
+async def _command(arguments: argparse.Namespace) -> int:
+    """Ask what would be done, let a person agree, and have it done by a new offer: the first is too old."""
+    from multidrop.fleet.command_words import CommandAnswer
+
+    what, agreed = _what(arguments), ""
+    if arguments.command not in _STOPPING and not arguments.yes:
+        async with _asker(arguments) as asker:
+            preview = await asker.preview(asker.request(arguments.drive, **what))
+        if isinstance(preview, CommandAnswer):
+            return _show(arguments, preview)
+        agreed = preview.text
+        confirm(f"{agreed}; gateway {preview.gateway} is to do it?", arguments)
+    async with _asker(arguments) as asker:
+        request = asker.request(arguments.drive, **what)
+        with _annotating(request.words):
+            return _show(arguments, await asker.carry_out(request, agreed))
+
+
+async def _stop(arguments: argparse.Namespace) -> int:
+    drives = arguments.drives
+    from multidrop.fleet.errors import FleetError
+    from multidrop.fleet.fleet_commands import HARD_WIRED
+
+    if bool(drives) == arguments.all:
+        raise ValueError("stop takes either drives or --all: `multidrop fleet stop pump-1`")
+    async with AsyncExitStack() as stack:
+        try:
+            asker = await stack.enter_async_context(_asker(arguments))
+        except FleetError as failure:
+            raise FleetError(f"the stop was NOT sent: {failure}; {HARD_WIRED}") from None
+        with _annotating(f"the stop of {', '.join(drives) or 'all drives'}"):
+            return _show(arguments, await asker.stop(drives or None, line=arguments.line or ""))
+
+
+@contextmanager
+def _annotating(what: str) -> Iterator[None]:
+    """Say what an interruption leaves open: Ctrl-C cancels what waits for the answer."""
+    try:
+        yield
+    except asyncio.CancelledError:
+        warn(f"{what}: it is not known whether it was sent; look at the drive, and at the gateway's log")
+        raise
+
+
+def _show(arguments: argparse.Namespace, answer: CommandAnswer) -> int:
+    if arguments.json:
+        print_text(json.dumps(answer.as_json(), indent=2))
+    else:
+        gateway = f" ({answer.gateway})" if answer.gateway else ""
+        text = f"{answer.outcome.value}: {answer.text}{gateway}"
+        print_text(text, file=sys.stdout if answer.is_done else sys.stderr)
+    return 0 if answer.is_done else 1

@@ -1,0 +1,80 @@
+"""The servers of a fleet: their addresses, and the paths to them that an action has."""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import logging
+import os
+from collections.abc import Awaitable, Callable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from multidrop.cli.support.arguments import add_json_argument
+from multidrop.cli.support.extras import require_extra
+from multidrop.cli.support.nats import add_nats_arguments, nats_options
+from multidrop.cli.support.output import logging_to, warn
+
+if TYPE_CHECKING:
+    from multidrop.fleet.servers import ServerPath
+
+URLS = "nats://127.0.0.1:4222"
+
+
+def add_server_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add what every action takes that speaks with the servers."""
+    parser.add_argument(
+        "--nats", metavar="URLS", help=f"servers, with commas; else MULTIDROP_NATS, or {URLS}"
+    )
+    add_nats_arguments(parser)
+    add_json_argument(parser)
+
+
+def urls_of(arguments: argparse.Namespace) -> list[str]:
+    """Return the servers' addresses. Raises ValueError for what is none."""
+    text = arguments.nats or os.environ.get("MULTIDROP_NATS") or URLS
+    found = [url.strip() for url in text.split(",") if url.strip()]
+    for url in found:
+        if not url.startswith(("nats://", "tls://")):
+            raise ValueError(f"{url} is no address of a NATS server; write {URLS}")
+    return found
+
+
+def state_folder() -> Path:
+    """Return the folder of this user's gateways, and of the commands that were asked for."""
+    state = os.environ.get("XDG_STATE_HOME")
+    return (Path(state) if state else Path.home() / ".local" / "state") / "multidrop" / "fleet"
+
+
+def require_fleet() -> None:
+    """Raise ValueError where a library is missing that every action needs."""
+    for library in ("nats", "pyarrow"):
+        require_extra(library, "fleet", "fleet")
+
+
+def run_action(work: Callable[[], Awaitable[int]], level: int = logging.ERROR) -> int:
+    """Run an action in a loop of its own; what the fleet logs from this level on is printed."""
+    require_fleet()
+
+    async def live() -> int:
+        return await work()
+
+    with logging_to(warn, "multidrop.fleet", level):
+        return asyncio.run(live())
+
+
+def run_with_paths(arguments: argparse.Namespace, work: Callable[[list[ServerPath]], Awaitable[int]]) -> int:
+    """Run an action with three paths to the servers, which are closed afterwards."""
+
+    async def with_paths() -> int:
+        from multidrop.fleet.servers import paths_of
+
+        urls = urls_of(arguments)
+        paths = paths_of(urls, nats_options(arguments, urls))
+        try:
+            return await work(paths)
+        finally:
+            for path in paths:
+                await path.close()
+
+    return run_action(with_paths)

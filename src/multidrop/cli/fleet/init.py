@@ -1,0 +1,58 @@
+"""`multidrop fleet init`: what a fleet needs in its NATS servers, and its plant."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from multidrop.cli.fleet.connection import add_server_arguments, require_fleet, run_with_paths, urls_of
+from multidrop.cli.support.nats import nats_options
+from multidrop.cli.support.output import print_text, warn
+
+if TYPE_CHECKING:
+    from multidrop.fleet.buckets import Record
+    from multidrop.fleet.servers import ServerPath
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("plant", metavar="PLANT.toml", nargs="?", type=Path, help="the lines to be stored")
+    add_server_arguments(parser)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    require_fleet()
+    from multidrop.fleet.plant_store import read_plant
+
+    records = read_plant(arguments.plant)[1] if arguments.plant else None
+    return run_with_paths(arguments, partial(_init, arguments, records))
+
+
+async def _init(
+    arguments: argparse.Namespace, records: dict[str, Record] | None, paths: list[ServerPath]
+) -> int:
+    from multidrop.fleet import names
+    from multidrop.fleet.buckets import Bucket
+    from multidrop.fleet.plant_store import store
+    from multidrop.fleet.samples_stream import connect, create_stream
+    from multidrop.fleet.setup import set_up
+
+    made = await set_up(paths)
+    urls = urls_of(arguments)
+    client = await connect(urls, **nats_options(arguments, urls))
+    await create_stream(client, replicas=made["replicas"])
+    await client.close()
+    if records is not None:
+        made["lines"] = await store(Bucket(names.PLANT, lambda: paths[0]), records)
+    if arguments.json:
+        print_text(json.dumps(made, indent=2))
+        return 0
+    servers = ", ".join(f"{name} {version}" for name, version in made["servers"].items())
+    print_text(f"servers: {servers}; each bucket on {made['replicas']}")
+    if records is not None:
+        print_text("lines: " + ", ".join(f"{count} {word}" for word, count in made["lines"].items()))
+    if made["replicas"] < 3:
+        warn("fewer than three servers: when one of them dies, no line is polled until it is back")
+    return 0

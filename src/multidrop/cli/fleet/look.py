@@ -1,0 +1,60 @@
+"""`multidrop fleet status` and `lines`: a fleet as its records have it, and its gateways say."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+from multidrop.cli.fleet.connection import add_server_arguments, run_with_paths
+from multidrop.cli.support.fleet_tables import (
+    count_sentence,
+    free_lines,
+    gateway_table,
+    line_table,
+    move_table,
+    trouble_sentences,
+)
+from multidrop.cli.support.output import print_text
+
+if TYPE_CHECKING:
+    from multidrop.fleet.servers import ServerPath
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    add_server_arguments(parser)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    return run_with_paths(arguments, partial(_LOOKS[arguments.command], arguments))
+
+
+async def _seen(paths: list[ServerPath]) -> dict[str, Any]:
+    from multidrop.fleet.overview import FleetView
+    from multidrop.fleet.setup import open_all
+
+    await open_all(paths)
+    view = FleetView(next(one for one in paths if one.is_open))
+    await view.look()
+    return view.fleet()
+
+
+async def _status(arguments: argparse.Namespace, paths: list[ServerPath]) -> int:
+    found = await _seen(paths)
+    if arguments.json:
+        print_text(json.dumps(found, indent=2))
+        return 0
+    print_text("\n".join([*gateway_table(found), "", count_sentence(found), *trouble_sentences(found)]))
+    if found["moves"]:
+        print_text("\n".join(["", "last moves:", *move_table(found["moves"])]))
+    return 1 if free_lines(found) else 0
+
+
+async def _lines(arguments: argparse.Namespace, paths: list[ServerPath]) -> int:
+    lines = (await _seen(paths))["lines"]
+    print_text(json.dumps(lines, indent=2) if arguments.json else "\n".join(line_table(lines)))
+    return 0
+
+
+_LOOKS = {"status": _status, "lines": _lines}

@@ -1,0 +1,51 @@
+"""`multidrop fleet serve`: one gateway of a fleet."""
+
+from __future__ import annotations
+
+import argparse
+import logging
+from contextlib import AsyncExitStack
+from functools import partial
+from pathlib import Path
+
+from multidrop.cli.fleet.connection import add_server_arguments, run_action, state_folder, urls_of
+from multidrop.cli.support.nats import nats_options
+from multidrop.cli.support.output import print_text
+from multidrop.cli.support.signals import on_end_signals
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("gateway", metavar="NAME", help="its name, such as gw-1; each has one of its own")
+    parser.add_argument("--folder", metavar="DIR", type=Path, help="where it keeps its spool, logs and lock")
+    parser.add_argument("--keep", metavar="SIZE", default="10 GB", help="most that the spool takes: 10 GB")
+    parser.add_argument("--metrics", metavar="HOST:PORT", help="answer GET /metrics there")
+    add_server_arguments(parser)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    return run_action(partial(_serve, arguments), logging.INFO)
+
+
+async def _serve(arguments: argparse.Namespace) -> int:
+    from importlib.metadata import version
+
+    from multidrop.fleet.gateway import FleetGateway
+    from multidrop.fleet.gateway_metrics import families_of
+    from multidrop.fleet.metrics_port import listen, serving
+    from multidrop.recording.retention import parse_size
+
+    name = arguments.gateway
+    listener = listen(arguments.metrics) if arguments.metrics else None
+    folder = arguments.folder or state_folder() / name
+    urls = urls_of(arguments)
+    options = nats_options(arguments, urls)
+    gateway = FleetGateway(name, urls, folder, options=options, spool_bytes=parse_size(arguments.keep))
+    on_end_signals(gateway.end)
+    async with AsyncExitStack() as stack:
+        if listener:
+            release = version("multidrop")
+            await stack.enter_async_context(serving(listener, lambda: families_of(gateway.state(), release)))
+            host, port, *_ = listener.getsockname()
+            print_text(f"metrics http://{host}:{port}/metrics", flush=True)
+        await gateway.run(lambda: print_text(f"ready {name}", flush=True))
+    return 0
