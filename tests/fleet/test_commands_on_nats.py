@@ -30,7 +30,7 @@ from multidrop.fleet.setup import open_all  # noqa: E402
 pytestmark = [pytest.mark.slow, pytest.mark.long]
 
 DONE, NOT_SENT, UNKNOWN = CommandOutcome.DONE, CommandOutcome.NOT_SENT, CommandOutcome.UNKNOWN
-DESCRIPTION = {"line": {"drive": [{"name": "pump"}]}, "files": {}, "may": MAY}
+DESCRIPTION = {"line": {"name": LINE, "drive": [{"name": "pump"}]}, "files": {}, "may": MAY}
 PATIENCE_S = 30.0
 ATTEMPTS = 20
 
