@@ -33,9 +33,10 @@ settings.load_profile("any machine")
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
+@pytest.hookimpl(optionalhook=True)  # of xdist
 def pytest_xdist_auto_num_workers() -> int:
-    """Two for each processor and one: many tests wait for a line; 12 at most, for each collects all."""
-    return min(2 * len(os.sched_getaffinity(0)) + 1, 12)
+    """Three for each processor: many tests wait for a line; 12 at most, for each collects all."""
+    return min(3 * len(os.sched_getaffinity(0)), 12)
 
 
 @pytest.hookimpl(optionalhook=True)  # of xdist
@@ -74,12 +75,8 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     items[:] = [*dealt, *others]
 
 
-@pytest.fixture(scope="module", autouse=True)
-def _frozen() -> None:
-    """Spare every collection of garbage, and every child of a fork, what is kept to the end.
-
-    That is what pytest collected, and what the files before this one imported.
-    """
+def pytest_collection_finish() -> None:
+    """Spare every collection of garbage, and every child of a fork, all that pytest keeps to the end."""
     gc.collect()
     gc.freeze()
 
@@ -107,6 +104,14 @@ def _is_counted(item: pytest.Item) -> bool:
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--kills", type=int, default=5, help="how many clients test_crash.py kills")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _gathered() -> Iterator[None]:
+    """Gather a file's garbage in the file, and spare the next ones' collections what it imported."""
+    yield
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.fixture

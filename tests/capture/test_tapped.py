@@ -150,6 +150,7 @@ def mixed(tmp_path_factory: pytest.TempPathFactory) -> Mixed:
     return Mixed(drives, capture, *captured(capture, real_wires, drives, Counter(ok=100)))
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_a_capture_of_all_variants_says_what_was_recorded(mixed: Mixed) -> None:
     check(mixed.rows, mixed.decoded)

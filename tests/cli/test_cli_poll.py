@@ -69,6 +69,7 @@ def test_simulate_brings_the_faults_of_its_file(tmp_path: Path) -> None:
             bus.read(bus.attach(Toy, 1), Toy.output_current)
 
 
+@pytest.mark.long
 def test_poll_in_segments(plant: Path, tmp_path: Path) -> None:
     counted = 0
     words = ["--seconds", 1.6, "--out", tmp_path / "run.arrows", "--rotate", "1 s", "--json"]

@@ -98,10 +98,10 @@ CELL = LedgerCell("/dev/ttyUSB0", 1, "delixi-modbus", "frequency")
 ENTRANT = """
 import sys, time
 from multidrop.control.eeprom_ledger import LedgerCell, Ledger
-ledger = Ledger(sys.argv[1], budget=100)
+ledger = Ledger(sys.argv[1], budget=30)
 cell = LedgerCell("/dev/ttyUSB0", 1, "delixi-modbus", "frequency")
 entered = 0
-for at in range(80):
+for at in range(25):
     entered += not ledger.enter(cell, 1e9 + at, 0.0)
     time.sleep(0.003)
 print(entered)
@@ -112,9 +112,9 @@ def test_two_processes_share_one_budget(tmp_path: Path) -> None:
     path = tmp_path / "wear.sqlite"
     words = [sys.executable, "-c", ENTRANT, str(path)]
     both = [subprocess.Popen(words, stdout=subprocess.PIPE, text=True) for _ in range(2)]
-    assert sum(int(each.communicate()[0]) for each in both) == 100
+    assert sum(int(each.communicate()[0]) for each in both) == 30
     (wear,) = Ledger(path).wear(1e9 + 100)
-    assert (wear.cell, wear.writes) == (CELL, 100)
+    assert (wear.cell, wear.writes) == (CELL, 30)
 
 
 def test_a_ledger_remembers(tmp_path: Path) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, nullcontext
 from math import inf
 from typing import Any
 
@@ -10,8 +10,13 @@ import pytest
 from simulated_bus import SimulatedBus, one
 
 from multidrop.control.time_limit import written_before
+from multidrop.drive import Direction, Drive, Script, read, wait, write
+from multidrop.drive.declare import reading, setting
+from multidrop.drive.table import Kept
+from multidrop.drive.verbs import verb
 from multidrop.drives import InvtCHE
 from multidrop.errors import Expired, Overtaken
+from multidrop.sim import simulated
 
 
 @pytest.fixture
@@ -48,6 +53,39 @@ def test_what_is_held_up_after_the_call_is_not_sent(line: SimulatedBus, seconds:
         with pytest.raises(Expired):
             line.bus.drives[0].set_frequency(20)
     assert len(written(line)) == before
+
+
+class Slow(Drive):
+    """A drive that is looked at for long before it is started, and in between."""
+
+    model = "slow"
+    title = "SLOW 1"
+    speed = reading(0x10, "rpm")
+    ratio = setting(0x21, kept=Kept.RAM)
+    before = 0.0  # s
+    between = 0.0
+
+    @verb
+    def start(self, direction: Direction | None = None) -> Script[None]:
+        """Start the motor, in two steps."""
+        yield from read(self.speed)
+        yield from wait(self.before)
+        yield from write(self.ratio, 1)
+        yield from wait(self.between)
+        yield from write(self.ratio, 2)
+
+
+@pytest.mark.parametrize(("before", "between", "sent"), [(0.1, 0.1, 2), (0.1, 5.0, 2), (0.9, 0.1, 0)])
+def test_no_verb_begins_later_and_none_is_cut_off(
+    monkeypatch: pytest.MonkeyPatch, before: float, between: float, sent: int
+) -> None:
+    """A bus alone counts no time that a script waits by itself."""
+    line = SimulatedBus(monkeypatch, simulated(Slow(1)))
+    drive = line.bus.attach(Slow(1, confirmed=1))
+    drive.before, drive.between = before, between
+    with within(line, 0.8), nullcontext() if sent else pytest.raises(Expired):
+        drive.start()
+    assert len(written(line)) == sent
 
 
 def test_an_inner_limit_is_never_longer_and_ends_with_its_block(line: SimulatedBus) -> None:

@@ -32,6 +32,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.long]
 DONE, NOT_SENT, UNKNOWN = CommandOutcome.DONE, CommandOutcome.NOT_SENT, CommandOutcome.UNKNOWN
 DESCRIPTION = {"line": {"drive": [{"name": "pump"}]}, "files": {}, "may": MAY}
 PATIENCE_S = 30.0
+ATTEMPTS = 20
 
 
 class OnNats:
@@ -257,9 +258,12 @@ def drill(tmp_path_factory: pytest.TempPathFactory) -> Iterator[CommandDrill]:
 
 
 def test_the_command_line_writes_and_stops(drill: CommandDrill) -> None:
-    done = drill.run("write", "drive-0", "frequency", "49.99", "--yes", "--json", "--by", "anna")
+    for _ in range(ATTEMPTS):
+        done = drill.run("write", "drive-0", "frequency", "49.99", "--yes", "--json", "--by", "anna")
+        answer = json.loads(done.stdout)
+        if answer["outcome"] != "not sent":  # as it is where the machine is too busy for a second
+            break
     assert done.returncode == 0, done.stderr
-    answer = json.loads(done.stdout)
     assert (answer["outcome"], answer["held"]) == ("done", "49.99 Hz")
     assert drill.setpoints("drive-0") == {4999: 1}
     assert "asked" in (drill.folder / "state/multidrop/fleet/commands.jsonl").read_text()

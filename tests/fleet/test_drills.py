@@ -9,6 +9,7 @@ import signal
 from collections.abc import Iterator
 
 import pytest
+from fleet_cuts import CUTS, cut, drilled_in_network
 from fleet_drills import DEEDS, FleetDrill, drilled
 from peers import require_module
 
@@ -51,3 +52,18 @@ def test_no_deed_makes_two_masters(drill: FleetDrill, deed: str) -> None:
     drill.settle()
     drill.judge(lambda: DEEDS[deed](drill))
     assert drill.hall.overlaps() == 0
+
+
+@pytest.fixture(scope="module")
+def cut_drill(tmp_path_factory: pytest.TempPathFactory) -> Iterator[FleetDrill]:
+    require_module("nats")
+    require_module("pyarrow")
+    with drilled_in_network(tmp_path_factory.mktemp("cuts")) as found:
+        yield found
+
+
+@pytest.mark.parametrize("name", CUTS)
+def test_no_cut_makes_two_masters(cut_drill: FleetDrill, name: str) -> None:
+    cut_drill.settle()
+    cut_drill.judge(lambda: cut(cut_drill, name))
+    assert cut_drill.hall.overlaps() == 0

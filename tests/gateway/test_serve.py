@@ -130,6 +130,7 @@ def test_tls(tmp_path: Path) -> None:
         connection.close()
 
 
+@pytest.mark.long
 def test_a_port_that_is_taken_is_one_sentence(tmp_path: Path) -> None:
     with listen("127.0.0.1", 0) as taken:
         port = taken.getsockname()[1]

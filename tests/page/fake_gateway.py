@@ -43,6 +43,7 @@ class FakeGateway:
         self.posts: list[tuple[str, Any]] = []
         self.token: str | None = None  # POST wants it where it is set
         self.has_history = True
+        self.fleet: dict[str, Any] = {}  # keys of /api/fleet with other values
         self.reloaded: dict[str, Any] = {
             "done": True,
             "text": "plant.toml is in effect",
@@ -222,6 +223,13 @@ def lines(handler: Any, gateway: FakeGateway, _: object) -> None:
     handler.tell(told)
 
 
+def fleet(handler: Any, gateway: FakeGateway, _: object) -> None:
+    if not fake_plant.plant(gateway.renamed).get("fleet"):
+        handler.tell({"error": "no fleet is looked at; add [serve.fleet] to the plant file"}, 404)
+        return
+    handler.tell(fake_plant.fleet(gateway.began) | gateway.fleet)
+
+
 def history(handler: Any, gateway: FakeGateway, asked: dict[str, list[str]]) -> None:
     if not gateway.has_history:
         handler.tell({"error": "No history is kept: the plant file has no [serve.history]."}, 404)
@@ -278,5 +286,5 @@ def export(handler: Any, _: object, asked: dict[str, list[str]]) -> None:
 
 ANSWERS = {
     "/api/plant": plant, "/api/lines": lines, "/api/history": history, "/api/alarms": alarms,
-    "/api/audit": audit, "/api/export": export,
+    "/api/audit": audit, "/api/export": export, "/api/fleet": fleet,
 }  # fmt: skip

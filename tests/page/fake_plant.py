@@ -60,7 +60,7 @@ def plant(renamed: dict[str, str]) -> dict[str, Any]:
     ]  # fmt: skip
     return {
         "revision": 1, "version": "0.2", "name": "bottling plant.toml", "demo": False, "lines": lines,
-        "file": True, "mistakes": [],
+        "file": True, "mistakes": [], "fleet": True,
         "may": {
             "role": "write",
             "write": ["pump-1.frequency_setpoint"],
@@ -161,3 +161,29 @@ def lines() -> dict[str, Any]:
         }
         for n in range(3)
     }  # fmt: skip
+
+
+def fleet(began: float) -> dict[str, Any]:
+    """Return `GET /api/fleet`: three gateways, of which one has died just now, and twelve lines."""
+    at = int(began * 1000)
+    spool = {"bytes": 81_234_567, "lost": 0, "behind": 2, "lag_s": 1.4, "trouble": None}
+    says = {"state": "working", "margin_s": 2.14, "troubles": {}, "trouble": "", "spool": spool}
+    gateways = {
+        f"gw-{n}": {
+            "host": f"pc-hall-{n}", "session": 4 + n, "began_ms": at - 86_400_000 * n, "draining": False,
+            "lines": 4, "unseen_s": 0.3, "says": None if n == 2 else says,
+        }
+        for n in (1, 2, 3)
+    }  # fmt: skip
+    lines = {
+        f"hall-{n}": {
+            "port": f"socket://10.0.0.{n}:4001", "revision": n, "session": 5,
+            "master": f"gw-{n % 3 + 1}" if n > 1 else None, "since_ms": at - 60_000 * n if n > 1 else None,
+        }
+        for n in range(1, 13)
+    }  # fmt: skip
+    moves = [
+        {"line": f"hall-{n}", "revision": n, "at_ms": at - 60_000 * n, "from": before, "to": "gw-1"}
+        for n, before in ((3, "gw-2"), (6, ""), (9, None))
+    ]
+    return {"at_ms": at, "age_s": 0.2, "trouble": None, "gateways": gateways, "lines": lines, "moves": moves}

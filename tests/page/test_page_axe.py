@@ -18,6 +18,7 @@ VIEWS = (
     "#/faults",
     "#/lines",
     "#/log",
+    "#/fleet",
     "settings",
     "stop",
     "reload",
@@ -31,7 +32,7 @@ def axe() -> str:
     try:
         return (files("axe_playwright_python") / "axe.min.js").read_text("utf-8")
     except ImportError:
-        missing("pip install '.[test]' brings axe-core, which is not here")
+        missing("axe-playwright-python is not installed")
 
 
 def violations(page: Any) -> list[str]:

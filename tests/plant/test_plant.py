@@ -107,7 +107,7 @@ def mistakes(load: Load, tmp_path: Path) -> Mistakes:
     def mistakes(text: str) -> list[str]:
         with pytest.raises(PlantError) as refusal:
             load(text)
-        start = f"{tmp_path}/plant.toml: "
+        start = f"{tmp_path / 'plant.toml'}: "
         assert all(sentence.startswith(start) for sentence in refusal.value.mistakes)
         assert str(refusal.value) == "\n".join(refusal.value.mistakes)
         return [sentence.removeprefix(start) for sentence in refusal.value.mistakes]

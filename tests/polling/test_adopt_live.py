@@ -361,6 +361,7 @@ def test_a_summary_is_of_the_plant_before_or_after(both: TwoLines) -> None:
 # ---- for ever ----
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_a_hundred_adoptions_leave_nothing_behind(both: TwoLines) -> None:
     """With threads that read by hand, look at statistics and take batches; every value is its own."""

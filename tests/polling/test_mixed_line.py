@@ -72,6 +72,7 @@ def test_values_tell_all_registers_apart() -> None:
         assert max(raws.values()) == 1
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_all_variants_on_one_line_at_the_pace_of_a_real_one() -> None:
     drives = []

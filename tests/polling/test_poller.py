@@ -384,6 +384,20 @@ def test_a_port_that_vanishes_and_comes_back_under_its_link(tmp_path: Path) -> N
     polling.check_summary()
 
 
+def test_polling_goes_on_where_a_stop_has_opened_the_port_again(port: str) -> None:
+    """What was queued on the port that is gone is lost; the poller may never have seen that it was gone."""
+    with Polling(line(port, polled(drive(), ONE, 0.01))) as polling:
+        polling.until("ok", 3)
+        (hall,) = polling.poller._lines
+        with hall._lock:  # the poller's thread looks at the line before or after this
+            hall.bus.line.drop()
+            hall.bus.line.regain()
+        polling.until("port lost")
+        polling.until("ok", 100)  # more than was queued ahead
+    assert polling.statuses().keys() <= {"ok", "port lost"} | HOST_LATE
+    polling.check_summary()
+
+
 def test_a_line_that_is_lost_does_not_disturb_the_others(port: str, tmp_path: Path) -> None:
     link = tmp_path / "hall-2"
     lines = [

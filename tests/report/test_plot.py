@@ -470,6 +470,7 @@ def test_what_has_no_room_is_named(run: Run, tmp_path: Path) -> None:
     )
 
 
+@pytest.mark.usefixtures("_unpainted")
 def test_the_report_is_one_page_that_needs_nothing_else(look: Recording) -> None:
     page = report_page(look)
     assert page.startswith("<!DOCTYPE html>")

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import asyncio
 import json
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import AbstractContextManager, contextmanager
 from itertools import count
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 from fleets import HandClock
 
-from multidrop import YD1000, Bus
+from multidrop import YD1000, Bus, written_before
+from multidrop.fleet import command_desk
 from multidrop.fleet.command_desk import CommandDesk
 from multidrop.fleet.command_log import CommandLog, read_command_log
 from multidrop.fleet.command_words import CommandAnswer, CommandOutcome, Offered
@@ -21,6 +23,7 @@ from multidrop.fleet.stop_desk import StopDesk
 from multidrop.sim import SimulatedDrive, Simulator, Wire, simulated
 
 LINE = "hall-1"
+PATIENCE_S = 60.0
 MAY = {"write": ["pump.frequency"], "verbs": ["pump.start"]}
 _ids = count(1)
 
@@ -93,14 +96,24 @@ class Desks:
         return answer
 
 
+def _patiently(patience_s: float) -> AbstractContextManager[Any]:
+    """Give the library more of the machine's time, for it may be busy; the desk's clock is the test's."""
+
+    def patient(limit: Callable[[], float]) -> AbstractContextManager[None]:
+        return written_before(lambda: (until := limit()) and until + patience_s * 1e9)
+
+    return patch.object(command_desk, "written_before", patient)
+
+
 @contextmanager
-def desks(folder: Path, may: Mapping[str, Any] = MAY) -> Iterator[Desks]:
+def desks(folder: Path, may: Mapping[str, Any] = MAY, patience_s: float = PATIENCE_S) -> Iterator[Desks]:
     sim = simulated(YD1000(address=1, name="pump"))
     audit = folder / "audit.jsonl"
     with Simulator([Wire([sim], unpaced=True)]) as line, Bus(line.wires[0].path, audit=audit) as bus:
         bus.attach(YD1000(address=1, name="pump"))
         made = Desks(bus, sim, folder, may)
         try:
-            yield made
+            with _patiently(patience_s):
+                yield made
         finally:
             made.log.close()

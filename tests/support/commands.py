@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import resource
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -23,11 +22,17 @@ def multidrop(*words: object, most_bytes: int | None = None) -> subprocess.Compl
     """A command to its end; `most_bytes`: as if the disk had only so much room."""
 
     def limit() -> None:
-        if most_bytes is not None:
-            resource.setrlimit(resource.RLIMIT_FSIZE, (most_bytes, most_bytes))
+        import resource  # which Windows lacks
+
+        assert most_bytes is not None
+        resource.setrlimit(resource.RLIMIT_FSIZE, (most_bytes, most_bytes))
 
     done = subprocess.run(
-        [*MULTIDROP, *map(str, words)], capture_output=True, text=True, timeout=180, preexec_fn=limit
+        [*MULTIDROP, *map(str, words)],
+        capture_output=True,
+        text=True,
+        timeout=180,
+        preexec_fn=None if most_bytes is None else limit,
     )
     done.stderr = done.stderr.replace(TOY_IS_RUN, "", 1)
     return done

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import os
 import random
@@ -9,13 +10,20 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-from nats_clusters import Cluster, cluster
+from namespaces import Namespace
+from nats_clusters import Cluster, Node, cluster
 from serial_hall import SerialHall
+
+from multidrop.fleet import names
+from multidrop.fleet.buckets import ask
+from multidrop.fleet.errors import FleetError
+from multidrop.fleet.servers import ServerPath
 
 GATEWAYS = ("gw-a", "gw-b", "gw-c")
 PATIENCE_S = 60.0
@@ -25,9 +33,18 @@ JUDGED_S = 11.0  # an election comes up to 9 s after a death
 class FleetDrill:
     """A fleet of processes; each round does something to it, and tells what the lines saw."""
 
-    def __init__(self, folder: Path, nats: Cluster, lines: int = 12, seed: int = 1) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        nats: Cluster,
+        lines: int = 12,
+        seed: int = 1,
+        places: Mapping[str, Namespace] | None = None,
+        host: str = "127.0.0.1",
+    ) -> None:
         self.nats = nats
-        self.hall = SerialHall(lines)
+        self.hall = SerialHall(lines, host)
+        self.places = places or {}  # of gateways; the others run here
         self.random = random.Random(seed)
         self._folder = folder
         self._environment = {
@@ -53,9 +70,10 @@ class FleetDrill:
 
     def start(self, *names: str) -> None:
         for name in names:
+            prefix = self.places[name].prefix if name in self.places else []
             with (self._folder / f"{name}.log").open("a") as log:
                 self.gateways[name] = subprocess.Popen(
-                    [sys.executable, "-m", "multidrop", "fleet", "serve", name],
+                    [*prefix, sys.executable, "-m", "multidrop", "fleet", "serve", name],
                     env=self._environment,
                     stdout=subprocess.DEVNULL,
                     stderr=log,
@@ -86,7 +104,17 @@ class FleetDrill:
             )
 
         self.wait(is_shared, "each gateway has lines")
-        time.sleep(2.5)  # paths and leaders come home
+        self.wait(self.are_leaders_home, "each node leads one bucket of the leases")
+        time.sleep(2.5)  # paths come home
+
+    def are_leaders_home(self) -> bool:
+        """Say whether each node leads one bucket of each group: else one deed does what two would do."""
+        leads = [node.leads() for node in self.nats.nodes]
+        return all(
+            sum(f"KV_{bucket}" in found for bucket in group) == 1
+            for found in leads
+            for group in (names.LEASES, names.OWNERS)
+        )
 
     def wait(self, condition: Callable[[], bool], what: str) -> float:
         begun = time.monotonic()
@@ -104,6 +132,9 @@ class FleetDrill:
         return self.hall.gaps()
 
     # ---- deeds ----
+
+    def do_nothing(self) -> None:
+        """Show what this machine does to the gaps by itself."""
 
     def kill_gateway(self) -> None:
         self._kill(self.random.choice(GATEWAYS))
@@ -138,6 +169,29 @@ class FleetDrill:
         time.sleep(self.random.uniform(1, 6))
         node.go_on()
 
+    def leader_alone(self, group: Sequence[str], others: Sequence[str]) -> Node:
+        """Return a node that leads one of this group of buckets, and none of the others'."""
+        bucket = self.random.choice(group)
+        while True:
+            leads = {node.name: node.leads() for node in self.nats.nodes}
+            for node in self.nats.nodes:
+                if f"KV_{bucket}" in leads[node.name]:
+                    too_much = [other for other in others if f"KV_{other}" in leads[node.name]]
+                    if not too_much:
+                        return node
+                    elsewhere = self.random.choice([one for one in self.nats.nodes if one is not node])
+                    asyncio.run(_make_leader(elsewhere, too_much))
+            time.sleep(0.05)
+
+    def kill_leader(self, group: Sequence[str], others: Sequence[str]) -> None:
+        self.leader_alone(group, others).kill()
+
+    def stop_leader(self, group: Sequence[str], others: Sequence[str]) -> None:
+        node = self.leader_alone(group, others)
+        node.pause()
+        time.sleep(self.random.uniform(1, 6))
+        node.go_on()
+
     def kill_all_nodes(self) -> None:
         for node in self.nats.nodes:
             node.kill()
@@ -158,7 +212,17 @@ class FleetDrill:
         self.hall.close()
 
 
+async def _make_leader(node: Node, buckets: Sequence[str]) -> None:
+    path = ServerPath([node.url])
+    await path.open()
+    for bucket in buckets:
+        with suppress(FleetError):  # it is asked again
+            await ask(path, f"STREAM.LEADER.STEPDOWN.KV_{bucket}", {"placement": {"preferred": node.name}})
+    await path.close()
+
+
 DEEDS: dict[str, Callable[[FleetDrill], None]] = {
+    "nothing": FleetDrill.do_nothing,
     "gateway killed": FleetDrill.kill_gateway,
     "two gateways killed": FleetDrill.kill_two_gateways,
     "gateway and node killed": FleetDrill.kill_gateway_and_node,
@@ -166,6 +230,10 @@ DEEDS: dict[str, Callable[[FleetDrill], None]] = {
     "gateway stands still shortly": FleetDrill.stop_gateway_shortly,
     "node killed": FleetDrill.kill_node,
     "node stands still": FleetDrill.stop_node,
+    "lease leader killed": partial(FleetDrill.kill_leader, group=names.LEASES, others=names.OWNERS),
+    "lease leader stands still": partial(FleetDrill.stop_leader, group=names.LEASES, others=names.OWNERS),
+    "ownership leader killed": partial(FleetDrill.kill_leader, group=names.OWNERS, others=names.LEASES),
+    "ownership leader stands still": partial(FleetDrill.stop_leader, group=names.OWNERS, others=names.LEASES),
     "all nodes killed": FleetDrill.kill_all_nodes,
 }
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 import signal
@@ -9,11 +10,12 @@ import socket
 import subprocess
 import time
 import urllib.request
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager, suppress
 from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
 
+from namespaces import Namespace
 from peers import require_program
 
 PATIENCE_S = 60.0
@@ -64,30 +66,40 @@ def _version(program: str) -> tuple[int, int]:
 
 
 class Node:
-    """One server's process."""
+    """One server's process, on this machine or in a namespace."""
 
-    def __init__(self, program: str, folder: Path, name: str, ports: list[int], routes: list[int]) -> None:
+    def __init__(
+        self,
+        program: str,
+        folder: Path,
+        name: str,
+        ports: list[int],
+        routes: list[str],
+        place: Namespace | None = None,
+    ) -> None:
         self.name = name
+        self.place = place
+        self.host = place.address if place else "127.0.0.1"
         self.port, cluster, self.monitor = ports
-        self._command = [program, "-c", str(folder / f"{name}.conf")]
+        prefix = place.prefix if place else []
+        self._command = [*prefix, program, "-c", str(folder / f"{name}.conf")]
         self._log = folder / f"{name}.log"
         text = f"""
             server_name: {name}
-            listen: 127.0.0.1:{self.port}
-            http: 127.0.0.1:{self.monitor}
+            listen: {self.host}:{self.port}
+            http: {self.host}:{self.monitor}
             jetstream {{ store_dir: "{folder / name}", max_mem: 64M, max_file: 256M }}
         """
         if len(routes) > 1:
-            others = ", ".join(f"nats://127.0.0.1:{port}" for port in routes)
-            text += (
-                f"cluster {{ name: fleet-{routes[0]}, listen: 127.0.0.1:{cluster}, routes: [{others}] }}\n"
-            )
+            others = ", ".join(f"nats://{route}" for route in routes)
+            group = f"fleet-{routes[0].replace(':', '-')}"
+            text += f"cluster {{ name: {group}, listen: {self.host}:{cluster}, routes: [{others}] }}\n"
         (folder / f"{name}.conf").write_text(text)
         self.start()
 
     @property
     def url(self) -> str:
-        return f"nats://127.0.0.1:{self.port}"
+        return f"nats://{self.host}:{self.port}"
 
     def start(self) -> None:
         with self._log.open("ab") as log:
@@ -107,21 +119,42 @@ class Node:
         """Say whether its JetStream is ready, and in a cluster has a leader."""
         with (
             suppress(OSError),
-            closing(urllib.request.urlopen(f"http://127.0.0.1:{self.monitor}/healthz", timeout=2)) as answer,
+            closing(
+                urllib.request.urlopen(f"http://{self.host}:{self.monitor}/healthz", timeout=2)
+            ) as answer,
         ):
             return bool(answer.status == 200)
         return False
+
+    def leads(self) -> set[str]:
+        """Return the streams of which this one is the leader."""
+        url = f"http://{self.host}:{self.monitor}/jsz?streams=true&accounts=true"
+        with closing(urllib.request.urlopen(url, timeout=2)) as answer:
+            found = json.load(answer)
+        streams = [one for account in found["account_details"] for one in account.get("stream_detail") or ()]
+        return {one["name"] for one in streams if one.get("cluster", {}).get("leader") == self.name}
 
 
 class Cluster:
     """Servers that know each other."""
 
-    def __init__(self, folder: Path, number: int = 3, program: str | None = None) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        number: int = 3,
+        program: str | None = None,
+        places: Sequence[Namespace] = (),
+    ) -> None:
         found = program or server_program()
         ports = [free_ports(3) for _ in range(number)]
-        routes = [port[1] for port in ports]
+        at: list[Namespace | None] = [*places] if places else [None] * number
+        hosts = [place.address if place else "127.0.0.1" for place in at]
+        routes = [f"{host}:{three[1]}" for host, three in zip(hosts, ports, strict=True)]
         folder.mkdir(parents=True, exist_ok=True)
-        self.nodes = [Node(found, folder, f"n{at + 1}", ports[at], routes) for at in range(number)]
+        self.nodes = [
+            Node(found, folder, f"n{node + 1}", three, routes, place)
+            for node, (three, place) in enumerate(zip(ports, at, strict=True))
+        ]
 
     @property
     def urls(self) -> list[str]:
@@ -149,9 +182,11 @@ class Cluster:
 
 
 @contextmanager
-def cluster(folder: Path, number: int = 3, program: str | None = None) -> Iterator[Cluster]:
+def cluster(
+    folder: Path, number: int = 3, program: str | None = None, places: Sequence[Namespace] = ()
+) -> Iterator[Cluster]:
     for attempt in range(ATTEMPTS):  # another program may have taken a port that was free just now
-        running = Cluster(folder / str(attempt) if attempt else folder, number, program)
+        running = Cluster(folder / str(attempt) if attempt else folder, number, program, places)
         if running.is_ready_within(READY_S) or attempt == ATTEMPTS - 1:
             break
         running.close()

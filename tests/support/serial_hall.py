@@ -42,7 +42,7 @@ class LineSeen:
 class SerialHall:
     """Listens on a port for each line, and answers Modbus RTU reads of address 1 with zeros."""
 
-    def __init__(self, number: int, delay: float = 0.0) -> None:
+    def __init__(self, number: int, host: str = "127.0.0.1") -> None:
         self._selector = selectors.DefaultSelector()
         self.lines: dict[str, LineSeen] = {}
         self._buffers: dict[socket.socket, tuple[LineSeen, int, bytearray]] = {}
@@ -50,8 +50,9 @@ class SerialHall:
         self._count = 0
         self._lock = threading.Lock()
         self._is_over = False
+        self._host = host
         for at in range(number):
-            listener = socket.create_server(("127.0.0.1", 0))
+            listener = socket.create_server((host, 0))
             listener.setblocking(False)
             line = LineSeen(f"line-{at}", listener.getsockname()[1])
             self.lines[line.name] = line
@@ -63,7 +64,7 @@ class SerialHall:
     def plant(self, every: str = "100 ms") -> str:
         """Return a plant file with all lines."""
         return "\n".join(
-            f'[[line]]\nname = "{line.name}"\nport = "socket://127.0.0.1:{line.port}"\n'
+            f'[[line]]\nname = "{line.name}"\nport = "socket://{self._host}:{line.port}"\n'
             f'[[line.drive]]\nname = "drive-{line.name}"\nmodel = "innovert-ibd"\naddress = 1\n'
             f'poll = ["output_current"]\nevery = "{every}"\n'
             for line in self.lines.values()

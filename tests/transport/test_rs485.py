@@ -123,6 +123,7 @@ def test_rts_stands_for_sending_while_a_request_leaves_and_no_longer(
     assert events[-2].count == 49  # a broadcast: the port was closed at once, and waited for its last bit
 
 
+@pytest.mark.long
 def test_the_driver_s_own_mode_is_switched_on_as_it_was_set_up(driver: Path) -> None:
     for flags in (ON_SEND, AFTER_SEND):
         read, events = play(driver, "kernel", 3, RS485_FLAGS=flags)

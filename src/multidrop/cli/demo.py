@@ -32,7 +32,7 @@ def run(arguments: argparse.Namespace) -> int:
     _make_room(arguments.out)
     with TemporaryDirectory(prefix="multidrop-") as directory:
         path = Path(directory) / "demo.toml"
-        path.write_text(plant_file(demo_port(Path(directory)), POLLED))
+        path.write_text(plant_file(demo_port(Path(directory)), POLLED), "utf-8")
         with simulator(path, Path(directory)):
             plant = load_plant(path)
             start_motors(plant.lines[0], Path(directory) / "wear.sqlite")

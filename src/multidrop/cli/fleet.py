@@ -199,12 +199,10 @@ async def _drain(arguments: argparse.Namespace) -> int:
 async def _seen(paths: list[ServerPath]) -> dict[str, Any]:
     """Return gateways, lines and moves as the records have them, and what the gateways say themselves."""
     from multidrop.fleet.overview import FleetView
-    from multidrop.fleet.setup import check_buckets, open_all
+    from multidrop.fleet.setup import open_all
 
     await open_all(paths)
-    path = next(one for one in paths if one.is_open)
-    await check_buckets(path)
-    view = FleetView(path)
+    view = FleetView(next(one for one in paths if one.is_open))
     await view.look()
     return view.fleet()
 

@@ -15,8 +15,8 @@ from multidrop.cli.support.output import print_text
 from multidrop.cli.support.signals import on_end_signals
 
 if TYPE_CHECKING:
-    from multidrop.fleet.overview import FleetView
     from multidrop.fleet.servers import ServerPath
+    from multidrop.fleet.watching import FleetWatch
 
 EVERY_S = 1.0
 
@@ -24,7 +24,8 @@ EVERY_S = 1.0
 async def watch(paths: list[ServerPath], *, is_json: bool) -> int:
     """Show the fleet until Ctrl-C; servers that are away meanwhile are told with the age of what is shown."""
     from multidrop.fleet.overview import FleetView
-    from multidrop.fleet.setup import check_buckets, open_all
+    from multidrop.fleet.setup import open_all
+    from multidrop.fleet.watching import FleetWatch
 
     if not is_json:
         require_extra("rich", "monitor", "fleet watch")
@@ -32,35 +33,28 @@ async def watch(paths: list[ServerPath], *, is_json: bool) -> int:
             raise ValueError("`multidrop fleet watch` needs a terminal; with --json it works without one")
     await open_all(paths)
     path = next(one for one in paths if one.is_open)
-    await check_buckets(path)
+    view = FleetView(path)
+    await view.check()
     over = asyncio.Event()
     on_end_signals(over.set)
     keeping = asyncio.create_task(path.keep())
     try:
         with _lines() if is_json else drawing() as show:
-            await follow(FleetView(path), show, over)
+            await follow(FleetWatch(view), show, over)
     finally:
         keeping.cancel()
         await asyncio.gather(keeping, return_exceptions=True)
     return 0
 
 
-async def follow(view: FleetView, show: Callable[[dict[str, Any]], object], over: asyncio.Event) -> None:
+async def follow(watch: FleetWatch, show: Callable[[dict[str, Any]], object], over: asyncio.Event) -> None:
     """Look once a second, and show what was found with its age, until it is over."""
-    looked_s: float | None = None
     while not over.is_set():
         begun = time.monotonic()
-        trouble = None
-        try:
-            await view.look()
-            looked_s = time.monotonic()
-        except OSError as failure:
-            trouble = str(failure)
-        now = time.monotonic()
-        age = None if looked_s is None else round(now - looked_s, 3)
-        show({"at_ms": time.time_ns() // 1_000_000, "age_s": age, "trouble": trouble, **view.fleet()})
+        await watch.look()
+        show(watch.told())
         with suppress(TimeoutError):
-            await asyncio.wait_for(over.wait(), max(0.0, begun + EVERY_S - now))
+            await asyncio.wait_for(over.wait(), max(0.0, begun + EVERY_S - time.monotonic()))
 
 
 @contextmanager

@@ -79,7 +79,7 @@ def serve_demo(*, is_shown: bool = True, log: str = "text") -> int:
     with TemporaryDirectory(prefix="multidrop-") as directory:
         folder = Path(directory)
         path = folder / "demo.toml"
-        path.write_text(plant_file(demo_port(folder), _demo_registers()))
+        path.write_text(plant_file(demo_port(folder), _demo_registers()), "utf-8")
         with simulator(path, folder), _logging(log, logging.WARNING):
             plant = load_plant(path)
             start_motors(plant.lines[0], folder / "wear.sqlite")

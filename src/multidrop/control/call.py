@@ -24,7 +24,7 @@ class Call:
     Nothing of it is written once a stop was called, nor when it is late by more than `expiry` seconds.
     It is late by all the time since it began that its own steps do not account for: what a read takes at
     most by the drive's document, and the waits of its script. So a process that was held up sends nothing.
-    `limit_ns`, a time of CLOCK_MONOTONIC, may leave it less than `expiry`.
+    Its first write is not sent after `limit_ns` either, a time of CLOCK_MONOTONIC.
     """
 
     def __init__(
@@ -36,17 +36,19 @@ class Call:
         self.sent = ""  # the latest write that may have left
         self.is_confirmed = False  # that one
         self.unverified: Outcome | None = None  # of that one, if nothing was read of the drive after it
+        self.expiry = expiry
         self._due_ns = clock.now_ns()
-        self.expiry = max(0.0, min(expiry, (limit_ns - self._due_ns) / 1e9))
+        self._limit_ns = limit_ns
 
     def anew(self) -> Call:
         """Return the same as if it was called now; stops called since the first one end it all the same."""
-        return Call(self.drive, self.permit, self.expiry, self.verb)
+        return Call(self.drive, self.permit, self.expiry, self.verb, self._limit_ns)
 
     @property
     def expires_ns(self) -> int:
         """The time of CLOCK_MONOTONIC after which nothing is sent; its drive may be given a rest before."""
-        return self._due_ns + round((self.expiry + self.drive.least_interval) * 1e9)
+        expires_ns = self._due_ns + round((self.expiry + self.drive.least_interval) * 1e9)
+        return expires_ns if self.sent else int(min(expires_ns, self._limit_ns))
 
     @contextmanager
     def step(self, seconds: float) -> Iterator[None]:
@@ -64,9 +66,11 @@ class Call:
         return self.step(drive.least_interval + drive.response_timeout + wire)
 
     def check(self, what: str) -> None:
-        """Raise Overtaken once a stop was called."""
+        """Raise Overtaken once a stop was called, and Expired where the limit of its caller is over."""
         if not self.permit.is_good:
             raise self.overtaken(what)
+        if not self.sent and clock.now_ns() >= self._limit_ns:
+            raise Expired(self.drive.name, what, self.expiry)
 
     def overtaken(self, what: str) -> Overtaken:
         return Overtaken(self.drive.name, what, self.permit.latch.why)

@@ -19,7 +19,6 @@ from multidrop.drive.script import Insist, Read, Script, Step, Wait, Write, carr
 from multidrop.errors import (
     BadReply,
     DriveRefused,
-    Expired,
     LineError,
     NoReply,
     NotAttached,
@@ -54,15 +53,9 @@ class Performer:
         self._expiry = expiry
 
     def call(self, drive: Drive, verb: str = "") -> Call:
-        """Begin a call: all that it writes has the permit and the time of this moment.
-
-        Raises Expired where the time limit that it is called within is over.
-        """
+        """Begin a call: all that it writes has the permit and the time of this moment."""
         permit = self._latches.latch(drive).permit()
-        call = Call(drive, permit, self._expiry, verb, time_limit.present_limit_ns())
-        if not call.expiry:
-            raise Expired(drive.name, f"the {verb}" if verb else "a write", call.expiry)
-        return call
+        return Call(drive, permit, self._expiry, verb, time_limit.present_limit_ns())
 
     def move(self, script: Script[Any], call: Call) -> Any:
         """Carry out a verb that may move the motor: a stop ends it at whatever step it is.

@@ -24,14 +24,14 @@ def present_limit_ns() -> float:
 
 @contextmanager
 def written_before(limit: Limit) -> Iterator[None]:
-    """Write nothing of what is called within the block after the time that `limit` returns.
+    """Begin to write nothing of what is called within the block after the time that `limit` returns.
 
     That is a time of CLOCK_MONOTONIC in ns, as `time.monotonic_ns()` has it; 0 is always past. It is asked
     for as each call begins, when a stop that is called from then on ends that call: so whoever notes a stop,
-    and lets `limit` return 0 since, misses none. What is late is not sent, and raises Expired. Time that its
-    own reads and waits may take is not counted, as for a bus's own `expiry`; the earlier one counts. Stops
-    are sent whenever it is. It holds for this thread and what it calls, or this task of asyncio and
-    `asyncio.to_thread`. Raises TypeError for what is no function.
+    and lets `limit` return 0 since, misses none. A call whose first write would leave later than that sends
+    nothing, and raises Expired; the further writes of a verb have the bus's own `expiry`, and are not cut
+    off. Stops are sent whenever it is. The block is that of this thread and what it calls, or of this task of
+    asyncio and `asyncio.to_thread`. Raises TypeError for what is no function.
     """
     if not callable(limit):
         raise TypeError(f"limit = {limit!r} is no function that returns a time of CLOCK_MONOTONIC in ns")

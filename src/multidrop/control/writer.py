@@ -155,9 +155,10 @@ class Writer:
     ) -> Completion:
         if call is None:
             return self._exchanges.carry_out(drive, request, insists=True, timeout=timeout)
+        expires_ns = call.expires_ns
         before, call.sent, call.is_confirmed = (call.sent, call.is_confirmed), what, False
         try:
-            completion = self._exchanges.carry_out(drive, request, call.expires_ns, permit=call.permit)
+            completion = self._exchanges.carry_out(drive, request, expires_ns, permit=call.permit)
         except NotMaster as failure:
             if not failure.is_sent:
                 call.sent, call.is_confirmed = before

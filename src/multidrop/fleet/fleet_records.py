@@ -35,23 +35,27 @@ class FleetRecords:
             for bucket in names.OWNERS
         }
         self.plant = Follower(Bucket(names.PLANT, path))
-        self.lines: tuple[str, ...] = ()  # of the plant, by name
+        self._lines: tuple[str, ...] = ()
         self._on_change = on_change
         self._read: set[str] = set()  # buckets that were read at least once
+        self._is_complete = asyncio.Event()
         self._looks: dict[str, Callable[[], Awaitable[Any]]] = {
             names.PLANT: self._look_at_plant,
             **{name: partial(self.observer.look, at) for at, name in enumerate(names.LEASES)},
             **{name: follower.look for name, follower in self.owners.items()},
         }
 
-    @property
-    def are_complete(self) -> bool:
-        """Say whether each bucket was read once."""
-        return len(self._read) == len(names.BUCKETS)
+    async def complete(self) -> None:
+        """Wait until each bucket was read once."""
+        await self._is_complete.wait()
 
     def owner(self, line: str) -> Record | None:
         """Return the record of a line's master."""
         return self.owners[names.owner_bucket(line)].records.get(line)
+
+    def lines(self) -> tuple[str, ...]:
+        """Return the lines of the plant, by name; the same tuple while none came or went."""
+        return self._lines
 
     def is_in_plant(self, line: str) -> bool:
         record = self.plant.records.get(line)
@@ -88,11 +92,13 @@ class FleetRecords:
         if await self._looks[name]() or name not in self._read:
             self._on_change()
         self._read.add(name)
+        if len(self._read) == len(names.BUCKETS):
+            self._is_complete.set()
 
     async def _look_at_plant(self) -> bool:
         changed = await self.plant.look()
         if changed:
-            self.lines = tuple(sorted(filter(self.is_in_plant, self.plant.records)))
+            self._lines = tuple(sorted(filter(self.is_in_plant, self.plant.records)))
         return bool(changed)
 
     def _note_move(self, bucket: str, before: Record | None, record: Record) -> None:

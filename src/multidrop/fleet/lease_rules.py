@@ -24,7 +24,7 @@ RENEW_S = 0.5  # between renewals of a path
 class Terms(NamedTuple):
     """The terms of a lease; all of a fleet's gateways have the same. Times in ns."""
 
-    lease: int = 2_500_000_000
+    lease: int = 2_300_000_000
     guard: int = 700_000_000  # from the end of a session to the first request of the next master
     needed: int = 2  # paths that the holder must have renewed
     ended: int = 2  # paths that a taker must have ended

@@ -161,6 +161,7 @@ class Member:
     async def _live(self) -> None:
         while True:
             if not self.lease.session:
+                await self.records.complete()  # of a large plant this takes seconds, in which no lease runs
                 await self.lease.begin()
                 self._settled_at = self.lease.clock() + int(SETTLE_S * SECOND)
                 self._is_dirty = True
@@ -209,7 +210,7 @@ class Member:
         now = (self._is_settled, self.keeper.may_poll)
         if self._is_dirty or now != self._stepped:
             self._is_dirty, self._stepped = False, now
-            if self.lease.is_valid and self.records.are_complete:
+            if self.lease.is_valid:
                 self._claim_and_release()
             self.keeper.reconcile()
 
@@ -221,7 +222,7 @@ class Member:
         )
         if not self.is_draining and self.lease.session:
             gateways = tuple(sorted((*gateways, self.name)))
-        lines = self.records.lines
+        lines = self.records.lines()
         if (gateways, lines) == self._balanced:
             return
         loop = asyncio.get_running_loop()

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import Container, Mapping
 from contextlib import suppress
 from types import NoneType
 from typing import Any
@@ -15,18 +16,13 @@ from multidrop.fleet.moves import move_of
 from multidrop.fleet.observer import BELIEVING
 from multidrop.fleet.ownership import owner_of
 from multidrop.fleet.servers import ServerPath
+from multidrop.fleet.setup import check_buckets
 
 MOVES_SHOWN = 20
-_SHOWN: Mapping[tuple[str, ...], tuple[type, ...]] = {
-    ("state",): (str,),
-    ("margin_s",): (int, float),
-    ("troubles",): (dict,),
-    ("trouble",): (str,),
-    ("spool", "bytes"): (int,),
-    ("spool", "lost"): (int,),
-    ("spool", "behind"): (int, NoneType),
-    ("spool", "lag_s"): (int, float, NoneType),
-    ("spool", "trouble"): (str, NoneType),
+_MAY_BE_NONE: Mapping[str, tuple[type, ...]] = {  # of the spool in a gateway's answer
+    "behind": (int, NoneType),
+    "lag_s": (int, float, NoneType),
+    "trouble": (str, NoneType),
 }
 
 
@@ -37,9 +33,19 @@ class FleetView:
         self._path = path
         self._records = FleetRecords("", lambda: path, BELIEVING, lambda: None)
         self._says: dict[str, dict[str, Any] | None] = {}
+        self._is_checked = False
+
+    async def check(self) -> None:
+        """Raise FleetError where there is no fleet in these servers, or no quorum."""
+        await check_buckets(self._path)
+        self._is_checked = True
 
     async def look(self) -> None:
         """Read the records and ask the gateways. Raises FleetError where no server gives the records."""
+        if not self._path.is_open:
+            raise FleetError(f"no NATS server is reached at {', '.join(self._path.urls)}")
+        if not self._is_checked:
+            await self.check()
         await self._records.look()
         present = list(self._records.observer.sessions())
         said = await asyncio.gather(*map(self._ask, present))
@@ -51,9 +57,9 @@ class FleetView:
     async def _ask(self, gateway: str) -> dict[str, Any] | None:
         try:
             state = await ask_gateway(self._path, gateway, "state")
-        except (FleetError, ValueError):
+        except FleetError:
             return None
-        return state if is_state(state) else None
+        return state if is_shown(state) else None
 
     def fleet(self) -> dict[str, Any]:
         """Return gateways with a session that nobody ended, lines with their masters, and the last moves.
@@ -61,14 +67,16 @@ class FleetView:
         A gateway that died a moment ago is still there, until another one has ended its session; `says` is
         None where it does not answer, and `unseen_s` tells for how long (s) this view saw no renewal.
         """
-        lines, sessions = self._lines(), self._records.observer.sessions()
+        sessions = self._records.observer.sessions()
+        lines = self._lines(sessions)
+        masters = Counter(line["master"] for line in lines.values())
         gateways = {
             name: {
                 "host": value["host"],
                 "session": value["session"],
                 "began_ms": value["began"],
                 "draining": value["draining"],
-                "lines": sum(line["master"] == name for line in lines.values()),
+                "lines": masters[name],
                 "unseen_s": round(self._records.observer.unseen_s(name), 3),
                 "says": self._says.get(name),
             }
@@ -77,33 +85,29 @@ class FleetView:
         moves = [move.as_json() for move in self._records.moves.newest(MOVES_SHOWN)]
         return {"gateways": gateways, "lines": lines, "moves": moves}
 
-    def _lines(self) -> dict[str, Any]:
+    def _lines(self, sessions: Container[str]) -> dict[str, Any]:
         observer, plant = self._records.observer, self._records.plant.records
-        sessions = observer.sessions()
+        held: dict[tuple[str, int], bool] = {}  # by owner: there are thousands of lines
         found: dict[str, Any] = {}
-        for name in self._records.lines:
+        for name in self._records.lines():
             record = self._records.owner(name)
-            gateway, session = owner_of(record)
-            is_held = gateway in sessions and not observer.is_over(gateway, session)
+            owner = owner_of(record)
+            if owner not in held:
+                held[owner] = owner[0] in sessions and not observer.is_over(*owner)
+            gateway, session = owner if held[owner] else (None, None)
             found[name] = {
                 "port": plant[name].value["line"].get("port", ""),
                 "revision": plant[name].revision,
-                "master": gateway if is_held else None,
-                "session": session if is_held else None,
-                "since_ms": record.value["since"] if record and record.value and is_held else None,
+                "master": gateway,
+                "session": session,
+                "since_ms": record.value["since"] if record and record.value and gateway else None,
             }
         return found
 
 
-def is_state(told: Any) -> bool:
-    """Say whether an answer has all that is shown of a gateway: another version may give something else."""
-    try:
-        return all(isinstance(_found(told, keys), kinds) for keys, kinds in _SHOWN.items())
-    except (KeyError, TypeError):
-        return False
-
-
-def _found(told: Any, keys: tuple[str, ...]) -> Any:
-    for key in keys:
-        told = told[key]
-    return told
+def is_shown(state: Mapping[str, Any]) -> bool:
+    """Say whether a gateway's answer has the rest that is shown of it: another version may lack some."""
+    spool = state["spool"]
+    return isinstance(state.get("trouble"), str) and all(
+        name in spool and isinstance(spool[name], kinds) for name, kinds in _MAY_BE_NONE.items()
+    )

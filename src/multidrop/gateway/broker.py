@@ -111,6 +111,8 @@ class Broker:
         self._loop = None
         self._client.disconnect()
         await asyncio.get_running_loop().run_in_executor(None, self._client.loop_stop)
+        self.is_connected = False
+        self._client = None  # with it go the sockets by which paho wakes its thread
 
     @property
     def trouble(self) -> str:

@@ -25,6 +25,7 @@ def describe(
     is_demo: bool,
     has_file: bool = False,
     mistakes: Sequence[str] = (),
+    has_fleet: bool = False,
 ) -> dict[str, Any]:
     """Return what GET /api/plant answers to a caller with this right."""
     is_writer = right is Right.WRITE
@@ -34,6 +35,7 @@ def describe(
         "name": plant.path.name,
         "demo": is_demo,
         "file": has_file,  # that can be read again
+        "fleet": has_fleet,  # that /api/fleet tells of
         "mistakes": list(mistakes),  # of the file, where the newest reload was refused
         "may": {
             "role": None if right is None else right.name.lower(),

@@ -16,7 +16,7 @@ from multidrop.gateway.hub import Hub
 
 
 class Part(NamedTuple):
-    """A module of the gateway, with the names in it."""
+    """A module, with the names in it: of the gateway, or of another client of the library."""
 
     module: str
     settings: str  # a frozen dataclass: the keys of its table, with their defaults
@@ -25,6 +25,7 @@ class Part(NamedTuple):
 
 
 PARTS: Mapping[str, Part] = {
+    "fleet": Part("multidrop.fleet.page_part", "FleetSettings", "build", "fleet"),
     "history": Part("multidrop.gateway.historian", "HistorySettings", "build", "history"),
     "modbus": Part("multidrop.gateway.passing", "ModbusSettings", "build", ""),
     "mqtt": Part("multidrop.gateway.mqtt", "MqttSettings", "build", "mqtt"),

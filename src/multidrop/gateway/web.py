@@ -60,6 +60,7 @@ def make_app(gateway: Gateway) -> ASGIApp:
         Route("/api/frame", pages.frame),
         Route("/api/drive/{name:path}", pages.drive),
         Route("/api/lines", pages.lines),
+        Route("/api/fleet", pages.fleet),
         Route("/api/history", pages.history),
         Route("/api/export", pages.export),
         Route("/api/audit", pages.audit),
@@ -135,6 +136,7 @@ class _Pages:
             is_demo=gateway.settings.is_demo,
             has_file=gateway.reload.has_file,
             mistakes=gateway.reload.mistakes,
+            has_fleet="fleet" in gateway.feeds,
         )
         return JSONResponse(described)
 
@@ -159,6 +161,12 @@ class _Pages:
 
     async def lines(self, request: Request) -> Response:
         return JSONResponse(look_at_lines(self._gateway))
+
+    async def fleet(self, request: Request) -> Response:
+        part: Any = self._gateway.feeds.get("fleet")
+        if part is None:
+            return _error(404, "no fleet is looked at; add [serve.fleet] to the plant file")
+        return JSONResponse(part.told())
 
     async def health(self, request: Request) -> Response:
         health = health_of(self._gateway)

@@ -166,7 +166,8 @@ class PolledLine:
             if port is None:
                 self._stand_by(now_ns)
                 return
-            if port is not self._queue.port:
+            if port is not self._queue.port:  # a stop may have opened it again before the loss was seen here
+                self._miss(self._queue.clear(now_ns), Status.LINE_LOST)
                 self._queue.move_to(port)
                 port.report_to(self._row_queue, self.number)
             self._queue.conclude(port)

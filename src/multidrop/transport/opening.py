@@ -30,7 +30,10 @@ _REASONS = {
 
 # pyserial keeps an error of Windows in its text alone: could not open port 'COM5': PermissionError(13, ...)
 _WINDOWS_ERROR = re.compile(r"Error\((\d+), ")
-_WINDOWS_REASONS = {errno.EACCES: _REASONS[errno.EBUSY]}  # a COM port is had by one program, whoever asks
+_WINDOWS_REASONS = {
+    errno.EACCES: _REASONS[errno.EBUSY],  # a COM port is had by one program, whoever asks
+    errno.EBADF: _REASONS[errno.ENOTTY],
+}
 
 
 def reason_of(failure: BaseException) -> str:

@@ -6,8 +6,11 @@ import array
 import errno
 import struct
 import sys
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
+
+from multidrop.transport.port_identity import of_name
 
 SYSFS = Path("/sys")
 
@@ -55,6 +58,15 @@ def find_adapter(device: str, sysfs: Path = SYSFS) -> Adapter:
         int(_text(timer)) if _text(timer).isdigit() else None,
         timer if timer.exists() else None,
     )
+
+
+def com_description(port: str) -> str:
+    """Return what Windows calls the adapter of a COM port, "" where it lists none."""
+    with suppress(ImportError, AttributeError, OSError):  # Wine has not all that is asked here
+        from serial.tools.list_ports import comports
+
+        return next((found.description for found in comports() if of_name(found.device) == of_name(port)), "")
+    return ""
 
 
 def _usb_device(tty: Path) -> Path | None:

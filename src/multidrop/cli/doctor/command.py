@@ -5,13 +5,14 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import sys
 import time
 from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
 
 from multidrop.bus import Bus
-from multidrop.cli.doctor.adapter import find_adapter, low_latency, rs485_mode
+from multidrop.cli.doctor.adapter import com_description, find_adapter, low_latency, rs485_mode
 from multidrop.cli.doctor.findings import (
     ROUNDS,
     Finding,
@@ -60,6 +61,7 @@ from multidrop.transport.prepared import make_exchange
 MOST_S = 5.0  # that the rounds take, where the drive is slow or silent
 LOOK_S = 0.05  # between attempts to send a request that was held back
 NOBODY = 247  # the address of the request that looks for an echo
+SETTING_UP_COM = "while it has the port, multidrop makes it raw, and sets each drive's baud rate and format"
 SETTING_UP = (
     "while it has the port, multidrop locks it against programs that heed such locks, makes it raw, sets "
     "each drive's baud rate and format, reads them back, and asks the driver for low latency"
@@ -174,13 +176,26 @@ def _remote(port: str) -> Iterator[Finding]:
 def _local(port: str, rs485: RS485) -> Iterator[Finding]:
     line = Line(port, rs485=rs485)  # raises LineError, with the reason, when it cannot be opened
     try:
-        yield from _opened(port, str(Path(port).resolve()), rs485)
+        yield from _opened_com(port) if sys.platform == "win32" else _opened(port, rs485)
     finally:
         line.close()
 
 
-def _opened(port: str, device: str, rs485: RS485) -> Iterator[Finding]:
+def _opened_com(port: str) -> Iterator[Finding]:
+    """Say of a COM port that multidrop has open what Windows tells of it."""
+    yield Finding("port", f"{port} is a serial port")
+    yield Finding("set here", SETTING_UP_COM)
+    yield Finding("adapter", com_description(port) or "the system lists none for it")
+    yield Finding(
+        "latency timer",
+        "it cannot be read here: an FTDI adapter may hold every reply back for 16 ms",
+        "set it to 1 ms in the device manager: Ports, the port's properties, Port Settings, Advanced",
+    )
+
+
+def _opened(port: str, rs485: RS485) -> Iterator[Finding]:
     """Examine a port that multidrop has open."""
+    device = str(Path(port).resolve())
     link = f", which is {device}" if device != port else ""
     if is_pseudo_terminal(device):
         yield Finding("port", f"{port} is a pseudo-terminal{link}: a program is at its other end")

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from multidrop.cli.fleet_demo.children import Children, await_line
 from multidrop.cli.fleet_demo.judgement import Judgement, Kill, judge
@@ -18,11 +18,9 @@ from multidrop.cli.fleet_demo.nats_nodes import server_program, start_nodes
 from multidrop.cli.fleet_demo.numbered_lines import DRIVES, drive_name, plant_file
 from multidrop.cli.fleet_demo.vanishing_folder import vanishing_folder
 from multidrop.cli.fleet_watch import drawing, follow
+from multidrop.cli.support.nats import CA, CREDENTIALS
 from multidrop.cli.support.output import print_text
 from multidrop.cli.support.signals import on_end_signals
-
-if TYPE_CHECKING:
-    from multidrop.fleet.servers import ServerPath
 
 GATEWAYS = ("gw-1", "gw-2", "gw-3")
 KILLED = "gw-2"
@@ -80,7 +78,8 @@ def run_demo() -> int:
     program = server_program(OLDEST)
     stage = Stage()
     with vanishing_folder() as folder, ExitStack() as stack:
-        children = Children(folder, {"XDG_STATE_HOME": str(folder / "state"), "MULTIDROP_NATS": ""})
+        none = dict.fromkeys((CREDENTIALS, CA), "")  # of a fleet that the user may have
+        children = Children(folder, {"XDG_STATE_HOME": str(folder / "state"), **none})
         stack.callback(children.close)
         demo = Demo(folder, children, stage)
         demo.begin(program)
@@ -154,11 +153,12 @@ class Demo:
     async def _watch(self, over: asyncio.Event) -> None:
         from multidrop.fleet.overview import FleetView
         from multidrop.fleet.servers import ServerPath
+        from multidrop.fleet.watching import FleetWatch
 
-        path: ServerPath = ServerPath(self._urls.split(","))
+        path = ServerPath(self._urls.split(","))
         try:
             await path.open()
-            await follow(FleetView(path), self._stage.show, over)
+            await follow(FleetWatch(FleetView(path)), self._stage.show, over)
         finally:
             await path.close()
 

@@ -7,6 +7,7 @@ import * as clock from "./clock.js";
 import { find } from "./dom.js";
 import * as drive from "./drive.js";
 import * as faults from "./faults.js";
+import * as fleet from "./fleet.js";
 import * as lines from "./lines.js";
 import { run } from "./link.js";
 import * as markers from "./markers.js";
@@ -18,7 +19,7 @@ import * as table from "./table.js";
 import { drawTop, showPlant } from "./top.js";
 import * as trends from "./trends.js";
 
-const VIEWS = ["drives", "trends", "faults", "lines", "log"];
+const VIEWS = ["drives", "trends", "faults", "lines", "log", "fleet"];
 const BEAT_MS = 100;
 const WIDE = 1000; // px: from here the panel stands beside the table
 
@@ -44,6 +45,7 @@ function route() {
   if (view === "faults") faults.show();
   if (view === "lines") lines.show();
   if (view === "log") audit.show();
+  if (view === "fleet") fleet.show();
 }
 
 function decoded(text) {
@@ -85,6 +87,7 @@ function tick() {
   if (view === "drives" && beat % 10 === 0) safely(table.drawSparks);
   if (view === "faults" && beat % 10 === 0) safely(faults.show);
   if (view === "lines" && beat % 30 === 0) lines.show();
+  if (view === "fleet" && beat % 10 === 0) safely(fleet.show);
   if (view === "drives" && beat % 20 === 0) drive.refresh();
 }
 
@@ -111,7 +114,8 @@ function keys(event) {
   }
   if (view === "drives") driveKeys(event);
   if (event.key === "u") clock.switchZone();
-  if (event.key >= "1" && event.key <= String(VIEWS.length)) location.hash = `#/${VIEWS[event.key - 1]}`;
+  const wanted = VIEWS[event.key - 1];
+  if (wanted && !find(`nav a[href="#/${wanted}"]`).hidden) location.hash = `#/${wanted}`;
 }
 
 function driveKeys(event) {
@@ -156,6 +160,7 @@ drive.begin();
 trends.begin();
 faults.begin();
 audit.begin();
+fleet.begin();
 onPlant(showPlant);
 onPlant(() => {
   if (view === "drives") route();

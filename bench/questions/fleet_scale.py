@@ -1,0 +1,62 @@
+"""Ten thousand lines: how soon does each have a gateway, when a fleet begins and when a quarter of it dies?
+
+20 real gateways' state machines, in four processes, three real NATS nodes, all on this machine; the lines are
+not there, so that nothing is opened and sent. A cold start counts from the moment at which all processes are
+connected.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+from bench.support import tables
+
+ROOT = Path(__file__).parents[2]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--lines", type=int, default=10_000)
+    parser.add_argument("--gateways", type=int, default=20)
+    parser.add_argument("--kills", type=int, default=3)
+    arguments = parser.parse_args()
+    sys.path.insert(0, str(ROOT / "tests" / "support"))
+    from fleet_scale import groups, large_fleet
+    from nats_clusters import cluster
+
+    tables.heading("How soon has each line of a large fleet a gateway?")
+    rows: list[tuple[object, ...]] = []
+
+    def note(what: str, seconds: float, lines: int) -> None:
+        loads = fleet.loads()
+        rows.append(
+            (what, lines, f"{seconds:.2f}", f"{loads[0]} to {loads[-1]}", f"{os.getloadavg()[0]:.1f}")
+        )
+        print(*rows[-1], sep=", ", file=sys.stderr)
+
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        cluster(Path(folder)) as nats,
+        large_fleet(nats, arguments.lines) as fleet,
+    ):
+        note("cold start", fleet.settled(fleet.start(*groups(arguments.gateways, 4))), arguments.lines)
+        fleet.check()
+        for at in range(arguments.kills):
+            dead = fleet.processes[at]
+            lost = sum(dead.counts.values())
+            note(f"{len(dead.gateways)} of {arguments.gateways} killed", fleet.kill(dead), lost)
+            fleet.check()
+            begun = fleet.start(dead.gateways)
+            fleet.settled(begun)
+            time.sleep(10)  # the balance moves lines to them
+            fleet.check()
+    tables.show(("what", "lines", "until the last, s", "lines a gateway", "load"), rows)
+
+
+if __name__ == "__main__":
+    main()

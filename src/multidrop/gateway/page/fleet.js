@@ -1,0 +1,172 @@
+// The fleet that this gateway looks at: its gateways, who is master of each line, and the last moves.
+// What is old is marked so, with its age; what a gateway does not answer is a dash.
+
+import { get } from "./api.js";
+import * as clock from "./clock.js";
+import { fill, find, glyph, make, named, put, setClass } from "./dom.js";
+import { onPlant, store } from "./store.js";
+import { UNKNOWN } from "./values.js";
+
+const OLD_S = 3;
+const MOST_LINES = 200; // are drawn, those without a master first
+const UNITS = ["B", "kB", "MB", "GB", "TB"];
+const TABLES = {
+  gateways: [
+    "Gateways",
+    [
+      ...["Gateway", "Host", "State", "Lines", "Lease left", "Spool", "Behind", "Lag", "Rows lost"],
+      ...["Session", "Since"],
+    ],
+  ],
+  lines: ["Lines", ["Line", "Port", "Master", "Since"]],
+  moves: ["Last moves", ["Line", "Time", "From", "To"]],
+};
+
+let newest = null,
+  cameAt = 0, // by this device's own clock
+  why = "",
+  isAsking = false;
+
+export function begin() {
+  fill(
+    find("#fleet"),
+    make("p", { class: "card note", id: "fleet-age" }),
+    Object.entries(TABLES).map(([id, [title, heads]]) => card(id, title, heads)),
+  );
+  onPlant(() => {
+    find('nav a[href="#/fleet"]').hidden = !store.plant.fleet;
+    if (!store.plant.fleet) newest = null;
+  });
+}
+
+function card(id, title, heads) {
+  return make(
+    "article",
+    { class: "card", "aria-label": title },
+    make("h2", {}, title),
+    make("p", { class: "note", id: `fleet-${id}-note` }),
+    make(
+      "div",
+      { class: "scroll", tabindex: "0", role: "group", "aria-label": `${title}, table` },
+      make(
+        "table",
+        { class: "plain" },
+        make(
+          "thead",
+          {},
+          make(
+            "tr",
+            {},
+            heads.map(h => make("th", { scope: "col" }, h)),
+          ),
+        ),
+        make("tbody", { id: `fleet-${id}` }),
+      ),
+    ),
+  );
+}
+
+// Ask for the fleet, and draw what is known with its age meanwhile.
+export function show() {
+  draw();
+  if (!isAsking) ask();
+}
+
+async function ask() {
+  isAsking = true;
+  try {
+    [newest, why] = [await get("api/fleet"), ""];
+    cameAt = performance.now();
+  } catch (problem) {
+    why = problem.message;
+  }
+  isAsking = false;
+  draw();
+}
+
+function draw() {
+  const age = newest?.age_s == null ? null : newest.age_s + (performance.now() - cameAt) / 1000,
+    { gateways = {}, lines = {}, moves = [] } = newest ?? {};
+  drawAge(age, age === null || age > OLD_S);
+  const members = Object.entries(gateways),
+    all = Object.entries(lines),
+    free = all.filter(([, line]) => line.master === null),
+    sorted = [...free, ...all.filter(([, line]) => line.master !== null)].slice(0, MOST_LINES),
+    more = all.length > sorted.length ? `; the first ${sorted.length} are shown` : "";
+  note("gateways", members.flatMap(troubles).join("; "), true);
+  note("lines", `${all.length} lines, ${free.length} without a master${more}`, free.length > 0);
+  note("moves", `Times are ${clock.zoneName()}; a dash stands for a master that nobody saw.`, false);
+  fill(find("#fleet-gateways"), members.map(gateway).map(row));
+  fill(find("#fleet-lines"), sorted.map(line).map(row));
+  fill(find("#fleet-moves"), moves.map(move).map(row));
+}
+
+function note(id, text, isBad) {
+  const place = find(`#fleet-${id}-note`);
+  put(place, text);
+  setClass(place, "bad", isBad);
+  place.hidden = !text;
+}
+
+function troubles([name, { says }]) {
+  const lines = Object.entries(says?.troubles ?? {}).map(([line, why]) => `${name}: line ${line}: ${why}`);
+  return [...lines, ...[says?.trouble, says?.spool?.trouble].filter(Boolean).map(one => `${name}: ${one}`)];
+}
+
+function drawAge(age, isOld) {
+  const seen = age === null ? "Nothing of the fleet was seen yet" : `Seen ${clock.lasting(age * 1000)} ago`,
+    reason = why || newest?.trouble,
+    place = find("#fleet-age");
+  put(place, isOld ? `${seen}${reason ? `: ${reason}` : ""}` : "Looked at once a second.");
+  setClass(place, "bad", isOld);
+  setClass(find("#fleet"), "stale", isOld);
+}
+
+const row = ([first, ...others]) =>
+  make(
+    "tr",
+    {},
+    make("th", { scope: "row" }, first),
+    others.map(one => make("td", {}, one)),
+  );
+
+// Return the cells of a gateway. What it does not say itself is not known.
+function gateway([name, { host, session, began_ms: began, lines, says }]) {
+  const spool = says?.spool;
+  return [
+    named(name),
+    named(host),
+    says ? named(says.state) : wrong("silent", "no answer"),
+    String(lines),
+    says ? seconds(says.margin_s) : UNKNOWN,
+    spool ? bytes(spool.bytes) : UNKNOWN,
+    spool?.behind == null ? UNKNOWN : String(spool.behind),
+    spool?.lag_s == null ? UNKNOWN : seconds(spool.lag_s),
+    spool ? (spool.lost ? wrong("fault", String(spool.lost)) : "0") : UNKNOWN,
+    String(session),
+    clock.when(began),
+  ];
+}
+
+const line = ([name, { port, master, since_ms: from }]) => [
+  named(name),
+  named(port),
+  master === null ? wrong("port", "none") : named(master),
+  from === null ? UNKNOWN : clock.when(from),
+];
+
+const move = ({ line: name, at_ms: at, from, to }) => [
+  named(name),
+  clock.when(at),
+  from === null ? UNKNOWN : named(from || "nobody"),
+  named(to || "nobody"),
+];
+
+const wrong = (shape, text) => make("span", { class: "bad" }, glyph(shape), ` ${text}`);
+const seconds = s => `${s.toFixed(1)} s`;
+
+function bytes(number) {
+  const power = Math.min(UNITS.length - 1, Math.floor(Math.log10(Math.max(1, number)) / 3)),
+    value = number / 1000 ** power;
+  return `${value.toFixed(power && value < 10 ? 1 : 0)} ${UNITS[power]}`;
+}

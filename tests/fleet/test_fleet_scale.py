@@ -1,0 +1,25 @@
+"""A thousand lines of 20 gateways' state machines in four processes; bench.questions.fleet_scale has more."""
+
+from __future__ import annotations
+
+import pytest
+from fleet_scale import groups, large_fleet, until
+from nats_clusters import Cluster
+from peers import require_module
+
+require_module("nats")
+
+pytestmark = [pytest.mark.slow, pytest.mark.long]
+
+
+def test_each_of_a_thousand_lines_has_one_gateway_when_five_of_twenty_die_and_return(nats: Cluster) -> None:
+    with large_fleet(nats, 1000) as fleet:
+        fleet.settled(fleet.start(*groups(20, 4)))
+        fleet.check()
+        assert 30 <= fleet.loads()[0] <= fleet.loads()[-1] <= 55
+        dead = fleet.processes[1]
+        fleet.kill(dead)
+        fleet.check()
+        fleet.start(dead.gateways)
+        until(lambda: fleet.loads()[0] >= 30, "those that come back have their share")
+        fleet.check()

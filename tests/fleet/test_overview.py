@@ -1,0 +1,122 @@
+"""FleetView: masters by the records, answers by the gateways, and nothing of those who do not answer."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from fleets import MemoryBucket
+from peers import require_module
+
+require_module("nats")
+
+from multidrop.fleet import names  # noqa: E402
+from multidrop.fleet.errors import FleetError  # noqa: E402
+from multidrop.fleet.overview import FleetView  # noqa: E402
+from multidrop.fleet.ownership import owner_value  # noqa: E402
+
+SPOOL = {"bytes": 1, "lost": 0, "behind": 0, "lag_s": 0.0, "trouble": None}
+STATE = {"state": "working", "lines": 1, "margin_s": 2.0, "troubles": {}, "trouble": "", "spool": SPOOL}
+MOVE = {"line": "line-1", "revision": 1, "at_ms": 7, "from": "gw-9", "to": "gw-1"}
+
+
+class Answering:
+    """A path on which gateways answer what a test says; the others are not there."""
+
+    urls = ["nats://a:4222"]
+    is_open = True
+
+    def __init__(self, answers: dict[str, Any]) -> None:
+        self.answers = answers
+
+    async def request(self, subject: str, *_: object, **__: object) -> Any:
+        for gateway, answer in self.answers.items():
+            if f".{gateway}." in subject:
+                return SimpleNamespace(data=json.dumps(answer).encode())
+        raise FleetError("nobody answers")
+
+
+def lease(session: int, *, ended: bool = False) -> dict[str, Any]:
+    return {"session": session, "ended": ended, "began": 5, "host": "pc", "draining": False}
+
+
+def view(answers: dict[str, Any] | None = None) -> FleetView:
+    """Return a view of three gateways, of which gw-3 has ended, and five lines."""
+    made = FleetView(Answering(answers or {}))  # type: ignore[arg-type]
+    records, leases = made._records, [MemoryBucket(name) for name in names.LEASES]
+    for follower, bucket in zip(records.observer.paths, leases, strict=True):
+        follower.bucket = bucket  # type: ignore[assignment]
+        for gateway, found in (("gw-1", lease(2)), ("gw-2", lease(1)), ("gw-3", lease(4, ended=True))):
+            bucket.store(gateway, found)
+    plant = records.plant.bucket = MemoryBucket(names.PLANT)  # type: ignore[assignment]
+    owners = {name: MemoryBucket(name) for name in names.OWNERS}
+    for name, bucket in owners.items():
+        records.owners[name].bucket = bucket  # type: ignore[assignment]
+    owned = {"line-1": ("gw-1", 2), "line-2": ("gw-1", 1), "line-3": ("gw-3", 4), "line-4": ("", 0)}
+    for number in range(1, 6):
+        line = f"line-{number}"
+        plant.store(line, {"line": {"port": f"socket://h:{number}"}, "files": {}})
+        if line in owned:
+            owners[names.owner_bucket(line)].store(line, owner_value(*owned[line], 1000 * number))
+    made._is_checked = True
+    return made
+
+
+def looked(made: FleetView) -> dict[str, Any]:
+    asyncio.run(made.look())
+    return made.fleet()
+
+
+def test_a_line_has_a_master_whose_session_is_not_over() -> None:
+    found = looked(view())
+    assert {name: line["master"] for name, line in found["lines"].items()} == {
+        "line-1": "gw-1",
+        "line-2": None,  # of a session before
+        "line-3": None,  # of one that ended
+        "line-4": None,  # given away
+        "line-5": None,  # nobody's yet
+    }
+    first = {"port": "socket://h:1", "revision": 1, "master": "gw-1", "session": 2, "since_ms": 1000}
+    assert found["lines"]["line-1"] == first
+    assert found["lines"]["line-2"]["since_ms"] is None
+    assert {name: gateway["lines"] for name, gateway in found["gateways"].items()} == {"gw-1": 1, "gw-2": 0}
+
+
+def test_who_does_not_answer_says_nothing() -> None:
+    made = view({"gw-1": STATE | {"last_moves": [MOVE]}})
+    found = looked(made)
+    assert found["gateways"]["gw-1"]["says"] == STATE
+    assert found["gateways"]["gw-2"]["says"] is None
+    assert [move["from"] for move in found["moves"] if move["line"] == "line-1"] == ["gw-9"]
+    made._path.answers.clear()  # type: ignore[attr-defined]
+    assert looked(made)["gateways"]["gw-1"]["says"] is None  # what it said before is not the present
+
+
+@pytest.mark.parametrize("moves", [[{}], [5], "text", None, [MOVE | {"at_ms": "now"}]])
+def test_moves_that_are_none_harm_nothing(moves: Any) -> None:
+    found = looked(view({"gw-1": STATE | {"last_moves": moves}}))
+    assert found["gateways"]["gw-1"]["says"] == STATE
+
+
+def test_without_a_connection_it_says_which_servers() -> None:
+    made = view()
+    made._path.is_open = False  # type: ignore[misc]
+    with pytest.raises(FleetError, match="no NATS server is reached at nats://a:4222"):
+        looked(made)
+
+
+def test_how_long_no_renewal_was_seen() -> None:
+    made = view()
+    now = [10 * 10**9]
+    observer = made._records.observer
+    observer._clock = lambda: now[0]
+    looked(made)
+    now[0] += 2 * 10**9
+    observer.paths[0].bucket.store("gw-1", lease(2))  # type: ignore[attr-defined]
+    found = looked(made)  # one path of three was renewed: that does not count
+    assert found["gateways"]["gw-1"]["unseen_s"] == 2.0
+    observer.paths[1].bucket.store("gw-1", lease(2))  # type: ignore[attr-defined]
+    assert looked(made)["gateways"]["gw-1"]["unseen_s"] == 0.0

@@ -1,0 +1,150 @@
+"""The part `fleet` of `serve`: its settings, its health, and what it tells of a real fleet."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+from gateways import served, written
+from lines import until
+from nats_clusters import Cluster, free_ports
+from peers import require_module
+
+require_module("nats")
+require_module("starlette")
+
+from multidrop import PlantError  # noqa: E402
+from multidrop.fleet.overview import FleetView  # noqa: E402
+from multidrop.fleet.page_part import FleetPart  # noqa: E402
+from multidrop.fleet.servers import ServerPath  # noqa: E402
+from multidrop.fleet.watching import FleetWatch  # noqa: E402
+from multidrop.gateway.settings import read_settings  # noqa: E402
+
+
+@pytest.mark.parametrize(
+    ("table", "sentence"),
+    [
+        ("nats = []", "nats = [] is not right; write nats = ["),
+        (
+            'nats = ["10.0.0.1"]',
+            "nats: '10.0.0.1' is no address of a NATS server; write nats = [\"nats://127",
+        ),
+        ("nats = [5]", "nats: 5 is no address of a NATS server"),
+        ('nats = "nats://a:4222"', "nats = 'nats://a:4222' is not right; write nats = ["),
+        ("every = 5", "every"),
+    ],
+)
+def test_each_mistake_is_told(tmp_path: Path, table: str, sentence: str) -> None:
+    with pytest.raises(PlantError) as raised:
+        read_settings(written(tmp_path, f"[serve.fleet]\n{table}\n"), {})
+    assert sentence in str(raised.value)
+
+
+def test_its_settings_need_no_library(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """`serve --check` works without it, and `serve` says what to install."""
+    for name in [name for name in sys.modules if name.split(".")[0] == "nats"]:
+        monkeypatch.setitem(sys.modules, name, None)
+    for name in [name for name in sys.modules if name.startswith("multidrop.fleet")]:
+        monkeypatch.delitem(sys.modules, name)
+    settings = read_settings(written(tmp_path, "[serve.fleet]\n"), {})
+    assert settings.parts["fleet"].nats == ("nats://127.0.0.1:4222",)
+    from multidrop.gateway import parts
+
+    with pytest.raises(
+        ValueError, match=r"it needs nats.*, which is not installed: pip install 'multidrop\[f"
+    ):
+        parts.build(parts.PARTS["fleet"], settings.parts["fleet"], None)  # type: ignore[arg-type]
+
+
+class Looks(FleetView):
+    """A view whose looks succeed until they are told not to."""
+
+    failure: OSError | None = None
+
+    async def look(self) -> None:
+        if self.failure:
+            raise self.failure
+
+
+def test_it_is_not_well_once_the_newest_look_is_old() -> None:
+    now = [0.0]
+    view = Looks(ServerPath([]))
+    watch = FleetWatch(view, lambda: now[0])
+    part = FleetPart(ServerPath([]), watch)
+
+    def health_after(seconds: float) -> str:
+        now[0] += seconds
+        return part.health()
+
+    assert health_after(0) == "nothing of it was seen yet: no look has ended yet"
+    view.failure = OSError("no server")
+    asyncio.run(watch.look())
+    assert health_after(0) == "nothing of it was seen yet: no server"
+    view.failure = None
+    asyncio.run(watch.look())
+    assert health_after(5) == ""
+    assert health_after(1) == "it was seen 6 s ago: no look has ended yet"
+    view.failure = OSError("no server")
+    asyncio.run(watch.look())
+    assert health_after(0) == "it was seen 6 s ago: no server"
+    assert watch.told()["age_s"] == 6.0
+
+
+def test_a_password_in_an_address_is_told_to_nobody() -> None:
+    view = Looks(ServerPath([]))
+    view.failure = OSError("no NATS server is reached at nats://anna:s3cret@a:4222, tls://t0ken@b:4222")
+    watch = FleetWatch(view)
+    asyncio.run(watch.look())
+    assert watch.told()["trouble"] == "no NATS server is reached at nats://a:4222, tls://b:4222"
+
+
+@pytest.mark.long
+def test_the_gateway_tells_of_a_real_fleet_and_of_none(fleet: Cluster, tmp_path: Path) -> None:
+    urls = ", ".join(f'"{url}"' for url in fleet.urls)
+    with served(tmp_path, f"[serve.fleet]\nnats = [{urls}]\n") as gateway:
+        assert gateway.get("/api/plant").json["fleet"] is True
+        until(lambda: gateway.get("/api/fleet").json["age_s"] is not None)
+        told: dict[str, Any] = gateway.get("/api/fleet").json
+        assert told["trouble"] is None
+        assert (told["gateways"], told["lines"], told["moves"]) == ({}, {}, [])
+        until(lambda: gateway.get("/health").json["parts"] == {"fleet": "ok"})
+    with served(tmp_path) as gateway:
+        assert gateway.get("/api/plant").json["fleet"] is False
+        answer = gateway.get("/api/fleet")
+        assert (answer.status, answer.json["error"]) == (
+            404,
+            "no fleet is looked at; add [serve.fleet] to the plant file",
+        )
+
+
+@pytest.mark.long
+def test_a_viewers_key_is_enough(tmp_path: Path) -> None:
+    require_module("nkeys")
+    from secured_clusters import secured_cluster
+    from secured_fleets import multidrop
+
+    plant = written(tmp_path, port="socket://127.0.0.1:4001")
+    with secured_cluster(tmp_path / "nats", 1) as servers:
+        made = multidrop(servers, "operator", "fleet", "init", str(plant.path))
+        assert made.returncode == 0, made.stderr
+        table = (
+            f'nats = ["{servers.urls[0]}"]\ncredentials = "{servers.key("viewer")}"\nca = "{servers.tls.ca}"'
+        )
+        with served(tmp_path, f"[serve.fleet]\n{table}\n") as gateway:
+            until(lambda: gateway.get("/api/fleet").json["lines"].keys() == {"hall"})
+            assert gateway.get("/health").json["parts"] == {"fleet": "ok"}
+        watched = multidrop(servers, "viewer", "fleet", "status", "--json")
+        assert json.loads(watched.stdout)["lines"]["hall"]["master"] is None
+
+
+def test_servers_that_are_not_there_are_told(tmp_path: Path) -> None:
+    [port] = free_ports(1)
+    with served(tmp_path, f'[serve.fleet]\nnats = ["nats://127.0.0.1:{port}"]\n') as gateway:
+        wanted = f"nothing of it was seen yet: no NATS server is reached at nats://127.0.0.1:{port}"
+        until(lambda: wanted == gateway.get("/health").json["parts"]["fleet"])
+        assert gateway.get("/api/fleet").json["age_s"] is None
+        assert gateway.frame()["drives"]  # the gateway's own lines go on

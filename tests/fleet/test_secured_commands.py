@@ -1,0 +1,77 @@
+"""Commands under the rights that `fleet rights` writes: a commander may, a viewer may not."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator, Iterator
+from contextlib import asynccontextmanager
+from pathlib import Path
+
+import pytest
+from command_desks import LINE, MAY, Desks, desks
+from peers import require_module
+
+require_module("nats")
+require_module("nkeys")
+
+from secured_clusters import GATEWAYS, SecuredCluster, secured_cluster  # noqa: E402
+
+from multidrop.fleet import names  # noqa: E402
+from multidrop.fleet.buckets import Bucket  # noqa: E402
+from multidrop.fleet.command_subjects import CommandSubjects  # noqa: E402
+from multidrop.fleet.command_words import CommandOutcome  # noqa: E402
+from multidrop.fleet.fleet_commands import FleetCommands  # noqa: E402
+from multidrop.fleet.plant_store import store  # noqa: E402
+from multidrop.fleet.servers import paths_of  # noqa: E402
+from multidrop.fleet.setup import open_all, set_up  # noqa: E402
+
+pytestmark = [pytest.mark.slow, pytest.mark.long]
+
+PLANT = {LINE: {"line": {"name": LINE, "drive": [{"name": "pump"}]}, "files": {}, "may": MAY}}
+
+
+@pytest.fixture
+def servers(tmp_path: Path) -> Iterator[SecuredCluster]:
+    with secured_cluster(tmp_path / "nats", 1) as running:
+        yield running
+
+
+@asynccontextmanager
+async def commanded(servers: SecuredCluster, made: Desks) -> AsyncIterator[None]:
+    """Take commands as a gateway of these rights."""
+    operator = paths_of(servers.urls, servers.options("operator"))
+    await set_up(operator)
+    await store(Bucket(names.PLANT, lambda: operator[0]), PLANT)
+    gateway = GATEWAYS[0]
+    paths = paths_of(servers.urls, servers.options(gateway))
+    subjects = CommandSubjects(gateway, paths, made.lines, made.log)
+    try:
+        await open_all(paths)
+        await subjects.begin()
+        subjects.open(LINE, PLANT[LINE])
+        await asyncio.gather(*subjects._tasks)
+        yield
+    finally:
+        for path in (*operator, *paths):
+            await path.close()
+
+
+def test_a_commander_may_and_a_viewer_may_not(servers: SecuredCluster, tmp_path: Path) -> None:
+    async def main(made: Desks) -> None:
+        async with commanded(servers, made):
+            for user, outcome in (("viewer", CommandOutcome.NOT_SENT), ("commander", CommandOutcome.DONE)):
+                log = tmp_path / f"{user}.jsonl"
+                async with FleetCommands(
+                    servers.urls, by=user, log=log, options=servers.options(user)
+                ) as asker:
+                    told = await asker.write("pump", "frequency", 20.0)
+                    assert told.outcome is outcome, told.text
+                    if outcome is CommandOutcome.NOT_SENT:
+                        assert f"do not allow to publish to cmd.{LINE}" in told.text
+                        assert made.writes == []
+                    stopped = await asker.stop()
+                    assert stopped.is_done == told.is_done, stopped.text
+            assert [name for name, _ in made.writes] == ["frequency", "control"]
+
+    with desks(tmp_path) as made:
+        asyncio.run(main(made))

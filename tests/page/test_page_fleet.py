@@ -1,0 +1,113 @@
+"""The view of a fleet: what is old is marked, what a gateway does not say is a dash, and it may be away."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import pytest
+from conftest import Opener
+from fake_gateway import FakeGateway
+from watching import until
+
+NONE = "\u2013"  # a dash
+pytestmark = pytest.mark.long  # Chromium is started for each file
+
+
+def cells(page: Any, table: str) -> list[list[str]]:
+    read = "rows => rows.map(row => [...row.cells].map(cell => cell.textContent.trim()))"
+    found: list[list[str]] = page.locator(f"#fleet-{table} tr").evaluate_all(read)
+    return found
+
+
+def await_note(page: Any, text: str) -> None:
+    until(page, f"document.querySelector('#fleet-age').textContent.includes({text!r})")
+
+
+def test_gateways_lines_and_moves(opened: Opener) -> None:
+    page = opened("#/fleet")
+    await_note(page, "Looked at once a second")
+    first, second, third = cells(page, "gateways")
+    assert first[:10] == ["gw-1", "pc-hall-1", "working", "4", "2.1 s", "81 MB", "2", "1.4 s", "0", "5"]
+    assert second[:9] == ["gw-2", "pc-hall-2", "no answer", "4", NONE, NONE, NONE, NONE, NONE]
+    assert third[0] == "gw-3"
+    lines = cells(page, "lines")
+    assert lines[0] == ["hall-1", "socket://10.0.0.1:4001", "none", NONE]
+    assert [line[0] for line in lines] == [f"hall-{n}" for n in range(1, 13)]
+    assert page.locator("#fleet-lines-note.bad").inner_text() == "12 lines, 1 without a master"
+    assert [[row[0], *row[2:]] for row in cells(page, "moves")] == [
+        ["hall-3", "gw-2", "gw-1"],
+        ["hall-6", "nobody", "gw-1"],
+        ["hall-9", NONE, "gw-1"],
+    ]
+
+
+def test_what_is_old_is_marked_with_its_age_and_why(opened: Opener, gateway: FakeGateway) -> None:
+    page = opened("#/fleet")
+    await_note(page, "Looked at once a second")
+    gateway.fleet = {"age_s": 40.0, "trouble": "no connection to nats://a:4222"}
+    await_note(page, "Seen 4")
+    assert page.locator("#fleet-age.bad").inner_text().endswith(" s ago: no connection to nats://a:4222")
+    style = "getComputedStyle(document.querySelector('#fleet-gateways td')).fontStyle"
+    assert page.evaluate(style) == "italic"
+    gateway.fleet = {}
+    await_note(page, "Looked at once a second")
+    assert page.evaluate(style) == "normal"
+
+
+def test_it_grows_old_by_itself_where_the_gateway_is_gone(opened: Opener, gateway: FakeGateway) -> None:
+    page = opened("#/fleet")
+    await_note(page, "Looked at once a second")
+    gateway.kill()
+    killed = time.monotonic()
+    await_note(page, "Seen")
+    assert time.monotonic() - killed > 2  # it was fresh when it died
+    assert "The daemon cannot be reached" in page.locator("#fleet-age").inner_text()
+
+
+def test_before_the_first_look_nothing_is_shown(opened: Opener, gateway: FakeGateway) -> None:
+    gateway.fleet = {"age_s": None, "trouble": "no such server", "gateways": {}, "lines": {}, "moves": []}
+    page = opened("#/fleet")
+    await_note(page, "Nothing of the fleet was seen yet: no such server")
+    assert cells(page, "gateways") == []
+
+
+def test_troubles_of_gateways_are_told(opened: Opener, gateway: FakeGateway) -> None:
+    spool = {"bytes": 5, "lost": 7, "behind": None, "lag_s": None, "trouble": "the disk is full"}
+    says = {"state": "working", "margin_s": 2.0, "trouble": "", "spool": spool}
+    says["troubles"] = {"hall-1": "cannot be opened"}
+    gateway.fleet = {
+        "gateways": {"gw-1": {"host": "pc", "session": 1, "began_ms": 0, "lines": 1, "says": says}}
+    }
+    page = opened("#/fleet")
+    until(page, "document.querySelector('#fleet-gateways-note').textContent !== ''")
+    note = page.locator("#fleet-gateways-note").inner_text()
+    assert note == "gw-1: line hall-1: cannot be opened; gw-1: the disk is full"
+    assert cells(page, "gateways")[0][5:9] == ["5 B", NONE, NONE, "7"]
+
+
+def test_of_very_many_lines_the_first_are_drawn(opened: Opener, gateway: FakeGateway) -> None:
+    line = {"port": "socket://h:1", "master": "gw-1", "since_ms": 0}
+    gateway.fleet = {"lines": {f"l{n}": line | ({"master": None} if n == 999 else {}) for n in range(1000)}}
+    page = opened("#/fleet")
+    until(page, "document.querySelectorAll('#fleet-lines tr').length === 200")
+    assert cells(page, "lines")[0][0] == "l999"
+    note = page.locator("#fleet-lines-note").inner_text()
+    assert note == "1000 lines, 1 without a master; the first 200 are shown"
+
+
+def test_without_a_fleet_there_is_no_such_view(opened: Opener, gateway: FakeGateway) -> None:
+    gateway.plant_changes = {"fleet": False}
+    page = opened()
+    assert page.locator("nav a:visible").all_inner_texts()[-1] == "Log"
+    page.keyboard.press("6")
+    assert page.evaluate("location.hash") == "#/drives"
+    page.keyboard.press("5")
+    assert page.evaluate("location.hash") == "#/log"
+
+
+def test_it_is_reached_by_its_key(opened: Opener) -> None:
+    page = opened()
+    page.keyboard.press("6")
+    await_note(page, "Looked at once a second")
+    assert page.locator("nav a[aria-current]").inner_text() == "Fleet"

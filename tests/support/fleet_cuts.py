@@ -1,0 +1,98 @@
+"""Drills in a network of namespaces: each gateway and each node on a machine of its own, and cables are cut.
+
+The lines are reached on their own way, unless a gateway is cut off as a whole.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+from fleet_drills import GATEWAYS, FleetDrill
+from namespaces import Namespace, network
+from nats_clusters import cluster
+
+NODES = 3
+
+
+class Cuts:
+    """Cuts of a drill's cables; all of them heal after 1 to 8 s."""
+
+    def __init__(self, drill: FleetDrill) -> None:
+        self.drill = drill
+        self.dice = drill.random
+        self.gateways = list(drill.places.values())
+        self.nodes = [node.place for node in drill.nats.nodes if node.place]
+
+    def _lost(self, senders: Sequence[Namespace], receivers: Sequence[Namespace]) -> None:
+        for sender in senders:
+            sender.cut_to(one for one in receivers if one is not sender)
+
+    def _part(self, some: Sequence[Namespace], others: Sequence[Namespace]) -> None:
+        self._lost(some, others)
+        self._lost(others, some)
+
+    def gateway(self) -> None:
+        """Its lines too: what it was about to send is in its buffers."""
+        self.dice.choice(self.gateways).cut()
+
+    def gateway_from_nodes(self) -> None:
+        self._part([self.dice.choice(self.gateways)], self.nodes)
+
+    def gateway_is_not_heard(self) -> None:
+        self._lost([self.dice.choice(self.gateways)], self.nodes)
+
+    def gateway_hears_nothing(self) -> None:
+        self._lost(self.nodes, [self.dice.choice(self.gateways)])
+
+    def node(self) -> None:
+        self.dice.choice(self.nodes).cut()
+
+    def node_is_not_heard(self) -> None:
+        self._lost([self.dice.choice(self.nodes)], [*self.nodes, *self.gateways])
+
+    def node_hears_nothing(self) -> None:
+        self._lost([*self.nodes, *self.gateways], [self.dice.choice(self.nodes)])
+
+    def gateway_and_node(self) -> None:
+        """They see each other, and nobody else of the fleet."""
+        inside = [self.dice.choice(self.gateways), self.dice.choice(self.nodes)]
+        self._part(inside, [one for one in (*self.gateways, *self.nodes) if one not in inside])
+
+
+CUTS: dict[str, Callable[[Cuts], None]] = {
+    "gateway cut off": Cuts.gateway,
+    "gateway cut off from the nodes": Cuts.gateway_from_nodes,
+    "nodes do not hear a gateway": Cuts.gateway_is_not_heard,
+    "gateway does not hear the nodes": Cuts.gateway_hears_nothing,
+    "node cut off": Cuts.node,
+    "nobody hears a node": Cuts.node_is_not_heard,
+    "node hears nobody": Cuts.node_hears_nothing,
+    "gateway and node cut off": Cuts.gateway_and_node,
+}
+
+
+def cut(drill: FleetDrill, name: str) -> None:
+    """Cut as this name says, and heal it."""
+    cuts = Cuts(drill)
+    CUTS[name](cuts)
+    time.sleep(drill.random.uniform(1, 8))
+    for one in (*cuts.gateways, *cuts.nodes):
+        one.heal([other for other in (*cuts.gateways, *cuts.nodes) if other is not one])
+
+
+@contextmanager
+def drilled_in_network(folder: Path, lines: int = 12, seed: int = 1) -> Iterator[FleetDrill]:
+    """A fleet as `drilled` makes it, in namespaces; where there can be none, as `network` says."""
+    with (
+        network(NODES + len(GATEWAYS)) as made,
+        cluster(folder / "nats", places=made.namespaces[:NODES]) as nats,
+    ):
+        places = dict(zip(GATEWAYS, made.namespaces[NODES:], strict=True))
+        drill = FleetDrill(folder, nats, lines, seed, places, made.address)
+        try:
+            yield drill
+        finally:
+            drill.close()

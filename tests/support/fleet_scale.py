@@ -1,0 +1,149 @@
+"""A large fleet: gateways' state machines in several processes, a real cluster, lines that are not there."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from nats_clusters import Cluster
+
+from multidrop.fleet import names
+from multidrop.fleet.buckets import Bucket
+from multidrop.fleet.plant_store import store
+from multidrop.fleet.servers import paths_of
+from multidrop.fleet.setup import set_up
+
+PROGRAM = Path(__file__).with_name("member_process.py")
+PATIENCE_S = 240.0
+
+
+class MemberProcess:
+    """One process, and how many lines each of its gateways polls since when."""
+
+    def __init__(self, urls: Sequence[str], gateways: Sequence[str]) -> None:
+        self.gateways = list(gateways)
+        self.counts = dict.fromkeys(gateways, 0)
+        self.changed_s = 0.0  # CLOCK_MONOTONIC
+        self.is_ready = False
+        self.polled: dict[str, list[str]] = {}
+        command = [sys.executable, str(PROGRAM), ",".join(urls), *gateways]
+        self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+        self._reader = threading.Thread(target=self._read, daemon=True)
+        self._reader.start()
+
+    def _read(self) -> None:
+        assert self._process.stdout is not None
+        for text in self._process.stdout:
+            said: dict[str, Any] = json.loads(text)
+            if "polled" in said:
+                self.polled[said["gateway"]] = said["polled"]
+            elif "ready" in said:
+                self.is_ready = True
+            else:
+                self.changed_s = said["at"]
+                self.counts[said["gateway"]] = said["lines"]
+
+    def ask(self) -> dict[str, list[str]]:
+        """Return the lines that each of its gateways polls."""
+        self.polled = {}
+        assert self._process.stdin is not None
+        self._process.stdin.write("\n")
+        self._process.stdin.flush()
+        until(lambda: len(self.polled) == len(self.gateways), "a process answers")
+        return self.polled
+
+    def is_alive(self) -> bool:
+        return self._process.poll() is None
+
+    def kill(self) -> None:
+        self._process.kill()
+        self._process.wait()
+        self._reader.join()
+
+
+def until(condition: Callable[[], bool], what: str) -> None:
+    ends = time.monotonic() + PATIENCE_S
+    while not condition():
+        assert time.monotonic() < ends, what
+        time.sleep(0.02)
+
+
+class LargeFleet:
+    """So many lines, shared by the gateways of all processes."""
+
+    def __init__(self, nats: Cluster, lines: dict[str, Any]) -> None:
+        self.nats = nats
+        self.lines = lines
+        self.processes: list[MemberProcess] = []
+        asyncio.run(self._make())
+
+    async def _make(self) -> None:
+        paths = paths_of(self.nats.urls)
+        await set_up(paths)
+        await store(Bucket(names.PLANT, lambda: paths[0]), self.lines)
+        for path in paths:
+            await path.close()
+
+    def start(self, *groups: Sequence[str]) -> float:
+        """Start a process for each group of gateways; return when they were all ready (CLOCK_MONOTONIC)."""
+        started = [MemberProcess(self.nats.urls, group) for group in groups]
+        self.processes += started
+        until(lambda: all(process.is_ready for process in started), "the processes are ready")
+        return time.monotonic()
+
+    def polled(self) -> int:
+        return sum(sum(process.counts.values()) for process in self.processes)
+
+    def settled(self, since_s: float) -> float:
+        """Wait until all lines are polled; return how long after `since_s` the last one was."""
+        until(lambda: self.polled() == len(self.lines), "all lines are polled")
+        return max(process.changed_s for process in self.processes) - since_s
+
+    def kill(self, process: MemberProcess) -> float:
+        """Kill it, and return how long it took until others polled all its lines (s)."""
+        self.processes.remove(process)
+        begun = time.monotonic()
+        process.kill()
+        return self.settled(begun)
+
+    def check(self) -> None:
+        """Wait until each line has one gateway, by name: none has two, and none is left out."""
+        wanted = sorted(self.lines)
+
+        def found() -> list[str]:
+            told = [process.ask().values() for process in self.processes]
+            return sorted(line for gateways in told for lines in gateways for line in lines)
+
+        until(lambda: found() == wanted, "each line has one gateway")
+
+    def loads(self) -> list[int]:
+        return sorted(count for process in self.processes for count in process.counts.values())
+
+    def close(self) -> None:
+        for process in self.processes:
+            process.kill()
+
+
+@contextmanager
+def large_fleet(nats: Cluster, lines: int) -> Iterator[LargeFleet]:
+    """Return a fleet with a plant of so many lines, and no gateway yet."""
+    described = {f"line-{at}": {"line": {"name": f"line-{at}"}, "files": {}} for at in range(lines)}
+    fleet = LargeFleet(nats, described)
+    try:
+        yield fleet
+    finally:
+        fleet.close()
+
+
+def groups(gateways: int, processes: int) -> list[list[str]]:
+    """Return the names of gateways, as many for each process."""
+    found = [f"gw-{at:02}" for at in range(gateways)]
+    return [found[at::processes] for at in range(processes)]

@@ -1,0 +1,119 @@
+"""Network namespaces on one bridge, each with an address, whose cables are cut in both ways or in one."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+
+import pytest
+from network_changes import changing_network
+
+NOBODYS_CARD = "02:00:00:00:00:00"
+
+
+def _ip(*words: str) -> None:
+    subprocess.run(["ip", *words], check=True, capture_output=True, text=True)
+
+
+class Namespace:
+    """One machine; what is run by `prefix` is there."""
+
+    def __init__(self, bridge: str, net: str, number: int) -> None:
+        self.name = f"{bridge}-{number}"
+        self.address = f"{net}.{number + 2}"
+        self.card = f"02:00:00:00:01:{number:02x}"
+        self._cable = f"{bridge}v{number}"
+        self._bridge = bridge
+        _ip("netns", "add", self.name)
+        peer = ("peer", "name", "eth0", "address", self.card, "netns", self.name)
+        _ip("link", "add", self._cable, "type", "veth", *peer)
+        _ip("link", "set", self._cable, "up", "master", bridge)
+        _ip("-n", self.name, "addr", "add", f"{self.address}/24", "dev", "eth0")
+        _ip("-n", self.name, "link", "set", "eth0", "up")
+        _ip("-n", self.name, "link", "set", "lo", "up")
+
+    @property
+    def prefix(self) -> list[str]:
+        return ["ip", "netns", "exec", self.name]
+
+    def cut(self) -> None:
+        """Let nothing in or out, and nobody be told."""
+        _ip("link", "set", self._cable, "nomaster")
+
+    def cut_to(self, others: Iterable[Namespace]) -> None:
+        """Lose all that is sent to these, and nothing that they send."""
+        for other in others:
+            self._know(other, NOBODYS_CARD)
+
+    def heal(self, others: Iterable[Namespace]) -> None:
+        """Undo both."""
+        _ip("link", "set", self._cable, "master", self._bridge)
+        for other in others:
+            self._know(other, other.card)
+
+    def _know(self, other: Namespace, card: str) -> None:
+        known = ("lladdr", card, "nud", "permanent", "dev", "eth0")
+        _ip("-n", self.name, "neigh", "replace", other.address, *known)
+
+    def close(self) -> None:
+        subprocess.run(["ip", "netns", "del", self.name], check=False, capture_output=True)
+
+
+class Network:
+    """A bridge here, whose address is `address`, and the namespaces on it, all of which know each other."""
+
+    def __init__(self, number: int) -> None:
+        self._bridge = f"md{os.getpid() % 100_000}"
+        net = f"10.{100 + os.getpid() % 50}.{os.getpid() // 50 % 250}"
+        self.address = f"{net}.1"
+        self.namespaces: list[Namespace] = []
+        _ip("link", "add", self._bridge, "type", "bridge")
+        try:
+            _ip("addr", "add", f"{self.address}/24", "dev", self._bridge)
+            _ip("link", "set", self._bridge, "up")
+            for at in range(number):
+                self.namespaces.append(Namespace(self._bridge, net, at))
+            for one in self.namespaces:
+                one.heal(self.others(one))
+        except BaseException:
+            self.close()
+            raise
+
+    def others(self, one: Namespace) -> list[Namespace]:
+        return [other for other in self.namespaces if other is not one]
+
+    def heal(self) -> None:
+        for one in self.namespaces:
+            one.heal(self.others(one))
+
+    def close(self) -> None:
+        for one in self.namespaces:
+            one.close()
+        subprocess.run(["ip", "link", "del", self._bridge], check=False, capture_output=True)
+
+
+@contextmanager
+def network(number: int) -> Iterator[Network]:
+    """Make so many namespaces. Where that cannot be, the test is skipped; in CI it fails."""
+    if reason := why_none():
+        (pytest.fail if os.environ.get("CI") else pytest.skip)(reason)
+    with changing_network():
+        made = Network(number)
+    try:
+        yield made
+    finally:
+        with changing_network():
+            made.close()
+
+
+def why_none() -> str:
+    """Return why no namespaces can be made here; "" where they can."""
+    if os.geteuid() != 0 or shutil.which("ip") is None:
+        return "network namespaces need root and the program ip"
+    trial = ["ip", "link", "add", f"mdt{os.getpid() % 100_000}", "type", "bridge"]
+    tried = subprocess.run(trial, check=False, capture_output=True, text=True)
+    subprocess.run(["ip", "link", "del", trial[3]], check=False, capture_output=True)
+    return f"this system makes no network of its own: {tried.stderr.strip()}" if tried.returncode else ""
