@@ -60,13 +60,14 @@ class SecuredNode(Node):
 
     def __init__(self, folder: Path, name: str, port: int, monitor: int) -> None:
         self.name, self.port, self.monitor = name, port, monitor
+        self.host, self.place = "127.0.0.1", None
         self._log = folder / f"{name}.log"
         self._command = [server_program(), "-c", str(folder / f"{name}.conf"), "-m", str(monitor)]
         self.start()
 
     @property
     def url(self) -> str:
-        return f"tls://127.0.0.1:{self.port}"
+        return f"tls://{self.host}:{self.port}"
 
 
 class SecuredCluster(Cluster):
