@@ -195,7 +195,7 @@ def test_all_works_with_the_rights_as_written(tmp_path: Path) -> None:
             assert ("do not allow" in said.stdout + said.stderr) is (user == "viewer"), said
         assert "drive-line-0" in "".join(path.read_text() for path in tmp_path.glob("gw-*/commands.jsonl"))
         fleet.running["gw-a"].kill()
-        until(lambda: set(fleet.status()["gateways"]) == {"gw-b", "gw-c"}, "its end")
+        until(lambda: "gw-a" not in fleet.status()["gateways"], "its end")
         fleet.wait_for_polling()
         drained = multidrop(fleet.servers, "operator", "fleet", "drain", "gw-b")
         assert (drained.returncode, drained.stderr) == (0, "")
@@ -226,15 +226,12 @@ def test_a_key_that_is_taken_away_is_told_of_and_its_lines_go_on(tmp_path: Path)
 
 
 @pytest.mark.long
-def test_a_gateway_in_wrong_hands_makes_no_two_others_send(tmp_path: Path) -> None:
-    """Somebody with the key of gw-c ends the others' sessions again and again: lines are silent, no more.
-
-    The others go on for as long as their lease holds; who takes over waits for that, whatever is written.
-    """
+def test_a_gateway_in_wrong_hands_makes_lines_silent_and_no_more(tmp_path: Path) -> None:
+    """Somebody with the key of gw-c ends the others' sessions again and again; they begin new ones."""
     with secured_fleet(tmp_path, 1) as fleet:
         fleet.wait_for_polling()
         fleet.running["gw-c"].kill()
-        until(lambda: set(fleet.status()["gateways"]) == {"gw-a", "gw-b"}, "its end")
+        until(lambda: "gw-c" not in fleet.status()["gateways"], "its end")
         fleet.wait_for_polling()
 
         async def end_all() -> None:

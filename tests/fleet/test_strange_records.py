@@ -215,6 +215,45 @@ def test_no_gateway_ends_by_strange_records(one: Cluster, monkeypatch: pytest.Mo
     asyncio.run(_with_path(one, work))
 
 
+@pytest.mark.long
+def test_a_session_that_another_ends_too_early_is_believed_when_it_must_be_over(one: Cluster) -> None:
+    """Its gateway hangs, and its engine polls on for as long as the lease holds: it cannot know."""
+
+    async def work(path: ServerPath) -> None:
+        await store(Bucket(names.PLANT, lambda: path), {"line-1": LINE})
+        hall, members, tasks = Hall(), {}, {}
+        for name in ("gw-p", "gw-q"):
+            paths = paths_of(one.urls)
+            await open_all(paths)
+            mastership = NotedMastership(boottime_ns)
+            members[name] = Member(name, paths, hall.add(name, mastership), mastership)
+            tasks[name] = asyncio.create_task(members[name].run())
+        while not any(member.polled for member in members.values()):
+            await asyncio.sleep(0.05)
+        holder, other = sorted(members.values(), key=lambda member: not member.polled)
+        holder._leave = _do_nothing  # type: ignore[method-assign]
+        tasks[holder.name].cancel()
+        await asyncio.gather(tasks[holder.name], return_exceptions=True)
+        for bucket in names.LEASES:
+            rogue = LeaseBucket(bucket, lambda: path, "rogue")
+            record = await rogue.get(holder.name)
+            await rogue.put(holder.name, record.value, record.revision)
+        while not other.polled:
+            await asyncio.sleep(0.05)
+        assert hall.overlaps == []
+        tasks[other.name].cancel()
+        await asyncio.gather(tasks[other.name], return_exceptions=True)
+        for member in members.values():
+            for opened in member.paths:
+                await opened.close()
+
+    asyncio.run(_with_path(one, work))
+
+
+async def _do_nothing() -> None:
+    pass
+
+
 STATE = {"state": "working", "lines": 1, "margin_s": 2.0, "troubles": {}, "spool": {"bytes": 0, "lost": 0}}
 
 

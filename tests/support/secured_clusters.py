@@ -67,7 +67,7 @@ class SecuredNode(Node):
 
     @property
     def url(self) -> str:
-        return f"tls://127.0.0.1:{self.port}"
+        return f"tls://{self.host}:{self.port}"
 
 
 class SecuredCluster(Cluster):
