@@ -84,7 +84,7 @@ class FleetDrill:
         return (self._folder / f"{name}.log").read_text()
 
     def settle(self) -> None:
-        """Start what died, and wait until all lines are polled by gateways of which each has some."""
+        """Start what died, and wait until each gateway polls lines, and paths and leaders are at home."""
         for node in self.nats.nodes:
             with suppress(ProcessLookupError):
                 node.go_on()
@@ -100,12 +100,13 @@ class FleetDrill:
         def is_shared() -> bool:
             found = self.status()
             return len(found["gateways"]) == len(GATEWAYS) and all(
-                one["lines"] for one in found["gateways"].values()
+                one["lines"] and one["says"] and len(set(one["says"]["paths"])) == len(self.nats.nodes)
+                for one in found["gateways"].values()
             )
 
-        self.wait(is_shared, "each gateway has lines")
+        self.wait(is_shared, "each gateway has lines, and paths to three nodes")
         self.wait(self.are_leaders_home, "each node leads one bucket of the leases")
-        time.sleep(2.5)  # paths come home
+        time.sleep(1.0)
 
     def are_leaders_home(self) -> bool:
         """Say whether each node leads one bucket of each group: else one deed does what two would do."""
