@@ -32,7 +32,7 @@ def toys(port: str = "pty") -> Simulator:
 
 
 def write(port: str, seconds: float, ledger: Ledger | None = None) -> None:
-    with Bus(port, ledger=ledger) as bus:
+    with Bus(port, ledger=ledger, expiry=60.0) as bus:
         toy = bus.attach(Toy, 1)
         bus.write(toy, toy.acceleration_time, seconds)
 

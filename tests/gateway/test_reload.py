@@ -137,8 +137,9 @@ def test_drives_come_and_go_and_a_line_that_is_the_same_goes_on(tmp_path: Path) 
         gateway.await_state("fan-2", "stands")
         frame = gateway.frame()
         assert (frame["revision"], frame["drives"].keys()) == (2, {"pump-1", "fan-2"})
-        (alarm,) = [one for one in frame["alarms"] if one["drive"] == "fan-1"]
-        assert alarm["ended"] is not None
+        ended = [one["ended"] for one in frame["alarms"] if one["drive"] == "fan-1"]
+        assert ended  # one, or more on a busy machine
+        assert None not in ended
         names = [line["drives"][0]["name"] for line in gateway.get("/api/plant").json["lines"]]
         assert names == ["pump-1", "fan-2"]
         assert rows.adopted == [gateway.gateway.plant]

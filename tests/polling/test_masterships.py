@@ -299,7 +299,7 @@ def test_no_port_is_opened_by_who_is_not_the_master(mastership: Mastership, far:
         Rows(poller).settle_unpolled("fan")
         assert len(far.received) == 1
         hold(mastership)
-        until(lambda: len(far.received) >= 2 and far.received[-1])  # a busy machine may need more
+        until(lambda: any(far.received[1:]))  # a busy machine may open it more than once
 
 
 def taken_of(poller: Poller, rows: list[Row]) -> list[Row]:
