@@ -12,29 +12,8 @@
 
 enum {
     MOST_LEAVING_MS = 100, /* that the end of a file waits for its last request to leave */
-    MOST_CANCELLED_MS = 1000
-};
-
-struct md_file {
-    HANDLE handle;
-    const struct kind *kind;
-    void *whose;
-    int is_watched;
-    int is_reading, is_writing; /* the system has its byte, or its request */
-    int is_held;                /* its byte has come */
-    int is_ended, error;        /* it hung up; an errno */
-    int is_ready;               /* it is in the list of those */
-    struct md_file *next_ready;
-    OVERLAPPED reading, writing;
-    uint8_t byte;
-    uint8_t leaving[MD_MOST_FRAME];
-};
-
-/* The calls in which COM ports and sockets differ; the first and the last return -1 and set errno. */
-struct kind {
-    ssize_t (*read)(struct md_file *file, void *bytes, size_t room); /* what is there */
-    DWORD (*begin)(struct md_file *file); /* to read its byte; return an error */
-    ssize_t (*write)(struct md_file *file, const void *bytes, size_t len);
+    MOST_CANCELLED_MS = 1000,
+    MOST_COMPLETING_MS = 5
 };
 
 /* Files by their handles, which are small multiples of 4. */
@@ -46,12 +25,6 @@ static struct md_file *find(int fd)
 {
     unsigned at = (unsigned)fd / 4;
     return at < room_for ? files[at] : NULL;
-}
-
-static ssize_t fail(DWORD error)
-{
-    errno = md_errno_of(error);
-    return -1;
 }
 
 /* ---- what completes while the thread waits ---- */
@@ -66,7 +39,7 @@ static void tell(struct md_file *file)
     first_ready = file;
 }
 
-static void has_read(struct md_file *file, DWORD error, DWORD got)
+void md_file_has_read(struct md_file *file, DWORD error, DWORD got)
 {
     file->is_reading = 0;
     file->is_held = !error && got;
@@ -76,31 +49,12 @@ static void has_read(struct md_file *file, DWORD error, DWORD got)
     tell(file);
 }
 
-static void CALLBACK port_has_read(DWORD error, DWORD got, OVERLAPPED *reading)
+void md_file_has_written(struct md_file *file, DWORD error)
 {
-    has_read(reading->hEvent, error, got);
-}
-
-static void CALLBACK socket_has_read(DWORD error, DWORD got, OVERLAPPED *reading, DWORD flags)
-{
-    (void)flags;
-    has_read(reading->hEvent, error, got);
-}
-
-static void CALLBACK port_has_written(DWORD error, DWORD written, OVERLAPPED *writing)
-{
-    struct md_file *file = writing->hEvent;
-    (void)written;
     file->is_writing = 0;
     if (error)
         file->error = md_errno_of(error);
     tell(file);
-}
-
-/* Have the completion routines run of what is complete. */
-static void run_completed(void)
-{
-    SleepEx(0, TRUE);
 }
 
 /* Read its byte, unless it is there or on its way. */
@@ -112,91 +66,29 @@ static void begin(struct md_file *file)
     file->is_reading = 1;
     DWORD error = file->kind->begin(file);
     if (error)
-        has_read(file, error, 0);
+        md_file_has_read(file, error, 0);
 }
-
-/* ---- COM ports ---- */
-
-static DWORD begin_port(struct md_file *file)
-{
-    return ReadFileEx(file->handle, &file->byte, 1, &file->reading, port_has_read) ? 0 : GetLastError();
-}
-
-static ssize_t read_port(struct md_file *file, void *bytes, size_t room)
-{
-    DWORD errors, got = 0;
-    COMSTAT state;
-    if (!ClearCommError(file->handle, &errors, &state))
-        return fail(GetLastError());
-    if (!state.cbInQue)
-        return fail(WSAEWOULDBLOCK);
-    DWORD most = state.cbInQue < room ? state.cbInQue : (DWORD)room;
-    OVERLAPPED now = {.hEvent = CreateEventW(NULL, TRUE, FALSE, NULL)};
-    if (!now.hEvent)
-        return fail(GetLastError());
-    int is_begun = ReadFile(file->handle, bytes, most, NULL, &now) || GetLastError() == ERROR_IO_PENDING;
-    int is_read = is_begun && GetOverlappedResult(file->handle, &now, &got, TRUE);
-    DWORD error = is_read ? 0 : GetLastError();
-    CloseHandle(now.hEvent);
-    return is_read ? (ssize_t)got : fail(error);
-}
-
-static ssize_t write_port(struct md_file *file, const void *bytes, size_t len)
-{
-    run_completed();
-    if (file->is_writing)
-        return fail(WSAEWOULDBLOCK);
-    DWORD most = len < sizeof file->leaving ? (DWORD)len : (DWORD)sizeof file->leaving;
-    memcpy(file->leaving, bytes, most);
-    file->writing = (OVERLAPPED){.hEvent = file};
-    if (!WriteFileEx(file->handle, file->leaving, most, &file->writing, port_has_written))
-        return fail(GetLastError());
-    file->is_writing = 1;
-    return (ssize_t)most;
-}
-
-/* Nothing ends a read but the byte that it waits for, and nothing a write but its last byte. */
-static int set_up_port(HANDLE handle)
-{
-    COMMTIMEOUTS none = {0};
-    return SetCommTimeouts(handle, &none) && SetCommMask(handle, 0);
-}
-
-/* ---- sockets ---- */
-
-static DWORD begin_socket(struct md_file *file)
-{
-    WSABUF buffer = {.len = 1, .buf = (char *)&file->byte};
-    DWORD flags = 0;
-    int is_begun = !WSARecv((SOCKET)file->handle, &buffer, 1, NULL, &flags, &file->reading, socket_has_read);
-    DWORD error = is_begun ? 0 : (DWORD)WSAGetLastError();
-    return error == WSA_IO_PENDING ? 0 : error;
-}
-
-static ssize_t read_socket(struct md_file *file, void *bytes, size_t room)
-{
-    int got = recv((SOCKET)file->handle, bytes, (int)room, 0);
-    return got < 0 ? fail((DWORD)WSAGetLastError()) : got;
-}
-
-static ssize_t write_socket(struct md_file *file, const void *bytes, size_t len)
-{
-    int written = send((SOCKET)file->handle, bytes, (int)len, 0);
-    return written < 0 ? fail((DWORD)WSAGetLastError()) : written;
-}
-
-static const struct kind port_kind = {read_port, begin_port, write_port};
-static const struct kind socket_kind = {read_socket, begin_socket, write_socket};
 
 /* ---- for port_io.c ---- */
+
+/* Have its byte, if it came. What Windows completes at once, Wine completes in another process; until then
+ * the byte lies in the queue, and must not be taken for missing. */
+static void complete(struct md_file *file)
+{
+    if (file->is_reading)
+        md_run_completed();
+    for (int ms = 0; ms < MOST_COMPLETING_MS && file->is_reading && file->kind->has_bytes(file); ms++)
+        SleepEx(1, TRUE);
+}
 
 ssize_t md_descriptor_read(int fd, void *bytes, size_t room)
 {
     struct md_file *file = find(fd);
-    if (file->is_reading)
-        run_completed();
+    if (!file)
+        return md_fail(ERROR_INVALID_HANDLE);
+    complete(file);
     if (file->is_reading) /* nothing has come since */
-        return fail(WSAEWOULDBLOCK);
+        return md_fail(WSAEWOULDBLOCK);
     size_t held = 0;
     if (file->is_held) {
         memcpy(bytes, &file->byte, 1);
@@ -219,7 +111,7 @@ ssize_t md_descriptor_read(int fd, void *bytes, size_t room)
 ssize_t md_descriptor_write(int fd, const void *bytes, size_t len)
 {
     struct md_file *file = find(fd);
-    return file->kind->write(file, bytes, len);
+    return file ? file->kind->write(file, bytes, len) : md_fail(ERROR_INVALID_HANDLE);
 }
 
 /* ---- for waiter.c and rts.c ---- */
@@ -246,15 +138,15 @@ int md_file_add(int fd, void *whose)
         errno = EBADF;
         return -1;
     }
-    if (type == FILE_TYPE_CHAR && !set_up_port(handle))
-        return (int)fail(GetLastError());
+    if (type == FILE_TYPE_CHAR && !md_port_prepare(handle))
+        return (int)md_fail(GetLastError());
     struct md_file *file = grow((unsigned)fd / 4) ? calloc(1, sizeof *file) : NULL;
     if (!file) {
         errno = ENOMEM;
         return -1;
     }
     file->handle = handle;
-    file->kind = type == FILE_TYPE_CHAR ? &port_kind : &socket_kind;
+    file->kind = type == FILE_TYPE_CHAR ? &md_port_kind : &md_socket_kind;
     file->whose = whose;
     files[(unsigned)fd / 4] = file;
     md_file_watch(fd, 1);
@@ -318,6 +210,6 @@ int md_file_is_writing(int fd)
     struct md_file *file = find(fd);
     if (!file)
         return 0;
-    run_completed();
+    md_run_completed();
     return file->is_writing;
 }

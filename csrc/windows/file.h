@@ -4,11 +4,48 @@
 
 #include "../internal.h"
 
+#include <errno.h>
+#include <sys/types.h>
+
 #define WIN32_LEAN_AND_MEAN
 #include <winsock2.h>
 #include <windows.h>
 
+struct md_file {
+    HANDLE handle;
+    const struct md_file_kind *kind;
+    void *whose;
+    int is_watched;
+    int is_reading, is_writing; /* the system has its byte, or its request */
+    int is_held;                /* its byte has come */
+    int is_ended, error;        /* it hung up; an errno */
+    int is_ready;               /* it is in the list of those */
+    struct md_file *next_ready;
+    OVERLAPPED reading, writing;
+    uint8_t byte;
+    uint8_t leaving[MD_MOST_FRAME];
+};
+
+/* The calls in which COM ports and sockets differ; the first and the last return -1 and set errno. */
+struct md_file_kind {
+    ssize_t (*read)(struct md_file *file, void *bytes, size_t room); /* what is there */
+    int (*has_bytes)(struct md_file *file);
+    DWORD (*begin)(struct md_file *file); /* to read its byte; return an error */
+    ssize_t (*write)(struct md_file *file, const void *bytes, size_t len);
+};
+
+/* ---- com.c, socket.c ---- */
+
+extern const struct md_file_kind md_port_kind, md_socket_kind;
+
+int md_port_prepare(HANDLE handle); /* so that its reads and writes have no time-outs; 0 where that fails */
+
 /* ---- file.c ---- */
+
+/* What completed: the read of its byte, or the write. */
+void md_file_has_read(struct md_file *file, DWORD error, DWORD got);
+void md_file_has_written(struct md_file *file, DWORD error);
+
 
 int md_file_add(int fd, void *whose); /* -1: see errno */
 void md_file_watch(int fd, int is_watched);
@@ -20,6 +57,18 @@ int md_file_is_writing(int fd); /* what was written last has not left yet */
 /* ---- failure.c ---- */
 
 int md_errno_of(DWORD error); /* of GetLastError() or WSAGetLastError() */
+
+static inline ssize_t md_fail(DWORD error) /* -1, and errno */
+{
+    errno = md_errno_of(error);
+    return -1;
+}
+
+/* Have the completion routines run of what is complete. */
+static inline void md_run_completed(void)
+{
+    SleepEx(0, TRUE);
+}
 
 static inline HANDLE handle_of(int fd)
 {

@@ -1,0 +1,107 @@
+"""Utilisation of a paced wire, and requests too early, on a COM port of Windows by Wine, and here.
+
+FOLDER is one that `tools/wine make` filled. Wine is not Windows: its timers keep time to a millisecond, each
+wait goes through a process of its own (wineserver), and its COM port is a pseudo-terminal here.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+from collections.abc import Callable
+from dataclasses import asdict, replace
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+from bench.masters import rivals
+from bench.masters.jobs import REGISTERS, Job
+from bench.support import tables
+from bench.support.programs import HERE, paced_line
+
+COLUMNS = ("baud", "system", "utilisation", "requests", "too early", "late us", "CPU us", "misses")
+COM = 5
+
+
+def here(job: Job, folder: Path) -> dict[str, Any]:
+    """Return CPU seconds and misses of a poll on this system."""
+    own = rivals.measure("multidrop", job)
+    return {"cpu": own["cpu_seconds"], "misses": own["failures"]}
+
+
+def on_windows(job: Job, folder: Path) -> dict[str, Any]:
+    """Return the same of a poll by Wine."""
+    link = folder / "wine" / "dosdevices" / f"com{COM}"
+    link.unlink(missing_ok=True)
+    link.symlink_to(job.port)
+    words = [HERE.parent / "tools" / "wine", folder, HERE / "masters" / "windows_master.py"]
+    told = subprocess.check_output([*words, json.dumps(asdict(replace(job, port=f"COM{COM}")))], text=True)
+    own = json.loads(told.splitlines()[-1])
+    return {"cpu": own["cpu_seconds"], "misses": own["misses"] // REGISTERS}
+
+
+SYSTEMS: dict[str, Callable[[Job, Path], dict[str, Any]]] = {"Linux": here, "Windows": on_windows}
+
+
+def measured(system: str, baudrate: int, seconds: float, folder: Path) -> dict[str, Any]:
+    """One slice, as the drives and as the master see it."""
+    with paced_line(baudrate=baudrate) as line:
+        own = SYSTEMS[system](Job(line.path, baudrate, seconds), folder)
+    report = line.report
+    requests = report["answered"] + report["unanswered"]
+    return own | {
+        "utilisation": report["utilisation"],
+        "requests": requests,
+        "early": report["early"],
+        "late": report["excess_us"]["p50"],
+        "cpu": own["cpu"] / max(1, requests) * 1e6,
+    }
+
+
+def row(baudrate: int, system: str, slices: list[dict[str, Any]]) -> list[str]:
+    middle = {key: median(each[key] for each in slices) for key in ("utilisation", "late", "cpu")}
+    total = {key: sum(each[key] for each in slices) for key in ("requests", "early", "misses")}
+    return [
+        str(baudrate),
+        system,
+        f"{middle['utilisation']:.4f}",
+        str(total["requests"]),
+        str(total["early"]),
+        f"{middle['late']:.0f}",
+        f"{middle['cpu']:.0f}",
+        str(total["misses"]),
+    ]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--baudrates", type=int, nargs="+", default=[9600, 38400, 115200])
+    parser.add_argument("--seconds", type=float, default=3.0, help="of a slice")
+    parser.add_argument("--slices", type=int, default=3)
+    parser.add_argument("--ahead", action="store_true", help="run line and masters by SCHED_RR; as root")
+    arguments = parser.parse_args()
+    if arguments.ahead:
+        os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(2))
+    tables.heading("A paced line, as in utilisation.py, on a pseudo-terminal: by Linux, and as COM5 by Wine.")
+    rows = []
+    for baudrate in arguments.baudrates:
+        slices: dict[str, list[dict[str, Any]]] = {system: [] for system in SYSTEMS}
+        for _ in range(arguments.slices):
+            for system in SYSTEMS:
+                slices[system].append(measured(system, baudrate, arguments.seconds, arguments.folder))
+        rows += [row(baudrate, system, slices[system]) for system in SYSTEMS]
+    tables.show(COLUMNS, rows)
+    print(
+        "\nutilisation: ideal bus cycle / measured."
+        "\ntoo early: requests more than 20 us before the silence was over."
+        "\nlate: median time from the end of the silence until a request is seen."
+        "\nCPU: of the master's process, per exchange, without Wine's server."
+        "\nmisses: exchanges without values."
+    )
+
+
+if __name__ == "__main__":
+    main()
