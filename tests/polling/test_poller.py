@@ -385,7 +385,7 @@ def test_a_port_that_vanishes_and_comes_back_under_its_link(tmp_path: Path) -> N
 
 
 def test_polling_goes_on_where_a_stop_has_opened_the_port_again(port: str) -> None:
-    """What was queued on the port that is gone is lost; the poller may never have seen that it was gone."""
+    """Lose what was queued on the port that is gone: the poller may never have seen that it was gone."""
     with Polling(line(port, polled(drive(), ONE, 0.01))) as polling:
         polling.until("ok", 3)
         (hall,) = polling.poller._lines
