@@ -144,12 +144,13 @@ def test_a_lost_mastership_is_no_failure_of_the_drive(scene: Scene) -> None:
     assert scene.bus.statistics().counters.ended == {Missed.NOT_MASTER: 3}
 
 
+@pytest.mark.long
 def test_a_deadline_that_passes_is_enough(scene: Scene) -> None:
-    """Nobody calls anything: the clock decides."""
-    mastership = Mastership(guard_s=1000)
+    """Nobody calls anything: the clock decides. Half a guard later this process would be killed."""
+    mastership = Mastership(guard_s=8)
     path = scene.simulator.wires[0].path
     scene.bus.close()
-    mastership.extend(until_ns := now_ns() + 3 * S)
+    mastership.extend(until_ns := now_ns() + 11 * S)
     with Bus(path, mastership=mastership) as bus:
         drive = bus.attach(Brief(1, name="pump"))
         bus.read(drive, Toy.output_current)
