@@ -310,11 +310,11 @@ def test_demo_reads_every_variant_of_every_family(tmp_path: Path) -> None:
         assert sum(map(len, Decoding(found))) > 0
 
 
-def test_a_demo_goes_on_without_a_motor_that_does_not_answer() -> None:
+def test_a_demo_goes_on_without_a_motor_that_does_not_answer(tmp_path: Path) -> None:
     """A machine may have much else to do."""
     toy = Toy(1)
     with Simulator([Faulty([simulated(toy)], lambda reply: b"", unpaced=True)]) as simulator:
-        start_motors(line(simulator.wires[0].path, polled(toy, toy.readings())))
+        start_motors(line(simulator.wires[0].path, polled(toy, toy.readings())), tmp_path / "wear.sqlite")
 
 
 def test_a_demo_takes_the_place_of_a_demo_only(run: Run, tmp_path: Path) -> None:
