@@ -42,7 +42,7 @@ int md_port_prepare(HANDLE handle); /* so that its reads and writes have no time
 
 /* ---- file.c ---- */
 
-/* What completed: the read of its byte, or the write. */
+/* Completions: of the read of its byte, or of the write. */
 void md_file_has_read(struct md_file *file, DWORD error, DWORD got);
 void md_file_has_written(struct md_file *file, DWORD error);
 
