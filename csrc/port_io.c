@@ -66,7 +66,7 @@ static int may_send(struct md_port *port)
 /* Write; 1: the port took something, or there is something else to do. The request leaves when it is written;
  * where the thread was held up just then, perhaps afterwards: from too early a time on its reply, and a late
  * one, would be waited for too short. */
-static int send(struct md_port *port, int64_t begun_ns)
+static int write_request(struct md_port *port, int64_t begun_ns)
 {
     struct md_line *line = &port->turn.line;
     if (port->mastership && !may_send(port))
@@ -139,7 +139,7 @@ static int act(struct md_port *port, int want, int64_t *wake_ns, int64_t *now_ns
             *now_ns = apply(port, &exchange->settings);
             return 1;
         }
-        if (send(port, *now_ns))
+        if (write_request(port, *now_ns))
             return 1;
         *wake_ns = *now_ns + RETRY_WRITE_NS;
         return 0;
