@@ -83,6 +83,13 @@ class Chaos:
         words = ("bench.players.fleet_gateway", name, str(self.folder / name), told, *self.servers.urls)
         return Process(self.folder, name, *words)
 
+    def await_told(self) -> None:
+        """Wait until each gateway was told that something is stored: before that there is nothing to lose."""
+        ends = time.monotonic() + PATIENCE_S
+        while not all(told(self.folder).values()):
+            assert time.monotonic() < ends, f"a gateway stores nothing: see {self.folder}"
+            time.sleep(0.1)
+
     def round(self) -> None:
         """Do one thing at random, and let all run for a while."""
         attacks: tuple[tuple[str, Callable[[], None]], ...] = (
@@ -208,7 +215,8 @@ def told(folder: Path) -> dict[str, dict[int, int]]:
     found: dict[str, dict[int, int]] = {}
     for name in GATEWAYS:
         runs: dict[int, int] = defaultdict(int)
-        for line in (folder / f"{name}.told").read_text().splitlines():
+        path = folder / f"{name}.told"
+        for line in path.read_text().splitlines() if path.exists() else ():
             first, count = map(int, line.split())
             runs[first] = max(runs[first], count)
         found[name] = runs
@@ -276,8 +284,8 @@ def everything(folder: Path, dice: random.Random) -> Iterator[Chaos]:
 def run(folder: Path, seconds: float, dice: random.Random) -> int:
     """Attack for so long, compare, and return the number of what must not be."""
     with everything(folder, dice) as chaos:
+        chaos.await_told()
         ends = time.monotonic() + seconds
-        time.sleep(min(2.0, seconds / 5))
         while time.monotonic() < ends:
             chaos.round()
         chaos.settle()

@@ -38,8 +38,11 @@ def now_ns() -> int:
     return time.clock_gettime_ns(time.CLOCK_BOOTTIME)
 
 
-def live(observer: socket.socket, lease: float, guard: float, beyond: float, ports: list[str]) -> None:
+def live(
+    observer: socket.socket, lease: float, guard: float, timer: float, beyond: float, ports: list[str]
+) -> None:
     mastership = Mastership(guard)
+    mastership.guard_s = timer  # for the kernel's timer alone: lines are listened to for the guard
     drives = [
         PolledDrive(Counted(1, name=f"drive-{n}"), (Polled(Counted.number, None),)) for n in range(len(ports))
     ]
@@ -61,12 +64,13 @@ def live(observer: socket.socket, lease: float, guard: float, beyond: float, por
 def main() -> None:
     signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # the system buries them
     for words in map(str.split, sys.stdin):
-        fd, lease, guard, beyond, *ports = words
+        fd, lease, guard, timer, beyond, *ports = words
         if child := os.fork():
             print(child, flush=True)
             continue
         try:
-            live(socket.socket(fileno=int(fd)), float(lease), float(guard), float(beyond), ports)
+            times = map(float, (lease, guard, timer, beyond))
+            live(socket.socket(fileno=int(fd)), *times, ports)
         except BaseException:
             traceback.print_exc()
         finally:

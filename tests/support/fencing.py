@@ -102,7 +102,7 @@ class Fence:
         self.far = FarEnd(lines)
         self._lease, self._guard, self._beyond = lease, guard, beyond
         self.early = 0  # masters that were killed before they were stopped
-        self._timer = timer or guard  # of the master's own guard: a long one is no timer
+        self._timer = timer or guard  # the guard of which the kernel's timer is half: a long one is no timer
         self._ours, self._theirs = socket.socketpair()
         self._theirs.set_inheritable(True)
         self._client = subprocess.Popen(
@@ -128,7 +128,8 @@ class Fence:
         """A life that polls; it is dead at the end."""
         assert self._client.stdin
         assert self._client.stdout
-        words = [self._theirs.fileno(), self._lease, self._timer, self._beyond, *self.far.ports]
+        times = (self._lease, self._guard, self._timer, self._beyond)
+        words = [self._theirs.fileno(), *times, *self.far.ports]
         self._client.stdin.write(" ".join(map(str, words)) + "\n")
         self._client.stdin.flush()
         pid = int(self._client.stdout.readline())
