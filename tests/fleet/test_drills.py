@@ -9,11 +9,21 @@ import signal
 from collections.abc import Iterator
 
 import pytest
-from fleet_cuts import CUTS, cut, drilled_in_network
+from fleet_cuts import cut, drilled_in_network
 from fleet_drills import DEEDS, FleetDrill, drilled
 from peers import require_module
 
 pytestmark = [pytest.mark.slow, pytest.mark.long]
+
+# One of each kind; the bench does them all. A gateway that stands still has a test of its own below.
+DONE = (
+    "gateway killed",
+    "gateway and node killed",
+    "node stands still",
+    "ownership leader killed",
+    "all nodes killed",
+)
+CUT = ("gateway cut off", "gateway does not hear the nodes", "node hears nobody")
 
 
 @pytest.fixture(scope="module")
@@ -47,7 +57,7 @@ def test_a_drained_gateway_gives_all_its_lines_away(drill: FleetDrill) -> None:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("deed", DEEDS)
+@pytest.mark.parametrize("deed", DONE)
 def test_no_deed_makes_two_masters(drill: FleetDrill, deed: str) -> None:
     drill.settle()
     drill.judge(lambda: DEEDS[deed](drill))
@@ -62,7 +72,7 @@ def cut_drill(tmp_path_factory: pytest.TempPathFactory) -> Iterator[FleetDrill]:
         yield found
 
 
-@pytest.mark.parametrize("name", CUTS)
+@pytest.mark.parametrize("name", CUT)
 def test_no_cut_makes_two_masters(cut_drill: FleetDrill, name: str) -> None:
     cut_drill.settle()
     cut_drill.judge(lambda: cut(cut_drill, name))

@@ -26,7 +26,7 @@ from multidrop.fleet.errors import FleetError
 from multidrop.fleet.servers import ServerPath
 
 GATEWAYS = ("gw-a", "gw-b", "gw-c")
-PATIENCE_S = 60.0
+PATIENCE_S = 120.0
 JUDGED_S = 11.0  # an election comes up to 9 s after a death
 
 
