@@ -175,8 +175,7 @@ def test_nine_tabs_are_live_at_once(browser: Any, gateway: FakeGateway) -> None:
     shown = "Number([...document.querySelectorAll('tr.drive .number')][0].textContent)"
     first = [page.evaluate(shown) for page in pages]
     for page, before in zip(pages, first, strict=True):
-        until(page, f"{shown} > {before}")
-        assert link(page) == "live"
+        until(page, f"{shown} > {before} && {LIVE}")
         then = page.evaluate(shown)
         assert (time.time() - then) % 1000 < BUSY_S
     context.close()

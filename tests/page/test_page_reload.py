@@ -103,5 +103,5 @@ def test_a_broken_file_and_a_good_one_before_the_gateway_itself(page: Any, tmp_p
         told(page, "plant.toml is in effect")
         assert page.locator("#ask .outcome li").all_inner_texts() == list(gateway.gateway.reload.restart)
         page.keyboard.press("Escape")
-        page.get_by_role("link", name="fan-2").wait_for()
+        page.get_by_role("link", name="fan-2", exact=True).wait_for()  # an alarm may name it too
         notice.wait_for(state="hidden")
