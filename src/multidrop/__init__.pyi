@@ -31,6 +31,8 @@ from multidrop.drive.declare import command as command
 from multidrop.drive.declare import reading as reading
 from multidrop.drive.declare import setting as setting
 from multidrop.drive.known_state import StateReader as StateReader
+from multidrop.drive.named_verbs import verb_arguments as verb_arguments
+from multidrop.drive.named_verbs import verbs_of as verbs_of
 from multidrop.drive.register import Access as Access
 from multidrop.drive.register import Register as Register
 from multidrop.drive.table import COIL as COIL
@@ -76,6 +78,8 @@ from multidrop.history.writer import HistoryState as HistoryState
 from multidrop.history.writer import HistoryWriter as HistoryWriter
 from multidrop.plant.loader import PlantError as PlantError
 from multidrop.plant.loader import load_plant as load_plant
+from multidrop.plant.may_lists import MAY_LISTS as MAY_LISTS
+from multidrop.plant.may_lists import check_listed as check_listed
 from multidrop.plant.model import Plant as Plant
 from multidrop.plant.model import PlantLine as PlantLine
 from multidrop.plant.model import Polled as Polled

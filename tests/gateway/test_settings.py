@@ -97,8 +97,9 @@ verbs = ["pump-1.fly"]
         '[serve.may]: look = "everybody" is neither "anyone" nor "token"',
         "[serve.may]: write: pump-1.output_current is never written: it can only be read",
         "[serve.may]: write: there is no drive 'pump-9'; did you mean pump-2 or pump-1?",
-        "[serve.may]: write: 'setpoint' is not drive.register, as \"pump-1.frequency_setpoint\" is",
-        "[serve.may]: verbs: pump-1 has no verb 'fly'; it has start, jog, reset_fault, set_frequency, coast",
+        "[serve.may]: write: 'setpoint' is not right; write write = [\"pump-1.frequency_setpoint\"]",
+        "[serve.may]: verbs: pump-1 has no verb 'fly' that a list allows; it has start, jog, reset_fault, "
+        "set_frequency, coast",
         f"[serve]: audit {tmp_path}/no/such/folder/audit.jsonl cannot be written: No such file or directory",
     ]
     assert sorted(found) == sorted(expected)

@@ -24,6 +24,7 @@ from multidrop.cli.support.extras import require_extra
 from multidrop.cli.support.output import print_text, warn
 from multidrop.cli.support.plants import add_port_option, plant_of
 from multidrop.cli.support.signals import on_end_signals
+from multidrop.drive.named_verbs import verbs_of
 from multidrop.drives import MODELS
 from multidrop.plant.loader import load_plant
 from multidrop.plant.model import Plant
@@ -107,7 +108,6 @@ def _demo_settings(plant: Plant, folder: Path) -> ServeSettings:
     from multidrop.gateway.parts import PARTS, settings_class
     from multidrop.gateway.rights import May, Right
     from multidrop.gateway.settings import ServeSettings
-    from multidrop.gateway.verb_rules import verbs_of
 
     drives = [polled.drive for line in plant.lines for polled in line.drives]
     writes = [

@@ -157,13 +157,12 @@ def _value(found: Mapping[str, Any]) -> float | str:
     value = found.get("value")
     if isinstance(value, str):
         return _text(found, "value")
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not is_finite(value):
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not _is_finite(value):
         raise ValueError("value is missing, or is neither a number nor a text")
     return value
 
 
-def is_finite(value: float) -> bool:
-    """Say whether a number from JSON is one that a register may hold."""
+def _is_finite(value: float) -> bool:
     try:
         return isfinite(value)
     except OverflowError:  # an int that no float holds

@@ -7,7 +7,6 @@ from typing import Any, NamedTuple
 
 from multidrop import (
     BadReply,
-    Direction,
     Drive,
     DriveRefused,
     Effect,
@@ -23,8 +22,10 @@ from multidrop import (
     Seen,
     Stopped,
     Unsupported,
+    verb_arguments,
+    verbs_of,
 )
-from multidrop.fleet.command_words import CommandAnswer, CommandOutcome, CommandRequest, is_finite
+from multidrop.fleet.command_words import CommandAnswer, CommandOutcome, CommandRequest
 
 _MOVING = ("start", "jog", "reset_fault", "set_frequency")
 
@@ -36,32 +37,9 @@ class Prepared(NamedTuple):
     work: Callable[[], CommandAnswer]
 
 
-def _direction(value: object) -> Direction:
-    try:
-        return Direction(value)
-    except ValueError:
-        raise ValueError(f"direction = {value!r} is neither forward nor reverse") from None
-
-
-def _hertz(value: object) -> float:
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not is_finite(value):
-        raise ValueError(f"hz = {value!r} is no number")
-    return float(value)
-
-
-VERBS: Mapping[str, Mapping[str, Callable[[object], Any]]] = {  # and options; `stop` goes a way of its own
-    "start": {"direction": _direction},
-    "jog": {"direction": _direction},
-    "reset_fault": {},
-    "set_frequency": {"hz": _hertz},
-    "coast": {},  # a hoist would drop its load
-    "emergency_stop": {},
-}
-
-
-def verbs_of(drive: Drive) -> list[str]:
-    """Return the verbs of these that the drive's family has."""
-    return [name for name in VERBS if getattr(type(drive), name) is not getattr(Drive, name)]
+def commands_of(drive: Drive) -> list[str]:
+    """Return the verbs that a command may ask for; `stop` goes a way of its own."""
+    return [verb for verb in verbs_of(drive) if verb != "stop"]
 
 
 def prepare(drive: Drive, request: CommandRequest) -> Prepared:
@@ -74,10 +52,10 @@ def prepare(drive: Drive, request: CommandRequest) -> Prepared:
 
 def _prepare_verb(drive: Drive, request: CommandRequest) -> Prepared:
     verb = request.verb
-    if verb not in verbs_of(drive):
-        known = ", ".join(verbs_of(drive)) or "none"
+    if verb not in commands_of(drive):
+        known = ", ".join(commands_of(drive)) or "none"
         raise ValueError(f"{drive.name} has no verb {verb!r}; it has {known}")
-    arguments = _arguments(verb, request.options)
+    arguments = verb_arguments(verb, request.options)
     if verb in _MOVING:
         drive.check_confirmed(verb)
     next(getattr(drive, verb).script(**arguments), None)  # raises for what the family forbids
@@ -93,19 +71,9 @@ def _prepare_verb(drive: Drive, request: CommandRequest) -> Prepared:
     return Prepared(f"{drive.name}: {verb}{told}", work)
 
 
-def _arguments(verb: str, options: Mapping[str, object]) -> dict[str, Any]:
-    takes = VERBS[verb]
-    for name in options:
-        if name not in takes:
-            raise ValueError(f"{verb} has no option {name!r}; it has {', '.join(takes) or 'none'}")
-    if "hz" in takes and options.get("hz") is None:
-        raise ValueError(f"{verb} needs a frequency: hz = 20.0")
-    return {name: takes[name](value) for name, value in options.items() if value is not None}
-
-
 def _prepare_write(drive: Drive, request: CommandRequest) -> Prepared:
     register = drive.register(request.register)
-    if register.never or not register.writable:
+    if not register.writable:
         why = register.never or "it can only be read"
         raise Refused(f"{request.entry} is never written: {why}", register=register.name)
     value = register.decode(register.encode(_typed(register, request.value)))

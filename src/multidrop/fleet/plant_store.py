@@ -13,19 +13,14 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from multidrop import Key, Plant, PlantError, PlantLine, TomlPlace, load_plant
+from multidrop import MAY_LISTS, Key, Plant, PlantError, PlantLine, TomlPlace, check_listed, load_plant
 from multidrop.fleet import names
 from multidrop.fleet.buckets import Bucket, Follower, Record
-from multidrop.fleet.drive_commands import verbs_of
 
 AT_ONCE = 64
 SOCKETS = ("socket://", "tcp://")
 
 _FLEET = {"may": Key(dict, "[fleet.may], a table")}
-_MAY = {
-    "write": Key(list, 'write = ["pump-1.frequency_setpoint"]'),
-    "verbs": Key(list, 'verbs = ["pump-1.start"]'),
-}
 
 
 def read_plant(path: Path) -> tuple[Plant, dict[str, Any]]:
@@ -53,31 +48,12 @@ def _lists(table: Any, plant: Plant) -> dict[str, list[str]]:
     may = place.check(table, _FLEET).get("may", {})
     inner = place.of_file(plant.path, "[fleet.may]")
     found = {
-        key: [entry for entry in entries if inner.attempt(_check_listed, key, entry, plant)]
-        for key, entries in inner.check(may, _MAY).items()
+        key: [entry for entry in entries if inner.attempt(check_listed, plant, key, entry)]
+        for key, entries in inner.check(may, MAY_LISTS).items()
     }
     if place.config_errors:
         raise PlantError(tuple(place.config_errors))
     return found
-
-
-def _check_listed(key: str, entry: object, plant: Plant) -> bool:
-    """Check that an entry is a register that can be written, or a verb that its drive has."""
-    name, dot, rest = entry.rpartition(".") if isinstance(entry, str) else ("", "", "")
-    if not dot:
-        raise ValueError(f"{key}: {entry!r} is not right; write {_MAY[key].example}")
-    try:
-        _, drive = plant.find_drive(name)
-    except ValueError as unknown:
-        raise ValueError(f"{key}: {str(unknown).replace(f'{plant.path} has', 'there is')}") from None
-    if key == "write":
-        register = drive.register(rest)
-        if register.never or not register.writable:
-            raise ValueError(f"{key}: {entry} is never written: {register.never or 'it can only be read'}")
-    elif rest not in verbs_of(drive):
-        known = ", ".join(verbs_of(drive)) or "none"
-        raise ValueError(f"{key}: {name} has no verb {rest!r} that a list allows; it has {known}")
-    return True
 
 
 def _description(table: Mapping[str, Any], folder: Path, may: Mapping[str, Sequence[str]]) -> dict[str, Any]:

@@ -24,6 +24,7 @@ from multidrop import (
     Seen,
     Stopped,
     Unsupported,
+    verb_arguments,
 )
 from multidrop.gateway.command_threads import begin_stop, in_thread
 from multidrop.gateway.rights import NEVER_THIS_WAY, NOT_ALLOWED, NOT_LISTED, Caller, May, Right
@@ -150,7 +151,7 @@ class Commands:
         if verb == "stop":
             return (await self.stop([drive], caller))[drive]
         try:
-            arguments = rule.arguments(verb, options)
+            arguments = verb_arguments(verb, options)
         except ValueError as mistake:
             return _failed(mistake)
         return await self._carry_out(drive, caller, what, partial(_act, verb=verb, arguments=arguments))

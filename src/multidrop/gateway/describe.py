@@ -7,9 +7,8 @@ from collections.abc import Sequence
 from enum import Flag
 from typing import Any, cast
 
-from multidrop import Drive, Plant, PlantLine, PolledDrive, Register
+from multidrop import Drive, Plant, PlantLine, PolledDrive, Register, verbs_of
 from multidrop.gateway.rights import May, Right
-from multidrop.gateway.verb_rules import verbs_of
 
 FREQUENCIES = ("output_frequency", "motor_speed")
 CURRENTS = ("output_current",)

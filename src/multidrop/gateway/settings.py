@@ -9,10 +9,9 @@ from dataclasses import MISSING, Field, dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
-from multidrop import Key, Plant, PlantError, TomlPlace
+from multidrop import MAY_LISTS, Key, Plant, PlantError, TomlPlace, check_listed
 from multidrop.gateway.parts import PARTS, Part, settings_class
 from multidrop.gateway.rights import May, Right, Token, is_loopback, read_tokens
-from multidrop.gateway.verb_rules import VERBS, verbs_of
 
 LISTEN = "127.0.0.1:8750"
 HOST = re.compile(r"[A-Za-z0-9]([A-Za-z0-9.-]{0,251}[A-Za-z0-9])?")
@@ -40,8 +39,7 @@ _SERVE = {
 _MAY = {
     "look": Key(str, 'look = "anyone"'),
     "stop": Key(str, 'stop = "token"'),
-    "write": Key(list, 'write = ["pump-1.frequency_setpoint"], or leave it out'),
-    "verbs": Key(list, 'verbs = ["pump-1.start"], or leave it out'),
+    **MAY_LISTS,
 }
 
 
@@ -178,35 +176,12 @@ def _may(table: Any, plant: Plant, place: TomlPlace) -> May:
             place.wrong(f'{key} = "{given[key]}" is neither "anyone" nor "token"')
     listed = {
         key: frozenset(
-            entry for entry in given.get(key, ()) if place.attempt(_check_listed, key, entry, plant)
+            entry for entry in given.get(key, ()) if place.attempt(check_listed, plant, key, entry)
         )
-        for key in ("write", "verbs")
+        for key in MAY_LISTS
     }
     on_loopback = Right.STOP if given.get("stop") == "anyone" else Right.LOOK
     return May(given.get("look", "anyone"), on_loopback, listed["write"], listed["verbs"])
-
-
-def _check_listed(key: str, entry: object, plant: Plant) -> bool:
-    """Check that an entry is a register that can be written, or a verb that its drive has."""
-    example = "pump-1.frequency_setpoint" if key == "write" else "pump-1.start"
-    name, dot, rest = entry.rpartition(".") if isinstance(entry, str) else ("", "", "")
-    if not dot:
-        raise ValueError(
-            f'{key}: {entry!r} is not drive.{"register" if key == "write" else "verb"}, as "{example}" is'
-        )
-    try:
-        _, drive = plant.find_drive(name)
-    except ValueError as unknown:
-        raise ValueError(f"{key}: {str(unknown).replace(f'{plant.path} has', 'there is')}") from None
-    if key == "write":
-        register = drive.register(rest)
-        if not register.writable:
-            why = register.never or "it can only be read"
-            raise ValueError(f"{key}: {entry} is never written: {why}")
-    elif rest not in verbs_of(drive):
-        known = ", ".join(verb for verb in verbs_of(drive) if VERBS[verb].is_listed) or "none"
-        raise ValueError(f"{key}: {name} has no verb {rest!r}; it has {known}")
-    return True
 
 
 def _part(part: Part, table: Mapping[str, Any], plant: Plant, place: TomlPlace) -> Any:

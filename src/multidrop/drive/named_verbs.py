@@ -1,0 +1,61 @@
+"""Named verbs: a drive's verbs as programs call them that send a name and options, such as JSON."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from math import isfinite
+from typing import Any
+
+from multidrop.drive.family import Drive
+from multidrop.drive.state import Direction
+
+
+def _direction(value: object) -> Direction:
+    try:
+        return Direction(value)
+    except ValueError:
+        raise ValueError(f"direction = {value!r} is neither forward nor reverse") from None
+
+
+def _hertz(value: object) -> float:
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not _is_finite(value):
+        raise ValueError(f"hz = {value!r} is no number")
+    return float(value)
+
+
+def _is_finite(value: float) -> bool:
+    try:
+        return isfinite(value)
+    except OverflowError:  # an int that no float holds
+        return False
+
+
+_OPTIONS: Mapping[str, Mapping[str, Callable[[object], Any]]] = {
+    "start": {"direction": _direction},
+    "jog": {"direction": _direction},
+    "reset_fault": {},
+    "set_frequency": {"hz": _hertz},
+    "coast": {},  # a hoist would drop its load
+    "emergency_stop": {},
+    "stop": {},
+}
+
+
+def verbs_of(drive: Drive) -> list[str]:
+    """Return the names of the verbs that change something and that the drive's family has."""
+    return [name for name in _OPTIONS if getattr(type(drive), name) is not getattr(Drive, name)]
+
+
+def verb_arguments(verb: str, options: Mapping[str, object]) -> dict[str, Any]:
+    """Return the arguments of a verb: `{"direction": "reverse"}` is Direction.REVERSE, `hz` is in Hz.
+
+    An option that is None is left out. Raises ValueError for one that the verb has not, that it lacks, or
+    that is not right; KeyError for an unknown verb.
+    """
+    takes = _OPTIONS[verb]
+    for name in options:
+        if name not in takes:
+            raise ValueError(f"{verb} has no option {name!r}; it has {', '.join(takes) or 'none'}")
+    if "hz" in takes and options.get("hz") is None:
+        raise ValueError(f"{verb} needs a frequency: hz = 20.0")
+    return {name: takes[name](value) for name, value in options.items() if value is not None}
