@@ -177,6 +177,16 @@ def test_who_is_not_the_master_keeps_silent(desk: Desks) -> None:
     assert isinstance(desk.ask(register=SETPOINT, value=20.0), Offered)
 
 
+def test_a_stop_waits_for_no_guard_and_a_command_does(desk: Desks) -> None:
+    """In its first second a new master lets nothing else pass, and the motor must stop in it too."""
+    desk.is_guarded = True
+    assert desk.ask(register=SETPOINT, value=20.0) is None
+    stopped = asyncio.run(desk.stop())
+    assert stopped is not None
+    assert stopped.outcome is DONE
+    assert [name for name, _ in desk.writes] == ["control"]
+
+
 def test_who_asks_what_became_of_it_first_ends_it(desk: Desks) -> None:
     token = desk.offered()
 

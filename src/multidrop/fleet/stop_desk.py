@@ -44,7 +44,7 @@ class StopDesk:
 
         A copy of the message gets the answer of the same stop; another message is another stop.
         """
-        held = self._lines.mine(line)
+        held = self._lines.for_stop(line)
         if held is None:
             return None
         try:
