@@ -14,7 +14,7 @@ from typing import Any
 from secured_clusters import GATEWAYS, SecuredCluster, secured_cluster
 from serial_hall import SerialHall
 
-PATIENCE_S = 180.0  # a stop goes on for 30 s where nothing says that the motor stands
+PATIENCE_S = 60.0
 
 
 def multidrop(servers: SecuredCluster, user: str, *words: str) -> subprocess.CompletedProcess[str]:
