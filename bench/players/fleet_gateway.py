@@ -7,8 +7,10 @@ of a run's first number and a count. With `-` for TOLD it forwards what it has. 
 from __future__ import annotations
 
 import asyncio
+import os
 import sys
 import time
+import traceback
 from pathlib import Path
 
 sys.path.append(str(Path(__file__).parents[2] / "tests" / "support"))
@@ -31,7 +33,11 @@ async def live(name: str, folder: Path, told: str, urls: list[str]) -> None:
     if told != "-":
         drives = Names([f"{name}-{drive}" for drive in range(4)])
         doing.append(asyncio.create_task(asyncio.to_thread(fill, spool, drives, Path(told))))
-    await asyncio.wait(doing, return_when=asyncio.FIRST_COMPLETED)
+    try:
+        await asyncio.gather(*doing)
+    except Exception:
+        traceback.print_exc()
+    os._exit(1)  # neither ends by itself, and the thread would go on
 
 
 def fill(spool: Spool, drives: Names, told: Path) -> None:

@@ -12,7 +12,6 @@ from __future__ import annotations
 import argparse
 import asyncio
 import json
-import os
 import random
 import subprocess
 import sys
@@ -36,7 +35,7 @@ from multidrop.fleet.samples_stream import StreamError, connect, create_stream, 
 
 ROOT = Path(__file__).parents[2]
 GATEWAYS = ("gateway-1", "gateway-2")
-PATIENCE_S = 120.0  # for all to be done after the last kill
+PATIENCE_S = 300.0  # for all to be done after the last kill
 
 Numbers = dict[str, Counter[int]]  # by gateway, how often each exchange is there
 
@@ -49,10 +48,9 @@ class Process:
         self.start()
 
     def start(self) -> None:
-        here = {**os.environ, "PYTHONPATH": os.pathsep.join((str(ROOT / "src"), str(ROOT)))}
-        with self._log.open("ab") as log:
+        with self._log.open("ab") as log:  # here, where `bench` is; the library is the installed one
             self.process = subprocess.Popen(
-                self._words, stdin=subprocess.DEVNULL, stdout=log, stderr=log, cwd=ROOT, env=here
+                self._words, stdin=subprocess.DEVNULL, stdout=log, stderr=log, cwd=ROOT
             )
 
     def kill(self) -> None:
@@ -61,6 +59,10 @@ class Process:
 
     def is_over(self) -> bool:
         return self.process.poll() is not None
+
+    def check_alive(self) -> None:
+        """Raise AssertionError with the end of its log where it ended by itself."""
+        assert not self.is_over(), f"it ended by itself: {self._log.read_text()[-1000:]}"
 
 
 class Chaos:
@@ -86,7 +88,9 @@ class Chaos:
     def await_told(self) -> None:
         """Wait until each gateway was told that something is stored: before that there is nothing to lose."""
         ends = time.monotonic() + PATIENCE_S
-        while not all(told(self.folder).values()):
+        while not all(sum(runs.values()) for runs in told(self.folder).values()):
+            for gateway in self.gateways:
+                gateway.check_alive()
             assert time.monotonic() < ends, f"a gateway stores nothing: see {self.folder}"
             time.sleep(0.1)
 
@@ -189,7 +193,7 @@ class Chaos:
         """Wait until the stream has the newest message of each spool."""
         ends = time.monotonic() + PATIENCE_S
         client = await connect(self.servers.urls)
-        for name in GATEWAYS:
+        for name, gateway in zip(GATEWAYS, self.gateways, strict=True):
             stored = [int(path.name[:12]) for path in (self.folder / name).glob("*.arrows")]
             if not stored:  # it was killed each time before it stored anything
                 continue
@@ -201,6 +205,7 @@ class Chaos:
                     last = None
                 if last and last.sequence >= max(stored):
                     break
+                gateway.check_alive()
                 assert time.monotonic() < ends, f"{name} does not forward: see {self.folder}"
                 await asyncio.sleep(0.1)
         await client.close()

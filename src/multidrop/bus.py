@@ -366,6 +366,14 @@ class Bus:
         in_turn = sorted(peers, key=lambda drive: (not is_known(drive), peers[drive].failures))
         return self._stopper.stop_all(in_turn, lambda: self._broadcaster.stop(self.drives), seconds)
 
+    def stops_under_way(self) -> dict[str, str]:
+        """Return, by drive's name, a sentence of what is known so far of its stop, while one is under way.
+
+        It says whether the stop was sent and confirmed, and why it goes on; it is the same as long as nothing
+        changes. Any thread may ask; nothing is sent, and nobody is waited for.
+        """
+        return self._stopper.so_far()
+
     def stop_on_exit(self) -> None:
         """From now on, stop all drives when the `with` block is left or the process ends.
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from command_desks import LINE, Desks, desks
+from command_desks import LINE, PATIENCE_S, Desks, desks
 from peers import require_module
 
 from multidrop import read_audit
@@ -177,6 +177,16 @@ def test_who_is_not_the_master_keeps_silent(desk: Desks) -> None:
     assert isinstance(desk.ask(register=SETPOINT, value=20.0), Offered)
 
 
+def test_a_stop_waits_for_no_guard_and_a_command_does(desk: Desks) -> None:
+    """In its first second a new master lets nothing else pass, and the motor must stop in it too."""
+    desk.is_guarded = True
+    assert desk.ask(register=SETPOINT, value=20.0) is None
+    stopped = asyncio.run(desk.stop())
+    assert stopped is not None
+    assert stopped.outcome is DONE
+    assert [name for name, _ in desk.writes] == ["control"]
+
+
 def test_who_asks_what_became_of_it_first_ends_it(desk: Desks) -> None:
     token = desk.offered()
 
@@ -220,6 +230,26 @@ def test_a_start_runs_the_motor_and_a_stop_stops_it(desk: Desks) -> None:
 
     assert asyncio.run(main()) == [DONE, DONE, DONE]
     assert {"begun", "over"} == {note["step"] for note in desk.notes if note["what"] == "stop"}
+
+
+def test_a_stop_that_goes_on_says_what_is_known_of_it(desk: Desks) -> None:
+    """Its asker is told that it was sent long before the motor stands; this one stands when that was told."""
+    desk.sim["output_frequency"] = 10.0
+    data = json.dumps({"id": "one", "by": "anna", "drives": None}).encode()
+    sentence = "pump: the stop was confirmed, and the motor is not seen to stand yet"
+
+    async def main() -> CommandAnswer:
+        while True:
+            answer = await desk.stops.stop(LINE, data)
+            assert answer is not None
+            if answer.outcome is not CommandOutcome.UNDER_WAY:
+                return answer
+            if answer.text.startswith(sentence):
+                assert answer.drives["pump"].outcome is CommandOutcome.UNDER_WAY
+                assert [name for name, _ in desk.writes] == ["control"]
+                desk.sim["output_frequency"] = 0.0
+
+    assert asyncio.run(asyncio.wait_for(main(), PATIENCE_S)).outcome is DONE
 
 
 def test_a_stop_ends_what_was_offered_before_and_copies_of_it_are_one(desk: Desks) -> None:

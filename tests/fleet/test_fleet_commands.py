@@ -194,6 +194,60 @@ def test_a_stop_is_sent_until_somebody_answers_and_told_at_once_where_nobody_can
     assert told.text.startswith(text)
 
 
+def test_what_is_known_of_a_stop_meanwhile_is_told_once(tmp_path: Path) -> None:
+    sent, turning = answer("under way", "sent"), answer("under way", "still turning")
+    path = ScriptedPath(stop=[sent, sent, LOST, turning, sent, IT_IS_DONE])
+    told: list[CommandAnswer] = []
+    last = asked(tmp_path, path, lambda asker: asker.stop(["pump-1"], on_news=told.append))
+    assert [(news.outcome, news.text) for news in told] == [
+        (CommandOutcome.UNDER_WAY, "sent"),
+        (CommandOutcome.UNDER_WAY, "still turning"),
+    ]
+    assert last.outcome is DONE
+
+
+def test_who_hears_nothing_of_a_stop_is_told_so_before_it_is_given_up(tmp_path: Path) -> None:
+    told: list[CommandAnswer] = []
+    path = ScriptedPath(stop=[LOST])
+    last = asked(tmp_path, path, lambda asker: asker.stop(["pump-1"], on_news=told.append))
+    assert last.outcome is UNKNOWN
+    [news] = told
+    assert news.text == "the stop of pump-1: no gateway has answered yet; use the hard-wired stop"
+
+
+class HangingPath(ScriptedPath):
+    """A path whose server stands still."""
+
+    async def request(self, subject: str, data: bytes) -> Said:
+        self.asked.append(subject)
+        await asyncio.Event().wait()
+        raise AssertionError("it hangs")
+
+
+def test_a_stop_waits_for_no_path_that_hangs(tmp_path: Path) -> None:
+    hanging, path = HangingPath(), ScriptedPath(stop=[IT_IS_DONE])
+
+    async def stop_on_both(asker: FleetCommands) -> CommandAnswer:
+        asker._paths = [hanging, path]  # type: ignore[list-item]
+        return await asyncio.wait_for(asker.stop(["pump-1"]), 60)
+
+    assert asked(tmp_path, path, stop_on_both).outcome is DONE
+    assert hanging.asked == ["stop.hall-1"]
+
+
+@pytest.mark.parametrize("others", [[NOBODY, NOBODY], [NOBODY, CUT], [LOST, NOBODY]])
+def test_a_stop_is_unsent_for_certain_where_each_path_says_so(tmp_path: Path, others: list[Given]) -> None:
+    paths = [ScriptedPath(stop=[given]) for given in (NOBODY, *others)]
+
+    async def stop_on_all(asker: FleetCommands) -> CommandAnswer:
+        asker._paths = paths  # type: ignore[assignment]
+        return await asker.stop(["pump-1"])
+
+    told = asked(tmp_path, paths[0], stop_on_all)
+    assert told.outcome is (UNKNOWN if LOST in others else NOT_SENT)
+    assert [path.asked[:1] for path in paths] == [["stop"]] * 3
+
+
 def test_a_full_disk_keeps_a_command_back_and_no_stop(tmp_path: Path) -> None:
     def full(*record: Any) -> None:
         raise OSError(28, "No space left on device")

@@ -52,18 +52,33 @@ class Trial:
         await until(lambda: "hall" in self.keeper.polled and not self.keeper._at_work)
 
 
-def test_a_claimed_line_is_polled_and_takes_commands_when_the_guard_is_over() -> None:
+def test_a_claimed_line_takes_stops_at_once_and_commands_when_the_guard_is_over() -> None:
     async def main() -> None:
         trial = Trial()
         await trial.claim()
         assert trial.lines.taken == {"hall"}
-        assert not trial.keeper.may_command("hall")
+
+        def may() -> tuple[bool, bool]:
+            return trial.keeper.may_stop("hall"), trial.keeper.may_command("hall")
+
+        assert may() == (True, False)
         trial.clock.pass_s(USUAL.guard / SECOND - 0.001)
-        assert not trial.keeper.may_command("hall")
+        assert may() == (True, False)
         trial.clock.pass_s(0.001)
-        assert trial.keeper.may_command("hall")
+        assert may() == (True, True)
         trial.clock.pass_s(USUAL.lease / SECOND)
-        assert not trial.keeper.may_command("hall")
+        assert may() == (False, False)
+
+
+def test_a_line_that_is_let_go_takes_no_stops() -> None:
+    async def main() -> None:
+        trial = Trial()
+        await trial.claim()
+        trial.keeper.releasing = {"hall"}
+        trial.keeper.reconcile()
+        await until(lambda: trial.keeper.is_silent)
+        assert trial.keeper.is_mine("hall")
+        assert not trial.keeper.may_stop("hall")
 
     asyncio.run(main())
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 import asyncio
 import json
 import ssl
+import subprocess
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
@@ -19,7 +21,7 @@ require_module("nkeys")
 require_module("pyarrow")
 
 from secured_clusters import GATEWAYS, SecuredCluster, certificates, secured_cluster  # noqa: E402
-from secured_fleets import PATIENCE_S, multidrop, secured_fleet, until  # noqa: E402
+from secured_fleets import PATIENCE_S, SecuredFleet, multidrop, secured_fleet, until  # noqa: E402
 
 from multidrop.fleet import names  # noqa: E402
 from multidrop.fleet.errors import Conflict  # noqa: E402
@@ -182,6 +184,28 @@ def test_a_context_for_tls_believes_this_authority_alone(servers: SecuredCluster
 # ---- a whole fleet ----
 
 
+def assert_told_while_it_goes_on(fleet: SecuredFleet) -> None:
+    """A stop that the drive refuses is repeated; who asked for it hears so, and then how it ended."""
+    fleet.hall.refusing.add("line-1")
+    asker = subprocess.Popen(
+        [sys.executable, "-m", "multidrop", "fleet", "stop", "drive-line-1"],
+        env=fleet.servers.environment("commander"),
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    assert asker.stderr
+    told = asker.stderr.readline()
+    while "the stop was sent" not in told:  # the machine may be too busy to send it in half a second
+        assert told.startswith("under way: "), told
+        told = asker.stderr.readline()
+    assert told.startswith("under way: drive-line-1: the stop was sent, and is not confirmed yet")
+    assert asker.poll() is None
+    fleet.hall.refusing.clear()
+    out, err = asker.communicate(timeout=PATIENCE_S)
+    assert out.startswith("done: drive-line-1: stopped after "), (out, err)
+
+
 @pytest.mark.long
 def test_all_works_with_the_rights_as_written(tmp_path: Path) -> None:
     """Cold start, a dead gateway's lines, a drain, the hub, and no denial in anybody's log."""
@@ -193,6 +217,7 @@ def test_all_works_with_the_rights_as_written(tmp_path: Path) -> None:
             said = multidrop(fleet.servers, user, "fleet", "stop", "drive-line-0")
             assert told in said.stdout + said.stderr
             assert ("do not allow" in said.stdout + said.stderr) is (user == "viewer"), said
+        assert_told_while_it_goes_on(fleet)
         assert "drive-line-0" in "".join(path.read_text() for path in tmp_path.glob("gw-*/commands.jsonl"))
         fleet.running["gw-a"].kill()
         until(lambda: "gw-a" not in fleet.status()["gateways"], "its end")

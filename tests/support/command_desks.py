@@ -41,16 +41,24 @@ class FailingLog(CommandLog):
 
 
 class Desks:
-    """One gateway's, with one line that it is master of as long as `is_master`."""
+    """One gateway's, with one line that it is master of as long as `is_master`.
+
+    As long as `is_guarded` a frame of the master before may still come there.
+    """
 
     def __init__(self, bus: Bus, sim: SimulatedDrive, folder: Path, may: Mapping[str, Any]) -> None:
         self.sim = sim
         self._bus = bus
         self.is_master = True
+        self.is_guarded = False
         self.clock = HandClock()
         self.path = folder / "commands.jsonl"
         self.log = FailingLog(self.path)
-        self.lines = HeldLines(self, lambda line: self.is_master)
+        self.lines = HeldLines(
+            self,
+            may_command=lambda line: self.is_master and not self.is_guarded,
+            may_stop=lambda line: self.is_master,
+        )
         self.desk = CommandDesk("gw-1", "do.gw-1.run", self.lines, self.log, self.clock)
         self.stops = StopDesk("gw-1", self.lines, self.desk.offers, self.log)
         self.may = may

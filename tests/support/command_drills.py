@@ -20,6 +20,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import NamedTuple
 
+from kills import kill_all
 from nats_clusters import Cluster, cluster
 
 from multidrop import YD1000
@@ -145,11 +146,7 @@ class CommandDrill:
             )
 
     def close(self) -> None:
-        for running in self.gateways.values():
-            with suppress(ProcessLookupError):
-                running.send_signal(signal.SIGCONT)
-            running.kill()
-            running.wait()
+        kill_all(self.gateways.values())
 
     # ---- what the drives saw ----
 

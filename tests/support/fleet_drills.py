@@ -16,6 +16,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from kills import kill_all
 from namespaces import Namespace
 from nats_clusters import Cluster, Node, cluster
 from serial_hall import SerialHall
@@ -205,11 +206,7 @@ class FleetDrill:
         self.gateways[name].wait()
 
     def close(self) -> None:
-        for running in self.gateways.values():
-            with suppress(ProcessLookupError):
-                running.send_signal(signal.SIGCONT)
-            running.kill()
-            running.wait()
+        kill_all(self.gateways.values())
         self.hall.close()
 
 

@@ -10,16 +10,16 @@ import socket
 import subprocess
 import time
 import urllib.request
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager, suppress
 from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
+from typing import TypeVar
 
 from namespaces import Namespace
 from peers import require_program
 
 PATIENCE_S = 60.0
-READY_S = 15.0
 ATTEMPTS = 4
 OLDEST = (2, 12)
 
@@ -173,6 +173,10 @@ class Cluster:
                 time.sleep(0.05)
         return True
 
+    def has_ended(self) -> bool:
+        """Say whether a server gave up by itself, as it does where another program has one of its ports."""
+        return any(node.process.poll() is not None for node in self.nodes)
+
     def close(self) -> None:
         for node in self.nodes:
             if node.process.poll() is None:
@@ -181,13 +185,26 @@ class Cluster:
                 node.kill()
 
 
+C = TypeVar("C", bound=Cluster)
+
+
 @contextmanager
 def cluster(
     folder: Path, number: int = 3, program: str | None = None, places: Sequence[Namespace] = ()
 ) -> Iterator[Cluster]:
-    for attempt in range(ATTEMPTS):  # another program may have taken a port that was free just now
-        running = Cluster(folder / str(attempt) if attempt else folder, number, program, places)
-        if running.is_ready_within(READY_S) or attempt == ATTEMPTS - 1:
+    def make(attempt: int) -> Cluster:
+        return Cluster(folder / str(attempt) if attempt else folder, number, program, places)
+
+    with begun(make) as running:
+        yield running
+
+
+@contextmanager
+def begun(make: Callable[[int], C]) -> Iterator[C]:
+    """Make servers and wait for them; anew where a port that was free just now was taken meanwhile."""
+    for attempt in range(ATTEMPTS):
+        running = make(attempt)
+        if running.is_ready_within(PATIENCE_S) or not running.has_ended():
             break
         running.close()
     try:

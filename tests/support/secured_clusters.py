@@ -11,7 +11,7 @@ from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from nats_clusters import ATTEMPTS, PATIENCE_S, READY_S, Cluster, Node, server_program
+from nats_clusters import PATIENCE_S, Cluster, Node, begun, server_program
 from peers import require_program
 
 from multidrop.fleet.credentials import connect_options
@@ -114,13 +114,5 @@ class SecuredCluster(Cluster):
 def secured_cluster(
     folder: Path, number: int = 3, gateways: Sequence[str] = GATEWAYS, change: Change = _as_written
 ) -> Iterator[SecuredCluster]:
-    for attempt in range(ATTEMPTS):  # another program may have taken a port that was free just now
-        running = SecuredCluster(folder / str(attempt), number, gateways, change)
-        if running.is_ready_within(READY_S) or attempt == ATTEMPTS - 1:
-            break
-        running.close()
-    try:
-        running.wait()
+    with begun(lambda attempt: SecuredCluster(folder / str(attempt), number, gateways, change)) as running:
         yield running
-    finally:
-        running.close()

@@ -11,10 +11,11 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from kills import kill_all
 from secured_clusters import GATEWAYS, SecuredCluster, secured_cluster
 from serial_hall import SerialHall
 
-PATIENCE_S = 180.0  # a stop goes on for 30 s where nothing says that the motor stands
+PATIENCE_S = 60.0
 
 
 def multidrop(servers: SecuredCluster, user: str, *words: str) -> subprocess.CompletedProcess[str]:
@@ -71,9 +72,7 @@ class SecuredFleet:
         until(lambda: self.hall.are_polled(0.5), "all lines are polled")
 
     def close(self) -> None:
-        for process in self.running.values():
-            process.kill()
-            process.wait()
+        kill_all(self.running.values())
         self.hall.close()
 
 

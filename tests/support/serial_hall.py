@@ -40,7 +40,10 @@ class LineSeen:
 
 
 class SerialHall:
-    """Listens on a port for each line, and answers Modbus RTU reads of address 1 with zeros."""
+    """Listens on a port for each line; answers Modbus RTU reads with zeros, and says that it took each write.
+
+    So its motors stand. A line whose name is in `refusing` takes no write.
+    """
 
     def __init__(self, number: int, host: str = "127.0.0.1") -> None:
         self._selector = selectors.DefaultSelector()
@@ -51,6 +54,7 @@ class SerialHall:
         self._lock = threading.Lock()
         self._is_over = False
         self._host = host
+        self.refusing: set[str] = set()
         for at in range(number):
             listener = socket.create_server((host, 0))
             listener.setblocking(False)
@@ -134,7 +138,7 @@ class SerialHall:
             del buffer[:REQUEST]
             with self._lock:
                 line.note(number, now)
-            _answer(client, request)
+            _answer(client, request, takes_writes=line.name not in self.refusing)
 
     def close(self) -> None:
         self._is_over = True
@@ -144,10 +148,12 @@ class SerialHall:
         self._selector.close()
 
 
-def _answer(client: socket.socket, request: bytes) -> None:
+def _answer(client: socket.socket, request: bytes, *, takes_writes: bool) -> None:
     address, function, _, count = struct.unpack(">BBHH", request[:6])
     if function in (3, 4) and count <= 125:
         body = bytes([address, function, 2 * count]) + bytes(2 * count)
+    elif function == 6 and takes_writes:
+        body = request[:-2]
     else:
         body = bytes([address, function | 0x80, 1])
     try:

@@ -52,6 +52,7 @@ class Outcome:
 class Seen(Enum):
     STOPPED = "stopped"  # seen to stand
     SENT = "sent but unknown"
+    REFUSED = "refused by the drive"  # each time that it was sent
     FAILED = "failed"  # no stop was sent
 
 

@@ -39,6 +39,12 @@ class Stopper:
         self._exchanges = exchanges
         self._writer = writer
         self._latches = latches
+        self._stops: set[StopAttempt] = set()  # under way
+
+    def so_far(self) -> dict[str, str]:
+        """Return, by drive's name, what is known of each stop under way; of several, of the one sent most."""
+        stops = sorted(self._stops.copy(), key=lambda stop: stop.times_sent)
+        return {stop.drive.name: stop.so_far() for stop in stops}
 
     def stop(self, drive: Drive, make: Callable[[], Script[Any]], seconds: float | None) -> None:
         """Carry out a stop, again and again until the motor stands, for as long as `seconds` s.
@@ -49,7 +55,7 @@ class Stopper:
         self._latches.latch(drive)  # raises for one that is not on this bus
         with self._under_way([drive]):
             stop = StopAttempt(drive, make, _now(), seconds)
-            stop_together([stop], self._do, lambda stop: None)
+            self._carry_out([stop], lambda stop: None)
         _log.info("%s", stop.result(_now()))
         if stop.known is not None:
             raise stop.known
@@ -80,10 +86,21 @@ class Stopper:
             def end(stop: StopAttempt) -> None:
                 found[stop.drive.name] = stop.result(_now())
 
-            stop_together(stops, self._do, end)
+            self._carry_out(stops, end)
         for stopped in found.values():  # not before: a logger's handler may hang
             _log.info("%s", stopped)
         return found
+
+    def _carry_out(self, stops: Sequence[StopAttempt], end: Callable[[StopAttempt], object]) -> None:
+        def over(stop: StopAttempt) -> None:
+            self._stops.discard(stop)
+            end(stop)
+
+        self._stops.update(stops)
+        try:
+            stop_together(stops, self._do, over)
+        finally:
+            self._stops.difference_update(stops)
 
     @contextmanager
     def _under_way(self, drives: Sequence[Drive]) -> Iterator[None]:

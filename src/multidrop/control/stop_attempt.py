@@ -60,7 +60,7 @@ class StopAttempt:
         self._begun = begun
         self._seconds = seconds
         self._make = script
-        self._sent = 0
+        self.times_sent = 0  # those that the drive refused too
         self._is_confirmed = False
         self._pulses: set[tuple[str, Any]] = set()
         self._has_warned = False
@@ -121,7 +121,7 @@ class StopAttempt:
         if not isinstance(step, Write):
             return
         if not isinstance(failure, UNSENT):
-            self._sent += 1
+            self.times_sent += 1
             if isinstance(step, Pulse):
                 self._pulses.add((step.register.name, step.value))
         self.is_sent |= not isinstance(failure, (*UNSENT, DriveRefused))
@@ -165,7 +165,7 @@ class StopAttempt:
         if self._is_confirmed and not isinstance(failure, Unconfirmed):
             reason = f"it was confirmed, but its effect could not be seen: {failure}"
         elif self.is_sent and not self._is_confirmed:
-            reason = f"sent {self._sent} times, it was never confirmed: {failure}"
+            reason = f"sent {self.times_sent} times, it was never confirmed: {failure}"
         else:
             return failure
         unknown = Unconfirmed(self.drive.name, "the stop", reason)
@@ -177,11 +177,23 @@ class StopAttempt:
         known, seconds = self.known, now - self._begun
         if known is None:
             return Stopped(self.drive.name, Seen.STOPPED, seconds)
-        seen = Seen.SENT if self.is_sent and not isinstance(known, Unsupported) else Seen.FAILED
+        if isinstance(known, Unsupported) or not (self.is_sent or self.times_sent):
+            seen = Seen.FAILED
+        else:
+            seen = Seen.SENT if self.is_sent else Seen.REFUSED
         why = str(known) if isinstance(known, (BusError, ValueError)) else f"{type(known).__name__}: {known}"
         return Stopped(self.drive.name, seen, seconds, why)
 
+    def so_far(self) -> str:
+        """Return what is known of it while it goes on: the same text as long as nothing changes."""
+        why = f": {self.failure}" if self.failure else ""
+        if self._is_confirmed:
+            return f"{self.drive.name}: the stop was confirmed, and the motor is not seen to stand yet{why}"
+        if self.is_sent or self.times_sent:
+            return f"{self.drive.name}: the stop was sent, and is not confirmed yet{why}"
+        return f"{self.drive.name}: no stop was sent yet{why}"
+
     def interrupted(self) -> str:
         """Return what is known of it when its caller no longer waits."""
-        times = f"the stop was sent {self._sent} times" if self._sent else "no stop was sent"
+        times = f"the stop was sent {self.times_sent} times" if self.times_sent else "no stop was sent"
         return f"{self.drive.name}: {times}; the motor is not seen to stand"

@@ -63,7 +63,7 @@ class CommandDesk:
 
         Another gateway may be, and the first answer is the one that counts.
         """
-        held = self._lines.mine(line)
+        held = self._lines.for_command(line)
         if held is None:
             return None
         try:
@@ -145,7 +145,7 @@ class CommandDesk:
         line = offer.held.name
         if offer.why_void:
             return offer.why_void
-        if self._lines.mine(line) is not offer.held:
+        if self._lines.for_command(line) is not offer.held:
             return f"since the offer line {line} was let go, or its plant has changed"
         if self._under_way[line] > MOST_WRITES:
             return f"{MOST_WRITES} others are under way on line {line}"

@@ -135,6 +135,8 @@ def stop_drive(drive: Drive) -> dict[str, CommandAnswer]:
     """Stop one drive; by its name, what is known of it. Never raises."""
     try:
         drive.stop()
+    except DriveRefused as failure:  # each time that it was sent
+        return {drive.name: CommandAnswer(CommandOutcome.FAILED, str(failure))}
     except Exception as failure:  # whatever it is: everybody must see it
         return {drive.name: answer_of_stop(failure)}
     return {drive.name: CommandAnswer(CommandOutcome.DONE, f"{drive.name}: stopped: seen to stand")}
@@ -152,6 +154,7 @@ def answers_of_stops(found: Mapping[str, Stopped]) -> dict[str, CommandAnswer]:
     outcomes = {
         Seen.STOPPED: CommandOutcome.DONE,
         Seen.SENT: CommandOutcome.UNKNOWN,
+        Seen.REFUSED: CommandOutcome.FAILED,
         Seen.FAILED: CommandOutcome.NOT_SENT,
     }
     return {name: CommandAnswer(outcomes[one.seen], str(one)) for name, one in found.items()}

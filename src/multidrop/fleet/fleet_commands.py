@@ -7,7 +7,7 @@ import difflib
 import json
 import logging
 import uuid
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Self
 
@@ -34,6 +34,11 @@ AGAIN_S = 0.2
 HARD_WIRED = "use the hard-wired stop"
 
 _log = logging.getLogger("multidrop.fleet")
+News = Callable[[CommandAnswer], object]
+
+
+def _tell_nobody(answer: CommandAnswer) -> None:
+    """Leave it at the answer at the end."""
 
 
 class FleetCommands:
@@ -153,11 +158,17 @@ class FleetCommands:
         )
         return await self._end_of(answer, offered.subject, asked, lost)
 
-    async def _end_of(self, answer: CommandAnswer, subject: str, asked: bytes, lost: str) -> CommandAnswer:
+    async def _end_of(
+        self, answer: CommandAnswer, subject: str, asked: bytes, lost: str, on_news: News = _tell_nobody
+    ) -> CommandAnswer:
         """Ask on all paths in turn until it is over; unknown where nobody has answered for LOST_S."""
         loop = asyncio.get_running_loop()
         ends, at = loop.time() + LOST_S, 0
+        told = {""}
         while answer.outcome is CommandOutcome.UNDER_WAY:
+            if answer.text not in told:
+                told.add(answer.text)
+                on_news(answer)
             at += 1
             try:
                 message = await self._paths[at % len(self._paths)].request(subject, asked)
@@ -171,14 +182,18 @@ class FleetCommands:
 
     # ---- stops ----
 
-    async def stop(self, drives: Sequence[str] | None = None, *, line: str = "") -> CommandAnswer:
+    async def stop(
+        self, drives: Sequence[str] | None = None, *, line: str = "", on_news: News = _tell_nobody
+    ) -> CommandAnswer:
         """Stop these drives, or all of the plant with None; the stops of many lines go side by side.
 
-        With `line` the plant is not looked at, and the drives are its. Raises ValueError for a drive that the
-        plant has not, FleetError where the plant cannot be read: then no stop was sent.
+        With `line` the plant is not looked at, and the drives are its. `on_news` is called in the loop with
+        what is known of a stop that is not over within half a second, and again when something else is.
+        Raises ValueError for a drive that the plant has not, FleetError where the plant cannot be read: then
+        no stop was sent.
         """
         wanted = await self._lines_of(drives, line)
-        answers = await asyncio.gather(*(self._stop(one, wanted[one]) for one in wanted))
+        answers = await asyncio.gather(*(self._stop(one, wanted[one], on_news) for one in wanted))
         if len(answers) == 1:
             return answers[0]
         text = "\n".join(answer.text for answer in answers) or "the plant has no lines"
@@ -198,7 +213,7 @@ class FleetCommands:
             here.append(drive)
         return found
 
-    async def _stop(self, line: str, drives: list[str] | None) -> CommandAnswer:
+    async def _stop(self, line: str, drives: list[str] | None, on_news: News) -> CommandAnswer:
         """Send a stop until a gateway answers, and go on until it is over."""
         request = StopRequest(uuid.uuid4().hex, self.by, None if drives is None else tuple(drives))
         what = f"the stop of {', '.join(drives) if drives else f'all drives of line {line}'}"
@@ -206,27 +221,36 @@ class FleetCommands:
         noting = asyncio.create_task(self._note_end(record, None))
         answer = await self._first_of_stop(line, request, what)
         lost = f"it is not known whether {what} was sent: its gateway gives no answer any more; {HARD_WIRED}"
-        answer = await self._end_of(answer, names.stop_subject(line), encode(request), lost)
+        answer = await self._end_of(answer, names.stop_subject(line), encode(request), lost, on_news)
         await noting
         await self._note_end(record, answer)
         return answer
 
     async def _first_of_stop(self, line: str, request: StopRequest, what: str) -> CommandAnswer:
-        """Return the first answer; at once where no gateway is the line's master, which is certain."""
+        """Ask on all paths at once, and return the first answer; no path waits for one that hangs.
+
+        Where each of them says that nobody was asked, that is certain.
+        """
+        subject, data = names.stop_subject(line), encode(request)
+        asking = [asyncio.create_task(path.request(subject, data)) for path in self._paths]
         why, is_certain = "", True
-        for path in self._paths:
-            try:
-                message = await path.request(names.stop_subject(line), encode(request))
-                return read_answer(message.data)
-            except NobodyThere:
-                why = f"no gateway is master of line {line}"
-            except NotDelivered as failure:
-                why = why or str(failure)
-            except (FleetError, ValueError):
-                is_certain = False
+        try:
+            for asked in asyncio.as_completed(asking):
+                try:
+                    return read_answer((await asked).data)
+                except NobodyThere:
+                    why = f"no gateway is master of line {line}"
+                except NotDelivered as failure:
+                    why = why or str(failure)
+                except (FleetError, ValueError):
+                    is_certain = False
+        finally:
+            for task in asking:
+                task.cancel()
+            await asyncio.gather(*asking, return_exceptions=True)
         if is_certain:
             return CommandAnswer(CommandOutcome.NOT_SENT, f"{what} was NOT sent: {why}; {HARD_WIRED}")
-        return CommandAnswer(CommandOutcome.UNDER_WAY, "")
+        return CommandAnswer(CommandOutcome.UNDER_WAY, f"{what}: no gateway has answered yet; {HARD_WIRED}")
 
     # ---- the plant, and the log ----
 

@@ -64,7 +64,11 @@ class FleetGateway:
         self.mastership = Mastership(guard_s=USUAL.guard / SECOND)
         self.spool = Spool(folder / "spool", name, most=spool_bytes)
         self.lines = FleetLines(self.mastership, folder)
-        held = HeldLines(self.lines.poller, self._may_command)
+        held = HeldLines(
+            self.lines.poller,
+            may_command=lambda line: self.member.keeper.may_command(line),  # it is made below
+            may_stop=lambda line: self.member.keeper.may_stop(line),
+        )
         self.log = CommandLog(folder / "commands.jsonl")
         self.commands = CommandSubjects(name, self.paths, held, self.log)
         commanded = CommandedLines(self.lines, self.commands)
@@ -130,9 +134,6 @@ class FleetGateway:
         self.spool.close()
         self.log.close()
         self.lock.close()
-
-    def _may_command(self, line: str) -> bool:
-        return self.member.may_command(line)
 
     # ---- what others ask ----
 

@@ -37,11 +37,18 @@ class HeldLine:
 
 
 class HeldLines:
-    """The lines that are open to commands; `may_command` says whether we are a line's master now."""
+    """The lines that are open to commands.
 
-    def __init__(self, buses: PolledBuses, may_command: Callable[[str], bool]) -> None:
+    `may_stop` says whether we are a line's master now, and `may_command` whether moreover no frame of the
+    one before can come any more. A stop that meets such a frame is repeated; a command would be lost.
+    """
+
+    def __init__(
+        self, buses: PolledBuses, *, may_command: Callable[[str], bool], may_stop: Callable[[str], bool]
+    ) -> None:
         self._buses = buses
         self._may_command = may_command
+        self._may_stop = may_stop
         self._held: dict[str, HeldLine] = {}
 
     def open(self, line: str, description: Mapping[str, Any]) -> None:
@@ -52,10 +59,13 @@ class HeldLines:
         """Take none any more."""
         self._held.pop(line, None)
 
-    def mine(self, line: str) -> HeldLine | None:
-        """Return the line if we are its master now."""
-        held = self._held.get(line)
-        return held if held is not None and self._may_command(line) else None
+    def for_command(self, line: str) -> HeldLine | None:
+        """Return the line if a command may be sent on it now."""
+        return self._held.get(line) if self._may_command(line) else None
+
+    def for_stop(self, line: str) -> HeldLine | None:
+        """Return the line if a stop may be sent on it now."""
+        return self._held.get(line) if self._may_stop(line) else None
 
 
 def lists_of(description: Mapping[str, Any]) -> dict[str, frozenset[str]]:

@@ -11,7 +11,7 @@ import logging
 import time
 from collections.abc import Callable, Coroutine, Mapping
 from contextlib import suppress
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 from multidrop.fleet import names
 from multidrop.fleet.buckets import Record
@@ -38,6 +38,13 @@ class Lines(Protocol):
         """Poll the line no more, and close it: when this returns nothing of ours is sent on it."""
 
 
+class TakenLine(NamedTuple):
+    """A line that is polled: the revision of its description, and since when (CLOCK_BOOTTIME, ns)."""
+
+    revision: int
+    since: int
+
+
 class LineKeeper:
     """The lines that one gateway polls, and what is under way on each of them.
 
@@ -48,8 +55,7 @@ class LineKeeper:
         self, lines: Lines, lease: Lease, records: FleetRecords, on_change: Callable[[], object]
     ) -> None:
         self.lines = lines
-        self.polled: dict[str, int] = {}  # lines, with the revision of their description
-        self._polled_since: dict[str, int] = {}  # CLOCK_BOOTTIME, ns
+        self.polled: dict[str, TakenLine] = {}
         self.troubles: dict[str, str] = {}  # lines that could not be taken, and why
         self.moves = 0
         self.releasing: set[str] = set()  # ours, and to be given away
@@ -80,11 +86,15 @@ class LineKeeper:
     def _owned(self) -> set[str]:
         return self._records.owned_by(self._lease.name, self._lease.session)
 
+    def may_stop(self, line: str) -> bool:
+        """Say whether this is the line's master now: a stop waits for no guard, here or in the engine."""
+        return self._lease.is_valid and self.is_mine(line) and line in self.polled
+
     def may_command(self, line: str) -> bool:
         """Say whether this is the line's master now, and the guard of the one before is over."""
-        if not (self._lease.is_valid and self.is_mine(line) and line in self.polled):
+        if not self.may_stop(line):
             return False
-        return self._lease.clock() - self._polled_since[line] >= self._lease.terms.guard
+        return self._lease.clock() - self.polled[line].since >= self._lease.terms.guard
 
     async def fail(self) -> None:
         """Wait until a line could not be let go, and raise what was wrong: the process must end."""
@@ -109,8 +119,8 @@ class LineKeeper:
             if line not in self.releasing and self._records.is_in_plant(line)
         }
         now = time.monotonic()
-        for line, revision in list(self.polled.items()):
-            if mine.get(line) != revision and line not in self._at_work:
+        for line, polled in list(self.polled.items()):
+            if mine.get(line) != polled.revision and line not in self._at_work:
                 self._start(line, self._let_go(line))
         for line in mine.keys() - self.polled.keys() - self._at_work.keys():
             if now >= self._again_at.get(line, 0.0):
@@ -176,8 +186,7 @@ class LineKeeper:
                 _log.warning("line %s is not taken, and tried again: %s", line, failure)
             else:
                 self.troubles.pop(line, None)
-                self.polled[line] = record.revision
-                self._polled_since[line] = self._lease.clock()
+                self.polled[line] = TakenLine(record.revision, self._lease.clock())
 
     async def _let_go(self, line: str) -> None:
         await self.lines.let_go(line)

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Coroutine, Sequence
+from collections.abc import Coroutine, Mapping, Sequence
 from contextlib import suppress
 from enum import StrEnum
 from functools import partial
@@ -24,14 +24,13 @@ from typing import Any
 
 from multidrop.fleet import names
 from multidrop.fleet.balance import Balance
-from multidrop.fleet.buckets import Record
 from multidrop.fleet.errors import FleetError
 from multidrop.fleet.fleet_records import FleetRecords
 from multidrop.fleet.leaders import bring_leaders_home
 from multidrop.fleet.lease import Lease, LifeLock, MayPoll
 from multidrop.fleet.lease_bucket import LeaseBucket
 from multidrop.fleet.lease_rules import SECOND, USUAL, Terms
-from multidrop.fleet.line_keeper import LineKeeper, Lines
+from multidrop.fleet.line_keeper import LineKeeper, Lines, TakenLine
 from multidrop.fleet.ownership import decide
 from multidrop.fleet.servers import ServerPath
 
@@ -92,8 +91,8 @@ class Member:
         return MemberState.WORKING if self._is_settled else MemberState.SETTLING
 
     @property
-    def polled(self) -> dict[str, int]:
-        """Return the lines that are polled, with the revision of their description."""
+    def polled(self) -> Mapping[str, TakenLine]:
+        """Return the lines that are polled."""
         return self.keeper.polled
 
     @property
@@ -114,14 +113,6 @@ class Member:
     def drain(self) -> None:
         """Give all lines away, and take none from now on."""
         self.is_draining = self._is_dirty = True
-
-    def record(self, line: str) -> Record | None:
-        """Return the record of a line's master."""
-        return self.records.owner(line)
-
-    def may_command(self, line: str) -> bool:
-        """Say whether this is the line's master now, and alone there."""
-        return self.keeper.may_command(line)
 
     def _note(self) -> dict[str, Any]:
         return {"draining": self.is_draining, "lines": len(self.polled), "margin_ms": self._margin_ms()}
@@ -237,7 +228,7 @@ class Member:
             me,
             self._share | owned,
             self.wanted,
-            self.record,
+            self.records.owner,
             self.records.observer.is_over,
             is_settled=self._is_settled,
             is_draining=self.is_draining,

@@ -1,4 +1,4 @@
-"""Metrics port: answers `GET /metrics` to this machine's own programs, and nothing else to nobody.
+"""Metrics port: answers `GET /metrics` to this machine's own programs, and nothing else.
 
 Whoever may connect may read, so no address that others reach is listened on. A page under a name of its own
 that was bound to this machine reads nothing either: the header `Host` is looked at.

@@ -42,9 +42,10 @@ class StopDesk:
     async def stop(self, line: str, data: bytes) -> CommandAnswer | None:
         """Stop drives of a line now; None where we are not its master and must keep silent.
 
-        A copy of the message gets the answer of the same stop; another message is another stop.
+        A copy of the message gets the answer of the same stop; another message is another stop. One that is
+        not over soon is under way, with what is known of it so far; the asker asks again.
         """
-        held = self._lines.mine(line)
+        held = self._lines.for_stop(line)
         if held is None:
             return None
         try:
@@ -59,8 +60,18 @@ class StopDesk:
         task = self._stops[key]
         await asyncio.wait({task}, timeout=HOLD_S)
         if not task.done():
-            return CommandAnswer(CommandOutcome.UNDER_WAY, f"line {line}: a stop is under way", self.gateway)
+            return self._so_far(held, request)
         return task.result()
+
+    def _so_far(self, held: HeldLine, request: StopRequest) -> CommandAnswer:
+        names = held.drives if request.drives is None else request.drives
+        known = held.bus.stops_under_way()
+        drives = {
+            name: CommandAnswer(CommandOutcome.UNDER_WAY, known[name]) for name in names if name in known
+        }
+        text = "; ".join(answer.text for answer in drives.values())
+        text = text or f"line {held.name}: a stop is under way"
+        return CommandAnswer(CommandOutcome.UNDER_WAY, text, self.gateway, drives=drives)
 
     async def _stop(self, held: HeldLine, request: StopRequest) -> CommandAnswer:
         """Begin the stops of all drives side by side, each in a thread of its own."""

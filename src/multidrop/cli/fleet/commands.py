@@ -119,7 +119,8 @@ async def _stop(arguments: argparse.Namespace) -> int:
         except FleetError as failure:
             raise FleetError(f"the stop was NOT sent: {failure}; {HARD_WIRED}") from None
         with _annotating(f"the stop of {', '.join(drives) or 'all drives'}"):
-            return _show(arguments, await asker.stop(drives or None, line=arguments.line or ""))
+            answer = await asker.stop(drives or None, line=arguments.line or "", on_news=_show_news)
+            return _show(arguments, answer)
 
 
 @contextmanager
@@ -136,7 +137,14 @@ def _show(arguments: argparse.Namespace, answer: CommandAnswer) -> int:
     if arguments.json:
         print_text(json.dumps(answer.as_json(), indent=2))
     else:
-        gateway = f" ({answer.gateway})" if answer.gateway else ""
-        text = f"{answer.outcome.value}: {answer.text}{gateway}"
-        print_text(text, file=sys.stdout if answer.is_done else sys.stderr)
+        print_text(_sentence(answer), file=sys.stdout if answer.is_done else sys.stderr)
     return 0 if answer.is_done else 1
+
+
+def _show_news(answer: CommandAnswer) -> None:
+    print_text(_sentence(answer), file=sys.stderr)
+
+
+def _sentence(answer: CommandAnswer) -> str:
+    gateway = f" ({answer.gateway})" if answer.gateway else ""
+    return f"{answer.outcome.value}: {answer.text}{gateway}"

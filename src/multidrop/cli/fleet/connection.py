@@ -6,9 +6,9 @@ import argparse
 import asyncio
 import logging
 import os
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Coroutine
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from multidrop.cli.support.arguments import add_json_argument
 from multidrop.cli.support.extras import require_extra
@@ -52,15 +52,11 @@ def require_fleet() -> None:
         require_extra(library, "fleet", "fleet")
 
 
-def run_action(work: Callable[[], Awaitable[int]], level: int = logging.ERROR) -> int:
+def run_action(work: Callable[[], Coroutine[Any, Any, int]], level: int = logging.ERROR) -> int:
     """Run an action in a loop of its own; what the fleet logs from this level on is printed."""
     require_fleet()
-
-    async def live() -> int:
-        return await work()
-
     with logging_to(warn, "multidrop.fleet", level):
-        return asyncio.run(live())
+        return asyncio.run(work())
 
 
 def run_with_paths(arguments: argparse.Namespace, work: Callable[[list[ServerPath]], Awaitable[int]]) -> int:
