@@ -13,7 +13,7 @@ import pytest
 from command_desks import LINE, PATIENCE_S, Desks, desks
 from peers import require_module
 
-from multidrop import read_audit
+from multidrop import Seen, Stopped, read_audit
 
 require_module("nats")
 
@@ -250,6 +250,34 @@ def test_a_stop_that_goes_on_says_what_is_known_of_it(desk: Desks) -> None:
                 desk.sim["output_frequency"] = 0.0
 
     assert asyncio.run(asyncio.wait_for(main(), PATIENCE_S)).outcome is DONE
+
+
+LOSSES: dict[str, Callable[[Desks], object]] = {
+    "the lease": lambda desk: setattr(desk, "is_master", False),
+    "the line": lambda desk: desk.lines.shut(LINE),
+}
+
+
+@pytest.mark.parametrize("loss", LOSSES)
+def test_who_loses_the_line_at_a_stop_leaves_it_to_the_next_master(
+    desk: Desks, monkeypatch: pytest.MonkeyPatch, loss: str
+) -> None:
+    """A copy may have reached that one. Where we have the line again, the asker's next copy stops it."""
+
+    def lost() -> dict[str, Stopped]:
+        LOSSES[loss](desk)
+        return {"pump": Stopped("pump", Seen.FAILED, 0.1, "not the master")}
+
+    same = {"id": "one", "drives": None}
+    with monkeypatch.context() as patched:
+        patched.setattr(desk.bus(LINE), "stop_all", lost)
+        assert asyncio.run(desk.stop(**same)) is None
+    desk.is_master = True
+    desk.take()
+    again = asyncio.run(desk.stop(**same))
+    assert again is not None
+    assert again.outcome is DONE
+    assert [name for name, _ in desk.writes] == ["control"]
 
 
 def test_a_stop_ends_what_was_offered_before_and_copies_of_it_are_one(desk: Desks) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from itertools import count
 from typing import Any, Protocol
 
 from multidrop import Bus, Drive
@@ -17,9 +18,12 @@ class PolledBuses(Protocol):
 
 
 class HeldLine:
-    """A line from when it was taken until it is let go: one that is taken again is another."""
+    """A line from when it was taken until it is let go: one that is taken again is another, by its number."""
+
+    _numbers = count(1)
 
     def __init__(self, name: str, bus: Bus, may: Mapping[str, frozenset[str]]) -> None:
+        self.number = next(self._numbers)
         self.name = name
         self.bus = bus
         self.may = may

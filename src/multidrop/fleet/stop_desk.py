@@ -36,14 +36,15 @@ class StopDesk:
         self._lines = lines
         self._offers = offers
         self._log = log
-        self._stops: dict[tuple[str, str], asyncio.Task[CommandAnswer]] = {}  # by line and id
+        self._stops: dict[tuple[int, str], asyncio.Task[CommandAnswer]] = {}  # by line's number and id
         self._notes: set[asyncio.Task[None]] = set()
 
     async def stop(self, line: str, data: bytes) -> CommandAnswer | None:
         """Stop drives of a line now; None where we are not its master and must keep silent.
 
         A copy of the message gets the answer of the same stop; another message is another stop. One that is
-        not over soon is under way, with what is known of it so far; the asker asks again.
+        not over soon is under way, with what is known of it so far; the asker asks again. Where we lost the
+        line at it, it is the next master's to stop: that one may even have had a copy, so we know nothing.
         """
         held = self._lines.for_stop(line)
         if held is None:
@@ -52,7 +53,7 @@ class StopDesk:
             request = read_stop(data)
         except ValueError as mistake:
             return CommandAnswer(CommandOutcome.REFUSED, f"no stop was sent: {mistake}", self.gateway)
-        key = (line, request.id)
+        key = (held.number, request.id)
         if key not in self._stops:
             self._stops[key] = asyncio.create_task(self._stop(held, request))
             while len(self._stops) > REMEMBERED:
@@ -61,7 +62,8 @@ class StopDesk:
         await asyncio.wait({task}, timeout=HOLD_S)
         if not task.done():
             return self._so_far(held, request)
-        return task.result()
+        answer = task.result()
+        return answer if answer.is_done or self._lines.for_stop(line) is held else None
 
     def _so_far(self, held: HeldLine, request: StopRequest) -> CommandAnswer:
         names = held.drives if request.drives is None else request.drives
