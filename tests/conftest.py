@@ -20,6 +20,11 @@ from patient import patient_peer
 from multidrop.cli import main
 from multidrop.transport import exchange as exchanges
 
+# Compiled tests are kept in any case, in folders that git ignores: six workers would compile each of them,
+# and each program that a test starts all that it imports.
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+sys.dont_write_bytecode = False
+
 ALL_TESTS = sorted(Path(__file__).parent.glob("*/test_*.py"))
 COMPILED_BEFORE = any((test.parent / "__pycache__").exists() for test in ALL_TESTS)
 
@@ -42,7 +47,7 @@ def pytest_xdist_auto_num_workers() -> int:
 @pytest.hookimpl(optionalhook=True)  # of xdist
 def pytest_configure_node(node: Any) -> None:
     """Tell a worker whether it has to compile its share of the tests."""
-    node.workerinput["compiles"] = not sys.dont_write_bytecode and not COMPILED_BEFORE
+    node.workerinput["compiles"] = not COMPILED_BEFORE
 
 
 def pytest_configure(config: pytest.Config) -> None:

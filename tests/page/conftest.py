@@ -10,10 +10,9 @@ from typing import Any, NoReturn
 import pytest
 from fake_gateway import FakeGateway
 from network_changes import steady_network
-from watching import LIVE, until
+from watching import LIVE, PATIENCE_S, until
 
 SIZES = {"desk": (1440, 900), "tablet": (820, 1180), "phone": (390, 844)}
-PATIENCE_MS = 30000  # a busy machine is no failure of the page
 OPTIONS = ("--no-sandbox", "--host-resolver-rules=MAP evil.example 127.0.0.1")  # a rebound name
 Opener = Callable[..., Any]
 
@@ -62,7 +61,7 @@ def opened(browser: Any, gateway: FakeGateway) -> Iterator[Opener]:
     def open_page(view: str = "#/drives", size: str = "desk", live: bool = True, **options: Any) -> Any:
         width, height = SIZES[size]
         context = browser.new_context(viewport={"width": width, "height": height}, **options)
-        context.set_default_timeout(PATIENCE_MS)
+        context.set_default_timeout(PATIENCE_S * 1000)
         contexts.append(context)
         page = context.new_page()
         page.on("pageerror", lambda error: problems.append(str(error)))
@@ -83,7 +82,7 @@ def opened(browser: Any, gateway: FakeGateway) -> Iterator[Opener]:
 def page(browser: Any) -> Iterator[Any]:
     """A page of no gateway yet; it fails at the end where it broke, or broke its CSP."""
     context = browser.new_context(viewport={"width": 1440, "height": 900})
-    context.set_default_timeout(PATIENCE_MS)
+    context.set_default_timeout(PATIENCE_S * 1000)
     page, problems = context.new_page(), []
     page.on("pageerror", lambda error: problems.append(str(error)))
     page.on("console", lambda said: problems.append(said.text) if is_problem(said) else None)

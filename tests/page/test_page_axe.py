@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 from conftest import SIZES, Opener, missing
 from fake_gateway import FakeGateway
+from watching import until_still
 
 pytestmark = pytest.mark.long  # Chromium is started for each file
 
@@ -68,5 +69,6 @@ def test_axe_finds_nothing(opened: Opener, gateway: FakeGateway, axe: str, size:
         else:
             page.evaluate("view => { location.hash = view }", view)
         page.wait_for_timeout(700)
+        until_still(page)
         found[view] = violations(page)
     assert {view: some for view, some in found.items() if some} == {}

@@ -22,7 +22,7 @@ ATTACK = """async gateway => {
   const note = (what, came) => found.push([what, came]);
   const attempt = async (what, path, options) => {
     try {
-      const answer = await fetch(gateway + path, { ...options, signal: AbortSignal.timeout(20000) });
+      const answer = await fetch(gateway + path, { ...options, signal: AbortSignal.timeout(60000) });
       note(what, `${answer.status} ${(await answer.text()).length}`);
     } catch (error) { note(what, error.name); }
   };

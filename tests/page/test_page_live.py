@@ -9,12 +9,13 @@ from typing import Any
 import pytest
 from conftest import Opener
 from fake_gateway import FakeGateway
-from watching import LIVE, STALE, cell, link, until
+from watching import LIVE, STALE, cell, link, until, until_met
 
 pytestmark = pytest.mark.long  # Chromium is started for each file
 
 DASH = "\u2013"
-BUSY_S = 20.0  # far beyond the promised 0.5 s and 2 s: those are measured on a quiet machine
+BUSY_S = 20.0  # far beyond the promised 0.5 s: that is measured on a quiet machine
+FRESH = "tr.drive td.frequency .value:not(.old)"
 
 
 def test_all_drives_are_live(opened: Opener, gateway: FakeGateway) -> None:
@@ -27,22 +28,21 @@ def test_all_drives_are_live(opened: Opener, gateway: FakeGateway) -> None:
         ages.append((time.time() - shown) % 1000)
         page.wait_for_timeout(70)
     assert max(ages) < BUSY_S
-    assert page.locator("tr.drive .old").count() == 2  # frequency and current of the silent drive
+    old = page.locator("tr.drive .old")
+    until_met(page, lambda: old.count() == 2)  # frequency and current of the silent drive
 
 
 def test_a_killed_daemon_is_told(opened: Opener, gateway: FakeGateway) -> None:
     page = opened("#/drives/pump-1")
     gateway.kill()
-    assert until(page, STALE) < BUSY_S
+    until(page, STALE)
     assert re.fullmatch(r"\d+ s old", link(page))
     notice = page.locator("#notice").inner_text()
     assert "cannot be reached" in notice
     assert re.search(r"What is shown is of \d\d:\d\d:\d\d UTC\.", notice)
-    page.wait_for_timeout(400)
-    assert page.locator("tr.drive td.frequency .value:not(.old)").count() == 0
-    assert re.search(
-        r"^\d+\.\d+Hz\d+\.\d s old$", cell(page, "pump-1", "frequency").inner_text().replace("\n", "")
-    )
+    until_met(page, lambda: page.locator(FRESH).count() == 0)
+    shown = cell(page, "pump-1", "frequency").inner_text().replace("\n", "")
+    assert re.search(r"^\d+\.\d+Hz\d+(\.\d)? s old$", shown)
     assert cell(page, "pump-1", "state").inner_text().strip() == "last: runs"
     assert page.locator("#said").inner_text() == "Values are old: no new ones come."
 
@@ -50,13 +50,12 @@ def test_a_killed_daemon_is_told(opened: Opener, gateway: FakeGateway) -> None:
 def test_a_daemon_that_hangs_is_told_of(opened: Opener, gateway: FakeGateway) -> None:
     page = opened()
     gateway.is_silent = True
-    assert until(page, STALE) < BUSY_S
-    assert link(page) == "2 s old"
+    until(page, STALE)
+    assert re.fullmatch(r"\d+ s old", link(page))
     assert "sends no new values" in page.locator("#notice").inner_text()
     gateway.is_silent = False
-    until(page, f"!{STALE}")
-    assert link(page) == "live"
-    assert page.locator("#notice").is_hidden()
+    until(page, LIVE)
+    page.locator("#notice").wait_for(state="hidden")
 
 
 def test_the_page_lives_again_when_the_daemon_does(opened: Opener, gateway: FakeGateway) -> None:
@@ -66,7 +65,7 @@ def test_the_page_lives_again_when_the_daemon_does(opened: Opener, gateway: Fake
     again = FakeGateway(gateway.port)  # its frames are numbered from 1 again
     try:
         until(page, LIVE)
-        assert page.locator("tr.drive td.frequency .value:not(.old)").count() == 30
+        until_met(page, lambda: page.locator(FRESH).count() == 30)
     finally:
         again.kill()
 
@@ -80,15 +79,15 @@ def test_an_old_value_is_never_shown_as_new(opened: Opener, gateway: FakeGateway
            && row.querySelector('td.frequency .value').classList.contains('old'))""",
     )
     shown = cell(page, "pump-2", "frequency")
-    assert re.search(r"\d\.\d s old", shown.inner_text())
+    assert re.search(r"\d s old", shown.inner_text())
     style = shown.locator(".value").evaluate(
         "e => [getComputedStyle(e).fontStyle, getComputedStyle(e).color]"
     )
     fresh = cell(page, "pump-1", "frequency").locator(".value")
     assert style[0] == "italic"
-    assert fresh.evaluate("e => getComputedStyle(e).fontStyle") == "normal"
-    assert style[1] != fresh.evaluate("e => getComputedStyle(e).color")
-    assert page.locator(".keys .value.old").count() == 3
+    until_met(page, lambda: fresh.evaluate("e => getComputedStyle(e).fontStyle") == "normal")
+    until_met(page, lambda: fresh.evaluate("e => getComputedStyle(e).color") != style[1])
+    until_met(page, lambda: page.locator(".keys .value.old").count() == 3)
     assert cell(page, "pump-2", "frequency").locator(".bar").is_hidden()
 
 
@@ -121,8 +120,8 @@ def test_what_is_not_known_is_a_dash_and_never_a_nought(opened: Opener, gateway:
         assert cell(page, "pump-1", part).inner_text().strip() == DASH
     assert cell(page, "pump-2", "frequency").inner_text().strip() == DASH
     assert cell(page, "pump-1", "state").inner_text().strip() == "unknown"
-    shown = set(page.locator(".registers .number").all_inner_texts())
-    assert shown == {DASH, "20.0", "4012"}  # two that are looked at
+    shown = page.locator(".registers .number")
+    until_met(page, lambda: {*shown.all_inner_texts()} == {DASH, "20.0", "4012"})  # two are looked at
     assert page.locator("tr.head .wire").first.inner_text().split() == ["wire", DASH, "of", DASH, "planned"]
 
 
@@ -134,9 +133,9 @@ def test_a_wrong_clock_of_the_viewer_is_told_and_ages_stay_right(opened: Opener,
     until(page, LIVE)
     notice = page.locator("#notice")
     notice.wait_for()
-    assert re.search(r"clock is (89|90|91) s (slow|fast); times", notice.inner_text())
+    assert re.search(r"clock is (8\d|9\d) s (slow|fast); times", notice.inner_text())
     assert ("slow" in notice.inner_text()) == (off_s < 0)
-    assert page.locator("tr.drive td.frequency .value:not(.old)").count() == 30
+    until_met(page, lambda: page.locator(FRESH).count() == 30)
 
 
 def test_times_are_of_24_hours_in_utc_or_local_by_a_switch(opened: Opener) -> None:

@@ -9,7 +9,7 @@ from urllib.parse import parse_qs, urlsplit
 import pytest
 from conftest import Opener
 from fake_gateway import FakeGateway
-from watching import cell, until
+from watching import cell, until, until_met
 
 pytestmark = pytest.mark.long  # Chromium is started for each file
 
@@ -26,17 +26,23 @@ def asked(page: Any) -> list[dict[str, list[str]]]:
     return questions
 
 
+def asked_width(questions: list[dict[str, list[str]]]) -> int:
+    """Return how many milliseconds were asked for last."""
+    return int(questions[-1]["to"][0]) - int(questions[-1]["from"][0])
+
+
 def test_the_filter_finds_drives_by_name_state_and_family(opened: Opener) -> None:
     page = opened()
     shown = page.locator("tr.drive:visible")
     page.keyboard.press("/")
     page.keyboard.type("pump")
-    assert shown.count() == 4
+    until_met(page, lambda: shown.count() == 4)
     page.get_by_label("Filter drives").fill("")
     page.get_by_role("button", name=re.compile("Fault, silent")).click()
-    assert shown.locator("td.name").all_inner_texts() == ["conveyor-2", "labeller", "booster-1"]
+    names = ["conveyor-2", "labeller", "booster-1"]
+    until_met(page, lambda: shown.locator("td.name").all_inner_texts() == names)
     page.get_by_role("button", name=re.compile("^All")).click()
-    assert shown.count() == 31
+    until_met(page, lambda: shown.count() == 31)
 
 
 def test_what_is_wrong_has_a_shape_and_a_word_beside_its_colour(opened: Opener) -> None:
@@ -48,7 +54,7 @@ def test_what_is_wrong_has_a_shape_and_a_word_beside_its_colour(opened: Opener) 
     first = page.locator("#strip a").first
     assert re.fullmatch(r"labeller: no reply, \d+ s", first.inner_text().strip())
     page.locator("#strip a", has_text="booster-1").click()
-    assert page.locator("#panel h2").inner_text() == "booster-1"
+    until_met(page, lambda: page.locator("#panel h2").inner_text() == "booster-1")
 
 
 def test_a_drive_shows_all_registers_with_unit_and_place(opened: Opener) -> None:
@@ -61,7 +67,8 @@ def test_a_drive_shows_all_registers_with_unit_and_place(opened: Opener) -> None
     assert rows.nth(8).locator(".value").inner_text() == "ready, at setpoint"
     page.get_by_text("half within 4.1 ms, 99 % within 6.1 ms").wait_for()
     assert "Missed 4 of 5120 requests" in page.locator("#delays").inner_text()
-    assert rows.nth(10).locator(".value").get_attribute("class") == "value"  # looked at just now
+    looked_at = rows.nth(10).locator(".value")  # just now
+    until_met(page, lambda: looked_at.get_attribute("class") == "value")
     assert rows.nth(9).locator(".value").get_attribute("class") == "value old"  # read an hour ago
     assert page.locator("#plots canvas").count() == 3
 
@@ -73,7 +80,7 @@ def test_trends_zoom_by_dragging_and_go_back(opened: Opener) -> None:
     until(page, DRAWN)
     first = questions[-1]
     assert first["series"] == ["pump-2.output_frequency", "pump-2.output_current"]
-    width = int(first["to"][0]) - int(first["from"][0])
+    width = asked_width(questions)
     assert abs(width - 3600_000) < 5
     box = page.locator("#trend-plots .u-over").first.bounding_box()
     y = box["y"] + 50
@@ -81,13 +88,10 @@ def test_trends_zoom_by_dragging_and_go_back(opened: Opener) -> None:
     page.mouse.down()
     page.mouse.move(box["x"] + box["width"] * 0.5, y, steps=4)
     page.mouse.up()
-    page.wait_for_timeout(600)
-    zoomed = questions[-1]
-    assert abs(int(zoomed["to"][0]) - int(zoomed["from"][0]) - width / 4) < width / 50
-    assert abs(int(zoomed["from"][0]) - int(first["from"][0]) - width / 4) < width / 50
+    until_met(page, lambda: abs(asked_width(questions) - width / 4) < width / 50)
+    assert abs(int(questions[-1]["from"][0]) - int(first["from"][0]) - width / 4) < width / 50
     page.keyboard.press("Escape")
-    page.wait_for_timeout(600)
-    assert abs(int(questions[-1]["to"][0]) - int(questions[-1]["from"][0]) - width) < 5
+    until_met(page, lambda: abs(asked_width(questions) - width) < 5)
 
 
 def test_trends_zoom_and_move_by_keyboard_and_have_markers(opened: Opener) -> None:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from typing import Any
 
+PATIENCE_S = 60.0  # for what comes at once but on a machine that has much else to do
 LIVE = "document.querySelector('#link').textContent.trim() === 'live'"
 STALE = "document.body.classList.contains('stale')"
 VIEWS = ("#/drives", "#/drives/pump-3", "#/trends", "#/faults", "#/lines", "#/log")
@@ -17,13 +19,29 @@ AT_ITS_PLACE = """() => {
 }"""
 
 
-def until(page: Any, expression: str, within: float = 30) -> float:
-    """Wait until this is true on the page. Return the seconds. Raises AssertionError."""
-    began = time.monotonic()
-    while not page.evaluate(expression):
-        assert time.monotonic() - began < within, f"not within {within} s: {expression}; {told(page)}"
+def until(page: Any, expression: str) -> None:
+    """Wait until this is true on the page. Raises AssertionError."""
+    until_met(page, lambda: page.evaluate(expression), expression)
+
+
+def until_met(page: Any, met: Callable[[], object], what: str = "") -> None:
+    """Wait until a condition is met: what a page shows now it may show differently a moment later.
+
+    Raises AssertionError.
+    """
+    end = time.monotonic() + PATIENCE_S
+    while not met():
+        assert time.monotonic() < end, f"not within {PATIENCE_S:g} s: {what}; {told(page)}"
         page.wait_for_timeout(20)
-    return time.monotonic() - began
+
+
+def until_still(page: Any) -> None:
+    """Wait until nothing moves or fades any more, but for what does so without end."""
+    until(
+        page,
+        "document.getAnimations().every(a => a.effect.getTiming().iterations === Infinity"
+        " || a.playState !== 'running')",
+    )
 
 
 def told(page: Any) -> str:
