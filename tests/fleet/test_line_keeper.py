@@ -13,7 +13,7 @@ from peers import require_module
 require_module("nats")
 
 from multidrop.fleet import names  # noqa: E402
-from multidrop.fleet.buckets import Follower, Record  # noqa: E402
+from multidrop.fleet.buckets import Record  # noqa: E402
 from multidrop.fleet.fleet_records import FleetRecords  # noqa: E402
 from multidrop.fleet.lease import Lease  # noqa: E402
 from multidrop.fleet.lease_rules import SECOND, USUAL  # noqa: E402
@@ -42,7 +42,7 @@ class Trial:
         self.records = FleetRecords("a", lambda: nowhere, USUAL, lambda: None)
         for name in names.OWNERS:
             bucket: Any = MemoryBucket(name)
-            self.records.owners[name] = Follower(bucket)
+            self.records.owners[name].bucket = bucket
         self.records.plant.take(Record("hall", 1, {"line": {"name": "hall"}}))
         self.keeper = LineKeeper(self.lines, self.lease, self.records, lambda: None)
 

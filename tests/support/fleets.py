@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from contextlib import suppress
 from typing import Any
 
 from multidrop.fleet.buckets import Record
@@ -45,6 +46,15 @@ class MemoryBucket:
         if self.loses_answers:
             raise Unsure("no answer")
         return self.last
+
+    async def put_all(self, records: Sequence[Record]) -> list[Record]:
+        found = []
+        for record in records:
+            with suppress(Conflict):
+                found.append(
+                    record._replace(revision=await self.put(record.key, record.value, record.revision))
+                )
+        return found
 
     def store(self, key: str, value: Any) -> None:
         self.last += 1

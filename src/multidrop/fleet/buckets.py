@@ -5,11 +5,10 @@ from __future__ import annotations
 import base64
 import json
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
-from nats.aio.msg import Msg
-
+from multidrop.fleet.batch_client import Request
 from multidrop.fleet.errors import Conflict, FleetError, Unsure
 from multidrop.fleet.record_shapes import largest, parsed
 from multidrop.fleet.servers import ServerPath
@@ -92,12 +91,7 @@ class Bucket:
 
         Raises Conflict where it has another, Unsure where it may or may not have been replaced.
         """
-        headers = {
-            "Nats-Expected-Last-Subject-Sequence": str(revision),
-            "Nats-Expected-Last-Subject-Sequence-Subject": self._all_of(key),
-        }
-        data = b"" if value is None else json.dumps(value, separators=(",", ":")).encode()
-        message = await self.path().request(self._subject(key), data, headers)
+        message = await self.path().request(*self._put(Record(key, revision, value)))
         said = json.loads(message.data)
         error = said.get("error")
         if error is None:
@@ -105,6 +99,31 @@ class Bucket:
         if error.get("err_code") in _WRONG_REVISION:
             raise Conflict(f"{self.name}.{key} has another revision than {revision}")
         raise Unsure(f"NATS did not store {self.name}.{key}: {error.get('description')}")
+
+    async def put_all(self, records: Sequence[Record]) -> list[Record]:
+        """Replace records, each at the revision given with it, and return those that were, with the new one.
+
+        All are sent one behind the other, and each is decided by itself. What became of one that is not
+        returned must be read.
+        """
+        answers = await self.path().request_all([self._put(record) for record in records])
+        said = [json.loads(answer) if answer else {} for answer in answers]
+        return [
+            record._replace(revision=int(one["seq"]))
+            for record, one in zip(records, said, strict=True)
+            if "seq" in one and "error" not in one
+        ]
+
+    def _put(self, record: Record) -> Request:
+        value = record.value
+        return Request(
+            self._subject(record.key),
+            b"" if value is None else json.dumps(value, separators=(",", ":")).encode(),
+            {
+                "Nats-Expected-Last-Subject-Sequence": str(record.revision),
+                "Nats-Expected-Last-Subject-Sequence-Subject": self._all_of(record.key),
+            },
+        )
 
     async def get(self, key: str) -> Record:
         """Return the record as the bucket's leader has it; revision 0 for none."""
@@ -125,8 +144,8 @@ class Bucket:
         """
         wanted = {"seq": after + 1, "batch": BATCH, "next_by_subj": f"$KV.{self.name}.>"}
         subject = f"$JS.API.DIRECT.GET.KV_{self.name}"
-        messages = await self.path().collect(subject, json.dumps(wanted).encode(), _is_end)
-        return [self._of(message) for message in messages]
+        messages = await self.path().collect(subject, json.dumps(wanted).encode())
+        return [self._record(*message) for message in messages]
 
     def _subject(self, key: str) -> str:
         """Return the subject on which a record is written."""
@@ -135,10 +154,6 @@ class Bucket:
     def _all_of(self, key: str) -> str:
         """Return all subjects whose newest message is the key's record."""
         return self._subject(key)
-
-    def _of(self, message: Msg) -> Record:
-        headers = message.headers or {}
-        return self._record(headers["Nats-Subject"], int(headers["Nats-Sequence"]), message.data)
 
     def _record(self, subject: str, revision: int, data: bytes) -> Record:
         key = subject.removeprefix(f"$KV.{self.name}.")
@@ -188,8 +203,3 @@ class Follower:
         self.records[record.key] = record
         self._on_take(before, record)
         return True
-
-
-def _is_end(message: Msg) -> bool:
-    headers = message.headers or {}
-    return headers.get("Status") in ("204", "404", "408")

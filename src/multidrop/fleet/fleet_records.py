@@ -34,6 +34,7 @@ class FleetRecords:
             bucket: Follower(Bucket(bucket, path), partial(self._note_move, bucket))
             for bucket in names.OWNERS
         }
+        self._owned: dict[tuple[str, int], set[str]] = {}  # by gateway and session
         self.plant = Follower(Bucket(names.PLANT, path))
         self._lines: tuple[str, ...] = ()
         self._on_change = on_change
@@ -63,13 +64,7 @@ class FleetRecords:
 
     def owned_by(self, gateway: str, session: int) -> set[str]:
         """Return the lines whose records name this session."""
-        me = (gateway, session)
-        return {
-            line
-            for follower in self.owners.values()
-            for line, record in follower.records.items()
-            if owner_of(record) == me
-        }
+        return set(self._owned.get((gateway, session), ()))
 
     async def look(self) -> None:
         """Read once what has changed in each bucket. Raises FleetError where that fails."""
@@ -102,4 +97,6 @@ class FleetRecords:
         return bool(changed)
 
     def _note_move(self, bucket: str, before: Record | None, record: Record) -> None:
+        self._owned.get(owner_of(before), set()).discard(record.key)
+        self._owned.setdefault(owner_of(record), set()).add(record.key)
         self.moves.note(before, record, is_first_look=bucket not in self._read)

@@ -9,13 +9,13 @@ from __future__ import annotations
 import asyncio
 import logging
 import time
-from collections.abc import Callable, Coroutine, Mapping
+from collections.abc import Callable, Coroutine, Mapping, Sequence
 from contextlib import suppress
 from typing import Any, NamedTuple, Protocol
 
 from multidrop.fleet import names
 from multidrop.fleet.buckets import Record
-from multidrop.fleet.errors import Conflict, FleetError
+from multidrop.fleet.errors import FleetError
 from multidrop.fleet.fleet_records import FleetRecords
 from multidrop.fleet.lease import Lease
 from multidrop.fleet.ownership import NOBODY, owner_of, owner_value
@@ -24,7 +24,8 @@ _log = logging.getLogger("multidrop.fleet")
 
 SILENT_S = 0.5  # before the lease runs out: time for closing; the timer leaves guard / 2 more
 TAKE_AGAIN_S = 2.0  # after a line that could not be taken
-CLAIMS_AT_ONCE = 64
+WRITTEN_AT_ONCE = 64  # records; more would keep the renewal of the lease waiting
+WRITERS = 2  # of them at a time in each bucket
 LINES_AT_ONCE = 32
 
 
@@ -67,7 +68,7 @@ class LineKeeper:
         self._again_at: dict[str, float] = {}
         self._failure: BaseException | None = None
         self._has_failed = asyncio.Event()
-        self._claims = asyncio.Semaphore(CLAIMS_AT_ONCE)
+        self._writing = {bucket: asyncio.Semaphore(WRITERS) for bucket in names.OWNERS}
         self._openings = asyncio.Semaphore(LINES_AT_ONCE)
 
     @property
@@ -81,7 +82,12 @@ class LineKeeper:
         return not self.polled and not self._at_work
 
     def is_mine(self, line: str) -> bool:
-        return owner_of(self._records.owner(line)) == (self._lease.name, self._lease.session)
+        return self._mine(line) is not None
+
+    def _mine(self, line: str) -> Record | None:
+        """Return the line's record where it names us and our present session."""
+        record = self._records.owner(line)
+        return record if owner_of(record) == (self._lease.name, self._lease.session) else None
 
     def _owned(self) -> set[str]:
         return self._records.owned_by(self._lease.name, self._lease.session)
@@ -106,9 +112,8 @@ class LineKeeper:
 
     def claim(self, claims: Mapping[str, int]) -> None:
         """Claim lines, each at the revision of its record that was judged."""
-        for line, revision in claims.items():
-            if line not in self._at_work:
-                self._start(line, self._write_owner(line, self._lease.name, revision))
+        free = {line: revision for line, revision in claims.items() if line not in self._at_work}
+        self._hand_over(free, self._lease.name, self._lease.session)
 
     def reconcile(self) -> None:
         """Let go of what is not ours any more, take what is, and give away what was let go."""
@@ -121,15 +126,14 @@ class LineKeeper:
         now = time.monotonic()
         for line, polled in list(self.polled.items()):
             if mine.get(line) != polled.revision and line not in self._at_work:
-                self._start(line, self._let_go(line))
+                self._start([line], self._let_go(line))
         for line in mine.keys() - self.polled.keys() - self._at_work.keys():
             if now >= self._again_at.get(line, 0.0):
-                self._start(line, self._take(line))
+                self._start([line], self._take(line))
         if valid:
-            for line in self.releasing - self.polled.keys() - self._at_work.keys():
-                record = self._records.owner(line)
-                if record and self.is_mine(line):
-                    self._start(line, self._write_owner(line, NOBODY, record.revision))
+            left = self.releasing - self.polled.keys() - self._at_work.keys()
+            mine_still = {line: record for line in left if (record := self._mine(line))}
+            self._hand_over({line: record.revision for line, record in mine_still.items()}, NOBODY, 0)
 
     async def let_all_go(self) -> None:
         """Let go of all lines, whatever is under way. Raises what kept a line from it."""
@@ -143,34 +147,51 @@ class LineKeeper:
         finally:
             self._is_leaving = False
 
+    # ---- who is whose ----
+
+    def _hand_over(self, revisions: Mapping[str, int], gateway: str, session: int) -> None:
+        """Claim lines, or give them away, each at this revision of its record: many in one go."""
+        value = owner_value(gateway, session, time.time_ns() // 1_000_000)
+        for bucket in self._writing:
+            records = [
+                Record(line, revision, value)
+                for line, revision in revisions.items()
+                if names.owner_bucket(line) == bucket
+            ]
+            for at in range(0, len(records), WRITTEN_AT_ONCE):
+                some = records[at : at + WRITTEN_AT_ONCE]
+                self._start([record.key for record in some], self._write_owners(bucket, some))
+
+    async def _write_owners(self, bucket: str, records: Sequence[Record]) -> None:
+        """Replace records: the server decides, by the revision of each. Lines that are ours now are taken."""
+        follower = self._records.owners[bucket]
+        async with self._writing[bucket]:
+            if not self.may_poll:
+                return
+            with suppress(FleetError):  # what became of them will be read
+                for stored in await follower.bucket.put_all(records):
+                    follower.take(stored)
+                    self.moves += 1
+        for line in (record.key for record in records):
+            if self.is_mine(line) and self._records.is_in_plant(line):
+                self._start([line], self._take(line))
+
     # ---- one line ----
 
-    def _start(self, line: str, work: Coroutine[Any, Any, None]) -> None:
+    def _start(self, lines: Sequence[str], work: Coroutine[Any, Any, None]) -> None:
         task = asyncio.create_task(work)
-        self._at_work[line] = task
-        task.add_done_callback(lambda done: self._done(line, done))
+        self._at_work |= dict.fromkeys(lines, task)
+        task.add_done_callback(lambda done: self._done(lines, done))
 
-    def _done(self, line: str, task: asyncio.Task[None]) -> None:
-        self._at_work.pop(line, None)
+    def _done(self, lines: Sequence[str], task: asyncio.Task[None]) -> None:
+        for line in lines:
+            if self._at_work.get(line) is task:  # else the next work on it has begun
+                del self._at_work[line]
         self._on_change()
         failure = None if task.cancelled() else task.exception()
         if failure and not self._failure:
             self._failure = failure  # a line that is not closed for certain
             self._has_failed.set()
-
-    async def _write_owner(self, line: str, gateway: str, revision: int) -> None:
-        """Claim a line, or give it away; only the server decides, by the revision."""
-        follower = self._records.owners[names.owner_bucket(line)]
-        value = owner_value(gateway, self._lease.session if gateway else 0, time.time_ns() // 1_000_000)
-        async with self._claims:
-            if not self.may_poll:
-                return
-            with suppress(Conflict, FleetError):  # what became of it will be read
-                stored = await follower.bucket.put(line, value, revision)
-                follower.take(Record(line, stored, value))
-                self.moves += 1
-        if gateway and line in self._records.plant.records:
-            await self._take(line)
 
     async def _take(self, line: str) -> None:
         record = self._records.plant.records[line]

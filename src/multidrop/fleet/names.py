@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import re
 import zlib
 
@@ -25,6 +26,7 @@ def is_name(text: str) -> bool:
     return re.fullmatch(r"[A-Za-z0-9_-]+", text) is not None
 
 
+@functools.lru_cache(1 << 16)
 def owner_bucket(line: str) -> str:
     """Return the bucket with the record of a line's master."""
     return OWNERS[zlib.crc32(line.encode()) % len(OWNERS)]

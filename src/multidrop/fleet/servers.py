@@ -9,11 +9,11 @@ from contextlib import suppress
 from typing import Any
 
 import nats
-from nats.aio.client import Client
 from nats.aio.msg import Msg
 from nats.aio.subscription import Subscription
 from nats.errors import Error as NatsError
 
+from multidrop.fleet.batch_client import BatchClient, DirectMessage, Request
 from multidrop.fleet.errors import FleetError, NobodyThere, NotAdmitted, NotDelivered, TooOld, Unsure
 from multidrop.fleet.lease_rules import PATHS
 from multidrop.fleet.refusals import Denials, failure_to_connect
@@ -36,7 +36,7 @@ class ServerPath:
         self.urls = list(urls)  # the first is home
         self.url = ""  # where it is
         self._options = options or {}
-        self._client: Client | None = None
+        self._client: BatchClient | None = None
         self._denials = Denials()
         self._trouble = ""  # that was told
         self._leaving: set[asyncio.Task[None]] = set()
@@ -141,7 +141,7 @@ class ServerPath:
                 with suppress(NatsError, OSError):  # it is left soon, and all is brought to the next server
                     await self._bring(self._client, self._standing)
 
-    async def _bring(self, client: Client, standing: dict[str, Subscription]) -> None:
+    async def _bring(self, client: BatchClient, standing: dict[str, Subscription]) -> None:
         """Subscribe to all that is wanted there now, and to nothing else."""
         while standing.keys() != self._wanted.keys():
             for subject in self._wanted.keys() - standing.keys():
@@ -180,29 +180,24 @@ class ServerPath:
             denials.check_request(subject, self._options.get("inbox_prefix", "_INBOX"), before)
             raise Unsure(f"{self.url} gave no answer to {subject}: {failure}") from None
 
-    async def collect(self, subject: str, data: bytes, is_last: Callable[[Msg], bool]) -> list[Msg]:
-        """Return all answers up to one that says that it is the last. Raises Unsure as `request` does."""
+    async def collect(self, subject: str, data: bytes) -> list[DirectMessage]:
+        """Return all messages that a direct get gives. Raises Unsure as `request` does."""
         client, denials = self._connected(), self._denials
         before = denials.of_request(subject)
-        found: list[Msg] = []
         try:
-            inbox = client.new_inbox()
-            subscription = await client.subscribe(inbox)
-            try:
-                await client.publish(subject, data, reply=inbox)
-                while True:
-                    message = await subscription.next_msg(ANSWER_S)
-                    if is_last(message):
-                        return found
-                    found.append(message)
-            finally:
-                with suppress(NatsError, OSError):
-                    await subscription.unsubscribe()
-        except (NatsError, OSError, TimeoutError) as failure:
+            return await client.batch(Request(subject, data), ANSWER_S)
+        except (NatsError, OSError) as failure:
             denials.check_request(subject, self._options.get("inbox_prefix", "_INBOX"), before)
             raise Unsure(f"{self.url} gave no whole answer to {subject}: {failure}") from None
 
-    def _connected(self) -> Client:
+    async def request_all(self, requests: Sequence[Request]) -> list[bytes | None]:
+        """Return the answer to each request, or None where it is unsure whether it was carried out."""
+        try:
+            return await self._connected().replies(requests, ANSWER_S)
+        except (NatsError, OSError) as failure:
+            raise Unsure(f"{self.url} was lost while {len(requests)} requests were sent: {failure}") from None
+
+    def _connected(self) -> BatchClient:
         if self._client is None or not self._client.is_connected:
             raise NotDelivered(f"no connection to {self.urls[0]}")
         return self._client
@@ -213,7 +208,7 @@ class ServerPath:
         await asyncio.gather(*self._leaving)
 
 
-async def connect(url: str, options: Mapping[str, Any], denials: Denials | None = None) -> Client:
+async def connect(url: str, options: Mapping[str, Any], denials: Denials | None = None) -> BatchClient:
     """Return a connection to this very server. Raises FleetError, in one sentence."""
     refusals: list[Exception] = []
     told = denials or Denials()
@@ -223,7 +218,7 @@ async def connect(url: str, options: Mapping[str, Any], denials: Denials | None 
             refusals.append(failure)
         await told.note(failure)
 
-    client = Client()
+    client = BatchClient()
     settings = {**ONE_TRY, "connect_timeout": CONNECT_S}
     try:
         await asyncio.wait_for(client.connect(url, error_cb=note, **{**options, **settings}), 2 * CONNECT_S)
@@ -243,7 +238,7 @@ async def connect(url: str, options: Mapping[str, Any], denials: Denials | None 
     return client
 
 
-async def _close(client: Client) -> None:
+async def _close(client: BatchClient) -> None:
     try:
         with suppress(NatsError, OSError, TimeoutError):
             await asyncio.wait_for(client.close(), CONNECT_S)
@@ -251,7 +246,7 @@ async def _close(client: Client) -> None:
         _cut(client)
 
 
-def _cut(client: Client) -> None:
+def _cut(client: BatchClient) -> None:
     """Close the socket, and end what hears messages.
 
     nats-py leaves both where it is cancelled, or the server is gone; what became of its reading is not asked.

@@ -1,0 +1,162 @@
+"""BatchClient: a NATS client that asks for many things at once, and takes the answers as they came.
+
+nats-py parses the headers of each message with Python's parser for e-mails, passes it on through a queue,
+and has a timer for each request; a gateway of a large fleet reads tens of thousands of records, and claims
+hundreds of lines at a time. Here such answers are taken where they leave the connection, and what is wanted
+of their headers is found by its name.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import NamedTuple
+
+from nats.aio.client import Client
+
+STATUS = slice(9, 12)  # of a block of headers: "NATS/1.0 404 No Messages"
+WHOLE = ("204", "404")  # the server's last word after messages, and for none
+
+
+class DirectMessage(NamedTuple):
+    """A message of a stream, as a direct get returns it."""
+
+    subject: str
+    sequence: int
+    data: bytes
+
+
+class Request(NamedTuple):
+    """A message whose answer is waited for."""
+
+    subject: str
+    data: bytes
+    headers: dict[str, str] | None = None
+
+
+class Gathered:
+    """Answers that come one by one; `last` has the status of the last one, once it came."""
+
+    def __init__(self) -> None:
+        self.count = 0
+        self.last: asyncio.Future[str] = asyncio.get_running_loop().create_future()
+
+    def end(self, status: str = "") -> None:
+        if not self.last.done():
+            self.last.set_result(status)
+
+    async def wait(self, silence_s: float) -> None:
+        """Return when the last one came, or nothing for so long."""
+        before = -1
+        while not self.last.done() and self.count > before:
+            before = self.count
+            await asyncio.wait({self.last}, timeout=silence_s)
+
+
+class DirectGet(Gathered):
+    """The messages that one direct get gives."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.messages: list[DirectMessage] = []
+
+    def take(self, headers: bytes, data: bytes) -> None:
+        """Keep a message, or learn that there are no more."""
+        self.count += 1
+        message = stored_message(headers, data)
+        if message is None:
+            self.end(headers[STATUS].decode("ascii", "replace"))
+        else:
+            self.messages.append(message)
+
+
+class Replies(Gathered):
+    """The answers to so many requests; None where there is none."""
+
+    def __init__(self, number: int) -> None:
+        super().__init__()
+        self.found: list[bytes | None] = [None] * number
+
+    def take(self, place: int, headers: bytes, data: bytes) -> None:
+        """Keep the first answer to a request."""
+        if self.found[place] is None:
+            self.found[place] = data
+            self.count += 1
+        if self.count == len(self.found):
+            self.end()
+
+
+class BatchClient(Client):
+    """A client of nats-py with one more subscription: such answers come there, each in its own inbox."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._takers: dict[bytes, Callable[[bytes, bytes], None]] = {}  # by inbox
+        self._inboxes = ""
+        self._batch_sid = 0
+        self._subscribing = asyncio.Lock()
+
+    async def batch(self, request: Request, silence_s: float) -> list[DirectMessage]:
+        """Return what a direct get gives. Raises OSError for less than that, and what nats-py raises."""
+        batch = DirectGet()
+        await self._ask([request], [batch.take], batch, silence_s)
+        if not batch.last.done():
+            raise TimeoutError(f"nothing came for {silence_s:g} s")
+        if batch.last.result() not in WHOLE:
+            raise OSError(f"it ended with {batch.last.result() or 'no status'}")
+        return batch.messages
+
+    async def replies(self, requests: Sequence[Request], silence_s: float) -> list[bytes | None]:
+        """Send all requests, one behind the other, and return their answers; None where none came in time."""
+        replies = Replies(len(requests))
+        takers = [partial(replies.take, place) for place in range(len(requests))]
+        await self._ask(requests, takers, replies, silence_s)
+        return replies.found
+
+    async def _ask(
+        self,
+        requests: Sequence[Request],
+        takers: Sequence[Callable[[bytes, bytes], None]],
+        gathered: Gathered,
+        silence_s: float,
+    ) -> None:
+        await self._subscribe()
+        inboxes = [f"{self._inboxes}.{self._nuid.next().decode()}" for _ in requests]
+        names = [inbox.encode() for inbox in inboxes]
+        self._takers.update(zip(names, takers, strict=True))
+        try:
+            for inbox, request in zip(inboxes, requests, strict=True):
+                await self.publish(request.subject, request.data, reply=inbox, headers=request.headers)
+            await gathered.wait(silence_s)
+        finally:
+            for name in names:
+                del self._takers[name]
+
+    async def _subscribe(self) -> None:
+        async with self._subscribing:
+            if not self._batch_sid:
+                self._inboxes = self.new_inbox()
+                self._batch_sid = (await self.subscribe(f"{self._inboxes}.*"))._id
+
+    async def _process_msg(self, sid: int, subject: bytes, reply: bytes, data: bytes, headers: bytes) -> None:
+        if sid != self._batch_sid:
+            await super()._process_msg(sid, subject, reply, data, headers)
+        elif take := self._takers.get(subject):
+            take(headers or b"", data)
+
+
+def stored_message(headers: bytes, data: bytes) -> DirectMessage | None:
+    """Return the message with these headers; None for the server's last word.
+
+    The writer's own headers come first, whatever he calls them; the server's are the last ones.
+    """
+    subject, sequence = _last(headers, b"\r\nNats-Subject: "), _last(headers, b"\r\nNats-Sequence: ")
+    if not subject or not sequence.isdigit():
+        return None
+    return DirectMessage(subject.decode("utf-8", "replace"), int(sequence), data)
+
+
+def _last(headers: bytes, name: bytes) -> bytes:
+    at = headers.rfind(name)
+    return headers[at + len(name) : headers.find(b"\r\n", at + len(name))] if at >= 0 else b""

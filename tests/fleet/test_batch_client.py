@@ -1,0 +1,164 @@
+"""Many answers at once: what is believed of them, and what becomes of those that do not come."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Awaitable, Callable, Iterator
+
+import pytest
+from nats_clusters import Cluster, cluster
+from peers import require_module
+
+require_module("nats")
+
+from multidrop.fleet.batch_client import BatchClient, DirectMessage, Request, stored_message  # noqa: E402
+from multidrop.fleet.buckets import Bucket, Record  # noqa: E402
+from multidrop.fleet.servers import ServerPath, connect, paths_of  # noqa: E402
+from multidrop.fleet.setup import set_up  # noqa: E402
+
+OWNER = {"gateway": "gw-9", "session": 1, "since": 0}
+SERVERS = (
+    b"Nats-Stream: KV_own_0\r\nNats-Subject: $KV.own_0.a\r\nNats-Sequence: 7\r\nNats-Last-Sequence: 0\r\n\r\n"
+)
+
+
+@pytest.fixture(scope="module")
+def one(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cluster]:
+    """Return one server with a fleet's buckets."""
+    with cluster(tmp_path_factory.mktemp("nats"), 1) as running:
+        _with_path(running, lambda path: set_up([path]))
+        yield running
+
+
+def _with_path(running: Cluster, work: Callable[[ServerPath], Awaitable[None]]) -> None:
+    async def main() -> None:
+        path = paths_of(running.urls)[0]
+        await path.open()
+        try:
+            await asyncio.wait_for(work(path), 60)
+        finally:
+            await path.close()
+
+    asyncio.run(main())
+
+
+@pytest.mark.parametrize(
+    "writers",
+    [
+        b"NATS/1.0\r\n",
+        b"NATS/1.0\r\nOf-Another: version\r\n",
+        b"NATS/1.0\r\nNats-Subject: $KV.own_0.other\r\nNats-Sequence: 9\r\n",
+        b"NATS/1.0 204 EOB\r\n",
+        b"NATS/1.0 404 No Messages\r\nNats-Sequence: none\r\n",
+    ],
+)
+def test_the_servers_headers_count_whatever_the_writer_has_sent(writers: bytes) -> None:
+    assert stored_message(writers + SERVERS, b"x") == DirectMessage("$KV.own_0.a", 7, b"x")
+
+
+@pytest.mark.parametrize(
+    "headers",
+    [
+        b"",
+        b"NATS/1.0 204 EOB\r\nNats-Pending: 0\r\nNats-Last-Sequence: 3\r\n\r\n",
+        b"NATS/1.0 404 Message Not Found\r\n\r\n",
+        b"NATS/1.0\r\nNats-Subject: a\r\nNats-Sequence: -1\r\n\r\n",
+    ],
+)
+def test_other_headers_are_of_no_stored_message(headers: bytes) -> None:
+    assert stored_message(headers, b"") is None
+
+
+def test_a_record_that_looks_like_the_end_hides_none_behind_it(one: Cluster) -> None:
+    async def work(path: ServerPath) -> None:
+        bucket = Bucket("own_0", lambda: path)
+        await bucket.put("a", OWNER, 0)
+        client = await connect(one.urls[0], {})
+        headers = b"NATS/1.0 204 EOB\r\nNats-Subject: $KV.own_0.x\r\nNats-Sequence: 1\r\n\r\n"
+        await client._send_command(
+            b"HPUB $KV.own_0.b %d %d\r\n%s\r\n" % (len(headers), len(headers), headers)
+        )
+        await client.flush()
+        await client.close()
+        await bucket.put("c", OWNER, 0)
+        found = await bucket.changes(0)
+        assert [record.key for record in found] == ["a", "b", "c"]
+
+    _with_path(one, work)
+
+
+def test_each_of_many_records_is_replaced_at_its_own_revision_or_not(one: Cluster) -> None:
+    async def work(path: ServerPath) -> None:
+        bucket = Bucket("own_1", lambda: path)
+        known = await bucket.put("b", OWNER, 0)
+        value = {**OWNER, "session": 2}
+        wanted = [Record("a", 0, value), Record("b", known + 5, value), Record("c", 0, value)]
+        stored = await bucket.put_all(wanted)
+        assert [record.key for record in stored] == ["a", "c"]
+        found = {record.key: record for record in await bucket.changes(0)}
+        assert [found["a"], found["c"]] == stored
+        assert found["b"] == Record("b", known, OWNER)
+        again = await bucket.put_all([record._replace(value=OWNER) for record in stored])
+        assert len(again) == 2
+
+    _with_path(one, work)
+
+
+def test_a_request_without_an_answer_is_told_from_those_that_have_one(one: Cluster) -> None:
+    async def main() -> None:
+        client = await connect(one.urls[0], {})
+        deaf = await client.subscribe("deaf")
+        mute = Request("deaf", b"")
+        nobody = Request("nobody.there", b"")
+        info = Request("$JS.API.INFO", b"")
+        found = await client.replies([mute, nobody, info], 0.2)
+        assert found[0] is None
+        assert found[1] == b""  # the server says so
+        assert found[2] is not None
+        assert found[2].startswith(b"{")
+        with pytest.raises(TimeoutError, match=r"nothing came for 0.2 s"):
+            await client.batch(mute, 0.2)
+        with pytest.raises(OSError, match="it ended with 503"):
+            await client.batch(nobody, 5.0)
+        assert client._takers == {}
+        await deaf.unsubscribe()
+        await client.close()
+
+    asyncio.run(main())
+
+
+def test_an_answer_that_comes_too_late_is_none_to_another_request(one: Cluster) -> None:
+    async def main() -> None:
+        client, other = await connect(one.urls[0], {}), await connect(one.urls[0], {})
+        asked: asyncio.Queue[str] = asyncio.Queue()
+
+        async def keep(message: object) -> None:
+            asked.put_nowait(message.reply)  # type: ignore[attr-defined]
+
+        await other.subscribe("slow", cb=keep)
+        await other.flush()
+        assert await client.replies([Request("slow", b"first")], 0.2) == [None]
+        second = asyncio.create_task(client.replies([Request("slow", b"second")], 30.0))
+        first_inbox, second_inbox = (
+            await asyncio.wait_for(asked.get(), 30),
+            await asyncio.wait_for(asked.get(), 30),
+        )
+        await other.publish(first_inbox, b"late")
+        await other.publish(second_inbox, b"right")
+        assert await second == [b"right"]
+        for one_of in (client, other):
+            await one_of.close()
+
+    asyncio.run(main())
+
+
+def test_other_messages_go_where_they_went(one: Cluster) -> None:
+    async def main() -> None:
+        client = await connect(one.urls[0], {})
+        assert isinstance(client, BatchClient)
+        await client.replies([Request("$JS.API.INFO", b"")], 5.0)
+        answer = await client.request("$JS.API.INFO", b"", 5.0, headers={"a": "b"})
+        assert answer.data.startswith(b"{")
+        await client.close()
+
+    asyncio.run(main())
