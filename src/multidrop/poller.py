@@ -191,10 +191,17 @@ class Poller(RowSource):
                 added.start()
 
     def remove_line(self, name: str) -> None:
-        """Poll a line no more, and close its port, as `adopt` does. Raises ValueError when there is none."""
+        """Poll a line no more, and close its port, as `adopt` does. Raises ValueError when there is none.
+
+        While its stops are waited for other lines come and go.
+        """
         with self._changing:
             self._check_polling()
-            self._lines.let_go([self._lines.find(name)], GONE)
+            leaving = self._lines.find(name)
+        leaving.bus.part()  # a stop may take half a minute
+        with self._changing:
+            if not self._closing and leaving in self._lines:
+                self._lines.let_go([leaving], GONE)
 
     def _check_polling(self) -> None:
         if self._closing:

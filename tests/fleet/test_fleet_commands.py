@@ -176,11 +176,11 @@ STOPS: dict[str, tuple[ScriptedPath, CommandOutcome, str]] = {
     "silence": (
         ScriptedPath(stop=[LOST]),
         UNKNOWN,
-        "it is not known whether the stop of pump-1 was sent: its gateway gives no answer any more; "
-        "use the hard-wired stop",
+        "it is not known what became of the stop of pump-1: its gateway gives no answer any more; "
+        "use the hard-wired stop (no answer)",
     ),
-    "any failure": (ScriptedPath(stop=[ANY]), UNKNOWN, "it is not known whether the stop"),
-    "silence, then nobody": (ScriptedPath(stop=[LOST, NOBODY]), UNKNOWN, "it is not known whether the stop"),
+    "any failure": (ScriptedPath(stop=[ANY]), UNKNOWN, "it is not known what became of the stop"),
+    "silence, then nobody": (ScriptedPath(stop=[LOST, NOBODY]), UNKNOWN, "it is not known what became of"),
 }
 
 
@@ -204,6 +204,15 @@ def test_what_is_known_of_a_stop_meanwhile_is_told_once(tmp_path: Path) -> None:
         (CommandOutcome.UNDER_WAY, "still turning"),
     ]
     assert last.outcome is DONE
+
+
+def test_who_hears_no_more_of_a_stop_is_told_what_was_heard_last(tmp_path: Path) -> None:
+    path = ScriptedPath(
+        stop=[{**answer("under way", "pump-1: the stop was sent"), "gateway": "gw-1"}, NOBODY]
+    )
+    last = asked(tmp_path, path, stop)
+    assert last.outcome is UNKNOWN
+    assert last.text.endswith("; the last that was heard: pump-1: the stop was sent")
 
 
 def test_who_hears_nothing_of_a_stop_is_told_so_before_it_is_given_up(tmp_path: Path) -> None:

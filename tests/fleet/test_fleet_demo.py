@@ -182,7 +182,7 @@ def test_the_demo() -> None:
         "again",
     ):
         assert word in said
-    assert int(re.search(r"gave (\d+) answers", said)[1]) > 1000  # type: ignore[index]
+    assert int(re.search(r"gave (\d+) answers", said)[1]) > 100  # type: ignore[index]
     assert "WRONG" not in said
     await_nothing_left(folder)
 

@@ -189,6 +189,62 @@ def test_a_stop_goes_on_while_its_line_is_to_go(both: TwoLines, monkeypatch: pyt
         assert list(poller.buses) == ["hall"]
 
 
+def test_a_stop_on_a_line_that_goes_holds_no_other_line_up(
+    both: TwoLines, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with Poller(plant(both.hall(), both.yard())) as poller:
+        bus = poller.bus("yard")
+        begun, go_on = threading.Event(), threading.Event()
+        step = bus._stopper._do
+
+        def slow(*arguments: object) -> object:
+            begun.set()
+            assert go_on.wait(PATIENCE)
+            return step(*arguments)
+
+        monkeypatch.setattr(bus._stopper, "_do", slow)
+        stopping = threading.Thread(target=bus.stop_all)
+        stopping.start()
+        assert begun.wait(PATIENCE)
+        removing = threading.Thread(target=poller.remove_line, args=["yard"])
+        removing.start()
+        until(lambda: bus._latches._is_shut)
+        others = threading.Thread(target=lambda: (poller.remove_line("hall"), poller.add_line(both.hall(1))))
+        others.start()
+        try:
+            until(lambda: not others.is_alive())
+            assert stopping.is_alive()
+            assert removing.is_alive()
+            assert sorted(poller.buses) == ["hall", "yard"]
+        finally:
+            go_on.set()
+        stopping.join(PATIENCE)
+        removing.join(PATIENCE)
+        assert list(poller.buses) == ["hall"]
+
+
+def test_a_line_that_goes_twice_at_a_time_goes_once(both: TwoLines) -> None:
+    """Two who find it there both wait for its stops, and one of them lets it go."""
+    with Poller(plant(both.hall(), both.yard())) as poller:
+        bus = poller.bus("yard")
+        both_wait, part = threading.Barrier(2), bus.part
+
+        def wait_and_part() -> None:
+            with suppress(threading.BrokenBarrierError):
+                both_wait.wait(PATIENCE)
+            both_wait.abort()  # it is waited for once more when the line goes
+            part()
+
+        vars(bus)["part"] = wait_and_part
+        removing = [threading.Thread(target=poller.remove_line, args=["yard"]) for _ in range(2)]
+        for one in removing:
+            one.start()
+        for one in removing:
+            one.join(PATIENCE)
+            assert not one.is_alive()
+        assert list(poller.buses) == ["hall"]
+
+
 def test_calls_on_what_has_gone_say_so(both: TwoLines) -> None:
     with Poller(plant(both.hall(), both.yard())) as poller:
         bus, (pump_1, pump_2) = poller.bus("hall"), poller.bus("hall").drives

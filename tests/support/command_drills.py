@@ -31,7 +31,7 @@ from multidrop.fleet.fleet_commands import FleetCommands
 from multidrop.sim import SimulatedDrive, Simulator, Wire, simulated
 
 GATEWAYS = ("gw-a", "gw-b", "gw-c")
-PATIENCE_S = 60.0
+PATIENCE_S = 120.0
 HIGHEST = 4999  # raw counts of the setpoint, each of which one drive gets once
 STOP_EVERY = 20  # commands of a drive
 SENT = (CommandOutcome.DONE, CommandOutcome.FAILED)

@@ -149,12 +149,13 @@ class FleetDrill:
         self.kill_gateway()
         self.kill_node()
 
-    def stop_gateway(self) -> None:
-        """Let it stand still for longer than a lease; the kernel kills it meanwhile."""
+    def stop_gateway(self) -> subprocess.Popen[str]:
+        """Let one stand still for longer than a lease, and return it; the kernel kills it meanwhile."""
         running = self.gateways[self.random.choice(GATEWAYS)]
         running.send_signal(signal.SIGSTOP)
         time.sleep(self.random.uniform(3.5, 6.0))
         running.send_signal(signal.SIGCONT)
+        return running
 
     def stop_gateway_shortly(self) -> None:
         running = self.gateways[self.random.choice(GATEWAYS)]
@@ -219,7 +220,7 @@ async def _make_leader(node: Node, buckets: Sequence[str]) -> None:
     await path.close()
 
 
-DEEDS: dict[str, Callable[[FleetDrill], None]] = {
+DEEDS: dict[str, Callable[[FleetDrill], object]] = {
     "nothing": FleetDrill.do_nothing,
     "gateway killed": FleetDrill.kill_gateway,
     "two gateways killed": FleetDrill.kill_two_gateways,

@@ -15,7 +15,7 @@ from kills import kill_all
 from secured_clusters import GATEWAYS, SecuredCluster, secured_cluster
 from serial_hall import SerialHall
 
-PATIENCE_S = 60.0
+PATIENCE_S = 120.0
 
 
 def multidrop(servers: SecuredCluster, user: str, *words: str) -> subprocess.CompletedProcess[str]:

@@ -50,8 +50,13 @@ class CommandSubjects:
         self._begin(self._hear(names.command_subject(line), partial(self._offer, line)))
         self._begin(self._hear(names.stop_subject(line), partial(self._stops.stop, line)))
 
+    def leave(self, line: str) -> None:
+        """Take stops alone from now on, and carry out nothing that was offered."""
+        self._lines.leave(line)
+        self._begin(self._deafen(names.command_subject(line)))
+
     def shut(self, line: str) -> None:
-        """Take none any more, and carry out nothing that was offered."""
+        """Take nothing any more."""
         self._lines.shut(line)
         self._begin(self._deafen(names.command_subject(line), names.stop_subject(line)))
 
@@ -99,6 +104,12 @@ class CommandedLines:
         self._subjects.open(line, description)
 
     async def let_go(self, line: str) -> None:
-        """Take no commands any more, poll the line no more, and close it."""
-        self._subjects.shut(line)
-        await self._lines.let_go(line)
+        """Take no commands any more, poll the line no more, and close it.
+
+        Its stops under way are waited for, and who asked for them is answered until then.
+        """
+        self._subjects.leave(line)
+        try:
+            await self._lines.let_go(line)
+        finally:
+            self._subjects.shut(line)

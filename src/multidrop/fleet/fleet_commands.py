@@ -176,7 +176,8 @@ class FleetCommands:
                 ends = loop.time() + LOST_S
             except (FleetError, ValueError) as failure:
                 if loop.time() > ends:
-                    return CommandAnswer(CommandOutcome.UNKNOWN, f"{lost} ({failure})")
+                    heard = f"; the last that was heard: {answer.text}" if answer.gateway else ""
+                    return CommandAnswer(CommandOutcome.UNKNOWN, f"{lost} ({failure}){heard}")
                 await asyncio.sleep(AGAIN_S)
         return answer
 
@@ -220,7 +221,7 @@ class FleetCommands:
         record = {"id": request.id, "line": line, "what": what, "by": self.by}
         noting = asyncio.create_task(self._note_end(record, None))
         answer = await self._first_of_stop(line, request, what)
-        lost = f"it is not known whether {what} was sent: its gateway gives no answer any more; {HARD_WIRED}"
+        lost = f"it is not known what became of {what}: its gateway gives no answer any more; {HARD_WIRED}"
         answer = await self._end_of(answer, names.stop_subject(line), encode(request), lost, on_news)
         await noting
         await self._note_end(record, answer)

@@ -24,6 +24,7 @@ class HeldLine:
 
     def __init__(self, name: str, bus: Bus, may: Mapping[str, frozenset[str]]) -> None:
         self.number = next(self._numbers)
+        self.is_leaving = False
         self.name = name
         self.bus = bus
         self.may = may
@@ -59,13 +60,19 @@ class HeldLines:
         """Take commands for a line that is polled from now on."""
         self._held[line] = HeldLine(line, self._buses.bus(line), lists_of(description))
 
+    def leave(self, line: str) -> None:
+        """Take stops alone from now on, until it is shut."""
+        if held := self._held.get(line):
+            held.is_leaving = True
+
     def shut(self, line: str) -> None:
         """Take none any more."""
         self._held.pop(line, None)
 
     def for_command(self, line: str) -> HeldLine | None:
         """Return the line if a command may be sent on it now."""
-        return self._held.get(line) if self._may_command(line) else None
+        held = self._held.get(line)
+        return held if held and not held.is_leaving and self._may_command(line) else None
 
     def for_stop(self, line: str) -> HeldLine | None:
         """Return the line if a stop may be sent on it now."""

@@ -1,0 +1,89 @@
+"""A line that is let go: its commands end at once, and its stops are answered until it is closed."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from command_desks import LINE, MAY, desks
+from peers import require_module
+
+require_module("nats")
+
+from multidrop.fleet import names  # noqa: E402
+from multidrop.fleet.command_subjects import CommandedLines, CommandSubjects  # noqa: E402
+
+
+class HeardPath:
+    """A path without a server: what is heard there, by subject."""
+
+    def __init__(self) -> None:
+        self.heard: dict[str, Callable[[Any], Any]] = {}
+
+    async def subscribe(self, subject: str, called: Callable[[Any], Any]) -> None:
+        self.heard[subject] = called
+
+    async def unsubscribe(self, subject: str) -> None:
+        self.heard.pop(subject, None)
+
+    async def ask(self, subject: str, **what: Any) -> dict[str, Any]:
+        """Return what is answered."""
+        answered: asyncio.Future[bytes] = asyncio.get_running_loop().create_future()
+
+        class Asked:
+            data = json.dumps({"id": "one", "by": "anna", **what}).encode()
+
+            async def respond(self, data: bytes) -> None:
+                answered.set_result(data)
+
+        await self.heard[subject](Asked())
+        found: dict[str, Any] = json.loads(await asyncio.wait_for(answered, 60))
+        return found
+
+
+class SlowLines:
+    """Lines that are closed when the test says so."""
+
+    def __init__(self) -> None:
+        self.closes = asyncio.Event()
+
+    async def take(self, line: str, description: Any) -> None:
+        """Nothing is to be opened."""
+
+    async def let_go(self, line: str) -> None:
+        await self.closes.wait()
+
+
+async def settled(subjects: CommandSubjects) -> None:
+    await asyncio.gather(*subjects._tasks)
+
+
+def test_a_line_that_is_let_go_answers_for_its_stops_until_it_is_closed(tmp_path: Path) -> None:
+    async def main() -> None:
+        path, lines = HeardPath(), SlowLines()
+        subjects = CommandSubjects("gw-1", [path], made.lines, made.log)  # type: ignore[list-item]
+        commanded = CommandedLines(lines, subjects)  # type: ignore[arg-type]
+        await commanded.take(LINE, {"may": MAY})
+        await settled(subjects)
+        offered = made.offered()
+        going = asyncio.create_task(commanded.let_go(LINE))
+        await asyncio.sleep(0)
+        await settled(subjects)
+        assert path.heard.keys() == {names.stop_subject(LINE)}
+        assert made.ask(register="frequency", value=20.0) is None
+        assert "was let go" in (await made.do(offered)).text
+        while (told := await path.ask(names.stop_subject(LINE), drives=None))["outcome"] == "under way":
+            pass
+        assert told["outcome"] == "done"
+        lines.closes.set()
+        await going
+        await settled(subjects)
+        assert path.heard == {}
+        assert await made.stop() is None
+        assert [name for name, _ in made.writes] == ["control"]
+
+    with desks(tmp_path) as made:
+        asyncio.run(main())
