@@ -15,10 +15,9 @@ import pytest
 from commands import Run
 from examples import examples
 from hypothesis import HealthCheck, settings
-from patient import patient_peer
+from patient import be_patient
 
 from multidrop.cli import main
-from multidrop.transport import exchange as exchanges
 
 # Compiled tests are kept in any case, in folders that git ignores: six workers would compile each of them,
 # and each program that a test starts all that it imports.
@@ -121,15 +120,15 @@ def _gathered() -> Iterator[None]:
 
 @pytest.fixture
 def _patient(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Wait for every drive however busy the machine is; not for tests in which one is silent."""
-    monkeypatch.setattr(exchanges, "Peer", patient_peer)
+    """Wait for every drive and turn however busy the machine is; not for tests in which one is silent."""
+    be_patient(monkeypatch.setattr, monkeypatch.setitem)
 
 
 @pytest.fixture(scope="module")
 def _patient_module() -> Iterator[None]:
     """Do the same for a line that a module's tests share."""
     with pytest.MonkeyPatch.context() as monkeypatch:
-        monkeypatch.setattr(exchanges, "Peer", patient_peer)
+        be_patient(monkeypatch.setattr, monkeypatch.setitem)
         yield
 
 

@@ -19,7 +19,6 @@ import multidrop.cli
 from multidrop.core import Framing, Message
 from multidrop.plant.loader import PlantError, load_plant
 from multidrop.printable import printable
-from multidrop.report import load, plot, plot_page, report_page
 
 # Clear the screen; set the title; write the clipboard; run from right to left; one-byte escape; two lines.
 TRAPS = ("\x1b[2J", "\x1b]0;title\x07", "\x1b]52;c;cm0gLXJm\x07", "\u202egpj.exe", "\x9b2J", "a\r\nb", "\0")
@@ -115,6 +114,8 @@ ALL_AT_ONCE = rf"_$x^{{$\frac%s{{0}}{TRAP}"
     "name", usually(ALL_AT_ONCE, "_hidden", "$", "$x^{$", "a$b$c", "\\frac", "%s{0}", TRAP)
 )
 def test_names_in_a_picture_are_no_mathematics_and_in_its_legend(tmp_path: Path, name: str) -> None:
+    from multidrop.report import load, plot, plot_page, report_page  # matplotlib, for 0.5 s
+
     rows = [
         row(at, name, register, at) for at in range(3) for register in (name, "output_frequency", "fault")
     ]

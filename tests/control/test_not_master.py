@@ -117,7 +117,7 @@ def test_nothing_is_sent_before_it_is_master(scene: Scene, call: Callable[[Scene
     begun = time.monotonic()
     with pytest.raises(NotMaster) as failure:
         call(scene)
-    assert time.monotonic() - begun < 10  # a stop is not repeated
+    assert time.monotonic() - begun < 25  # a stop is not repeated, for 30 s
     assert not failure.value.is_sent
     assert not failure.value.heard
     assert scene.requests == 0

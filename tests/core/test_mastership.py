@@ -154,9 +154,9 @@ def test_a_process_that_extends_in_time_lives() -> None:
     then = (
         "for n in range(40):\n"
         " mastership.extend(time.clock_gettime_ns(time.CLOCK_BOOTTIME) + 4 * 10**9)\n"
-        "time.sleep(0.7)"  # the first deadline and its guard are over
+        "time.sleep(1.5)"  # the first deadline and its guard are over
     )
-    with keeper(0.2, 0.3, then) as process:
+    with keeper(1.0, 0.3, then) as process:
         assert until_of(process)
         assert process.poll() is None
 
@@ -165,7 +165,7 @@ def test_a_process_that_extends_in_time_lives() -> None:
     "end", ["mastership.end()", "del mastership; import gc; gc.collect(); mastership = Mastership()"]
 )
 def test_a_process_that_ended_it_is_not_killed(end: str) -> None:
-    with keeper(0.1, 0.2, f"{end}; time.sleep(0.6)") as process:
+    with keeper(1.0, 0.2, f"{end}; time.sleep(1.5)") as process:
         assert until_of(process) == 0
         assert process.poll() is None
 

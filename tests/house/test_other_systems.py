@@ -48,6 +48,7 @@ print(len(names), *failed, sep="\\n")
 """
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_every_module_can_be_imported_without_posix() -> None:
     ran = subprocess.run([sys.executable, "-c", PROGRAM], capture_output=True, text=True, check=False)

@@ -222,9 +222,8 @@ def test_a_drive_that_left_and_comes_back_has_the_rates_it_is_added_with() -> No
         assert set(values(made.run(10)).values()) <= {99, 100, 101}
 
 
-@pytest.mark.parametrize(
-    ("drive", "register", "every", "sentence"),
-    [
+def test_what_is_no_rate_changes_nothing(two: ClockedLines) -> None:
+    for drive, register, every, sentence in (
         ("pump-3", None, 1.0, r"pump-3 is not polled here; did you mean pump-\d"),
         ("zzz", None, 1.0, "zzz is not polled here; there are pump-1, pump-2"),
         ("pump-1", "output_curent", 1.0, "has no register 'output_curent'; did you mean output_current"),
@@ -236,13 +235,9 @@ def test_a_drive_that_left_and_comes_back_has_the_rates_it_is_added_with() -> No
         ("pump-1", None, True, "every = True is not"),
         ("pump-1", None, "1 s", "every = '1 s' is not"),
         ("pump-1", None, 86401, "every = 86401 is not"),
-    ],
-)
-def test_what_is_no_rate_changes_nothing(
-    two: ClockedLines, drive: str, register: str | None, every: float, sentence: str
-) -> None:
-    with pytest.raises(ValueError, match=sentence):
-        two.poller.set_rate(drive, register, every)
+    ):
+        with pytest.raises(ValueError, match=sentence):
+            two.poller.set_rate(drive, register, every)
     assert set(values(two.run(10)).values()) <= {99, 100, 101}
 
 

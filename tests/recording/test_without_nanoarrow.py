@@ -17,6 +17,7 @@ def multidrop(*words: str, folder: Path) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_it_polls_and_records(tmp_path: Path) -> None:
     ran = multidrop("demo", "--seconds", "1", "--out", "run.arrows", folder=tmp_path)

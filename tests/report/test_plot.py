@@ -9,7 +9,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 from batches import METADATA, SECOND, UTC_0, example
 from commands import Run
@@ -20,15 +19,25 @@ import multidrop.cli.support.extras
 from multidrop.plant.loader import load_plant
 from multidrop.polling.batch import Row
 from multidrop.recording import open_writer
-from multidrop.report import Recording, load, plot, plot_page, png, report_page
-from multidrop.report.health import MOST_REASONS, delays, draw_rates, miss_shares, reasons_of
-from multidrop.report.html import _about, _drives
-from multidrop.report.lanes import MOST_LANES
-from multidrop.report.utilisation import line_uses
-from multidrop.report.value_plot import MOST_PANELS, MOST_POINTS, thinned
 
 PNG = b"\x89PNG\r\n\x1a\n"
 REQUEST_9600 = 9 * 10 / 9600  # 8 characters of the request and the first one of the reply
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _imported() -> None:
+    """Import matplotlib where these tests run; each worker that only collects them needs 0.5 s for it."""
+    global np, Recording, load, plot, plot_page, png, report_page, _about, _drives
+    global MOST_REASONS, delays, draw_rates, miss_shares, reasons_of, line_uses
+    global MOST_LANES, MOST_PANELS, MOST_POINTS, thinned
+    import numpy as np
+
+    from multidrop.report import Recording, load, plot, plot_page, png, report_page
+    from multidrop.report.health import MOST_REASONS, delays, draw_rates, miss_shares, reasons_of
+    from multidrop.report.html import _about, _drives
+    from multidrop.report.lanes import MOST_LANES
+    from multidrop.report.utilisation import line_uses
+    from multidrop.report.value_plot import MOST_PANELS, MOST_POINTS, thinned
 
 
 def noisy_ramp() -> list[Row]:

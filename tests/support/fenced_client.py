@@ -8,6 +8,7 @@ printed.
 
 from __future__ import annotations
 
+import faulthandler
 import os
 import signal
 import socket
@@ -63,6 +64,7 @@ def live(
 
 def main() -> None:
     signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # the system buries them
+    faulthandler.register(signal.SIGUSR1)
     for words in map(str.split, sys.stdin):
         fd, lease, guard, timer, beyond, *ports = words
         if child := os.fork():
