@@ -16,9 +16,10 @@ static void bring(const void *from, size_t len)
     __builtin_prefetch(at + len - 1);
 }
 
-static void bring_port(const struct md_turn *turn)
+static void bring_port(const struct md_port *port)
 {
-    bring(turn, offsetof(struct md_turn, line.rx) + CACHE_LINE);
+    const struct md_turn *turn = &port->turn;
+    bring(port, offsetof(struct md_port, turn.line.rx) + CACHE_LINE);
     bring(&turn->completion, offsetof(struct md_completion, reply.data) + CACHE_LINE);
     bring(turn->completion.raw, CACHE_LINE);
 }
@@ -34,15 +35,17 @@ static int find(const struct md_turn *turn, const struct md_exchange *exchanges[
     return n;
 }
 
-static void bring_exchanges(const struct md_turn *turn)
+static void bring_exchanges(const struct md_port *port)
 {
+    const struct md_turn *turn = &port->turn;
     const struct md_exchange *exchanges[2];
     for (int n = find(turn, exchanges); n-- > 0;)
         bring(exchanges[n], offsetof(struct md_exchange, request.data));
 }
 
-static void bring_drives(const struct md_turn *turn)
+static void bring_drives(const struct md_port *port)
 {
+    const struct md_turn *turn = &port->turn;
     const struct md_exchange *exchanges[2];
     for (int n = find(turn, exchanges); n-- > 0;)
         bring(exchanges[n]->drive, offsetof(struct md_drive, delays));
@@ -50,14 +53,15 @@ static void bring_drives(const struct md_turn *turn)
         bring(turn->line.exchange->block, sizeof *turn->line.exchange->block);
 }
 
-static void bring_history(const struct md_turn *turn)
+static void bring_history(const struct md_port *port)
 {
+    const struct md_turn *turn = &port->turn;
     if (turn->whose != MD_NOBODYS)
         bring(md_usual_delays(turn->line.exchange->drive), 1);
 }
 
 /* Each needs what the one behind it brought: the last one is for the port that is farthest ahead. */
-static void (*const steps[MD_STEPS_AHEAD])(const struct md_turn *turn) = {
+static void (*const steps[MD_STEPS_AHEAD])(const struct md_port *port) = {
     bring_history, bring_drives, bring_exchanges, bring_port,
 };
 
@@ -65,5 +69,5 @@ void md_look_ahead(struct md_port *const *ports, int n, int next)
 {
     for (int step = 0; step < MD_STEPS_AHEAD; step++, next++)
         if (next >= 0 && next < n && ports[next])
-            steps[step](&ports[next]->turn);
+            steps[step](ports[next]);
 }

@@ -26,15 +26,16 @@ struct md_port {
     int is_blind;      /* nothing is worth reading before the port's waking time */
     int is_watched;    /* the waiter tells when it can be read */
     int is_empty;      /* it was read empty a moment ago: nothing is there yet */
+    int is_closing;
     struct md_settings settings; /* in force; baudrate 0: not yet set */
     struct md_engine *engine;
     const struct md_mastership *mastership; /* NULL: nobody else may be master here */
-    int is_unheard;                         /* another one may have been since the last request */
-    struct md_turn turn;
     struct md_rs485 rs485;
+    struct md_turn turn;
 
+    int is_unheard;       /* another master may have been since the last request */
     struct md_port *next; /* of those that wait to be opened */
-    int is_opened, open_error, is_closing, is_closed;
+    int is_opened, open_error, is_closed;
 };
 
 struct md_engine {

@@ -10,6 +10,7 @@ from struct import calcsize
 from typing import Any, Literal, NamedTuple
 
 from multidrop._core import ffi, lib
+from multidrop.core.memory import new_beside
 
 
 class NumberFormat(IntEnum):
@@ -109,8 +110,8 @@ class RowLayout:
 
     def __init__(self, drive: int, fields: Sequence[Field]) -> None:
         self._fields, self._extra = _shared(tuple(fields))
-        self.c = ffi.new(
-            "struct md_block *",
+        self.c, self._memory = new_beside(
+            "struct md_block",
             {
                 "fields": self._fields,
                 "extra": self._extra,

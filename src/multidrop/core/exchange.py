@@ -11,6 +11,7 @@ from multidrop.core.columns import RowLayout
 from multidrop.core.counters import Counters, read_counters
 from multidrop.core.frame import Framing, Message, build_request, from_c, to_c
 from multidrop.core.latch import Permit
+from multidrop.core.memory import new_apart, new_beside
 from multidrop.core.port_settings import settings_to_c
 from multidrop.core.result import Status
 
@@ -27,8 +28,8 @@ class Peer:
 
     def __init__(self, *, least_timeout: float, most_timeout: float, interval: float = 0.0) -> None:
         self._history = ffi.new("struct md_history *")
-        self.c = ffi.new(
-            "struct md_drive *",
+        self.c, self._memory = new_beside(
+            "struct md_drive",
             {
                 "least_timeout_ns": round(least_timeout * 1e9),
                 "most_timeout_ns": round(most_timeout * 1e9),
@@ -119,7 +120,7 @@ class Exchange:
     reply is never a copy of its request. Once a stop was called, `permit` keeps the request from being sent.
     """
 
-    __slots__ = ("block", "c", "echo_probe", "framing", "peer", "permit", "request", "settings")
+    __slots__ = ("_memory", "block", "c", "echo_probe", "framing", "peer", "permit", "request", "settings")
 
     def __init__(
         self,
@@ -150,8 +151,10 @@ class Exchange:
         self.echo_probe = echo_probe
         self.permit = permit
         self.settings = (baudrate, format)
-        self.c: Any = ffi.new(
-            "struct md_exchange *",
+        self.c: Any
+        is_polled = block is not None and block.count > 0
+        self.c, self._memory = (new_beside if is_polled else new_apart)(
+            "struct md_exchange",
             {
                 "framing": framing,
                 "request": to_c(request)[0],

@@ -29,6 +29,9 @@ class PolledDrive:
     drive: Drive
     polls: tuple[Polled, ...]
 
+    def __hash__(self) -> int:  # not that of all polls: it is looked up again and again
+        return hash(self.drive)
+
     @property
     def wanted(self) -> list[tuple[Register[Any], float | None]]:
         """Registers and their periods in s, as planning takes them."""

@@ -1,0 +1,73 @@
+"""Memory of what the core touches at every exchange: side by side, and in whole cache lines.
+
+With many lines it has left the caches since a line's last exchange, and the translations of its pages too.
+What belongs to one drive is made together, so that it shares a page or two.
+"""
+
+from __future__ import annotations
+
+from threading import Lock
+from typing import Any
+
+from multidrop._core import ffi
+
+CHUNK = 1 << 14
+CACHE_LINE = 64
+
+
+class Chunk:
+    """A piece of memory from which structs are taken, and how much of it is left."""
+
+    def __init__(self, size: int) -> None:
+        self.owner = ffi.new("uint8_t[]", size + CACHE_LINE)
+        self._next = int(ffi.cast("uintptr_t", self.owner))
+        self._next += -self._next % CACHE_LINE
+        self._end = self._next + size
+
+    def has_room(self, size: int) -> bool:
+        return self._next + size <= self._end
+
+    def take(self, kind: str, size: int) -> Any:
+        made = ffi.cast(f"{kind} *", self._next)
+        self._next += size
+        return made
+
+
+class Chunks:
+    """The memory in which a process makes structs, a chunk at a time."""
+
+    def __init__(self) -> None:
+        self._lock = Lock()
+        self._present = Chunk(0)
+
+    def take(self, kind: str) -> tuple[Any, Any]:
+        """Return a pointer to a struct of zeros, and the owner of its memory."""
+        size = -(-ffi.sizeof(kind) // CACHE_LINE) * CACHE_LINE
+        if not self._lock.acquire(blocking=False):  # another thread's, or a signal's handler interrupts this
+            chunk = Chunk(size)
+            return chunk.take(kind, size), chunk.owner
+        try:
+            if not self._present.has_room(size):
+                self._present = Chunk(max(size, CHUNK))
+            return self._present.take(kind, size), self._present.owner
+        finally:
+            self._lock.release()
+
+
+_chunks = Chunks()
+
+
+def new_beside(kind: str, fields: dict[str, Any]) -> tuple[Any, Any]:
+    """Return a pointer to a new struct of this kind, beside the one made before, and what owns its memory.
+
+    Keep both: the struct lives as long as the owner.
+    """
+    made, owner = _chunks.take(kind)
+    made[0] = fields
+    return made, owner
+
+
+def new_apart(kind: str, fields: dict[str, Any]) -> tuple[Any, Any]:
+    """Return the same for a struct that is seldom touched: it has no place beside the others."""
+    made = ffi.new(f"{kind} *", fields)
+    return made, made

@@ -1,0 +1,93 @@
+"""Memory of what the core touches at every exchange."""
+
+from __future__ import annotations
+
+import gc
+from concurrent.futures import ThreadPoolExecutor
+from itertools import pairwise
+from typing import Any
+
+import pytest
+from multidrop._core import ffi
+
+from multidrop.core import Exchange, Field, Framing, Message, NumberFormat, Peer, RowLayout, memory
+from multidrop.core.memory import CACHE_LINE, new_beside
+
+SIZE = -(-ffi.sizeof("struct md_drive") // CACHE_LINE) * CACHE_LINE
+
+
+def new_drive(number: int) -> tuple[Any, Any]:
+    return new_beside("struct md_drive", {"delay_ns": number})
+
+
+def place(made: tuple[Any, Any]) -> int:
+    return int(ffi.cast("uintptr_t", made[0]))
+
+
+def read_of(peer: Peer, rows: RowLayout | None) -> Exchange:
+    request = Message(1, 3, 0, 1)
+    line = {"baudrate": 9600, "format": "8N1"}
+    return Exchange(Framing.RTU, request, peer, **line, character=1e-3, silence=0.0, block=rows)
+
+
+def numbers(*made: tuple[Any, Any]) -> list[int]:
+    return [int(struct.delay_ns) for struct, _ in made]
+
+
+@pytest.fixture(autouse=True)
+def new_chunk(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(memory, "_chunks", memory.Chunks())
+
+
+def test_what_is_made_together_is_side_by_side_in_whole_cache_lines() -> None:
+    first, second = new_drive(1), new_drive(2)
+    block = new_beside("struct md_block", {"count": 3})
+    assert place(first) % CACHE_LINE == 0
+    assert place(second) == place(first) + SIZE
+    assert place(block) == place(second) + SIZE
+    assert numbers(first, second) == [1, 2]
+    assert block[0].count == 3
+
+
+def test_a_struct_lives_as_long_as_its_owner() -> None:
+    made = [new_drive(number) for number in range(100)]
+    kept = made[::7]
+    del made
+    gc.collect()
+    more = [new_drive(-1) for _ in range(100)]
+    assert numbers(*kept) == list(range(0, 100, 7))
+    assert len({place(each) for each in [*kept, *more]}) == len(kept) + len(more)
+
+
+def test_threads_get_memory_of_their_own() -> None:
+    with ThreadPoolExecutor(8) as threads:
+        made = list(threads.map(new_drive, range(4000)))
+    places = sorted(map(place, made))
+    assert all(after - before >= SIZE for before, after in pairwise(places))
+    assert numbers(*made) == list(range(4000))
+
+
+def test_what_interrupts_it_gets_memory_of_its_own() -> None:
+    """A signal's handler may stop a motor, in the midst of this."""
+    before = new_drive(1)
+    with memory._chunks._lock:
+        made = new_drive(2)
+    after = new_drive(3)
+    assert place(made) % CACHE_LINE == 0
+    assert place(after) == place(before) + SIZE
+    assert numbers(before, made, after) == [1, 2, 3]
+
+
+def test_a_struct_larger_than_a_chunk_has_room(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(memory, "CHUNK", CACHE_LINE)
+    assert numbers(*map(new_drive, range(3))) == [0, 1, 2]
+
+
+def test_what_is_polled_of_a_drive_is_side_by_side() -> None:
+    """Proofs, and what is read by hand, have no part in its exchanges."""
+    peer = Peer(least_timeout=0.02, most_timeout=1.0)
+    peer.prove_by([read_of(peer, None), read_of(peer, None)])
+    rows = RowLayout(0, [Field(0, NumberFormat.U16, 0, 1, 1)])
+    polled = read_of(peer, rows)
+    assert place((rows.c, None)) == place((peer.c, None)) + SIZE
+    assert place((polled.c, None)) == place((rows.c, None)) + CACHE_LINE
