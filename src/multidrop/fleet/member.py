@@ -26,14 +26,14 @@ from multidrop.fleet import names
 from multidrop.fleet.balance import Balance
 from multidrop.fleet.buckets import Record
 from multidrop.fleet.errors import FleetError
-from multidrop.fleet.fleet_records import FleetRecords
 from multidrop.fleet.leaders import bring_leaders_home
 from multidrop.fleet.lease import Lease, LifeLock, MayPoll
 from multidrop.fleet.lease_bucket import LeaseBucket
 from multidrop.fleet.lease_rules import SECOND, USUAL, Terms
 from multidrop.fleet.line_keeper import LineKeeper, Lines
-from multidrop.fleet.ownership import decide
+from multidrop.fleet.ownership import decide, owner_of
 from multidrop.fleet.servers import ServerPath
+from multidrop.fleet.share_records import ShareRecords
 
 _log = logging.getLogger("multidrop.fleet")
 
@@ -70,7 +70,7 @@ class Member:
         self.is_draining = False
         own = [LeaseBucket(bucket, partial(self._path, at), name) for at, bucket in enumerate(names.LEASES)]
         self.lease = Lease(name, own, mastership, lock=lock, terms=terms, note=self._note)
-        self.records = FleetRecords(name, self.best, terms, self._mark_dirty)
+        self.records = ShareRecords(name, self.best, terms, self._mark_dirty, self._is_mine)
         self.keeper = LineKeeper(lines, self.lease, self.records, self._mark_dirty)
         self.wanted: dict[str, str] = {}  # each line's gateway, by the balance
         self._share: set[str] = set()  # the lines that should be ours
@@ -118,6 +118,9 @@ class Member:
     def record(self, line: str) -> Record | None:
         """Return the record of a line's master."""
         return self.records.owner(line)
+
+    def _is_mine(self, record: Record) -> bool:
+        return owner_of(record) == (self.name, self.lease.session)
 
     def may_command(self, line: str) -> bool:
         """Say whether this is the line's master now, and alone there."""
@@ -228,6 +231,7 @@ class Member:
         loop = asyncio.get_running_loop()
         self.wanted = await loop.run_in_executor(None, self._balance.assign, lines, gateways)
         self._share = {line for line, gateway in self.wanted.items() if gateway == self.name}
+        self.records.want(self._share)
         self._balanced, self._is_dirty = (gateways, lines), True
 
     def _claim_and_release(self) -> None:
@@ -235,7 +239,7 @@ class Member:
         owned = self.records.owned_by(*me)
         step = decide(
             me,
-            self._share | owned,
+            owned.union(line for line in self._share if self.record(line)),  # of the others nothing is known
             self.wanted,
             self.record,
             self.records.observer.is_over,
