@@ -14,11 +14,11 @@ require_module("nats")
 
 from multidrop.fleet import names  # noqa: E402
 from multidrop.fleet.buckets import Record  # noqa: E402
-from multidrop.fleet.fleet_records import FleetRecords  # noqa: E402
 from multidrop.fleet.lease import Lease  # noqa: E402
 from multidrop.fleet.lease_rules import SECOND, USUAL  # noqa: E402
 from multidrop.fleet.line_keeper import LineKeeper  # noqa: E402
 from multidrop.fleet.ownership import owner_of  # noqa: E402
+from multidrop.fleet.share_records import ShareRecords  # noqa: E402
 
 
 async def until(condition: Callable[[], bool]) -> None:
@@ -39,12 +39,15 @@ class Trial:
         leases: list[Any] = [MemoryBucket(name) for name in names.LEASES]
         self.lease = Lease("a", leases, self.mastership, clock=self.clock)
         nowhere: Any = None
-        self.records = FleetRecords("a", lambda: nowhere, USUAL, lambda: None)
+        self.records = ShareRecords("a", lambda: nowhere, USUAL, lambda: None, self._is_mine)
         for name in names.OWNERS:
             bucket: Any = MemoryBucket(name)
             self.records.owners[name].bucket = bucket
         self.records.plant.take(Record("hall", 1, {"line": {"name": "hall"}}))
         self.keeper = LineKeeper(self.lines, self.lease, self.records, lambda: None)
+
+    def _is_mine(self, record: Record) -> bool:
+        return owner_of(record) == ("a", self.lease.session)
 
     async def claim(self) -> None:
         assert await self.lease.try_to_begin()

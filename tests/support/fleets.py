@@ -32,6 +32,7 @@ class MemoryBucket:
         self.name = name
         self.records: dict[str, Record] = {}
         self.last = 0
+        self.asked = 0  # times that `newest` was
         self.is_down = False
         self.loses_answers = False
         self.before_put: Callable[[str], object] = lambda key: None  # called when a put arrives
@@ -67,6 +68,12 @@ class MemoryBucket:
         if self.is_down:
             raise Unsure("down")
         return self.records.get(key, Record(key, 0, None))
+
+    async def newest(self, keys: Sequence[str]) -> list[Record]:
+        if self.is_down:
+            raise Unsure("down")
+        self.asked += 1
+        return [self.records[key] for key in keys if key in self.records]
 
     async def changes(self, after: int) -> list[Record]:
         if self.is_down:

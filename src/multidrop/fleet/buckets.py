@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import base64
 import json
 import logging
@@ -15,6 +16,7 @@ from multidrop.fleet.servers import ServerPath
 
 NONE_YET = 0  # the revision of a key without a record
 BATCH = 1000  # records asked for at a time
+FOLLOW_S = 0.2  # between looks at a bucket
 MOST_STRANGE = 1000  # records of a bucket that are told of
 _WRONG_REVISION = (10071, 10164)
 _NO_MESSAGE = 10037
@@ -147,6 +149,13 @@ class Bucket:
         messages = await self.path().collect(subject, json.dumps(wanted).encode())
         return [self._record(*message) for message in messages]
 
+    async def newest(self, keys: Sequence[str]) -> list[Record]:
+        """Return the records of these keys, 1000 at most, as any of the servers has them: some may be old."""
+        wanted = {"multi_last": [self._all_of(key) for key in keys]}
+        subject = f"$JS.API.DIRECT.GET.KV_{self.name}"
+        messages = await self.path().collect(subject, json.dumps(wanted).encode())
+        return [self._record(*message) for message in messages]
+
     def _subject(self, key: str) -> str:
         """Return the subject on which a record is written."""
         return f"$KV.{self.name}.{key}"
@@ -170,15 +179,16 @@ class Bucket:
         return value
 
 
+OnTake = Callable[[Record | None, Record], object]
+
+
 class Follower:
     """The records of a bucket, by key, as far as they were read.
 
     `on_take` is called with each record that is newer than the one known, which comes first.
     """
 
-    def __init__(
-        self, bucket: Bucket, on_take: Callable[[Record | None, Record], object] = lambda *_: None
-    ) -> None:
+    def __init__(self, bucket: Bucket, on_take: OnTake = lambda *_: None) -> None:
         self.bucket = bucket
         self._on_take = on_take
         self.records: dict[str, Record] = {}
@@ -194,6 +204,10 @@ class Follower:
                 self._after = found[-1].revision
             if len(found) < BATCH:
                 return changed
+
+    async def rest(self) -> None:
+        """Wait until the next look."""
+        await asyncio.sleep(FOLLOW_S)
 
     def take(self, record: Record) -> bool:
         """Keep a record unless a newer one is known."""

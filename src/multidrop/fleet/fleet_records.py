@@ -9,7 +9,7 @@ from functools import partial
 from typing import Any
 
 from multidrop.fleet import names
-from multidrop.fleet.buckets import Bucket, Follower, Record
+from multidrop.fleet.buckets import Bucket, Follower, OnTake, Record
 from multidrop.fleet.errors import FleetError
 from multidrop.fleet.lease_bucket import LeaseBucket
 from multidrop.fleet.lease_rules import Terms
@@ -18,7 +18,6 @@ from multidrop.fleet.observer import Observer
 from multidrop.fleet.ownership import owner_of
 from multidrop.fleet.servers import ServerPath
 
-FOLLOW_S = 0.2  # between looks at a bucket
 LEASES_S = 0.1  # the same of leases: how long a dead gateway's lines stay silent begins with it
 
 
@@ -31,7 +30,7 @@ class FleetRecords:
         self.observer = Observer(me, [LeaseBucket(bucket, path, me) for bucket in names.LEASES], terms)
         self.moves = Moves()
         self.owners = {
-            bucket: Follower(Bucket(bucket, path), partial(self._note_move, bucket))
+            bucket: self._owner_follower(Bucket(bucket, path), partial(self._note_move, bucket))
             for bucket in names.OWNERS
         }
         self._owned: dict[tuple[str, int], set[str]] = {}  # by gateway and session
@@ -45,6 +44,10 @@ class FleetRecords:
             **{name: partial(self.observer.look, at) for at, name in enumerate(names.LEASES)},
             **{name: follower.look for name, follower in self.owners.items()},
         }
+
+    def _owner_follower(self, bucket: Bucket, on_take: OnTake) -> Follower:
+        """Return what follows a bucket of lines' masters: here all of them."""
+        return Follower(bucket, on_take)
 
     async def complete(self) -> None:
         """Wait until each bucket was read once."""
@@ -75,13 +78,15 @@ class FleetRecords:
 
     def works(self) -> list[Coroutine[Any, Any, None]]:
         """Return what reads them for ever, a coroutine for each bucket, so that none waits for another."""
-        return [self._follow(name) for name in self._looks]
+        rests = {name: follower.rest for name, follower in {**self.owners, names.PLANT: self.plant}.items()}
+        rests |= {name: partial(asyncio.sleep, LEASES_S) for name in names.LEASES}
+        return [self._follow(name, rests[name]) for name in self._looks]
 
-    async def _follow(self, name: str) -> None:
+    async def _follow(self, name: str, rest: Callable[[], Awaitable[object]]) -> None:
         while True:
             with suppress(FleetError):
                 await self._look(name)
-            await asyncio.sleep(LEASES_S if name in names.LEASES else FOLLOW_S)
+            await rest()
 
     async def _look(self, name: str) -> None:
         if await self._looks[name]() or name not in self._read:
@@ -99,4 +104,8 @@ class FleetRecords:
     def _note_move(self, bucket: str, before: Record | None, record: Record) -> None:
         self._owned.get(owner_of(before), set()).discard(record.key)
         self._owned.setdefault(owner_of(record), set()).add(record.key)
-        self.moves.note(before, record, is_first_look=bucket not in self._read)
+        self.moves.note(before, record, is_first_look=self._is_first_look(bucket))
+
+    def _is_first_look(self, bucket: str) -> bool:
+        """Say whether a record of which none was known before may have had another one."""
+        return bucket not in self._read

@@ -16,9 +16,9 @@ from typing import Any, NamedTuple, Protocol
 from multidrop.fleet import names
 from multidrop.fleet.buckets import Record
 from multidrop.fleet.errors import FleetError
-from multidrop.fleet.fleet_records import FleetRecords
 from multidrop.fleet.lease import Lease
 from multidrop.fleet.ownership import NOBODY, owner_of, owner_value
+from multidrop.fleet.share_records import ShareRecords
 
 _log = logging.getLogger("multidrop.fleet")
 
@@ -53,7 +53,7 @@ class LineKeeper:
     """
 
     def __init__(
-        self, lines: Lines, lease: Lease, records: FleetRecords, on_change: Callable[[], object]
+        self, lines: Lines, lease: Lease, records: ShareRecords, on_change: Callable[[], object]
     ) -> None:
         self.lines = lines
         self.polled: dict[str, TakenLine] = {}
@@ -168,13 +168,15 @@ class LineKeeper:
         async with self._writing[bucket]:
             if not self.may_poll:
                 return
-            with suppress(FleetError):  # what became of them will be read
-                for stored in await follower.bucket.put_all(records):
-                    follower.take(stored)
-                    self.moves += 1
-        for line in (record.key for record in records):
-            if self.is_mine(line) and self._records.is_in_plant(line):
-                self._start([line], self._take(line))
+            stored: list[Record] = []
+            with suppress(FleetError):
+                stored = await follower.bucket.put_all(records)
+        for record in stored:
+            follower.take(record)
+            if self.is_mine(record.key) and self._records.is_in_plant(record.key):
+                self._start([record.key], self._take(record.key))
+        self.moves += len(stored)
+        self._records.doubt(bucket, {record.key for record in records} - {record.key for record in stored})
 
     # ---- one line ----
 

@@ -24,15 +24,16 @@ from typing import Any
 
 from multidrop.fleet import names
 from multidrop.fleet.balance import Balance
+from multidrop.fleet.buckets import Record
 from multidrop.fleet.errors import FleetError
-from multidrop.fleet.fleet_records import FleetRecords
 from multidrop.fleet.leaders import bring_leaders_home
 from multidrop.fleet.lease import Lease, LifeLock, MayPoll
 from multidrop.fleet.lease_bucket import LeaseBucket
 from multidrop.fleet.lease_rules import SECOND, USUAL, Terms
 from multidrop.fleet.line_keeper import LineKeeper, Lines, TakenLine
-from multidrop.fleet.ownership import decide
+from multidrop.fleet.ownership import decide, owner_of
 from multidrop.fleet.servers import ServerPath
+from multidrop.fleet.share_records import ShareRecords
 
 _log = logging.getLogger("multidrop.fleet")
 
@@ -69,7 +70,7 @@ class Member:
         self.is_draining = False
         own = [LeaseBucket(bucket, partial(self._path, at), name) for at, bucket in enumerate(names.LEASES)]
         self.lease = Lease(name, own, mastership, lock=lock, terms=terms, note=self._note)
-        self.records = FleetRecords(name, self.best, terms, self._mark_dirty)
+        self.records = ShareRecords(name, self.best, terms, self._mark_dirty, self._is_mine)
         self.keeper = LineKeeper(lines, self.lease, self.records, self._mark_dirty)
         self.wanted: dict[str, str] = {}  # each line's gateway, by the balance
         self._share: set[str] = set()  # the lines that should be ours
@@ -113,6 +114,9 @@ class Member:
     def drain(self) -> None:
         """Give all lines away, and take none from now on."""
         self.is_draining = self._is_dirty = True
+
+    def _is_mine(self, record: Record) -> bool:
+        return owner_of(record) == (self.name, self.lease.session)
 
     def _note(self) -> dict[str, Any]:
         return {"draining": self.is_draining, "lines": len(self.polled), "margin_ms": self._margin_ms()}
@@ -219,6 +223,7 @@ class Member:
         loop = asyncio.get_running_loop()
         self.wanted = await loop.run_in_executor(None, self._balance.assign, lines, gateways)
         self._share = {line for line, gateway in self.wanted.items() if gateway == self.name}
+        self.records.want(self._share)
         self._balanced, self._is_dirty = (gateways, lines), True
 
     def _claim_and_release(self) -> None:
@@ -226,7 +231,7 @@ class Member:
         owned = self.records.owned_by(*me)
         step = decide(
             me,
-            self._share | owned,
+            owned.union(line for line in self._share if self.records.owner(line)),  # of the others nothing is known
             self.wanted,
             self.records.owner,
             self.records.observer.is_over,
