@@ -229,9 +229,10 @@ class Member:
     def _claim_and_release(self) -> None:
         me = (self.name, self.lease.session)
         owned = self.records.owned_by(*me)
+        known = {line for line in self._share if self.records.owner(line)}
         step = decide(
             me,
-            owned.union(line for line in self._share if self.records.owner(line)),  # of the others nothing is known
+            known | owned,
             self.wanted,
             self.records.owner,
             self.records.observer.is_over,
