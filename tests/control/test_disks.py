@@ -4,23 +4,30 @@ from __future__ import annotations
 
 import json
 import sqlite3
+import threading
 from contextlib import AbstractContextManager, closing
 from itertools import pairwise
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 from disks import full_at, read_only_directory
 from simulated_bus import one
 
 from multidrop.cli import main
+from multidrop.control import records as write_records
 from multidrop.control.audit_log import AuditLog, read_audit
 from multidrop.control.eeprom_ledger import Ledger, LedgerCell
+from multidrop.control.outcome import Effect
+from multidrop.core import Message
 from multidrop.drives import DelixiModbus, ErmanERG220, InvtCHE
 from multidrop.errors import Refused
 
 CELL = LedgerCell("/dev/ttyUSB0", 1, "delixi-modbus", "frequency")
 HOUR = 3600.0
 NOON = 1_795_000_000.0
+PATIENCE_S = 60.0
 
 
 def raises_unkept() -> AbstractContextManager[object]:
@@ -50,6 +57,34 @@ def test_a_record_that_had_no_room_harms_no_other(tmp_path: Path, room: int) -> 
     assert [each["write"] for each in read_audit(path)] == ["first", "second", "third"]
     whole = path.read_bytes().splitlines()
     assert sum(not _is_record(line) for line in whole) == (1 if room else 0)
+
+
+def test_closing_waits_for_a_record_that_another_thread_writes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A stop is noted when it is over, and its line may be closed in that very moment."""
+    begun, go_on = threading.Event(), threading.Event()
+
+    class SlowLog(AuditLog):
+        def add(self, utc_ns: int, record: dict[str, Any]) -> None:
+            begun.set()
+            assert go_on.wait(PATIENCE_S)
+            super().add(utc_ns, record)
+
+    monkeypatch.setattr(write_records, "CLOSING_NS", PATIENCE_S * 1e9)
+    path = tmp_path / "audit.jsonl"
+    line: Any = SimpleNamespace(port="/dev/ttyUSB0", identity="usb-1")
+    records = write_records.WriteRecords(line, Ledger(tmp_path / "ledger"), SlowLog(path))
+    records.log_later(InvtCHE(1), Message(1, 6, 0x1000, data=b"\0\5"), "control = STOP", Effect.DONE)
+    noting, closing_it = threading.Thread(target=records.catch_up), threading.Thread(target=records.close)
+    noting.start()
+    assert begun.wait(PATIENCE_S)
+    closing_it.start()
+    closing_it.join(0.1)
+    go_on.set()
+    for thread in (noting, closing_it):
+        thread.join(PATIENCE_S)
+    assert [record["write"] for record in read_audit(path)] == ["control = STOP"]
 
 
 def _is_record(line: bytes) -> bool:

@@ -23,6 +23,7 @@ from multidrop.errors import Advice
 from multidrop.transport import clock
 from multidrop.transport.line import Line
 
+CLOSING_NS = 1_000_000_000  # that closing waits for other threads' records
 _log = logging.getLogger("multidrop.control")
 
 
@@ -36,6 +37,7 @@ class WriteRecords:
         self._ledger = ledger
         self._uncounted: deque[LedgerCell] = deque()
         self._unlogged: deque[tuple[int, dict[str, Any]]] = deque()  # each with its time, UTC in ns
+        self._writers: list[None] = []  # in `catch_up`; a list grows and shrinks without a lock
 
     def count(self, drive: Drive, register: Register[Any], kept: Kept) -> None:
         """Count a write in the ledger before it is sent; Refused when it must not be."""
@@ -83,12 +85,16 @@ class WriteRecords:
 
     def catch_up(self) -> None:
         """Log and count what was queued; failing to is a warning."""
-        with suppress(IndexError):  # another thread may be at it
-            while True:
-                self._append(*self._unlogged.popleft())
-        with suppress(IndexError):
-            while True:
-                self._note(self._uncounted.popleft())
+        self._writers.append(None)  # before a record is taken: `close` then waits for this thread
+        try:
+            with suppress(IndexError):  # another thread may be at it
+                while True:
+                    self._append(*self._unlogged.popleft())
+            with suppress(IndexError):
+                while True:
+                    self._note(self._uncounted.popleft())
+        finally:
+            self._writers.pop()
 
     def _append(self, at_ns: int, record: dict[str, Any]) -> None:
         why = f": {record['why']}" if "why" in record else ""
@@ -120,7 +126,11 @@ class WriteRecords:
         )
 
     def close(self) -> None:
+        """Close the log when what was queued is in it; a disk that hangs holds nobody up for long."""
         self.catch_up()
+        given_up_ns = clock.now_ns() + CLOSING_NS
+        while self._writers and clock.now_ns() < given_up_ns:
+            clock.sleep(0.001)
         if self.audit is not None:
             self.audit.close()
             self.audit = None
