@@ -15,7 +15,7 @@ import pytest
 from commands import Run
 from examples import examples
 from hypothesis import HealthCheck, settings
-from patient import be_patient
+from patient import await_turns, be_patient
 
 from multidrop.cli import main
 
@@ -122,6 +122,12 @@ def _gathered() -> Iterator[None]:
 def _patient(monkeypatch: pytest.MonkeyPatch) -> None:
     """Wait for every drive and turn however busy the machine is; not for tests in which one is silent."""
     be_patient(monkeypatch.setattr, monkeypatch.setitem)
+
+
+@pytest.fixture
+def _turns_awaited(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Wait for a write's turn however busy the machine is, also where a drive is silent."""
+    await_turns(monkeypatch.setattr, monkeypatch.setitem)
 
 
 @pytest.fixture(scope="module")

@@ -28,6 +28,8 @@ from multidrop.sim.memory import MemoryCell
 from multidrop.sim.simulator import Simulator
 from multidrop.sim.wire import Wire
 
+pytestmark = pytest.mark.usefixtures("_turns_awaited")
+
 DOG = "watchdog: The document names no watchdog: the motor runs on when the client dies."
 
 

@@ -22,6 +22,8 @@ from multidrop.sim.drive import SimulatedDrive
 from multidrop.sim.simulator import Simulator
 from multidrop.sim.wire import Wire
 
+pytestmark = pytest.mark.usefixtures("_turns_awaited")
+
 FAN = f"{Path(__file__).parents[1]}/support/own_fan.py:Fan"
 find_model(FAN)  # says that the file is run, once in a process: not in the midst of a test
 LINE = '[[line]]\nname = "{}"\nport = "{}"\n'

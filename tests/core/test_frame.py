@@ -76,21 +76,21 @@ def test_all_printed_frames_have_a_meaning() -> None:
     assert len(GOOD_REQUESTS) + len(GOOD_REPLIES) + len(REFUSED) == len(PRINTED)
 
 
-@pytest.mark.parametrize("printed", GOOD_REQUESTS + GOOD_REPLIES, ids=str)
-def test_printed_frame_means_what_the_document_says(printed: Printed) -> None:
-    assert parse(printed, printed.frame) == (len(printed.frame), printed.says)
+def test_printed_frame_means_what_the_document_says() -> None:
+    for printed in GOOD_REQUESTS + GOOD_REPLIES:
+        assert parse(printed, printed.frame) == (len(printed.frame), printed.says)
 
 
-@pytest.mark.parametrize("printed", GOOD_REQUESTS, ids=str)
-def test_request_is_built_as_printed(printed: Printed) -> None:
-    assert isinstance(printed.says, Message)
-    assert build_request(printed.framing, printed.says) == printed.frame
+def test_request_is_built_as_printed() -> None:
+    for printed in GOOD_REQUESTS:
+        assert isinstance(printed.says, Message)
+        assert build_request(printed.framing, printed.says) == printed.frame
 
 
-@pytest.mark.parametrize("printed", [reply for reply in GOOD_REPLIES if reply.text != MISPRINTED], ids=str)
-def test_reply_is_built_as_printed(printed: Printed) -> None:
-    assert isinstance(printed.says, Message)
-    assert build_reply(printed.framing, printed.says) == printed.frame
+def test_reply_is_built_as_printed() -> None:
+    for printed in (reply for reply in GOOD_REPLIES if reply.text != MISPRINTED):
+        assert isinstance(printed.says, Message)
+        assert build_reply(printed.framing, printed.says) == printed.frame
 
 
 def test_89h_is_accepted_for_88h_but_never_said() -> None:
@@ -102,31 +102,31 @@ def test_89h_is_accepted_for_88h_but_never_said() -> None:
     assert parse_reply(RTU, bytes.fromhex(MISPRINTED), Message(1, 0x03, 0, 1))[0] == FrameFault.BAD_FUNCTION
 
 
-@pytest.mark.parametrize("printed", REFUSED, ids=str)
-def test_misprinted_frame_is_refused(printed: Printed) -> None:
-    assert parse(printed, printed.frame) == (printed.says, None)
+def test_misprinted_frame_is_refused() -> None:
+    for printed in REFUSED:
+        assert parse(printed, printed.frame) == (printed.says, None)
 
 
-@pytest.mark.parametrize("printed", GOOD_REQUESTS + GOOD_REPLIES, ids=str)
-def test_part_of_a_frame_is_incomplete(printed: Printed) -> None:
-    for length in range(len(printed.frame)):
-        assert parse(printed, printed.frame[:length]) == (FrameFault.INCOMPLETE, None)
+def test_part_of_a_frame_is_incomplete() -> None:
+    for printed in GOOD_REQUESTS + GOOD_REPLIES:
+        for length in range(len(printed.frame)):
+            assert parse(printed, printed.frame[:length]) == (FrameFault.INCOMPLETE, None)
 
 
-@pytest.mark.parametrize("printed", GOOD_REQUESTS + GOOD_REPLIES, ids=str)
-def test_what_follows_a_frame_is_left_alone(printed: Printed) -> None:
-    for after in (b"\x00", b":", b"\x01\x03\x02", b"\xff" * 300):
-        assert parse(printed, printed.frame + after) == (len(printed.frame), printed.says)
+def test_what_follows_a_frame_is_left_alone() -> None:
+    for printed in GOOD_REQUESTS + GOOD_REPLIES:
+        for after in (b"\x00", b":", b"\x01\x03\x02", b"\xff" * 300):
+            assert parse(printed, printed.frame + after) == (len(printed.frame), printed.says)
 
 
-@pytest.mark.parametrize("printed", GOOD_REPLIES, ids=str)
-def test_reply_is_found_behind_junk(printed: Printed) -> None:
+def test_reply_is_found_behind_junk() -> None:
     """The reply is whole or comes byte by byte."""
-    assert printed.request is not None
-    for before, piece in product((b"", b"\x00", b"\x01", b":01", b"\xff\x00" * 40), (4096, 1)):
-        found = carry_out(printed.framing, printed.request, before + printed.frame, piece)
-        assert (found.result, found.raw, found.skipped) == (len(printed.frame), printed.frame, len(before))
-        assert found.reply == printed.says
+    for printed in GOOD_REPLIES:
+        assert printed.request is not None
+        for before, piece in product((b"", b"\x00", b"\x01", b":01", b"\xff\x00" * 40), (4096, 1)):
+            found = carry_out(printed.framing, printed.request, before + printed.frame, piece)
+            assert (found.result, found.skipped) == (len(printed.frame), len(before))
+            assert (found.raw, found.reply) == (printed.frame, printed.says)
 
 
 def test_text_frame_that_breaks_off_does_not_hide_the_next() -> None:
@@ -134,12 +134,12 @@ def test_text_frame_that_breaks_off_does_not_hide_the_next() -> None:
     assert (found.result, found.skipped) == (17, 7)
 
 
-@pytest.mark.parametrize("printed", GOOD_REPLIES, ids=str)
-def test_length_of_a_good_reply_is_known_beforehand(printed: Printed) -> None:
-    assert printed.request is not None
-    assert isinstance(printed.says, Message)
-    if not printed.says.exception:
-        assert reply_length(printed.framing, printed.request) == len(printed.frame)
+def test_length_of_a_good_reply_is_known_beforehand() -> None:
+    for printed in GOOD_REPLIES:
+        assert printed.request is not None
+        assert isinstance(printed.says, Message)
+        if not printed.says.exception:
+            assert reply_length(printed.framing, printed.request) == len(printed.frame)
 
 
 @pytest.mark.parametrize(("framing", "finish"), [(RTU, checksums.rtu), (ASCII, checksums.ascii)])

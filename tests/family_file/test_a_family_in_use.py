@@ -17,6 +17,8 @@ from multidrop.drives.registry import find_model
 from multidrop.planning.blocks import blocks
 from multidrop.sim import Simulator, Wire, simulated
 
+pytestmark = pytest.mark.usefixtures("_turns_awaited")
+
 PUMP = """\
 [family]
 title = "Pump P-2"

@@ -126,8 +126,9 @@ class Breaker:
         return call
 
 
-# A segment takes 10 steps: those that are always tried, 23 apart, are other ones in each, and of a merge.
-@pytest.mark.parametrize("apart", usually(23, 1))
+# A segment takes 10 steps, and there are five: 3 apart, each of the ten is tried in one of them or two.
+# Those that are always tried, 23 apart, are other ones in each, and of a merge.
+@pytest.mark.parametrize("apart", usually(23, 3))
 def test_broken_off_before_each_step(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, apart: int) -> None:
     rows = segments()
     expected = [row for some in rows for row in some]

@@ -6,7 +6,7 @@ from importlib.resources import files
 from typing import Any
 
 import pytest
-from conftest import SIZES, Opener, missing
+from conftest import Opener, missing
 from fake_gateway import FakeGateway
 from watching import until_still
 
@@ -24,7 +24,7 @@ VIEWS = (
     "stop",
     "reload",
 )
-SHORT = {("desk", "light"), ("phone", "dark")}
+LOOKS = [("desk", "light"), ("tablet", "light"), ("phone", "dark")]
 TAGS = ["wcag2a", "wcag2aa", "wcag21a", "wcag21aa", "wcag22aa", "best-practice"]
 
 
@@ -41,14 +41,7 @@ def violations(page: Any) -> list[str]:
     return [f"{v['id']}: {node['target']} {node['failureSummary']}" for v in found for node in v["nodes"]]
 
 
-@pytest.mark.parametrize(
-    ("size", "theme"),
-    [
-        pytest.param(size, theme, marks=() if (size, theme) in SHORT else pytest.mark.long)
-        for size in SIZES
-        for theme in ("light", "dark")
-    ],
-)
+@pytest.mark.parametrize(("size", "theme"), LOOKS)
 def test_axe_finds_nothing(opened: Opener, gateway: FakeGateway, axe: str, size: str, theme: str) -> None:
     gateway.reloaded |= {"done": False, "mistakes": ["plant.toml: a mistake"] * 40}
     page = opened(size=size, color_scheme=theme)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import pytest
 from clocked_lines import ClockedLines, ClockedWire, S
-from examples import usually
 from lines import polled, rows_of
 from toy import Toy
 
@@ -65,8 +64,7 @@ def test_silent_drives_cost_the_others_little_and_are_soon_back(dead: int, back_
 @pytest.mark.slow
 @pytest.mark.long
 @pytest.mark.story
-@pytest.mark.parametrize(("count", "dead"), usually((16, 5), (16, 1), (31, 10)))
-@pytest.mark.parametrize("every", usually(None, 0.5), ids=["in turn", "at a rate"])
+@pytest.mark.parametrize(("count", "dead", "every"), [(16, 5, None), (16, 1, 0.5), (31, 10, None)])
 def test_drives_that_are_dead_from_the_start_cost_the_others_little_at_once(
     count: int, dead: int, every: float | None
 ) -> None:

@@ -9,7 +9,7 @@ from collections import Counter
 from collections.abc import Callable
 
 import pytest
-from examples import every_other, usually
+from examples import every_fourth, usually
 from lines import proof
 from motors import MAKE, ReceivedRequests
 from paths import (
@@ -46,9 +46,9 @@ PATHS = [
     for seconds in delays
 ]
 FRAMINGS = ("innovert-ibd rtu", "innovert-ibd ascii", "delixi-native delixi")
-STORIES = every_other(LINES, PATHS, [(name, (constant, 0.6)) for name in FRAMINGS])
-STALLS = every_other(LINES, (0.9, 0.1, 0.3, 3.0, 15.0, 60.0), [("innovert-ibd rtu", 0.9)])
-READS = every_other(LINES, PATHS, [(name, (constant, 0.6)) for name in LINES])
+STORIES = every_fourth(LINES, PATHS, [(name, (constant, 0.6)) for name in FRAMINGS])
+STALLS = every_fourth(LINES, (0.9, 0.1, 0.3, 3.0, 15.0, 60.0), [("innovert-ibd rtu", 0.9)])
+READS = every_fourth(LINES, PATHS, [(name, (constant, 0.6)) for name in LINES])
 ASKED = [pair for pair in READS if "native" not in pair.values[0]]
 
 

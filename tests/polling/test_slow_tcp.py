@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 import pytest
-from examples import every_other, usually
+from examples import every_fourth, usually
 from motors import MAKE, ReceivedRequests
 from paths import (
     TAIL,
@@ -42,7 +42,7 @@ PATHS = [
     for path, delays in ((constant, (0.0, 0.3, 0.6, 1.5, 10.0)), (jittering, (0.6, 10.0)))
     for seconds in delays
 ]
-ON_PATHS = every_other(FAMILIES, PATHS, [("innovert-ibd", (constant, 0.6))])
+ON_PATHS = every_fourth(FAMILIES, PATHS, [("innovert-ibd", (constant, 0.6))])
 KINDS = ("delay", "twice", "merge")  # what a gateway may do without damage to the stream
 
 

@@ -25,8 +25,13 @@ def patient_peer(*, interval: float, **timeouts: float) -> Peer:
 
 def be_patient(set_attribute: Callable[..., None], set_item: Callable[..., None]) -> None:
     """Wait for every drive, and for every write's turn: the given functions change what the library has."""
-    defaults: dict[str, Any] = bus.Bus.__init__.__kwdefaults__
     set_attribute(exchange, "Peer", patient_peer)
+    await_turns(set_attribute, set_item)
+
+
+def await_turns(set_attribute: Callable[..., None], set_item: Callable[..., None]) -> None:
+    """Wait for every write's turn alone: for tests in which a drive may be silent."""
+    defaults: dict[str, Any] = bus.Bus.__init__.__kwdefaults__
     set_attribute(bus, "EXPIRY", PATIENCE)
     set_item(defaults, "expiry", PATIENCE)
 
