@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 from mutation.edits import mutants
+from mutation.trials import core_names
 
 ROOT = Path(__file__).parents[2]
 EXPLAINED = tomllib.loads((ROOT / "tests" / "mutation" / "explained.toml").read_text("utf-8"))["mutant"]
@@ -82,3 +83,8 @@ def test_explained_mutants_can_be_made() -> None:
     for row in EXPLAINED:
         assert row["why"]
         assert (row["file"], row["function"], row["line"], row["becomes"], row.get("nth", 1)) in names
+
+
+def test_the_trials_compile_files_that_are_there() -> None:
+    assert all((ROOT / "csrc" / f"{name}.c").exists() for name in core_names(ROOT))
+    assert {"frame", "waiter_epoll", "wakeup"} <= {*core_names(ROOT)}

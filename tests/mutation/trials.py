@@ -76,14 +76,18 @@ TRIALS: dict[str, tuple[Trial, ...]] = {
 }
 
 
-def _core(tree: Path) -> list[str]:
+def core_names(tree: Path) -> list[str]:
     """The names of the core's files."""
-    (sources,) = re.findall(r"set\(SOURCES ([^)]+)\)", (tree / "csrc" / "CMakeLists.txt").read_text())
-    return [Path(part).stem for part in sources.replace("${WAITER}", "epoll").split()]
+    text = (tree / "csrc" / "CMakeLists.txt").read_text()
+    (sources,) = re.findall(r"set\(SOURCES ([^)]+)\)", text)
+    _windows, system = re.findall(r"set\(SYSTEM ([^)]+)\)", text)
+    return [
+        Path(part).stem for part in sources.replace("${SYSTEM}", system).replace("${WAITER}", "epoll").split()
+    ]
 
 
 def _objects(tree: Path, directory: str, main: str) -> list[str]:
-    return [f"{directory}/{name}.o" for name in (main, *_core(tree))]
+    return [f"{directory}/{name}.o" for name in (main, *core_names(tree))]
 
 
 def _pytest(tree: Path, *tests: str) -> str | None:
@@ -123,7 +127,7 @@ def scratch() -> Iterator[Path]:
             (tree / name).mkdir()
         _must(tree, sys.executable, "csrc/cdef.py", "module/_core.c")
         headers = f"-I{sysconfig.get_path('include')}"
-        sources = {name: f"csrc/{name}.c" for name in _core(tree)}
+        sources = {name: f"csrc/{name}.c" for name in core_names(tree)}
         for name, source in {"test_core": "tests/c/test_core.c", **sources}.items():
             _must(tree, CC, *SANITIZED, "-c", source, "-o", f"checked/{name}.o")
         for name, source in {"_core": "module/_core.c", **sources}.items():

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from operator import add, itemgetter, mul, truediv
+from operator import add, itemgetter, mul
 from struct import Struct
 from typing import Any
 
@@ -65,7 +65,10 @@ class BlockDecoder:
         counts = self._numbers.unpack_from(data)
         if self._is_affine:
             counts = tuple(map(add, map(mul, counts, self._multipliers), self._addends))
-        found: dict[str, Any] = dict(zip(self.plain, map(truediv, counts, self._divisors), strict=True))
+        found: dict[str, Any] = {
+            name: count / divisor
+            for name, count, divisor in zip(self.plain, counts, self._divisors, strict=True)
+        }
         for name, at in self._whole:
             found[name] = counts[at]
         for name, decode in self._named:

@@ -294,7 +294,8 @@ class Exchanges:
                 raise
             raise NotMaster(drive.name, self.line.port) from None
         if completion.result != Failure.LATE_ANSWER_DUE:
-            check_master(drive, completion)
+            if completion.result < 0:
+                check_master(drive, completion)
             return completion
         until_ns = min(late_until_ns, expires_ns + 1) if expires_ns else late_until_ns
         clock.sleep(max(0, until_ns - clock.now_ns()) / 1e9)

@@ -337,7 +337,8 @@ class Line:
                 raise self._closed()
             found = core.carry_out(exchange, not_before_ns=not_before_ns, expires_ns=expires_ns)
             is_lost = found.result < 0 and _is_lost(core, found.result)
-            self.note_foreign()
+            if self.mastership is not None:
+                self.note_foreign()
         finally:
             self._callers.pop()
         if _log.isEnabledFor(logging.DEBUG):
