@@ -250,12 +250,27 @@ def test_a_full_disk_leaves_the_segment(tmp_path: Path) -> None:
 
 
 def test_it_asks_for_the_lowest_priority_and_needs_none(monkeypatch: pytest.MonkeyPatch) -> None:
-    asked = []
+    asked: list[object] = []
 
-    def forbidden(step: int) -> int:
-        asked.append(step)
+    def forbidden(*given: object) -> None:
+        asked.append(given)
         raise PermissionError
 
     monkeypatch.setattr(os, "nice", forbidden)
+    monkeypatch.setattr(os, "sched_setscheduler", forbidden)
     compact_module.be_low()
-    assert asked == [19]
+    assert asked == [(0, os.SCHED_BATCH, os.sched_param(0)), (19,)]
+
+
+def test_it_leaves_the_real_time_of_its_recorder() -> None:
+    """A process that may not run by SCHED_RR leaves the usual scheduling all the same."""
+    lines = (
+        "import contextlib, os",
+        "from multidrop.history.compact import be_low",
+        "with contextlib.suppress(PermissionError):",
+        "    os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(1))",
+        "be_low()",
+        "print(os.sched_getscheduler(0) == os.SCHED_BATCH, os.nice(0))",
+    )
+    ended = subprocess.run([sys.executable, "-c", "\n".join(lines)], capture_output=True, text=True)
+    assert ended.stdout == "True 19\n", ended.stderr

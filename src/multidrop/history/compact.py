@@ -231,7 +231,12 @@ def _make_tens(folder: Path, rows: list[HistoryFile]) -> None:
 
 
 def be_low() -> None:
-    """Give way to everything else, where that is allowed."""
+    """Give way to everything else, where that is allowed.
+
+    A child inherits the scheduling of a recorder that runs by SCHED_RR, and would hold its polling up.
+    """
+    with suppress(OSError, AttributeError):  # Windows and macOS have no such call
+        os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
     with suppress(OSError):
         os.nice(19)
 
