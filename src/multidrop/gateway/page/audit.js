@@ -2,7 +2,7 @@
 
 import { get, query } from "./api.js";
 import * as clock from "./clock.js";
-import { fill, find, glyph, make, named } from "./dom.js";
+import { fill, find, glyph, make, named, tableHead } from "./dom.js";
 
 const COUNT = 100;
 const DONE = /^(ok|confirmed|done|written|unchanged)/i;
@@ -64,15 +64,7 @@ export function auditRows(list, isWhole) {
   return make(
     "table",
     { class: "plain audit" },
-    make(
-      "thead",
-      {},
-      make(
-        "tr",
-        {},
-        heads.map(h => make("th", { scope: "col" }, h)),
-      ),
-    ),
+    tableHead(heads),
     make(
       "tbody",
       {},

@@ -2,7 +2,7 @@
 
 import { get } from "./api.js";
 import { auditRows } from "./audit.js";
-import { fill, find, make } from "./dom.js";
+import { fill, find, make, tableHead } from "./dom.js";
 import { takeOthers } from "./registers.js";
 import { UNKNOWN, milliseconds, share, words } from "./values.js";
 
@@ -60,11 +60,7 @@ function delays({ delays, misses, asked, ledger }) {
       ? make(
           "table",
           { class: "plain" },
-          make(
-            "thead",
-            {},
-            make("tr", {}, make("th", { scope: "col" }, "Reason"), make("th", { scope: "col" }, "Missed")),
-          ),
+          tableHead(["Reason", "Missed"]),
           make(
             "tbody",
             {},

@@ -20,6 +20,22 @@ export function make(tag, attributes = {}, ...children) {
 // Return a name from outside, which cannot change the order of the text around it.
 export const named = (text, attributes = {}) => make("bdi", attributes, String(text));
 
+// Return the head of a table. A head is a text, or a text and its class; an empty text is a cell that names
+// no column.
+export const tableHead = heads =>
+  make(
+    "thead",
+    {},
+    make(
+      "tr",
+      {},
+      heads.map(head => {
+        const [text, kind] = [head].flat();
+        return text ? make("th", { scope: "col", class: kind }, text) : make("td");
+      }),
+    ),
+  );
+
 // Return one of the shapes in index.html.
 export function glyph(name) {
   const svg = document.createElementNS(SVG, "svg"),

@@ -2,7 +2,7 @@
 
 import { get, query } from "./api.js";
 import * as clock from "./clock.js";
-import { fill, find, glyph, make, named } from "./dom.js";
+import { fill, find, glyph, make, named, tableHead } from "./dom.js";
 import { now } from "./link.js";
 import { alarms } from "./store.js";
 
@@ -63,15 +63,7 @@ function part(title, alarms) {
       ? make(
           "table",
           { class: "plain faults" },
-          make(
-            "thead",
-            {},
-            make(
-              "tr",
-              {},
-              heads.map((h, i) => (i === 5 ? make("td", {}) : make("th", { scope: "col" }, h))),
-            ),
-          ),
+          tableHead(heads),
           make("tbody", {}, alarms.map(row)),
         )
       : make("p", { class: "note" }, "None."),

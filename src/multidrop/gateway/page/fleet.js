@@ -3,7 +3,7 @@
 
 import { get } from "./api.js";
 import * as clock from "./clock.js";
-import { fill, find, glyph, make, named, put, setClass } from "./dom.js";
+import { fill, find, glyph, make, named, put, setClass, tableHead } from "./dom.js";
 import { onPlant, store } from "./store.js";
 import { UNKNOWN } from "./values.js";
 
@@ -51,15 +51,7 @@ function card(id, title, heads) {
       make(
         "table",
         { class: "plain" },
-        make(
-          "thead",
-          {},
-          make(
-            "tr",
-            {},
-            heads.map(h => make("th", { scope: "col" }, h)),
-          ),
-        ),
+        tableHead(heads),
         make("tbody", { id: `fleet-${id}` }),
       ),
     ),

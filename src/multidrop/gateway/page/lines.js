@@ -2,7 +2,7 @@
 
 import { get } from "./api.js";
 import * as clock from "./clock.js";
-import { fill, find, glyph, make, named } from "./dom.js";
+import { fill, find, glyph, make, named, tableHead } from "./dom.js";
 import { misses } from "./misses.js";
 import { isLive, store } from "./store.js";
 import { now } from "./link.js";
@@ -92,17 +92,7 @@ function delays(line, told) {
       make(
         "table",
         { class: "plain delays" },
-        make(
-          "thead",
-          {},
-          make(
-            "tr",
-            {},
-            ["Drive", "Half within", "99 % within", "", "Missed"].map((h, i) =>
-              i === 3 ? make("td", {}) : make("th", { scope: "col" }, h),
-            ),
-          ),
-        ),
+        tableHead(["Drive", "Half within", "99 % within", "", "Missed"]),
         make(
           "tbody",
           {},

@@ -1,7 +1,7 @@
 // Two markers in the trends, A and B: values at each, and what lies between.
 
 import * as clock from "./clock.js";
-import { colour, fill, find, make, named } from "./dom.js";
+import { colour, fill, find, make, named, tableHead } from "./dom.js";
 import { label } from "./history.js";
 
 const marks = { A: null, B: null }; // ms
@@ -118,17 +118,7 @@ export function draw() {
       "table",
       { class: "plain" },
       make("caption", { class: "hidden" }, "Values at the markers"),
-      make(
-        "thead",
-        {},
-        make(
-          "tr",
-          {},
-          ["", `A ${told(marks.A)}`, `B ${told(marks.B)}`, `B − A, ${between}`, "unit"].map((h, i) =>
-            i ? make("th", { scope: "col" }, h) : make("td", {}),
-          ),
-        ),
-      ),
+      tableHead(["", `A ${told(marks.A)}`, `B ${told(marks.B)}`, `B − A, ${between}`, "unit"]),
       make("tbody", {}, rows),
     ),
   );

@@ -1,7 +1,7 @@
 // Misses of a line in the last hour, by minute and by reason.
 
 import * as clock from "./clock.js";
-import { colour, make } from "./dom.js";
+import { colour, make, tableHead } from "./dom.js";
 import { share } from "./values.js";
 
 const REASONS = ["c2", "c4", "c1", "c3", "c5", "c6"];
@@ -39,15 +39,7 @@ export function misses(minutes) {
     make(
       "table",
       { class: "plain" },
-      make(
-        "thead",
-        {},
-        make(
-          "tr",
-          {},
-          ["Reason", "Missed", "Share"].map(h => make("th", { scope: "col" }, h)),
-        ),
-      ),
+      tableHead(["Reason", "Missed", "Share"]),
       make(
         "tbody",
         {},

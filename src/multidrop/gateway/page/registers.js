@@ -2,7 +2,7 @@
 
 import { change } from "./actions.js";
 import * as clock from "./clock.js";
-import { make, put } from "./dom.js";
+import { make, put, tableHead } from "./dom.js";
 import { key, mayWrite, reading, store } from "./store.js";
 import { UNKNOWN, makeValue, showValue, withUnit, words } from "./values.js";
 
@@ -28,15 +28,7 @@ export function build(spec) {
     make(
       "table",
       { class: "registers" },
-      make(
-        "thead",
-        {},
-        make(
-          "tr",
-          {},
-          ["Register", "Value", "Age"].map(h => make("th", { scope: "col" }, h)),
-        ),
-      ),
+      tableHead(["Register", "Value", "Age"]),
       make("tbody", {}, rows.map(row)),
     ),
   );

@@ -1,6 +1,6 @@
 // The drives by line: which rows there are, which are shown, and which one is chosen.
 
-import { colour, fill, find, make, put, setClass } from "./dom.js";
+import { colour, fill, find, make, put, setClass, tableHead } from "./dom.js";
 import { now } from "./link.js";
 import { drawHead, drawRow, makeHead, makeRow } from "./rows.js";
 import { spark } from "./spark.js";
@@ -65,15 +65,7 @@ function build() {
     "table",
     {},
     make("caption", { class: "hidden" }, "Drives by line"),
-    make(
-      "thead",
-      {},
-      make(
-        "tr",
-        {},
-        HEADS.map(([title, kind]) => make("th", { scope: "col", class: kind }, title)),
-      ),
-    ),
+    tableHead(HEADS),
     store.plant.lines.map(line =>
       make(
         "tbody",
