@@ -174,6 +174,12 @@ def test_a_grid_covers_its_range() -> None:
         assert grid.step < 10 * SECOND or grid.is_of_tens
 
 
+def test_an_hour_is_made_of_tens_from_2_s_a_point_on() -> None:
+    hour = NOON, NOON + 3600 * SECOND
+    assert grid_of(*hour, 1800).is_of_tens
+    assert grid_of(*hour, 1801).step < 2 * SECOND
+
+
 # ---- while it records ----
 
 

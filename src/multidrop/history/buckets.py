@@ -11,7 +11,7 @@ from multidrop.history.folder import SECOND_NS, TEN_NS
 
 STEPS_S = (10, 20, 30, 60, 120, 300, 600, 900, 1800, 3600, 7200, 10800, 21600, 43200, 86400)
 MOST_POINTS = 100_000
-FINE_NS = 2 * SECOND_NS  # shorter times are made of rows; longer ones of tens, which cost a hundredth
+FINE_NS = 2 * SECOND_NS  # shorter times are made of rows; others of tens, which cost a hundredth
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ def grid_of(begin: int, end: int, points: int) -> Grid:
     if begin >= end:
         raise ValueError(f"the range ends at {end} ns, and begins not before it, at {begin} ns")
     least = -(-(end - begin) // points)
-    if least <= FINE_NS:
+    if least < FINE_NS:
         return Grid(begin, least, -(-(end - begin) // least))
     for step in _handy_steps(least):
         first = begin // step * step

@@ -140,8 +140,8 @@ class History:
         """Return least, mean and most of each series in at most `points` equal times that cover the range.
 
         `end` None is now. Nothing is hidden: a value that stood out for one row is in `most` or `least`.
-        Times above 2 s become whole tens of seconds, minutes, hours or days of UTC, so that the first may
-        begin before `begin` and the last end after `end`.
+        Times of 2 s and more become whole tens of seconds, minutes, hours or days of UTC, so that the first
+        may begin before `begin` and the last end after `end`.
         """
         names = _parsed(series)
         if not names:
