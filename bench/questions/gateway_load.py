@@ -193,28 +193,10 @@ def broker(folder: Path, port: int) -> Iterator[None]:
 
 # ---- slices ----
 
-HEAD = ("slice", "exchanges/s", "values/s", "missed", "CPU %", "children %", "MB begin", "middle", "end")
-
-
-def slice_of(name: str, polling: Polling, seconds: float) -> tuple[object, ...]:
-    """Measure for so many seconds."""
-    counts = polling.counts()
-    begun, before = time.monotonic(), used(polling.pid)
-    time.sleep(seconds / 2)
-    middle = used(polling.pid).resident
-    time.sleep(max(0.0, begun + seconds - time.monotonic()))
-    after, took = used(polling.pid), time.monotonic() - begun
-    now = polling.counts()
-    counted = now.at - counts.at
-    return (
-        name,
-        f"{(now.exchanges - counts.exchanges) / counted:.1f}",
-        f"{(now.samples - counts.samples) / counted:.0f}",
-        f"{sum(now.misses.values()) - sum(counts.misses.values()):.0f}",
-        f"{(after.own - before.own) / took * 100:.1f}",
-        f"{(after.children - before.children) / took * 100:.1f}",
-        *(f"{mb:.1f}" for mb in (before.resident, middle, after.resident)),
-    )
+HEAD = (
+    *("slice", "exchanges/s", "values/s", "missed", "CPU %", "children %", "MB begin", "middle", "end"),
+    "simulator late, ms",
+)
 
 
 class Hall:
@@ -223,6 +205,7 @@ class Hall:
     def __init__(self, pumps: SimulatedPumps, plant: Path, place: Place, before: Sequence[str]) -> None:
         self.pumps, self.plant, self.place, self.before = pumps, plant, place, before
         self.failures: Counter[str] = Counter()
+        self.missed: Counter[str] = Counter()  # by slice and reason
         self.counts: dict[str, float] = {}
         self.loaded_s = 0.0
 
@@ -239,16 +222,40 @@ class Hall:
             before = self.counts.get(what, 0.0)
             self.counts[what] = max(before, number) if "longest" in what else before + number
 
+    def slice(self, name: str, polling: Polling, seconds: float) -> tuple[object, ...]:
+        """Measure for so many seconds. A simulator that stood still answers late, and values are missed."""
+        self.pumps.late_s()
+        counts = polling.counts()
+        begun, before = time.monotonic(), used(polling.pid)
+        time.sleep(seconds / 2)
+        middle = used(polling.pid).resident
+        time.sleep(max(0.0, begun + seconds - time.monotonic()))
+        after, took = used(polling.pid), time.monotonic() - begun
+        now = polling.counts()
+        counted = now.at - counts.at
+        for why, number in (Counter(now.misses) - Counter(counts.misses)).items():
+            self.missed[f"{name}: {why}"] += round(number)
+        return (
+            name,
+            f"{(now.exchanges - counts.exchanges) / counted:.1f}",
+            f"{(now.samples - counts.samples) / counted:.0f}",
+            f"{sum(now.misses.values()) - sum(counts.misses.values()):.0f}",
+            f"{(after.own - before.own) / took * 100:.1f}",
+            f"{(after.children - before.children) / took * 100:.1f}",
+            *(f"{mb:.1f}" for mb in (before.resident, middle, after.resident)),
+            f"{self.pumps.late_s() * 1e3:.0f}",
+        )
+
     def slices(self, number: int, seconds: float) -> Iterator[tuple[object, ...]]:
         for _ in range(number):
             with plain_poll(self.plant, self.before) as polling:
                 time.sleep(SETTLE_S)
-                yield slice_of("poll", polling, seconds)
+                yield self.slice("poll", polling, seconds)
             with serving(self.plant, self.place, self.before) as gateway:
                 time.sleep(SETTLE_S)
-                yield slice_of("serve", gateway, seconds)
+                yield self.slice("serve", gateway, seconds)
                 with self.users():
-                    yield slice_of("serve, users", gateway, seconds)
+                    yield self.slice("serve, users", gateway, seconds)
 
     def stops(self, rounds: int) -> Iterator[tuple[object, ...]]:
         """Stop all, in turns of some without users and some beside them."""
@@ -282,13 +289,13 @@ class Hall:
         """Poll alone for a while, then serve beside users for so many minutes, and poll alone again."""
         with plain_poll(self.plant, self.before) as polling:
             time.sleep(SETTLE_S)
-            yield slice_of("poll", polling, seconds)
+            yield self.slice("poll", polling, seconds)
         with serving(self.plant, self.place, self.before) as gateway, self.users():
             for minute in range(number):
-                yield slice_of(f"minute {minute + 1}", gateway, 60.0)
+                yield self.slice(f"minute {minute + 1}", gateway, 60.0)
         with plain_poll(self.plant, self.before) as polling:
             time.sleep(SETTLE_S)
-            yield slice_of("poll", polling, seconds)
+            yield self.slice("poll", polling, seconds)
 
 
 def _spread(times: Sequence[float]) -> tuple[float, float, float]:
@@ -352,6 +359,9 @@ def run(arguments: argparse.Namespace) -> None:
             print("\nall drives stopped over HTTP; ms\n")
             stops = here.stops(arguments.stops) if arguments.stops else iter(())
             tables.show(("until", "beside", "stops", "least", "median", "longest"), [*stops])
+        print("\nvalues that were missed")
+        for what, missed in sorted(here.missed.items()) or [("none", 0)]:
+            print(f"  {what}: {missed}")
         print(f"\nthe users, in {here.loaded_s:.0f} s")
         for what, number in sorted(here.counts.items()):
             print(f"  {what}: {number:.3f}" if " s" in what else f"  {what}: {number:.0f}")

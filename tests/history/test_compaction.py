@@ -264,7 +264,7 @@ def test_it_asks_for_the_lowest_priority_and_needs_none(monkeypatch: pytest.Monk
 
 
 def test_it_leaves_the_real_time_of_its_recorder() -> None:
-    """Where this process may not run by SCHED_RR, it leaves the usual scheduling all the same."""
+    """A process that may not run by SCHED_RR leaves the usual scheduling all the same."""
     lines = (
         "import contextlib, os",
         "from multidrop.history.compact import be_low",

@@ -42,9 +42,9 @@ class FakeHub:
         age = round(self.ages.get(key, 0.0) * 1e9)
         return FakeRow(time.monotonic_ns() - age, self.values[key])
 
-    def last_good(self, drive: str, register: str) -> FakeRow | None:
-        row = self.newest(drive, register)
-        return row if row is not None and row.value is not None else None
+    def answered_ns(self, drive: str) -> int | None:
+        rows = [self.newest(*key) for key in self.values if key[0] == drive]
+        return max((row.monotonic_ns for row in rows if row and row.value is not None), default=None)
 
     def state(self, drive: str) -> str:
         return self.states.get(drive, "unknown")

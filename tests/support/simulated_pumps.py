@@ -115,6 +115,10 @@ class SimulatedPumps:
         """Let all motors run, and forget all stops."""
         self._ask("run")
 
+    def late_s(self) -> float:
+        """Return the longest time, since the last call, for which the process stood still."""
+        return float(self._ask("late"))
+
     def stops(self) -> dict[str, tuple[float | None, bool]]:
         """Return for each drive when the first frame of a stop had come, in s of CLOCK_MONOTONIC.
 
@@ -151,20 +155,26 @@ def _stop_of(sim: MotorDrive) -> tuple[float | None, bool]:
     return min(stops, default=None), bool(sim.motor.goal) or sim.motor.energised
 
 
-def _serve_words(sims: dict[str, MotorDrive]) -> None:
+def _serve_words(sims: dict[str, MotorDrive], late: list[float]) -> None:
     for word in sys.stdin:
         if word.strip() == "run":
             for sim in sims.values():
                 sim.counters.writes.clear()
                 sim.motor.run(1)
             print("null", flush=True)
+        elif word.strip() == "late":
+            print(json.dumps(late[0]), flush=True)
+            late[:] = [0.0]
         else:
             print(json.dumps({name: _stop_of(sim) for name, sim in sims.items()}), flush=True)
 
 
-def _make_waves(sims: dict[str, MotorDrive]) -> None:
+def _make_waves(sims: dict[str, MotorDrive], late: list[float]) -> None:
+    due = time.monotonic()
     while True:
         now = time.monotonic()
+        late[:] = [max(late[0], now - due)]
+        due = now + WAVE_S
         for phase, sim in enumerate(sims.values()):
             sim.motor.load = 0.5 + 0.4 * math.sin(now / 3 + phase)
             sim.motor.target = 40.0 + 5.0 * math.sin(now / 7 + phase)
@@ -181,8 +191,9 @@ def main(path: str) -> None:
             sim.motor.deceleration_time = RAMP_S
             sims[sim.drive.name] = sim
         wires.append(Wire(here, name=line.name, port=str(line.port)))
+    late = [0.0]  # s
     for work in (_serve_words, _make_waves):
-        threading.Thread(target=work, args=(sims,), daemon=True).start()
+        threading.Thread(target=work, args=(sims, late), daemon=True).start()
     serve(wires, lambda simulator: print("ready", flush=True))
 
 

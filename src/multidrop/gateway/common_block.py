@@ -6,7 +6,7 @@ known has a count of its own, so that it never reads as 0.
 
 from __future__ import annotations
 
-from typing import Any, Protocol
+from typing import Protocol
 
 from multidrop import PolledDrive
 from multidrop.gateway.drive_words import NewestRow, fresh_ns, is_fresh
@@ -26,7 +26,7 @@ class CommonSource(Protocol):
     """The part of the hub that the block needs."""
 
     def newest(self, drive: str, register: str) -> NewestRow | None: ...
-    def last_good(self, drive: str, register: str) -> NewestRow | None: ...
+    def answered_ns(self, drive: str) -> int | None: ...
     def state(self, drive: str) -> str: ...
 
 
@@ -73,8 +73,7 @@ def _fault(polled: PolledDrive, hub: CommonSource, now_ns: int, state: str) -> i
 
 def _age(polled: PolledDrive, hub: CommonSource, now_ns: int) -> int:
     """Return the ms since the newest value of the drive was asked for."""
-    rows: list[Any] = [hub.last_good(polled.drive.name, poll.register.name) for poll in polled.polls]
-    newest = max((row.monotonic_ns for row in rows if row is not None), default=None)
+    newest = hub.answered_ns(polled.drive.name)
     return NEVER if newest is None else min(max(now_ns - newest, 0) // 1_000_000, LONGEST_AGE)
 
 

@@ -12,6 +12,7 @@ import math
 import struct
 from collections.abc import Callable, Iterable
 from enum import Enum
+from functools import lru_cache
 from typing import Any, Protocol
 
 from multidrop import Carrier, NumberFormat, PolledDrive, Register, Table
@@ -21,6 +22,7 @@ FRESH_PERIODS = 3
 
 _FLOATS = {NumberFormat.F32: (">f", ">I"), NumberFormat.F64: (">d", ">Q")}
 _OPEN = frozenset({NumberFormat.I8, NumberFormat.U32_EITHER})
+MOST_KNOWN = 8192  # values whose data are remembered: drives of a family share their registers
 _MOST_EXACT = 1 << 53  # beyond it a float64 does not hold every whole number
 _FUNCTIONS = {Carrier.BIT: (1, 2), Carrier.WORD: (3, 4)}
 
@@ -59,6 +61,7 @@ def is_fresh(row: NewestRow | None, fresh_ns: int, now_ns: int, since_ns: int = 
     return row.monotonic_ns >= since_ns and now_ns - row.monotonic_ns <= fresh_ns
 
 
+@lru_cache(maxsize=MOST_KNOWN)
 def exact_data(register: Register[Any], value: float) -> bytes | None:
     """Return the bytes that the drive sends for this value (coils: one byte, 0 or 1); None where in doubt."""
     coding = register.coding

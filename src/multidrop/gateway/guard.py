@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from http.cookies import CookieError, SimpleCookie
 from typing import Any, NamedTuple
 
-from starlette.datastructures import Headers, MutableHeaders
+from starlette.datastructures import Headers
 from starlette.responses import JSONResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
@@ -29,6 +29,13 @@ PAGE_HEADERS = HEADERS | {
     "cache-control": "no-cache",  # a page's file is asked for again, by its ETag
 }
 ANYONE = "anyone"
+
+
+def _raw(headers: Mapping[str, str]) -> list[tuple[bytes, bytes]]:
+    return [(name.encode("latin-1"), value.encode("latin-1")) for name, value in headers.items()]
+
+
+_RAW_HEADERS, _RAW_PAGE_HEADERS = _raw(HEADERS), _raw(PAGE_HEADERS)
 
 _log = logging.getLogger("multidrop.gateway")
 
@@ -75,13 +82,13 @@ class Guard:
             return  # uvicorn refuses a connection that nobody accepts
 
         is_page = scope["path"] == "/" or scope["path"].startswith("/page/")
-        added = PAGE_HEADERS if is_page else HEADERS
+        added = _RAW_PAGE_HEADERS if is_page else _RAW_HEADERS
 
         async def send_with_headers(message: Message) -> None:
             if message["type"] == "http.response.start":
-                headers = MutableHeaders(scope=message)
-                for name, value in added.items():
-                    headers.setdefault(name, value)
+                headers = message["headers"]
+                own = {name for name, _ in headers}
+                message["headers"] = [*headers, *(one for one in added if one[0] not in own)]
             await send(message)
 
         try:

@@ -144,8 +144,12 @@ class Hub:
 
     def newest(self, drive: str, register: str) -> Newest | None:
         """Return the newest row, which may be a miss; None when it was never asked."""
-        cell = self._known(drive, register)
-        return self._row(cell.newest) if cell and cell.newest else None
+        watched = self._watched.get(drive)
+        cell = watched.cells.get(register) if watched else None
+        if cell is None or cell.newest is None:
+            return None
+        time, monotonic_ns, value, status = cell.newest
+        return Newest(time, monotonic_ns, None if status else value, self._statuses[status])
 
     def last_good(self, drive: str, register: str) -> Newest | None:
         """Return the newest row with a value, however old it is; None when there never was one."""
@@ -183,11 +187,17 @@ class Hub:
         """Return the words of a row's status."""
         return self._statuses[code]
 
+    def answered_ns(self, drive: str) -> int | None:
+        """Return when its newest value was asked for, by the monotonic clock; None: it never answered."""
+        watched = self._watched.get(drive)
+        cells = watched.cells.values() if watched else ()
+        return max([cell.good[1] for cell in cells if cell.good], default=None)
+
     def seen_at(self, drive: str) -> int | None:
         """Return when the newest value of a drive was asked for, UTC in ns; None: it never answered."""
         watched = self._watched.get(drive)
         cells = watched.cells.values() if watched else ()
-        return max((cell.good[0] for cell in cells if cell.good), default=None)
+        return max([cell.good[0] for cell in cells if cell.good], default=None)
 
     def _known(self, drive: str, register: str) -> RegisterRows | None:
         watched = self._watched.get(drive)

@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 
 from multidrop import LineStatistics, Plant, PlantLine, Statistics
 
-SECONDS = 5.0  # over which the use of a line is taken
+SECONDS = 5.0  # over which the use of a line is taken, and after which figures of the last minute are anew
 MINUTES = 60
 
 Reading = Mapping[str, LineStatistics]
@@ -25,6 +25,8 @@ class Lately:
     def __init__(self, plant: Plant) -> None:
         self.newest: Reading = {}
         self._recent: deque[tuple[float, Reading]] = deque()
+        self._minute: dict[str, LineStatistics | None] = {}  # the last one, of each line
+        self._due = 0.0  # when it is taken anew
         self._drives: dict[str, dict[str, Any]] = {}  # figures of the last minute
         self._figures: dict[str, dict[str, Any]] = {}  # of the lines, as of the newest reading
         self._minutes: deque[tuple[int, Reading]] = deque(maxlen=2)  # the newest: one takes much memory
@@ -44,7 +46,9 @@ class Lately:
         self.newest = _of_lines(self.newest, goes_on)
         planned = plant.metadata()["planned"] if planned is None else planned
         self._planned = {name: float(line["utilisation"]) for name, line in planned.items()}
-        self._figures = {name: self._line_figures(name, self._last_minute(name)) for name in self._lines}
+        self._minute = {name: self._last_minute(name) for name in self._lines}
+        self._due = 0.0
+        self._figures = {name: self._line_figures(name, minute) for name, minute in self._minute.items()}
 
     def tick(self, now: float, utc_ms: int, reading: Reading) -> None:
         """Take a reading; `now` is of the monotonic clock, in s."""
@@ -56,27 +60,40 @@ class Lately:
             for line in reading:
                 self._hours.setdefault(line, deque(maxlen=MINUTES)).extend(self._this_minute(line))
             self._minutes.append((utc_ms, reading))
-        minutes = {line: self._last_minute(line) for line in reading}
-        self._drives = {
-            name: _of_minute(statistics)
-            for line, minute in minutes.items()
-            for name, statistics in (minute or reading[line]).drives.items()
-        }
-        self._figures = {line: self._line_figures(line, minute) for line, minute in minutes.items()}
+        is_complete = reading.keys() == self._minute.keys() and None not in self._minute.values()
+        if now >= self._due or not is_complete:
+            self._due = now + SECONDS
+            self._minute = {line: self._last_minute(line) for line in reading}
+            self._drives = {
+                name: _of_minute(statistics)
+                for line, minute in self._minute.items()
+                for name, statistics in (minute or reading[line]).drives.items()
+            }
+        self._figures = {line: self._line_figures(line, minute) for line, minute in self._minute.items()}
 
     def line(self, name: str) -> dict[str, Any]:
         """Return a line's use, as measured and as planned, its rate, and the misses of the last minute."""
         return self._figures.get(name) or self._line_figures(name, None)
 
     def _line_figures(self, name: str, minute: LineStatistics | None) -> dict[str, Any]:
-        lately = self._since(self._recent[0][1] if self._recent else {}, name)
+        used, rate = self._use(name)
         return {
-            "used": None if lately is None else round(lately.utilisation, 4),
+            "used": used,
             "planned": round(self._planned.get(name, 0.0), 4),
-            "rate": None if lately is None else round(lately.exchanges_per_second, 1),
+            "rate": rate,
             "p99": None if minute is None else _ms(minute.delays.p99),
             "misses": sum(minute.misses.values()) if minute else 0,
         }
+
+    def _use(self, name: str) -> tuple[float | None, float | None]:
+        """Return the used share of a line's time and its exchanges a second, lately."""
+        before = self._recent[0][1].get(name) if self._recent else None
+        now = self.newest.get(name)
+        if before is None or now is None or before is now:
+            return None, None
+        seconds = max(now.seconds - before.seconds, 1e-9)
+        used_s = (now.counters.ideal_ns - before.counters.ideal_ns) / 1e9
+        return round(used_s / seconds, 4), round((now.exchanges - before.exchanges) / seconds, 1)
 
     def drive_figures(self, name: str) -> dict[str, Any]:
         """Return the share that was missed in the last minute, and the delay of a drive."""

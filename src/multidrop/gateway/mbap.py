@@ -152,10 +152,10 @@ class ModbusClient(asyncio.Protocol):
         """Add the answers that are known at once; return True where more requests may be waiting."""
         begun = self._port.clock()
         for _ in range(SLICE):
-            request = self._next_request()
+            request = self._next_request() if self._buffer else None
             if request is None:
                 return False
-            self.last_request = self._port.clock()
+            self.last_request = begun
             answer = self._port.serve(request, self)
             if answer is None:
                 self._is_refused = True
@@ -164,7 +164,7 @@ class ModbusClient(asyncio.Protocol):
                 answers.append(answer)
             else:
                 self._begin(request, answer)
-            if self.last_request - begun > SLICE_S:
+            if self._buffer and self._port.clock() - begun > SLICE_S:
                 break
         return True
 

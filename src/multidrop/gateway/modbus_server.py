@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import time
 from collections import Counter
 from collections.abc import Awaitable, Callable, Sequence
 from functools import partial
@@ -285,5 +286,5 @@ class ModbusServer:
 
     @staticmethod
     def _now_ns() -> int:
-        """Return the time of CLOCK_MONOTONIC, which is the loop's, as rows have it."""
-        return round(asyncio.get_running_loop().time() * 1e9)
+        """Return the time of CLOCK_MONOTONIC, as rows have it."""
+        return time.monotonic_ns()

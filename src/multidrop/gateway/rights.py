@@ -9,6 +9,7 @@ import secrets
 from collections import deque
 from collections.abc import Iterable
 from enum import IntEnum
+from functools import lru_cache
 from ipaddress import ip_address
 from typing import NamedTuple
 from urllib.parse import urlsplit
@@ -146,6 +147,7 @@ class May(NamedTuple):
         return Right.LOOK if self.look == "anyone" else None
 
 
+@lru_cache(maxsize=256)
 def is_loopback(host: str) -> bool:
     """Return True for addresses and names that this machine alone can reach."""
     if host in ("localhost", ""):
@@ -187,6 +189,7 @@ class OwnNames:
         return (theirs[0], theirs[1] or usual) == (ours[0], ours[1] or usual)
 
 
+@lru_cache(maxsize=64)  # each request of a viewer has the same one
 def _split(host: str) -> tuple[str, int | None] | None:
     """Return name and port of a Host header; None where it is not one."""
     if not re.fullmatch(r"[A-Za-z0-9._-]+(:\d{1,5})?|\[[0-9A-Fa-f:.]+\](:\d{1,5})?", host):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import count
 
@@ -11,6 +11,8 @@ from multidrop.history.folder import SECOND_NS, TEN_NS
 
 STEPS_S = (10, 20, 30, 60, 120, 300, 600, 900, 1800, 3600, 7200, 10800, 21600, 43200, 86400)
 MOST_POINTS = 100_000
+_BEFORE_ALL, _AFTER_ALL = -(1 << 64), 1 << 64  # ns
+_NOTHING = 0, 0, 0.0, math.inf, -math.inf  # values, misses, their sum, least, most
 FINE_NS = 2 * SECOND_NS  # shorter times are made of rows; others of tens, which cost a hundredth
 
 
@@ -55,6 +57,15 @@ class Grid:
     def is_of_tens(self) -> bool:
         """True where every edge is one of ten seconds."""
         return self.step % TEN_NS == 0 and self.begin % TEN_NS == 0
+
+    def bucket_of(self, time: int) -> tuple[int, int, int]:
+        """Return the number, begin and end of the bucket of a time; -1 for all before or behind them."""
+        if time < self.begin:
+            return -1, _BEFORE_ALL, self.begin
+        if time >= self.end:
+            return -1, self.end, _AFTER_ALL
+        number = (time - self.begin) // self.step
+        return number, self.begin + number * self.step, self.begin + (number + 1) * self.step
 
 
 def grid_of(begin: int, end: int, points: int) -> Grid:
@@ -101,6 +112,31 @@ class Accumulator:
             self._sum[bucket] += total
             self._least[bucket] = min(self._least[bucket], least)
             self._most[bucket] = max(self._most[bucket], most)
+
+    def add_rows(self, times: Iterable[int], values: Iterable[float], valid: Iterable[int]) -> None:
+        """Add rows, in ns; a row that is not valid is a miss. Those outside of the grid are left out.
+
+        Rows of a bucket mostly follow each other: they are summed up here before they are added.
+        """
+        grid, bucket, begin, end = self._grid, -1, 0, 0
+        n, missed, total, least, most = _NOTHING
+        for time, value, is_valid in zip(times, values, valid, strict=True):
+            if not begin <= time < end:
+                if bucket >= 0:
+                    self.add(bucket, n, missed, total, least, most)
+                n, missed, total, least, most = _NOTHING
+                bucket, begin, end = grid.bucket_of(time)
+            if is_valid:
+                n += 1
+                total += value
+                if value < least:
+                    least = value
+                if value > most:
+                    most = value
+            else:
+                missed += 1
+        if bucket >= 0:
+            self.add(bucket, n, missed, total, least, most)
 
     def buckets(self) -> Buckets:
         has = self._n

@@ -129,13 +129,7 @@ class GrowingSegment:
 
     def _gather_rows(self, found: Mapping[Series, Accumulator], grid: Grid) -> None:
         for series, rows in self._kept.rows_of(found, self._batches_between(grid.begin, grid.end)).items():
-            into = found[series]
-            for time, value in rows.between(grid.begin, grid.end):
-                bucket = (time - grid.begin) // grid.step
-                if value is None:
-                    into.add(bucket, 0, 1, 0.0, 0.0, 0.0)
-                else:
-                    into.add(bucket, 1, 0, value, value, value)
+            found[series].add_rows(rows.times, rows.values, rows.valid)
 
     def _batches_between(self, begin: int, end: int) -> range:
         """Return the numbers of all batches from the first to the last that may have rows of this range."""

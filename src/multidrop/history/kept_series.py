@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from array import array
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from typing import NamedTuple
 
 Series = tuple[str, str]  # drive and register
@@ -31,12 +31,6 @@ class SeriesRows:
         self.times.append(row.time)
         self.values.append(0.0 if row.value is None else row.value)
         self.valid.append(row.value is not None)
-
-    def between(self, begin: int, end: int) -> Iterator[tuple[int, float | None]]:
-        """Yield time and value of the rows from `begin` to before `end`, in ns; None is a miss."""
-        for time, value, is_valid in zip(self.times, self.values, self.valid, strict=True):
-            if begin <= time < end:
-                yield time, value if is_valid else None
 
 
 class KeptSeries:

@@ -21,6 +21,8 @@ from multidrop.transport.exchange import Exchanges
 # Bytes came instead of the reply, and no good frame among them.
 _DAMAGED = (Status.BAD_CHECKSUM, Status.BAD_CHARACTER, Status.CUT_SHORT, Status.NO_START)
 
+_NOTHING = Counters()
+
 
 @dataclass(frozen=True)
 class Diagnostics:
@@ -174,7 +176,7 @@ class LineStatistics(Statistics):
             lost = self.overruns - earlier.overruns
         before = {name: drive.counters for name, drive in earlier.drives.items()}
         counters_by_drive = {
-            name: _difference(drive.counters, before.get(name, Counters()))
+            name: _difference(drive.counters, before.get(name, _NOTHING))
             for name, drive in self.drives.items()
         }
         return line_statistics(seconds, counters_by_drive, lost)
@@ -233,6 +235,8 @@ def _total(column: Sequence[Any]) -> Any:
 
 
 def _difference(now: Counters, earlier: Counters) -> Counters:
+    if earlier == _NOTHING:
+        return now
     found = Counters._make(map(sub, now, earlier))
     longest = now.longest_ns
     if longest == earlier.longest_ns:  # it may have been before

@@ -1,0 +1,227 @@
+"""Measure what each kind of work of `multidrop serve` takes of a processor, alone and with warm caches.
+
+31 drives x 10 values lie in the hub of a gateway that does not run: requests are handed to its protocols as
+asyncio would. Before each turn come new rows with other values. The least of many turns is what a machine
+with other work to do disturbs least; the kernel's share and cold caches are not in it, see `gateway_load`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import struct
+import sys
+import time
+from collections import Counter
+from collections.abc import Callable
+from functools import partial
+from itertools import count
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+sys.path.append(str(Path(__file__).parents[2] / "tests" / "support"))
+
+from gateway_users import COMMON, COMMON_WORDS, WORDS
+from simulated_pumps import FIRST_READING, POLLED, write_plant
+
+from bench.support import tables
+from multidrop import expose_metrics, load_plant
+from multidrop.core import Columns, Counters, Names, Status
+from multidrop.gateway.connections import Connections, Watched
+from multidrop.gateway.gateway import Gateway
+from multidrop.gateway.mbap import ModbusClient, ModbusPort
+from multidrop.gateway.metrics import families_of
+from multidrop.gateway.modbus_server import ModbusServer
+from multidrop.gateway.passing import ModbusSettings
+from multidrop.gateway.settings import ServeSettings
+from multidrop.gateway.views import figures_of
+from multidrop.gateway.web import make_app
+from multidrop.polling.batch import Batch
+from multidrop.transport.statistics import line_statistics
+
+LINES = (8, 8, 8, 7)  # drives on each
+
+
+def as_numbers(data: Any, kind: str) -> memoryview:
+    """Return bytes as numbers of a kind that is known at run time alone."""
+    found: memoryview = data.cast(kind)
+    return found
+
+
+class GivenColumns(Columns):
+    """Columns that no core made."""
+
+    def __init__(self, columns: dict[str, memoryview]) -> None:
+        self._columns = columns
+
+    def __len__(self) -> int:
+        return len(self._columns["time"])
+
+    def array(self, name: str) -> memoryview:
+        return self._columns[name]
+
+
+class FakeTransport(asyncio.Transport):
+    """The network: bytes that are written to it are gone."""
+
+    written = 0
+
+    def get_extra_info(self, name: str, default: Any = None) -> Any:
+        return {"peername": ("127.0.0.1", 1), "sockname": ("127.0.0.1", 2)}.get(name, default)
+
+    def write(self, data: Any) -> None:
+        self.written += len(data)
+
+    def is_closing(self) -> bool:
+        return False
+
+    def pause_reading(self) -> None: ...
+    def resume_reading(self) -> None: ...
+    def close(self) -> None: ...
+
+
+class Worker:
+    """A gateway that does not run, and the kinds of its work, each to be done once for all drives."""
+
+    def __init__(self, folder: Path) -> None:
+        self.plant = load_plant(write_plant(folder, LINES))
+        self.gateway = Gateway(self.plant, ServeSettings(port=0))
+        self.drives = [polled.drive.name for line in self.plant.lines for polled in line.drives]
+        self._names = Names(self.drives), Names(POLLED)
+        self._turns = count(1)
+        self.transport = FakeTransport()
+
+    def take_rows(self) -> None:
+        """Give the hub a row of each register."""
+        turn, drives, registers = next(self._turns), len(self.drives), len(POLLED)
+        codes = [(drive, register) for drive in range(drives) for register in range(registers)]
+        now_ns, size = time.monotonic_ns(), len(codes)
+
+        def column(kind: str, numbers: list[Any]) -> memoryview:
+            return as_numbers(memoryview(struct.pack(f"{size}{kind}", *numbers)), kind)
+
+        rows = {
+            "time": column("q", [1_790_000_000_000_000_000 + turn * 10**8] * size),
+            "sent": column("q", [now_ns] * size),
+            "uncertainty": column("q", [1000] * size),
+            "drive": column("H", [drive for drive, _ in codes]),
+            "reg": column("H", [register for _, register in codes]),
+            "status": column("H", [0] * size),
+            "value": column("d", [float((at + turn) % 30 if at % 10 > 1 else 0) for at in range(size)]),
+            "valid": memoryview(b"\xff" * (size // 8 + 1)),
+        }
+        self.gateway.hub.pass_time(now_ns)
+        self.batch = Batch(GivenColumns(rows), *self._names)
+        self.gateway.hub.take(self.batch)
+
+    # ---- kinds of work ----
+
+    def take_given(self) -> None:
+        self.gateway.hub.take(self.batch)
+
+    def frame(self) -> None:
+        self.gateway.frames._build()
+
+    def events(self) -> None:
+        self.gateway._look_for_events()
+
+    def statistics(self) -> None:
+        """Take a reading of a second's exchanges."""
+        turn = next(self._turns)
+        delays = Counter(dict.fromkeys(range(60, 75), turn))
+        of_drive = Counters(turn, turn, 10 * turn, turn, ideal_ns=turn, missed=Counter({Status.NO_REPLY: 1}))
+        reading = {
+            line.name: line_statistics(
+                float(turn), {p.drive.name: of_drive._replace(delays=delays) for p in line.drives}, None
+            )
+            for line in self.plant.lines
+        }
+        self.gateway.lately.tick(float(turn), turn * 1000, reading)
+
+    def metrics(self) -> None:
+        gateway = self.gateway
+        expose_metrics(families_of(gateway.hub, gateway.lately.newest, figures_of(gateway)), "")
+
+    def masters(self, start: int, words: int) -> Callable[[], None]:
+        """Return what reads these words of all drives."""
+        units = {name: number for number, name in enumerate(self.drives, 1)}
+        gateway, settings = self.gateway, ModbusSettings(units=units)
+        server = ModbusServer(self.plant, gateway.hub, gateway.commands, settings, gateway.ask)
+        client = ModbusClient(ModbusPort(partial(server.serve, ""), lambda address: True, time.monotonic))
+        client.connection_made(self.transport)
+
+        def read() -> None:
+            before = self.transport.written
+            for unit in units.values():
+                client.data_received(struct.pack(">HHHBBHH", unit, 0, 6, unit, 3, start, words))
+                client._drain()  # where it would have let others have their turn
+            assert self.transport.written - before == len(units) * (9 + 2 * words)
+
+        return read
+
+    def viewer(self) -> Callable[[], Any]:
+        """Return what asks for a frame that is there."""
+        from uvicorn import Config
+        from uvicorn.protocols.http.h11_impl import H11Protocol
+        from uvicorn.server import ServerState
+
+        app = Watched(make_app(self.gateway), Connections(time.monotonic))
+        config = Config(app, http="h11", ws="none", lifespan="off", log_config=None, access_log=False)
+        config.load()
+        protocol = H11Protocol(config, ServerState(), {})
+        protocol.connection_made(self.transport)
+
+        async def ask() -> None:
+            before = self.transport.written
+            protocol.data_received(
+                b"GET /api/frame?after=-1 HTTP/1.1\r\nhost: localhost\r\naccept-encoding: gzip\r\n\r\n"
+            )
+            while protocol.tasks:
+                await asyncio.sleep(0)
+            assert self.transport.written - before > 500
+
+        self.gateway.frames._build()
+        return ask
+
+
+WORKS: dict[str, Callable[[Worker], Callable[[], Any]]] = {
+    "310 rows": lambda worker: worker.take_given,
+    "events": lambda worker: worker.events,
+    "a frame": lambda worker: worker.frame,
+    "a frame over HTTP": Worker.viewer,
+    "31 x ten words by Modbus": lambda worker: worker.masters(FIRST_READING, WORDS),
+    "31 x common block by Modbus": lambda worker: worker.masters(COMMON, COMMON_WORDS),
+    "statistics": lambda worker: worker.statistics,
+    "metrics": lambda worker: worker.metrics,
+}
+
+
+async def least_us(name: str, turns: int) -> float:
+    """Return the least CPU time of so many turns."""
+    with TemporaryDirectory() as folder:
+        worker = Worker(Path(folder))
+        act, least = WORKS[name](worker), float("inf")
+        for _ in range(turns):
+            worker.take_rows()
+            worker.gateway.frames._has_news = False
+            begun = time.thread_time()
+            done = act()
+            if asyncio.iscoroutine(done):
+                await done
+            least = min(least, time.thread_time() - begun)
+        worker.gateway.listener.close()
+    return least * 1e6
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--turns", type=int, default=400)
+    arguments = parser.parse_args()
+    tables.heading(f"{sum(LINES)} drives x {len(POLLED)} values: CPU of each work, once; us.")
+    found = [(name, f"{asyncio.run(least_us(name, arguments.turns)):.0f}") for name in WORKS]
+    tables.show(("work", "us"), found)
+
+
+if __name__ == "__main__":
+    main()
