@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Coroutine, Sequence
+from collections.abc import Coroutine, Mapping, Sequence
 from contextlib import suppress
 from enum import StrEnum
 from functools import partial
@@ -39,6 +39,7 @@ _log = logging.getLogger("multidrop.fleet")
 
 GUARD_LOOK_S = 0.02
 STEP_S = 0.05
+TIDY_NS = SECOND // 2  # between looks at all lines of the share, where nothing is known to have changed
 SETTLE_S = 3.0
 HOME_S = 1.0
 CANCEL_S = 0.2
@@ -79,7 +80,7 @@ class Member:
         self._settled_at = 0
         self._is_dirty = True
         self._was_valid = False
-        self._stepped: tuple[bool, bool] | None = None
+        self._stepped: tuple[Any, ...] = ()
 
     # ---- what others ask ----
 
@@ -202,24 +203,26 @@ class Member:
 
     async def step(self) -> None:
         """Do what is to be done now; nothing here waits for a server, but the ending of dead gateways."""
+        observer = self.records.observer
+        present = observer.sessions()
         if not self.lease.is_valid:
             self._was_valid = False
         elif not self._was_valid:
             self._was_valid = True
-            self.records.observer.begin_anew()
-        else:
-            await self.records.observer.end_the_dead()
-        await self._share_out()
-        now = (self._is_settled, self.keeper.may_poll)
+            observer.begin_anew()
+        elif await observer.end_the_dead(present):
+            present = observer.sessions()
+        await self._share_out(present)
+        sessions = tuple((name, value["session"]) for name, value in present.items())
+        now = (self._is_settled, self.keeper.may_poll, sessions, self.lease.clock() // TIDY_NS)
         if self._is_dirty or now != self._stepped:
             self._is_dirty, self._stepped = False, now
             if self.lease.is_valid:
                 self._claim_and_release()
             self.keeper.reconcile()
 
-    async def _share_out(self) -> None:
+    async def _share_out(self, present: Mapping[str, Mapping[str, Any]]) -> None:
         """Make the balance anew where gateways or lines came or went; it takes long: outside of the loop."""
-        present = self.records.observer.sessions()
         gateways = tuple(
             name for name, value in present.items() if not value["draining"] and name != self.name
         )
