@@ -14,7 +14,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -57,21 +57,26 @@ def main() -> None:
     shares = Balance().assign(list(everywhere), [name for group in every for name in group])
     own = [line for line, gateway in shares.items() if gateway == REAL]
 
-    def watch(hall: SerialHall, pid: int) -> Seen:
-        until(lambda: hall.are_polled(2.0), "all lines of the real gateway are polled")
-        time.sleep(SETTLE_S)
-        hall.reset()
-        before, used, begun = hall.requests(), cpu_s_of(pid), time.monotonic()
-        time.sleep(arguments.seconds)
-        seconds = time.monotonic() - begun
-        return Seen(hall.requests() - before, max(hall.gaps().values()), cpu_s_of(pid) - used, seconds)
-
-    def run(words: Sequence[str], watched: Callable[[int], Seen]) -> Seen:
-        with subprocess.Popen(
-            [sys.executable, "-m", "multidrop", *words], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
-        ) as process:
+    def run(words: Sequence[str]) -> Seen:
+        """Poll the lines of `hall` by `multidrop` with these words."""
+        log, command = Path(folder) / "log", [sys.executable, "-m", "multidrop", *words]
+        with (
+            log.open("wb") as output,
+            subprocess.Popen(command, stdout=output, stderr=output) as process,
+        ):
             try:
-                return watched(process.pid)
+
+                def are_polled() -> bool:
+                    assert process.poll() is None, f"multidrop {words[0]} ended: {log.read_text()}"
+                    return hall.are_polled(2.0)
+
+                until(are_polled, "all lines are polled")
+                time.sleep(SETTLE_S)
+                hall.reset()
+                before, used, begun = hall.requests(), cpu_s_of(process.pid), time.monotonic()
+                time.sleep(arguments.seconds)
+                requests, seconds = hall.requests() - before, time.monotonic() - begun
+                return Seen(requests, max(hall.gaps().values()), cpu_s_of(process.pid) - used, seconds)
             finally:
                 process.kill()
 
@@ -79,22 +84,16 @@ def main() -> None:
         hall = SerialHall(len(own), names=own)
         plant = Path(folder) / "plant.toml"
         plant.write_text(hall.plant(arguments.every))
-        alone = ["poll", str(plant), "--out", f"{folder}/alone.arrows"]
-        rows = [("multidrop poll, alone", run(alone, lambda pid: watch(hall, pid)))]
+        rows = [("multidrop poll, alone", run(["poll", str(plant), "--out", f"{folder}/alone.arrows"]))]
         _, real = read_plant(plant)
         with (
             cluster(Path(folder) / "nats") as nats,
             large_fleet(nats, everywhere | real) as fleet,
         ):
-            others = [[name for name in group if name != REAL] for group in every]
+            fleet.start(*[[name for name in group if name != REAL] for group in every])
+            until(lambda: fleet.polled() == arguments.lines, "the others have all lines")
             serve = ["fleet", "serve", REAL, "--folder", f"{folder}/{REAL}", "--nats", ",".join(nats.urls)]
-
-            def among(pid: int) -> Seen:
-                fleet.start(*others)
-                until(lambda: fleet.polled() == arguments.lines - len(own), "the others have their lines")
-                return watch(hall, pid)
-
-            rows.append((f"a gateway among {arguments.gateways}", run(serve, among)))
+            rows.append((f"a gateway among {arguments.gateways}", run(serve)))
         hall.close()
     tables.show(
         ("what polls", "lines", "requests/s", "of what is asked", "longest gap, s", "of a core"),
