@@ -6,7 +6,6 @@ The lines are kept busy by the core's own thread; one thread here tends them all
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -22,14 +21,13 @@ from multidrop.errors import LineError
 from multidrop.plant.model import Plant, PlantLine, PolledDrive
 from multidrop.polling.adoption import GONE, Adoption
 from multidrop.polling.line_set import LineSet
-from multidrop.polling.polled_line import PolledLine
 from multidrop.polling.row_source import RowSource
 from multidrop.toml_check import check_period
 from multidrop.transport import clock
 from multidrop.transport.statistics import LineStatistics
 
-LOOK_S = 0.05  # between looks at the lines, while one of them or a reader of `fileno` needs them
-REST_S = 0.5  # the same, where neither does
+LOOK_NS = 50_000_000  # between looks at the lines, while one of them or a reader of `fileno` needs them
+REST_NS = 500_000_000  # the same, where neither does
 
 
 class Poller(RowSource):
@@ -121,17 +119,19 @@ class Poller(RowSource):
             self._caller.join()
 
     def _poll(self) -> None:
-        called: Iterable[PolledLine] = self._lines
+        look_ns = 0  # when lines that have not called are looked at again: each look costs them all
         while not self._closing:
+            seconds = max(0, look_ns - clock.now_ns()) / 1e9
+            called = self._lines.called(self._row_queue.await_calls(seconds))
+            now = clock.now_ns()
+            if now >= look_ns:
+                restless = [line for line in self._lines if not line.is_steady(now)]
+                called = list(dict.fromkeys([*restless, *called]))
+                look_ns = now + (LOOK_NS if restless or self._is_watched else REST_NS)
             for line in called:
                 line.tend(clock.now_ns())
             if self._is_watched and self._row_queue.chunks:
                 self._wakeup.set()
-            now = clock.now_ns()
-            restless = [line for line in self._lines if not line.is_steady(now)]
-            seconds = LOOK_S if restless or self._is_watched else REST_S
-            lines = self._lines.called(self._row_queue.await_calls(seconds))
-            called = dict.fromkeys([*restless, *lines])
 
     # ---- lines and drives ----
 

@@ -30,6 +30,7 @@ from multidrop.plant.model import PlantLine, PolledDrive
 from multidrop.poller import Poller
 from multidrop.polling import line_set
 from multidrop.polling.batch import Row
+from multidrop.polling.polled_line import PolledLine
 from multidrop.sim import EncodedDrive, Faults, SimulatedDrive, Simulator, Wire, simulated
 from multidrop.transport import clock
 
@@ -250,6 +251,29 @@ def test_many_lines_at_once() -> None:
     assert polling.statuses().keys() <= {"ok"} | HOST_LATE
     polling.check_summary()
     assert list(polling.poller.summary()["lines"]) == [f"drive-{at}" for at in range(1, 17)]
+
+
+def test_a_call_of_one_line_costs_the_others_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Lines with a rate are looked at every 50 ms, however often any of them calls."""
+    looks: list[int] = []
+    is_steady = PolledLine.is_steady
+
+    def noted(polled_line: PolledLine, now_ns: int) -> bool:
+        looks.append(now_ns)
+        return is_steady(polled_line, now_ns)
+
+    monkeypatch.setattr(PolledLine, "is_steady", noted)
+    with Simulator([Wire([EncodedDrive(Quick(at))], unpaced=True) for at in range(1, 17)]) as sim:
+        drives = [polled(Quick(at, name=f"drive-{at}"), READINGS[:1], 0.02) for at in range(1, 17)]
+        lines = [
+            line(wire.path, each, name=each.drive.name) for wire, each in zip(sim.wires, drives, strict=True)
+        ]
+        begun = clock.now_ns()
+        with Polling(*lines) as polling:
+            for each in drives:
+                polling.until("ok", 10, each.drive.name)
+        seconds = (clock.now_ns() - begun) / 1e9
+    assert len(looks) <= len(lines) * (seconds * 1e9 / poller_module.LOOK_NS + 2)
 
 
 def test_commands_go_ahead_while_the_line_is_polled(port: str, pump: SimulatedDrive) -> None:

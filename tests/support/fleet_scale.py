@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import os
 import subprocess
 import sys
 import threading
@@ -60,6 +61,9 @@ class MemberProcess:
         until(lambda: len(self.polled) == len(self.gateways), "a process answers")
         return self.polled
 
+    def cpu_s(self) -> float:
+        return cpu_s_of(self._process.pid)
+
     def is_alive(self) -> bool:
         return self._process.poll() is None
 
@@ -67,6 +71,12 @@ class MemberProcess:
         self._process.kill()
         self._process.wait()
         self._reader.join()
+
+
+def cpu_s_of(pid: int) -> float:
+    """Return the CPU time (s) that a process has used."""
+    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
 def until(condition: Callable[[], bool], what: str) -> None:
@@ -98,6 +108,11 @@ class LargeFleet:
         self.processes += started
         until(lambda: all(process.is_ready for process in started), "the processes are ready")
         return time.monotonic()
+
+    def cpu_s(self) -> float:
+        """Return the CPU time (s) of its gateways and servers."""
+        servers = sum(cpu_s_of(node.process.pid) for node in self.nats.nodes)
+        return servers + sum(process.cpu_s() for process in self.processes)
 
     def polled(self) -> int:
         return sum(sum(process.counts.values()) for process in self.processes)
@@ -132,11 +147,15 @@ class LargeFleet:
             process.kill()
 
 
+def nowhere(lines: int) -> dict[str, Any]:
+    """Return a plant of so many lines that are not there."""
+    return {f"line-{at}": {"line": {"name": f"line-{at}"}, "files": {}} for at in range(lines)}
+
+
 @contextmanager
-def large_fleet(nats: Cluster, lines: int) -> Iterator[LargeFleet]:
-    """Return a fleet with a plant of so many lines, and no gateway yet."""
-    described = {f"line-{at}": {"line": {"name": f"line-{at}"}, "files": {}} for at in range(lines)}
-    fleet = LargeFleet(nats, described)
+def large_fleet(nats: Cluster, lines: dict[str, Any]) -> Iterator[LargeFleet]:
+    """Return a fleet with this plant, and no gateway yet."""
+    fleet = LargeFleet(nats, lines)
     try:
         yield fleet
     finally:

@@ -11,6 +11,7 @@ import socket
 import struct
 import threading
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 REQUEST = 8  # bytes of a Modbus RTU read
@@ -45,7 +46,7 @@ class SerialHall:
     So its motors stand. A line whose name is in `refusing` takes no write.
     """
 
-    def __init__(self, number: int, host: str = "127.0.0.1") -> None:
+    def __init__(self, number: int, host: str = "127.0.0.1", names: Sequence[str] = ()) -> None:
         self._selector = selectors.DefaultSelector()
         self.lines: dict[str, LineSeen] = {}
         self._buffers: dict[socket.socket, tuple[LineSeen, int, bytearray]] = {}
@@ -58,7 +59,7 @@ class SerialHall:
         for at in range(number):
             listener = socket.create_server((host, 0))
             listener.setblocking(False)
-            line = LineSeen(f"line-{at}", listener.getsockname()[1])
+            line = LineSeen(names[at] if names else f"line-{at}", listener.getsockname()[1])
             self.lines[line.name] = line
             self._selector.register(listener, selectors.EVENT_READ, line)
             self._listeners.append(listener)
@@ -85,6 +86,10 @@ class SerialHall:
     def overlaps(self) -> int:
         with self._lock:
             return sum(line.overlaps for line in self.lines.values())
+
+    def requests(self) -> int:
+        with self._lock:
+            return sum(line.requests for line in self.lines.values())
 
     def gaps(self) -> dict[str, float]:
         """Return the longest gap of each line (s), the present one included."""

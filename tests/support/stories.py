@@ -92,7 +92,7 @@ class Story:
         """
         cost = sum(drive.response_timeout for drive in self.drives) / 2  # and rarely more
         longest = max(back_off.LONGEST_REST_NS / S, cost / back_off.SILENT_SHARE)
-        longest += Faults().away + polled_line.REOPEN_NS / S + poller.LOOK_S
+        longest += Faults().away + polled_line.REOPEN_NS / S + poller.LOOK_NS / S
         ended = self.clocked.now
         asked: dict[str, int] = {}
         while len(asked) < len(self.drives):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import resource
 import shutil
 import socket
 import subprocess
@@ -11,7 +12,7 @@ import threading
 import time
 import tracemalloc
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from itertools import count, pairwise
 from pathlib import Path
 
@@ -391,3 +392,29 @@ def test_a_port_that_was_never_opened_is_closed_without_a_word() -> None:
     port = SocketPort()
     port.close()
     assert not port.is_open
+
+
+def test_a_port_opens_whatever_the_number_of_its_descriptor() -> None:
+    """Hundreds of lines take more than the 1024 that select() bears."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    if hard != resource.RLIM_INFINITY and hard < 1400:
+        pytest.skip("this system gives a process fewer than 1400 descriptors")
+    resource.setrlimit(resource.RLIMIT_NOFILE, (max(soft, 1400), hard))
+    with ExitStack() as stack:
+        stack.callback(resource.setrlimit, resource.RLIMIT_NOFILE, (soft, hard))
+        listener = stack.enter_context(socket.create_server(("127.0.0.1", 0)))
+        for _ in range(1100):
+            stack.callback(os.close, os.dup(listener.fileno()))
+        port = SocketPort(f"socket://127.0.0.1:{listener.getsockname()[1]}")
+        stack.callback(port.close)
+        assert port.fileno() > 1023
+        far, _ = listener.accept()
+        stack.callback(far.close)
+        far.sendall(b"of before")
+        assert port._socket is not None
+        port._socket.setblocking(True)
+        assert port._socket.recv(1, socket.MSG_PEEK) == b"o"
+        port._socket.setblocking(False)
+        port.reset_input_buffer()
+        with pytest.raises(BlockingIOError):
+            port._socket.recv(1)

@@ -23,6 +23,7 @@ class Balance:
     def __init__(self) -> None:
         self._gateways: list[str] = []  # by number
         self._ranks: dict[str, list[int]] = {}  # of each line, the best one last
+        self._hashes: dict[str, int] = {}  # of each line
 
     def assign(self, lines: Sequence[str], gateways: Sequence[str]) -> dict[str, str]:
         """Return the gateway of each line; empty where there is no gateway."""
@@ -46,6 +47,7 @@ class Balance:
             self._gateways, self._ranks = [], {}
         if len(self._ranks) > len(lines):
             self._ranks = {line: self._ranks[line] for line in lines if line in self._ranks}
+            self._hashes = {line: self._hashes[line] for line in self._ranks}
 
     def _weigh(self, lines: Sequence[str], gateways: Sequence[str]) -> None:
         known = set(self._gateways)
@@ -56,7 +58,7 @@ class Balance:
         for line in lines:
             rank = self._ranks.setdefault(line, [])
             if news := new_ones if rank else all_of_them:
-                own = _hash(line)
+                own = self._hashes.get(line) or self._hashes.setdefault(line, _hash(line))
                 rank += [((own ^ other) * _MIXER & _WEIGHT) | number for other, number in news]
                 rank.sort()
         self._gateways += came

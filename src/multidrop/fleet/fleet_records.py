@@ -22,7 +22,10 @@ LEASES_S = 0.1  # the same of leases: how long a dead gateway's lines stay silen
 
 
 class FleetRecords:
-    """The records of all buckets, as far as they were read; `on_change` is called when some have changed."""
+    """The records of all buckets, as far as they were read.
+
+    `on_change` is called when some of lines or their masters have changed. Leases change all the time.
+    """
 
     def __init__(
         self, me: str, path: Callable[[], ServerPath], terms: Terms, on_change: Callable[[], object]
@@ -89,7 +92,7 @@ class FleetRecords:
             await rest()
 
     async def _look(self, name: str) -> None:
-        if await self._looks[name]() or name not in self._read:
+        if (await self._looks[name]() and name not in names.LEASES) or name not in self._read:
             self._on_change()
         self._read.add(name)
         if len(self._read) == len(names.BUCKETS):

@@ -39,7 +39,9 @@ _log = logging.getLogger("multidrop.fleet")
 
 GUARD_LOOK_S = 0.02
 STEP_S = 0.05
+TIDY_NS = SECOND // 2  # between looks at all lines of the share, where nothing is known to have changed
 SETTLE_S = 3.0
+QUIET_NS = SECOND // 2  # without a gateway that comes or goes, before shares are made anew while we settle
 HOME_S = 1.0
 CANCEL_S = 0.2
 
@@ -75,11 +77,13 @@ class Member:
         self.wanted: dict[str, str] = {}  # each line's gateway, by the balance
         self._share: set[str] = set()  # the lines that should be ours
         self._balance = Balance()
-        self._balanced: tuple[Any, ...] = ()
+        self._balanced: tuple[Any, ...] = ()  # gateways and lines
+        self._seen: tuple[Any, ...] = ()  # the same, newest
+        self._seen_at = 0
         self._settled_at = 0
         self._is_dirty = True
         self._was_valid = False
-        self._stepped: tuple[bool, bool] | None = None
+        self._stepped: tuple[Any, ...] = ()
 
     # ---- what others ask ----
 
@@ -99,6 +103,11 @@ class Member:
     @property
     def _is_settled(self) -> bool:
         return self.lease.clock() >= self._settled_at
+
+    @property
+    def _is_settling_down(self) -> bool:
+        """Say whether other gateways may come one after the other, as in a cold start."""
+        return bool(self._balanced) and not self._is_settled
 
     def _path(self, number: int) -> ServerPath:
         return self.paths[number]
@@ -159,6 +168,7 @@ class Member:
                 await self.records.complete()  # of a large plant this takes seconds, in which no lease runs
                 await self.lease.begin()
                 self._settled_at = self.lease.clock() + int(SETTLE_S * SECOND)
+                self._balanced = ()
                 self._is_dirty = True
                 _log.info("%s: session %d began", self.name, self.lease.session)
             elif self.lease.is_over:
@@ -194,37 +204,42 @@ class Member:
 
     async def step(self) -> None:
         """Do what is to be done now; nothing here waits for a server, but the ending of dead gateways."""
+        observer = self.records.observer
+        present = observer.sessions()
         if not self.lease.is_valid:
             self._was_valid = False
         elif not self._was_valid:
             self._was_valid = True
-            self.records.observer.begin_anew()
-        else:
-            await self.records.observer.end_the_dead()
-        await self._share_out()
-        now = (self._is_settled, self.keeper.may_poll)
+            observer.begin_anew()
+        elif await observer.end_the_dead(present):
+            present = observer.sessions()
+        await self._share_out(present)
+        sessions = tuple((name, value["session"]) for name, value in present.items())
+        now = (self._is_settled, self.keeper.may_poll, sessions, self.lease.clock() // TIDY_NS)
         if self._is_dirty or now != self._stepped:
             self._is_dirty, self._stepped = False, now
             if self.lease.is_valid:
                 self._claim_and_release()
             self.keeper.reconcile()
 
-    async def _share_out(self) -> None:
+    async def _share_out(self, present: Mapping[str, Mapping[str, Any]]) -> None:
         """Make the balance anew where gateways or lines came or went; it takes long: outside of the loop."""
-        present = self.records.observer.sessions()
         gateways = tuple(
             name for name, value in present.items() if not value["draining"] and name != self.name
         )
         if not self.is_draining and self.lease.session:
             gateways = tuple(sorted((*gateways, self.name)))
         lines = self.records.lines()
-        if (gateways, lines) == self._balanced:
+        now, wanted = self.lease.clock(), (gateways, lines)
+        if wanted != self._seen:
+            self._seen, self._seen_at = wanted, now
+        if wanted == self._balanced or (self._is_settling_down and now - self._seen_at < QUIET_NS):
             return
         loop = asyncio.get_running_loop()
         self.wanted = await loop.run_in_executor(None, self._balance.assign, lines, gateways)
         self._share = {line for line, gateway in self.wanted.items() if gateway == self.name}
         self.records.want(self._share)
-        self._balanced, self._is_dirty = (gateways, lines), True
+        self._balanced, self._is_dirty = wanted, True
 
     def _claim_and_release(self) -> None:
         me = (self.name, self.lease.session)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from typing import Any
 
@@ -99,11 +99,14 @@ class Observer:
 
     # ---- dead gateways ----
 
-    def dead(self) -> dict[str, dict[int, Record]]:
-        """Return who may be ended, with the very records that were watched for so long, by path."""
+    def dead(self, present: Iterable[str] | None = None) -> dict[str, dict[int, Record]]:
+        """Return who may be ended, with the very records that were watched for so long, by path.
+
+        `present` are the names in `sessions`, where the caller has just asked for them.
+        """
         now = self._clock()
         found = {}
-        for name in self.sessions():
+        for name in self.sessions() if present is None else present:
             if name == self.me:
                 continue
             stale = {
@@ -123,14 +126,19 @@ class Observer:
             and lease_rules.is_stale(watched, now, self.terms)
         )
 
-    async def end_the_dead(self) -> None:
-        """End the sessions that nobody renews: each record at the revision that was judged, or not at all."""
-        for name, records in self.dead().items():
+    async def end_the_dead(self, present: Iterable[str] | None = None) -> bool:
+        """End the sessions that nobody renews: each record at the revision that was judged, or not at all.
+
+        Return True where one was ended.
+        """
+        before = self.ended
+        for name, records in self.dead(present).items():
             session = max(record.value["session"] for record in records.values())
             done = await asyncio.gather(*(self._end(path, record) for path, record in records.items()))
             if any(done):
                 self.ended += 1
                 _log.warning("session %d of %s has run out; ended by %s", session, name, self.me)
+        return self.ended > before
 
     async def _end(self, path: int, record: Record) -> bool:
         value = {**record.value, "ended": True, "by": self.me}

@@ -20,3 +20,9 @@ class SocketPort(Serial):
             with suppress(OSError):  # it may have ended already
                 connection.shutdown(socket.SHUT_RDWR)
             connection.close()
+
+    def reset_input_buffer(self) -> None:
+        """Discard what has come; pyserial asks `select` for it, which bears no descriptor above 1023."""
+        with suppress(BlockingIOError):
+            while self._socket and self._socket.recv(4096):
+                pass
