@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -267,6 +268,23 @@ def test_a_child_that_fails_is_told_and_tried_again(
     until(lambda: len(parquet_files(tmp_path / "rows")) == 1)
     with History(tmp_path) as history:
         assert sorted(rows_in(history)) == sorted(rows)
+
+
+def test_a_child_may_say_any_bytes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    program = tmp_path / "python"
+    program.write_text("#!/bin/sh\nprintf 'no \\377 file' >&2\nexit 1\n", "utf-8")
+    program.chmod(0o755)
+    monkeypatch.setattr(sys, "executable", str(program))
+    compactor = writer_module.Compactor(tmp_path)
+    compactor.is_possible = True
+
+    def is_told() -> bool:
+        compactor.tend(1)
+        return "compaction ended with 1: no \ufffd file" in caplog.text
+
+    until(is_told)
 
 
 def test_names_of_files() -> None:

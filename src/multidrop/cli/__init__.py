@@ -90,9 +90,10 @@ def main(argv: Sequence[str] | None = None) -> int:
 
         print(f"multidrop {version('multidrop')}")
         return DONE
-    from multidrop.cli.support.output import logging_to, warn
+    from multidrop.cli.support.output import logging_to, spell_out_unencodable, warn
     from multidrop.cli.support.signals import sigterm_interrupts
 
+    spell_out_unencodable()
     with sigterm_interrupts(), logging_to(warn, "multidrop.drives.registry", logging.INFO):
         return _guarded(words[0], words[1:])
 

@@ -75,7 +75,7 @@ class LifeLock:
 def machine_id() -> str:
     """Return this machine's own id; "" where it has none, which proves nothing."""
     with suppress(OSError):
-        return Path("/etc/machine-id").read_text().strip()
+        return Path("/etc/machine-id").read_text("utf-8", "replace").strip()
     return ""
 
 

@@ -11,7 +11,7 @@ import threading
 import time
 from contextlib import suppress
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from multidrop.history.folder import STEM, listing, stored_files
 from multidrop.polling.batch import Batch
@@ -189,10 +189,14 @@ class Compactor:
             self._child = None
         if self._child or not self.is_possible or below <= self._done or clock.now_ns() < self._not_before_ns:
             return
-        words = [sys.executable, "-m", "multidrop.history.compact", str(self._folder), "--below", str(below)]
+        program = [sys.executable, "-X", "utf8", "-m", "multidrop.history.compact"]
+        told: dict[str, Any] = {"stderr": subprocess.PIPE, "encoding": "utf-8", "errors": "replace"}
         try:
             self._child = subprocess.Popen(
-                words, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
+                [*program, str(self._folder), "--below", str(below)],
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,
+                **told,
             )
             self._below = below
         except OSError as failure:

@@ -79,7 +79,7 @@ def _usb_device(tty: Path) -> Path | None:
 
 def _text(path: Path) -> str:
     try:
-        return path.read_text().strip()
+        return path.read_text("utf-8", "replace").strip()
     except OSError:
         return ""
 

@@ -68,7 +68,7 @@ def start_motors(line: PlantLine, ledger: Path) -> None:
 @contextmanager
 def simulator(plant: Path, ports: Path) -> Iterator[None]:
     """Simulate in another process, which ends with this one: the two sides do not share an interpreter."""
-    words = [sys.executable, "-m", __name__, str(plant)]
+    words = [sys.executable, "-X", "utf8", "-m", __name__, str(plant)]
     if hasattr(os, "openpty"):
         words += ["--ports", str(ports)]
     pipe = subprocess.PIPE
@@ -76,7 +76,7 @@ def simulator(plant: Path, ports: Path) -> Iterator[None]:
     apart: dict[str, Any] = {"start_new_session": True}
     if sys.platform == "win32":
         apart = {"creationflags": subprocess.CREATE_NEW_PROCESS_GROUP}
-    with subprocess.Popen(words, stdin=pipe, stdout=pipe, text=True, **apart) as process:
+    with subprocess.Popen(words, stdin=pipe, stdout=pipe, encoding="utf-8", **apart) as process:
         assert process.stdin is not None
         assert process.stdout is not None
         try:

@@ -6,9 +6,16 @@ import logging
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from io import TextIOWrapper
 from typing import TextIO
 
 from multidrop.printable import printable
+
+
+def spell_out_unencodable() -> None:
+    """Let stdout spell out what its encoding lacks, as stderr does: a pipe on Windows has few letters."""
+    if isinstance(sys.stdout, TextIOWrapper):
+        sys.stdout.reconfigure(errors="backslashreplace")
 
 
 def print_text(text: object, *, file: TextIO | None = None, flush: bool = False) -> None:

@@ -27,13 +27,13 @@ class Children:
     def start(self, name: str, *words: str) -> subprocess.Popen[str]:
         """Start a program; what it says on stderr stands in its log."""
         guard = [sys.executable, "-I", "-S", str(dying_child.__file__), str(os.getpid())]
-        with self._log(name).open("a") as log:
+        with self._log(name).open("ab") as log:
             self._running[name] = subprocess.Popen(
                 [*guard, *words],
                 stdout=subprocess.PIPE,
                 stderr=log,
                 env=self._environment,
-                text=True,
+                encoding="utf-8",
                 start_new_session=True,
             )
         return self._running[name]

@@ -117,7 +117,7 @@ class Demo:
         self._urls = ",".join(urls)
         note(f"three NATS servers of this machine are ready, in {self._folder}")
         plant = self._folder / "plant.toml"
-        plant.write_text(plant_file(json.loads(await_line(simulator) or "{}")))
+        plant.write_text(plant_file(json.loads(await_line(simulator) or "{}")), "utf-8")
         children.run_multidrop("init", "fleet", "init", str(plant), "--nats", self._urls)
         note(f"`fleet init` has stored {LINES} lines of {DRIVES} simulated drives each")
         for gateway in GATEWAYS:

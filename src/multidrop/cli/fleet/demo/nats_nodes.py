@@ -56,10 +56,10 @@ def _programs() -> Iterator[str]:
 def version_of(program: str) -> tuple[int, int]:
     """Return the version that a nats-server says; (0, 0) for what is none."""
     try:
-        said = subprocess.run([program, "--version"], capture_output=True, text=True, check=False).stdout
+        said = subprocess.run([program, "--version"], capture_output=True, check=False).stdout
     except OSError:
         return 0, 0
-    found = re.search(r"v?(\d+)\.(\d+)\.", said)
+    found = re.search(rb"v?(\d+)\.(\d+)\.", said)
     return (int(found[1]), int(found[2])) if found else (0, 0)
 
 
@@ -80,7 +80,8 @@ def start_nodes(children: Children, folder: Path, program: str) -> list[str]:
                     cluster=f"demo-{os.getpid()}",
                     route=route,
                     routes=others,
-                )
+                ),
+                "utf-8",
             )
             children.start(name, program, "-c", str(path), "-l", str(folder / f"{name}.nats.log"))
         if _are_ready(children, names, monitors):

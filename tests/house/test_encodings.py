@@ -1,0 +1,71 @@
+"""Every text file and pipe of the package says its encoding: on Windows it would be the console's."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+import multidrop
+
+SOURCE = Path(multidrop.__file__).parent
+TEXT_MODES = frozenset("rwaxt+")
+
+
+def lacks_encoding(call: ast.Call) -> bool:
+    """Look for it where each call has it. `x.open()` without a mode may open anything, and counts as none."""
+    name = ast.unparse(call.func)
+    options = {keyword.arg for keyword in call.keywords}
+    modes = {
+        mode.value for mode in call.args if isinstance(mode, ast.Constant) and isinstance(mode.value, str)
+    }
+    if "encoding" in options:
+        return False
+    if name.endswith(".read_text"):
+        return not call.args
+    if name.endswith(".write_text"):
+        return len(call.args) < 2
+    if name in ("open", "os.fdopen"):
+        return not any("b" in mode for mode in modes)
+    is_text = name.endswith(".open") and any(mode and set(mode) <= TEXT_MODES for mode in modes)
+    return is_text or not options.isdisjoint({"text", "universal_newlines"})
+
+
+def lacking(source: str) -> Iterator[int]:
+    """Return the lines of the calls that open a text and do not say its encoding."""
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Call) and lacks_encoding(node):
+            yield node.lineno
+
+
+def test_every_text_that_is_opened_says_its_encoding() -> None:
+    found = [
+        f"{path.relative_to(SOURCE)}:{line}"
+        for path in sorted(SOURCE.rglob("*.py"))
+        for line in lacking(path.read_text("utf-8"))
+    ]
+    assert found == []
+
+
+@pytest.mark.parametrize(
+    "call",
+    ["p.read_text()", "p.write_text(text)", "open(name)", 'p.open("w")', "subprocess.run([], text=True)"],
+)
+def test_a_call_without_one_is_found(call: str) -> None:
+    assert list(lacking(call)) == [1]
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        'p.read_text("utf-8")',
+        'open(name, "rb")',
+        "os.open(name, 0)",
+        "port.open()",
+        'p.open("w", encoding=e)',
+    ],
+)
+def test_a_call_with_one_is_not(call: str) -> None:
+    assert list(lacking(call)) == []
