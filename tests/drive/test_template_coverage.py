@@ -216,7 +216,7 @@ def test_the_script_prints_its_tables(tmp_path: Path) -> None:
     assert "templates, whole 1 0 0.0%" in lines
     assert f"entries, as they are {whole} {len(HELD)} {len(HELD) / whole:.1%}" in lines
     assert "its register type press_counter has no table 1 1" in lines
-    assert lines[-1].startswith(f"not read: {tmp_path}/b.json: ")
+    assert lines[-1].startswith(f"not read: {tmp_path / 'b.json'}: ")
 
 
 @pytest.mark.parametrize(("folder", "sentence"), [("none", "is no folder"), (".", "has no template")])

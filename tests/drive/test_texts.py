@@ -9,6 +9,7 @@ import pytest
 from commands import Run
 from hypothesis import given
 from hypothesis import strategies as st
+from lines import ANY_PORT
 from simulated_bus import SimulatedBus
 
 from multidrop.core import Message
@@ -159,7 +160,7 @@ def test_the_command_line_prints_texts_and_what_has_no_value(run: Run, tmp_path:
     exec(METER, namespace)
     sim = SimulatedDrive(namespace["Meter"](1))
     sim["level"], sim["speed"], sim["serial"] = None, 1440, "EM3-0042"
-    with Simulator([Wire([sim], unpaced=True)]) as simulator:
+    with Simulator([Wire([sim], port=ANY_PORT, unpaced=True)]) as simulator:
         port = simulator.wires[0].path
         status, out, _ = run("read", port, model, 1)
         assert (status, out) == (0, "level        no valid value\nspeed  1440  rpm\nserial  EM3-0042\n")

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 from commands import Run
 from families import Meter, write_meter
+from lines import ANY_PORT
 from simulated_bus import SimulatedBus
 
 from multidrop import INPUT, Bus, Drive, Refused, load_family, load_plant, open_reader
@@ -95,7 +96,7 @@ def test_values_are_those_of_a_class(plant: Path) -> None:
         drive = simulated(family(1))
         for name, value in (("voltage", 230.5), ("power", -12.3), ("energy", 123456), ("alarms", 9)):
             drive[name] = value
-        with Simulator([Wire([drive], unpaced=True)]) as line, Bus(line.wires[0].path) as bus:
+        with Simulator([Wire([drive], port=ANY_PORT, unpaced=True)]) as line, Bus(line.wires[0].path) as bus:
             meter = bus.attach(family, address=1)
             found.append({each.name: float(bus.read(meter, each)) for each in meter.readings()})
     assert found[0] == found[1]
@@ -148,7 +149,8 @@ def test_a_file_that_could_move_a_motor_writes_nothing_unconfirmed(
     pump: type[Drive], name: str, value: str
 ) -> None:
     """Nor what it calls harmless: without a stop verb nobody has held that against anything."""
-    with Simulator([Wire([simulated(pump(2))], unpaced=True)]) as line, Bus(line.wires[0].path) as bus:
+    wire = Wire([simulated(pump(2))], port=ANY_PORT, unpaced=True)
+    with Simulator([wire]) as line, Bus(wire.path) as bus:
         drive = bus.attach(pump, address=2)
         with pytest.raises(Refused, match=r"`multidrop check pump\.toml`") as refused:
             bus.write(drive, drive.register(name), drive.register(name).parse(value))
@@ -173,7 +175,8 @@ def test_an_unconfirmed_file_broadcasts_nothing(tmp_path: Path, monkeypatch: pyt
 
 
 def test_a_confirmed_one_is_written_to(pump: type[Drive]) -> None:
-    with Simulator([Wire([simulated(pump(2))], unpaced=True)]) as line, Bus(line.wires[0].path) as bus:
+    wire = Wire([simulated(pump(2))], port=ANY_PORT, unpaced=True)
+    with Simulator([wire]) as line, Bus(wire.path) as bus:
         drive = bus.attach(pump, address=2, confirmed=1)
         assert bus.write(drive, drive.register("ramp"), 5.0) == 5.0
         with pytest.raises(Refused, match="on commands the motor"):
@@ -207,7 +210,7 @@ def test_files_of_one_name_have_wear_of_their_own(plant: Path) -> None:
     both = [load_family(folder / "pump.toml") for folder in (plant.parent / "families", other)]
     for family in both:
         with (
-            Simulator([Wire([simulated(family(2))], unpaced=True)]) as line,
+            Simulator([Wire([simulated(family(2))], port=ANY_PORT, unpaced=True)]) as line,
             Bus(line.wires[0].path, ledger=ledger) as bus,
         ):
             drive = bus.attach(family, address=2, confirmed=1)

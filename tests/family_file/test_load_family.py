@@ -32,7 +32,7 @@ def mistakes(folder: Path, text: str) -> list[str]:
     with pytest.raises(FamilyError) as wrong:
         family(folder, text)
     assert str(wrong.value) == "\n".join(wrong.value.mistakes)
-    return [mistake.removeprefix(f"{folder}/") for mistake in wrong.value.mistakes]
+    return [mistake.removeprefix(f"{folder}{os.sep}") for mistake in wrong.value.mistakes]
 
 
 def facts(register: Register[Any]) -> dict[str, Any]:
@@ -204,7 +204,7 @@ def test_more_than_twenty_mistakes_are_told_in_one_run(tmp_path: Path) -> None:
     path.write_text(TWENTY)
     with pytest.raises(FamilyError) as wrong:
         load_family(path)
-    assert [mistake.removeprefix(f"{tmp_path}/") for mistake in wrong.value.mistakes] == TOLD
+    assert [mistake.removeprefix(f"{tmp_path}{os.sep}") for mistake in wrong.value.mistakes] == TOLD
     assert len(TOLD) > 20
 
 
@@ -309,6 +309,9 @@ def test_mistakes_of_verbs_are_told_beside_those_of_a_register(tmp_path: Path) -
         (HEAD + "registers = ['/etc/passwd']\n", ["registers has '/etc/passwd', which is no CSV file"]),
         (HEAD + "registers = ['/etc/x.csv']\n", ["a CSV file is beside the family's, or below it"]),
         (HEAD + "registers = ['../x.csv']\n", ["a CSV file is beside the family's, or below it"]),
+        (HEAD + r"registers = ['C:\x.csv']" + "\n", ["a CSV file is beside the family's, or below it"]),
+        (HEAD + r"registers = ['C:x.csv']" + "\n", ["a CSV file is beside the family's, or below it"]),
+        (HEAD + r"registers = ['..\x.csv']" + "\n", ["a CSV file is beside the family's, or below it"]),
         (HEAD + "registers = ['x.csv']\n", ['registers = ["x.csv"]: there is no such file']),
         ("family = 3\n", ["[family]: 3 is not a table with title"]),
         ("family = 3\nreading = 4\n", ["[reading] is no table"]),

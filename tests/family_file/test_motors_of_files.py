@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 from commands import Run
 from declared_families import FAMILIES, NAMES, class_of, document_of
+from lines import ANY_PORT
 from simulated_bus import one
 
 from multidrop import Bus, Condition, Direction, FamilyError, Refused, load_family, load_plant
@@ -71,7 +72,8 @@ def test_a_file_is_the_class_that_these_tests_make(name: str) -> None:
 
 def test_a_plant_s_motor_is_started_and_stopped(plant: Path) -> None:
     lines, sims = load_plant(plant).lines, sims_of(plant)
-    with Simulator([Wire(sims, unpaced=True)]) as line, Bus(line.wires[0].path, expiry=30) as bus:
+    wire = Wire(sims, port=ANY_PORT, unpaced=True)
+    with Simulator([wire]), Bus(wire.path, expiry=30) as bus:
         first, second = (bus.attach(polled.drive) for polled in lines[0].drives)
         first.set_frequency(20)
         first.start()

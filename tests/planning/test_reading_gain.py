@@ -25,7 +25,7 @@ port = "/dev/ttyUSB0"
 
 [[line.drive]]
 name = "meter-1"
-model = "{SUPPORT / "meter.py"}:Meter"
+model = '{SUPPORT / "meter.py"}:Meter'
 address = 1
 baudrate = 9600
 format = "8N1"

@@ -94,7 +94,7 @@ def load(tmp_path: Path) -> Load:
 
     def load(text: str) -> Plant:
         path = tmp_path / "plant.toml"
-        path.write_text(text)
+        path.write_text(text, "utf-8")
         return load_plant(path)
 
     return load
@@ -445,7 +445,7 @@ def test_a_sentence_stays_one_line_whatever_the_names(mistakes: Mistakes) -> Non
 
 def test_a_model_s_file_whose_name_is_too_long_is_a_sentence(mistakes: Mistakes) -> None:
     (sentence,) = mistakes(HEAD + TOY.replace("family.py:Toy", "a" * 300 + ".py"))
-    assert sentence.endswith(".py: File name too long")
+    assert sentence.endswith((".py: File name too long", ".py to take a model from"))  # the latter on Windows
 
 
 @pytest.mark.parametrize(

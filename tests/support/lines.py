@@ -21,6 +21,7 @@ from multidrop.poller import Poller
 from multidrop.polling.batch import Row
 from multidrop.sim import SimulatedDrive, Simulator, Wire, proof, serve
 
+ANY_PORT = "socket://127.0.0.1:0"  # for lines that are simulated where there are no pseudo-terminals, too
 PATIENCE = 120.0  # s, for what comes at once but on a machine that has much else to do
 # What a machine that has much else to do may add to what a test is about.
 HOST_LATE = {

@@ -8,7 +8,7 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Iterator
-from pathlib import Path
+from pathlib import Path, PureWindowsPath
 from typing import Any
 
 from multidrop.drive.register import Access
@@ -120,6 +120,7 @@ def beside(path: Path, name: Any) -> Path:
         raise ValueError(
             f'registers has {shown(name)}, which is no CSV file; write registers = ["meter.csv"]'
         )
-    if Path(name).is_absolute() or ".." in Path(name).parts or not name.isprintable():
+    place = PureWindowsPath(name)  # which knows the roots of all systems, and both separators
+    if place.anchor or ".." in place.parts or not name.isprintable():
         raise ValueError(f"registers has {shown(name)}; a CSV file is beside the family's, or below it")
     return path.parent / name
