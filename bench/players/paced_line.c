@@ -45,7 +45,8 @@ struct samples {
 static struct samples lateness, excess;
 static int64_t settled_ns, first_ns, last_ns; /* of requests: counted from, first, last */
 static int64_t pending_ideal_ns, ideal_ns;
-static long answered, unanswered, early, refused, per_drive[MOST_DRIVES + 1];
+static long answered, unanswered, early, given_up, refused, per_drive[MOST_DRIVES + 1];
+static int is_crossed; /* a request came before the reply to the one before was over */
 
 static void add(struct samples *samples, int64_t sample)
 {
@@ -92,9 +93,8 @@ static void print_report(void)
         }
     double span = (double)(last_ns - first_ns), ideal = (double)ideal_ns;
     double cycles = drives ? (double)counted / (double)drives : 1;
-    printf("}, \"seconds\": %.3f, \"answered\": %ld, \"unanswered\": %ld, \"early\": %ld, \"refused\": %ld, ",
-           span / 1e9,
-           answered, unanswered, early, refused);
+    printf("}, \"seconds\": %.3f, \"answered\": %ld, \"unanswered\": %ld, \"early\": %ld, \"given_up\": %ld, \"refused\": %ld, ",
+           span / 1e9, answered, unanswered, early, given_up, refused);
     printf("\"ideal_cycle_ms\": %.4f, \"cycle_ms\": %.4f, \"utilisation\": %.5f, ", ideal / cycles / 1e6,
            span / cycles / 1e6, span > 0 ? ideal / span : 0);
     print_percentiles("lateness_us", &lateness);
@@ -168,6 +168,12 @@ static size_t make_reply(const uint8_t *request, uint8_t *out)
     return len + (options.stray ? 1 : 0);
 }
 
+static int has_request(int fd)
+{
+    struct pollfd ready = {.fd = fd, .events = POLLIN};
+    return poll(&ready, 1, 0) > 0;
+}
+
 /* The time at which the last byte was handed over. */
 static int64_t send_reply(int fd, const uint8_t *reply, size_t len, int64_t begin_ns)
 {
@@ -176,6 +182,7 @@ static int64_t send_reply(int fd, const uint8_t *reply, size_t len, int64_t begi
     for (size_t sent = 0; sent < len; sent += step) {
         int64_t deadline = begin_ns + (int64_t)(sent + step) * character_ns;
         wait_until(deadline);
+        is_crossed |= sent + step >= len && has_request(fd);
         now = now_ns();
         if (write(fd, reply + sent, step) != (ssize_t)step)
             exit(1);
@@ -185,8 +192,8 @@ static int64_t send_reply(int fd, const uint8_t *reply, size_t len, int64_t begi
     return now;
 }
 
-/* A request that was seen at begun_ns; since when the line is silent again. */
-static int64_t answer(int fd, const uint8_t *request, int64_t begun_ns, int64_t quiet_ns)
+/* A request that was seen at begun_ns, perhaps with the next one; since when the line is silent again. */
+static int64_t answer(int fd, const uint8_t *request, int64_t begun_ns, int64_t quiet_ns, int has_next)
 {
     uint8_t reply[300];
     int64_t end_ns = begun_ns + REQUEST * character_ns;
@@ -199,10 +206,13 @@ static int64_t answer(int fd, const uint8_t *request, int64_t begun_ns, int64_t 
         ideal_ns += pending_ideal_ns;
         pending_ideal_ns = 0;
         if (quiet_ns && character_ns) {
-            early += begun_ns < quiet_ns + silence_ns - TOLERANCE_NS;
+            int is_early = begun_ns < quiet_ns + silence_ns - TOLERANCE_NS;
+            early += is_early;
+            given_up += is_early && is_crossed; /* its master no longer waited for the reply */
             add(&excess, begun_ns - quiet_ns - silence_ns);
         }
     }
+    is_crossed = has_next;
     if (request[0] < 1 || request[0] > options.drives || options.silent[request[0]]) {
         unanswered += counts;
         return end_ns;
@@ -284,7 +294,7 @@ static void play(int fd)
                 have = 0;
                 break;
             }
-            quiet_ns = answer(fd, received, begun_ns, quiet_ns);
+            quiet_ns = answer(fd, received, begun_ns, quiet_ns, have > REQUEST);
             memmove(received, received + REQUEST, have - REQUEST);
             begun_ns = came_ns;
         }

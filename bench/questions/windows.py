@@ -21,7 +21,17 @@ from bench.masters.jobs import REGISTERS, Job
 from bench.support import tables
 from bench.support.programs import HERE, paced_line
 
-COLUMNS = ("baud", "system", "utilisation", "requests", "too early", "late us", "CPU us", "misses")
+COLUMNS = (
+    "baud",
+    "system",
+    "utilisation",
+    "requests",
+    "too early",
+    "given up",
+    "late us",
+    "CPU us",
+    "misses",
+)
 COM = 5
 
 
@@ -55,6 +65,7 @@ def measured(system: str, baudrate: int, seconds: float, folder: Path) -> dict[s
         "utilisation": report["utilisation"],
         "requests": requests,
         "early": report["early"],
+        "given_up": report["given_up"],
         "late": report["excess_us"]["p50"],
         "cpu": own["cpu"] / max(1, requests) * 1e6,
     }
@@ -62,13 +73,14 @@ def measured(system: str, baudrate: int, seconds: float, folder: Path) -> dict[s
 
 def row(baudrate: int, system: str, slices: list[dict[str, Any]]) -> list[str]:
     middle = {key: median(each[key] for each in slices) for key in ("utilisation", "late", "cpu")}
-    total = {key: sum(each[key] for each in slices) for key in ("requests", "early", "misses")}
+    total = {key: sum(each[key] for each in slices) for key in ("requests", "early", "given_up", "misses")}
     return [
         str(baudrate),
         system,
         f"{middle['utilisation']:.4f}",
         str(total["requests"]),
         str(total["early"]),
+        str(total["given_up"]),
         f"{middle['late']:.0f}",
         f"{middle['cpu']:.0f}",
         str(total["misses"]),
@@ -97,6 +109,8 @@ def main() -> None:
     print(
         "\nutilisation: ideal bus cycle / measured."
         "\ntoo early: requests more than 20 us before the silence was over."
+        "\ngiven up: of these, those that came while the line still owed the reply before: it was held up for"
+        "\nlonger than the time-out, and the master did not wait for it any more."
         "\nlate: median time from the end of the silence until a request is seen."
         "\nCPU: of the master's process, per exchange, without Wine's server."
         "\nmisses: exchanges without values."

@@ -22,7 +22,11 @@ def heading(what: str) -> None:
 
 def _machine() -> str:
     cpus = Path("/proc/cpuinfo")
-    names = [line for line in cpus.read_text("utf-8").splitlines() if "model name" in line] if cpus.exists() else []
+    names = (
+        [line for line in cpus.read_text("utf-8").splitlines() if "model name" in line]
+        if cpus.exists()
+        else []
+    )
     cpu = names[0].partition(":")[2].strip() if names else platform.processor() or platform.machine()
     loads = os.getloadavg() if hasattr(os, "getloadavg") else ()
     load = ", ".join(f"{each:.1f}" for each in loads) or "unknown"

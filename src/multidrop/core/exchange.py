@@ -190,7 +190,7 @@ class Completion:
 
     @property
     def error(self) -> int:
-        """An errno of a line that was lost, or the REFUSALS of settings."""
+        """An errno of a line that was lost, as C numbers it; or the REFUSALS of settings."""
         return int(self._c.error)
 
     @property
