@@ -49,6 +49,7 @@ NOT_RUN = {
     ".venv/bin/ruff": "is a step of .ci/run",
     ".ci/run": "runs the tests themselves",
     "tools/wheels": "compiles for six machines: many minutes",
+    "tools/musl": "builds a Python: many minutes",
     "tools/wine": "needs Wine, and downloads a Python for Windows",
     ".venv/bin/python -m bench": "needs rivals and a quiet machine; .ci/run runs a benchmark",
     ".venv/bin/python -m sphinx": "is a test of its own, below",

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import os
 import random
 import sys
 from collections.abc import Iterator
@@ -16,6 +17,10 @@ from fencing import Fence, Round
 
 if sys.platform != "linux":
     pytest.skip("masterships are Linux's", allow_module_level=True)
+if not hasattr(os, "pidfd_open"):
+    pytest.skip(
+        "this Python was built without pidfd_open, which the test watches by", allow_module_level=True
+    )
 
 LINES, LEASE, GUARD = 10, 0.4, 0.3  # s
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import socket
 import threading
@@ -154,6 +155,12 @@ def test_a_port_without_a_descriptor_has_one_kind_of_settings(server: SerialServ
 # ---- ports that cannot be opened ----
 
 
+def os_words_of_an_unknown_zone() -> str:
+    with pytest.raises(socket.gaierror) as failure:
+        socket.getaddrinfo("fe80::1%nowhere", 4001)
+    return str(failure.value.strerror)
+
+
 @pytest.mark.parametrize(
     ("port", "reason"),
     [
@@ -172,7 +179,7 @@ def test_a_port_without_a_descriptor_has_one_kind_of_settings(server: SerialServ
             "there is no sokcet://; a URL is such as tcp://10.0.0.7, socket://10.0.0.7:4001 or "
             "rfc2217://10.0.0.7:4001",
         ),
-        ("socket://[fe80::1%nowhere]:4001", "Name or service not known"),
+        ("socket://[fe80::1%nowhere]:4001", "{unknown}"),
         ("spy://{tmp}/absent", "there is no such port"),
     ],
 )
@@ -181,6 +188,7 @@ def test_what_cannot_be_opened_is_a_sentence(tmp_path: Path, port: str, reason: 
     with socket.create_server(("127.0.0.1", 0)) as listener:
         closed = listener.getsockname()[1]
     port = port.format(tmp=tmp_path, closed=closed)
+    reason = reason.format(unknown=os_words_of_an_unknown_zone())
     with pytest.raises(LineError) as caught:
         Line(port)
     assert str(caught.value) == f"{port}: {reason}"
@@ -332,7 +340,7 @@ def test_a_bridged_port_that_cannot_be_set_up_is_a_sentence() -> None:
         with pytest.raises(LineError) as caught:
             bus.read(toy, toy.output_current)
     assert caught.value.port == port
-    assert "Input/output error" in caught.value.reason
+    assert os.strerror(errno.EIO) in caught.value.reason
     assert "\n" not in str(caught.value)
 
 

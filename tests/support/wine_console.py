@@ -1,0 +1,120 @@
+"""Programs for Windows by Wine, each on a terminal of its own, which is its console."""
+
+from __future__ import annotations
+
+import os
+import pty
+import re
+import select
+import signal
+import subprocess
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+PATIENCE_S = 300.0  # a busy machine takes a minute to begin Python by Wine
+NOWHERE = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.DEVNULL)
+ESCAPES = re.compile(r"\x1b(\[[0-9;?]*[A-Za-z]|\][^\x07]*\x07)")
+
+
+class Console:
+    """A program of Windows, and what it has said on its console."""
+
+    def __init__(self, folder: Path, words: list[str], environment: dict[str, str]) -> None:
+        self._heard = b""
+        self._status: int | None = None
+        self._pid, self._terminal = pty.fork()
+        if self._pid == 0:
+            os.execvpe("wine", ["wine", str(folder / "python" / "python.exe"), *words], environment)
+
+    def _hear(self) -> None:
+        """Take in what has been said: a program whose terminal is full waits."""
+        while select.select([self._terminal], [], [], 0.01)[0]:
+            try:
+                self._heard += os.read(self._terminal, 4096)
+            except OSError:  # a terminal's end
+                time.sleep(0.01)
+                return
+
+    @property
+    def said(self) -> str:
+        return ESCAPES.sub("", self._heard.decode("utf-8", "replace"))
+
+    @property
+    def is_over(self) -> bool:
+        if self._status is None:
+            found, status = os.waitpid(self._pid, os.WNOHANG)
+            self._status = os.waitstatus_to_exitcode(status) if found else None
+        return self._status is not None
+
+    def until(self, met: Callable[[], object]) -> None:
+        """Wait for this."""
+        end = time.monotonic() + PATIENCE_S
+        while not met():
+            self._hear()
+            assert time.monotonic() < end, f"not met; it said {self.said!r}"
+
+    def until_said(self, text: str) -> None:
+        self.until(lambda: text in self.said)
+
+    def press_ctrl_c(self) -> None:
+        os.write(self._terminal, b"\x03")
+
+    def status(self) -> int:
+        """Wait for its end, and return its status."""
+        self.until(lambda: self.is_over)
+        assert self._status is not None
+        return self._status
+
+    def close(self) -> None:
+        if not self.is_over:
+            os.kill(self._pid, signal.SIGKILL)
+            os.waitpid(self._pid, 0)
+        os.close(self._terminal)
+
+
+class Wine:
+    """A folder that `tools/wine make` has filled."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder.resolve()
+        self.environment = os.environ | {
+            "WINEPREFIX": str(self.folder / "wine"),
+            "WINEDEBUG": "-all",
+            "WINEDLLOVERRIDES": "mscoree,mshtml=",
+            "LC_ALL": "C.UTF-8",
+            "TERM": "xterm",
+        }
+
+    def _port(self, name: str) -> Path:
+        return self.folder / "wine" / "dosdevices" / name
+
+    def terminal_of(self, name: str) -> str:
+        return str(self._port(name).readlink())
+
+    def link(self, name: str, terminal: str) -> None:
+        """Make a terminal the COM port of this name."""
+        port = self._port(name)
+        port.unlink(missing_ok=True)
+        port.symlink_to(terminal)
+
+    def begin(self) -> None:
+        """Begin its services, which keep what they inherit: a pipe would never end."""
+        line = ["wine", str(self.folder / "python" / "python.exe"), "-c", ""]
+        subprocess.run(line, env=self.environment, check=True, timeout=PATIENCE_S, **NOWHERE)
+
+    def run(self, *words: object) -> subprocess.CompletedProcess[bytes]:
+        """Run Python to its end, with pipes."""
+        line = ["wine", str(self.folder / "python" / "python.exe"), *map(str, words)]
+        pipes = {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+        return subprocess.run(line, env=self.environment, check=False, timeout=PATIENCE_S, **pipes)
+
+    @contextmanager
+    def console(self, *words: object) -> Iterator[Console]:
+        """Begin Python on a console."""
+        console = Console(self.folder, list(map(str, words)), self.environment)
+        try:
+            yield console
+        finally:
+            console.close()

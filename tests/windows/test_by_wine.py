@@ -1,0 +1,215 @@
+"""multidrop on Windows, by Wine: Ctrl-C, names of ports, ports that vanish, consoles, paths.
+
+`tools/wine test FOLDER` runs these; without a folder that `tools/wine make` has filled they are left out.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+
+import pytest
+from motors import ReceivedRequests
+from wine_console import Wine
+
+from multidrop.drives import InvtCHE
+from multidrop.recording import open_reader
+from multidrop.sim import MotorDrive, Simulator, Wire, simulated
+
+FOLDER = os.environ.get("MULTIDROP_WINE", "")
+pytestmark = [
+    pytest.mark.long,
+    pytest.mark.skipif(not FOLDER, reason="needs Wine: `tools/wine test FOLDER` runs it"),
+]
+
+
+@pytest.fixture(scope="module")
+def wine() -> Iterator[Wine]:
+    """Wine, with a server that no vanishing terminal takes along: a leader of a session would get it."""
+    found = Wine(Path(FOLDER))
+    subprocess.run(["wineserver", "-w"], env=found.environment, check=True)
+    with subprocess.Popen(["wineserver", "-f", "-p"], env=found.environment) as server:
+        found.begin()
+        yield found
+        subprocess.run(["wineserver", "-k"], env=found.environment, check=False)
+        server.wait()
+
+
+@pytest.fixture
+def pump(wine: Wine) -> Iterator[MotorDrive]:
+    """A drive on COM5."""
+    with on_com5(wine) as drive:
+        yield drive
+
+
+PLANT = """
+[[line]]
+name = "hall"
+port = 'COM5'
+[[line.drive]]
+name = "насос"
+model = "invt-che"
+address = 1
+"""
+
+
+@pytest.fixture
+def plant(tmp_path: Path) -> Path:
+    path = tmp_path / "зал.toml"
+    path.write_text(PLANT, "utf-8")
+    return path
+
+
+# ---- Ctrl-C ----
+
+
+def test_ctrl_c_ends_a_poll_and_its_recording_is_whole(wine: Wine, pump: MotorDrive, plant: Path) -> None:
+    out = plant.with_name("запись.arrows")
+    with wine.console("-m", "multidrop", "poll", plant, "--out", out) as console:
+        console.until(lambda: "ok" in statuses(out))
+        console.press_ctrl_c()
+        assert console.status() == 0, console.said
+        console.until_said("насос")
+    assert "ok" in statuses(out)
+
+
+CLIENT = """
+import time
+from multidrop import Bus, InvtCHE
+with Bus("COM5") as bus:
+    pump = bus.attach(InvtCHE(1, maximum_frequency=50))
+    pump.set_frequency(20)
+    pump.start()
+    bus.stop_on_exit()
+    print("running", flush=True)
+    time.sleep(600)
+"""
+
+
+def test_ctrl_c_stops_a_motor_that_is_to_stop_at_exit(wine: Wine, pump: MotorDrive) -> None:
+    with wine.console("-c", CLIENT) as console:
+        console.until_said("running")
+        assert pump.motor.energised
+        console.press_ctrl_c()
+        console.status()
+        console.until_said("KeyboardInterrupt")
+    assert not pump.motor.energised
+
+
+def test_ctrl_c_cuts_no_stop_short(wine: Wine, pump: MotorDrive) -> None:
+    pump.motor.deceleration_time = 5.0
+    received = ReceivedRequests(pump)
+
+    def stops() -> int:
+        return sum(write.start == 0x1000 and write.data[-1] == 5 for write in received.writes)
+
+    with wine.console("-c", CLIENT) as console:
+        console.until_said("running")
+        console.press_ctrl_c()
+        console.until(stops)
+        console.press_ctrl_c()
+        console.status()
+    assert not pump.motor.energised
+
+
+# ---- names, paths, consoles ----
+
+
+@pytest.mark.parametrize("name", ["COM5", "com5", r"\\.\COM5", "COM10", "com10", r"\\.\COM10"])
+def test_a_port_has_all_its_names(wine: Wine, pump: MotorDrive, name: str) -> None:
+    wine.link("com10", wine.terminal_of("com5"))
+    ran = wine.run("-m", "multidrop", "state", name, "invt-che", 1)
+    assert ran.returncode == 0, ran.stderr
+    assert b"stopped" in ran.stdout
+
+
+@pytest.mark.parametrize(
+    ("name", "reason"), [("COM77", "there is no such port"), ("NUL", "it is not a serial port")]
+)
+def test_what_is_no_port_is_a_sentence(wine: Wine, name: str, reason: str) -> None:
+    ran = wine.run("-m", "multidrop", "state", name, "invt-che", 1)
+    assert ran.returncode == 1
+    (sentence,) = ran.stderr.decode().splitlines()
+    assert reason in sentence
+
+
+def test_a_pipe_has_letters_that_its_encoding_lacks_spelt_out(wine: Wine, plant: Path) -> None:
+    ran = wine.run("-m", "multidrop", "plan", plant)
+    assert ran.returncode == 0, ran.stderr
+    assert rb"\u043d\u0430\u0441\u043e\u0441" in ran.stdout
+
+
+def test_a_console_has_them(wine: Wine, plant: Path) -> None:
+    with wine.console("-m", "multidrop", "plan", plant) as console:
+        assert console.status() == 0
+        console.until_said("насос")
+
+
+# ---- settings, RTS ----
+
+
+@pytest.mark.parametrize("form", ["8E1", "8O1", "8N2"])
+def test_a_port_is_set_to_parity_and_stop_bits(wine: Wine, pump: MotorDrive, form: str) -> None:
+    """Both are taken, and no terminal shows them on its wire: it has none."""
+    ran = wine.run("-m", "multidrop", "state", "COM5", "invt-che", 1, "--format", form)
+    assert ran.returncode == 0, ran.stderr
+
+
+OPEN = "from multidrop import Bus\nBus('COM5', rs485={!r})"
+
+
+@pytest.mark.parametrize(
+    ("mode", "reason"),
+    [
+        ("rts-up", "does not switch RTS"),
+        ("rts-down", "does not switch RTS"),
+        ("kernel", "has no RS-485 mode"),
+    ],
+)
+def test_a_terminal_has_no_rts_and_is_not_opened(
+    wine: Wine, pump: MotorDrive, mode: str, reason: str
+) -> None:
+    ran = wine.run("-c", OPEN.format(mode))
+    assert ran.returncode == 1
+    sentence = ran.stderr.decode().splitlines()[-1]
+    assert sentence.startswith("multidrop.errors.LineError: COM5: the driver " + reason)
+
+
+# ---- ports that vanish ----
+
+
+def test_a_port_that_vanishes_and_comes_back(wine: Wine, plant: Path) -> None:
+    out = plant.with_name("rows.arrows")
+    with ExitStack() as stack:
+        cable = stack.enter_context(ExitStack())
+        cable.enter_context(on_com5(wine))
+        console = stack.enter_context(wine.console("-m", "multidrop", "poll", plant, "--out", out))
+        console.until(lambda: statuses(out).count("ok") > 20)
+        cable.close()
+        console.until(lambda: "port lost" in statuses(out))
+        before = statuses(out).count("ok")
+        cable.enter_context(on_com5(wine))
+        console.until(lambda: statuses(out).count("ok") > before + 20)
+        console.press_ctrl_c()
+        assert console.status() == 0, console.said
+
+
+@contextmanager
+def on_com5(wine: Wine) -> Iterator[MotorDrive]:
+    """A drive on COM5 that can turn its motor."""
+    drive = simulated(InvtCHE(1, maximum_frequency=50))
+    assert isinstance(drive, MotorDrive)
+    drive.motor.acceleration_time = drive.motor.deceleration_time = 0.2
+    with Simulator([Wire([drive])]) as line:
+        wine.link("com5", line.wires[0].path)
+        yield drive
+
+
+def statuses(path: Path) -> list[str]:
+    """Return the status of each row so far."""
+    if not path.exists() or not path.stat().st_size:
+        return []
+    return [row.status for batch in open_reader(path) for row in batch]
