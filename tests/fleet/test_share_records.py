@@ -13,8 +13,9 @@ from peers import require_module
 
 require_module("nats")
 
-from multidrop.fleet import names, share_records  # noqa: E402
+from multidrop.fleet import buckets, names, share_records  # noqa: E402
 from multidrop.fleet.buckets import Bucket, Record  # noqa: E402
+from multidrop.fleet.errors import Unsure  # noqa: E402
 from multidrop.fleet.lease_rules import USUAL  # noqa: E402
 from multidrop.fleet.ownership import owner_of, owner_value  # noqa: E402
 from multidrop.fleet.servers import paths_of  # noqa: E402
@@ -130,6 +131,28 @@ def test_moves_into_a_share_are_told_with_the_master_before() -> None:
     assert [(move.before, move.after) for move in records.moves.newest(1)] == [("b", "a")]
     assert records.owned_by("a", 2) == {"line"}
     assert records.owned_by("b", 1) == set()
+
+
+def test_lines_that_were_read_before_a_failure_are_known(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The lines fill whole batches, and a server does not say that there are no more."""
+    monkeypatch.setattr(buckets, "BATCH", 2)
+    path: Any = None
+    records = ShareRecords("a", lambda: path, USUAL, lambda: None, is_mine)
+    bucket = MemoryBucket(names.PLANT)
+    records.plant.bucket = bucket  # type: ignore[assignment]
+    for name in ("line-1", "line-2"):
+        bucket.store(name, {"line": {"name": name}, "files": {}})
+    changes = bucket.changes
+
+    async def fail_at_the_end(after: int) -> list[Record]:
+        if after == 2:
+            raise Unsure("no answer")
+        return await changes(after)
+
+    bucket.changes = fail_at_the_end  # type: ignore[method-assign]
+    with pytest.raises(Unsure):
+        asyncio.run(records._look_at_plant())
+    assert records.lines() == ("line-1", "line-2")
 
 
 @pytest.fixture(scope="module")

@@ -37,7 +37,8 @@ class FleetRecords:
             for bucket in names.OWNERS
         }
         self._owned: dict[tuple[str, int], set[str]] = {}  # by gateway and session
-        self.plant = Follower(Bucket(names.PLANT, path))
+        self.plant = Follower(Bucket(names.PLANT, path), self._note_plant)
+        self._has_plant_changed = False
         self._lines: tuple[str, ...] = ()
         self._on_change = on_change
         self._read: set[str] = set()  # buckets that were read at least once
@@ -99,10 +100,15 @@ class FleetRecords:
             self._is_complete.set()
 
     async def _look_at_plant(self) -> bool:
-        changed = await self.plant.look()
-        if changed:
-            self._lines = tuple(sorted(filter(self.is_in_plant, self.plant.records)))
-        return bool(changed)
+        try:
+            return bool(await self.plant.look())
+        finally:  # what was read before a failure is not read again
+            if self._has_plant_changed:
+                self._has_plant_changed = False
+                self._lines = tuple(sorted(filter(self.is_in_plant, self.plant.records)))
+
+    def _note_plant(self, before: Record | None, record: Record) -> None:
+        self._has_plant_changed = True
 
     def _note_move(self, bucket: str, before: Record | None, record: Record) -> None:
         self._owned.get(owner_of(before), set()).discard(record.key)
