@@ -80,6 +80,8 @@ def test_a_record_that_looks_like_the_end_hides_none_behind_it(one: Cluster) -> 
         )
         await client.flush()
         await client.close()
+        while "b" not in [record.key for record in await bucket.changes(0)]:
+            await asyncio.sleep(0.05)  # nothing tells that it is stored
         await bucket.put("c", OWNER, 0)
         found = await bucket.changes(0)
         assert [record.key for record in found] == ["a", "b", "c"]
