@@ -28,6 +28,7 @@ from multidrop.fleet.command_words import (
 from multidrop.fleet.errors import FleetError, NobodyThere, NotDelivered, Unsure
 from multidrop.fleet.servers import ServerPath, paths_of
 from multidrop.fleet.setup import open_all
+from multidrop.fleet.task_end import end_tasks
 
 LOST_S = 6.0  # without any answer, after which what became of a command stays unknown
 AGAIN_S = 0.2
@@ -72,9 +73,7 @@ class FleetCommands:
 
     async def close(self) -> None:
         """Leave the servers."""
-        for task in self._keeping:
-            task.cancel()
-        await asyncio.gather(*self._keeping, return_exceptions=True)
+        await end_tasks(*self._keeping)
         for path in self._paths:
             await path.close()
         self._log.close()
@@ -246,9 +245,7 @@ class FleetCommands:
                 except (FleetError, ValueError):
                     is_certain = False
         finally:
-            for task in asking:
-                task.cancel()
-            await asyncio.gather(*asking, return_exceptions=True)
+            await end_tasks(*asking)
         if is_certain:
             return CommandAnswer(CommandOutcome.NOT_SENT, f"{what} was NOT sent: {why}; {HARD_WIRED}")
         return CommandAnswer(CommandOutcome.UNDER_WAY, f"{what}: no gateway has answered yet; {HARD_WIRED}")

@@ -29,6 +29,7 @@ from multidrop.fleet.samples_stream import connect
 from multidrop.fleet.servers import ServerPath, paths_of
 from multidrop.fleet.setup import check_buckets, open_all
 from multidrop.fleet.spool import Spool
+from multidrop.fleet.task_end import end_tasks
 
 SPOOL_BYTES = 10_000_000_000
 STATE = {"state": str, "lines": int, "margin_s": float, "troubles": dict, "spool": dict}
@@ -108,8 +109,7 @@ class FleetGateway:
             await asyncio.to_thread(self.spool.sync, FORWARD_S)
             await self._forward_the_rest(forwarding)
         finally:
-            forwarding.cancel()
-            await asyncio.gather(forwarding, return_exceptions=True)
+            await end_tasks(forwarding)
             await client.close()
             await self._close()
 

@@ -34,6 +34,7 @@ from multidrop.fleet.line_keeper import LineKeeper, Lines, TakenLine
 from multidrop.fleet.ownership import decide, owner_of
 from multidrop.fleet.servers import ServerPath
 from multidrop.fleet.share_records import ShareRecords
+from multidrop.fleet.task_end import end_tasks
 
 _log = logging.getLogger("multidrop.fleet")
 
@@ -43,7 +44,6 @@ TIDY_NS = SECOND // 2  # between looks at all lines of the share, where nothing 
 SETTLE_S = 3.0
 QUIET_NS = SECOND // 2  # without a gateway that comes or goes, before shares are made anew while we settle
 HOME_S = 1.0
-CANCEL_S = 0.2
 
 
 class MemberState(StrEnum):
@@ -150,8 +150,7 @@ class Member:
         try:
             await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
         finally:
-            await _cancel(tasks)
-            ended = await asyncio.gather(*tasks, return_exceptions=True)
+            ended = await end_tasks(*tasks)
             await self._leave()
             for failure in ended:
                 if isinstance(failure, Exception):
@@ -256,12 +255,3 @@ class Member:
         )
         self.keeper.releasing = step.releases | {line for line in owned if not self.records.is_in_plant(line)}
         self.keeper.claim(step.claims)
-
-
-async def _cancel(tasks: Sequence[asyncio.Task[None]]) -> None:
-    """End the tasks: again where one of the libraries below has swallowed it."""
-    left = set(tasks)
-    while left:
-        for task in left:
-            task.cancel()
-        _, left = await asyncio.wait(left, timeout=CANCEL_S)

@@ -10,6 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
+from multidrop.fleet.task_end import end_tasks
+
 if TYPE_CHECKING:
     from multidrop.fleet.servers import ServerPath
     from multidrop.fleet.watching import FleetWatch
@@ -51,8 +53,7 @@ class FleetPart:
         try:
             await self._watch.run()
         finally:
-            keeping.cancel()
-            await asyncio.gather(keeping, return_exceptions=True)
+            await end_tasks(keeping)
 
     async def close(self) -> None:
         await self._path.close()

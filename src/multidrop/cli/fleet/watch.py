@@ -36,6 +36,7 @@ async def watch(paths: list[ServerPath], *, is_json: bool) -> int:
     """Show the fleet until Ctrl-C; servers that are away meanwhile are told with the age of what is shown."""
     from multidrop.fleet.overview import FleetView
     from multidrop.fleet.setup import open_all
+    from multidrop.fleet.task_end import end_tasks
     from multidrop.fleet.watching import FleetWatch
 
     if not is_json:
@@ -53,8 +54,7 @@ async def watch(paths: list[ServerPath], *, is_json: bool) -> int:
         with _lines() if is_json else drawing() as show:
             await follow(FleetWatch(view), show, over)
     finally:
-        keeping.cancel()
-        await asyncio.gather(keeping, return_exceptions=True)
+        await end_tasks(keeping)
     return 0
 
 

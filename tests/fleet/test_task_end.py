@@ -1,0 +1,64 @@
+"""Tasks that swallow a cancellation are ended all the same, and nobody waits for them for ever."""
+
+from __future__ import annotations
+
+import asyncio
+from pathlib import Path
+
+from peers import require_module
+
+require_module("nats")
+
+from multidrop.fleet.fleet_commands import FleetCommands  # noqa: E402
+from multidrop.fleet.task_end import end_tasks  # noqa: E402
+
+PATIENCE_S = 60.0
+
+
+async def deaf(times: int) -> str:
+    """Go on after so many cancellations, as a path does whose pong comes in that moment."""
+    for _ in range(times):
+        try:
+            await asyncio.sleep(3600)
+        except asyncio.CancelledError:
+            continue
+    await asyncio.sleep(3600)
+    return "never"
+
+
+async def _begun(times: int) -> asyncio.Task[str]:
+    task = asyncio.create_task(deaf(times))
+    await asyncio.sleep(0)
+    return task
+
+
+def test_a_task_is_cancelled_until_it_is_over() -> None:
+    async def main() -> None:
+        tasks = [await _begun(times) for times in (0, 1, 3)]
+        found = await asyncio.wait_for(end_tasks(*tasks), PATIENCE_S)
+        assert [type(one) for one in found] == [asyncio.CancelledError] * 3
+        assert await end_tasks() == []
+
+    asyncio.run(main())
+
+
+def test_what_is_over_keeps_its_end() -> None:
+    async def main() -> None:
+        async def failing() -> None:
+            raise OSError("the disk is full")
+
+        failed = asyncio.create_task(failing())
+        await asyncio.wait({failed})
+        (found,) = await end_tasks(failed)
+        assert str(found) == "the disk is full"
+
+    asyncio.run(main())
+
+
+def test_a_command_s_end_waits_for_no_path_that_was_deaf_once(tmp_path: Path) -> None:
+    async def main() -> None:
+        fleet = FleetCommands(["nats://127.0.0.1:1"], by="anna", log=tmp_path / "commands.jsonl")
+        fleet._keeping = [await _begun(1)]  # type: ignore[list-item]
+        await asyncio.wait_for(fleet.close(), PATIENCE_S)
+
+    asyncio.run(main())
