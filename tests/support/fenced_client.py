@@ -15,6 +15,7 @@ import socket
 import sys
 import time
 import traceback
+from contextlib import suppress
 from pathlib import Path
 
 from multidrop import Mastership, Plant, PlantLine, Polled, PolledDrive, Poller
@@ -57,7 +58,8 @@ def live(
             observer.send(b"?")
             if not observer.recv(1):
                 return
-            mastership.extend(asked_ns + round((lease + beyond) * 1e9))
+            with suppress(ValueError):  # it stood still since it asked, and the answer is worth nothing
+                mastership.extend(asked_ns + round((lease + beyond) * 1e9))
             poller.take()
             time.sleep(lease / 3)
 
