@@ -155,19 +155,25 @@ def _note_writes(sim: SimulatedDrive, writes: list[int]) -> None:
 # ---- calls under way ----
 
 
+def _held_up(bus: Bus, monkeypatch: pytest.MonkeyPatch) -> tuple[threading.Event, threading.Event]:
+    """Hold up each step of a stop; return what tells that one has begun, and what lets them go on."""
+    begun, go_on = threading.Event(), threading.Event()
+    step = bus._stopper._do
+
+    def slow(*arguments: object) -> object:
+        begun.set()
+        assert go_on.wait(PATIENCE)
+        return step(*arguments)
+
+    monkeypatch.setattr(bus._stopper, "_do", slow)
+    return begun, go_on
+
+
 def test_a_stop_goes_on_while_its_line_is_to_go(both: TwoLines, monkeypatch: pytest.MonkeyPatch) -> None:
     with Poller(plant(both.hall(), both.yard())) as poller:
         bus = poller.bus("yard")
         bus.drives[0].start()
-        begun, go_on = threading.Event(), threading.Event()
-        step = bus._stopper._do
-
-        def slow(*arguments: object) -> object:
-            begun.set()
-            assert go_on.wait(PATIENCE)
-            return step(*arguments)
-
-        monkeypatch.setattr(bus._stopper, "_do", slow)
+        begun, go_on = _held_up(bus, monkeypatch)
         found: dict[str, Stopped] = {}
         stopping = threading.Thread(target=lambda: found.update(bus.stop_all()))
         stopping.start()
@@ -194,15 +200,7 @@ def test_a_stop_on_a_line_that_goes_holds_no_other_line_up(
 ) -> None:
     with Poller(plant(both.hall(), both.yard())) as poller:
         bus = poller.bus("yard")
-        begun, go_on = threading.Event(), threading.Event()
-        step = bus._stopper._do
-
-        def slow(*arguments: object) -> object:
-            begun.set()
-            assert go_on.wait(PATIENCE)
-            return step(*arguments)
-
-        monkeypatch.setattr(bus._stopper, "_do", slow)
+        begun, go_on = _held_up(bus, monkeypatch)
         stopping = threading.Thread(target=bus.stop_all)
         stopping.start()
         assert begun.wait(PATIENCE)
