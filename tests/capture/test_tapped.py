@@ -199,12 +199,13 @@ def epoch(time_ns: int) -> str:
     return f"{time_ns // 10**9}.{time_ns % 10**9:09}"
 
 
+@pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "make",
     [
         pytest.param(rough_wires, id="rough"),
-        pytest.param(echoing_wires, id="echoing", marks=pytest.mark.long),
+        pytest.param(echoing_wires, id="echoing"),
     ],
 )
 def test_noise_echo_damage_and_late_replies_are_told_as_the_poll_took_them(

@@ -223,6 +223,7 @@ def test_a_place_that_takes_no_recording_is_a_sentence(
     assert (done, err) == (status, f"multidrop: {tmp_path / out}: {sentence}\n")
 
 
+@pytest.mark.long
 @pytest.mark.uncounted
 def test_a_full_disk_ends_polling_with_a_sentence_and_keeps_the_rows_before(
     plant: Path, tmp_path: Path
@@ -283,6 +284,7 @@ def test_convert_of_no_recording_is_a_mistake(run: Run, tmp_path: Path) -> None:
     assert run("convert", tmp_path / "none.csv", tmp_path / "b.csv")[0] == 2
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_demo_reads_every_variant_of_every_family(tmp_path: Path) -> None:
     """It takes the place of an earlier demo's recording, and is captured."""

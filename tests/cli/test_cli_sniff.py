@@ -181,6 +181,7 @@ class ResponderLine:
         return self.told
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", ["socket", "rfc2217"])
 @pyserials_own
 def test_a_line_behind_a_network_is_heard_and_told_nothing(run: Run, kind: str) -> None:

@@ -426,6 +426,7 @@ def test_a_drive_on_modbus_tcp_is_measured(port: str, run: Run) -> None:
     assert "other way" not in told
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("port", "asked", "spoken", "other"),
     usually(

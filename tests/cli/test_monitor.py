@@ -467,6 +467,7 @@ def test_the_page_says_why_what_is_not_polled_is_not_known(plant: Path) -> None:
         assert terminal.process.wait(timeout=60) == 0
 
 
+@pytest.mark.long
 def test_what_it_shows_is_recorded(plant: Path, tmp_path: Path) -> None:
     out = tmp_path / "seen.arrows"
     with on_terminal("monitor", plant, "--out", out) as terminal:

@@ -116,6 +116,7 @@ def told_as_said(told: dict[str, Any]) -> Said:
     return told["address"], told["function"], values
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_every_exchange_of_a_mixed_line_is_heard() -> None:
     said, told = mastered()

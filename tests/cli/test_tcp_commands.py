@@ -5,6 +5,7 @@ from __future__ import annotations
 import socket
 from pathlib import Path
 
+import pytest
 from commands import Run, running
 
 from multidrop.drives import ErmanERG220, InnovertIBD, InvtCHE
@@ -55,6 +56,7 @@ def test_a_pseudo_terminal_needs_a_place(tmp_path: Path, run: Run) -> None:
     )
 
 
+@pytest.mark.long
 def test_scan_finds_drives_behind_a_gateway_and_writes_their_plant(tmp_path: Path, run: Run) -> None:
     sims = [simulated(drive) for drive in (InnovertIBD(1), InvtCHE(2), ErmanERG220(3))]
     out = tmp_path / "found.toml"

@@ -108,6 +108,7 @@ def test_the_names_in_a_recording_are_told_without_their_commands(run: Run, tmp_
 ALL_AT_ONCE = rf"_$x^{{$\frac%s{{0}}{TRAP}"
 
 
+@pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:Glyph")
 @pytest.mark.parametrize("name", usually(ALL_AT_ONCE, "_hidden", "$x^{$", "\\frac"))
@@ -168,6 +169,7 @@ def test_commands_print_through_what_spells_out() -> None:
     assert found == ours
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("command", usually("poll", "plan"))
 def test_a_plant_file_that_runs_a_file_says_so_once(tmp_path: Path, command: str) -> None:
     """In a process of its own, as a file is run once in each."""

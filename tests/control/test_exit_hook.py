@@ -225,6 +225,7 @@ def test_a_signal_while_the_block_is_left_leaves_no_motor_running() -> None:
         assert not any(each.sim.motor.energised for each in received[0])
 
 
+@pytest.mark.long
 def test_a_second_bus_does_not_wait_for_the_ramps_of_the_first() -> None:
     with lines(2) as (received, ports), client("wait", ports) as process:
         turning_at_last_stop: list[bool] = []

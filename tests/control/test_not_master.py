@@ -353,6 +353,7 @@ def test_the_line_is_listened_to_where_another_one_may_have_been_master(
     assert waits(far, bus, drives[2]) >= listening
 
 
+@pytest.mark.long
 def test_another_master_is_told_and_nothing_is_sent(
     shared: tuple[int, Bus, Mastership], caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -54,6 +54,7 @@ def test_a_start_whose_reply_is_lost_is_sent_once(model: str) -> None:
         assert sim.motor.energised  # it did happen, and the caller was told that it may have
 
 
+@pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize(("model", "lost"), in_turn(MAKE, [3, 2, 7]))
 def test_a_stop_whose_replies_are_lost(model: str, lost: int) -> None:
@@ -127,6 +128,7 @@ def test_a_trip_while_starting(monkeypatch: pytest.MonkeyPatch) -> None:
         assert not sim.motor.energised
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_a_power_cycle_in_mid_ramp() -> None:
     """The drive has forgotten its setpoint: it stays off, and the next start says so."""

@@ -211,6 +211,7 @@ def echoing(hears: Any = None) -> Iterator[str]:
         os.close(ours)
 
 
+@pytest.mark.long
 def test_an_echo_without_a_drive_confirms_nothing() -> None:
     with echoing() as port, Bus(port) as bus:
         pump = bus.attach(InvtCHE(1, maximum_frequency=50))

@@ -51,6 +51,7 @@ def test_ports_come_and_go_on_threads_of_their_own(build: Callable[..., None], s
     build("test_engine", *core, sanitizers=sanitizers)
 
 
+@pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="others wait by poll")
 def test_a_client_that_is_back_soon_wakes_nobody(build: Callable[..., None]) -> None:

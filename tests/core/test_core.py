@@ -776,6 +776,7 @@ def descriptors() -> Iterator[int]:
     resource.setrlimit(resource.RLIMIT_NOFILE, (least, most))
 
 
+@pytest.mark.long
 def test_a_thousand_ports_come_and_go_at_once(descriptors: int) -> None:
     """Twice over; each is closed while the others are still under way."""
     if descriptors < 2500:

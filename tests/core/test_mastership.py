@@ -161,6 +161,7 @@ def test_a_process_that_extends_in_time_lives() -> None:
         assert process.poll() is None
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "end", ["mastership.end()", "del mastership; import gc; gc.collect(); mastership = Mastership()"]
 )

@@ -494,6 +494,7 @@ def test_the_unchanged_files_do_no_harm(name: str) -> None:
     assert dangers_of(document_of(name), name) == []
 
 
+@pytest.mark.long
 @pytest.mark.uncounted
 @pytest.mark.slow
 @pytest.mark.parametrize(

@@ -310,6 +310,7 @@ SAMPLES = """select time_ns, uncertainty_us, drive, register, value, status,
 extract(epoch from time) * 1000000 from multidrop.samples order by time_ns, drive, register"""
 
 
+@pytest.mark.long
 def test_rows_come_back_from_postgresql(running: Cluster, empty: Postgres) -> None:
     async def live() -> None:
         async with client_of(running) as client:

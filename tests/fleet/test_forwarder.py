@@ -205,6 +205,7 @@ def test_a_folder_that_was_set_back_is_told_and_sends_nothing(
     assert "the spool has another one" in told[1]
 
 
+@pytest.mark.long
 def test_servers_that_are_away_for_a_while(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     async def live() -> None:
         spool = filled(tmp_path / "spool", 3)

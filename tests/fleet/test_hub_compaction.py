@@ -66,6 +66,7 @@ def merge(folder: Path) -> None:
     assert compact([str(folder), "--below", "0", "--merge-rows"]) == 0
 
 
+@pytest.mark.long
 def test_hours_that_are_over_become_one_file(sink: ParquetSink, tmp_path: Path) -> None:
     write(sink, range(FILES))
     merge(tmp_path)

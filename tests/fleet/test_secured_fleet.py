@@ -128,6 +128,7 @@ MISTAKES: dict[str, tuple[Callable[[SecuredCluster, Path], list[str]], int, str]
 }
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("command", ["status", "hub"])
 @pytest.mark.parametrize("mistake", MISTAKES)
 def test_mistaken_credentials_are_one_sentence(

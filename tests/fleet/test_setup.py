@@ -137,6 +137,7 @@ async def _check(fleet: Cluster) -> None:
     await path.close()
 
 
+@pytest.mark.long
 def test_a_path_goes_elsewhere_and_comes_home(tmp_path: Path) -> None:
     with cluster(tmp_path, 3) as three:
 

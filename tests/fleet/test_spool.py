@@ -99,6 +99,7 @@ def test_a_new_folder_is_a_new_log(tmp_path: Path) -> None:
 # ---- power cuts ----
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("step", usually(83, 1))
 def test_a_newest_file_cut_at_every_byte_loses_nothing_that_was_stored_before(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, step: int
@@ -170,6 +171,7 @@ def test_nothing_has_its_name_before_it_is_on_the_disk(folder: Path, monkeypatch
     files.close()
 
 
+@pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize(("kills", "longest_s"), usually((2, 0.1), (12, 0.6)))
 def test_kills_at_any_moment(folder: Path, kills: int, longest_s: float) -> None:

@@ -44,6 +44,7 @@ def descriptors(pid: int) -> int:
     return sum(1 for _ in Path(f"/proc/{pid}/fd").iterdir())
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("sent", usually(*SLOW), ids=["silent", "headers", "body"])
 @pytest.mark.parametrize("way", usually("http", "https"))
 def test_a_stop_gets_in_beside_500_slow_clients(tmp_path: Path, sent: bytes, way: str) -> None:

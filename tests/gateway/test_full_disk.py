@@ -77,6 +77,7 @@ def dropped(gateway: Served) -> float:
     return float(line.split()[1])
 
 
+@pytest.mark.long
 def test_polling_and_stops_go_on_and_it_is_said_until_there_is_room(disk: Path, tmp_path: Path) -> None:
     with served(tmp_path, SERVE) as gateway:
         gateway.await_state("pump-2", "stands")

@@ -70,6 +70,7 @@ def test_a_frame_has_values_with_their_own_times(gateway: Served) -> None:
     assert following["n"] > frame["n"]
 
 
+@pytest.mark.long
 def test_a_silent_drives_values_are_said_to_be_old(gateway: Served) -> None:
     gateway.sims["pump-2"]["output_current"] = 45.6
     until(lambda: gateway.frame()["drives"]["pump-2"]["values"]["output_current"][0] == 45.6)

@@ -124,6 +124,7 @@ def test_a_file_with_mistakes_changes_nothing(tmp_path: Path) -> None:
         assert drives == [polled.drive for polled in gateway.gateway.plant.lines[0].drives]
 
 
+@pytest.mark.long
 def test_drives_come_and_go_and_a_line_that_is_the_same_goes_on(tmp_path: Path) -> None:
     with two_lines(tmp_path) as (gateway, rows):
         gateway.await_state("fan-1", "stands")

@@ -56,6 +56,7 @@ def test_ready_alive_and_stopping_are_told_and_the_log_is_json(tmp_path: Path) -
     assert all({"time", "level", "logger", "message"} <= one.keys() for one in records)
 
 
+@pytest.mark.long
 def test_sighup_reloads_and_systemd_is_told(tmp_path: Path) -> None:
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
         manager.bind(str(tmp_path / "notify"))

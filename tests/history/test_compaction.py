@@ -128,6 +128,7 @@ class Breaker:
 
 # A segment takes 10 steps, and there are five: 3 apart, each of the ten is tried in one of them or two.
 # Those that are always tried, 23 apart, are other ones in each, and of a merge.
+@pytest.mark.long
 @pytest.mark.parametrize("apart", usually(23, 3))
 def test_broken_off_before_each_step(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, apart: int) -> None:
     rows = segments()
@@ -237,6 +238,7 @@ def test_a_segment_without_a_head(tmp_path: Path, content: bytes) -> None:
         assert sorted(rows_in(history)) == sorted(left)
 
 
+@pytest.mark.long
 def test_a_full_disk_leaves_the_segment(tmp_path: Path) -> None:
     rows = segments()
     record(tmp_path, rows)

@@ -64,6 +64,7 @@ def total_of_tens(history: History, runs: int) -> int:
     return sum(sum(buckets.n) + sum(buckets.missed) for buckets in found.values())
 
 
+@pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize("kills", usually(3, 15, 200))
 def test_kills_at_any_moment(tmp_path: Path, kills: int) -> None:

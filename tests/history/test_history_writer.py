@@ -167,6 +167,7 @@ def test_a_disk_that_hangs_holds_nobody_up(
     assert writer.state() == (220, 400, None)
 
 
+@pytest.mark.long
 def test_polling_and_stops_go_on_beside_a_full_disk(
     tmp_path: Path, writers: Callable[..., HistoryWriter]
 ) -> None:

@@ -249,6 +249,7 @@ def bomb(levels: int) -> str:
     return f"{lists}modbus: *a{levels - 1}\n"
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("text", "told"),
     [

@@ -166,6 +166,7 @@ ENTITIES = entries_of(
 ROWS = st.lists(st.lists(st.text("0123456789!#.BLWS,;xH-au\t \"'", max_size=8), max_size=7), max_size=5)
 
 
+@pytest.mark.long
 @settings(
     max_examples=examples(100), deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
 )
@@ -237,6 +238,7 @@ COSTLY = (  # up to a second each; the first is always tried
 )
 
 
+@pytest.mark.long
 @pytest.mark.uncounted
 @pytest.mark.parametrize("name", [*(name for name in HOSTILE if name not in COSTLY), *usually(*COSTLY)])
 def test_a_hostile_file_takes_bounded_time(tmp_path: Path, name: str) -> None:
@@ -257,6 +259,7 @@ print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before)
 MOST_MEMORY = 400_000  # KiB for 5 MB at most: a row of a million empty cells takes 150,000
 
 
+@pytest.mark.long
 @pytest.mark.skipif(sys.platform == "win32", reason="getrusage tells memory on POSIX alone")
 @pytest.mark.parametrize("name", usually("aliases", "a row of a million cells", "many entries", "deep lists"))
 def test_a_hostile_file_takes_bounded_memory(tmp_path: Path, name: str) -> None:

@@ -57,6 +57,7 @@ async def flood(share: LineShare, line: PacedLine, seconds: float, clients: int 
     return answered
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("seconds", usually(0.03, 0.005, 0.7))
 def test_a_flood_has_a_fifth_of_the_line_s_time_and_all_of_it(seconds: float) -> None:
     async def main() -> None:

@@ -97,6 +97,7 @@ def watched(slots: Slots) -> dict[str, list[Slot]]:
     return slots.between(begin, end)
 
 
+@pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", usually("gone", "frozen"))
 def test_nothing_of_the_polling_changes_and_what_was_dropped_is_counted(tmp_path: Path, kind: str) -> None:

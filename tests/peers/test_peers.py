@@ -103,6 +103,7 @@ def test_an_exception_is_the_device_s_refusal(server: tuple[str, str]) -> None:
         assert refusal.value.code == 2
 
 
+@pytest.mark.long
 def test_another_address_is_silence(server: tuple[str, str]) -> None:
     port, framing = server
     with Bus(port) as bus:

@@ -56,6 +56,7 @@ class Seen:
         return self.values.get(name, [])
 
 
+@pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize("every", [None, EVERY_S])
 def test_a_drive_is_added_and_removed_while_the_others_are_polled(port: str, every: float | None) -> None:

@@ -197,6 +197,7 @@ def test_nothing_is_sent_while_the_master_before_may_still_be_there(port: str) -
         mastership.end()
 
 
+@pytest.mark.long
 @paces
 def test_another_master_is_told_and_polling_begins_when_it_is_silent(
     mastership: Mastership, every: float | None
@@ -305,6 +306,7 @@ def taken_of(poller: Poller, rows: list[Row]) -> list[Row]:
     return rows
 
 
+@pytest.mark.long
 def test_rows_of_other_lines_go_on_while_lines_come_and_go(mastership: Mastership, far: Listener) -> None:
     hold(mastership)
     yard = line(far.url, quick("fan", 1, None), name="yard")

@@ -90,6 +90,7 @@ def test_all_variants_on_one_line_at_the_pace_of_a_real_one() -> None:
     assert kept + summary["overrun_slots"] >= len(drives) * (REAL_SECONDS // EVERY - 2)
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_late_lost_and_doubled_replies_are_never_taken_for_others() -> None:
     drives = [polled(drive, drive.readings()) for drive in fast_drives()]

@@ -235,6 +235,7 @@ def test_rows_nobody_takes_are_bounded_and_counted(port: str, monkeypatch: pytes
 # ---- several lines; commands ----
 
 
+@pytest.mark.long
 def test_many_lines_at_once() -> None:
     with Simulator([Wire([EncodedDrive(Quick(at))], unpaced=True) for at in range(1, 17)]) as sim:
         drives = [polled(Quick(at, name=f"drive-{at}"), READINGS) for at in range(1, 17)]
@@ -253,6 +254,7 @@ def test_many_lines_at_once() -> None:
     assert list(polling.poller.summary()["lines"]) == [f"drive-{at}" for at in range(1, 17)]
 
 
+@pytest.mark.long
 def test_a_call_of_one_line_costs_the_others_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     """Lines with a rate are looked at every 50 ms, however often any of them calls."""
     looks: list[int] = []
@@ -438,6 +440,7 @@ def test_a_line_that_is_lost_does_not_disturb_the_others(port: str, tmp_path: Pa
     polling.check_summary()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("slow", ["close", "open"])
 def test_a_lost_port_that_takes_its_time_does_not_hold_the_others_up(
     port: str, slow: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

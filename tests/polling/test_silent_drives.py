@@ -30,10 +30,11 @@ def test_a_slot_that_is_not_asked_has_its_row_when_it_has_come() -> None:
     assert clocked.poller.summary()["lines"]["line"]["misses"]["not asked: drive is silent"] > 400
 
 
+@pytest.mark.long
 @pytest.mark.story
 @pytest.mark.parametrize(
     ("dead", "back_s"),
-    [pytest.param(1, 5, marks=pytest.mark.long), pytest.param(5, 25, marks=pytest.mark.long), (10, 45)],
+    [(1, 5), (5, 25), (10, 45)],
 )
 def test_silent_drives_cost_the_others_little_and_are_soon_back(dead: int, back_s: int) -> None:
     drives = [InvtCHE(address, name=f"drive-{address}", baudrate=38_400) for address in range(1, DRIVES + 1)]

@@ -210,6 +210,7 @@ def test_a_stop_over_a_slow_path_is_seen_to_be_done(
     assert (line.now - begun) / S < 8 * seconds + 3
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", usually("drop", "flip", "split", "noise"))
 def test_all_families_on_a_slow_path_that_is_rough_too(kind: str) -> None:
     story = Path(of_all_variants())

@@ -105,6 +105,7 @@ def test_a_stall_costs_no_truth(story_of: type[Path]) -> None:
     story_of([family(at) for at, family in enumerate(FAMILIES.values(), 1)], port=TCP).tell_of(stalling(15.0))
 
 
+@pytest.mark.long
 def test_what_is_provably_late_holds_nothing_up() -> None:
     """No request waits for a late reply, and none is sent to prove anything."""
     story = TrueIdsPath(two_of("innovert-ibd"), port=TCP)

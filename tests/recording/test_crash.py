@@ -155,6 +155,7 @@ def check_audit(directory: Path, numbers: Sequence[int], acknowledged: Sequence[
     assert len(numbers) - lives <= len(noted)
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_what_a_killed_client_told_of_is_there_once(
     request: pytest.FixtureRequest, nursery: Nursery, counting: Counting, tmp_path: Path

@@ -59,6 +59,7 @@ def record(path: Path, batches: int) -> list[int]:
 # ---- truncated ends ----
 
 
+@pytest.mark.long
 def test_random_cuts_of_arrows_lose_only_what_is_not_whole(tmp_path: Path) -> None:
     path = tmp_path / "a.arrows"
     lengths = record(path, 12)

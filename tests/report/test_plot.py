@@ -562,6 +562,7 @@ def with_odd(about: Any, odd: Any) -> Iterator[Any]:
             yield whole
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("_unpainted")
 @pytest.mark.slow
 @pytest.mark.parametrize("odd", usually(*ODD), ids=lambda odd: repr(odd)[:12])
@@ -585,6 +586,7 @@ def test_metadata_that_makes_no_sense_is_left_out(tmp_path: Path, odd: Any) -> N
 LARGEST_VALUES = [1e308, float("-inf"), 1e149]
 
 
+@pytest.mark.long
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("value", usually(*LARGEST_VALUES))
 @pytest.mark.parametrize("register", usually("output_frequency", "fault", "output_current"))

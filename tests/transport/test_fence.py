@@ -39,6 +39,7 @@ def rounds(made: Fence, stops: int) -> list[Round]:
     return [made.stop_once(chance) for _ in range(stops)]
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_a_master_that_stood_still_sends_nothing_and_is_killed() -> None:
     with fence() as made:
@@ -58,6 +59,7 @@ def test_a_master_that_goes_on_sends_nothing() -> None:
     assert sum(each.stale for each in found) <= 1
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_without_the_look_it_sends() -> None:
     """So the tests above can fail: the master believes that it may send for longer than others know."""

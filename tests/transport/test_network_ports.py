@@ -347,6 +347,7 @@ def start_into_the_cut(bus: Bus, toy: Toy, network: FarNetwork) -> None:
         bus.raw(toy, 6, 0x14, bytes([0, Status.RUNNING]))
 
 
+@pytest.mark.long
 @pyserials_own
 def test_a_start_into_a_cut_network_never_arrives_after_closing(far_network: FarNetwork) -> None:
     with Bus(far_network.url, echo="off", expiry=PATIENCE) as bus:

@@ -132,6 +132,7 @@ def test_the_driver_s_own_mode_is_switched_on_as_it_was_set_up(driver: Path) -> 
     assert [event.count for event in events if event.what == "mode"] == [ON_SEND | ENABLED]
 
 
+@pytest.mark.long
 def test_a_driver_that_refuses_is_told_of_in_a_sentence_and_nothing_is_sent(driver: Path) -> None:
     for mode, variables, why in (
         ("kernel", {}, f"has no RS-485 mode ({os.strerror(errno.ENOTTY)})"),
