@@ -290,10 +290,11 @@ void md_turn_lose(struct md_turn *turn, int error)
     stop_repeating(turn);
 }
 
-/* The client learns whether a request had begun to leave. */
+/* The client learns whether a request had begun to leave. What was counted just now has its rows. */
 void md_turn_close(struct md_turn *turn)
 {
-    if (turn->whose == MD_URGENT || (turn->is_ending && turn->whose != MD_NOBODYS)) {
+    int is_told = turn->whose == MD_URGENT || turn->is_ending || turn->line.state == MD_IDLE;
+    if (is_told && turn->whose != MD_NOBODYS) {
         md_line_abandon(&turn->line, turn->whose == MD_URGENT ? MD_LINE_LOST : MD_POLL_ENDED, 0);
         finish(turn);
     }

@@ -533,6 +533,28 @@ def test_a_port_that_is_closed_tells_whether_what_was_under_way_had_left(drive: 
     assert sorted(each.sent_ns > 0 for each in found) == [False, True]
 
 
+def test_what_was_counted_before_a_port_closed_has_its_rows() -> None:
+    """Close it in the moment in which a reply comes."""
+    values = 0
+    for _ in range(60):
+        near, far = socket.socketpair()
+        near.setblocking(False)
+        asked = read(7)
+        with near, far, closing(Port(near.fileno(), NO_SETTINGS)) as port:
+            rows = Rows(port)
+            port.submit([asked], [0])
+            _, request = parse_request(Framing.RTU, far.recv(100))
+            assert request is not None
+            far.send(echo_start(request))
+            port.stop()
+            counted = asked.peer.counters().values
+            assert len(rows.of("status", counted)) == counted
+            assert port.done == counted
+        assert port.done == counted
+        values += counted
+    assert values
+
+
 def wait_until_it_sleeps(thread: threading.Thread) -> None:
     """Wait until the thread is in the core: asleep at every look, while nobody holds the interpreter."""
     stat = Path(f"/proc/self/task/{thread.native_id}/stat")

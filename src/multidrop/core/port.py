@@ -186,9 +186,12 @@ class Port:
             lib.md_port_stop(self.c)
 
     def close(self) -> None:
-        """Stop, and free its memory."""
+        """Stop, and free its memory. What it did can still be asked."""
+        self.stop()
+        if self.c is not None:
+            self._progress = ffi.new("struct md_progress *", self._progress[0])
         self._free()
-        self.c = self._progress = None
+        self.c = None
 
     def report_to(self, row_queue: RowQueue, number: int) -> None:
         """Deliver rows to `row_queue`, and call it with `number` when the port needs attention.

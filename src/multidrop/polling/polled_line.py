@@ -218,7 +218,6 @@ class PolledLine:
 
     def _lose(self, port: Port, now_ns: int) -> None:
         port.stop()
-        self._queue.conclude(port)
         self._miss(self._queue.clear(now_ns), Status.LINE_LOST)
         self.bus.line.drop()
         self._reopen_ns = now_ns

@@ -83,7 +83,12 @@ class PortQueue:
         return [(turn.job, turn.due_ns) for turn in self._queued if turn.due_ns is not None]
 
     def clear(self, now_ns: int) -> list[Slot]:
-        """Forget what is queued: the port failed. Returns the slots, those without a time as of now."""
+        """Forget what is queued: the port failed. Returns the slots, those without a time as of now.
+
+        What was carried out before has its rows already.
+        """
+        if self.port is not None:
+            self.conclude(self.port)
         slots = [
             (turn.job, now_ns if turn.due_ns is None else min(turn.due_ns, now_ns)) for turn in self._queued
         ]
