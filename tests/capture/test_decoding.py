@@ -137,6 +137,7 @@ def frames_of(path: Path, exchanges: Iterable[tuple[Message, Message | None]]) -
     return path
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("data", "end"), usually((b"\0\7", (7, "ok")), (b"", (None, "no reply"))))
 def test_more_requests_than_are_remembered_are_decoded_all_the_same(
     tmp_path: Path, data: bytes, end: tuple[float | None, str]

@@ -254,6 +254,7 @@ def test_convert_keeps_every_row(run: Run, plant: Path, tmp_path: Path) -> None:
     assert recorded(tmp_path / "b.csv") == rows
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("_unpainted")
 @pytest.mark.parametrize("suffix", usually(".arrows", ".csv"))
 def test_that_the_end_of_a_recording_is_missing_is_told(run: Run, tmp_path: Path, suffix: str) -> None:

@@ -77,6 +77,7 @@ def plant(directory: Path, port: str) -> Path:
     return path
 
 
+@pytest.mark.long
 def test_a_poll_s_values_are_heard_captured_and_decoded(
     line: tuple[str, str], tmp_path: Path, run: Run
 ) -> None:

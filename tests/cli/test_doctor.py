@@ -416,6 +416,7 @@ def test_mistakes_are_one_sentence(run: Run, words: tuple[str, ...], status: int
 # ---- Modbus TCP and RTU over TCP ----
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("port", ["tcp://127.0.0.1:0"], indirect=True)
 def test_a_drive_on_modbus_tcp_is_measured(port: str, run: Run) -> None:
     status, said, _ = run("doctor", port, "--model", "invt-che", "--address", "1")

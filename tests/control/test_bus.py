@@ -454,6 +454,7 @@ WRONG_ECHOES = {
 }
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("wrong", WRONG_ECHOES)
 def test_a_wrong_confirmation_confirms_nothing(wrong: str) -> None:
     echo = checksums.rtu(WRONG_ECHOES[wrong])

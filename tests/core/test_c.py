@@ -41,6 +41,7 @@ def test_the_time_of_day_is_asked_for_again_and_again(build: Callable[..., None]
     build("test_row_queue", "row_queue", "columns", "body", "frame", "checksum", "reason")
 
 
+@pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="others wait by poll")
 @pytest.mark.parametrize(
@@ -60,6 +61,7 @@ def test_a_client_that_is_back_soon_wakes_nobody(build: Callable[..., None]) -> 
     build("test_wakings", *core)
 
 
+@pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="others wait by poll")
 def test_a_port_is_read_once_for_an_exchange(build: Callable[..., None]) -> None:
@@ -73,6 +75,7 @@ def test_a_transceiver_sends_until_the_last_bit_has_left(build: Callable[..., No
     build("test_rs485", "port_rs485")
 
 
+@pytest.mark.long
 @pytest.mark.skipif(sys.platform != "linux", reason="others wait by poll")
 @pytest.mark.parametrize("program", ["test_waiter", "test_waiter_refused"])
 def test_no_wait_is_rounded(build: Callable[..., None], program: str) -> None:

@@ -114,6 +114,7 @@ async def read_all(client: Client, sink: SampleSink, place: int) -> HubState:
     return hub.state()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("fates", ["", "bababb", "aaaa"])
 def test_after_any_failure_each_row_is_kept_once(running: Cluster, fates: str) -> None:
     async def live() -> None:

@@ -285,6 +285,7 @@ def test_no_such_stream(running: Cluster, tmp_path: Path) -> None:
     asyncio.run(live())
 
 
+@pytest.mark.long
 def test_rights_that_do_not_suffice(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(samples_stream, "ANSWER_S", 1.0)
     with cluster(tmp_path, 1) as servers:

@@ -164,6 +164,7 @@ def test_files_are_no_larger_than_may_be(
     check(tmp_path, FILES)
 
 
+@pytest.mark.long
 def test_a_hub_has_it_done_beside_its_reading(sink: ParquetSink, tmp_path: Path) -> None:
     write(sink, range(FILES))
 

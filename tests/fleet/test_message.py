@@ -81,6 +81,7 @@ def test_an_uncertainty_is_rounded_up(ns: int, told: int) -> None:
     assert unpack(message.data).column("uncertainty_ns").to_pylist() == [told]
 
 
+@pytest.mark.long
 def test_a_message_is_no_larger_than_it_may_be() -> None:
     found = packed(numbered(0, 2000), most=8_000)
     assert len(found) > 2

@@ -183,6 +183,7 @@ def test_an_hour_is_made_of_tens_from_2_s_a_point_on() -> None:
 # ---- while it records ----
 
 
+@pytest.mark.long
 def test_a_reader_sees_what_comes_and_each_row_once(tmp_path: Path) -> None:
     pytest.importorskip("duckdb", reason="needs duckdb")
     rows: list[Row] = []

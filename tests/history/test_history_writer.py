@@ -252,6 +252,7 @@ def test_the_oldest_of_all_kinds_go_when_all_take_too_much(
     assert (tmp_path / "rows.00000021.arrows").exists()
 
 
+@pytest.mark.long
 def test_a_child_that_fails_is_told_and_tried_again(
     tmp_path: Path,
     writers: Callable[..., HistoryWriter],

@@ -70,6 +70,7 @@ def plant_file(folder: Path, port: str, family: Path, *polled: str) -> Path:
     return path
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("stated", [True, False], ids=["gaps stated", "nothing stated"])
 def test_all_40_values_of_a_poll_are_the_server_s(tmp_path: Path, stated: bool) -> None:
     """The server refuses whatever the file does not declare."""

@@ -267,6 +267,7 @@ def far() -> Iterator[Listener]:
     made.close()
 
 
+@pytest.mark.long
 def test_a_line_that_was_removed_is_closed_and_gets_no_byte(mastership: Mastership, far: Listener) -> None:
     hold(mastership)
     yard = line(far.url, quick("fan", 1, None), name="yard")

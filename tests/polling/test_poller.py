@@ -388,6 +388,7 @@ def test_a_port_that_is_gone_in_the_middle_of_a_reply() -> None:
     polling.check_summary()
 
 
+@pytest.mark.long
 def test_a_port_that_vanishes_and_comes_back_under_its_link(tmp_path: Path) -> None:
     link = tmp_path / "by-id"
     asked = [polled(drive(), ONE), polled(drive(2, "pump-2"), ONE, 0.05)]

@@ -91,6 +91,7 @@ def test_a_slow_path_costs_time_and_no_truth(
     assert answering == {drive.name for drive in story.drives}
 
 
+@pytest.mark.long
 @STORIES
 @pytest.mark.parametrize("kind", usually(*KINDS))
 def test_replies_late_doubled_and_in_another_order_cost_no_truth(kind: str, story_of: type[Path]) -> None:
@@ -100,6 +101,7 @@ def test_replies_late_doubled_and_in_another_order_cost_no_truth(kind: str, stor
     assert story.wire.struck[kind] > 50
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("story_of", usually(TrueIdsPath, OwnIdsPath))
 def test_a_stall_costs_no_truth(story_of: type[Path]) -> None:
     story_of([family(at) for at, family in enumerate(FAMILIES.values(), 1)], port=TCP).tell_of(stalling(15.0))

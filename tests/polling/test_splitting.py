@@ -129,6 +129,7 @@ def test_trials_of_the_whole_make_no_rows(monkeypatch: pytest.MonkeyPatch) -> No
 # ---- silent to long requests ----
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("every", [None, 0.5])
 @pytest.mark.parametrize("longest", usually(10, 1))
 def test_a_device_that_is_silent_to_long_requests_is_read_in_shorter_ones(

@@ -212,6 +212,7 @@ for at in count():
 """
 
 
+@pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize("suffix", usually(".arrows", ".csv"))
 def test_killed_while_writing(tmp_path: Path, suffix: str) -> None:

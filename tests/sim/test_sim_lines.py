@@ -187,6 +187,7 @@ def _serve(link: str, connection: Connection) -> None:
     serve([wire(port=link)], lambda simulator: connection.send(simulator.wires[0].path))
 
 
+@pytest.mark.long
 def test_a_line_in_another_process_that_is_terminated(tmp_path: Path) -> None:
     link = tmp_path / "hall-1"
     ours, theirs = multiprocessing.Pipe()

@@ -101,6 +101,7 @@ def play(driver: Path, mode: str, reads: int, **variables: object) -> tuple[list
     return json.loads(ran.stdout), [Event(int(ns), what, int(count)) for ns, what, count in fields]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("mode", "sending", "receiving"), [("rts-up", "up", "down"), ("rts-down", "down", "up")]
 )
