@@ -1,4 +1,4 @@
-/* Bodies of frames: what a request or a reply says, whatever wraps it.
+/* Bodies of frames: what a request or a reply says, whatever wraps it; does the reply confirm the request?
  *
  * The Modbus framings wrap the same bytes, address + PDU (application protocol V1.1b3). Delixi's body is
  * A K P1 P0 D3 D2 D1 D0. */

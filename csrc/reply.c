@@ -1,6 +1,7 @@
 /* The reply among the bytes that came since the request left: when to look, where it begins, what it tells.
  *
- * It may begin at any byte. Late replies stand in front of it, or in its place. */
+ * It may begin at any byte. Late replies stand in front of it, or in its place. frame.c and body.c check it
+ * against its request. */
 #include "line.h"
 
 #include <string.h>
