@@ -1,4 +1,4 @@
-/* Bodies of frames: what a request or a reply says, whatever wraps it.
+/* Bodies of frames: what a request or a reply says, whatever wraps it; does the reply confirm the request?
  *
  * The Modbus framings wrap the same bytes, address + PDU (application protocol V1.1b3). Delixi's body is
  * A K P1 P0 D3 D2 D1 D0. */
@@ -53,7 +53,6 @@ enum {
     EXCEPTION_BODY = 3,
     NO_PATH = 0x0A, /* of a gateway: it cannot reach the unit, or has no reply from it */
     NO_TARGET = 0x0B,
-    EXCEPTION_BIT = 0x80,
     DELIXI_BODY = 8
 };
 
@@ -164,14 +163,14 @@ static int reply_length(int framing, const uint8_t *body, size_t have, const str
     const struct function *function = find_function(framing, request->function);
     if (have >= 1 && (body[0] != request->address || !is_answered(framing, request->address)))
         return MD_BAD_ADDRESS;
-    if (request->function & EXCEPTION_BIT) /* no request has it */
+    if (request->function & MD_EXCEPTION_BIT) /* no request has it */
         return MD_BAD_FUNCTION;
     if (have < 2)
         return MD_INCOMPLETE;
     if (framing == MD_DELIXI && is_delixi_refusal(body[1]))
         return DELIXI_BODY;
     /* ERMAN, section 8, prints 89H for an exception to 08 (as Yaskawa's manuals do). */
-    if (framing != MD_DELIXI && (body[1] == (request->function | EXCEPTION_BIT) ||
+    if (framing != MD_DELIXI && (body[1] == (request->function | MD_EXCEPTION_BIT) ||
                                  (request->function == MD_LOOPBACK && body[1] == 0x89)))
         return have >= EXCEPTION_BODY && body[2] == 0 ? MD_BAD_FUNCTION : EXCEPTION_BODY;
     if (body[1] != request->function || function->reply == NONE)
@@ -293,7 +292,7 @@ int md_body_put_reply(int framing, const struct md_message *message, uint8_t *bo
         body[1] = message->exception;
         return DELIXI_BODY;
     }
-    body[1] |= EXCEPTION_BIT;
+    body[1] |= MD_EXCEPTION_BIT;
     body[2] = message->exception;
     return EXCEPTION_BODY;
 }

@@ -1,16 +1,13 @@
 /* Reads the monotonic clock, and by how much the time of day is ahead of it. */
 #include "internal.h"
 
-#include <stdatomic.h>
-#include <time.h>
-
 enum { WRONG_NS = 100000 }; /* a kept difference that is off by more is replaced */
 
 static int64_t read_clock(clockid_t clock)
 {
     struct timespec now;
     clock_gettime(clock, &now);
-    return now.tv_sec * INT64_C(1000000000) + now.tv_nsec;
+    return now.tv_sec * MD_SECOND_NS + now.tv_nsec;
 }
 
 int64_t md_now_ns(void)

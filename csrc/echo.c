@@ -1,6 +1,6 @@
 /* Adapters that repeat what they send. A reply that is no copy of its request tells whether the adapter
  * does, and so does a copy that is all that comes before a time-out. Until that is known, no copy is taken
- * for the reply. */
+ * for the reply. That a drive's reply echoes the written address and value is checked in body.c. */
 #include "line.h"
 
 #include <string.h>

@@ -16,7 +16,7 @@ static int64_t earliest(const struct md_engine *engine)
 {
     int64_t least = MD_NEVER;
     for (unsigned i = 0; i < engine->count; i++)
-        least = engine->wakes[i] < least ? engine->wakes[i] : least;
+        least = sooner(engine->wakes[i], least);
     return least;
 }
 
@@ -30,8 +30,7 @@ static int wait_until(struct md_engine *engine, void **ready, int64_t until_ns)
         return n;
     int64_t late = md_now_ns() - until_ns;
     if (left > 0 && late >= 0) { /* else it could not sleep for so short a time */
-        if (late > MD_MOST_LATENESS)
-            late = MD_MOST_LATENESS;
+        late = sooner(late, MD_MOST_LATENESS);
         engine->lateness_ns += (late - engine->lateness_ns) / (late > engine->lateness_ns ? 4 : 16);
     }
     return n;

@@ -53,6 +53,16 @@ struct md_engine {
     int64_t lateness_ns; /* of the thread's waking, as is usual */
 };
 
+/* Until when this process may send, as the ports see it. */
+struct md_mastership {
+    int64_t until_ns;         /* of CLOCK_BOOTTIME; read and written atomically; 0: it does not hold */
+    int64_t guard_ns;         /* from the end of one master to the beginning of the next */
+    struct md_engine *engine; /* that looks at it; NULL: none does yet */
+#ifdef __linux__
+    timer_t timer;
+#endif
+};
+
 /* Nanoseconds of a wake-up that are reckoned with. */
 #ifdef _WIN32
 enum { MD_MOST_LATENESS = 1500000 }; /* its best timers keep time to half a millisecond, or one */

@@ -52,7 +52,7 @@ int md_body_get_reply(int framing, const uint8_t *body, const struct md_message 
 
 enum { MD_MOST_ADDRESS = 247, MD_TCP_HEAD = 6 /* before the unit id, which is the address */ };
 
-enum { MD_WRITE_COIL = 0x05, MD_WRITE_ONE = 0x06, MD_LOOPBACK = 0x08 };
+enum { MD_WRITE_COIL = 0x05, MD_WRITE_ONE = 0x06, MD_LOOPBACK = 0x08, MD_EXCEPTION_BIT = 0x80 };
 
 /* Delixi's K (part 3): a master sends these, and those between them. */
 enum { MD_DELIXI_RUN = 2, MD_DELIXI_STATE_QUERY = 3, MD_DELIXI_PARAMETER_QUERY = 7 };
@@ -127,6 +127,10 @@ void md_waiter_change(struct md_waiter *waiter, int fd, void *whose, int watched
 void md_waiter_remove(struct md_waiter *waiter, int fd);
 /* Wait so long, for ever where it is negative; write who can read, and return how many. */
 int md_waiter_wait(struct md_waiter *waiter, void **ready, int room, int64_t timeout_ns);
+
+/* ---- termios.c ---- */
+
+int md_port_keep_rts(int fd); /* leave RTS as it is when the port is closed; 0, -errno */
 
 /* ---- wakeup.c ---- */
 

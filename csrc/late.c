@@ -187,12 +187,6 @@ void md_late_expect(struct md_line *line, int64_t window_ns)
     md_late_link(line, drive);
 }
 
-void md_late_resume(struct md_line *line, struct md_drive *drive)
-{
-    if (drive->owed_count)
-        md_late_link(line, drive);
-}
-
 void md_late_inherit(struct md_drive *drive, const struct md_drive *before)
 {
     int is_known = drive->owed_count > 0 && before->late_until_ns <= drive->late_until_ns;

@@ -122,7 +122,8 @@ void md_line_begin(struct md_line *line, const struct md_exchange *exchange, str
     go(line, MD_BEGUN);
     if (md_listen_is_held(line))
         line->give_up_ns = later(line->give_up_ns, line->listened_ns + exchange->drive->most_timeout_ns);
-    md_late_resume(line, exchange->drive);
+    if (exchange->drive->owed_count) /* of another line, or from before the port was lost */
+        md_late_link(line, exchange->drive);
     int refused = md_late_bars(exchange, now_ns) ? MD_LATE_ANSWER_DUE : load(line, exchange);
     if (refused)
         finish(line, (struct md_ending){refused, 0, 0});

@@ -213,8 +213,6 @@ int md_late_is_repeated(const struct md_exchange *exchange);
 void md_late_expect(struct md_line *line, int64_t window_ns);
 /* The drive has requests whose replies may come on this line. */
 void md_late_link(struct md_line *line, struct md_drive *drive);
-/* Replies of this drive may still come to requests on another line, or before the port was lost. */
-void md_late_resume(struct md_line *line, struct md_drive *drive);
 /* Account for the late reply that begins there: its length, MD_INCOMPLETE, or MD_NO_START. Where it may
  * answer the exchange under way instead, `since_ns` is to have the time at which that was sent first, 0 if
  * it never was; else NULL. */

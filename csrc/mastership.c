@@ -3,7 +3,7 @@
  *
  * A look at the clock cannot be enough: the process may be stopped between the look and write(2). The timer
  * needs nothing of the process, and a stopped process can be killed. */
-#include "mastership.h"
+#include "engine.h"
 
 #include <errno.h>
 #include <signal.h>

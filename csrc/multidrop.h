@@ -92,7 +92,6 @@ enum md_refusal {
 /* Make the port raw with these settings, and read them back to find what it did not take. */
 int md_port_set(int fd, const struct md_settings *settings);
 int md_port_get(int fd, struct md_settings *settings);
-int md_port_keep_rts(int fd); /* leave RTS as it is when the port is closed */
 
 /* ---- clock.c: return a time ---- */
 

@@ -66,11 +66,10 @@ int md_owed_is_mistakable(const struct md_owed *owed, const struct md_exchange *
 
 int md_is_in_range(const struct md_message *reply, uint16_t least, uint16_t most)
 {
-    int value = reply->data[0] << 8 | reply->data[1];
+    int value = md_get16(reply->data);
     return most == 0 || reply->exception || reply->data_len < 2 || (value >= least && value <= most);
 }
 
-/* Parse the reply to this that begins there: its length, MD_INCOMPLETE or a reason. */
 int md_owed_parse(const struct md_owed *owed, const uint8_t *bytes, size_t len)
 {
     struct md_message request = {.address = owed->address, .function = owed->function, .start = owed->start,
@@ -85,9 +84,14 @@ int md_owed_parse(const struct md_owed *owed, const uint8_t *bytes, size_t len)
 
 /* ---- when it was sent ---- */
 
+static uint32_t last_place(const struct md_owed *owed)
+{
+    return (owed->times < MD_TIMES_KEPT ? owed->times : MD_TIMES_KEPT) - 1;
+}
+
 int64_t md_owed_last_ns(const struct md_owed *owed)
 {
-    return owed->sent_ns[(owed->times < MD_TIMES_KEPT ? owed->times : MD_TIMES_KEPT) - 1];
+    return owed->sent_ns[last_place(owed)];
 }
 
 void md_owed_add_time(struct md_owed *owed, int64_t sent_ns)
@@ -95,7 +99,7 @@ void md_owed_add_time(struct md_owed *owed, int64_t sent_ns)
     if (owed->times >= MD_TIMES_KEPT)
         memmove(owed->sent_ns + 1, owed->sent_ns + 2, (MD_TIMES_KEPT - 2) * sizeof *owed->sent_ns);
     owed->times++;
-    owed->sent_ns[(owed->times < MD_TIMES_KEPT ? owed->times : MD_TIMES_KEPT) - 1] = sent_ns;
+    owed->sent_ns[last_place(owed)] = sent_ns;
 }
 
 void md_owed_drop_time(struct md_owed *owed)

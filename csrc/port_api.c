@@ -1,6 +1,6 @@
 /* What clients do with a port, on any thread of theirs. */
 #define _GNU_SOURCE
-#include "mastership.h"
+#include "engine.h"
 
 #include <errno.h>
 #include <stdlib.h>

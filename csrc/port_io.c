@@ -1,7 +1,7 @@
 /* One port on the engine's thread: reading, writing and switching, until there is nothing to do but wait. */
 #define _GNU_SOURCE
 #include "descriptor.h"
-#include "mastership.h"
+#include "engine.h"
 
 enum {
     WORTH_BLINDNESS = 200000, /* ns; a shorter wait is not worth the system calls to look away */
@@ -97,7 +97,7 @@ static int64_t apply(struct md_port *port, const struct md_settings *settings)
     int64_t now_ns = md_now_ns();
     port->turn.line.wake_ns += now_ns - begun_ns; /* so long the port could take nothing */
     progress->switching_ns += now_ns - begun_ns;
-    __atomic_store_n(&progress->switches, progress->switches + 1, __ATOMIC_SEQ_CST);
+    md_store(&progress->switches, progress->switches + 1);
     port->settings = *settings;
     if (refused < 0 || (refused & port->must_take))
         port->settings = (struct md_settings){0}; /* some of them may be in force now */

@@ -1,6 +1,7 @@
 /* The reply among the bytes that came since the request left: when to look, where it begins, what it tells.
  *
- * It may begin at any byte. Late replies stand in front of it, or in its place. */
+ * It may begin at any byte. Late replies stand in front of it, or in its place. frame.c and body.c check it
+ * against its request. */
 #include "line.h"
 
 #include <string.h>
@@ -56,7 +57,7 @@ void md_reply_foresee(struct md_line *line, int64_t now_ns)
     }
     int function_at = exchange->framing == MD_RTU ? 1 : 3;
     int missing = md_reply_length(exchange->framing, &exchange->request) - have;
-    int may_be_exception = have <= function_at || (begun[function_at] & 0x80) || begun[function_at] >= '8';
+    int may_be_exception = have <= function_at || (begun[function_at] & MD_EXCEPTION_BIT) || begun[function_at] >= '8';
     if (missing > 1 && !(may_be_exception && have > 0))
         line->ready_ns = now_ns + (missing - 1) * exchange->character_ns;
 }
@@ -98,7 +99,7 @@ static void learn_burst(struct md_line *line, size_t at, int reply_len)
         line->burst = line->sight;
 }
 
-static inline void accept(struct md_line *line, size_t at, int used, const struct md_message *reply)
+void md_reply_accept(struct md_line *line, size_t at, int used, const struct md_message *reply)
 {
     if (!line->exchange->insists)
         line->exchange->drive->answered_ns = line->quiet_ns;
@@ -157,16 +158,15 @@ static struct md_ending end_in_doubt(struct md_line *line, size_t at, int used,
 
 enum found { NOTHING, SKIPPED, ENDED }; /* SKIPPED: look at the same place again, or behind an echo */
 
-/* Decide whether it is this exchange's, or a late one. */
-static inline int is_its_reply(struct md_line *line, size_t at, int used, const struct md_message *reply,
-                               int64_t now_ns, struct md_ending *ending)
+int md_reply_judge(struct md_line *line, size_t at, int used, const struct md_message *reply, int64_t now_ns,
+                   struct md_ending *ending)
 {
     const struct md_exchange *exchange = line->exchange;
     int64_t since_ns;
     int is_late = !exchange->insists && exchange->drive->owed_count &&
                   md_late_take(line, at, now_ns, &since_ns) > 0;
     if (!is_late) {
-        accept(line, at, used, reply);
+        md_reply_accept(line, at, used, reply);
         *ending = (struct md_ending){used, at, (size_t)used};
         return 1;
     }
@@ -190,9 +190,8 @@ static enum found judge(struct md_line *line, size_t *at, int used, const struct
         *at += line->tx_len;
         return SKIPPED;
     }
-    return is_its_reply(line, *at, used, reply, now_ns, ending) ? ENDED : SKIPPED;
+    return md_reply_judge(line, *at, used, reply, now_ns, ending) ? ENDED : SKIPPED;
 }
-
 
 /* Look at every place where the reply may still begin. A late reply is looked for only where what precedes it
  * cannot be the reply's beginning: it may be the inside of the reply. */
@@ -225,19 +224,6 @@ int md_reply_find(struct md_line *line, int64_t now_ns, struct md_ending *ending
     }
     line->rx_from = first_open < line->rx_len ? (uint16_t)first_open : line->rx_len;
     return 0;
-}
-
-/* ---- the same for frames that were found by their headers ---- */
-
-int md_reply_judge(struct md_line *line, size_t at, int used, const struct md_message *reply, int64_t now_ns,
-                   struct md_ending *ending)
-{
-    return is_its_reply(line, at, used, reply, now_ns, ending);
-}
-
-void md_reply_accept(struct md_line *line, size_t at, int used, const struct md_message *reply)
-{
-    accept(line, at, used, reply);
 }
 
 /* ---- no reply ---- */

@@ -10,8 +10,6 @@
 
 #include <string.h>
 
-enum { HEAD_KNOWN = 6 };
-
 void md_tcp_begin(struct md_line *line)
 {
     md_put16(line->long_tx, ++line->transaction);
@@ -22,7 +20,7 @@ void md_tcp_begin(struct md_line *line)
 size_t md_tcp_put(struct md_line *line, const uint8_t *bytes, size_t len)
 {
     int whole = md_tcp_length(line->frame, line->frame_len);
-    size_t wanted = (whole > 0 ? (size_t)whole : HEAD_KNOWN) - line->frame_len;
+    size_t wanted = (whole > 0 ? (size_t)whole : MD_TCP_HEAD) - line->frame_len;
     size_t taken = len < wanted ? len : wanted;
     memcpy(line->frame + line->frame_len, bytes, taken);
     line->frame_len = (uint16_t)(line->frame_len + taken);
@@ -74,6 +72,15 @@ static void remember(struct md_line *line)
     md_late_link(line, drive);
 }
 
+/* The exchange under way is over, and its reply may still come. */
+static void expect(struct md_line *line)
+{
+    if (line->transactions == MD_IGNORED)
+        md_late_expect(line, md_window_ns(line->exchange));
+    else
+        remember(line);
+}
+
 /* This one and those before it are answered, or never will be. */
 static void forget_up_to(struct md_drive *drive, uint32_t last)
 {
@@ -84,10 +91,10 @@ static void forget_up_to(struct md_drive *drive, uint32_t last)
 
 static int is_reply_to(const struct md_line *line, const struct md_unanswered *unanswered)
 {
-    enum { EXCEPTION_BIT = 0x80, EXCEPTION_AT = MD_TCP_HEAD + 2 };
+    enum { EXCEPTION_AT = MD_TCP_HEAD + 2 };
     const uint8_t *body = line->frame + MD_TCP_HEAD;
     struct md_message reply = {0};
-    if (line->frame_len > EXCEPTION_AT && (body[1] & EXCEPTION_BIT))
+    if (line->frame_len > EXCEPTION_AT && (body[1] & MD_EXCEPTION_BIT))
         reply.exception = body[2];
     return md_get16(line->frame) == unanswered->transaction && body[0] == unanswered->address &&
            !md_is_gateways(MD_TCP, &reply);
@@ -132,22 +139,13 @@ static void pass(struct md_line *line, int64_t now_ns)
     drop(line, now_ns);
 }
 
-/* A gateway's exception: the drive said nothing, and may still say it. */
-static struct md_ending end_unreached(struct md_line *line, size_t at)
-{
-    if (line->transactions == MD_IGNORED)
-        md_late_expect(line, md_window_ns(line->exchange));
-    else
-        remember(line);
-    return (struct md_ending){MD_NO_REPLY, at, line->frame_len};
-}
-
 static int judge(struct md_line *line, size_t at, int64_t now_ns, struct md_ending *ending)
 {
     struct md_message reply;
     int used = md_reply_parse(line, at, &reply);
-    if (used > 0 && md_is_gateways(MD_TCP, &reply)) {
-        *ending = end_unreached(line, at);
+    if (used > 0 && md_is_gateways(MD_TCP, &reply)) { /* the drive said nothing, and may still say it */
+        expect(line);
+        *ending = (struct md_ending){MD_NO_REPLY, at, line->frame_len};
         return 1;
     }
     if (used > 0 && line->transactions == MD_IGNORED)
@@ -197,10 +195,7 @@ struct md_ending md_tcp_missed(struct md_line *line)
         keep(line);
         line->frame_told = line->frame_len;
     }
-    if (line->transactions == MD_IGNORED)
-        md_late_expect(line, md_window_ns(exchange));
-    else
-        remember(line);
+    expect(line);
     md_learn_silence(exchange->drive);
     int reason = md_reason(MD_TCP, &exchange->request, line->rx, line->rx_len);
     return (struct md_ending){reason, 0, line->rx_len};

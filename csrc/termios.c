@@ -6,7 +6,6 @@
 #include "internal.h"
 
 #include <errno.h>
-#include <string.h>
 
 #ifdef __linux__
 #include <asm/termbits.h>

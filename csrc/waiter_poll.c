@@ -7,7 +7,6 @@
 #include <errno.h>
 #include <poll.h>
 #include <stdlib.h>
-#include <string.h>
 
 struct md_waiter {
     struct pollfd *fds; /* one that is not watched is kept as its complement, which poll() ignores */

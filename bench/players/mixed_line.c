@@ -6,15 +6,14 @@
  * until standard input ends; then prints as JSON what came, and when. */
 #define _GNU_SOURCE
 #include "multidrop.h"
+#include "raw_pty.h"
 
 #include <errno.h>
-#include <fcntl.h>
 #include <poll.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
 #include <sys/prctl.h>
-#include <termios.h>
 #include <time.h>
 #include <unistd.h>
 
@@ -118,21 +117,6 @@ static int64_t answer(int fd, struct drive *drive, const struct md_message *requ
 
 /* ---- the line ---- */
 
-static int open_pty(void)
-{
-    int master = posix_openpt(O_RDWR | O_NOCTTY | O_NONBLOCK);
-    if (master < 0 || grantpt(master) || unlockpt(master))
-        exit(1);
-    int slave = open(ptsname(master), O_RDWR | O_NOCTTY); /* keeps the pty alive between clients */
-    struct termios raw;
-    tcgetattr(slave, &raw);
-    cfmakeraw(&raw);
-    tcsetattr(slave, TCSANOW, &raw);
-    printf("%s\n", ptsname(master));
-    fflush(stdout);
-    return master;
-}
-
 /* A request that came; the line had been silent since quiet_ns, and was to be for silence_ns. */
 static void note(const struct md_message *request, int64_t came_ns, int64_t quiet_ns, int64_t silence_ns)
 {
@@ -198,7 +182,7 @@ int main(int argc, char **argv)
         drive->silence_ns = silence_ns;
     }
     prctl(PR_SET_TIMERSLACK, 1UL, 0UL, 0UL, 0UL);
-    play(open_pty());
+    play(announce_pty());
     double span_ns = (double)(seen.last_ns - seen.first_ns);
     printf("{\"requests\": %ld, \"early\": %ld, \"refused\": %ld, \"utilisation\": %.5f, \"cycles\": %ld, \"cycle_ms\": %.4f, ",
            seen.requests, seen.early, seen.refused, span_ns > 0 ? (double)seen.ideal_ns / span_ns : 0,

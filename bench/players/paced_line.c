@@ -4,9 +4,9 @@
  * JSON what came, and when. A request is deemed to be on the wire for its characters' time from when
  * it was seen here; every byte of the reply is handed over when its last bit would have come. */
 #define _GNU_SOURCE
+#include "raw_pty.h"
 #include <arpa/inet.h>
 #include <errno.h>
-#include <fcntl.h>
 #include <getopt.h>
 #include <netinet/in.h>
 #include <netinet/tcp.h>
@@ -17,7 +17,6 @@
 #include <string.h>
 #include <sys/prctl.h>
 #include <sys/socket.h>
-#include <termios.h>
 #include <time.h>
 #include <unistd.h>
 
@@ -228,21 +227,6 @@ static int64_t answer(int fd, const uint8_t *request, int64_t begun_ns, int64_t 
 
 /* ---- the line's end ---- */
 
-static int open_pty(void)
-{
-    int master = posix_openpt(O_RDWR | O_NOCTTY | O_NONBLOCK);
-    if (master < 0 || grantpt(master) || unlockpt(master))
-        exit(1);
-    int slave = open(ptsname(master), O_RDWR | O_NOCTTY); /* keeps the pty alive between clients */
-    struct termios raw;
-    tcgetattr(slave, &raw);
-    cfmakeraw(&raw);
-    tcsetattr(slave, TCSANOW, &raw);
-    printf("%s\n", ptsname(master));
-    fflush(stdout);
-    return master;
-}
-
 static int open_tcp(void)
 {
     struct sockaddr_in at = {.sin_family = AF_INET, .sin_addr.s_addr = htonl(INADDR_LOOPBACK)};
@@ -358,7 +342,7 @@ int main(int argc, char **argv)
         delay_ns = options.delay_us * 1000;
     }
     prctl(PR_SET_TIMERSLACK, 1UL, 0UL, 0UL, 0UL);
-    play(options.tcp ? open_tcp() : open_pty());
+    play(options.tcp ? open_tcp() : announce_pty());
     print_report();
     return 0;
 }

@@ -1,13 +1,11 @@
 /* A server that answers at once: 10 registers to every 8-byte request on a new pty, whose path it
  * prints. Runs until standard input ends. */
 #define _GNU_SOURCE
+#include "raw_pty.h"
+
 #include <poll.h>
-#include <stdio.h>
-#include <stdlib.h>
 #include <string.h>
-#include <termios.h>
 #include <unistd.h>
-#include <fcntl.h>
 
 static unsigned crc16(const unsigned char *bytes, int len)
 {
@@ -22,17 +20,7 @@ static unsigned crc16(const unsigned char *bytes, int len)
 
 int main(void)
 {
-    int master = posix_openpt(O_RDWR | O_NOCTTY);
-    if (master < 0 || grantpt(master) || unlockpt(master))
-        return 1;
-    int slave = open(ptsname(master), O_RDWR | O_NOCTTY); /* keeps the pty alive between clients */
-    struct termios raw;
-    tcgetattr(slave, &raw);
-    cfmakeraw(&raw);
-    tcsetattr(slave, TCSANOW, &raw);
-    puts(ptsname(master));
-    fflush(stdout);
-
+    int master = announce_pty();
     unsigned char reply[25] = {1, 3, 20}, request[256];
     for (int i = 3; i < 23; i++)
         reply[i] = (unsigned char)i;

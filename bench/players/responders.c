@@ -9,6 +9,7 @@
  * new ptys, whose paths are printed. Runs until standard input ends, then prints JSON. */
 #define _GNU_SOURCE
 #include "multidrop.h"
+#include "raw_pty.h"
 
 #include <errno.h>
 #include <fcntl.h>
@@ -18,7 +19,6 @@
 #include <string.h>
 #include <sys/epoll.h>
 #include <sys/prctl.h>
-#include <termios.h>
 #include <time.h>
 #include <unistd.h>
 
@@ -186,21 +186,6 @@ static void hear(struct line *line)
 
 /* ---- lines ---- */
 
-static int open_pty(void)
-{
-    int master = posix_openpt(O_RDWR | O_NOCTTY);
-    if (master < 0 || grantpt(master) || unlockpt(master)) {
-        perror("responders: no more ptys");
-        exit(1);
-    }
-    int slave = open(ptsname(master), O_RDWR | O_NOCTTY); /* keeps the pty alive between clients */
-    struct termios raw;
-    tcgetattr(slave, &raw);
-    cfmakeraw(&raw);
-    tcsetattr(slave, TCSANOW, &raw);
-    return master;
-}
-
 static void watch(int epoll, int fd, struct line *line)
 {
     struct epoll_event event = {.events = EPOLLIN, .data.ptr = line};
@@ -277,7 +262,7 @@ int main(int argc, char **argv)
     for (size_t i = 0; i < inherited; i++)
         watch(epoll, atoi(argv[optind + (int)i]), &lines[i]);
     for (size_t i = inherited; i < count; i++) {
-        int fd = open_pty();
+        int fd = open_raw_pty();
         watch(epoll, fd, &lines[i]);
         printf("%s ", ptsname(fd));
     }

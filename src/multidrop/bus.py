@@ -2,22 +2,21 @@
 
 from __future__ import annotations
 
-import logging
-from collections.abc import Iterable, Mapping, Sequence
-from math import inf
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
-from multidrop.control.attached import Attached
+from multidrop.control.attached import Attached, made
 from multidrop.control.audit_log import AuditLog
 from multidrop.control.broadcast import Broadcaster
 from multidrop.control.eeprom_ledger import Ledger
-from multidrop.control.exit_hook import LastAct, exit_hook
 from multidrop.control.latches import Latches
-from multidrop.control.outcome import Outcome, Seen, Stopped
+from multidrop.control.leaving import Leaving
+from multidrop.control.outcome import Outcome, Stopped
 from multidrop.control.performer import Performer
 from multidrop.control.records import WriteRecords
 from multidrop.control.stop_all import Stopper
+from multidrop.control.time_limit import checked_expiry
 from multidrop.control.writer import Writer
 from multidrop.core import RS485, Echo, Mastership, Message, Peer, TransactionIds
 from multidrop.core.fork import register_at_fork
@@ -37,8 +36,6 @@ T = TypeVar("T", bound=float)
 
 EXPIRY = 1.0  # s
 
-_log = logging.getLogger("multidrop.bus")
-
 
 def _facts(port: str, echo: str, transaction: str, rs485: str) -> tuple[Echo, TransactionIds, RS485]:
     """Return what a line is told of its port. Raises ValueError."""
@@ -52,13 +49,13 @@ class Bus:
 
     `port` is a device such as /dev/ttyUSB0, any pyserial URL, or tcp://10.0.0.7:502 for Modbus TCP, which all
     drives on such a port then speak; `transaction` is "ignore" where its gateway replies with transaction ids
-    of its own. `baudrate` and `format` replace the
-    families' defaults for drives that are attached without their own, and `silence`, in s, the standard's
-    t3.5 between frames, if all of them bear it. `echo` says that the adapter repeats what it sends: "on",
-    "off" (until it does), or "auto", to find out. `rs485` is who switches between sending and receiving where
-    the adapter does not: "kernel", the driver, or "rts-up" or "rts-down", the core, by RTS being on or off
-    while a request leaves. Raises LineError when the port cannot be opened. Writes that may wear an EEPROM
-    are counted in `ledger`, a file that all processes share, and all writes are noted in the file `audit`.
+    of its own. `baudrate` and `format` replace the families' defaults for drives that are attached without
+    their own, and `silence`, in s, the standard's t3.5 between frames, if all of them bear it. `echo` says
+    that the adapter repeats what it sends: "on", "off" (until it does), or "auto", to find out. `rs485` is
+    who switches between sending and receiving where the adapter does not: "kernel", the driver, or "rts-up"
+    or "rts-down", the core, by RTS being on or off while a request leaves. Raises LineError when the port
+    cannot be opened. Writes that may wear an EEPROM are counted in `ledger`, a file that all processes share,
+    and all writes are noted in the file `audit`.
 
     A write is not sent when it is late by `expiry` seconds: since the verb was called, but for the time that
     its own reads may take. It is not sent either once a stop was called: that ends all that may move a motor
@@ -88,7 +85,7 @@ class Bus:
         expiry: float = EXPIRY,
         mastership: Mastership | None = None,
     ) -> None:
-        _checked_expiry(expiry, "a write")
+        checked_expiry(expiry, "a write")
         self.baudrate = baudrate
         self.format = format
         self.silence = silence
@@ -132,7 +129,7 @@ class Bus:
         self._performer = Performer(self._exchanges, self._writer, self._stopper, self._latches, expiry)
         self._broadcaster = Broadcaster(self._writer, self._performer, self._latches)
         self._meter = LineMeter(self._exchanges)
-        self._last_act: LastAct | None = None
+        self._leaving = Leaving(self._latches, self._stopper, self.stop_all)
         self._is_closed = False
         self._attached = Attached(self, self._exchanges, self._latches, self._performer, self._stopper)
         register_at_fork(self)
@@ -164,17 +161,11 @@ class Bus:
 
     def leave(self) -> None:
         """End all that moves a motor, and begin to stop the drives if `stop_on_exit` was called."""
-        self._latches.shut()
-        if self._last_act is not None:
-            self._last_act.begin()
+        self._leaving.begin()
 
     def part(self) -> None:
         """Leave, and wait for all stops under way; the port stays open."""
-        self.leave()
-        if self._last_act is not None:
-            exit_hook().finish(self._last_act)
-        if self._last_act is None or not self._last_act.is_cut_short:
-            self._latches.await_stops()
+        self._leaving.finish()
 
     def close(self) -> None:
         """Leave the line and close the port. A write that was sent and is not answered yet is Unconfirmed."""
@@ -206,23 +197,11 @@ class Bus:
         call this. Raises ValueError for what the family does not allow, an address taken, or a drive that is
         on another bus.
         """
-        made = self._made(drive, address, details)
-        made.take_framing_of(self.line.port)
-        self._attached.add(made)
-        return made
-
-    def _made(self, drive: D | type[D], address: int | None, details: dict[str, Any]) -> D:
-        family = drive if isinstance(drive, type) else type(drive)
-        if not issubclass(family, Drive):
-            raise TypeError(f"attach takes a family such as InnovertIBD, or a drive of one, not {drive!r}")
-        if isinstance(drive, type):
-            if address is None:
-                raise TypeError(f"attach({drive.__name__}, address=...): which address does it have?")
-            line = {"baudrate": self.baudrate, "format": self.format, "silence": self.silence}
-            return drive(address, **{**line, **details})
-        if address is not None or details:
-            raise TypeError(f"{drive.name} is made already: what it is to be goes into {family.__name__}(…)")
-        return drive
+        line = {"baudrate": self.baudrate, "format": self.format, "silence": self.silence}
+        attached = made(drive, address, line, details)
+        attached.take_framing_of(self.line.port)
+        self._attached.add(attached)
+        return attached
 
     def detach(self, drive: Drive) -> None:
         """Take a drive off the bus: nothing is asked of it any more, and its verbs raise ValueError.
@@ -293,7 +272,7 @@ class Bus:
         a failure of the drive. Raises NoReply, BadReply, DriveRefused, Expired or LineError; ValueError or
         TypeError, and nothing is sent, for what no such request can say.
         """
-        return self._exchanges.ask(drive, function, start, count, _checked_expiry(expiry, "a read"))
+        return self._exchanges.ask(drive, function, start, count, checked_expiry(expiry, "a read"))
 
     # ---- writing ----
 
@@ -382,27 +361,16 @@ class Bus:
         it short, with a message on standard error. From the signal on nothing that moves a motor is sent.
         Without this call leaving sends nothing: the motors go on as they are. Call it from the main thread.
         """
-        if self._last_act is None:
-            self._last_act = exit_hook().add(self._latches.shut, self._stop_at_last)
+        self._leaving.stop_on_exit()
 
     @property
     def stops_on_exit(self) -> bool:
         """True once `stop_on_exit` was called."""
-        return self._last_act is not None
+        return self._leaving.stops
 
     def stop_leaving(self, drives: Sequence[Drive]) -> None:
         """Stop these if `stop_on_exit` was called: once they are detached, nobody would."""
-        if drives and self.stops_on_exit:
-            self._tell(self._stopper.stop_all(drives, lambda: False, None))
-
-    def _stop_at_last(self) -> None:
-        self._tell(self.stop_all())
-
-    @staticmethod
-    def _tell(found: Mapping[str, Stopped]) -> None:
-        for stopped in found.values():
-            if stopped.seen is not Seen.STOPPED:
-                _log.warning("%s", stopped)
+        self._leaving.stop(drives)
 
     # ---- how it went ----
 
@@ -421,9 +389,3 @@ class Bus:
     def reset_statistics(self) -> None:
         """Count from here on."""
         self._meter.reset()
-
-
-def _checked_expiry(expiry: float, what: str) -> float:
-    if isinstance(expiry, bool) or not isinstance(expiry, (int, float)) or not 0 < expiry < inf:
-        raise ValueError(f"expiry = {expiry!r} is not a number of seconds above 0 for {what}'s turn to come")
-    return expiry

@@ -14,9 +14,9 @@ from peers import require_module
 
 require_module("nats")
 
+from multidrop import read_audit  # noqa: E402
 from multidrop.fleet import fleet_commands as asker_module  # noqa: E402
 from multidrop.fleet.buckets import Record  # noqa: E402
-from multidrop.fleet.command_log import read_command_log  # noqa: E402
 from multidrop.fleet.command_words import CommandAnswer, CommandOutcome  # noqa: E402
 from multidrop.fleet.errors import FleetError, NobodyThere, NotDelivered, Unsure  # noqa: E402
 from multidrop.fleet.fleet_commands import FleetCommands  # noqa: E402
@@ -145,7 +145,7 @@ def test_a_command_is_sent_once_and_its_outcome_is_as_certain_as_it_is(tmp_path:
     assert told.outcome is outcome
     assert told.text
     assert path.asked.count("do") == sent
-    first, last = read_command_log(tmp_path / "asked.jsonl")
+    first, last = read_audit(tmp_path / "asked.jsonl")
     assert (first["step"], first["by"]) == ("asked", "anna")
     assert (last["step"], last["outcome"]) == ("over", outcome.value)
 

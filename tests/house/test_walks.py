@@ -1,14 +1,16 @@
-"""The two walks through the rooms name files and functions that are there."""
+"""The rooms' description has every file, and the two walks through them name what is there."""
 
 from __future__ import annotations
 
 import ast
 import re
+from fnmatch import fnmatch
 from pathlib import Path
 
 import pytest
 from sources import PACKAGE, ROOT, parsed
 
+ARCHITECTURE = ROOT / "docs" / "reference" / "architecture.md"
 WALKS = sorted((ROOT / "docs" / "reference").glob("walk-*.md"))
 STEP = re.compile(r"`(?:(?:src/multidrop/)?([\w/]+\.py):([\w.]+)|(?:csrc/)?(\w+\.c))`")
 
@@ -37,6 +39,15 @@ def missing(walk: Path) -> list[str]:
         if not (ROOT / "csrc" / file if file.endswith(".c") else PACKAGE / file).exists()
         or (name and name not in defined(PACKAGE / file))
     ]
+
+
+def test_every_file_has_its_row() -> None:
+    """A folder stands for what is in it, and a pattern for each file that it fits."""
+    rows = [line.split("|")[1] for line in ARCHITECTURE.read_text("utf-8").splitlines() if line[:1] == "|"]
+    named = {name.rstrip("/") for row in rows for name in re.findall(r"`([^`]+)`", row)}
+    places = [*PACKAGE.iterdir(), *(ROOT / "csrc").glob("*.c"), ROOT / "csrc" / "windows"]
+    rooms = {path.name for path in places if path.name[0] != "_" and path.suffix in ("", ".py", ".c")}
+    assert {room for room in rooms if not any(fnmatch(room, name) for name in named)} == set()
 
 
 @pytest.mark.parametrize("walk", WALKS, ids=[walk.stem for walk in WALKS])

@@ -1,4 +1,4 @@
-"""Drives that fall silent, on a world's clock: what they cost the others, and how soon they are back."""
+"""Drives that fall silent, on a test line's clock: what they cost the others, and how soon they are back."""
 
 from __future__ import annotations
 

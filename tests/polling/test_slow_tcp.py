@@ -35,7 +35,7 @@ from multidrop.sim import EncodedDrive, Faults, MotorDrive, SimulatedDrive, simu
 
 pytestmark = pytest.mark.story
 
-TCP = "tcp://world:502"
+TCP = "tcp://test-line:502"
 FAMILIES = {family.model: family for family in (ErmanERG220, InvtCHE, InnovertIBD, DelixiModbus, YD1000)}
 PATHS = [
     (path, seconds)

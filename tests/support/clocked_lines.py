@@ -60,7 +60,7 @@ class ClockedWire(FaultyWire):
     chunk = 1.0  # s; characters that end within it come together: a reply is heard when it is whole
 
     def open(self) -> None:
-        path = "world"
+        path = "test line"
         port: Any = SimpleNamespace(path=path, close=lambda: None)
         self.port = port
 
@@ -294,7 +294,7 @@ class ClockedLines:
 
     def __init__(self, wire: ClockedWire, drives: Sequence[PolledDrive]) -> None:
         wire.open()
-        name = wire.where if speaks_tcp(wire.where) else "world"
+        name = wire.where if speaks_tcp(wire.where) else "test line"
         declared = line(name, *drives)
         self._begin({name: wire}, plant(replace(declared, ids=wire.ids)))
 

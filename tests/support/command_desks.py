@@ -13,10 +13,10 @@ from unittest.mock import patch
 
 from fleets import HandClock
 
-from multidrop import YD1000, Bus, written_before
+from multidrop import YD1000, Bus, read_audit, written_before
 from multidrop.fleet import command_desk
 from multidrop.fleet.command_desk import CommandDesk
-from multidrop.fleet.command_log import CommandLog, read_command_log
+from multidrop.fleet.command_log import CommandLog
 from multidrop.fleet.command_words import CommandAnswer, CommandOutcome, Offered
 from multidrop.fleet.held_lines import HeldLines
 from multidrop.fleet.stop_desk import StopDesk
@@ -77,7 +77,7 @@ class Desks:
 
     @property
     def notes(self) -> list[dict[str, Any]]:
-        return list(read_command_log(self.path)) if self.path.exists() else []
+        return list(read_audit(self.path)) if self.path.exists() else []
 
     def ask(self, **what: Any) -> Offered | CommandAnswer | None:
         what = {"id": f"id-{next(_ids)}", "by": "anna", "drive": "pump", **what}

@@ -23,8 +23,7 @@ from typing import NamedTuple
 from kills import kill_all
 from nats_clusters import Cluster, cluster
 
-from multidrop import YD1000
-from multidrop.fleet.command_log import read_command_log
+from multidrop import YD1000, read_audit
 from multidrop.fleet.command_words import CommandAnswer, CommandOutcome, Offered
 from multidrop.fleet.errors import FleetError
 from multidrop.fleet.fleet_commands import FleetCommands
@@ -216,7 +215,7 @@ class CommandDrill:
         noted = {
             (note["drive"], note["what"])
             for path in self.folder.glob("state/multidrop/fleet/*/commands.jsonl")
-            for note in read_command_log(path)
+            for note in read_audit(path)
             if note["step"] == "begun" and "drive" in note
         }
         twice = wrongly = unknown_sent = unnoted = 0

@@ -95,7 +95,7 @@ class PathLine:
     """A bus's view of a line behind such a path; time passes only while it waits."""
 
     def __init__(self, wire: PathWire) -> None:
-        self.port = self.identity = wire.where if speaks_tcp(wire.where) else "world"
+        self.port = self.identity = wire.where if speaks_tcp(wire.where) else "test line"
         self.now = BEGIN_NS
         self.wire = wire
         self.has_echo = self.is_lost = False

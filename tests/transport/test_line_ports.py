@@ -23,7 +23,7 @@ from multidrop.core import Echo, Port, set_settings
 from multidrop.errors import LineError, NoReply, Unconfirmed
 from multidrop.poller import Poller
 from multidrop.sim import Simulator, Wire, simulated
-from multidrop.transport import line as line_module
+from multidrop.transport import open_port
 from multidrop.transport.bridge import MOST_STALL_MS
 from multidrop.transport.line import Line
 
@@ -60,7 +60,7 @@ def test_a_network_that_stalls_hands_on_nothing_later(monkeypatch: pytest.Monkey
                 told.append(connection.getsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT))
             super().__init__(fd, must_take, **details)
 
-    monkeypatch.setattr(line_module, "Port", Watched)
+    monkeypatch.setattr(open_port, "Port", Watched)
     with Simulator([wire("socket://127.0.0.1:0")]) as sim, Bus(sim.wires[0].path):
         assert told == [MOST_STALL_MS]
 

@@ -28,7 +28,7 @@ from multidrop.errors import LineError
 from multidrop.plant.loader import PlantError, load_plant
 from multidrop.poller import Poller
 from multidrop.sim import Simulator, Wire, simulated
-from multidrop.transport import line as line_module
+from multidrop.transport import open_port
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="the driver is Linux's")
 CHARACTER_NS = 1_041_667  # of a toy: 9600 8N1
@@ -48,9 +48,9 @@ from multidrop.bus import Bus
 from multidrop.core import Exchange, Framing, Message, Peer
 from multidrop.errors import BusError
 from multidrop.sim import Simulator, Wire, simulated
-from multidrop.transport import line as line_module
+from multidrop.transport import open_port
 
-line_module.is_pseudo_terminal = lambda device: False  # its driver is a UART's
+open_port.is_pseudo_terminal = lambda device: False  # its driver is a UART's
 said = []
 with Simulator([Wire([simulated(Toy(1))])]) as sim:
     try:
@@ -156,7 +156,7 @@ def test_rts_that_breaks_loses_the_port_and_nothing_more_is_sent(driver: Path) -
 
 
 def test_a_poller_is_told_at_once_and_leaves_nothing_behind(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(line_module, "is_pseudo_terminal", lambda device: False)
+    monkeypatch.setattr(open_port, "is_pseudo_terminal", lambda device: False)
     with Simulator([Wire([simulated(Toy(1))])]) as sim:
         before = descriptors(), threads()
         drive = polled(Toy(1), [Toy.output_current])

@@ -4,13 +4,32 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Iterable
-from typing import Any
+from typing import Any, TypeVar
 
 from multidrop.control.latches import Latches
 from multidrop.control.performer import Performer
 from multidrop.control.stop_all import Stopper
 from multidrop.drive.family import Drive
 from multidrop.transport.exchange import Exchanges
+
+D = TypeVar("D", bound=Drive)
+
+
+def made(drive: D | type[D], address: int | None, line: dict[str, Any], details: dict[str, Any]) -> D:
+    """Return a drive that was made before, or a new one of a family: `details` go before those of the line.
+
+    Raises TypeError for what is neither, an address that is missing, and details that come too late.
+    """
+    family = drive if isinstance(drive, type) else type(drive)
+    if not issubclass(family, Drive):
+        raise TypeError(f"attach takes a family such as InnovertIBD, or a drive of one, not {drive!r}")
+    if isinstance(drive, type):
+        if address is None:
+            raise TypeError(f"attach({drive.__name__}, address=...): which address does it have?")
+        return drive(address, **{**line, **details})
+    if address is not None or details:
+        raise TypeError(f"{drive.name} is made already: what it is to be goes into {family.__name__}(…)")
+    return drive
 
 
 class Attached:
@@ -58,7 +77,7 @@ class Attached:
         drive.carry_out_stop = lambda verb, script, seconds: stopper.stop(drive, script, seconds)
 
     def remove(self, drive: Drive) -> None:
-        """Take a drive off, which nothing moves any more; NotAttached where it is not on the bus."""
+        """Take a drive off the bus: nothing moves it any more. NotAttached where it is not there."""
         with self.lock:
             self._exchanges.peer(drive)
             self.drives = [other for other in self.drives if other is not drive]

@@ -1,4 +1,4 @@
-"""Call: one call of what may move a motor: how long it may be sent, and what of it was."""
+"""Call: one call that may move a motor: until when it may be sent, and what of it was sent."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ class Call:
     """One call of a verb, `verb`, or of a plain write.
 
     Nothing of it is written once a stop was called, nor when it is late by more than `expiry` seconds.
-    It is late by all the time since it began that its own steps do not account for: what a read takes at
-    most by the drive's document, and the waits of its script. So a process that was held up sends nothing.
+    Its lateness is the time since it began, less what its own steps may take: its reads, by the drive's
+    document, and the waits of its script. So a process that was held up sends nothing.
     Its first write is not sent after `limit_ns` either, a time of CLOCK_MONOTONIC.
     """
 
@@ -41,7 +41,7 @@ class Call:
         self._limit_ns = limit_ns
 
     def anew(self) -> Call:
-        """Return the same as if it was called now; stops called since the first one end it all the same."""
+        """Return the same call, made now. Stops that were called since the first one still end it."""
         return Call(self.drive, self.permit, self.expiry, self.verb, self._limit_ns)
 
     @property

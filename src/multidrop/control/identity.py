@@ -111,7 +111,7 @@ class IdentityCheck:
         self._stoppable[drive] = port
 
     def _is_in_step(self, drive: Drive) -> bool:
-        """Return True where an answer from its address can only be to the request sent now."""
+        """Return True where an answer from its address can only belong to the request sent now."""
         peer = self._exchanges.peer(drive)
         return not (peer.counters().late or peer.silences or peer.late_until_ns)
 

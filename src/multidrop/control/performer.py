@@ -37,7 +37,7 @@ _ENDING = (NoReply, BadReply, DriveRefused, LineError, NotAttached, NotMaster)
 
 
 class _Over(Exception):
-    """A script goes on after Overtaken was raised in it."""
+    """The script went on after Overtaken was raised in it."""
 
 
 class Performer:
@@ -76,7 +76,7 @@ class Performer:
             return result
 
     def write(self, drive: Drive, register: Register[Any], value: Any) -> Outcome:
-        """Carry out a plain write, or at once and by all means one that stops the motor."""
+        """Carry out a plain write. One that stops the motor is sent at once, and nothing holds it back."""
         raw = raw_count(drive, register, value)
         check_plain(drive, register, raw)
         step = Write(register, value)

@@ -61,7 +61,7 @@ class WriteRecords:
     def log(
         self, drive: Drive, request: Message, what: str, effect: Effect, why: str = "", held: Any = None
     ) -> None:
-        """Note a write in the audit log; failing to is a warning."""
+        """Note a write in the audit log; a failure is logged as a warning."""
         self.log_later(drive, request, what, effect, why, held)
         self.catch_up()
 
@@ -84,7 +84,7 @@ class WriteRecords:
         self._unlogged.append((clock.utc_ns(), record))
 
     def catch_up(self) -> None:
-        """Log and count what was queued; failing to is a warning."""
+        """Log and count what was queued; a failure is logged as a warning."""
         self._writers.append(None)  # before a record is taken: `close` then waits for this thread
         try:
             with suppress(IndexError):  # another thread may be at it

@@ -80,13 +80,13 @@ def _has(drive: Drive, name: str) -> bool:
 
 
 def check_broadcast(drive: Drive, register: Register[Any], raw: float) -> None:
-    """Raise Refused where nobody has confirmed what a file or a class calls a broadcast, unless it stops."""
+    """Raise Refused for a broadcast of a user's family that nobody has confirmed, unless it stops."""
     if not is_stop(drive, register, raw):
         drive.check_confirmed(register.name)
 
 
 def is_stop(drive: Drive, register: Register[Any], raw: float) -> bool:
-    """Return True for a harmless count of a family that has a stop: in a file each is one of its words."""
+    """Return True for a harmless count of a family that has a stop; a file calls only its words so."""
     return is_harmless(register, raw) and _has(drive, "stop")
 
 

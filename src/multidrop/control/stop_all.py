@@ -42,7 +42,7 @@ class Stopper:
         self._stops: set[StopAttempt] = set()  # under way
 
     def so_far(self) -> dict[str, str]:
-        """Return, by drive's name, what is known of each stop under way; of several, of the one sent most."""
+        """Return what is known of each drive's stop under way, by name; of several, the one sent most."""
         stops = sorted(self._stops.copy(), key=lambda stop: stop.times_sent)
         return {stop.drive.name: stop.so_far() for stop in stops}
 
@@ -111,7 +111,7 @@ class Stopper:
             self._writer.records.catch_up()
 
     def _do(self, stop: StopAttempt, step: Step) -> Any:
-        """Carry out a step; a stop's first write must not hold up others', a later one may wait."""
+        """Carry out a step. A stop's first write must not hold up those of others; a later one may wait."""
         self._regain()
         if isinstance(step, Read):  # once: where it is not answered the stop is sent again
             return self._exchanges.value(stop.drive, step.register, 1)
@@ -154,7 +154,7 @@ def _check(seconds: float | None) -> None:
 def stop_together(stops: Sequence[StopAttempt], do: Do, end: Callable[[StopAttempt], object]) -> None:
     """Carry the stops out, a step of each in turn; call `end` with each at its end.
 
-    An interruption has each that is not over sent once more, unless that is interrupted too.
+    At an interruption each stop that is not over is sent once more, unless a second one comes.
     """
     under_way = list(stops)
     try:

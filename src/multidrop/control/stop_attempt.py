@@ -142,7 +142,7 @@ class StopAttempt:
         return True
 
     def _tell_unsent(self, failure: NotMaster) -> None:
-        """Say it at once and loudest: nobody else stops this motor by itself."""
+        """Log it at once, as critical: no other process stops this motor by itself."""
         if not self.is_sent:
             log_aside(_log, logging.CRITICAL, "%s", failure.of_a_stop())
 

@@ -22,16 +22,23 @@ def present_limit_ns() -> float:
     return _limit.get()()
 
 
+def checked_expiry(expiry: float, what: str) -> float:
+    """Return it, if it is a time in s that a write's or a read's turn may take; else raise ValueError."""
+    if isinstance(expiry, bool) or not isinstance(expiry, (int, float)) or not 0 < expiry < inf:
+        raise ValueError(f"expiry = {expiry!r} is not a number of seconds above 0 for {what}'s turn to come")
+    return expiry
+
+
 @contextmanager
 def written_before(limit: Limit) -> Iterator[None]:
-    """Begin to write nothing of what is called within the block after the time that `limit` returns.
+    """Send nothing of a call within the block whose first write would leave after the time of `limit`.
 
-    That is a time of CLOCK_MONOTONIC in ns, as `time.monotonic_ns()` has it; 0 is always past. It is asked
-    for as each call begins, when a stop that is called from then on ends that call: so whoever notes a stop,
-    and lets `limit` return 0 since, misses none. A call whose first write would leave later than that sends
-    nothing, and raises Expired; the further writes of a verb have the bus's own `expiry`, and are not cut
-    off. Stops are sent whenever it is. The block is that of this thread and what it calls, or of this task of
-    asyncio and `asyncio.to_thread`. Raises TypeError for what is no function.
+    `limit` returns a time of CLOCK_MONOTONIC in ns, as `time.monotonic_ns()` does; 0 is always past. It is
+    called when a call begins; from then on a stop ends that call. So whoever notes a stop, and has `limit`
+    return 0 from then on, misses none. A call that is too late sends nothing and raises Expired. The later
+    writes of a verb have the bus's own `expiry`, and are not cut off. Stops are sent at any time. The block
+    is that of this thread and what it calls, or of this task of asyncio and `asyncio.to_thread`. Raises
+    TypeError for what is no function.
     """
     if not callable(limit):
         raise TypeError(f"limit = {limit!r} is no function that returns a time of CLOCK_MONOTONIC in ns")

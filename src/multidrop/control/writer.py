@@ -73,8 +73,8 @@ class Writer:
         """Write what stops the motor, or does no harm at any time: only the port can hold it back.
 
         Neither a rule nor the ledger is asked; the records are kept afterwards, by `catch_up`. Only proof of
-        another family is Refused. Where answers are known to be late, its own is waited for for as long as
-        `timeout` seconds.
+        another family is Refused. Where answers are known to be late, it waits up to `timeout` seconds for
+        its own.
         """
         register = step.register
         raw = raw_count(drive, register, step.value)
@@ -87,7 +87,7 @@ class Writer:
                 self.records.count_later(drive, register)
 
     def verified(self, drive: Drive, outcome: Outcome) -> Outcome:
-        """Return the outcome after something was read of the drive since: its reply may be an echo."""
+        """Return the outcome once something else was read of the drive: the write's reply may be an echo."""
         if outcome.effect is not Effect.DONE or outcome.held is not None:
             return outcome
         why = self._echo.why_doubtful(drive)

@@ -10,7 +10,7 @@ import hashlib
 from collections.abc import Sequence
 
 BOUND = 110  # percent of the mean
-NUMBER_BITS = 16  # of an entry: which gateway it is of; what is above is its weight
+NUMBER_BITS = 16  # the low bits of an entry: its gateway's number; the others are its weight
 
 
 class Balance:

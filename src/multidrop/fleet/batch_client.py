@@ -2,8 +2,8 @@
 
 nats-py parses the headers of each message with Python's parser for e-mails, passes it on through a queue,
 and has a timer for each request; a gateway of a large fleet reads tens of thousands of records, and claims
-hundreds of lines at a time. Here such answers are taken where they leave the connection, and what is wanted
-of their headers is found by its name.
+hundreds of lines at a time. Here such answers are taken where they leave the connection, and only
+the headers that are wanted are looked for.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ class Gathered:
             self.last.set_result(status)
 
     async def wait(self, silence_s: float) -> None:
-        """Return when the last one came, or nothing for so long."""
+        """Wait for the last one, or until nothing has come for so long."""
         before = -1
         while not self.last.done() and self.count > before:
             before = self.count
@@ -88,7 +88,7 @@ class Replies(Gathered):
 
 
 class BatchClient(Client):
-    """A client of nats-py with one more subscription: such answers come there, each in its own inbox."""
+    """A client of nats-py with one more subscription, to which such answers come."""
 
     def __init__(self) -> None:
         super().__init__()

@@ -103,10 +103,10 @@ class Bucket:
         raise Unsure(f"NATS did not store {self.name}.{key}: {error.get('description')}")
 
     async def put_all(self, records: Sequence[Record]) -> list[Record]:
-        """Replace records, each at the revision given with it, and return those that were, with the new one.
+        """Replace records, each at the revision given with it; return the new revision of each that was.
 
-        All are sent one behind the other, and each is decided by itself. What became of one that is not
-        returned must be read.
+        All are sent one behind the other, and the server decides each by itself. A record that is not
+        returned may have been replaced or not: read it.
         """
         answers = await self.path().request_all([self._put(record) for record in records])
         said = [json.loads(answer) if answer else {} for answer in answers]
@@ -169,7 +169,7 @@ class Bucket:
         return Record(key, revision, self._value(key, data))
 
     def _value(self, key: str, data: bytes) -> Any:
-        """Return the value, or None and a warning for what is none of ours: once, until it is again."""
+        """Return the value; None for what is none of ours, with one warning until a good one comes."""
         value, mistake = parsed(self.name, key, data)
         if not mistake:
             self._strange.discard(key)

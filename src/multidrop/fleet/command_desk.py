@@ -61,7 +61,7 @@ class CommandDesk:
     def offer(self, line: str, data: bytes) -> Offered | CommandAnswer | None:
         """Return an offer, a refusal, or None where we are not the line's master and must keep silent.
 
-        Another gateway may be, and the first answer is the one that counts.
+        The first answer counts, and it must be the master's.
         """
         held = self._lines.for_command(line)
         if held is None:
@@ -78,8 +78,8 @@ class CommandDesk:
     async def do(self, data: bytes) -> CommandAnswer:
         """Carry out what was offered, once; a copy of the message gets the same answer.
 
-        A message with `ask` in place of `do` asks what became of it; where nobody had told to do it, nobody
-        can any more, and the answer is certain.
+        A message with `ask` in place of `do` asks what became of it. If nobody has told us to do it by then,
+        nobody can any more: the answer is certain.
         """
         try:
             message = read_json(data)
@@ -131,7 +131,7 @@ class CommandDesk:
         return answer
 
     def _send(self, offer: Offer) -> CommandAnswer:
-        """Send it, in a thread of its own, unless it is too late: what stood still sends nothing."""
+        """Send it on a thread of its own, unless it is too late: a process that stood still sends nothing."""
         now_ns = time.monotonic_ns()  # before the other clock is read: a pause between them shortens the time
         until_ns = now_ns + self.offers.left_ns(offer)
         why = self._why_not(offer)

@@ -6,12 +6,10 @@ import asyncio
 import json
 import os
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
-
-from multidrop import read_audit
 
 _sync = getattr(os, "fdatasync", os.fsync)  # an asker may be on a system without it
 
@@ -58,8 +56,3 @@ class CommandLog:
         """Close it after what is queued; a record that comes later is not taken."""
         self._disk.submit(self._file.close)
         self._disk.shutdown(wait=False)
-
-
-def read_command_log(path: Path) -> Iterator[dict[str, Any]]:
-    """Yield the records of a log in order, without those that a crash truncated. Raises OSError."""
-    return read_audit(path)

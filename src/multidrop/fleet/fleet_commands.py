@@ -39,7 +39,7 @@ News = Callable[[CommandAnswer], object]
 
 
 def _tell_nobody(answer: CommandAnswer) -> None:
-    """Leave it at the answer at the end."""
+    """Do nothing: the answer at the end is enough."""
 
 
 class FleetCommands:
@@ -87,7 +87,7 @@ class FleetCommands:
     async def write(self, drive: str, register: str, value: float | str) -> CommandAnswer:
         """Write a register once; a choice by its name or its raw count.
 
-        Raises ValueError for a drive that the plant has not, FleetError where the plant cannot be read.
+        Raises ValueError for a drive that is not in the plant, FleetError where the plant cannot be read.
         """
         return await self.carry_out(self.request(drive, register=register, value=value))
 
@@ -102,8 +102,7 @@ class FleetCommands:
     async def carry_out(self, request: CommandRequest, agreed: str = "") -> CommandAnswer:
         """Have a command carried out, once, and return what is known of it; raises as `write`.
 
-        `agreed` is the text of a preview that a person agreed to: where it would be another now, nothing is
-        sent.
+        `agreed` is the text of a preview that a person agreed to. Where it would differ now, nothing is sent.
         """
         line = await self._line_of(request.drive)
         record = {"id": request.id, "line": line, "what": request.words, "by": request.by}
@@ -189,8 +188,8 @@ class FleetCommands:
 
         With `line` the plant is not looked at, and the drives are its. `on_news` is called in the loop with
         what is known of a stop that is not over within half a second, and again when something else is.
-        Raises ValueError for a drive that the plant has not, FleetError where the plant cannot be read: then
-        no stop was sent.
+        Raises ValueError for a drive that is not in the plant, FleetError where the plant cannot be read;
+        then no stop was sent.
         """
         wanted = await self._lines_of(drives, line)
         answers = await asyncio.gather(*(self._stop(one, wanted[one], on_news) for one in wanted))
@@ -270,7 +269,7 @@ class FleetCommands:
         return self._find(drive)
 
     async def _read_plant(self, otherwise: str) -> None:
-        """Read what has changed of the plant; what was read before will do: the line's master knows more."""
+        """Read what has changed of the plant. What was read before will do: the line's master checks."""
         try:
             await self._plant.look()
         except FleetError as failure:

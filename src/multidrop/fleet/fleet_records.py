@@ -18,13 +18,13 @@ from multidrop.fleet.observer import Observer
 from multidrop.fleet.ownership import owner_of
 from multidrop.fleet.servers import ServerPath
 
-LEASES_S = 0.1  # the same of leases: how long a dead gateway's lines stay silent begins with it
+LEASES_S = 0.1  # the same of leases: the silence of a dead gateway's lines is longer by this
 
 
 class FleetRecords:
     """The records of all buckets, as far as they were read.
 
-    `on_change` is called when some of lines or their masters have changed. Leases change all the time.
+    `on_change` is called when lines or their masters have changed. Leases change all the time.
     """
 
     def __init__(
@@ -81,7 +81,7 @@ class FleetRecords:
                 raise failure
 
     def works(self) -> list[Coroutine[Any, Any, None]]:
-        """Return what reads them for ever, a coroutine for each bucket, so that none waits for another."""
+        """Return a coroutine for each bucket, which reads it for ever: none waits for another."""
         rests = {name: follower.rest for name, follower in {**self.owners, names.PLANT: self.plant}.items()}
         rests |= {name: partial(asyncio.sleep, LEASES_S) for name in names.LEASES}
         return [self._follow(name, rests[name]) for name in self._looks]

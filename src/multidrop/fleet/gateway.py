@@ -114,7 +114,7 @@ class FleetGateway:
             await self._close()
 
     def end(self) -> None:
-        """Let `run` come to its end. To be called in the loop."""
+        """Let `run` come to its end. Call it in the loop."""
         self._end.set()
 
     async def _forward_the_rest(self, forwarding: asyncio.Task[None]) -> None:

@@ -18,7 +18,7 @@ class PolledBuses(Protocol):
 
 
 class HeldLine:
-    """A line from when it was taken until it is let go: one that is taken again is another, by its number."""
+    """A line while it is held. Taken again, it is another HeldLine with another number."""
 
     _numbers = count(1)
 
@@ -44,8 +44,8 @@ class HeldLine:
 class HeldLines:
     """The lines that are open to commands.
 
-    `may_stop` says whether we are a line's master now, and `may_command` whether moreover no frame of the
-    one before can come any more. A stop that meets such a frame is repeated; a command would be lost.
+    `may_stop` says whether we are a line's master now, and `may_command` whether no frame of the master
+    before can come any more either. A stop that meets such a frame is repeated; a command would be lost.
     """
 
     def __init__(
@@ -80,7 +80,7 @@ class HeldLines:
 
 
 def lists_of(description: Mapping[str, Any]) -> dict[str, frozenset[str]]:
-    """Return the lists of a line's record; empty for what is none, so that nothing is allowed."""
+    """Return the lists of a line's record; empty ones, which allow nothing, where it is none."""
     may = description.get("may")
     given = may if isinstance(may, dict) else {}
     return {key: _entries(given.get(key)) for key in LISTS}

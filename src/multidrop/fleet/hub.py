@@ -75,7 +75,7 @@ class SampleSink(Protocol):
 
 
 async def _on_thread(act: Callable[..., T], *arguments: Any) -> T:
-    """Return act(*arguments), done by a thread; who is cancelled waits for it: then a sink can be closed."""
+    """Return act(*arguments), called on a thread. A cancelled caller waits for it too, to close a sink."""
     done = asyncio.ensure_future(asyncio.to_thread(act, *arguments))
     try:
         return await asyncio.shield(done)

@@ -25,7 +25,7 @@ def is_ready(server: str, cluster: Mapping[str, Any]) -> bool:
 
 
 async def bring_leaders_home(path: ServerPath) -> int:
-    """Ask leaders that are not at home to step down for who is; return how many."""
+    """Ask leaders elsewhere to step down in favour of their home; return how many were asked."""
     moved = 0
     for group in (names.LEASES, names.OWNERS):
         for place, bucket in enumerate(group):

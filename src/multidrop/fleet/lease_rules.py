@@ -43,7 +43,7 @@ class SeenRevision(NamedTuple):
 def deadline(sent: Iterable[int | None], terms: Terms) -> int:
     """Return the time (ns) until which the holder may send; 0 where too few paths are renewed.
 
-    `sent` has a time for each path: when the newest renewal that was acknowledged had not yet been sent.
+    `sent` has a time for each path: right before its newest acknowledged renewal was sent.
     """
     latest = sorted((moment for moment in sent if moment is not None), reverse=True)
     return latest[terms.needed - 1] + terms.lease if len(latest) >= terms.needed else 0

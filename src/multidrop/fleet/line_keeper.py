@@ -73,7 +73,7 @@ class LineKeeper:
 
     @property
     def may_poll(self) -> bool:
-        """Say whether lines are taken and kept: there is a lease, and time to close them before it ends."""
+        """Say whether lines may be taken and kept: the lease leaves time to close them before it ends."""
         return bool(self._lease.session) and self._lease.left_s > SILENT_S and not self._is_leaving
 
     @property
@@ -103,7 +103,7 @@ class LineKeeper:
         return self._lease.clock() - self.polled[line].since >= self._lease.terms.guard
 
     async def fail(self) -> None:
-        """Wait until a line could not be let go, and raise what was wrong: the process must end."""
+        """Wait for a line that cannot be let go, and raise its error: the process must end."""
         await self._has_failed.wait()
         assert self._failure is not None
         raise self._failure
@@ -136,7 +136,7 @@ class LineKeeper:
             self._hand_over({line: record.revision for line, record in mine_still.items()}, NOBODY, 0)
 
     async def let_all_go(self) -> None:
-        """Let go of all lines, whatever is under way. Raises what kept a line from it."""
+        """Let go of all lines, whatever is under way. Raises the error of a line that could not be."""
         self._is_leaving = True
         try:
             while not self.is_silent:

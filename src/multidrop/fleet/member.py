@@ -106,14 +106,14 @@ class Member:
 
     @property
     def _is_settling_down(self) -> bool:
-        """Say whether other gateways may come one after the other, as in a cold start."""
+        """Say whether more gateways may be about to come, as in a cold start."""
         return bool(self._balanced) and not self._is_settled
 
     def _path(self, number: int) -> ServerPath:
         return self.paths[number]
 
     def best(self) -> ServerPath:
-        """Return the path whose lease was renewed last, or before there is one any that is open."""
+        """Return the path whose lease was renewed last; before there is a lease, any open path."""
         path = self.paths[self.lease.best]
         return path if path.is_open else next((one for one in self.paths if one.is_open), path)
 
@@ -202,7 +202,7 @@ class Member:
     # ---- one step ----
 
     async def step(self) -> None:
-        """Do what is to be done now; nothing here waits for a server, but the ending of dead gateways."""
+        """Do what is due now. Only the ending of dead gateways waits for a server."""
         observer = self.records.observer
         present = observer.sessions()
         if not self.lease.is_valid:
@@ -222,7 +222,7 @@ class Member:
             self.keeper.reconcile()
 
     async def _share_out(self, present: Mapping[str, Mapping[str, Any]]) -> None:
-        """Make the balance anew where gateways or lines came or went; it takes long: outside of the loop."""
+        """Make the balance anew where gateways or lines came or went; in a thread, for it takes long."""
         gateways = tuple(
             name for name, value in present.items() if not value["draining"] and name != self.name
         )

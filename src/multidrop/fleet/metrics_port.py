@@ -1,7 +1,7 @@
 """Metrics port: answers `GET /metrics` to this machine's own programs, and nothing else.
 
-Whoever may connect may read, so no address that others reach is listened on. A page under a name of its own
-that was bound to this machine reads nothing either: the header `Host` is looked at.
+Whoever may connect may read, so it listens only on addresses that this machine alone can reach. It checks the
+header `Host` too: a page of another site, whose name was made to lead here, reads nothing.
 """
 
 from __future__ import annotations

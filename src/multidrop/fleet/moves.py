@@ -68,7 +68,7 @@ class Moves:
         self.add([move])
 
     def add(self, moves: Iterable[Move]) -> None:
-        """Add moves that others saw; of two that are one the one that knows more is kept."""
+        """Add moves that others saw. Where two are the same move, the one that knows more is kept."""
         for move in moves:
             key = (move.line, move.revision)
             known = self._moves.get(key)

@@ -37,7 +37,7 @@ class Observer:
         self._clock = clock
 
     def begin_anew(self) -> None:
-        """Count from now on: whoever was cut off itself knows nothing of the others meanwhile."""
+        """Count from now on: while we were cut off we saw nothing of the others."""
         now = self._clock()
         for seen in self._watched:
             seen.update({name: one._replace(since=now) for name, one in seen.items()})
@@ -92,7 +92,7 @@ class Observer:
         return not is_ended_by_another(record) or self._is_stale(path, record, now)
 
     def unseen_s(self, gateway: str) -> float:
-        """Return for how long (s) no renewal was seen that counts: the second latest of the paths."""
+        """Return for how long (s) no renewal was seen on two of the paths, as many as must be renewed."""
         seen = [watched[gateway].since for watched in self._watched if gateway in watched]
         latest = sorted(seen, reverse=True)[: self.terms.needed]
         return (self._clock() - latest[-1]) / lease_rules.SECOND if latest else 0.0

@@ -68,7 +68,7 @@ class Offers:
         return self._by_token.get(token)
 
     def take(self, offer: Offer) -> bool:
-        """Return True for who takes it first: he alone carries it out."""
+        """Return True for the first who takes it, and who alone carries it out."""
         is_first = not offer.is_taken
         offer.is_taken = True
         return is_first

@@ -106,7 +106,7 @@ class FleetView:
 
 
 def is_shown(state: Mapping[str, Any]) -> bool:
-    """Say whether a gateway's answer has the rest that is shown of it: another version may lack some."""
+    """Say whether a gateway's answer has all else that is shown: another version's may lack some."""
     spool = state["spool"]
     return isinstance(state.get("trouble"), str) and all(
         name in spool and isinstance(spool[name], kinds) for name, kinds in _MAY_BE_NONE.items()

@@ -46,7 +46,7 @@ class FleetPart:
         self._watch = watch
 
     def take(self, batch: object) -> None:
-        """Take rows of the gateway's own lines, of which the fleet knows nothing."""
+        """Ignore them: they are of the gateway's own lines, and not of the fleet's."""
 
     async def run(self) -> None:
         keeping = asyncio.create_task(self._path.keep())

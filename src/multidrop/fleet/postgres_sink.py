@@ -8,9 +8,9 @@
 | `multidrop.register_sets` | id and names, in the order of the values                                 |
 | `multidrop.hub`           | one row: the stream, the place of its last message here, the sources     |
 
-A row a value takes four and a half times the disk. Rows come by COPY in the
-transaction that moves the place on from where this hub left it: another hub's is refused then. A timestamptz
-has microseconds; `time_ns` is exact. The drive's monotonic clock is not kept.
+A row for each value would take four and a half times the disk. Rows come by COPY, in the transaction that
+moves the place on from where this hub left it. Where another hub has moved it, the transaction is refused.
+A timestamptz has microseconds; `time_ns` is exact. The drive's monotonic clock is not kept.
 """
 
 from __future__ import annotations

@@ -49,7 +49,7 @@ def parsed(bucket: str, key: str, data: bytes) -> tuple[Any, str]:
 
 
 def misshapen(value: Any, shape: Mapping[str, type]) -> str:
-    """Return what a value lacks of a shape; "" where it has it. More than that it may have."""
+    """Return what a value lacks of a shape; "" where it lacks nothing. It may have more."""
     if not isinstance(value, dict):
         return "it is no table"
     for name, kind in shape.items():

@@ -65,7 +65,7 @@ class Denials:
         return self._said["publish", subject.lower()]
 
     def check_request(self, subject: str, inbox: str, before: int) -> None:
-        """Raise what a request without an answer fails by, where that is a want of rights.
+        """Raise MayNotSend or NoRight where a request has no answer for want of rights.
 
         `before` is how often it was denied before it was sent. MayNotSend says that it reached nobody,
         NoRight that nothing can be heard in this inbox.

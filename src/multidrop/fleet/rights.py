@@ -10,7 +10,7 @@
 | operator  | what a viewer may, and make what is missing, store the plant, drain gateways                |
 
 Nobody may change, empty or remove a stream (but for the one that `fleet init` tries servers with), make a
-consumer, or read answers to another one.
+consumer, or read another user's answers.
 """
 
 from __future__ import annotations

@@ -102,7 +102,7 @@ async def connect(servers: list[str], **options: Any) -> Client:
 
 
 async def _ignore(_: Exception) -> None:
-    """Leave it to who asks: the client would log a traceback for each."""
+    """Do nothing: whoever asked has the error too, and the client would log a traceback for each."""
 
 
 async def create_stream(client: Client, *, replicas: int = 3, most_bytes: int = -1) -> None:

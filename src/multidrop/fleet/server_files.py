@@ -5,7 +5,7 @@
     keys/NAME.key        the secret key of a user; for its machine alone
     keys/routes          the servers' own password, as the servers' files have it
 
-Keys that are there stay as they are, so a gateway that comes needs no other one's key. Whose name is not
+Keys that are there stay as they are, so that a new gateway changes no other one's. A user whose name is not
 given any more has no rights.
 """
 

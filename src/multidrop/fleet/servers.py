@@ -76,7 +76,7 @@ class ServerPath:
         raise refusals[0] if refusals else FleetError("; ".join(map(str, failures)))
 
     async def keep(self) -> None:
-        """Come home, or go elsewhere from a server that does not answer; for ever."""
+        """Go elsewhere from a server that does not answer, and come home again; for ever."""
         while True:
             try:
                 await self.look_after()
@@ -247,9 +247,9 @@ async def _close(client: BatchClient) -> None:
 
 
 def _cut(client: BatchClient) -> None:
-    """Close the socket, and end what hears messages.
+    """Close the socket and end the subscriptions' tasks, which nats-py may leave behind.
 
-    nats-py leaves both where it is cancelled, or the server is gone; what became of its reading is not asked.
+    It does so where it is cancelled, or the server is gone. The error of its reading task is ignored.
     """
     for subscription in client._subs.values():
         subscription._stop_processing()

@@ -71,7 +71,7 @@ async def check_buckets(path: ServerPath) -> None:
 
 
 async def _led(path: ServerPath, bucket: str) -> dict[str, Any]:
-    """Return what a bucket is, once it has a leader; that is on its way home for a moment."""
+    """Return the state of a bucket once it has a leader: it has none while that moves home."""
     ends = asyncio.get_running_loop().time() + LEADER_S
     while True:
         info = await ask(path, f"STREAM.INFO.KV_{bucket}")

@@ -1,7 +1,7 @@
 """Share records: what a gateway reads of its fleet; of the masters of lines, those of its own share alone.
 
-A large fleet has thousands of lines, and a gateway needs to know of those that it is to have and has not:
-what it has nobody else takes while its session lasts. So in rest nothing is asked about masters at all.
+A large fleet has thousands of lines. A gateway asks only about those that it should have and has not: nobody
+takes the others from it while its session lasts. So at rest it asks nothing about masters at all.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ class ShareFollower(Follower):
         return sorted(self._doubted.keys() | {line for line in self._share if self._may_change(line)})
 
     def _may_change(self, line: str) -> bool:
-        """Say whether a line is another one's, or unknown. (Who claims a free one learns what it is.)"""
+        """Say whether a line is another gateway's, or unknown. Claiming a free one tells what it is."""
         record = self.records.get(line)
         return record is None or (owner_of(record)[0] != NOBODY and not self._is_mine(record))
 

@@ -41,6 +41,6 @@ class SourceCheck:
         return True
 
     def alarm(self, sentence: str) -> None:
-        """Tell and count what must not be."""
+        """Log and count something that must never happen."""
         self.alarms += 1
         _log.error("%s", sentence)

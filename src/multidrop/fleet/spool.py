@@ -84,7 +84,7 @@ class Spool:
     # ---- for the poller: any thread ----
 
     def append(self, batch: Batch) -> None:
-        """Copy the rows for the thread to write; within microseconds, and never raising for the disk."""
+        """Copy the rows for the thread to write. It takes microseconds, and raises nothing for the disk."""
         columns = batch.columns()
         with self._changing:
             rows = len(columns.time)
@@ -222,7 +222,7 @@ class Spool:
             self._remove_acknowledged()
 
     def _remove_acknowledged(self) -> None:
-        """Give back what is kept for convenience alone: the disk has no room."""
+        """Remove what the stream has: it is kept for convenience alone, and the disk has no room."""
         oldest = self.following(0)
         if oldest and oldest.sequence <= (self._acknowledged or 0) and oldest.sequence < self._folder.newest:
             self._remove(oldest)

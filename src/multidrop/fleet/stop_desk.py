@@ -42,9 +42,9 @@ class StopDesk:
     async def stop(self, line: str, data: bytes) -> CommandAnswer | None:
         """Stop drives of a line now; None where we are not its master and must keep silent.
 
-        A copy of the message gets the answer of the same stop; another message is another stop. One that is
-        not over soon is under way, with what is known of it so far; the asker asks again. Where we lost the
-        line at it, it is the next master's to stop: that one may even have had a copy, so we know nothing.
+        A copy of the message gets the answer of the same stop; another message is another stop. The answer
+        to one that is not over soon is "under way", with what is known of it so far; the asker asks again.
+        Where we lost the line meanwhile we keep silent too: its next master may have had a copy, and stops.
         """
         held = self._lines.for_stop(line)
         if held is None:

@@ -65,7 +65,7 @@ class Speaker(Protocol):
         """Take a message."""
 
     def pass_over(self) -> int:
-        """Return how many messages there would be now, of which nobody hears."""
+        """Return how many messages would be sent now, had the broker a connection."""
 
 
 class Broker:

@@ -1,4 +1,4 @@
-"""Threads of commands: one for each, which runs to its end whoever waits for it."""
+"""Threads of commands: one for each. It runs to its end, though nobody may wait for it any more."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def begin_stop(work: Callable[[], R], caller: Caller) -> asyncio.Future[R]:
 
 
 def in_thread(work: Callable[[], R], caller: Caller) -> asyncio.Future[R]:
-    """Begin work in a thread of its own, as this caller's, whoever waits for it or no longer does."""
+    """Do work in a thread of its own, in this caller's name; it goes on though its waiter is cancelled."""
     loop = asyncio.get_running_loop()
     future: asyncio.Future[R] = loop.create_future()
 

@@ -1,7 +1,8 @@
 """Commands: everything that is written, by whichever way it is asked for.
 
-The caller's role, the plant file's lists, and then the library's own rules. Each command has a thread of its
-own, so that a stop waits for nothing of the gateway; a write that comes while many are under way is refused.
+The caller's role, the plant file's lists and the library's own rules must allow it. Each command has a thread
+of its own, so that a stop waits for nothing of the gateway; a write that comes while many are under way is
+refused.
 """
 
 from __future__ import annotations
@@ -136,7 +137,7 @@ class Commands:
         )
 
     async def act(self, drive: str, verb: str, options: Mapping[str, object], caller: Caller) -> Told:
-        """Carry out a verb that the plant file lists, once; never by a way that cannot ask a person."""
+        """Carry out a verb that the plant file lists, once; refused by a way that cannot ask a person."""
         what = f"{drive}.{verb}"
         rule = VERBS.get(verb)
         if rule is None:

@@ -1,9 +1,10 @@
 """DriveWords: the words that a drive sent, made again from the values that were polled, or none.
 
 A row has a value in its unit; a Modbus client wants the count in the drive's words. A value is turned back
-only where one count alone has it: the count is packed, read again by the register's own coding, and must be
-this value, while its two neighbours must not be. So these are never made of values: a part of a word, what a
-scale register scales, `I8` and `U32_EITHER`, which leave bits open, and the zero of a float, which has two.
+only where one count alone has it: the count is packed and read again by the register's own coding. It must
+give this value, and its two neighbours must not. So some words are never made of values: a part of a word,
+what a scale register scales, `I8` and `U32_EITHER`, which leave bits open, and a float's zero, which has two
+signs.
 """
 
 from __future__ import annotations

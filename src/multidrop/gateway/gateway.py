@@ -140,7 +140,7 @@ class Gateway:
             self._threads.shutdown(wait=False, cancel_futures=True)
 
     def end(self) -> None:
-        """Let `run` come to its end. To be called in the loop."""
+        """Let `run` come to its end. Call it in the loop."""
         self._end.set()
 
     def _server_config(self) -> uvicorn.Config:

@@ -41,7 +41,7 @@ _log = logging.getLogger("multidrop.gateway")
 
 
 class Needed(NamedTuple):
-    """The method of a path, and the right that it needs; None: nobody has to be known."""
+    """The method of a path, and the right that it needs; None: anybody may, and no token is asked for."""
 
     method: str
     right: Right | None
@@ -142,8 +142,8 @@ class Guard:
     def _admit(self, scope: Scope, headers: Headers, needed: Right) -> Caller:
         """Return the caller of a request that needs this right.
 
-        A wrong token gives what no token gives. After some wrong ones no more are looked at for a while, but
-        for a stop, which nothing may hold back.
+        A wrong token gives the rights of no token. After several wrong ones from an address none from there
+        is looked at for a while, but for a stop, which nothing may hold back.
         """
         address = self.address(scope, headers)
         local = is_loopback(address) and not self._behind_proxy

@@ -1,4 +1,4 @@
-"""Identities: each drive is asked what it is while nobody stops it: its first stop is sent at once."""
+"""Identities: each drive is asked what it is beforehand, so that its first stop is sent at once."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _log = logging.getLogger("multidrop.gateway")
 class Identities:
     """Asks the drives of the present plant one by one; a bus asks each only once while its port is open.
 
-    `fail` is called within the handling of whatever else goes wrong.
+    `fail` is called while any other exception is handled.
     """
 
     def __init__(

@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 
 from multidrop import LineStatistics, Plant, PlantLine, Statistics
 
-SECONDS = 5.0  # over which the use of a line is taken, and after which figures of the last minute are anew
+SECONDS = 5.0  # over which a line's use is taken, and between two readings of the last minute's figures
 MINUTES = 60
 
 Reading = Mapping[str, LineStatistics]

@@ -209,7 +209,7 @@ class ModbusClient(asyncio.Protocol):
             self.transport.write(data)
 
     def close(self) -> None:
-        """Close this connection once what was written to it is gone."""
+        """Close this connection once all that was written to it has left."""
         if self.transport is not None:
             self.transport.close()
 

@@ -27,7 +27,7 @@ from multidrop.gateway.rights import Caller, Right
 from multidrop.gateway.units import StopWrite, Unit, Units
 
 STOP_WAIT_S = 0.4  # for which a stop's answer waits for the motor: less than clients wait for a reply
-MOST_STOPS = 8  # of one drive that are under way, after which a further one is one of them
+MOST_STOPS = 8  # of one drive, under way; further requests are acknowledged alone
 
 Ask = Callable[[str, int, int, int, float], Awaitable[list[int]]]
 

@@ -179,8 +179,8 @@ class LineShare:
     def ask(self, client: object, work: Callable[[float], Awaitable[Any]]) -> asyncio.Future[Any]:
         """Queue work, which gets the seconds until it expires; the result is what it returns or raises.
 
-        Raises PassingBusy, or the result does, where its turn does not come. A client that waits for several
-        gives up its last one to a client that waits for fewer.
+        Raises PassingBusy, or the result does, where its turn does not come. Where the queue is full, the
+        client that waits for most loses its last request to one that waits for fewer.
         """
         if len(self._waiting) >= MOST_WAITING:
             self._make_place(client)
@@ -210,7 +210,7 @@ class LineShare:
             asked.answer.set_exception(PassingBusy(why))
 
     def _forget(self, asked: _WaitingAsk) -> None:
-        """Free the place of one that is answered, or whose client is gone."""
+        """Free the place of a request that is answered, or that lost its client."""
         if asked.timer is not None:
             asked.timer.cancel()
         if asked in self._waiting:

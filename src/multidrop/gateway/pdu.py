@@ -61,7 +61,7 @@ def _one_word(request: MbapRequest) -> WriteRequest:
 
 
 def _several(carrier: Carrier, request: MbapRequest) -> WriteRequest:
-    """Return what 15 and 16 write, which is to be one register."""
+    """Return the words or bits that functions 15 and 16 write."""
     if len(request.data) < 5:
         raise Declined(ModbusCode.ILLEGAL_VALUE)
     address, count, size = struct.unpack_from(">HHB", request.data)

@@ -104,7 +104,7 @@ class Tokens:
         self._tokens = tuple(tokens)
 
     def find(self, secret: str) -> Token | None:
-        """Return the token of this secret; it takes as long for a wrong one."""
+        """Return the token of this secret, in the same time whether or not there is one."""
         given, found = digest(secret), None
         for token in self._tokens:
             if hmac.compare_digest(token.sha256, given):
@@ -159,7 +159,7 @@ def is_loopback(host: str) -> bool:
 
 
 class OwnNames:
-    """The names under which the gateway is called: all others are somebody else's page."""
+    """The names of the gateway; a page under any other name is somebody else's."""
 
     def __init__(self, names: Iterable[str], listen: str, port: int) -> None:
         self._always = {"localhost", "127.0.0.1", "[::1]"}

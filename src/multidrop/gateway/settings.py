@@ -114,7 +114,7 @@ def read_settings(plant: Plant, environment: Mapping[str, str]) -> ServeSettings
 
 
 def _has_begun(given: Mapping[str, Any]) -> bool:
-    """Return True where all that a listener needs is there, though with mistakes told already."""
+    """Return True where all keys that an open listener needs are given; their mistakes are told apart."""
     return {"tokens", "certificate", "key"} <= given.keys()
 
 

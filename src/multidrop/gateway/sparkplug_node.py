@@ -123,7 +123,7 @@ class SparkplugNode:
     # ---- payloads, each made when it is sent: their numbers go up by one ----
 
     def _begin_anew(self, drive: str, kind: str, make: Any) -> None:
-        """Say that a drive is born or dead, and nothing any more of what waited to be said of it."""
+        """Say that a drive is born or dead, and drop all else that waited to be said of it."""
         for other in {"DBIRTH", "DDATA", "DDEATH"} - {kind}:
             self.outbox.withdraw(self._topic(other, drive))
         self._put(drive, kind, make)

@@ -85,7 +85,7 @@ def make_app(gateway: Gateway) -> ASGIApp:
     frames = FrameRoute(gateway.frames)
 
     async def app(scope: Scope, receive: Receive, send: Send) -> None:
-        """Give frames past the router: nothing is asked for as often."""
+        """Answer for frames before the router: they are asked for most often by far."""
         await (frames if scope["path"] == "/api/frame" else others)(scope, receive, send)
 
     return Guard(

@@ -38,7 +38,7 @@ MOST_MERGED = 200_000_000  # bytes of files of rows that become one
 
 
 def main(words: list[str] | None = None) -> int:
-    """Compact what can be; return 0, also where another process is at it already."""
+    """Compact what can be compacted. Return 0, also where another process does so already."""
     parser = argparse.ArgumentParser(prog="multidrop.history.compact", description=__doc__)
     parser.add_argument("folder", type=Path)
     parser.add_argument("--below", type=int, required=True, help="segments with a lower number are closed")
@@ -57,7 +57,7 @@ def main(words: list[str] | None = None) -> int:
 
 
 def compact(folder: Path, below: int, *, merge_rows: bool = False) -> None:
-    """Make Parquet of segments below this number, and one file of the tens of an hour or day that is over.
+    """Make Parquet of segments below this number, and merge the tens of each hour and day that is over.
 
     With `merge_rows` the rows of an hour that is over become one file too, and files of rows get their tens.
     """
@@ -69,7 +69,7 @@ def compact(folder: Path, below: int, *, merge_rows: bool = False) -> None:
             _compact_segment(folder, number, path)
     if merge_rows:
         rows = widest(parquet_files(folder / "rows"))
-        _make_tens(folder, rows[:-1])  # first: a merged file hides the numbers of those without
+        _make_tens(folder, rows[:-1])  # first: behind a merged file those without tens would not be found
         for part in (part for run in finished(rows, 3600, set()) for part in _parts(run)):
             _merge_rows(folder, part)
     for seconds in (3600, 86400):
@@ -172,9 +172,9 @@ def _without_tens(folder: Path, tens: list[HistoryFile]) -> set[int]:
 
 
 def finished(tens: list[HistoryFile], seconds: int, missing: set[int]) -> list[list[HistoryFile]]:
-    """Return the files to merge: runs of one hour or day, behind which there is another one.
+    """Return the files to merge: those of each hour or day, once a later one has begun.
 
-    No segment whose tens are missing may have a number among theirs: the merged file would hide it.
+    Where a segment between them has no tens yet, nothing is merged: the file would hide its number.
     """
     runs = [list(run) for _, run in groupby(tens, key=lambda file: file.begin // seconds)]
     return [
@@ -194,7 +194,7 @@ def _merge(folder: Path, run: list[HistoryFile]) -> None:
 
 
 def _parts(run: list[HistoryFile]) -> Iterator[list[HistoryFile]]:
-    """Yield two files and more that follow each other without a hole, no larger together than may be."""
+    """Yield groups of files that may be merged: neighbours, and together below the largest size."""
     part: list[HistoryFile] = []
     size = 0
     for file in run:

@@ -38,7 +38,7 @@ def connect(memory: str, spill: Path | None = None) -> Any:
 
 
 class ArrowStream:
-    """Batches as DuckDB takes them; it asks anew for each query."""
+    """Batches in the form that DuckDB reads; it asks for them again at each query."""
 
     def __init__(self, batches: Iterable[Rows]) -> None:
         self._arrays = [rows.arrow() for rows in batches]
@@ -50,7 +50,7 @@ class ArrowStream:
 
 
 def insert(database: Any, batches: Iterable[Rows]) -> None:
-    """Put rows into the table `recorded`, which is made here."""
+    """Create the table `recorded`, and put rows into it."""
     database.execute(TABLE)
     waiting: list[Rows] = []
     for rows in batches:

@@ -57,6 +57,6 @@ class KeptSeries:
         return found
 
     def _found(self, series: Series, batches: range) -> SeriesRows:
-        """Return what is kept where it reaches these batches; what is to be read anew otherwise."""
+        """Return the rows that are kept, if these batches follow on them; else none, to be read anew."""
         rows = self._kept.pop(series, None)
         return rows if rows and rows.first <= batches.start <= rows.past else SeriesRows(batches.start)

@@ -45,7 +45,7 @@ class Sources:
                 self._database = None
 
     def listing(self) -> Listing:
-        """List the files that hold the history now, and let go of those that do not any more."""
+        """List the files that hold the history now, and close those that no longer do."""
         found = listing(self.folder)
         with self._changing:
             for number in set(self._growing) - set(found.segments):
@@ -106,7 +106,7 @@ class Sources:
             return self._database.cursor()
 
     def again(self, act: Callable[[Listing], T]) -> T:
-        """Return act(listing), done anew while files are replaced under it."""
+        """Return act(listing), called again as long as files are replaced meanwhile."""
         for _ in range(MOST_TRIES):
             try:
                 return act(self.listing())

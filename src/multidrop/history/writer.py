@@ -81,7 +81,7 @@ class HistoryWriter:
         return []
 
     def take(self, batch: Batch) -> None:
-        """Copy the rows for the thread to write; within microseconds, and never raising for the disk."""
+        """Copy the rows for the thread to write. It takes microseconds, and raises nothing for the disk."""
         with self._changing:
             if self._over.is_set() or self._waiting_rows + len(batch) > MOST_WAITING:
                 self._dropped += len(batch)

@@ -6,9 +6,6 @@ import errno
 import logging
 import os
 import threading
-from contextlib import suppress
-
-import serial
 
 from multidrop.core import (
     RS485,
@@ -21,9 +18,6 @@ from multidrop.core import (
     Port,
     Tap,
     TransactionIds,
-    Transactions,
-    is_pseudo_terminal,
-    must_take,
     refused_names,
 )
 from multidrop.core.fork import register_at_fork
@@ -31,26 +25,11 @@ from multidrop.drive.network import speaks_tcp
 from multidrop.errors import LineError, NoSuchPort, PortLost
 from multidrop.transport import clock
 from multidrop.transport.aside_log import flush, log_aside
-from multidrop.transport.bridge import PORT_FAILURES, Bridge, hand_on_nothing_late, set_up
+from multidrop.transport.bridge import PORT_FAILURES
 from multidrop.transport.frame_log import log_frames
 from multidrop.transport.mixed_up import mixed_up
-from multidrop.transport.opening import (
-    check_fencible,
-    connection_of,
-    descriptor_of,
-    device_of,
-    identity_of,
-    is_bridged,
-    reason_of,
-    unopened,
-)
-from multidrop.transport.overruns import overruns
-
-_NO_SETTINGS = -1
-_TRANSACTIONS = {
-    TransactionIds.MATCH: Transactions.MATCHED,
-    TransactionIds.IGNORE: Transactions.IGNORED,
-}
+from multidrop.transport.open_port import OpenPort
+from multidrop.transport.opening import check_fencible, reason_of
 
 LEAVING_NS = 1_000_000_000  # for callers to leave a port that was stopped
 LOGGING_S = 1.0  # that closing waits for loggers
@@ -66,12 +45,6 @@ FOREIGN = (
 def _is_lost(core: Port, result: int) -> bool:
     is_lost = result in (Failure.LINE_LOST, Failure.SETTINGS_REFUSED)
     return is_lost or (result == Failure.LATE_ANSWER_DUE and core.lost)
-
-
-def _refusal(rs485: RS485, failure: OSError) -> str:
-    """Return why a port cannot be polled: its driver refuses to switch the transceiver."""
-    what = "has no RS-485 mode" if rs485 is RS485.KERNEL else "does not switch RTS"
-    return f'the driver {what} ({os.strerror(failure.errno or 0)}), which rs485 = "{rs485}" needs'
 
 
 class Line:
@@ -119,14 +92,11 @@ class Line:
         self.mastership = mastership
         self.is_tcp = isinstance(port, str) and speaks_tcp(port)
         self.ids = ids
-        self.identity = port  # see port_identity; known once the port is open
         self._echo = echo
-        self._bridge: Bridge | None = None
-        self._settings: tuple[int, str] | None = None  # that a bridged port must have
+        self._opened = OpenPort(port, ids, rs485, mastership)
         # Of the core, to queue exchanges on; None while it is closed. Dropped before the descriptor that it
         # looks at.
         self.queue: Port | None = None
-        self._serial: serial.SerialBase | None = None
         self._tap: Tap | None = None
         self._is_loss_logged = False
         self.foreign = 0  # bytes that came while it was listened to before a request
@@ -148,14 +118,12 @@ class Line:
         self._is_over = True
         self._why_closed = "it was opened before this process was forked; open it again here"
         self.queue = None
-        if self._bridge:
-            self._bridge.forget()
-            self._bridge = None
-        # Of a network port the socket alone: pyserial would end the connection, which the parent has too.
-        port = connection_of(self._serial) or self._serial
-        if port:
-            with suppress(*PORT_FAILURES):
-                port.close()
+        self._opened.forget()
+
+    @property
+    def identity(self) -> str:
+        """The same however the port's name is spelt, once it is open; see port_identity."""
+        return self._opened.identity
 
     # ---- opening and closing ----
 
@@ -165,21 +133,12 @@ class Line:
         if not self.may_send:
             raise LineError(self.port, UNOPENED)
         try:
-            port = self._serial = unopened(self.port)
-            port.timeout = 0
-            if isinstance(port, serial.Serial):
-                port.exclusive = True
-                port.rts = self.rs485 is not RS485.RTS_UP  # else the transceiver sends once it is open
-            port.open()
-            self.identity = identity_of(port, self.port)
-            core = self._drive(port)
+            core = self._opened.open()
             core.tell_echo(Echo.OFF if self.is_tcp else self._echo)
             if self._tap:
                 core.tap(self._tap)
             self._foreign_here = 0
             self.queue = core
-            with suppress(*PORT_FAILURES, AttributeError, NotImplementedError):
-                port.set_low_latency_mode(True)  # a USB adapter else holds bytes back for 16 ms
         except NoSuchPort:
             raise
         except LineError:
@@ -191,33 +150,6 @@ class Line:
         again = " again" if self._is_loss_logged else ""
         log_aside(_log, logging.INFO, "%s: opened%s (%s)", self.port, again, self.identity)
         self._is_loss_logged = False
-
-    def _drive(self, port: serial.SerialBase) -> Port:
-        """Give the core a descriptor of this port."""
-        if type(port).read is serial.Serial.read:
-            device = device_of(port)
-            opened = Port(descriptor_of(port), must_take(device), mastership=self.mastership)
-            return self._switched(opened, device)
-        if connection := connection_of(port):
-            hand_on_nothing_late(connection)
-        if connection and not is_bridged(port):
-            connection.setblocking(False)
-            ids = _TRANSACTIONS[self.ids] if self.is_tcp else Transactions.NONE
-            return Port(connection.fileno(), _NO_SETTINGS, transactions=ids, mastership=self.mastership)
-        if self._settings:
-            set_up(port, self._settings)
-        self._bridge = Bridge(port)
-        return Port(self._bridge.theirs.fileno(), _NO_SETTINGS)
-
-    def _switched(self, core: Port, device: str) -> Port:
-        """Have its transceiver switched; a pseudo-terminal has none, and goes without."""
-        try:
-            core.switch(self.rs485)
-        except OSError as failure:
-            if not is_pseudo_terminal(device):
-                core.close()
-                raise LineError(self.port, _refusal(self.rs485, failure)) from failure
-        return core
 
     def drop(self) -> None:
         """Carry out nothing more; what is queued and not yet sent never will be.
@@ -249,15 +181,7 @@ class Line:
     def _let_go(self) -> None:
         with self._lock:
             self.drop()
-            if self._bridge:
-                self._bridge.close()
-                self._bridge = None
-            if self._serial:
-                connection = connection_of(self._serial)
-                with suppress(*PORT_FAILURES):
-                    self._serial.close()
-                if connection:  # pyserial leaves one open that has ended already
-                    connection.close()
+            self._opened.close()
 
     def reopen(self) -> None:
         """Close what is left of the port and open it again; LineError when it is not there."""
@@ -298,23 +222,12 @@ class Line:
         Raises LineError when it has others already, or does not take these.
         """
         with self._lock:
-            if self._serial is None or self._bridge is None:  # it may be one, when it is there
-                self._settings = self._settings or settings
-                return
-            if self._settings == settings:
-                return
-            if self._settings:
-                raise LineError(self.port, "this kind of port cannot change its settings from drive to drive")
-            try:
-                set_up(self._serial, settings)
-            except PORT_FAILURES as failure:
-                raise LineError(self.port, reason_of(failure)) from failure
-            self._settings = settings
+            self._opened.require(settings)
 
     @property
     def only_settings(self) -> tuple[int, str] | None:
         """Settings that a bridged port has, and keeps while it is open; None for other ports."""
-        return self._settings if self._bridge else None
+        return self._opened.settings if self._opened.bridge else None
 
     def inherit(self, peer: Peer, before: Peer) -> None:
         """Let a drive take the place of another at its address, whose answers may still come."""
@@ -328,7 +241,7 @@ class Line:
 
     def carry_out(self, exchange: Exchange, *, not_before_ns: int = 0, expires_ns: int = 0) -> Completion:
         """Carry an exchange out ahead of what is queued, and wait for it; LineError when the port fails."""
-        if self.queue and self._bridge and self._settings != exchange.settings:
+        if self.queue and self._opened.bridge and self._opened.settings != exchange.settings:
             self.require(exchange.settings)
         self._callers.append(None)  # before the port is looked at: `drop` then waits for this thread
         try:
@@ -377,10 +290,7 @@ class Line:
 
         None while it is closed, and where the driver does not count them.
         """
-        try:
-            return None if self._bridge or not self._serial else overruns(self._serial.fileno())
-        except (*PORT_FAILURES, TypeError, AttributeError):  # it may be closed meanwhile
-            return None
+        return self._opened.overruns()
 
     @property
     def may_send(self) -> bool:

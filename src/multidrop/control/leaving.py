@@ -1,0 +1,62 @@
+"""Leaving: what becomes of the motors when a bus is left, or the process ends."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Mapping, Sequence
+
+from multidrop.control.exit_hook import LastAct, exit_hook
+from multidrop.control.latches import Latches
+from multidrop.control.outcome import Seen, Stopped
+from multidrop.control.stop_all import Stopper
+from multidrop.drive.family import Drive
+
+_log = logging.getLogger("multidrop.bus")
+
+
+class Leaving:
+    """Ends all that moves the motors of a bus, and stops them where that was asked for."""
+
+    def __init__(
+        self, latches: Latches, stopper: Stopper, stop_all: Callable[[], Mapping[str, Stopped]]
+    ) -> None:
+        self._latches = latches
+        self._stopper = stopper
+        self._stop_all = stop_all
+        self._last_act: LastAct | None = None
+
+    @property
+    def stops(self) -> bool:
+        """True once `stop_on_exit` was called."""
+        return self._last_act is not None
+
+    def stop_on_exit(self) -> None:
+        """Stop all drives at the end. Raises ValueError outside the main thread, the first time."""
+        if self._last_act is None:
+            self._last_act = exit_hook().add(self._latches.shut, lambda: _warn_of(self._stop_all()))
+
+    def begin(self) -> None:
+        """End all that moves a motor, and begin to stop the drives if that was asked for."""
+        self._latches.shut()
+        if self._last_act is not None:
+            self._last_act.begin()
+
+    def finish(self) -> None:
+        """Do that, and wait for all stops under way."""
+        self.begin()
+        if self._last_act is not None:
+            exit_hook().finish(self._last_act)
+        if self._last_act is None or not self._last_act.is_cut_short:
+            self._latches.await_stops()
+
+    def stop(self, drives: Sequence[Drive]) -> None:
+        """Stop drives that are about to be detached, if all were to be stopped at the end."""
+        if drives and self.stops:
+            _warn_of(self._stopper.stop_all(drives, lambda: False, None))
+
+
+def _warn_of(found: Mapping[str, Stopped]) -> None:
+    """Log each drive that is not seen to stand."""
+    for stopped in found.values():
+        if stopped.seen is not Seen.STOPPED:
+            _log.warning("%s", stopped)
