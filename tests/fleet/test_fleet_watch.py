@@ -9,6 +9,7 @@ import re
 import signal
 import subprocess
 import sys
+from itertools import pairwise
 from typing import Any
 
 import pytest
@@ -75,6 +76,29 @@ def test_lines_that_do_not_fit_are_counted_and_the_masterless_come_first() -> No
     assert f"and {500 - shown} more lines" in text
     assert "line-0  " in text
     assert text.count("from gw-1") >= 6
+
+
+def test_a_narrow_terminal_has_the_columns_that_matter_whole() -> None:
+    head = [drawn(told(), width).splitlines()[2] for width in (200, 80, 72, 64)]
+    assert [re.sub(" +", " ", one) for one in head] == [
+        "GATEWAY HOST SESSION SINCE STATE LINES MARGIN SPOOL BEHIND LAG LOST",
+        "GATEWAY HOST SESSION STATE LINES MARGIN SPOOL BEHIND LAG LOST",
+        "GATEWAY SESSION STATE LINES MARGIN SPOOL BEHIND LAG LOST",
+        "GATEWAY STATE LINES MARGIN SPOOL BEHIND LAG LOST",
+    ]
+
+
+@pytest.mark.parametrize("height", range(1, 60))
+def test_no_head_stands_without_a_row(height: int) -> None:
+    rows = drawn(told(lines=12), 80, height).splitlines()
+    for row, next_row in pairwise(rows):
+        if row.startswith(("LINE ", "last moves")):
+            assert re.match(r"line-|1970-", next_row), (row, next_row)
+
+
+def test_lines_are_in_the_order_of_their_numbers() -> None:
+    rows = drawn(told(lines=12)).splitlines()
+    assert [row.split()[0] for row in rows if row.startswith("line-")] == [f"line-{at}" for at in range(12)]
 
 
 def test_what_is_old_is_dim_and_its_age_is_told() -> None:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 from collections.abc import Callable
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -12,7 +14,7 @@ from peers import require_module
 
 require_module("nats")
 
-from multidrop.fleet import names  # noqa: E402
+from multidrop.fleet import line_keeper, names  # noqa: E402
 from multidrop.fleet.buckets import Record  # noqa: E402
 from multidrop.fleet.lease import Lease  # noqa: E402
 from multidrop.fleet.lease_rules import SECOND, USUAL  # noqa: E402
@@ -120,5 +122,80 @@ def test_a_line_that_is_not_closed_for_certain_ends_the_gateway() -> None:
         with pytest.raises(RuntimeError, match="the port is stuck"):
             await asyncio.wait_for(failing, 10)
         assert trial.keeper.polled
+
+    asyncio.run(main())
+
+
+class BrokenLines(NotedLines):
+    """Lines whose port cannot be opened, for this reason; "" for none."""
+
+    why = "nothing listens there"
+
+    async def take(self, line: str, description: Any) -> None:
+        if self.why:
+            raise OSError(self.why)
+        await super().take(line, description)
+
+
+class BrokenTrial(Trial):
+    """The same with a port that cannot be opened."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        super().__init__()
+        self.now = 1000.0
+        clock = SimpleNamespace(monotonic=lambda: self.now, time_ns=lambda: 0)
+        monkeypatch.setattr(line_keeper, "time", clock)
+        self.broken = BrokenLines("a", self.mastership, Hall())
+        self.keeper.lines = self.broken
+
+    async def claim(self) -> None:
+        assert await self.lease.try_to_begin()
+        self.keeper.claim({"hall": 0})
+        await until(lambda: "hall" in self.keeper.troubles and not self.keeper._at_work)
+
+    async def try_again(self) -> None:
+        self.keeper.reconcile()
+        assert self.keeper.is_silent, "it is too early"
+        self.now += line_keeper.TAKE_AGAIN_S
+        self.keeper.reconcile()
+        assert not self.keeper.is_silent
+        await until(lambda: not self.keeper._at_work)
+
+
+def test_a_line_that_cannot_be_taken_is_told_once_for_each_reason_and_when_it_is(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.INFO)
+
+    async def main() -> None:
+        trial = BrokenTrial(monkeypatch)
+        await trial.claim()
+        await trial.try_again()
+        await trial.try_again()
+        trial.broken.why = "no route to host"
+        await trial.try_again()
+        assert trial.keeper.troubles == {"hall": "no route to host"}
+        trial.broken.why = ""
+        await trial.try_again()
+        assert trial.keeper.troubles == {}
+        assert "hall" in trial.keeper.polled
+
+    asyncio.run(main())
+    assert [message for message in caplog.messages if "line hall" in message] == [
+        "line hall is not taken, and tried again and again: nothing listens there",
+        "line hall is not taken, and tried again and again: no route to host",
+        "line hall is taken now",
+    ]
+
+
+def test_of_a_line_that_another_has_by_now_no_trouble_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    async def main() -> None:
+        trial = BrokenTrial(monkeypatch)
+        await trial.claim()
+        trial.keeper.releasing = {"hall"}
+        trial.keeper.reconcile()
+        assert trial.keeper.troubles == {}
+        await until(lambda: trial.keeper.is_silent)
+        assert owner_of(trial.records.owner("hall")) == ("", 0)
 
     asyncio.run(main())

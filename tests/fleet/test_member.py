@@ -237,7 +237,9 @@ def test_a_node_that_dies_costs_nothing(fleet: Cluster) -> None:
     asyncio.run(main())
 
 
-def test_without_servers_all_fall_silent_and_nobody_is_killed(fleet: Cluster) -> None:
+def test_without_servers_all_fall_silent_and_nobody_is_killed(
+    fleet: Cluster, caplog: pytest.LogCaptureFixture
+) -> None:
     """The timer is called off after the lines were let go, and never set to the past."""
 
     async def main() -> None:
@@ -251,5 +253,9 @@ def test_without_servers_all_fall_silent_and_nobody_is_killed(fleet: Cluster) ->
             for node in fleet.nodes:
                 node.go_on()
             await until(running.all_are_polled, "they come back")
+            for name in ("a", "b"):
+                await until(
+                    lambda name=name: f"{name}: the lease is valid again" in caplog.messages, "a word"
+                )
 
     asyncio.run(main())

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import asyncio
 import re
+import subprocess
 import time
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from nats_clusters import Cluster, cluster, free_ports, old_server_program
+from nats_clusters import Cluster, cluster, free_ports, old_server_program, server_program
 
 from multidrop.fleet import lease_bucket, servers, setup
 from multidrop.fleet.buckets import ask
@@ -95,6 +97,40 @@ def test_no_quorum_is_one_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPat
             node.kill()
         with pytest.raises(FleetError, match="have no quorum: more than half of them must run"):
             asyncio.run(_init(three.urls))
+
+
+NO_LEADER = (
+    b'{"error":{"code":503,"err_code":10008,"description":"JetStream system temporarily unavailable"}}'
+)
+
+
+def test_servers_that_say_that_they_cannot_decide_have_no_quorum(
+    nats: Cluster, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(setup, "WAIT_S", 0.5)
+
+    async def refuse(self: ServerPath, subject: str, *rest: object) -> SimpleNamespace:
+        return SimpleNamespace(data=NO_LEADER)
+
+    monkeypatch.setattr(ServerPath, "request", refuse)
+    with pytest.raises(FleetError, match=r"have no quorum: .* \(nats:.* says: JetStream system temporarily"):
+        asyncio.run(_init(nats.urls))
+
+
+def test_a_server_without_jetstream_is_one_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(setup, "WAIT_S", 0.5)
+    [port] = free_ports(1)
+    command = [server_program(), "-a", "127.0.0.1", "-p", str(port)]
+    with (tmp_path / "log").open("wb") as log, subprocess.Popen(command, stdout=log, stderr=log) as server:
+        try:
+            ends = time.monotonic() + 60
+            while b"Server is ready" not in (tmp_path / "log").read_bytes():
+                assert time.monotonic() < ends
+                time.sleep(0.02)
+            with pytest.raises(FleetError, match=r"no JetStream answers at nats:.* needs `jetstream"):
+                asyncio.run(_init([f"nats://127.0.0.1:{port}"]))
+        finally:
+            server.kill()
 
 
 def test_a_bucket_without_a_leader_is_no_quorum(fleet: Cluster, monkeypatch: pytest.MonkeyPatch) -> None:

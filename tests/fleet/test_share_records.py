@@ -133,6 +133,17 @@ def test_moves_into_a_share_are_told_with_the_master_before() -> None:
     assert records.owned_by("b", 1) == set()
 
 
+def test_of_sessions_that_have_no_line_any_more_nothing_is_kept() -> None:
+    path: Any = None
+    records = ShareRecords("a", lambda: path, USUAL, lambda: None, is_mine)
+    follower = records.owners[names.owner_bucket("line")]
+    for session in range(1, 1000):
+        follower.take(Record("line", session, owner_value("b", session, 0)))
+    follower.take(Record("line", 1000, owner_value("b", 999, 0)))
+    assert records.owned_by("b", 999) == {"line"}
+    assert len(records._owned) == 1
+
+
 def test_lines_that_were_read_before_a_failure_are_known(monkeypatch: pytest.MonkeyPatch) -> None:
     """The lines fill whole batches, and a server does not say that there are no more."""
     monkeypatch.setattr(buckets, "BATCH", 2)

@@ -383,6 +383,14 @@ def test_five_mistakes_in_one_file_are_all_reported_at_once(mistakes: Mistakes) 
             '[[line]]\nname = "L"\n' + TOY,
             'line "L": \'port\' is missing; add port = "/dev/ttyUSB0"',
         ),
+        (
+            HEAD.replace("/dev/a", "socket://10.0.0.9:40O1") + TOY,
+            "line \"L\": socket://10.0.0.9:40O1: Port could not be cast to integer value as '40O1'",
+        ),
+        (
+            HEAD.replace("/dev/a", "socket://10.0.0.9") + TOY,
+            'line "L": socket://10.0.0.9: it needs a host and a port number, such as socket://10.0.0.7:4001',
+        ),
     ],
 )
 def test_a_mistake_is_one_sentence_with_place_and_remedy(

@@ -21,6 +21,7 @@ MOST_STRANGE = 1000  # records of a bucket that are told of
 _WRONG_REVISION = (10071, 10164)
 _NO_MESSAGE = 10037
 _NO_STREAM = 10059
+_UNAVAILABLE = 10008  # there is no leader, and none can be elected
 
 _log = logging.getLogger("multidrop.fleet")
 
@@ -60,11 +61,17 @@ def bucket_settings(name: str, replicas: int) -> dict[str, Any]:
 
 
 async def ask(path: ServerPath, subject: str, data: Mapping[str, Any] | None = None) -> dict[str, Any]:
-    """Return what JetStream says to a request about streams; FleetError with its own words for an error."""
+    """Return what JetStream says to a request about streams.
+
+    Raises FleetError with its own words for an error, Unsure where the servers cannot decide.
+    """
     message = await path.request(f"$JS.API.{subject}", json.dumps(data).encode() if data else b"")
     said: dict[str, Any] = json.loads(message.data)
-    if "error" in said:
-        raise ServerError(said["error"])
+    error = said.get("error")
+    if error and error.get("err_code") == _UNAVAILABLE:
+        raise Unsure(f"{path.url} says: {error.get('description')}")
+    if error:
+        raise ServerError(error)
     return said
 
 

@@ -111,8 +111,12 @@ class FleetRecords:
         self._has_plant_changed = True
 
     def _note_move(self, bucket: str, before: Record | None, record: Record) -> None:
-        self._owned.get(owner_of(before), set()).discard(record.key)
         self._owned.setdefault(owner_of(record), set()).add(record.key)
+        former = owner_of(before)
+        if former != owner_of(record) and former in self._owned:
+            self._owned[former].discard(record.key)
+            if not self._owned[former]:
+                del self._owned[former]  # sessions come and go for years
         self.moves.note(before, record, is_first_look=self._is_first_look(bucket))
 
     def _is_first_look(self, bucket: str) -> bool:

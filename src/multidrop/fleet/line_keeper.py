@@ -123,6 +123,8 @@ class LineKeeper:
             for line in (self._owned() if valid else ())
             if line not in self.releasing and self._records.is_in_plant(line)
         }
+        for line in self.troubles.keys() - mine.keys():
+            self._forget_trouble(line)
         now = time.monotonic()
         for line, polled in list(self.polled.items()):
             if mine.get(line) != polled.revision and line not in self._at_work:
@@ -203,13 +205,19 @@ class LineKeeper:
             try:
                 await self.lines.take(line, record.value)
             except (OSError, ValueError) as failure:
-                self.troubles[line] = str(failure)
+                told, self.troubles[line] = self.troubles.get(line), str(failure)
                 self._again_at[line] = time.monotonic() + TAKE_AGAIN_S
                 asyncio.get_running_loop().call_later(1.01 * TAKE_AGAIN_S, self._on_change)
-                _log.warning("line %s is not taken, and tried again: %s", line, failure)
+                if told != str(failure):
+                    _log.warning("line %s is not taken, and tried again and again: %s", line, failure)
             else:
-                self.troubles.pop(line, None)
+                if line in self.troubles:
+                    _log.warning("line %s is taken now", line)
+                    self._forget_trouble(line)
                 self.polled[line] = TakenLine(record.revision, self._lease.clock())
+
+    def _forget_trouble(self, line: str) -> None:
+        del self.troubles[line], self._again_at[line]
 
     async def _let_go(self, line: str) -> None:
         await self.lines.let_go(line)

@@ -179,14 +179,16 @@ class Member:
 
     async def _guard(self) -> None:
         """Close the lines before the lease has run out; only then is the kernel's timer called off."""
-        is_armed = False
+        is_armed = was_late = False
         while True:
             if self.keeper.may_poll:
-                is_armed = True
+                if was_late:
+                    _log.warning("%s: the lease is valid again", self.name)
+                is_armed, was_late = True, False
             elif is_armed:
                 self.keeper.reconcile()
                 if self.keeper.is_silent:
-                    is_armed = False
+                    is_armed, was_late = False, True
                     self.mastership.end()
                     _log.warning("%s: the lease was not renewed in time; no line is polled", self.name)
             await asyncio.sleep(GUARD_LOOK_S)

@@ -12,7 +12,7 @@ from typing import Any
 
 from multidrop.fleet import names
 from multidrop.fleet.buckets import NONE_YET, ServerError, ask, bucket_settings
-from multidrop.fleet.errors import Conflict, FleetError, NoRight, TooOld, Unsure
+from multidrop.fleet.errors import Conflict, FleetError, NobodyThere, NoRight, TooOld, Unsure
 from multidrop.fleet.leaders import bring_leaders_home
 from multidrop.fleet.lease_bucket import LeaseBucket
 from multidrop.fleet.servers import ServerPath
@@ -93,7 +93,12 @@ def check_clock(path: ServerPath, server_time: str) -> None:
 
 
 def no_quorum(path: ServerPath, failure: Exception) -> FleetError:
-    """Return the sentence for a cluster that does not decide anything."""
+    """Return the sentence for servers that do not decide anything."""
+    if isinstance(failure, NobodyThere):
+        return FleetError(
+            f"no JetStream answers at {path.url}: the configuration of each server needs "
+            '`jetstream { store_dir: "/var/lib/nats" }`'
+        )
     return FleetError(
         f"the NATS servers around {path.url} have no quorum: more than half of them must run and reach each "
         f"other ({failure})"

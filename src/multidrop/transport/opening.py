@@ -8,11 +8,11 @@ import re
 import socket
 import sys
 from typing import cast
-from urllib.parse import SplitResult, urlsplit
+from urllib.parse import SplitResult
 
 import serial
 
-from multidrop.drive.network import MODBUS_PORT
+from multidrop.drive.network import MODBUS_PORT, url_of
 from multidrop.errors import NoSuchPort
 from multidrop.transport import port_identity
 from multidrop.transport.rfc2217 import RFC2217Port
@@ -53,12 +53,6 @@ def reason_of(failure: BaseException) -> str:
 _URLS = "tcp://10.0.0.7, socket://10.0.0.7:4001 or rfc2217://10.0.0.7:4001"
 
 
-def _needs_place(url: SplitResult) -> bool:
-    if url.scheme == "tcp":
-        return not url.hostname or url.port == 0
-    return url.scheme in ("socket", "rfc2217") and not (url.hostname and url.port)
-
-
 def _socket_url(url: SplitResult) -> str:
     host = f"[{url.hostname}]" if ":" in str(url.hostname) else url.hostname
     return f"socket://{host}:{url.port or MODBUS_PORT}"
@@ -68,15 +62,7 @@ def unopened(port: str) -> serial.Serial:
     """Return the port, not opened yet. Raises TypeError, and NoSuchPort for a URL that no port can have."""
     if not isinstance(port, str):
         raise TypeError(f"a port is a device such as '/dev/ttyUSB0' or a pyserial URL, not {port!r}")
-    try:
-        url = urlsplit(port)
-        needs_place = _needs_place(url)
-    except ValueError as mistake:
-        raise NoSuchPort(port, str(mistake)) from mistake
-    if needs_place and url.scheme == "tcp":
-        raise NoSuchPort(port, f"it needs a host, such as tcp://10.0.0.7 or tcp://10.0.0.7:{MODBUS_PORT}")
-    if needs_place:
-        raise NoSuchPort(port, f"it needs a host and a port number, such as {url.scheme}://10.0.0.7:4001")
+    url = url_of(port)
     try:
         if url.scheme == "rfc2217":
             found = RFC2217Port()

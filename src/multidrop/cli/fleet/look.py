@@ -14,6 +14,7 @@ from multidrop.cli.support.fleet_tables import (
     gateway_table,
     line_table,
     move_table,
+    natural,
     trouble_sentences,
 )
 from multidrop.cli.support.output import print_text
@@ -53,7 +54,8 @@ async def _status(arguments: argparse.Namespace, paths: list[ServerPath]) -> int
 
 async def _lines(arguments: argparse.Namespace, paths: list[ServerPath]) -> int:
     lines = (await _seen(paths))["lines"]
-    print_text(json.dumps(lines, indent=2) if arguments.json else "\n".join(line_table(lines)))
+    ordered = {name: lines[name] for name in sorted(lines, key=natural)}
+    print_text(json.dumps(ordered, indent=2) if arguments.json else "\n".join(line_table(ordered)))
     return 0
 
 

@@ -16,6 +16,7 @@ from multidrop.cli.support.fleet_tables import (
     gateway_table,
     line_table,
     move_table,
+    natural,
     trouble_sentences,
 )
 from multidrop.printable import printable
@@ -32,30 +33,36 @@ def picture(told: Told, size: tuple[int, int], head: str) -> list[Text]:
     top = [_title(told, head, width), _warning(told, width)]
     foot = [Text(_cut(note, width)) for note in (*told.get("notes", ())[-NOTES:], "Ctrl-C ends it")]
     room = max(0, height - len(top) - len(foot))
-    body = [_row(text, width, is_old) for text in _body(told, room)[:room]]
+    body = [_row(text, width, is_old) for text in _body(told, width, room)[:room]]
     return [*top, *body, *[Text()] * (room - len(body)), *foot][:height]
 
 
-def _body(told: Told, room: int) -> list[str]:
+def _body(told: Told, width: int, room: int) -> list[str]:
     """Return gateways whole, and of moves and lines as many as there is room for."""
-    begin = [*gateway_table(told), "", count_sentence(told), *trouble_sentences(told)[:NOTES], ""]
-    room -= len(begin)
+    begin = [*gateway_table(told, width - 1), "", count_sentence(told), *trouble_sentences(told)[:NOTES], ""]
+    room = max(0, room - len(begin))
     lines = line_table(dict(sorted(told["lines"].items(), key=_urgency)))
-    moves = ["", "last moves:", *move_table(told["moves"])]
-    moves = moves[: max(MOVES, room - len(lines))]
+    moves = _moves(told, max(min(MOVES, room // 2), room - len(lines)))
     return [*begin, *_fitting(lines, room - len(moves)), *moves]
+
+
+def _moves(told: Told, room: int) -> list[str]:
+    rows = move_table(told["moves"])[: max(0, room - 2)]
+    return ["", "last moves:", *rows] if rows else []
 
 
 def _fitting(lines: list[str], room: int) -> list[str]:
     if len(lines) <= room:
         return lines
-    kept = max(1, room - 1)  # the head is one of them
+    kept = room - 1
+    if kept < 2:  # a head alone
+        return []
     return [*lines[:kept], f"and {len(lines) - kept} more lines"]
 
 
-def _urgency(line: tuple[str, Told]) -> tuple[bool, str]:
+def _urgency(line: tuple[str, Told]) -> tuple[bool, list[str | int]]:
     """Order the lines without a master before the others."""
-    return line[1]["master"] is not None, line[0]
+    return line[1]["master"] is not None, natural(line[0])
 
 
 def _title(told: Told, head: str, width: int) -> Text:

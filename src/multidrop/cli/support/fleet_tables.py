@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import re
 import time
 from collections.abc import Iterable, Mapping
+from math import inf
 from typing import Any
 
 from multidrop.cli.support.values import Row, aligned
@@ -23,6 +25,7 @@ GATEWAYS = (
     "LOST",
 )
 LINES = ("LINE", "PORT", "MASTER", "SINCE")
+LEFT_OUT = ("SINCE", "HOST", "SESSION")  # in this order, where a terminal is too narrow for all
 UNITS = ("B", "kB", "MB", "GB", "TB")
 
 
@@ -34,9 +37,18 @@ def moment(ms: int) -> str:
         return "?"
 
 
-def gateway_table(fleet: Told) -> list[str]:
-    rows = [_gateway_row(name, gateway) for name, gateway in fleet["gateways"].items()]
-    return aligned([GATEWAYS, *rows], "<<><<>>>>>>")
+def gateway_table(fleet: Told, width: float = inf) -> list[str]:
+    """Return the gateways; where they are wider than that, without some of the columns."""
+    table = [GATEWAYS, *(_gateway_row(name, gateway) for name, gateway in fleet["gateways"].items())]
+    sides = "<<><<>>>>>>"
+    for column in LEFT_OUT:
+        found = aligned(table, sides)
+        if max(map(len, found)) <= width:
+            return found
+        at = table[0].index(column)
+        table = [(*row[:at], *row[at + 1 :]) for row in table]
+        sides = sides[:at] + sides[at + 1 :]
+    return aligned(table, sides)
 
 
 def _gateway_row(name: str, gateway: Told) -> Row:
@@ -64,6 +76,11 @@ def size(number: float) -> str:
             return f"{number:.0f} {unit}" if number >= 10 or unit == "B" else f"{number:.1f} {unit}"
         number /= 1000
     return f"{number:.0f} {UNITS[-1]}"
+
+
+def natural(name: str) -> list[str | int]:
+    """Return what orders names as people do: line-2 before line-10."""
+    return [int(part) if at % 2 else part for at, part in enumerate(re.split(r"([0-9]+)", name))]
 
 
 def line_table(lines: Mapping[str, Told]) -> list[str]:

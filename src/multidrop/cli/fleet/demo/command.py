@@ -20,6 +20,7 @@ from multidrop.cli.fleet.demo.nats_nodes import server_program, start_nodes
 from multidrop.cli.fleet.demo.numbered_lines import DRIVES, drive_name, plant_file
 from multidrop.cli.fleet.demo.vanishing_folder import vanishing_folder
 from multidrop.cli.fleet.watch import drawing, follow
+from multidrop.cli.support.fleet_tables import natural
 from multidrop.cli.support.nats import CA, CREDENTIALS
 from multidrop.cli.support.output import print_text
 from multidrop.cli.support.signals import on_end_signals
@@ -199,7 +200,7 @@ class Demo:
             before,
             time.time_ns(),
         )
-        self._stage.note(f"{KILLED} is KILLED; it was master of {', '.join(lines)}")
+        self._stage.note(f"{KILLED} is KILLED; it was master of {', '.join(sorted(lines, key=natural))}")
         return kill
 
     # ---- what is left ----
