@@ -29,6 +29,7 @@ from bench.support import tables
 from multidrop import expose_metrics, load_plant
 from multidrop.core import Columns, Counters, Names, Status
 from multidrop.gateway.connections import Connections, Watched
+from multidrop.gateway.frames import WHOLE
 from multidrop.gateway.gateway import Gateway
 from multidrop.gateway.mbap import ModbusClient, ModbusPort
 from multidrop.gateway.metrics import families_of
@@ -121,7 +122,14 @@ class Worker:
         self.gateway.hub.take(self.batch)
 
     def frame(self) -> None:
+        """Make a frame, and encode it for those who have the one before."""
+        frames = self.gateway.frames
+        frames._build()
+        frames._since(frames._remembered[-2]["n"] if len(frames._remembered) > 1 else WHOLE)
+
+    def whole_frame(self) -> None:
         self.gateway.frames._build()
+        self.gateway.frames._since(WHOLE)
 
     def events(self) -> None:
         self.gateway._look_for_events()
@@ -188,7 +196,8 @@ class Worker:
 WORKS: dict[str, Callable[[Worker], Callable[[], Any]]] = {
     "310 rows": lambda worker: worker.take_given,
     "events": lambda worker: worker.events,
-    "a frame": lambda worker: worker.frame,
+    "a frame, as what changed": lambda worker: worker.frame,
+    "a frame, whole": lambda worker: worker.whole_frame,
     "a frame over HTTP": Worker.viewer,
     "31 x ten words by Modbus": lambda worker: worker.masters(FIRST_READING, WORDS),
     "31 x common block by Modbus": lambda worker: worker.masters(COMMON, COMMON_WORDS),

@@ -10,6 +10,7 @@ whole packets of 1500 bytes, and once a relay that counts bytes.
 from __future__ import annotations
 
 import argparse
+import json
 import re
 import shutil
 import signal
@@ -35,8 +36,9 @@ AGES = """async ([seconds, every]) => {
   const end = performance.now() + seconds * 1000, shown = [], came = [];
   let n = store.frame.n;
   while (performance.now() < end) {
-    const now = Date.now(), drives = Object.values(store.frame.drives);
-    shown.push([now - store.time, Math.max(...drives.map(d => now - d.values.output_frequency[1]))]);
+    const now = Date.now();
+    const values = [...store.drives.values()].map(d => d.newest.get('output_frequency').ms);
+    shown.push([now - store.time, now - Math.min(...values)]);
     if (n !== store.frame.n) came.push(now - store.time);
     n = store.frame.n;
     await new Promise(done => setTimeout(done, every));
@@ -114,14 +116,22 @@ def figures(ages: list[float]) -> list[str]:
 
 
 def frame_sizes(url: str) -> str:
-    """Return the bytes of a frame, as the daemon sends it and unpacked."""
+    """Return the bytes of a whole frame, and of what changed since another one, on the wire and unpacked."""
     import gzip
     import urllib.request
 
-    request = urllib.request.Request(f"{url}api/frame", headers={"accept-encoding": "gzip"})
-    with urllib.request.urlopen(request) as answer:
-        packed = answer.read()
-    return f"a frame has {len(packed)} bytes on the wire, {len(gzip.decompress(packed))} unpacked"
+    def packed(query: str) -> bytes:
+        request = urllib.request.Request(f"{url}api/frame{query}", headers={"accept-encoding": "gzip"})
+        with urllib.request.urlopen(request) as answer:
+            found: bytes = answer.read()
+        return found
+
+    whole = packed("")
+    changes = packed(f"?after={json.loads(gzip.decompress(whole))['n']}")
+    sizes = [
+        f"{len(one)} bytes on the wire, {len(gzip.decompress(one))} unpacked" for one in (whole, changes)
+    ]
+    return f"a whole frame has {sizes[0]}; what changed since the one before {sizes[1]}"
 
 
 def main() -> None:

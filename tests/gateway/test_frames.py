@@ -1,4 +1,4 @@
-"""Frames: made once for all viewers, ten a second at most, and none waits in a queue."""
+"""Frames: made once for all viewers, five a second at most, whole or as what changed; none is queued."""
 
 from __future__ import annotations
 
@@ -9,9 +9,11 @@ from typing import Any
 
 import pytest
 from clocks import Clock
+from hypothesis import given
+from hypothesis import strategies as st
 
 from multidrop.gateway import frames as module
-from multidrop.gateway.frames import Frames
+from multidrop.gateway.frames import REMEMBERED, WHOLE, Encoded, Frames, changes
 
 
 @pytest.fixture
@@ -28,7 +30,7 @@ def made() -> list[int]:
 def frames(clock: Clock, made: list[int]) -> Frames:
     def make(n: int) -> dict[str, Any]:
         made.append(n)
-        return {"n": n}
+        return {"n": n, "revision": 1}
 
     return Frames(make, clock)
 
@@ -45,7 +47,7 @@ def test_a_hundred_viewers_share_one_frame(frames: Frames, clock: Clock, made: l
         found = await asyncio.gather(*viewers)
         assert {id(one) for one in found} == {id(found[0])}
         assert found[0] is not None
-        assert json.loads(gzip.decompress(found[0].gzipped)) == json.loads(found[0].plain) == {"n": 2}
+        assert json.loads(gzip.decompress(found[0].gzipped)) == told(found[0]) == {"n": 2, "since": 1}
         assert frames.viewers == 0
 
     asyncio.run(watch())
@@ -107,8 +109,78 @@ def test_a_viewer_who_comes_late_gets_the_newest_and_no_other(frames: Frames, cl
         late = await frames.after(first.n)
         assert late is not None
         assert late.n == 51
+        assert told(late) == {"n": 51, "revision": 1}
         other = await frames.after(900)  # seen of an earlier process
         assert other is late
+
+    asyncio.run(watch())
+
+
+def told(frame: Encoded | None) -> dict[str, Any]:
+    assert frame is not None
+    found: dict[str, Any] = json.loads(frame.plain)
+    return found
+
+
+def merged(before: dict[str, Any], now: dict[str, Any]) -> dict[str, Any]:
+    """Return an object with the values of another one in place of its own, and so on in the objects in it."""
+    both = {key: merged(before[key], value) for key, value in now.items() if isinstance(value, dict)}
+    return {**before, **now, **both}
+
+
+values = st.none() | st.integers(0, 2) | st.lists(st.none() | st.integers(0, 2), max_size=2)
+drives = st.fixed_dictionaries(
+    {
+        "state": st.sampled_from(["runs", "stands"]),
+        "values": st.fixed_dictionaries({"a": values, "b": values}),
+    }
+)
+plants = st.fixed_dictionaries(
+    {"drives": st.fixed_dictionaries({"pump": drives, "fan": drives}), "c": values}
+)
+
+
+@given(plants, plants)
+def test_what_changed_makes_the_newer_one_of_the_older_and_says_nothing_else(
+    before: dict[str, Any], now: dict[str, Any]
+) -> None:
+    said = changes(before, now)
+    assert merged(before, said) == now
+    assert changes(before, merged(before, said)) == said
+    assert changes(now, now) == {}
+
+
+@given(st.lists(st.tuples(plants, st.integers(0, 9)), min_size=2, max_size=12), st.integers(0, 2**32))
+def test_each_viewer_has_the_newest_whole_however_late_it_comes(
+    pictures: list[tuple[dict[str, Any], int]], begin: int
+) -> None:
+    """A second number says for how many frames a viewer stays away; there is another plant in the middle."""
+    clock, whole = Clock(), dict[int, dict[str, Any]]()
+
+    def make(n: int) -> dict[str, Any]:
+        at = n - begin - 1
+        whole[n] = {"n": n, "revision": 2 * at // len(pictures), **pictures[at][0]}
+        return whole[n]
+
+    async def watch() -> None:
+        frames = Frames(make, clock, begin)
+        has: dict[int, dict[str, Any]] = {}  # of each viewer: it comes again after so many frames
+        for turn, _ in enumerate(pictures):
+            clock.now += 0.25
+            frames.note_news()
+            for every in {away + 1 for _, away in pictures}:
+                if turn % every:
+                    continue
+                mine = has.get(every)
+                news = told(await frames.after(WHOLE if mine is None else mine["n"]))
+                since = news.pop("since", None)
+                if since is None:
+                    has[every] = news
+                else:
+                    assert mine is not None
+                    assert since == mine["n"] > news["n"] - REMEMBERED
+                    has[every] = merged(mine, news)
+                assert has[every] == whole[max(whole)]
 
     asyncio.run(watch())
 

@@ -15,6 +15,8 @@ from urllib.parse import parse_qs, unquote, urlsplit
 
 import fake_plant
 
+from multidrop.gateway.frames import changes
+
 PAGE = files("multidrop.gateway") / "page"
 TYPES = {
     "html": "text/html; charset=utf-8",
@@ -28,6 +30,7 @@ HEADERS = {
     "Cross-Origin-Resource-Policy": "same-origin",
 }
 FRAMES_A_SECOND = 10
+REMEMBERED = 5  # frames
 HOLD_S = 20  # before a request for a frame is answered with 304
 
 
@@ -55,7 +58,7 @@ class FakeGateway:
         self.began = time.time()
         self.outcomes: dict[str, dict[str, Any]] = {}
         self._lock = threading.Lock()
-        self._newest = (0, b"")
+        self._made: dict[int, dict[str, Any]] = {}  # the newest frames
         self._sockets: set[socket.socket] = set()
         self._server = _Server(("127.0.0.1", port), _handler(self))
         self._thread = threading.Thread(target=self._server.serve_forever, args=(0.02,), daemon=True)
@@ -75,16 +78,20 @@ class FakeGateway:
         """Return the number of the newest frame."""
         return 1 if self.stands_still else int((time.time() - self.began) * FRAMES_A_SECOND) + 1
 
-    def encoded(self) -> bytes:
-        """Return the newest frame, encoded once for all viewers."""
+    def encoded(self, after: int) -> bytes:
+        """Return the newest frame, or what changed in it since another one that is remembered."""
         with self._lock:
             number = self.number()
-            if self._newest[0] != number:
+            if number not in self._made:
                 told = fake_plant.frame(number, self.began, self.renamed, self.stuck)
                 if self.clocked:
                     told["drives"][self.clocked]["values"]["output_frequency"][0] = time.time() % 1000
-                self._newest = (number, json.dumps({**told, **self.changes}).encode())
-            return self._newest[1]
+                newest = [*self._made.items()][-REMEMBERED:]
+                self._made = dict([*newest, (number, {**told, **self.changes})])
+            told = self._made[number]
+            if after in self._made and after != number:
+                told = {"n": number, "since": after, **changes(self._made[after], told)}
+            return json.dumps(told).encode()
 
 
 class _Server(ThreadingHTTPServer):
@@ -152,7 +159,7 @@ def _handler(gateway: FakeGateway) -> type[BaseHTTPRequestHandler]:
                 if time.monotonic() > end:
                     return self.answer(304, b"")
                 time.sleep(0.01)
-            return self.answer(200, gateway.encoded())
+            return self.answer(200, gateway.encoded(after))
 
         def do_POST(self) -> None:
             body = json.loads(self.rfile.read(int(self.headers["Content-Length"])))

@@ -136,18 +136,20 @@ def frame(n: int, began: float, renamed: dict[str, str], stuck: dict[str, float]
         if name in SILENT:
             seen = began - SILENT[name]
             old = values(name, number, seen)
-            rows = {r: [None, ms(now), "no reply", old[r], ms(seen)] for r in polled}
+            rows = {r: [None, 0, "no reply", old[r], 1] for r in polled}
+            ages = [0, ms(now) - ms(seen)]
         else:
             seen = at
-            rows = {r: [held[r], ms(at), "ok"] for r in polled}
+            rows = {r: [held[r], 0] for r in polled}
+            ages = [ms(now) - ms(at)]
         drives[renamed.get(name, name)] = {
-            "state": state(name), "fault": FAULTS[name][0] if name in FAULTS else None, "seen": ms(seen),
-            "values": rows, "why": "no reply" if name in SILENT else None,
+            "state": state(name), "fault": FAULTS[name][0] if name in FAULTS else None, "seen": len(ages) - 1,
+            "ages_ms": ages, "values": rows, "why": "no reply" if name in SILENT else None,
             "missed": {"labeller": 1.0, "tower-fan-2": 0.031}.get(name, 0), "p99": 6.1,
         }  # fmt: skip
     return {
         "n": n, "revision": 1, "time": str(int(now * 1e9)), "drives": drives, "lines": lines(),
-        "alarms": alarms(renamed, began),
+        "alarms": alarms(renamed, began), "troubles": [],
     }  # fmt: skip
 
 

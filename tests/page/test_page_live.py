@@ -111,9 +111,8 @@ def test_a_silent_drive_keeps_its_last_value_with_its_age(opened: Opener) -> Non
 
 
 def test_what_is_not_known_is_a_dash_and_never_a_nought(opened: Opener, gateway: FakeGateway) -> None:
-    now = int(time.time() * 1000)
-    rows = {"output_frequency": [None, now, "no reply"], "output_current": [None, None, "not asked yet"]}
-    drive = {"state": "unknown", "fault": None, "seen": None, "values": rows}
+    rows = {"output_frequency": [None, 0, "no reply"], "output_current": [None, 0, "not asked yet"]}
+    drive = {"state": "unknown", "fault": None, "seen": None, "ages_ms": [0], "values": rows}
     gateway.changes = {"drives": {"pump-1": drive}, "lines": {}}
     page = opened("#/drives/pump-1")
     for part in ("frequency", "current", "age", "missed"):

@@ -8,7 +8,7 @@ from starlette.datastructures import Headers
 from starlette.responses import JSONResponse
 from starlette.types import Receive, Scope, Send
 
-from multidrop.gateway.frames import Frames
+from multidrop.gateway.frames import WHOLE, Frames
 from multidrop.gateway.guard import Denied
 from multidrop.gateway.request_fields import number_in
 
@@ -25,7 +25,7 @@ class FrameRoute:
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         try:
             asked = parse_qs(scope["query_string"].decode("latin-1"), keep_blank_values=True)
-            frame = await self._frames.after(number_in(asked.get("after", ["-1"])[-1], "after"))
+            frame = await self._frames.after(number_in(asked.get("after", [str(WHOLE)])[-1], "after"))
         except Denied as denied:
             await JSONResponse({"error": str(denied)}, denied.status)(scope, receive, send)
             return

@@ -1,6 +1,7 @@
 """Frames: what all viewers see, made once for all of them, five times a second at most.
 
-A viewer asks for the next frame when it has the last one: nothing queues for one that is slow.
+A viewer asks for the next frame when it has the last one: nothing queues for one that is slow. It names the
+one that it has, and is sent what changed since that one while it is remembered.
 """
 
 from __future__ import annotations
@@ -8,6 +9,7 @@ from __future__ import annotations
 import asyncio
 import gzip
 import json
+from collections import deque
 from collections.abc import Callable
 from math import isfinite
 from typing import Any, NamedTuple
@@ -21,11 +23,13 @@ LEAST_S = 0.2  # between two frames, on the whole: the page draws no faster
 EARLY_S = 0.02  # by which one may come sooner after one that was late
 WAIT_S = 20.0  # for which a viewer waits for a frame
 MOST_VIEWERS = 200  # that wait at the same time
+WHOLE = -1  # the number of no frame: who has none is sent a whole one
+REMEMBERED = 6  # frames, the newest among them: a viewer may be a second behind
 LOST = ("port lost", "port refused its settings")  # statuses of all rows of a line that is not there
 
 
 class Encoded(NamedTuple):
-    """A frame as it is sent."""
+    """A frame as it is sent, whole or as what changed since another one."""
 
     n: int
     plain: bytes
@@ -56,26 +60,40 @@ def frame_of(
 def _drive(hub: Hub, name: str, time_ns: int) -> dict[str, Any]:
     state, words = hub.seen(name)
     seen = hub.seen_at(name)
+    places = Places()
+    values = {known[0]: _value(hub, known, places, time_ns) for known in hub.known(name)}
     return {
         "state": state,
         "fault": words if state == FAULT else None,
         "why": words if state == SILENT else None,
-        "seen": None if seen is None else seen // 1_000_000,
-        "values": {known[0]: _value(hub, known, time_ns) for known in hub.known(name)},
+        "seen": None if seen is None else places[seen],
+        "ages_ms": [time_ns // 1_000_000 - time // 1_000_000 for time in places],
+        "values": values,
     }
 
 
-def _value(hub: Hub, known: Known, time_ns: int) -> list[Any]:
-    """Return value, time and status; of what is not known now null, and then the last value and its time."""
+class Places(dict[int, int]):
+    """The places of times in a list without doubles: what was read by one request has one time."""
+
+    def __missing__(self, time: int) -> int:
+        self[time] = place = len(self)
+        return place
+
+
+def _value(hub: Hub, known: Known, places: Places, time_ns: int) -> tuple[Any, ...]:
+    """Return value, place of its time, status; of what is not known now null, and the last value and time.
+
+    The status of a good value is left out.
+    """
     _, newest, good, is_fresh = known
     if newest is None:
-        return [None, time_ns // 1_000_000, "not asked yet"]
+        return None, places[time_ns], "not asked yet"
     if newest is good and is_fresh:
-        return [_finite(good[2]), good[0] // 1_000_000, "ok"]
-    last = [] if good is None else [_finite(good[2]), good[0] // 1_000_000]
+        return _finite(good[2]), places[good[0]]
+    last = () if good is None else (_finite(good[2]), places[good[0]])
     if newest[3]:
-        return [None, newest[0] // 1_000_000, hub.status(newest[3]), *last]
-    return [None, time_ns // 1_000_000, "overdue", *last]
+        return None, places[newest[0]], hub.status(newest[3]), *last
+    return None, places[time_ns], "overdue", *last
 
 
 def _finite(value: float) -> float | None:
@@ -99,13 +117,33 @@ def lost_of(hub: Hub, line: str) -> str | None:
     return hub.unopened.get(line) or max(statuses, default=None)
 
 
-class Frames:
-    """The newest frame, and those who wait for the next one. `clock` gives monotonic seconds."""
+def changes(before: dict[str, Any], now: dict[str, Any]) -> dict[str, Any]:
+    """Return those keys of `now` whose values are others than in `before`, which has the same keys.
 
-    def __init__(self, make: Callable[[int], dict[str, Any]], clock: Callable[[], float]) -> None:
+    Of an object in an object it is again those that changed; anything else is there as a whole.
+    """
+    return {
+        key: changes(before[key], value) if isinstance(value, dict) else value
+        for key, value in now.items()
+        if before[key] != value
+    }
+
+
+class Frames:
+    """The newest frames, and those who wait for the next one.
+
+    `clock` gives monotonic seconds. Frames are numbered on from `begin`, so that none that a viewer has of an
+    earlier process is taken for one of ours.
+    """
+
+    def __init__(
+        self, make: Callable[[int], dict[str, Any]], clock: Callable[[], float], begin: int = 0
+    ) -> None:
         self._make = make
         self._clock = clock
-        self._newest: Encoded | None = None
+        self._begin = begin
+        self._remembered: deque[dict[str, Any]] = deque(maxlen=REMEMBERED)  # the newest last
+        self._encoded: dict[int, Encoded] = {}  # the newest, by the frame since which it tells
         self._due = 0.0
         self._timer: asyncio.TimerHandle | None = None
         self._has_news = True
@@ -139,12 +177,13 @@ class Frames:
     async def after(self, n: int) -> Encoded | None:
         """Return a frame other than the n-th as soon as there is one; None after 20 s without one.
 
-        Raises OverflowError when too many wait already.
+        Where the n-th is remembered, that is what changed since then. Raises OverflowError when too many
+        wait already.
         """
         if self._has_news and self._clock() >= self._due:
             self._build()
-        if self._newest is not None and self._newest.n != n:
-            return self._newest
+        if (news := self._since(n)) is not None:
+            return news
         if len(self._waiting) >= MOST_VIEWERS:
             raise OverflowError(f"{MOST_VIEWERS} viewers wait already")
         if self._is_closed:
@@ -158,17 +197,32 @@ class Frames:
             return None
         finally:
             self._waiting.discard(turn)
-        return self._newest if self._newest is not None and self._newest.n != n else None
+        return self._since(n)
 
     def close(self) -> None:
         """Let all waiting viewers go, without a frame."""
         self._is_closed = True
         self._wake()
 
+    def _since(self, n: int) -> Encoded | None:
+        """Return the newest frame for one who has the n-th; None where that is the newest."""
+        if not self._remembered or self._remembered[-1]["n"] == n:
+            return None
+        newest = self._remembered[-1]
+        known = next((one for one in self._remembered if one["n"] == n), None)
+        if known is None or known["revision"] != newest["revision"]:  # another plant has other keys
+            n, told = WHOLE, newest
+        else:
+            told = {"n": newest["n"], "since": n, **changes(known, newest)}
+        if n not in self._encoded:
+            plain = json.dumps(told, separators=(",", ":"), allow_nan=False).encode()
+            self._encoded[n] = Encoded(newest["n"], plain, gzip.compress(plain, 6, mtime=0))
+        return self._encoded[n]
+
     def _build(self) -> None:
         self.made += 1
-        plain = json.dumps(self._make(self.made), separators=(",", ":"), allow_nan=False).encode()
-        self._newest = Encoded(self.made, plain, gzip.compress(plain, 6, mtime=0))
+        self._remembered.append(self._make(self._begin + self.made))
+        self._encoded.clear()
         self._due = max(self._due + LEAST_S, self._clock() + LEAST_S - EARLY_S)
         self._has_news = False
         self._wake()

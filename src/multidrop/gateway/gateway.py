@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import secrets
 import struct
 import time
 from collections.abc import Callable, Mapping
@@ -57,7 +58,7 @@ class Gateway:
         self.plant = plant
         self.settings = settings
         self.version = multidrop.__version__
-        self.revision = 1
+        self.revision = secrets.randbits(32)  # of the plant: no page takes another process's for ours
         self.failures: dict[str, int] = {}
         self.dead: dict[str, str] = {}  # parts, and why they do not live any more
         self.parts = LiveParts(self)
@@ -80,7 +81,7 @@ class Gateway:
         self.lately = Lately(plant)
         self.notifier = Notifier()
         self.reload = Reload(self, read)
-        self.frames = Frames(self._frame, self.clock)
+        self.frames = Frames(self._frame, self.clock, begin=secrets.randbits(32))
         self.commands = Commands(self, settings.may)
         self.side_reads = SideReads(self.bus, self._is_there, self.clock, _utc_ms)
         self.identities = Identities(

@@ -111,7 +111,7 @@ class Reload:
         self.mistakes, self.restart = (), tuple(_after_restart(self._begun_with, plant.serve))
         for sentence in self.restart:
             _log.warning("%s", sentence)
-        _log.info("the plant file is in effect: revision %d", gateway.revision)
+        _log.info("the plant file is in effect")
         return Reloaded(True, f"{plant.path.name} is in effect", (), self.restart)
 
     def _take_up(self, poller: Poller, settings: ServeSettings, planned: Mapping[str, Any] | None) -> None:

@@ -5,6 +5,7 @@ import { store, takeFrame, takePlant } from "./store.js";
 
 const PATIENCE_MS = 25000; // the daemon answers after 20 s where there is nothing new
 const AGAIN_MS = 500;
+const NONE = -1; // the number of no frame
 const HIDDEN_MS = 1000; // a tab that nobody sees asks once a second, and holds no connection
 
 export const link = { why: "" };
@@ -36,20 +37,20 @@ addEventListener("command", () => under?.abort());
 
 // Ask for frames until the page is closed.
 export async function run() {
-  let n = 0,
+  let n = NONE,
     isKnown = false;
   for (;;) {
     try {
       if (!isKnown) {
         takePlant(await get("api/plant"));
-        [n, isKnown] = [0, true];
+        [n, isKnown] = [NONE, true];
       }
-      const frame = await newer(document.hidden ? 0 : n);
+      const told = await newer(document.hidden ? NONE : n);
       [store.isLost, link.why] = [false, ""];
-      if (frame) {
-        isKnown = frame.revision === store.plant.revision && frame.n >= n;
-        n = frame.n;
-        takeFrame(frame);
+      if (told) {
+        takeFrame(told);
+        n = store.frame.n;
+        isKnown = store.frame.revision === store.plant.revision;
       }
       if (document.hidden) await pause(HIDDEN_MS);
     } catch (error) {
@@ -61,7 +62,7 @@ export async function run() {
   }
 }
 
-// Return the frame after `n`, or null where there is none yet.
+// Return what changed since frame `n`, a whole frame where that is not remembered, or null without news.
 async function newer(n) {
   const sent = Date.now();
   under = new AbortController();

@@ -34,24 +34,42 @@ export function takePlant(plant) {
         registers,
         good: old?.good ?? new Map(),
         pasts: old?.pasts ?? new Map(),
+        newest: new Map(), // {ms, status} of each register's newest request
+        seen: null, // when its newest value was asked for, in ms
       });
     }
   }
   for (const watcher of watchers) watcher();
 }
 
-// Take a frame: keep each value that is newer than the one before.
-export function takeFrame(frame) {
+// Take a frame, or what changed since the one before: keep each value that is newer than its last one.
+export function takeFrame(told) {
+  const frame = told.since === undefined ? told : merged(store.frame, told);
   store.frame = frame;
   store.time = Number(BigInt(frame.time) / 1000000n);
   for (const [name, drive] of store.drives) {
-    const values = frame.drives[name]?.values ?? {};
-    for (const [register, row] of Object.entries(values)) keep(drive, register, row);
+    const { ages_ms = [], values = {}, seen = null } = frame.drives[name] ?? {};
+    const at = place => store.time - ages_ms[place];
+    drive.seen = seen === null ? null : at(seen);
+    drive.newest.clear();
+    for (const [register, [value, place, status = "ok", lastValue, lastPlace]] of Object.entries(values))
+      keep(drive, register, [value, at(place), status, lastValue, at(lastPlace)]);
   }
+}
+
+// Return an object with the values of `changes` in place of its own, and so on in the objects in it.
+function merged(before, changes) {
+  const result = { ...before };
+  for (const [key, value] of Object.entries(changes)) {
+    const isObject = value !== null && typeof value === "object" && !Array.isArray(value);
+    result[key] = isObject ? merged(before[key], value) : value;
+  }
+  return result;
 }
 
 // A row is [value, ms, "ok"], or [null, ms, status, last good value, its ms] where the newest request failed.
 function keep(drive, register, [value, ms, status, lastValue, lastMs]) {
+  drive.newest.set(register, { ms, status });
   if (value !== null) drive.good.set(register, { value, ms });
   else if (lastMs > (drive.good.get(register)?.ms ?? 0))
     drive.good.set(register, { value: lastValue, ms: lastMs });
@@ -71,11 +89,11 @@ function most() {
 // three periods, than a second where the newest request failed, or when the frame itself is old.
 export function reading(name, register, now) {
   const drive = store.drives.get(name),
-    row = store.frame?.drives[name]?.values?.[register];
+    newest = drive?.newest.get(register);
   const good = drive?.good.get(register);
   if (!good)
-    return row ? { value: null, ms: row[1], status: row[2], age: now - row[1], isOld: true } : null;
-  const status = row ? row[2] : "no more polled";
+    return newest ? { value: null, ...newest, age: now - newest.ms, isOld: true } : null;
+  const status = newest ? newest.status : "no more polled";
   const age = (isLive(now) ? store.time : now) - good.ms;
   return {
     value: good.value,
@@ -95,7 +113,7 @@ export const isLive = now => store.frame !== null && !store.isLost && now - stor
 
 // Return the age of the drive's newest good reply in ms, or null where there never was one.
 export function driveAge(name, now) {
-  const seen = store.frame?.drives[name]?.seen ?? null;
+  const seen = store.drives.get(name)?.seen ?? null;
   return seen === null ? null : Math.max(0, (isLive(now) ? store.time : now) - seen);
 }
 
