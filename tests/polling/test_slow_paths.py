@@ -155,17 +155,27 @@ def test_what_became_of_a_write_over_a_slow_path_is_true(
 
 @pytest.mark.parametrize("name", WRITTEN)
 def test_a_write_has_the_time_that_reads_did_not_need(
-    name: str, path_of: Callable[..., tuple[Bus, PathLine]]
+    name: str, path_of: Callable[..., tuple[Bus, PathLine]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """Its answer alone is slow; nor is it found out only by reading the register back."""
     drive = WRITTEN[name]
-    opened, line = path_of([simulated(drive)], constant(0.0))
+    sim = simulated(drive)
+    opened, line = path_of([sim], constant(0.0))
     register = drive.register(name)
+    write, slow = sim.write, iter([0.25])
+
+    def write_slowly(function: int, start: int, raws: list[int]) -> None:
+        write(function, start, raws)
+        line.wire.delay = lambda now: next(slow, 0.0)
+
+    monkeypatch.setattr(sim, "write", write_slowly)
     with opened:
         for _ in range(12):
             opened.read(drive, register)
         assert opened.peer(drive).timeout < 0.15
-        line.wire.delay = constant(0.25)
         assert opened.try_write(drive, register, 11.0).effect is Effect.DONE
+        assert not any(slow)
+        assert (opened.peer(drive).counters().late, opened.peer(drive).silences) == (0, 0)
 
 
 def test_reads_of_a_delixi_have_the_80_ms_of_its_document(

@@ -1,0 +1,105 @@
+"""Beyond the window of a late answer: what could be taken for another waits until a proof was answered."""
+
+from __future__ import annotations
+
+import pytest
+from frames import words
+from line_driver import MS, LineDriver
+from line_exchanges import LONGER, OTHER, READ, WRITE, ask, drive, exchange, line, reply
+
+from multidrop.core import Exchange, Failure, Framing, Message, Peer, build_reply
+
+__all__ = ["drive", "line"]  # fixtures
+
+PROOF_REPLY = build_reply(Framing.RTU, Message(1, 3, data=words(4, 5)))
+AGAIN = Message(1, 6, 9, data=words(1))
+
+
+@pytest.fixture
+def proof(line: LineDriver, drive: Peer) -> Exchange:
+    """The drive's proof, a read of another length. READ was not answered, and its window is over."""
+    found = exchange(LONGER, drive)
+    drive.prove_by([found])
+    time_out(line, drive, READ)
+    return found
+
+
+def time_out(line: LineDriver, drive: Peer, request: Message) -> None:
+    ask(line, drive, request)
+    line.wait_until_done()
+    assert line.completion.result == Failure.NO_REPLY
+    line.now = drive.late_until_ns + MS
+
+
+def send(line: LineDriver, asked: Exchange) -> None:
+    line.begin(asked)
+    line.wait_until_write()
+
+
+def is_barred(line: LineDriver, drive: Peer, request: Message) -> bool:
+    line.begin(exchange(request, drive))
+    return line.want == "done" and line.completion.result == Failure.LATE_ANSWER_DUE
+
+
+@pytest.mark.usefixtures("proof")
+def test_a_read_of_the_same_length_waits_for_a_proof(line: LineDriver, drive: Peer) -> None:
+    assert is_barred(line, drive, OTHER)
+    ask(line, drive, Message(1, 4, 50, 1))  # no reply to READ is one to this
+
+
+@pytest.mark.usefixtures("proof")
+def test_a_write_waits_for_the_answer_of_an_earlier_one(line: LineDriver, drive: Peer) -> None:
+    """A late refusal of the first would be told as the second's, whose motor has started."""
+    time_out(line, drive, WRITE)
+    assert is_barred(line, drive, AGAIN)
+
+
+def test_an_answered_proof_says_that_the_earlier_answer_never_comes(
+    line: LineDriver, drive: Peer, proof: Exchange
+) -> None:
+    send(line, proof)
+    line.receive(PROOF_REPLY)
+    assert (line.want, line.completion.reply.data) == ("done", words(4, 5))
+    ask(line, drive, OTHER)
+    line.receive(reply(2222))
+    assert (line.want, line.completion.reply.data) == ("done", words(2222))
+
+
+def test_a_late_answer_before_the_proof_s_is_neither(line: LineDriver, drive: Peer, proof: Exchange) -> None:
+    send(line, proof)
+    line.receive(reply(1111))
+    assert line.listens
+    assert drive.counters().late == 1
+    line.receive(PROOF_REPLY)
+    assert (line.want, line.completion.reply.data) == ("done", words(4, 5))
+    ask(line, drive, OTHER)
+    line.receive(reply(2222))
+    assert (line.want, line.completion.reply.data) == ("done", words(2222))
+
+
+def test_an_unanswered_proof_proves_nothing(line: LineDriver, drive: Peer, proof: Exchange) -> None:
+    send(line, proof)
+    line.wait_until_done()
+    assert line.completion.result == Failure.NO_REPLY
+    line.now = drive.late_until_ns + MS
+    assert is_barred(line, drive, OTHER)
+
+
+@pytest.mark.usefixtures("proof")
+def test_a_stop_waits_for_no_proof(line: LineDriver, drive: Peer) -> None:
+    time_out(line, drive, WRITE)
+    stop = exchange(AGAIN, drive)
+    stop.c.insists = 1
+    send(line, stop)
+
+
+@pytest.mark.usefixtures("proof")
+def test_a_late_answer_is_known_on_a_port_that_was_opened_again(line: LineDriver, drive: Peer) -> None:
+    """The value may be that of the first question: by hand it is asked for again."""
+    line.lose(0)
+    again = LineDriver()
+    again.now = line.now
+    ask(again, drive, READ)
+    again.receive(reply(1111))
+    assert (again.want, again.completion.result) == ("done", Failure.LATE_ANSWER_DUE)
+    assert drive.counters().late == 1
