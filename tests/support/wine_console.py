@@ -8,12 +8,14 @@ import re
 import select
 import signal
 import subprocess
+import termios
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 PATIENCE_S = 300.0  # a busy machine takes a minute to begin Python by Wine
+SIZE = 50, 400  # rows and columns: no sentence is broken
 NOWHERE = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.DEVNULL)
 ESCAPES = re.compile(r"\x1b(\[[0-9;?]*[A-Za-z]|\][^\x07]*\x07)")
 
@@ -26,6 +28,7 @@ class Console:
         self._status: int | None = None
         self._pid, self._terminal = pty.fork()
         if self._pid == 0:
+            termios.tcsetwinsize(0, SIZE)
             os.execvpe("wine", ["wine", str(folder / "python" / "python.exe"), *words], environment)
 
     def _hear(self) -> None:
@@ -109,6 +112,17 @@ class Wine:
         line = ["wine", str(self.folder / "python" / "python.exe"), *map(str, words)]
         pipes = {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
         return subprocess.run(line, env=self.environment, check=False, timeout=PATIENCE_S, **pipes)
+
+    def type_line(self, line: str, folder: Path) -> int:
+        """Type this to Windows' own shell, after Python's name, and return the status."""
+        typed = folder / "typed.bat"
+        program = f"Z:{self.folder}/python/python.exe".replace("/", "\\")
+        typed.write_text(f"@{program} {line}\r\n", "ascii")
+        shell = ["wine", "cmd", "/c", typed.name]
+        ran = subprocess.run(
+            shell, cwd=folder, env=self.environment, check=False, timeout=PATIENCE_S, **NOWHERE
+        )
+        return ran.returncode
 
     @contextmanager
     def console(self, *words: object) -> Iterator[Console]:

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
@@ -13,7 +14,7 @@ from pathlib import Path
 
 import pytest
 from motors import ReceivedRequests
-from wine_console import Wine
+from wine_console import Console, Wine
 
 from multidrop.drives import InvtCHE
 from multidrop.recording import open_reader
@@ -115,6 +116,40 @@ def test_ctrl_c_cuts_no_stop_short(wine: Wine, pump: MotorDrive) -> None:
     assert not pump.motor.energised
 
 
+# A motor that does not turn is waited for, here for as long as Ctrl-C may take.
+START = """
+import sys
+import multidrop.cli
+import multidrop.drive.family
+multidrop.drive.family.START_TIME = 300.0
+sys.exit(multidrop.cli.main(sys.argv[1:]))
+"""
+
+
+def test_ctrl_c_within_a_start_says_what_was_sent_and_how_to_stop_it(
+    wine: Wine, pump: MotorDrive, tmp_path: Path
+) -> None:
+    """The stop that it names is typed as it stands, and stops the motor."""
+    vars(pump.motor)["run"] = lambda direction=None: None
+    received = ReceivedRequests(pump)
+    plant = tmp_path / "hall 2.toml"
+    plant.write_text(PLANT.replace("насос", "pump") + "maximum_frequency = 50\n", "utf-8")
+    words = ("start", f"Z:{plant}".replace("/", "\\"), "pump", "--frequency", 20, "--yes")
+    with wine.console("-c", START, *words) as console:
+        console.until(lambda: received.starts)
+        console.press_ctrl_c()
+        assert console.status() == 130, console.said
+        console.until_said("to stop it, type: ")
+    assert len(received.starts) == 1
+    interrupted, sent, offered = said_by(console)
+    assert interrupted == "multidrop: interrupted"
+    assert sent.startswith("multidrop: pump: control = FORWARD ")
+    stop = offered.removeprefix("multidrop: to stop it, type: multidrop ")
+    begun = len(received.writes)
+    assert wine.type_line(f"-m multidrop {stop}", tmp_path) == 0
+    assert [write.data for write in received.writes[begun:]] == [b"\0\5"]
+
+
 # ---- names, paths, consoles ----
 
 
@@ -206,6 +241,11 @@ def on_com5(wine: Wine) -> Iterator[MotorDrive]:
     with Simulator([Wire([drive])]) as line:
         wine.link("com5", line.wires[0].path)
         yield drive
+
+
+def said_by(console: Console) -> list[str]:
+    """Return what the program has said of itself, sentence by sentence."""
+    return re.findall(r"multidrop: .*\S", console.said)
 
 
 def statuses(path: Path) -> list[str]:

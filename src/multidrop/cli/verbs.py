@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import argparse
 import json
-import shlex
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
 from multidrop.cli.support.arguments import add_json_argument, add_writing_arguments, duration
 from multidrop.cli.support.confirm import confirm
-from multidrop.cli.support.output import print_text
+from multidrop.cli.support.output import command_line, print_text
 from multidrop.cli.support.target import Target, add_target_arguments, check_words, number_of, target_of
 from multidrop.cli.support.values import as_json, nearest_value
 from multidrop.drive.family import Drive
@@ -107,7 +106,7 @@ def _annotating(command: str, target: Target) -> Iterator[list[str]]:
         for text in known:
             interruption.add_note(text)
         if command != "state":
-            interruption.add_note(f"to stop it, type: {shlex.join(('multidrop', 'stop', *target.words))}")
+            interruption.add_note(f"to stop it, type: {command_line(('multidrop', 'stop', *target.words))}")
         raise
 
 

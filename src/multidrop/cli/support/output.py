@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import logging
+import shlex
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from io import TextIOWrapper
 from typing import TextIO
@@ -21,6 +22,15 @@ def spell_out_unencodable() -> None:
 def print_text(text: object, *, file: TextIO | None = None, flush: bool = False) -> None:
     """Print the text. Only \\n ends a line."""
     print("\n".join(map(printable, str(text).split("\n"))), file=file, flush=flush)
+
+
+def command_line(words: Sequence[str]) -> str:
+    """Return the words as they are typed: a console of Windows knows no other quotes than its own."""
+    if sys.platform == "win32":
+        from subprocess import list2cmdline
+
+        return list2cmdline(words)
+    return shlex.join(words)
 
 
 def warn(sentences: str) -> None:

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import argparse
-import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from multidrop.bus import Bus
+from multidrop.cli.support.output import command_line
 from multidrop.cli.support.plants import add_port_option, is_plant, plant_of
 from multidrop.core import RS485, Echo
 from multidrop.drive.family import Drive
@@ -114,7 +114,7 @@ def _by_plant(arguments: argparse.Namespace) -> Target:
     line, drive = plant.find_drive(names[0])
     ports = [f"--port={name}={port}" for name, port in arguments.ports]
     words = (path, drive.name, *ports)
-    return Target(drive, line.port, line.echo, line.rs485, words, shlex.join((path, drive.name)))
+    return Target(drive, line.port, line.echo, line.rs485, words, command_line((path, drive.name)))
 
 
 def _by_hand(arguments: argparse.Namespace) -> Target:

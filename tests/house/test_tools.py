@@ -1,0 +1,87 @@
+"""Mistakes at the command lines of tools/: each is one sentence, and nothing is begun."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+pytestmark = pytest.mark.long
+
+TOOLS = Path(__file__).parents[2] / "tools"
+LINUX = "multidrop-0.1.0-cp311-abi3-manylinux2014_x86_64.manylinux_2_17_x86_64.whl"
+WINDOWS = "multidrop-0.1.0-cp311-abi3-win_amd64.whl"
+
+# What is typed in a folder that holds the two wheels, a file and an empty folder, and what is said of it.
+MISTAKES = {
+    "bare": "bare: it takes RELEASE WHEEL, and was given nothing",
+    f"bare stable {LINUX} {LINUX}": f"bare: it takes RELEASE WHEEL, and was given: stable {LINUX} {LINUX}",
+    "bare stable none.whl": "bare: there is no wheel none.whl: `tools/wheels` makes one",
+    "bare stable file": "bare: file is no wheel: the name of one ends with .whl",
+    f"bare stable {WINDOWS}": f"bare: {WINDOWS} is not for this: *manylinux*_x86_64.whl would be right",
+    "booted": "booted: it takes RELEASE WHEEL, and was given nothing",
+    "booted stable none.whl": "booted: there is no wheel none.whl: `tools/wheels` makes one",
+    f"booted stable {WINDOWS}": f"booted: {WINDOWS} is not for this: *manylinux*_x86_64.whl would be right",
+    "foreign": "foreign: it takes MACHINE WHEEL [WORD]..., and was given nothing",
+    f"foreign sparc {LINUX}": "foreign: no machine is called sparc: arm64 or armhf would be right",
+    "foreign arm64 none.whl": "foreign: there is no wheel none.whl: `tools/wheels` makes one",
+    f"foreign arm64 {LINUX}": f"foreign: {LINUX} is not for this: *manylinux*_aarch64.whl would be right",
+    "foreign armhf empty": "foreign: empty is no wheel: the name of one ends with .whl",
+    "musl": "musl: it takes make FOLDER WHEEL [PACKAGE]..., or FOLDER WORD..., and was given nothing",
+    "musl make new": "musl: make takes FOLDER WHEEL [PACKAGE]..., and was given: new",
+    "musl make empty none.whl": "musl: empty is there already: name a new folder",
+    "musl make new none.whl": "musl: there is no wheel none.whl: `tools/wheels` makes one",
+    f"musl make new {LINUX}": f"musl: {LINUX} is not for this: *musllinux*_x86_64.whl would be right",
+    "musl none -V": "musl: none is no folder that `tools/musl make` has filled",
+    "musl empty -V": "musl: empty is no folder that `tools/musl make` has filled",
+    "wine": "wine: it takes make FOLDER WHEEL [PACKAGE]..., test FOLDER, or FOLDER WORD..., and was given",
+    "wine make new": "wine: make takes FOLDER WHEEL [PACKAGE]..., and was given: new",
+    "wine make empty none.whl": "wine: empty is there already: name a new folder",
+    "wine make new none.whl": "wine: there is no wheel none.whl: `tools/wheels` makes one",
+    f"wine make new {LINUX}": f"wine: {LINUX} is not for this: *win_amd64.whl would be right",
+    "wine test": "wine: test takes FOLDER, and was given nothing",
+    "wine test empty": "wine: empty is no folder that `tools/wine make` has filled",
+    "wine test none": "wine: none is no folder that `tools/wine make` has filled",
+    "wine build new": "wine: build is no folder that `tools/wine make` has filled",
+    "wine file -V": "wine: file is no folder that `tools/wine make` has filled",
+    "wheels dist": "wheels: error: unrecognized arguments: dist",
+    "wheels --only sparc": "wheels: error: argument --only: invalid choice: 'sparc'",
+    "wheels --out file": "wheels: error: file is no folder: name an empty or a new one with --out",
+    "wheels --out .": "wheels: error: . holds sdists or wheels already: name an empty folder with --out",
+    "wheels --out new --python pithon": "wheels: error: there is no interpreter pithon to try a wheel with",
+    "wheels --out new --only windows --python python3": "wheels: error: --python tries the wheel of x86_64",
+}
+
+
+@pytest.mark.parametrize("words", MISTAKES)
+def test_a_mistake_is_one_sentence_and_nothing_is_begun(tmp_path: Path, words: str) -> None:
+    for name in (LINUX, WINDOWS, "file"):
+        (tmp_path / name).touch()
+    (tmp_path / "empty").mkdir()
+    there = sorted(tmp_path.rglob("*"))
+    tool, *others = words.split()
+    program = [sys.executable] if tool == "wheels" else []
+    ran = subprocess.run(
+        [*program, TOOLS / tool, *others],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=60,
+    )
+    assert ran.returncode == 2, ran.stderr
+    assert ran.stdout == ""
+    *usage, sentence = ran.stderr.splitlines()
+    assert sentence.startswith(MISTAKES[words])
+    assert not usage or (tool == "wheels" and usage[0].startswith("usage: "))
+    assert sorted(tmp_path.rglob("*")) == there
+
+
+@pytest.mark.parametrize("tool", ["bare", "booted", "foreign", "musl", "wheels", "wine"])
+def test_help_is_its_own_head(tool: str) -> None:
+    ran = subprocess.run([TOOLS / tool, "--help"], capture_output=True, text=True, check=True, timeout=60)
+    assert f"tools/{tool} " in ran.stdout
+    assert ran.stdout.isascii()
+    assert ran.stderr == ""
