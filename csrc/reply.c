@@ -57,8 +57,8 @@ void md_reply_foresee(struct md_line *line, int64_t now_ns)
     }
     int function_at = exchange->framing == MD_RTU ? 1 : 3;
     int missing = md_reply_length(exchange->framing, &exchange->request) - have;
-    uint8_t function = have > function_at ? begun[function_at] : MD_EXCEPTION_BIT;
-    int may_be_exception = (function & MD_EXCEPTION_BIT) || function >= '8';
+    int may_be_exception =
+        have <= function_at || (begun[function_at] & MD_EXCEPTION_BIT) || begun[function_at] >= '8';
     if (missing > 1 && !(may_be_exception && have > 0))
         line->ready_ns = now_ns + (missing - 1) * exchange->character_ns;
 }
