@@ -10,36 +10,6 @@
 
 static const int64_t WORTH_WAITING = 250000; /* ns; before a shorter time a sleep costs more than a look */
 
-/* ---- states and transitions ---- */
-
-enum { IDLE = MD_IDLE, SILENCE, CHECK, READY, WRITING, AWAITING, LAST_LOOK, NONE = -1 };
-
-static const int8_t follows[MD_LINE_STATES][MD_LINE_EVENTS] = {
-    /*              begun    silent  nothing stray    part     sent      timeout    in time   ended */
-    [IDLE]      = { SILENCE, NONE,   NONE,   IDLE,    NONE,    NONE,     NONE,      NONE,     NONE },
-    [SILENCE]   = { NONE,    CHECK,  NONE,   SILENCE, NONE,    NONE,     NONE,      NONE,     IDLE },
-    [CHECK]     = { NONE,    NONE,   READY,  SILENCE, NONE,    NONE,     NONE,      NONE,     IDLE },
-    [READY]     = { NONE,    NONE,   NONE,   SILENCE, WRITING, AWAITING, NONE,      NONE,     IDLE },
-    [WRITING]   = { NONE,    NONE,   NONE,   WRITING, WRITING, AWAITING, NONE,      NONE,     IDLE },
-    [AWAITING]  = { NONE,    NONE,   NONE,   NONE,    NONE,    NONE,     LAST_LOOK, AWAITING, IDLE },
-    [LAST_LOOK] = { NONE,    NONE,   NONE,   NONE,    NONE,    NONE,     NONE,      AWAITING, IDLE },
-};
-
-int md_line_follows(int state, int event)
-{
-    return follows[state][event];
-}
-
-/* Go where the table says; 0 where this cannot happen now. */
-static int go(struct md_line *line, enum md_line_event event)
-{
-    int next = follows[line->state][event];
-    if (next == NONE)
-        return 0;
-    line->state = next;
-    return 1;
-}
-
 /* ---- the end of an exchange ---- */
 
 /* A network needs none. Where replies have no ids to be told by, it shows whether more is to come, such as a
@@ -61,7 +31,7 @@ static void finish(struct md_line *line, struct md_ending ending)
         line->quiet_ns = completion->last_ns;
     if (completion->sent_ns) /* else the silence after what went before still holds */
         line->silence_ns = silence_of(line, line->exchange);
-    go(line, MD_ENDED);
+    md_line_go(line, MD_ENDED);
 }
 
 /* End it with all that came. */
@@ -72,9 +42,9 @@ static void fail(struct md_line *line, int result)
 
 void md_line_abandon(struct md_line *line, int result, int error)
 {
-    if (line->state == IDLE)
+    if (line->state == MD_IDLE)
         return;
-    if (line->state >= AWAITING && line->transactions != MD_MATCHED)
+    if (line->state >= MD_AWAITING && line->transactions != MD_MATCHED)
         md_late_expect(line, md_window_ns(line->exchange)); /* the port may be back before it comes */
     line->completion->error = error;
     fail(line, result);
@@ -84,7 +54,7 @@ void md_line_abandon(struct md_line *line, int result, int error)
 
 void md_line_init(struct md_line *line, int64_t now_ns)
 {
-    *line = (struct md_line){.state = IDLE, .quiet_ns = now_ns, .transaction = (uint16_t)(now_ns >> 16)};
+    *line = (struct md_line){.state = MD_IDLE, .quiet_ns = now_ns, .transaction = (uint16_t)(now_ns >> 16)};
 }
 
 /* Find the request's bytes: an exchange keeps short ones. 0, or a result. */
@@ -119,7 +89,7 @@ void md_line_begin(struct md_line *line, const struct md_exchange *exchange, str
     line->echo_due = line->echo != MD_NO_ECHO && !line->transactions;
     line->silence_ns = later(line->silence_ns, silence_of(line, exchange));
     line->give_up_ns = later(now_ns, md_line_silent_ns(line)) + exchange->drive->most_timeout_ns;
-    go(line, MD_BEGUN);
+    md_line_go(line, MD_BEGUN);
     if (md_listen_is_held(line))
         line->give_up_ns = later(line->give_up_ns, line->listened_ns + exchange->drive->most_timeout_ns);
     if (exchange->drive->owed_count) /* of another line, or from before the port was lost */
@@ -144,29 +114,29 @@ static int64_t free_ns(const struct md_line *line)
 int md_line_want(struct md_line *line, int64_t now_ns)
 {
     switch (line->state) {
-    case SILENCE: /* a line that babbles is not waited for without end */
+    case MD_SILENCE: /* a line that babbles is not waited for without end */
         line->wake_ns = sooner(free_ns(line), line->give_up_ns);
         if (now_ns < line->wake_ns)
             return md_listen_is_held(line) ? MD_READ : MD_WAIT;
-        go(line, MD_FELL_SILENT);
+        md_line_go(line, MD_FELL_SILENT);
         return MD_READ;
-    case CHECK:
+    case MD_CHECK:
         if (line->listened_ns && !md_listen_end(line, now_ns)) {
             fail(line, MD_OTHER_MASTER);
             return MD_DONE;
         }
-        go(line, MD_NOTHING_CAME);
+        md_line_go(line, MD_NOTHING_CAME);
         line->rx_len = line->rx_from = 0;
         line->wake_ns =
             now_ns + line->exchange->drive->most_timeout_ns + md_wire_ns(line->exchange, line->tx_len);
         return MD_WRITE;
-    case READY:
-    case WRITING: /* a port that takes nothing is a broken port */
+    case MD_READY:
+    case MD_WRITING: /* a port that takes nothing is a broken port */
         if (now_ns < line->wake_ns)
             return MD_WRITE;
         md_line_abandon(line, MD_LINE_LOST, ETIMEDOUT);
         return MD_DONE;
-    case AWAITING:
+    case MD_AWAITING:
         if (line->ready_ns - now_ns > WORTH_WAITING && line->ready_ns < line->give_up_ns) {
             line->wake_ns = line->ready_ns;
             line->waited = 1;
@@ -175,9 +145,9 @@ int md_line_want(struct md_line *line, int64_t now_ns)
         line->wake_ns = md_reply_has_begun(line) ? line->give_up_ns : line->begun_by_ns;
         line->looks++;
         if (now_ns >= line->wake_ns) /* it may be late to look at all */
-            go(line, MD_TIME_OUT);
+            md_line_go(line, MD_TIME_OUT);
         return MD_READ;
-    case LAST_LOOK:
+    case MD_LAST_LOOK:
         finish(line, line->transactions ? md_tcp_missed(line) : md_reply_missed(line));
         return MD_DONE;
     default:
@@ -188,7 +158,7 @@ int md_line_want(struct md_line *line, int64_t now_ns)
 void md_line_sent(struct md_line *line, size_t len, int64_t begun_ns, int64_t now_ns)
 {
     const struct md_exchange *exchange = line->exchange;
-    if (len == 0 || (line->state != READY && line->state != WRITING))
+    if (len == 0 || (line->state != MD_READY && line->state != MD_WRITING))
         return;
     if (line->tx_at == 0) {
         line->completion->sent_ns = begun_ns;
@@ -197,8 +167,8 @@ void md_line_sent(struct md_line *line, size_t len, int64_t begun_ns, int64_t no
     md_tap_put(line->tap, MD_ASKING, begun_ns, line->tx + line->tx_at, len);
     line->quiet_ns = later(line->quiet_ns, now_ns) + md_wire_ns(exchange, (int64_t)len);
     line->tx_at = (uint16_t)(line->tx_at + len);
-    go(line, line->tx_at < line->tx_len ? MD_PART_LEFT : MD_ALL_LEFT);
-    if (line->state == WRITING)
+    md_line_go(line, line->tx_at < line->tx_len ? MD_PART_LEFT : MD_ALL_LEFT);
+    if (line->state == MD_WRITING)
         return;
     md_echo_keep(line);
     int reply_len = md_reply_length(exchange->framing, &exchange->request);
@@ -242,12 +212,12 @@ static void take_stray(struct md_line *line, const uint8_t *bytes, size_t len, i
     line->quiet_ns = later(line->quiet_ns, now_ns); /* the request before may still be leaving */
     if (line->listened_ns)
         md_listen_hear(line, len, now_ns);
-    if (line->state != IDLE)
+    if (line->state != MD_IDLE)
         line->completion->stale += (uint32_t)len;
     if (!md_line_is_under_way(line))
         md_tap_put(line->tap, MD_NOISE, now_ns, bytes, len);
-    if (line->state == IDLE || now_ns < line->give_up_ns)
-        go(line, MD_STRAY_BYTES);
+    if (line->state == MD_IDLE || now_ns < line->give_up_ns)
+        md_line_go(line, MD_STRAY_BYTES);
     for (size_t at = 0; at < len;)
         at += keep(line, bytes + at, len - at);
     md_reply_find_late(line, 0, now_ns);
@@ -257,13 +227,13 @@ static void take_stray(struct md_line *line, const uint8_t *bytes, size_t len, i
 static void take_frames(struct md_line *line, const uint8_t *bytes, size_t len, int64_t now_ns)
 {
     struct md_ending ending;
-    if (line->state < AWAITING && line->transactions == MD_IGNORED) {
+    if (line->state < MD_AWAITING && line->transactions == MD_IGNORED) {
         line->quiet_ns = later(line->quiet_ns, now_ns);
-        if (line->state == IDLE || now_ns < line->give_up_ns)
-            go(line, MD_STRAY_BYTES);
+        if (line->state == MD_IDLE || now_ns < line->give_up_ns)
+            md_line_go(line, MD_STRAY_BYTES);
     }
     while (len > 0 && !line->is_out_of_step) {
-        if (line->state >= AWAITING) {
+        if (line->state >= MD_AWAITING) {
             line->completion->last_ns = now_ns;
             if (line->completion->first_ns == 0)
                 line->completion->first_ns = now_ns;
@@ -274,12 +244,12 @@ static void take_frames(struct md_line *line, const uint8_t *bytes, size_t len, 
         if (md_tcp_find(line, now_ns, &ending))
             finish(line, ending);
     }
-    if (line->state < AWAITING) /* behind what is out of step */
+    if (line->state < MD_AWAITING) /* behind what is out of step */
         md_tap_put(line->tap, MD_NOISE, now_ns, bytes, len);
-    for (size_t at = 0; at < len && line->state >= AWAITING;) /* it may tell what is spoken there */
+    for (size_t at = 0; at < len && line->state >= MD_AWAITING;) /* it may tell what is spoken there */
         at += keep(line, bytes + at, len - at);
-    if (line->state != IDLE && now_ns < line->give_up_ns)
-        go(line, MD_BYTES_IN_TIME);
+    if (line->state != MD_IDLE && now_ns < line->give_up_ns)
+        md_line_go(line, MD_BYTES_IN_TIME);
 }
 
 void md_line_received(struct md_line *line, const uint8_t *bytes, size_t len, int64_t now_ns)
@@ -292,7 +262,7 @@ void md_line_received(struct md_line *line, const uint8_t *bytes, size_t len, in
         take_frames(line, bytes, len, now_ns);
         return;
     }
-    if (line->state < AWAITING) {
+    if (line->state < MD_AWAITING) {
         take_stray(line, bytes, len, now_ns);
         return;
     }
@@ -301,15 +271,15 @@ void md_line_received(struct md_line *line, const uint8_t *bytes, size_t len, in
     completion->last_ns = now_ns;
     completion->skipped += (uint32_t)len;
     size_t at = 0;
-    while (at < len && line->state != IDLE) {
+    while (at < len && line->state != MD_IDLE) {
         at += keep(line, bytes + at, len - at);
         if (md_reply_find(line, now_ns, &ending))
             finish(line, ending);
     }
     if (at < len) /* behind the reply, and there was no room for it beside what came before that */
         md_tap_put(line->tap, MD_NOISE, now_ns, bytes + at, len - at);
-    if (line->state != IDLE && now_ns < line->give_up_ns)
-        go(line, MD_BYTES_IN_TIME);
-    if (line->state == AWAITING)
+    if (line->state != MD_IDLE && now_ns < line->give_up_ns)
+        md_line_go(line, MD_BYTES_IN_TIME);
+    if (line->state == MD_AWAITING)
         md_reply_foresee(line, now_ns);
 }

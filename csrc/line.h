@@ -5,16 +5,7 @@
 #include "internal.h"
 
 /* cdef: begin */
-/* ---- line.c: one line as a state machine; bytes and time come in as arguments ---- */
-
-enum { MD_RX_ROOM = 2 * MD_MOST_FRAME };
-
-enum md_want {
-    MD_DONE,  /* nothing: the completion is filled in */
-    MD_WAIT,  /* to be left alone until wake_ns: nothing worth reading comes before */
-    MD_WRITE, /* tx[tx_at] to tx[tx_len] written, as much as the port takes */
-    MD_READ   /* bytes, or to be asked again at wake_ns */
-};
+/* ---- line_states.c ---- */
 
 enum md_line_state {
     MD_IDLE,
@@ -38,6 +29,20 @@ enum md_line_event {
     MD_BYTES_IN_TIME, /* came, but not yet the reply, and there is time left */
     MD_ENDED,         /* the completion is filled in */
     MD_LINE_EVENTS
+};
+
+/* The state that follows on an event; -1 where the event cannot happen. */
+extern const int8_t md_line_follows[MD_LINE_STATES][MD_LINE_EVENTS];
+
+/* ---- line.c: one line as a state machine; bytes and time come in as arguments ---- */
+
+enum { MD_RX_ROOM = 2 * MD_MOST_FRAME };
+
+enum md_want {
+    MD_DONE,  /* nothing: the completion is filled in */
+    MD_WAIT,  /* to be left alone until wake_ns: nothing worth reading comes before */
+    MD_WRITE, /* tx[tx_at] to tx[tx_len] written, as much as the port takes */
+    MD_READ   /* bytes, or to be asked again at wake_ns */
 };
 
 struct md_line {
@@ -75,8 +80,6 @@ struct md_line {
     uint8_t frame[MD_MOST_TCP];
 };
 
-/* Return the state that follows on an event; -1 where the event cannot happen. */
-int md_line_follows(int state, int event);
 void md_line_init(struct md_line *line, int64_t now_ns);
 /* Take up an exchange; one that is barred by late replies ends at once. Nothing happens before the line's
  * silence is over. */
@@ -98,6 +101,16 @@ void md_line_abandon(struct md_line *line, int result, int error);
 int md_listen_begin(struct md_line *line, int64_t now_ns, int64_t guard_ns);
 void md_listen_put_back(struct md_line *line); /* an exchange that waits for it, as if it had never begun */
 /* cdef: end */
+
+/* ---- line_states.c ---- */
+
+/* Go where the table says; an event that cannot happen now changes nothing. */
+static inline void md_line_go(struct md_line *line, enum md_line_event event)
+{
+    int next = md_line_follows[line->state][event];
+    if (next >= 0)
+        line->state = next;
+}
 
 /* ---- listen.c, of a line that is listened to ---- */
 

@@ -16,7 +16,7 @@ int md_listen_begin(struct md_line *line, int64_t now_ns, int64_t guard_ns)
     int longest = exchange->framing == MD_ASCII ? MD_MOST_FRAME : LONGEST_RTU;
     if (line->state != MD_READY || (line->transactions && !guard_ns))
         return 0;
-    line->state = md_line_follows(MD_READY, MD_STRAY_BYTES);
+    md_line_go(line, MD_STRAY_BYTES);
     line->listen_ns = longest * exchange->character_ns + exchange->drive->most_timeout_ns;
     if (line->transactions)
         line->listen_ns = 0;
@@ -27,7 +27,7 @@ int md_listen_begin(struct md_line *line, int64_t now_ns, int64_t guard_ns)
 
 void md_listen_put_back(struct md_line *line)
 {
-    line->state = md_line_follows(line->state, MD_ENDED);
+    md_line_go(line, MD_ENDED);
 }
 
 void md_listen_hear(struct md_line *line, size_t len, int64_t now_ns)

@@ -91,16 +91,3 @@ int md_mastership_extend(struct md_mastership *mastership, int64_t until_ns, int
     __atomic_store_n(&mastership->until_ns, until_ns, __ATOMIC_SEQ_CST);
     return 0;
 }
-
-/* The engine's thread has its mutex from the look to the end of write(2): who had it after the deadline was
- * taken back knows that nothing is on its way there. */
-void md_mastership_end(struct md_mastership *mastership)
-{
-    __atomic_store_n(&mastership->until_ns, 0, __ATOMIC_SEQ_CST);
-    struct md_engine *engine = __atomic_load_n(&mastership->engine, __ATOMIC_SEQ_CST);
-    if (engine) {
-        md_engine_enter(engine);
-        md_engine_leave(engine);
-    }
-    set_timer(mastership, 0);
-}

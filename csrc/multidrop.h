@@ -298,7 +298,7 @@ void md_count_stop(uint32_t *stops);
 void md_port_carry_out(struct md_port *port, const struct md_exchange *exchange, int64_t not_before_ns,
                        int64_t expires_ns, struct md_completion *completion);
 
-/* ---- mastership.c: return NULL or -1 and set errno on failure; else a time, or a flag ---- */
+/* ---- mastership.c, port_api.c: return NULL or -1 and set errno on failure; else a time, or a flag ---- */
 
 int64_t md_boottime_ns(void); /* CLOCK_BOOTTIME, of which are the times below */
 /* Make one that does not hold yet; ENOSYS where the kernel has no such timer. A line is listened to for

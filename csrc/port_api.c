@@ -178,3 +178,16 @@ void md_port_carry_out(struct md_port *port, const struct md_exchange *exchange,
     }
     md_engine_leave(engine);
 }
+
+/* The engine's thread has its mutex from the look to the end of write(2): who had it after the deadline was
+ * taken back knows that nothing is on its way there. */
+void md_mastership_end(struct md_mastership *mastership)
+{
+    __atomic_store_n(&mastership->until_ns, 0, __ATOMIC_SEQ_CST);
+    struct md_engine *engine = __atomic_load_n(&mastership->engine, __ATOMIC_SEQ_CST);
+    if (engine) {
+        md_engine_enter(engine);
+        md_engine_leave(engine);
+    }
+    md_mastership_extend(mastership, 0, 0); /* call the timer off */
+}

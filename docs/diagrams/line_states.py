@@ -27,7 +27,7 @@ def transitions() -> dict[tuple[int, int], list[str]]:
     found: dict[tuple[int, int], list[str]] = {}
     for state in range(len(STATES)):
         for number, event in enumerate(EVENTS):
-            following = lib.md_line_follows(state, number)
+            following = lib.md_line_follows[state][number]
             if following >= 0:
                 found.setdefault((state, following), []).append(event)
     return found

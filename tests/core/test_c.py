@@ -26,8 +26,8 @@ def build(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Callable[
 
 @pytest.mark.slow
 def test_core(build: Callable[..., None]) -> None:
-    line = ("line", "listen", "line_end", "reply", "tcp", "echo", "owed", "late", "delay", "counters")
-    core = ("checksum", "body", "frame", "reason", "tap", *line, "columns")
+    line = ("line", "line_states", "listen", "line_end", "reply", "tcp", "echo", "owed", "late")
+    core = ("checksum", "body", "frame", "reason", "tap", *line, "delay", "counters", "columns")
     build("test_core", *core, arguments=["tests/data/frames.csv"])
 
 

@@ -31,7 +31,7 @@ TABLE = {
     (state, event): following
     for state in STATES.values()
     for event in EVENTS.values()
-    if (following := lib.md_line_follows(state, event)) >= 0
+    if (following := lib.md_line_follows[state][event]) >= 0
 }
 
 

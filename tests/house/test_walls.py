@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 import pytest
@@ -176,3 +177,87 @@ def test_drive_and_planning_are_pure() -> None:
     outside = OUTSIDE | ports | {"datetime", "random", "threading", "pathlib", "asyncio"}
     pure = [path for path in FILES if room(path) in ("drive", "planning")]
     assert offenders({str(path.relative_to(PACKAGE)): _imported(path) & outside for path in pure}) == {}
+
+
+# ---- the C core ----
+
+DEFINED = re.compile(r"^[a-z][\w ]*?[ *](md_\w+)\([^;{]*?\)\s*\{", re.MULTILINE)
+CALLED = re.compile(r"\b(md_\w+)\s*\(")
+SYSTEM = re.compile(r"#include <(pthread|sched|time|signal|unistd|poll|termios|sys/\w+)\.h>")
+HEADERS_OF_PYTHON = ("multidrop", "rows", "capture")
+MOST_LINES = 60
+PURE = (  # framing, and one line as a state machine
+    *("checksum", "body", "frame", "reason", "split"),
+    *(
+        "line",
+        "line_states",
+        "line_end",
+        "listen",
+        "reply",
+        "tcp",
+        "echo",
+        "owed",
+        "late",
+        "delay",
+        "counters",
+    ),
+)
+
+
+def calls(code: dict[str, str]) -> dict[str, set[str]]:
+    """Return the files that each file of C calls; a function is the first one's that defines it."""
+    homes: dict[str, str] = {}
+    for name, text in code.items():
+        for function in DEFINED.findall(text):
+            homes.setdefault(function, name)
+    return {
+        name: {homes[function] for function in CALLED.findall(text) if function in homes} - {name}
+        for name, text in code.items()
+    }
+
+
+def core() -> dict[str, str]:
+    """Return the text of each file of the core, without comments."""
+    found = sorted((ROOT / "csrc").glob("*.c"))
+    return {path.stem: re.sub(r"/\*.*?\*/", "", path.read_text("utf-8"), flags=re.DOTALL) for path in found}
+
+
+def test_calls_of_the_core_run_one_way() -> None:
+    graph = calls(core())
+    assert graph["port_api"] >= {"engine", "port_queue"}
+    assert graph["port_io"] >= {"port_turn", "line"}
+    TopologicalSorter(graph).prepare()
+
+
+def test_a_circle_is_found() -> None:
+    graph = calls({"a": "int md_a(void)\n{\n    md_b();\n}", "b": "void md_b(void)\n{\n    md_a();\n}"})
+    with pytest.raises(CycleError):
+        TopologicalSorter(graph).prepare()
+
+
+def test_framing_and_a_line_know_no_system() -> None:
+    code = core()
+    engine = {"engine", "clock", "wakeup", "port_io", "port_api", "row_queue", "mastership"}
+    graph = calls(code)
+    assert offenders({name: graph[name] & engine for name in PURE}) == {}
+    assert offenders({name: set(SYSTEM.findall(code[name])) for name in PURE}) == {}
+
+
+def test_python_calls_each_function_of_its_headers() -> None:
+    headers = "".join((ROOT / "csrc" / f"{name}.h").read_text("utf-8") for name in HEADERS_OF_PYTHON)
+    declared = set(CALLED.findall(re.sub(r"/\*.*?\*/", "", headers, flags=re.DOTALL)))
+    called = {
+        name for path in files("src") for name in re.findall(r"\blib\.(md_\w+)", path.read_text("utf-8"))
+    }
+    assert len(declared) > 40
+    assert declared - called == set()
+
+
+def test_no_function_of_the_core_is_long() -> None:
+    bodies = {
+        f"{name}: {head}": body.count("\n") + 1
+        for name, text in core().items()
+        for head, body in re.findall(r"^(\w[^\n;]*)\n\{\n(.*?)\n\}$", text, re.MULTILINE | re.DOTALL)
+    }
+    assert len(bodies) > 300
+    assert {name: lines for name, lines in bodies.items() if lines > MOST_LINES} == {}

@@ -8,10 +8,11 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
-from datetime import UTC, datetime
 from io import SEEK_END
 from pathlib import Path
 from typing import Any
+
+from multidrop.iso_time import format_time
 
 
 class AuditLog:
@@ -23,8 +24,7 @@ class AuditLog:
 
     def add(self, utc_ns: int, record: dict[str, Any]) -> None:
         """Append a record. Raises OSError, also when there was room for a part of it only."""
-        time = datetime.fromtimestamp(utc_ns // 10**9, UTC).strftime("%Y-%m-%dT%H:%M:%S")
-        line = json.dumps({"time": f"{time}.{utc_ns % 10**9:09d}Z", **record}, ensure_ascii=False)
+        line = json.dumps({"time": format_time(utc_ns), **record}, ensure_ascii=False)
         whole = (b"\n" if self._is_truncated() else b"") + line.encode() + b"\n"
         if self._file.write(whole) < len(whole):
             raise OSError(f"{self.path}: there was room for a part of a record only")
