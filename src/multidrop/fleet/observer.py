@@ -80,6 +80,17 @@ class Observer:
                 found[name] = present[0]
         return found
 
+    def weak(self) -> list[str]:
+        """Return the gateways whose session others have ended on a path, and which go on by the rest."""
+        return [
+            name
+            for name, value in self.sessions().items()
+            if any(
+                is_ended_by_another(record) and record.value["session"] == value["session"]
+                for _, record in self._of(name)
+            )
+        ]
+
     def _of(self, gateway: str) -> list[tuple[int, Record]]:
         """Return the records of a gateway, with their paths, but for those that are removed or strange."""
         records = enumerate(self.records(gateway))
