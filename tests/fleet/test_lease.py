@@ -14,7 +14,7 @@ from peers import require_module
 require_module("nats")
 
 from multidrop.fleet import life_lock  # noqa: E402
-from multidrop.fleet.errors import FleetError  # noqa: E402
+from multidrop.fleet.errors import FleetError, Unsure  # noqa: E402
 from multidrop.fleet.lease import Lease  # noqa: E402
 from multidrop.fleet.lease_rules import SECOND, USUAL  # noqa: E402
 from multidrop.fleet.life_lock import LifeLock  # noqa: E402
@@ -278,6 +278,7 @@ def test_a_dead_gateway_is_ended_after_a_lease_by_the_watchers_clock() -> None:
         await look(observer)
         assert observer.dead() == {}
         trial.clock.pass_s(USUAL.lease / SECOND)
+        await look(observer)
         await observer.end_the_dead()
         assert observer.is_over("a", 1)
         assert [value["ended"] for value in trial.values()] == [True, True, True]
@@ -295,6 +296,7 @@ def test_what_is_judged_is_what_is_ended() -> None:
         assert await lease.try_to_begin()
         await look(observer)
         trial.clock.pass_s(USUAL.lease / SECOND)
+        await look(observer)
         judged = observer.dead()["a"]
         await renew(lease)  # the network heals just now
         await look(observer)
@@ -319,11 +321,39 @@ def test_who_was_cut_off_itself_ends_nobody_for_what_it_saw_meanwhile() -> None:
         await look(observer)
         trial.clock.pass_s(60)
         observer.begin_anew()
+        await look(observer)
         await observer.end_the_dead()
         assert not observer.is_over("a", 1)
         trial.clock.pass_s(USUAL.lease / SECOND)
+        await look(observer)
         await observer.end_the_dead()
         assert observer.is_over("a", 1)
+
+    asyncio.run(main())
+
+
+def test_who_gets_no_answer_judges_nobody() -> None:
+    """The server that it reads from may stand still, while the leases are renewed by others."""
+
+    async def main() -> None:
+        trial = Trial()
+        lease, observer = trial.lease(), trial.observer()
+        assert await lease.try_to_begin()
+        await look(observer)
+        for bucket in trial.buckets:
+            bucket.is_down = True
+        for _ in range(60):
+            trial.clock.pass_s(0.1)
+            for path in range(3):
+                with pytest.raises(Unsure):
+                    await observer.look(path)
+            assert observer.dead() == {}
+        for bucket in trial.buckets:
+            bucket.is_down = False
+        await observer.look(0)
+        assert observer.dead() == {}
+        await observer.look(1)
+        assert observer.dead().keys() == {"a"}
 
     asyncio.run(main())
 
@@ -395,7 +425,8 @@ def test_a_gateway_with_one_stale_path_is_left_alone() -> None:
             trial.clock.pass_s(0.5)
             await lease.renew_once(0)
             await lease.renew_once(2)
-        assert observer.dead() == {}
+            await look(observer)
+            assert observer.dead() == {}
 
     asyncio.run(main())
 
