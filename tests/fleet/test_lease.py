@@ -13,10 +13,11 @@ from peers import require_module
 
 require_module("nats")
 
-from multidrop.fleet import lease as lease_module  # noqa: E402
-from multidrop.fleet.errors import FleetError  # noqa: E402
-from multidrop.fleet.lease import Lease, LifeLock  # noqa: E402
+from multidrop.fleet import life_lock  # noqa: E402
+from multidrop.fleet.errors import FleetError, Unsure  # noqa: E402
+from multidrop.fleet.lease import Lease  # noqa: E402
 from multidrop.fleet.lease_rules import SECOND, USUAL  # noqa: E402
+from multidrop.fleet.life_lock import LifeLock  # noqa: E402
 from multidrop.fleet.observer import Observer  # noqa: E402
 
 
@@ -199,7 +200,7 @@ def test_two_that_begin_at_once_are_never_both_valid() -> None:
 def test_who_holds_the_lock_file_knows_that_the_one_before_is_dead(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(lease_module, "machine_id", lambda: "this machine")
+    monkeypatch.setattr(life_lock, "machine_id", lambda: "this machine")
 
     async def main() -> None:
         trial = Trial()
@@ -222,11 +223,11 @@ def test_a_lock_file_of_another_machine_proves_nothing(
 ) -> None:
     async def main() -> None:
         trial = Trial()
-        monkeypatch.setattr(lease_module, "machine_id", lambda: "this machine")
+        monkeypatch.setattr(life_lock, "machine_id", lambda: "this machine")
         lock = LifeLock(tmp_path / "a.lock")
         assert await trial.lease(lock=lock).try_to_begin()
         lock.close()
-        monkeypatch.setattr(lease_module, "machine_id", lambda: machine)
+        monkeypatch.setattr(life_lock, "machine_id", lambda: machine)
         with closing(LifeLock(tmp_path / "a.lock")) as lock:
             assert not await trial.lease(lock=lock).try_to_begin()
 
@@ -237,7 +238,7 @@ def test_another_file_at_the_same_path_proves_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Two containers of one machine may both have /var/lib/multidrop/a.lock."""
-    monkeypatch.setattr(lease_module, "machine_id", lambda: "this machine")
+    monkeypatch.setattr(life_lock, "machine_id", lambda: "this machine")
 
     async def main() -> None:
         trial = Trial()
@@ -255,7 +256,7 @@ def test_two_machines_without_an_id_prove_nothing_to_each_other(
 ) -> None:
     async def main() -> None:
         trial = Trial()
-        monkeypatch.setattr(lease_module, "machine_id", lambda: "")
+        monkeypatch.setattr(life_lock, "machine_id", lambda: "")
         lock = LifeLock(tmp_path / "a.lock")
         assert await trial.lease(lock=lock).try_to_begin()
         lock.close()
@@ -277,6 +278,7 @@ def test_a_dead_gateway_is_ended_after_a_lease_by_the_watchers_clock() -> None:
         await look(observer)
         assert observer.dead() == {}
         trial.clock.pass_s(USUAL.lease / SECOND)
+        await look(observer)
         await observer.end_the_dead()
         assert observer.is_over("a", 1)
         assert [value["ended"] for value in trial.values()] == [True, True, True]
@@ -294,6 +296,7 @@ def test_what_is_judged_is_what_is_ended() -> None:
         assert await lease.try_to_begin()
         await look(observer)
         trial.clock.pass_s(USUAL.lease / SECOND)
+        await look(observer)
         judged = observer.dead()["a"]
         await renew(lease)  # the network heals just now
         await look(observer)
@@ -318,11 +321,39 @@ def test_who_was_cut_off_itself_ends_nobody_for_what_it_saw_meanwhile() -> None:
         await look(observer)
         trial.clock.pass_s(60)
         observer.begin_anew()
+        await look(observer)
         await observer.end_the_dead()
         assert not observer.is_over("a", 1)
         trial.clock.pass_s(USUAL.lease / SECOND)
+        await look(observer)
         await observer.end_the_dead()
         assert observer.is_over("a", 1)
+
+    asyncio.run(main())
+
+
+def test_who_gets_no_answer_judges_nobody() -> None:
+    """The server that it reads from may stand still, while the leases are renewed by others."""
+
+    async def main() -> None:
+        trial = Trial()
+        lease, observer = trial.lease(), trial.observer()
+        assert await lease.try_to_begin()
+        await look(observer)
+        for bucket in trial.buckets:
+            bucket.is_down = True
+        for _ in range(60):
+            trial.clock.pass_s(0.1)
+            for path in range(3):
+                with pytest.raises(Unsure):
+                    await observer.look(path)
+            assert observer.dead() == {}
+        for bucket in trial.buckets:
+            bucket.is_down = False
+        await observer.look(0)
+        assert observer.dead() == {}
+        await observer.look(1)
+        assert observer.dead().keys() == {"a"}
 
     asyncio.run(main())
 
@@ -394,7 +425,8 @@ def test_a_gateway_with_one_stale_path_is_left_alone() -> None:
             trial.clock.pass_s(0.5)
             await lease.renew_once(0)
             await lease.renew_once(2)
-        assert observer.dead() == {}
+            await look(observer)
+            assert observer.dead() == {}
 
     asyncio.run(main())
 
@@ -411,6 +443,33 @@ def test_an_ended_path_stays_ended_for_this_session() -> None:
         assert lease.held[1] is None
         assert trial.values()[1]["ended"]
         assert lease.is_valid
+
+    asyncio.run(main())
+
+
+def test_a_session_that_lost_a_path_is_weak_until_a_whole_one_follows() -> None:
+    async def main() -> None:
+        trial = Trial()
+        lease, observer = trial.lease(), trial.observer()
+        assert await lease.try_to_begin()
+        await look(observer)
+        assert (lease.is_weak, observer.weak()) == (False, [])
+        trial.buckets[1].store("a", {**trial.values()[1], "ended": True, "by": "b"})
+        await renew(lease)
+        await look(observer)
+        assert lease.is_valid
+        assert (lease.is_weak, observer.weak()) == (True, ["a"])
+        trial.buckets[1].is_down = True
+        assert not await lease.could_be_whole()
+        trial.buckets[1].is_down = False
+        assert await lease.could_be_whole()
+        await lease.end()
+        assert await lease.try_to_begin()
+        await renew(lease)
+        await look(observer)
+        assert lease.session == 2
+        assert None not in lease.held
+        assert (lease.is_weak, observer.weak()) == (False, [])
 
     asyncio.run(main())
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import time
 from collections.abc import AsyncIterator, Callable
-from contextlib import asynccontextmanager
+from contextlib import asynccontextmanager, suppress
 from itertools import count
 
 import pytest
@@ -18,7 +18,9 @@ require_module("nats")
 from multidrop.fleet import member as member_module  # noqa: E402
 from multidrop.fleet import names  # noqa: E402
 from multidrop.fleet.buckets import Bucket  # noqa: E402
+from multidrop.fleet.errors import Conflict  # noqa: E402
 from multidrop.fleet.lease import Lease, boottime_ns  # noqa: E402
+from multidrop.fleet.lease_bucket import LeaseBucket  # noqa: E402
 from multidrop.fleet.lease_rules import SECOND, USUAL, Terms  # noqa: E402
 from multidrop.fleet.member import Member, MemberState  # noqa: E402
 from multidrop.fleet.plant_store import store  # noqa: E402
@@ -233,6 +235,39 @@ def test_a_node_that_dies_costs_nothing(fleet: Cluster) -> None:
             fleet.nodes[1].start()
             await asyncio.to_thread(fleet.wait)
             await until(lambda: all(path.url == path.urls[0] for path in member.paths), "home again")
+
+    asyncio.run(main())
+
+
+def test_who_lost_a_path_gives_the_session_up_one_after_another(
+    fleet: Cluster, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Else it would fall silent with the next server that dies."""
+    monkeypatch.setattr(member_module, "WEAK_NS", 3600 * SECOND)
+
+    async def lose_a_path(member: Member) -> None:
+        other = LeaseBucket(names.LEASES[1], member.best, "other")
+        while not member.lease.is_weak:
+            record = await other.get(member.name)
+            with suppress(Conflict):  # it was renewed meanwhile
+                await other.put(member.name, {**record.value, "ended": True}, record.revision)
+            await member.lease.renew_once(1)
+
+    async def main() -> None:
+        async with gateways(fleet, "a", "b", terms=LONG) as running:
+            members = running.members
+            for member in members.values():
+                await lose_a_path(member)
+                assert "a new session begins soon" in member.trouble
+            monkeypatch.setattr(member_module, "WEAK_NS", 0)
+            began = {name: member.lease.session for name, member in members.items()}
+            await until(lambda: members["a"].lease.session > began["a"], "a's new session")
+            assert members["b"].lease.session == began["b"]
+            await until(lambda: members["b"].lease.session > began["b"], "b's new session")
+            await until(lambda: all(None not in one.lease.held for one in members.values()), "all paths")
+            assert [member.trouble for member in members.values()] == ["", ""]
+            await until(running.are_shared, "shares")
+            assert running.hall.overlaps == []
 
     asyncio.run(main())
 

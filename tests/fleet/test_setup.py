@@ -14,8 +14,9 @@ import pytest
 from nats_clusters import Cluster, cluster, free_ports, old_server_program, server_program
 
 from multidrop.fleet import lease_bucket, servers, setup
+from multidrop.fleet.batch_client import DirectMessage
 from multidrop.fleet.buckets import ask
-from multidrop.fleet.errors import FleetError
+from multidrop.fleet.errors import FleetError, Unsure
 from multidrop.fleet.servers import ServerPath, paths_of
 
 
@@ -115,6 +116,22 @@ def test_servers_that_say_that_they_cannot_decide_have_no_quorum(
     monkeypatch.setattr(ServerPath, "request", refuse)
     with pytest.raises(FleetError, match=r"have no quorum: .* \(nats:.* says: JetStream system temporarily"):
         asyncio.run(_init(nats.urls))
+
+
+def test_a_plant_that_cannot_be_read_yet_is_waited_for(
+    nats: Cluster, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A direct get of a bucket that was made just now may find nobody."""
+    collect, failures = ServerPath.collect, [Unsure("it ended with 503")] * 2
+
+    async def fail_at_first(self: ServerPath, subject: str, data: bytes) -> list[DirectMessage]:
+        if failures:
+            raise failures.pop()
+        return await collect(self, subject, data)
+
+    monkeypatch.setattr(ServerPath, "collect", fail_at_first)
+    assert asyncio.run(_init(nats.urls))["replicas"] == 3
+    assert failures == []
 
 
 def test_a_server_without_jetstream_is_one_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

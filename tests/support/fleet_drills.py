@@ -23,7 +23,8 @@ from serial_hall import SerialHall
 
 from multidrop.fleet import names
 from multidrop.fleet.buckets import ask
-from multidrop.fleet.errors import FleetError
+from multidrop.fleet.errors import Conflict, FleetError
+from multidrop.fleet.lease_bucket import LeaseBucket
 from multidrop.fleet.servers import ServerPath
 
 GATEWAYS = ("gw-a", "gw-b", "gw-c")
@@ -85,7 +86,7 @@ class FleetDrill:
         return (self._folder / f"{name}.log").read_text()
 
     def settle(self) -> None:
-        """Start what died, and wait until each gateway polls lines, and paths and leaders are at home."""
+        """Start what died, and wait until each gateway polls lines, and leases, paths, leaders are whole."""
         for node in self.nats.nodes:
             with suppress(ProcessLookupError):
                 node.go_on()
@@ -101,11 +102,14 @@ class FleetDrill:
         def is_shared() -> bool:
             found = self.status()
             return len(found["gateways"]) == len(GATEWAYS) and all(
-                one["lines"] and one["says"] and len(set(one["says"]["paths"])) == len(self.nats.nodes)
+                one["lines"]
+                and one["says"]
+                and not one["says"]["trouble"]
+                and len(set(one["says"]["paths"])) == len(self.nats.nodes)
                 for one in found["gateways"].values()
             )
 
-        self.wait(is_shared, "each gateway has lines, and paths to three nodes")
+        self.wait(is_shared, "each gateway has lines, a whole lease, and paths to three nodes")
         self.wait(self.are_leaders_home, "each node leads one bucket of the leases")
         time.sleep(1.0)
 
@@ -166,6 +170,10 @@ class FleetDrill:
     def kill_node(self) -> None:
         self.random.choice(self.nats.nodes).kill()
 
+    def end_one_record(self) -> None:
+        """End one of a lease's records, as another gateway does that is late by an instant."""
+        asyncio.run(_end_record(self.nats, self.random.choice(GATEWAYS), self.random.choice(names.LEASES)))
+
     def stop_node(self) -> None:
         node = self.random.choice(self.nats.nodes)
         node.pause()
@@ -220,6 +228,18 @@ async def _make_leader(node: Node, buckets: Sequence[str]) -> None:
     await path.close()
 
 
+async def _end_record(nats: Cluster, gateway: str, bucket: str) -> None:
+    path = ServerPath(nats.urls)
+    await path.open()
+    other = LeaseBucket(bucket, lambda: path, "another")
+    while True:
+        record = await other.get(gateway)
+        with suppress(Conflict):  # it was renewed meanwhile
+            await other.put(gateway, {**record.value, "ended": True}, record.revision)
+            break
+    await path.close()
+
+
 DEEDS: dict[str, Callable[[FleetDrill], object]] = {
     "nothing": FleetDrill.do_nothing,
     "gateway killed": FleetDrill.kill_gateway,
@@ -227,6 +247,7 @@ DEEDS: dict[str, Callable[[FleetDrill], object]] = {
     "gateway and node killed": FleetDrill.kill_gateway_and_node,
     "gateway stands still": FleetDrill.stop_gateway,
     "gateway stands still shortly": FleetDrill.stop_gateway_shortly,
+    "gateway's lease loses a record": FleetDrill.end_one_record,
     "node killed": FleetDrill.kill_node,
     "node stands still": FleetDrill.stop_node,
     "lease leader killed": partial(FleetDrill.kill_leader, group=names.LEASES, others=names.OWNERS),

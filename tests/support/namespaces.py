@@ -12,6 +12,7 @@ import pytest
 from network_changes import changing_network
 
 NOBODYS_CARD = "02:00:00:00:00:00"
+BRIDGES_CARD = "02:00:00:00:02:00"
 
 
 def _ip(*words: str) -> None:
@@ -70,7 +71,8 @@ class Network:
         net = f"10.{100 + os.getpid() % 50}.{os.getpid() // 50 % 250}"
         self.address = f"{net}.1"
         self.namespaces: list[Namespace] = []
-        _ip("link", "add", self._bridge, "type", "bridge")
+        # A bridge without a card of its own has a port's: a cut of that port would hold up all others.
+        _ip("link", "add", self._bridge, "address", BRIDGES_CARD, "type", "bridge")
         try:
             _ip("addr", "add", f"{self.address}/24", "dev", self._bridge)
             _ip("link", "set", self._bridge, "up")

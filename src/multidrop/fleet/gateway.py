@@ -20,8 +20,8 @@ from multidrop.fleet.errors import FleetError, NoRight
 from multidrop.fleet.fleet_lines import FleetLines
 from multidrop.fleet.forwarder import Forwarder
 from multidrop.fleet.held_lines import HeldLines
-from multidrop.fleet.lease import LifeLock
 from multidrop.fleet.lease_rules import SECOND, USUAL
+from multidrop.fleet.life_lock import LifeLock
 from multidrop.fleet.member import Member
 from multidrop.fleet.moves import TOLD
 from multidrop.fleet.record_shapes import misshapen
@@ -159,7 +159,7 @@ class FleetGateway:
             "lines": len(member.polled),
             "moves": member.keeper.moves,
             "troubles": dict(sorted(member.keeper.troubles.items())),
-            "trouble": member.lease.trouble,
+            "trouble": member.trouble,
             "last_moves": [move.as_json() for move in member.records.moves.newest(TOLD)],
             "spool": {
                 "bytes": spool.stored,

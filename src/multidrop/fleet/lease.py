@@ -9,14 +9,13 @@ import time
 import uuid
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
-from multidrop.fleet import lease_rules
+from multidrop.fleet import lease_rules, life_lock
 from multidrop.fleet.buckets import NONE_YET, Bucket, Record
 from multidrop.fleet.errors import Conflict, FleetError, Unsure
-from multidrop.fleet.file_lock import lock
 from multidrop.fleet.lease_rules import RENEW_S, SECOND, SeenRevision, Terms
+from multidrop.fleet.life_lock import LifeLock
 
 _log = logging.getLogger("multidrop.fleet")
 
@@ -36,47 +35,6 @@ class MayPoll(Protocol):
 
     def end(self) -> object:
         """Send nothing more, and call the timer off."""
-
-
-class LifeLock:
-    """A lock on a local file, held for life: who gets it knows that the one before has died.
-
-    The file has a random id of its own: containers may have the same machine's id and the same path.
-    Raises FleetError when another process of this machine holds it.
-    """
-
-    def __init__(self, path: Path) -> None:
-        self.path = path.resolve()
-        path.parent.mkdir(parents=True, exist_ok=True)
-        self._file = path.open("a+b")
-        try:
-            lock(self._file.fileno())
-        except OSError:
-            self._file.close()
-            sentence = f"another gateway of this machine runs with {path}; end that one first"
-            raise FleetError(sentence) from None
-        self._file.seek(0)
-        self.id = self._file.read().decode("ascii", "replace").strip()
-        if not self.id:
-            self.id = uuid.uuid4().hex
-            self._file.write(self.id.encode())
-            self._file.flush()
-            os.fsync(self._file.fileno())
-
-    def proves_death(self, value: Mapping[str, Any]) -> bool:
-        """Say whether a record is of a process that held this very lock, and so is dead."""
-        mine = (str(self.path), self.id, machine_id())
-        return "" not in mine and (value.get("lock"), value.get("lock_id"), value.get("machine")) == mine
-
-    def close(self) -> None:
-        self._file.close()
-
-
-def machine_id() -> str:
-    """Return this machine's own id; "" where it has none, which proves nothing."""
-    with suppress(OSError):
-        return Path("/etc/machine-id").read_text("utf-8", "replace").strip()
-    return ""
 
 
 class Held(NamedTuple):
@@ -140,6 +98,16 @@ class Lease:
     def is_over(self) -> bool:
         """Say whether too few paths are left to this session, ever."""
         return sum(path is not None for path in self.held) < self.terms.needed
+
+    @property
+    def is_weak(self) -> bool:
+        """Say whether others have ended one of its paths for good: one more, and it is over."""
+        return bool(self.session and self._ended)
+
+    async def could_be_whole(self) -> bool:
+        """Say whether all paths answer, so that a session that began now would have each of them."""
+        records = await asyncio.gather(*(self._read(path) for path in range(len(self._buckets))))
+        return None not in records
 
     # ---- a session begins ----
 
@@ -216,7 +184,7 @@ class Lease:
             "ended": ended,
             "began": self.began_ms,
             "host": os.uname().nodename,
-            "machine": machine_id(),
+            "machine": life_lock.machine_id(),
             "lock": str(self._lock.path) if self._lock else "",
             "lock_id": self._lock.id if self._lock else "",
             "pid": os.getpid(),

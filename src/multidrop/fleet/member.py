@@ -27,9 +27,10 @@ from multidrop.fleet.balance import Balance
 from multidrop.fleet.buckets import Record
 from multidrop.fleet.errors import FleetError
 from multidrop.fleet.leaders import bring_leaders_home
-from multidrop.fleet.lease import Lease, LifeLock, MayPoll
+from multidrop.fleet.lease import Lease, MayPoll
 from multidrop.fleet.lease_bucket import LeaseBucket
 from multidrop.fleet.lease_rules import SECOND, USUAL, Terms
+from multidrop.fleet.life_lock import LifeLock
 from multidrop.fleet.line_keeper import LineKeeper, Lines, TakenLine
 from multidrop.fleet.ownership import decide, owner_of
 from multidrop.fleet.servers import ServerPath
@@ -44,6 +45,7 @@ TIDY_NS = SECOND // 2  # between looks at all lines of the share, where nothing 
 SETTLE_S = 3.0
 QUIET_NS = SECOND // 2  # without a gateway that comes or goes, before shares are made anew while we settle
 HOME_S = 1.0
+WEAK_NS = 10 * SECOND  # from the end of settling on, before a session that lost a path is given up
 
 
 class MemberState(StrEnum):
@@ -83,6 +85,7 @@ class Member:
         self._settled_at = 0
         self._is_dirty = True
         self._was_valid = False
+        self._is_too_weak = False
         self._stepped: tuple[Any, ...] = ()
 
     # ---- what others ask ----
@@ -94,6 +97,12 @@ class Member:
         if self.is_draining:
             return MemberState.DRAINING
         return MemberState.WORKING if self._is_settled else MemberState.SETTLING
+
+    @property
+    def trouble(self) -> str:
+        """Return what is not well with the lease; "" for nothing."""
+        weak = "others have ended one path of its lease; a new session begins soon"
+        return self.lease.trouble or (weak if self.lease.is_weak else "")
 
     @property
     def polled(self) -> Mapping[str, TakenLine]:
@@ -143,6 +152,7 @@ class Member:
             *self.records.works(),
             self._guard(),
             self._home(),
+            self._watch_strength(),
             self._live(),
             self.keeper.fail(),
         ]
@@ -172,10 +182,16 @@ class Member:
                 _log.info("%s: session %d began", self.name, self.lease.session)
             elif self.lease.is_over:
                 _log.warning("%s: session %d is over", self.name, self.lease.session)
-                await self._leave()
-                self._is_dirty = True
+                await self._begin_anew()
+            elif self._is_too_weak:
+                _log.warning("%s: session %d lost a path; a new one begins", self.name, self.lease.session)
+                await self._begin_anew()
             await self.step()
             await asyncio.sleep(STEP_S)
+
+    async def _begin_anew(self) -> None:
+        await self._leave()
+        self._is_dirty, self._is_too_weak = True, False
 
     async def _guard(self) -> None:
         """Close the lines before the lease has run out; only then is the kernel's timer called off."""
@@ -200,6 +216,19 @@ class Member:
             if self.lease.is_valid and min(self.records.observer.sessions(), default="") == self.name:
                 with suppress(FleetError):
                     await bring_leaders_home(self.best())
+
+    async def _watch_strength(self) -> None:
+        """Give a session up that lost a path to others: the next server that dies would end it.
+
+        Its lines are others' for a moment, so one gateway at a time does it, once all paths answer.
+        """
+        while True:
+            await asyncio.sleep(HOME_S)
+            now = self.lease.clock()
+            if not (self.lease.is_weak and self.lease.is_valid) or now < self._settled_at + WEAK_NS:
+                continue
+            if self.records.observer.weak()[:1] == [self.name]:
+                self._is_too_weak = await self.lease.could_be_whole()
 
     # ---- one step ----
 

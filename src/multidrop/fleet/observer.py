@@ -34,6 +34,7 @@ class Observer:
         self.paths = [Follower(bucket) for bucket in buckets]
         self.ended = 0  # sessions that this one ended
         self._watched: list[dict[str, SeenRevision]] = [{} for _ in buckets]
+        self._looked = [0] * len(self.paths)  # when the newest look that had an answer began
         self._clock = clock
 
     def begin_anew(self) -> None:
@@ -44,8 +45,10 @@ class Observer:
 
     async def look(self, path: int) -> None:
         """Read what changed on a path. Raises FleetError where it is not reached."""
+        begun = self._clock()
         for record in await self.paths[path].look():
             self._note(path, record)
+        self._looked[path] = begun
 
     def _note(self, path: int, record: Record) -> None:
         watched = self._watched[path]
@@ -80,6 +83,17 @@ class Observer:
                 found[name] = present[0]
         return found
 
+    def weak(self) -> list[str]:
+        """Return the gateways whose session others have ended on a path, and which go on by the rest."""
+        return [
+            name
+            for name, value in self.sessions().items()
+            if any(
+                is_ended_by_another(record) and record.value["session"] == value["session"]
+                for _, record in self._of(name)
+            )
+        ]
+
     def _of(self, gateway: str) -> list[tuple[int, Record]]:
         """Return the records of a gateway, with their paths, but for those that are removed or strange."""
         records = enumerate(self.records(gateway))
@@ -102,9 +116,9 @@ class Observer:
     def dead(self, present: Iterable[str] | None = None) -> dict[str, dict[int, Record]]:
         """Return who may be ended, with the very records that were watched for so long, by path.
 
+        What was not looked at since may have been renewed: a server that stands still answers nobody.
         `present` are the names in `sessions`, where the caller has just asked for them.
         """
-        now = self._clock()
         found = {}
         for name in self.sessions() if present is None else present:
             if name == self.me:
@@ -112,7 +126,10 @@ class Observer:
             stale = {
                 path: record
                 for path, record in enumerate(self.records(name))
-                if record and record.value and not record.value["ended"] and self._is_stale(path, record, now)
+                if record
+                and record.value
+                and not record.value["ended"]
+                and self._is_stale(path, record, self._looked[path])
             }
             if lease_rules.is_over(len(stale), self.terms):  # fewer: it lives, and would only be weakened
                 found[name] = stale

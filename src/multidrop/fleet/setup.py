@@ -11,7 +11,7 @@ from functools import partial
 from typing import Any
 
 from multidrop.fleet import names
-from multidrop.fleet.buckets import NONE_YET, ServerError, ask, bucket_settings
+from multidrop.fleet.buckets import NONE_YET, Bucket, ServerError, ask, bucket_settings
 from multidrop.fleet.errors import Conflict, FleetError, NobodyThere, NoRight, TooOld, Unsure
 from multidrop.fleet.leaders import bring_leaders_home
 from multidrop.fleet.lease_bucket import LeaseBucket
@@ -38,6 +38,7 @@ async def set_up(paths: Sequence[ServerPath]) -> dict[str, Any]:
     await _contest(paths, replicas)
     for bucket in names.BUCKETS:
         await _create(paths[0], bucket_settings(bucket, replicas))
+    await _wait_for_plant(paths[0])
     await bring_leaders_home(paths[0])
     servers = {path.server_name: ".".join(map(str, path.version)) for path in paths}
     return {"servers": servers, "replicas": replicas, "buckets": list(names.BUCKETS)}
@@ -133,6 +134,22 @@ async def _create(path: ServerPath, settings: Mapping[str, Any]) -> None:
         except FleetError as failure:
             if asyncio.get_running_loop().time() > ends:
                 raise no_quorum(path, failure) from None
+
+
+async def _wait_for_plant(path: ServerPath) -> None:
+    """Wait until the plant can be read: for a moment no server answers for a new bucket."""
+    ends = asyncio.get_running_loop().time() + WAIT_S
+    while True:
+        try:
+            await Bucket(names.PLANT, partial(_itself, path)).changes(0)
+        except NoRight:
+            raise
+        except FleetError as failure:
+            if asyncio.get_running_loop().time() > ends:
+                raise no_quorum(path, failure) from None
+            await asyncio.sleep(0.2)
+        else:
+            return
 
 
 async def _contest(paths: Sequence[ServerPath], replicas: int) -> None:

@@ -1,0 +1,54 @@
+"""LifeLock: a lock on a local file that proves that the process which held it before is dead."""
+
+from __future__ import annotations
+
+import os
+import uuid
+from collections.abc import Mapping
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+from multidrop.fleet.errors import FleetError
+from multidrop.fleet.file_lock import lock
+
+
+class LifeLock:
+    """A lock on a local file, held for life: who gets it knows that the one before has died.
+
+    The file has a random id of its own: containers may have the same machine's id and the same path.
+    Raises FleetError when another process of this machine holds it.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path.resolve()
+        path.parent.mkdir(parents=True, exist_ok=True)
+        self._file = path.open("a+b")
+        try:
+            lock(self._file.fileno())
+        except OSError:
+            self._file.close()
+            sentence = f"another gateway of this machine runs with {path}; end that one first"
+            raise FleetError(sentence) from None
+        self._file.seek(0)
+        self.id = self._file.read().decode("ascii", "replace").strip()
+        if not self.id:
+            self.id = uuid.uuid4().hex
+            self._file.write(self.id.encode())
+            self._file.flush()
+            os.fsync(self._file.fileno())
+
+    def proves_death(self, value: Mapping[str, Any]) -> bool:
+        """Say whether a record is of a process that held this very lock, and so is dead."""
+        mine = (str(self.path), self.id, machine_id())
+        return "" not in mine and (value.get("lock"), value.get("lock_id"), value.get("machine")) == mine
+
+    def close(self) -> None:
+        self._file.close()
+
+
+def machine_id() -> str:
+    """Return this machine's own id; "" where it has none, which proves nothing."""
+    with suppress(OSError):
+        return Path("/etc/machine-id").read_text("utf-8", "replace").strip()
+    return ""
