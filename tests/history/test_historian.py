@@ -26,6 +26,14 @@ def test_all_mistakes_of_its_table_at_once() -> None:
     HistorySettings()
 
 
+def test_a_folder_that_cannot_be_is_one_sentence(tmp_path: Path) -> None:
+    """Nobody may make a folder in /sys, root neither."""
+    inside = SimpleNamespace(plant=Plant((), Path("plant.toml")), folder=tmp_path)
+    with pytest.raises(OSError, match="folder /sys/history cannot be written: ") as failure:
+        build(HistorySettings(folder="/sys/history"), inside)
+    assert "Errno" not in str(failure.value)
+
+
 def test_it_records_and_answers(tmp_path: Path) -> None:
     async def live() -> None:
         inside = SimpleNamespace(plant=Plant((), Path("plant.toml")), folder=tmp_path)

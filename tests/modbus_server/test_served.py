@@ -149,7 +149,7 @@ def test_mistakes_in_the_table_are_told_with_their_place(tmp_path: Path) -> None
             read_settings(load_plant(path), {})
         shown = str(mistakes.value)
         assert "[serve.modbus]" in shown
-        assert "passing = " in shown
+        assert 'passing = 3 is not right; write passing = "declared"' in shown
         assert "may = 'root' is none of look, stop, write" in shown
         path.write_text(text.replace("mill = 21", "mil = 21"))
         with pytest.raises(PlantError, match="units: there is no drive 'mil'; did you mean mill"):

@@ -46,7 +46,13 @@ class Surroundings(Protocol):
 
 def build(settings: HistorySettings, inside: Surroundings) -> Historian:
     """Return the historian of a gateway; a relative folder is beside its plant file."""
-    return Historian(inside.plant, inside.folder / settings.folder, settings)
+    folder = inside.folder / settings.folder
+    try:
+        return Historian(inside.plant, folder, settings)
+    except OSError as failure:
+        if failure.filename is None:  # it is a sentence
+            raise
+        raise OSError(f"folder {folder} cannot be written: {failure.strerror}") from failure
 
 
 class Historian:

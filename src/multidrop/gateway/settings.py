@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import ssl
 from collections.abc import Mapping
@@ -213,7 +214,8 @@ def _key_of(name: str, default: object) -> Key:
     if default is None:
         return Key((str, int, float, dict, list), f"{name} = …")
     kind = list if isinstance(default, tuple) else type(default)
-    return Key((int, float) if kind is float else kind, f"{name} = {EXAMPLES[kind]}")
+    example = json.dumps(default) if kind is str and default else EXAMPLES[kind]
+    return Key((int, float) if kind is float else kind, f"{name} = {example}")
 
 
 # ---- files ----
