@@ -1,4 +1,4 @@
-"""Commands of a fleet on one drive: what is told where it has left its line meanwhile."""
+"""Commands of a fleet on a drive that has left its line meanwhile."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is known of the end of a drive's commands, by whichever way they came."""
+"""The end of a drive's commands: when it was, and its outcome, by whichever way they came."""
 
 from __future__ import annotations
 
