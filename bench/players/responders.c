@@ -132,9 +132,10 @@ static int64_t through_path(struct line *line, int64_t at_ns)
         if (since_ns < options.stall_us * 1000)
             due_ns += options.stall_us * 1000 - since_ns;
     }
-    if (due_ns > line->last_due_ns)
-        line->last_due_ns = due_ns;
-    return line->last_due_ns;
+    if (due_ns <= line->last_due_ns) /* the heap keeps no order of those that are due together */
+        due_ns = line->last_due_ns + 1;
+    line->last_due_ns = due_ns;
+    return due_ns;
 }
 
 static void answer(struct line *line, const uint8_t *request, int64_t came_ns)

@@ -21,7 +21,16 @@ from multidrop.drive.verbs import verb
 from multidrop.drives import YD1000, DelixiModbus, DelixiNative, ErmanERG220, InnovertIBD, InvtCHE
 from multidrop.drives.innovert_ibd import IBDControl
 from multidrop.drives.invt_che import parameter
-from multidrop.errors import BadReply, BusError, DriveRefused, LineError, NoReply, Refused, Unconfirmed
+from multidrop.errors import (
+    BadReply,
+    BusError,
+    DriveRefused,
+    LineError,
+    NoReply,
+    NotAttached,
+    Refused,
+    Unconfirmed,
+)
 from multidrop.poller import Poller
 from multidrop.sim import EncodedDrive, SimulatedDrive, Simulator, Wire, simulated
 from multidrop.transport import exchange as exchanges
@@ -357,7 +366,7 @@ def test_a_mistake_is_told_before_anything_is_sent(mistake: str) -> None:
 
 
 def test_a_verb_of_a_drive_that_is_on_no_bus() -> None:
-    with pytest.raises(RuntimeError, match=r"^toy@1 is not attached to a bus: use bus\.attach\(\.\.\.\)$"):
+    with pytest.raises(NotAttached, match=r"^toy@1 is not attached to a bus: use bus\.attach\(\.\.\.\)$"):
         Toy(1).start()
 
 

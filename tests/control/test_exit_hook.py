@@ -85,6 +85,18 @@ def test_a_signal_while_one_bus_is_left_begins_the_others(caught: list[int], num
     release.join()
 
 
+def test_a_bus_that_asks_for_it_after_the_signal_is_begun_at_once(caught: list[int]) -> None:
+    """Its motors would turn on, and the process would wait for it."""
+    hook, acts = ExitHook(), [Act(), Act()]
+    hook.add(acts[0].begin, acts[0].work)
+    signal.raise_signal(signal.SIGTERM)
+    hook.add(acts[1].begin, acts[1].work)
+    assert acts[1].works.wait(PATIENCE)
+    for act in acts:
+        act.go_on.set()
+    until(lambda: caught)
+
+
 def test_the_third_signal_within_a_second_cuts_it_short_and_says_so(
     caught: list[int], capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -726,7 +726,7 @@ def test_a_stop_that_is_interrupted_is_sent_once_more(
     stops = [write for write in writes(line, begun) if STOPS[model](write)]
     assert len(stops) == 2
     assert interruption.value.__notes__ == [
-        f"{drive.name}: the stop was sent {1 if model != 'erman-er-g-220' else 2} times; "
+        f"{drive.name}: the stop was sent {'1 to 2' if model != 'erman-er-g-220' else '2 to 3'} times; "
         "the motor is not seen to stand"
     ]
 
@@ -739,9 +739,12 @@ def test_a_second_interruption_ends_it(monkeypatch: pytest.MonkeyPatch) -> None:
         raise KeyboardInterrupt
 
     line.answers = press
-    with pytest.raises(KeyboardInterrupt):
+    with pytest.raises(KeyboardInterrupt) as interruption:
         drive.stop()
     assert len(writes(line)) == 2
+    assert interruption.value.__notes__ == [
+        f"{drive.name}: the stop was sent 0 to 2 times; the motor is not seen to stand"
+    ]
 
 
 @pytest.mark.parametrize(

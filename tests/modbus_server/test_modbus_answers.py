@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import threading
+import time
 from collections.abc import Iterator
 from typing import Any
 
@@ -144,6 +145,16 @@ def test_a_value_from_before_a_write_is_not_given_after_it(gateway: Gateway) -> 
         assert client.ask(1, 3, CHE_OUTPUT_VOLTAGE, 1).words == [CHE_OUTPUT_VOLTAGE]  # passed
         gateway.hub.ages["mill", "output_voltage"] = 0.0
         assert client.ask(1, 3, CHE_OUTPUT_VOLTAGE, 1).words == [231]
+
+
+def test_a_value_from_before_a_write_is_not_given_after_a_reload(gateway: Gateway) -> None:
+    """Nor is one from before a command that came by another way."""
+    gateway.hub.ages["mill", "output_voltage"] = 0.2
+    with gateway.client() as client:
+        assert client.ask(1, 3, CHE_OUTPUT_VOLTAGE, 1).words == [231]
+        gateway.commands.ended["mill"] = time.monotonic_ns()
+        gateway.server.adopt(plant())
+        assert client.ask(1, 3, CHE_OUTPUT_VOLTAGE, 1).words == [CHE_OUTPUT_VOLTAGE]  # passed
 
 
 @pytest.mark.parametrize("function", [1, 2, 3, 4])

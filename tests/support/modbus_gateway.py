@@ -60,17 +60,24 @@ class FakeCommands:
         self.told: Told | Callable[[], Awaitable[Told]] = DONE
         self.written: list[tuple[str, str, float, Caller]] = []
         self.stopped: list[tuple[Sequence[str] | None, Caller]] = []
+        self.ended: dict[str, int] = {}
 
-    async def _end(self) -> Told:
-        return self.told if isinstance(self.told, Told) else await self.told()
+    async def _end(self, *drives: str) -> Told:
+        try:
+            return self.told if isinstance(self.told, Told) else await self.told()
+        finally:
+            self.ended |= dict.fromkeys(drives, time.monotonic_ns())
 
     async def stop(self, drives: Sequence[str] | None, caller: Caller) -> dict[str, Told]:
         self.stopped.append((drives, caller))
-        return dict.fromkeys(drives or (), await self._end())
+        return dict.fromkeys(drives or (), await self._end(*(drives or ())))
 
     async def write(self, drive: str, register: str, value: float, caller: Caller) -> Told:
         self.written.append((drive, register, value, caller))
-        return await self._end()
+        return await self._end(drive)
+
+    def ended_ns(self, drive: str) -> int:
+        return self.ended.get(drive, 0)
 
 
 class FakeLine:

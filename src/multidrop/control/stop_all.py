@@ -6,7 +6,7 @@ Of several the stops take turns, so none waits for another's ramp.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 from math import isnan
@@ -80,8 +80,8 @@ class Stopper:
             except BaseException as interruption:
                 send_once_more(stops, self._do, interruption)
                 raise
-            for stop in stops:
-                stop.is_sent = sent
+            for stop in stops if sent else ():
+                stop.note_broadcast()
 
             def end(stop: StopAttempt) -> None:
                 found[stop.drive.name] = stop.result(_now())
@@ -171,10 +171,15 @@ def stop_together(stops: Sequence[StopAttempt], do: Do, end: Callable[[StopAttem
         raise
 
 
-def send_once_more(stops: Iterable[StopAttempt], do: Do, interruption: BaseException) -> None:
-    """Send these again, and note in the interruption what is known of them."""
-    for stop in stops:
-        try:
+def send_once_more(stops: Sequence[StopAttempt], do: Do, interruption: BaseException) -> None:
+    """Send these again, and note in the interruption, or in another one meanwhile, what is known of them."""
+    latest = interruption
+    try:
+        for stop in stops:
             stop.once_more(do)
-        finally:
-            interruption.add_note(stop.interrupted())
+    except BaseException as another:
+        latest = another
+        raise
+    finally:
+        for stop in stops:
+            latest.add_note(stop.interrupted())

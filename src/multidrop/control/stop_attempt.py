@@ -61,6 +61,7 @@ class StopAttempt:
         self._seconds = seconds
         self._make = script
         self.times_sent = 0  # those that the drive refused too
+        self._times_in_doubt = 0  # those that an interruption may have kept back
         self._is_confirmed = False
         self._pulses: set[tuple[str, Any]] = set()
         self._has_warned = False
@@ -69,6 +70,11 @@ class StopAttempt:
     def _begin(self) -> None:
         script = self._script = self._make()
         self._resume: Callable[[], Step] = lambda: next(script)
+
+    def note_broadcast(self) -> None:
+        """Note that the stop was broadcast: it was sent, and nobody confirms it."""
+        self.is_sent = True
+        self.times_sent += 1
 
     def advance(self, do: Do, now: Callable[[], float]) -> bool:
         """Carry out one step; True when the stop is over."""
@@ -113,6 +119,9 @@ class StopAttempt:
             error = failure  # outlives the except clause
             self._note(step, error)
             self._resume = lambda: script.throw(error)
+        except (KeyboardInterrupt, SystemExit):
+            self._times_in_doubt += isinstance(step, Write)
+            raise
         else:
             self._note(step, None)
             self._resume = lambda: script.send(result)
@@ -195,5 +204,7 @@ class StopAttempt:
 
     def interrupted(self) -> str:
         """Return what is known of it when its caller no longer waits."""
-        times = f"the stop was sent {self.times_sent} times" if self.times_sent else "no stop was sent"
-        return f"{self.drive.name}: {times}; the motor is not seen to stand"
+        least, most = self.times_sent, self.times_sent + self._times_in_doubt
+        times = f"{least}" if least == most else f"{least} to {most}"
+        sent = f"the stop was sent {times} times" if most else "no stop was sent"
+        return f"{self.drive.name}: {sent}; the motor is not seen to stand"

@@ -20,7 +20,7 @@ from multidrop.drive.script import Script, read, until, write
 from multidrop.drive.state import Condition, Direction, State
 from multidrop.drive.text import Text, text_errors
 from multidrop.drive.verbs import MOVING, verb
-from multidrop.errors import Advice, NotDone, Refused, Unconfirmed, Unsupported
+from multidrop.errors import Advice, NotAttached, NotDone, Refused, Unconfirmed, Unsupported
 
 START_TIME = 5.0  # s, after which a motor that was started must be seen to run
 _SETPOINT_FIRST = Advice("call set_frequency before start", "add --frequency HZ")
@@ -123,7 +123,7 @@ class Drive(ManualFacts):
         return self.perform(script)
 
     def _perform_nowhere(self, script: Script[Any]) -> Any:
-        raise RuntimeError(f"{self.name} is not attached to a bus: use bus.attach(...)")
+        raise NotAttached(f"{self.name} is not attached to a bus: use bus.attach(...)")
 
     # ---- verbs; each family replaces those that its document has ----
 

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 from multidrop import (
     BadReply,
+    Bus,
     Drive,
     DriveRefused,
     Effect,
@@ -79,8 +80,11 @@ def _prepare_write(drive: Drive, request: CommandRequest) -> Prepared:
     value = register.decode(register.encode(_typed(register, request.value)))
 
     def work() -> CommandAnswer:
+        bus: Bus | None = drive.bus
+        if bus is None:
+            return CommandAnswer(CommandOutcome.NOT_SENT, f"{drive.name} is on no line any more")
         try:
-            outcome = drive.bus.try_write(drive, register, value)
+            outcome = bus.try_write(drive, register, value)
         except Exception as failure:  # whatever it is: the asker must know
             return answer_of(failure)
         if outcome.failure is not None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from math import isfinite
@@ -24,7 +25,6 @@ from multidrop import (
     Register,
     Seen,
     Stopped,
-    Unsupported,
     verb_arguments,
 )
 from multidrop.gateway.command_threads import begin_stop, in_thread
@@ -64,6 +64,17 @@ class Commands:
         self.called = 0  # commands that passed all rights, so far
         self._under_way: dict[str, int] = {}  # writes, by line
         self._stops: dict[str, int] = {}  # that were called so far, by drive
+        self._ended_ns: dict[str, int] = {}  # by drive
+
+    def ended_ns(self, drive: str) -> int:
+        """Return when the latest command of a drive ended (CLOCK_MONOTONIC); 0 without one.
+
+        What was polled before may be old.
+        """
+        return self._ended_ns.get(drive, 0)
+
+    def _note_end(self, drives: Iterable[str]) -> None:
+        self._ended_ns |= dict.fromkeys(drives, time.monotonic_ns())
 
     # ---- stops ----
 
@@ -104,15 +115,25 @@ class Commands:
             for name in here:
                 self._stops[name] = self._stops.get(name, 0) + 1
             if here and len(here) == len(line.drives):
-                waited.append(begin_stop(partial(self._stop_line, line.name, list(here)), caller))
+                waited.append(self._begin_stop(partial(self._stop_line, line.name, list(here)), here, caller))
             else:
-                waited += [begin_stop(partial(_stop_one, drive), caller) for drive in here.values()]
+                waited += [
+                    self._begin_stop(partial(_stop_one, drive), [name], caller)
+                    for name, drive in here.items()
+                ]
         for name in wanted:
             if name not in there:
                 told[name] = _failed(ValueError(f"there is no drive {name!r}"))
         for found in await asyncio.gather(*waited):
             told |= found
         return {name: told[name] for name in wanted if name in told}
+
+    def _begin_stop(
+        self, work: Callable[[], dict[str, Told]], drives: Iterable[str], caller: Caller
+    ) -> asyncio.Future[dict[str, Told]]:
+        future = begin_stop(work, caller)
+        future.add_done_callback(lambda _: self._note_end(drives))
+        return future
 
     def _stop_line(self, line: str, names: list[str]) -> dict[str, Told]:
         try:
@@ -177,15 +198,16 @@ class Commands:
         try:
             future = in_thread(checked, caller)
         except RuntimeError as failure:
-            self._end(line.name)
+            self._end(line.name, drive)
             return _failed(failure)
-        future.add_done_callback(lambda _: self._end(line.name))
+        future.add_done_callback(lambda _: self._end(line.name, drive))
         told = await asyncio.shield(future)
         _log.info("%s, asked for by %s: %s", what, caller.by, told.text)
         return told
 
-    def _end(self, line: str) -> None:
+    def _end(self, line: str, drive: str) -> None:
         self._under_way[line] -= 1
+        self._note_end([drive])
 
 
 def _drives(plant: Plant) -> dict[str, Drive]:
@@ -207,10 +229,13 @@ def _of_stop(stopped: Stopped) -> Told:
 
 
 def _write(drive: Drive, register: str, value: float) -> Told:
+    bus: Bus | None = drive.bus
+    if bus is None:
+        return _failed(ValueError(f"{drive.name} is on no line any more"))
     try:
         known = drive.register(register)
-        outcome = drive.bus.try_write(drive, known, _typed(known, value))
-    except (BusError, ValueError, TypeError) as failure:
+        outcome = bus.try_write(drive, known, _typed(known, value))
+    except Exception as failure:  # whatever it is: its caller must see it
         return _failed(failure)
     if outcome.effect is Effect.DONE:
         return Told(True, str(outcome))
@@ -221,7 +246,7 @@ def _typed(register: Register[Any], value: float) -> Any:
     """Return a number as the register takes it: a choice by its raw count, which is never rounded."""
     if register.values is None:
         return value
-    if not isfinite(value) or value != int(value):
+    if isinstance(value, float) and (not isfinite(value) or value != int(value)):
         raise ValueError(f"{register.name} takes the number of a choice, not {value!r}")
     return register.decode(value)
 
@@ -229,7 +254,7 @@ def _typed(register: Register[Any], value: float) -> Any:
 def _act(drive: Drive, verb: str, arguments: Mapping[str, Any]) -> Told:
     try:
         getattr(drive, verb)(**arguments)
-    except (BusError, ValueError, TypeError, Unsupported) as failure:
+    except Exception as failure:  # whatever it is: its caller must see it
         return _failed(failure)
     return Told(True, f"{drive.name}: {verb} is done")
 

@@ -39,6 +39,7 @@ class ModbusCommands(Protocol):
 
     async def stop(self, drives: Sequence[str] | None, caller: Caller) -> dict[str, Told]: ...
     async def write(self, drive: str, register: str, value: float, caller: Caller) -> Told: ...
+    def ended_ns(self, drive: str) -> int: ...
 
 
 class ModbusServer:
@@ -166,7 +167,7 @@ class ModbusServer:
                 addresses,
                 partial(self._hub.newest, unit.drive.name),
                 self._now_ns(),
-                unit.written_ns,
+                self._commands.ended_ns(unit.drive.name),
             )
             if isinstance(found, Lack):
                 return self._pass(unit, request, addresses, found, client)
@@ -248,10 +249,7 @@ class ModbusServer:
     async def _write_one(self, unit: Unit, register: Register[Any], raw: float, caller: Caller) -> int:
         """Write a register, and return 0 or the code that says why it was not done."""
         value = raw if register.values is not None else register.decode(raw)
-        try:
-            told = await self._commands.write(unit.drive.name, register.name, value, caller)
-        finally:
-            unit.written_ns = self._now_ns()
+        told = await self._commands.write(unit.drive.name, register.name, value, caller)
         self.answered["written" if told.is_done else "not written"] += 1
         return 0 if told.is_done else code_of(told.error)
 
@@ -274,8 +272,6 @@ class ModbusServer:
         except Exception:
             _log.exception("stop of %s by a modbus client", name)
             return ModbusCode.NO_RESPONSE
-        finally:
-            unit.written_ns = self._now_ns()
         if told.is_done:
             return 0
         code = code_of(told.error)

@@ -33,7 +33,6 @@ class Unit:
         self.polled = polled
         self.drive = polled.drive
         self.words = DriveWords(polled)
-        self.written_ns = 0  # when a client's last write ended: what was polled before may be old
         self.stops = frozenset(_stop_writes(polled.drive))
         self._readable: dict[int, set[int]] = {code: set() for code in range(5)}  # 0: by none
         self._gaps: list[tuple[int, range]] = []

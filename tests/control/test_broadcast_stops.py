@@ -1,0 +1,135 @@
+"""A broadcast of a stop: sent to drives of one known family alone, and ended by nothing called before it."""
+
+from __future__ import annotations
+
+from collections import deque
+from contextlib import suppress
+from typing import Any
+
+import pytest
+from motors import MAKE, STARTS
+from simulated_bus import SimulatedBus, is_write
+
+from multidrop.control.outcome import Seen
+from multidrop.core import Message
+from multidrop.drives import MODELS, InvtCHE
+from multidrop.errors import BusError, PortLost, Refused
+from multidrop.sim import simulated
+
+BROADCASTING = [model for model, family in MODELS.items() if family.broadcasts]
+every_broadcasting = pytest.mark.parametrize("model", BROADCASTING)
+
+
+def line_of(monkeypatch: pytest.MonkeyPatch, *models: str) -> tuple[SimulatedBus, list[Any], list[Any]]:
+    """Return a line of drives from address 1 on, that have shown what they are, and their simulations."""
+    sims = [simulated(MAKE[model](address)) for address, model in enumerate(models, 1)]
+    line = SimulatedBus(monkeypatch, *sims)
+    drives = [line.attach(sim.drive) for sim in sims]
+    for drive in drives:
+        line.bus.check_identity(drive)
+    return line, drives, sims
+
+
+def stop_of(drive: Any) -> Any:
+    return drive.control.decode(drive.control.broadcast[0])
+
+
+def broadcasts(line: SimulatedBus) -> list[Message]:
+    return [request for request, _ in line.frames if request.address == 0]
+
+
+def test_there_are_families_with_broadcasts() -> None:
+    assert set(BROADCASTING) == set(MODELS) - {"erman-er-g-220"}
+
+
+@every_broadcasting
+def test_a_stop_of_all_is_no_broadcast_where_families_differ(
+    monkeypatch: pytest.MonkeyPatch, model: str
+) -> None:
+    """One family's stop may be another's run, whichever was attached first."""
+    models = deque(MAKE)
+    models.rotate(-models.index(model))
+    line, drives, sims = line_of(monkeypatch, *models)
+    for drive in drives:
+        drive.set_frequency(20)
+        drive.start()
+    assert {each.seen for each in line.bus.stop_all().values()} == {Seen.STOPPED}
+    assert broadcasts(line) == []
+    assert not any(sim.motor.energised for sim in sims)
+
+
+@every_broadcasting
+def test_a_stop_of_all_is_a_broadcast_where_all_are_alike(
+    monkeypatch: pytest.MonkeyPatch, model: str
+) -> None:
+    line, _, _ = line_of(monkeypatch, model, model)
+    line.bus.stop_all()
+    assert len(broadcasts(line)) == 1
+
+
+@pytest.mark.parametrize("address", [1, 2])
+def test_nothing_is_broadcast_where_one_is_of_another_family(
+    monkeypatch: pytest.MonkeyPatch, address: int
+) -> None:
+    """A Goodrive has its setpoint where a CHE has its control word."""
+    sims = [simulated(InvtCHE(at, maximum_frequency=50)) for at in (1, 2)]
+    sims[address - 1]["device"] = 0x010A
+    line = SimulatedBus(monkeypatch, *sims)
+    drives = [line.attach(sim.drive) for sim in sims]
+    with pytest.raises(Refused, match="010AH"):
+        line.bus.broadcast(drives[0].control, stop_of(drives[0]))
+    assert line.written == []
+
+
+@every_broadcasting
+@pytest.mark.parametrize("frames", range(1, 12))
+def test_nothing_that_was_called_before_it_starts_a_motor_after_it(
+    monkeypatch: pytest.MonkeyPatch, model: str, frames: int
+) -> None:
+    line, drives, _ = line_of(monkeypatch, model, model)
+    drives[0].set_frequency(20)
+    begun = len(line.frames)
+
+    def broadcast_meanwhile(request: Message) -> bytes | None:
+        if len(line.frames) == begun + frames:
+            line.answers = lambda request: None
+            line.bus.broadcast(drives[0].control, stop_of(drives[0]))
+        return None
+
+    line.answers = broadcast_meanwhile
+    with suppress(BusError):
+        drives[0].start()
+    asked = [request for request, _ in line.frames[begun:]]
+    after = [at for at, request in enumerate(asked) if request.address == 0]
+    for request in asked[after[0] if after else len(asked) :]:
+        assert request.address == 0 or not (is_write(request) and STARTS[model](request))
+
+
+def test_a_broadcast_is_told_as_sent(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The port is lost after it: nothing else is sent to any drive."""
+    line, _, _ = line_of(monkeypatch, "invt-che", "invt-che")
+
+    def lose(request: Message) -> bytes | None:
+        if broadcasts(line) and request.address:
+            raise PortLost("hall", "the port was lost (hung up)")
+        return None
+
+    line.answers = lose
+    for told in line.bus.stop_all(seconds=1.0).values():
+        assert told.seen is Seen.SENT
+        assert "sent 1 times, it was never confirmed" in told.why
+
+
+def test_two_interruptions_say_of_each_drive_that_it_was_broadcast(monkeypatch: pytest.MonkeyPatch) -> None:
+    line, _, _ = line_of(monkeypatch, "invt-che", "invt-che")
+
+    def press(request: Message) -> bytes | None:
+        if broadcasts(line) and request.address:
+            raise KeyboardInterrupt
+        return None
+
+    line.answers = press
+    with pytest.raises(KeyboardInterrupt) as interruption:
+        line.bus.stop_all()
+    told = "the stop was sent 1 to 2 times; the motor is not seen to stand"
+    assert {*interruption.value.__notes__} == {f"invt-che@1: {told}", f"invt-che@2: {told}"}

@@ -1,0 +1,18 @@
+"""Commands of a fleet on a drive that has left its line meanwhile."""
+
+from __future__ import annotations
+
+from multidrop import InvtCHE
+from multidrop.fleet.command_words import CommandOutcome, CommandRequest
+from multidrop.fleet.drive_commands import prepare
+
+
+def test_a_command_to_a_drive_that_has_left_its_line_was_not_sent() -> None:
+    drive = InvtCHE(1, name="mill", maximum_frequency=50)
+    for request in (
+        CommandRequest("1", "anna", "mill", register="setpoint", value=10.0),
+        CommandRequest("2", "anna", "mill", verb="start"),
+    ):
+        answer = prepare(drive, request).work()
+        assert answer.outcome is CommandOutcome.NOT_SENT
+        assert answer.text.startswith("mill is ")

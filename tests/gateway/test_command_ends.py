@@ -1,0 +1,100 @@
+"""The end of a drive's commands: when it was, and its outcome, by whichever way they came."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import Awaitable, Callable
+from typing import Any
+
+import pytest
+from modbus_gateway import plant_of
+from simulated_bus import one
+
+from multidrop import Bus, InvtCHE, Plant
+from multidrop.gateway.commands import Commands, Told
+from multidrop.gateway.rights import Caller, May, Right
+
+CALLER = Caller("anna", "http", "10.0.0.7", Right.WRITE)
+MAY = May(write=frozenset({"mill.setpoint"}), verbs=frozenset({"mill.start"}))
+
+
+class UnopenedLines:
+    """Two drives of a plant whose line no poller has: each command fails, and ends."""
+
+    plant: Plant = plant_of(("hall", InvtCHE(1, name="mill")), ("hall", InvtCHE(2, name="fan")), polled=False)
+
+    def bus(self, line: str) -> Bus:
+        raise ValueError(f"line {line} is not open")
+
+    async def settled(self) -> None:
+        pass
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        lambda commands: commands.write("mill", "setpoint", 10.0, CALLER),
+        lambda commands: commands.act("mill", "start", {}, CALLER),
+        lambda commands: commands.stop(["mill"], CALLER),
+        lambda commands: commands.stop(None, CALLER),
+    ],
+    ids=["a write", "a verb", "a stop", "a stop of all"],
+)
+def test_a_command_s_end_is_known(command: Callable[[Commands], Awaitable[Any]]) -> None:
+    commands = Commands(UnopenedLines(), MAY)
+    assert commands.ended_ns("mill") == 0
+    begun_ns = time.monotonic_ns()
+
+    async def carry_out() -> None:
+        await command(commands)
+
+    asyncio.run(carry_out())
+    assert begun_ns <= commands.ended_ns("mill") <= time.monotonic_ns()
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        lambda commands: commands.write("mill", "setpoint", 10.0, CALLER),
+        lambda commands: commands.act("mill", "start", {}, CALLER),
+    ],
+    ids=["a write", "a verb"],
+)
+def test_a_drive_that_has_left_its_line_is_told_of(command: Callable[[Commands], Awaitable[Told]]) -> None:
+    async def carry_out() -> Told:
+        return await command(Commands(UnopenedLines(), MAY))
+
+    told = asyncio.run(carry_out())
+    assert not told.is_done
+    assert told.text.startswith("mill is ")
+
+
+@pytest.mark.parametrize(
+    "value",
+    [10**400, -(10**400), float("inf"), float("nan"), 1.5],
+    ids=["huge", "huge below 0", "inf", "nan", "1.5"],
+)
+@pytest.mark.parametrize("register", ["setpoint", "control"])
+def test_a_number_that_is_none_is_told_of(
+    register: str, value: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """JSON has whole numbers that no float holds."""
+    line, mill, _ = one(monkeypatch, InvtCHE(1, name="mill", maximum_frequency=50))
+    lines = UnopenedLines()
+    lines.plant = plant_of(("hall", mill))
+    may = May(write=frozenset({"mill.control", "mill.setpoint"}))
+
+    async def carry_out() -> Told:
+        return await Commands(lines, may).write("mill", register, value, CALLER)
+
+    told = asyncio.run(carry_out())
+    assert told.is_done == (register == "setpoint" and value == 1.5)
+    assert told.text.startswith(("mill: setpoint", "setpoint ", "control takes"))
+    assert len(line.written) == told.is_done
+
+
+def test_a_command_that_was_not_carried_out_has_no_end() -> None:
+    commands = Commands(UnopenedLines(), MAY)
+    asyncio.run(commands.write("fan", "setpoint", 10.0, CALLER))
+    assert commands.ended_ns("fan") == 0
