@@ -1,6 +1,7 @@
 """multidrop on Windows, by Wine: Ctrl-C, names of ports, ports that vanish, consoles, paths.
 
-`tools/wine test FOLDER` runs these; without a folder that `tools/wine make` has filled they are left out.
+`MULTIDROP_WINE=FOLDER pytest -n 0 -m "" tests/windows` runs these; without a folder that `tools/wine make`
+has filled they are left out.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from multidrop.sim import MotorDrive, Simulator, Wire, simulated
 FOLDER = os.environ.get("MULTIDROP_WINE", "")
 pytestmark = [
     pytest.mark.long,
-    pytest.mark.skipif(not FOLDER, reason="needs Wine: `tools/wine test FOLDER` runs it"),
+    pytest.mark.skipif(not FOLDER, reason="needs Wine, and MULTIDROP_WINE to name a folder of tools/wine"),
 ]
 
 
