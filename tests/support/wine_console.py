@@ -70,10 +70,14 @@ class Console:
         assert self._status is not None
         return self._status
 
-    def close(self) -> None:
+    def kill(self) -> None:
+        """End it as `kill -9` does."""
         if not self.is_over:
             os.kill(self._pid, signal.SIGKILL)
-            os.waitpid(self._pid, 0)
+            self.status()
+
+    def close(self) -> None:
+        self.kill()
         os.close(self._terminal)
 
 

@@ -1,12 +1,14 @@
 """multidrop on Windows, by Wine: Ctrl-C, names of ports, ports that vanish, consoles, paths.
 
-`tools/wine test FOLDER` runs these; without a folder that `tools/wine make` has filled they are left out.
+`MULTIDROP_WINE=FOLDER pytest -n 0 -m "" tests/windows` runs these; without a folder that `tools/wine make`
+has filled they are left out.
 """
 
 from __future__ import annotations
 
 import os
 import re
+import signal
 import subprocess
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
@@ -23,7 +25,7 @@ from multidrop.sim import MotorDrive, Simulator, Wire, simulated
 FOLDER = os.environ.get("MULTIDROP_WINE", "")
 pytestmark = [
     pytest.mark.long,
-    pytest.mark.skipif(not FOLDER, reason="needs Wine: `tools/wine test FOLDER` runs it"),
+    pytest.mark.skipif(not FOLDER, reason="needs Wine, and MULTIDROP_WINE to name a folder of tools/wine"),
 ]
 
 
@@ -211,6 +213,25 @@ def test_a_terminal_has_no_rts_and_is_not_opened(
     assert ran.returncode == 1
     sentence = ran.stderr.decode().splitlines()[-1]
     assert sentence.startswith("multidrop.errors.LineError: COM5: the driver " + reason)
+
+
+# ---- a process that is killed ----
+
+
+def test_what_a_killed_poll_has_recorded_is_read(wine: Wine, pump: MotorDrive, plant: Path) -> None:
+    """The whole of it, and the port is free for the next one."""
+    out = plant.with_name("killed.arrows")
+    with wine.console("-m", "multidrop", "poll", plant, "--out", out) as console:
+        console.until(lambda: statuses(out).count("ok") > 20)
+        seen = len(statuses(out))
+        console.kill()
+        assert console.status() == -signal.SIGKILL
+    assert len(statuses(out)) >= seen
+    assert set(statuses(out)) == {"ok"}
+    later = out.with_name("later.arrows")
+    ran = wine.run("-m", "multidrop", "poll", plant, "--out", later, "--seconds", 2)
+    assert ran.returncode == 0, ran.stderr
+    assert "ok" in statuses(later)
 
 
 # ---- ports that vanish ----
