@@ -17,6 +17,7 @@ from multidrop.fleet import lease_bucket, servers, setup
 from multidrop.fleet.batch_client import DirectMessage
 from multidrop.fleet.buckets import ask
 from multidrop.fleet.errors import FleetError, Unsure
+from multidrop.fleet.leaders import have_leaders
 from multidrop.fleet.servers import ServerPath, paths_of
 
 
@@ -54,6 +55,29 @@ def test_each_path_is_at_a_server_of_its_own_and_so_is_each_leader(fleet: Cluste
             await path.close()
 
     asyncio.run(main())
+
+
+class OneDeaf:
+    """A path on which the leader of one bucket of lines' masters says this, or nothing."""
+
+    def __init__(self, said: bytes | None) -> None:
+        self.said = said
+
+    async def request(self, subject: str, data: bytes) -> SimpleNamespace:
+        if not subject.endswith("own_1"):
+            return SimpleNamespace(data=b'{"cluster":{"leader":"n1"}}')
+        if self.said is None:
+            raise Unsure("no answer")
+        return SimpleNamespace(data=self.said)
+
+
+@pytest.mark.parametrize(
+    ("said", "has"),
+    [(b'{"cluster":{"leader":"n2"}}', True), (b"{}", True), (b'{"cluster":{}}', False), (None, False)],
+)
+def test_a_bucket_that_has_no_leader_takes_no_claims(said: bytes | None, has: bool) -> None:
+    path: Any = OneDeaf(said)
+    assert asyncio.run(have_leaders(path)) is has
 
 
 def test_no_server_is_one_sentence() -> None:

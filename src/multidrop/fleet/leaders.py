@@ -24,6 +24,15 @@ def is_ready(server: str, cluster: Mapping[str, Any]) -> bool:
     return bool(server in peers and peers[server].get("current") and not peers[server].get("offline"))
 
 
+async def have_leaders(path: ServerPath) -> bool:
+    """Say whether each bucket of lines' masters has a leader that answers: else no line can be claimed."""
+    try:
+        infos = [await ask(path, f"STREAM.INFO.KV_{bucket}") for bucket in names.OWNERS]
+    except FleetError:
+        return False
+    return all("cluster" not in info or info["cluster"].get("leader") for info in infos)
+
+
 async def bring_leaders_home(path: ServerPath) -> int:
     """Ask leaders elsewhere to step down in favour of their home; return how many were asked."""
     moved = 0

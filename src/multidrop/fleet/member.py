@@ -26,7 +26,7 @@ from multidrop.fleet import names
 from multidrop.fleet.balance import Balance
 from multidrop.fleet.buckets import Record
 from multidrop.fleet.errors import FleetError
-from multidrop.fleet.leaders import bring_leaders_home
+from multidrop.fleet.leaders import bring_leaders_home, have_leaders
 from multidrop.fleet.lease import Lease, MayPoll
 from multidrop.fleet.lease_bucket import LeaseBucket
 from multidrop.fleet.lease_rules import SECOND, USUAL, Terms
@@ -220,7 +220,8 @@ class Member:
     async def _watch_strength(self) -> None:
         """Give a session up that lost a path to others: the next server that dies would end it.
 
-        Its lines are others' for a moment, so one gateway at a time does it, once all paths answer.
+        Its lines are others' for a moment, so one gateway at a time does it, once all paths answer and lines
+        can be claimed.
         """
         while True:
             await asyncio.sleep(HOME_S)
@@ -228,7 +229,7 @@ class Member:
             if not (self.lease.is_weak and self.lease.is_valid) or now < self._settled_at + WEAK_NS:
                 continue
             if self.records.observer.weak()[:1] == [self.name]:
-                self._is_too_weak = await self.lease.could_be_whole()
+                self._is_too_weak = await have_leaders(self.best()) and await self.lease.could_be_whole()
 
     # ---- one step ----
 
