@@ -230,6 +230,7 @@ struct md_completion {
     int64_t begun_ns;          /* its turn came: the line's silence may not have been over */
     int64_t sent_ns;           /* the request began to leave; 0: it never did */
     int64_t first_ns, last_ns; /* first and last byte after the request were seen */
+    int64_t late_until_ns;     /* of an urgent one: its drive's, when its caller asked for it */
     uint32_t stale;            /* bytes thrown away before the request left: late replies, noise */
     uint32_t skipped;          /* bytes after the request that were not part of the reply */
     uint16_t raw_len;
@@ -294,9 +295,10 @@ const struct md_progress *md_port_progress(struct md_port *port);
 void md_count_stop(uint32_t *stops);
 /* Carry one out ahead of the queue and wait for it; one that insists goes ahead of those that do not. After
  * `expires_ns` (0: never), or after a stop, it is not sent (MD_EXPIRED). Beside many of these the queue keeps
- * a 20th of the line, one exchange at a time, but none while one that insists waits. */
-void md_port_carry_out(struct md_port *port, const struct md_exchange *exchange, int64_t not_before_ns,
-                       int64_t expires_ns, struct md_completion *completion);
+ * a 20th of the line, one exchange at a time, but none while one that insists waits. Return the length of the
+ * good reply's data; -1 where there is none, and of an exception. */
+int md_port_carry_out(struct md_port *port, const struct md_exchange *exchange, int64_t not_before_ns,
+                      int64_t expires_ns, struct md_completion *completion);
 
 /* ---- mastership.c, port_api.c: return NULL or -1 and set errno on failure; else a time, or a flag ---- */
 

@@ -161,13 +161,14 @@ static int is_attended(const struct md_port *port)
            port->engine->wakes[port->index] <= md_line_silent_ns(&port->turn.line);
 }
 
-void md_port_carry_out(struct md_port *port, const struct md_exchange *exchange, int64_t not_before_ns,
-                       int64_t expires_ns, struct md_completion *completion)
+int md_port_carry_out(struct md_port *port, const struct md_exchange *exchange, int64_t not_before_ns,
+                      int64_t expires_ns, struct md_completion *completion)
 {
     struct md_engine *engine = port->engine; /* the port may be gone at the end */
     struct md_urgent urgent = {.exchange = exchange, .not_before_ns = not_before_ns, .expires_ns = expires_ns,
                                .completion = completion};
     md_engine_enter(engine);
+    int64_t late_until_ns = exchange->drive->late_until_ns;
     if (port->is_closing) { /* nobody carries it out any more */
         *completion = (struct md_completion){.result = MD_LINE_LOST};
     } else {
@@ -177,6 +178,8 @@ void md_port_carry_out(struct md_port *port, const struct md_exchange *exchange,
         md_engine_await(engine, &urgent.is_done);
     }
     md_engine_leave(engine);
+    completion->late_until_ns = late_until_ns;
+    return completion->result > 0 && !completion->reply.exception ? completion->reply.data_len : -1;
 }
 
 /* The engine's thread has its mutex from the look to the end of write(2): who had it after the deadline was

@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator
 from contextlib import suppress
 from itertools import count
 from pathlib import Path
+from typing import Any
 
 import pytest
 from completions import new_completion
@@ -223,7 +224,7 @@ def hold_back(monkeypatch: pytest.MonkeyPatch, scene: Scene, *, sent_ns: int, af
     """Have the core hold writes back from so many on, before or after a part of the request has left."""
     carry_out, writes = scene.bus.line.carry_out, count()
 
-    def held_back(exchange: Exchange, **details: int) -> Completion:
+    def held_back(exchange: Exchange, **details: Any) -> Completion:
         if exchange.request.function == 6 and next(writes) >= after:
             return Completion(new_completion(result=Failure.NOT_MASTER, begun_ns=1, sent_ns=sent_ns))
         return carry_out(exchange, **details)
@@ -265,7 +266,7 @@ def test_a_stop_that_left_and_cannot_be_followed_is_unconfirmed(
     scene.become_master()
     carry_out = scene.bus.line.carry_out
 
-    def end_after_write(exchange: Exchange, **details: int) -> Completion:
+    def end_after_write(exchange: Exchange, **details: Any) -> Completion:
         found = carry_out(exchange, **details)
         if exchange.request.function == 6:
             scene.mastership.end()

@@ -264,7 +264,7 @@ def test_only_a_stop_is_sent_before_an_earlier_answer_has_come(
     insisted: list[bool] = []
     carry_out = line.carry_out
 
-    def watched(exchange: Exchange, **times: int) -> Completion:
+    def watched(exchange: Exchange, **times: Any) -> Completion:
         if is_write(exchange.request):
             insisted.append(bool(exchange.c.insists))
         return carry_out(exchange, **times)
@@ -617,7 +617,7 @@ def test_a_broadcast_is_followed_by_the_turnaround_delay(monkeypatch: pytest.Mon
     line, _, _ = one(monkeypatch, InvtCHE(1))
     made: list[Exchange] = []
 
-    def keep(exchange: Exchange, **times: int) -> Completion:
+    def keep(exchange: Exchange, **times: Any) -> Completion:
         made.append(exchange)
         return SimulatedBus.carry_out(line, exchange, **times)
 
@@ -811,7 +811,7 @@ def test_a_port_that_fails_in_a_write_is_noted_as_unconfirmed(
     drive.set_frequency(20)
     carry_out = line.carry_out
 
-    def fail(exchange: Exchange, **times: int) -> Completion:
+    def fail(exchange: Exchange, **times: Any) -> Completion:
         if exchange.request.function == 6:
             raise LineError("hall", "the port was lost")
         return carry_out(exchange, **times)
@@ -860,7 +860,7 @@ def test_a_write_whose_outcome_never_came_is_noted_all_the_same(
     before = len(line.written)
     carry_out = line.carry_out
 
-    def fail(exchange: Exchange, **times: int) -> Completion:
+    def fail(exchange: Exchange, **times: Any) -> Completion:
         if exchange.request.function == function and (function == 6 or len(line.written) > before):
             raise failure
         return carry_out(exchange, **times)

@@ -98,7 +98,7 @@ class Meanwhile:
         self._carry_out = line.carry_out
         vars(line)["carry_out"] = self.carry_out
 
-    def carry_out(self, exchange: Exchange, **times: int) -> Completion:
+    def carry_out(self, exchange: Exchange, **times: Any) -> Completion:
         completion = self._carry_out(exchange, **times)
         self._left -= 1
         if self._left == 0:
@@ -326,7 +326,7 @@ def test_the_first_look_of_a_stop_and_the_stop_itself_wait_for_no_late_answer(
     insisted: list[bool] = []
     carry_out = line.carry_out
 
-    def watched(exchange: Any, **times: int) -> Any:
+    def watched(exchange: Any, **times: Any) -> Any:
         if not writes(line):
             insisted.append(bool(exchange.c.insists))
         return carry_out(exchange, **times)

@@ -15,9 +15,15 @@ def new_completion(**fields: object) -> Any:
     return ffi.new("struct md_completion *", fields)
 
 
+def completion_of(found: Any) -> Completion:
+    """Return the same as md_port_carry_out() would fill in."""
+    is_good = found.result > 0 and not found.reply.exception
+    return Completion(found, found.reply.data_len if is_good else -1)
+
+
 def copied(found: Any) -> Completion:
     """Return what a struct md_completion holds now: the core may write to it again."""
-    return Completion(ffi.new("struct md_completion *", found[0]))
+    return completion_of(ffi.new("struct md_completion *", found[0]))
 
 
 def completed(result: int, reply: Message, raw: bytes, *, at_ns: int, skipped: int = 0) -> Completion:
@@ -25,7 +31,7 @@ def completed(result: int, reply: Message, raw: bytes, *, at_ns: int, skipped: i
     times = dict.fromkeys(("begun_ns", "sent_ns", "first_ns", "last_ns"), at_ns)
     found = new_completion(result=result, skipped=skipped, reply=to_c(reply)[0], raw_len=len(raw), **times)
     found.raw[0 : len(raw)] = list(raw)
-    return Completion(found)
+    return completion_of(found)
 
 
 def add_rows(columns: Columns, block: RowLayout, found: Any, utc_minus_monotonic_ns: int) -> bool:

@@ -118,11 +118,16 @@ class PathLine:
     def sleep(self, seconds: float) -> None:
         self._pass_until(self.now + round(seconds * S))
 
-    def carry_out(self, exchange: Exchange, *, expires_ns: int = 0) -> Completion:
+    def carry_out(
+        self, exchange: Exchange, *, expires_ns: int = 0, into: Completion | None = None
+    ) -> Completion:
+        late_until_ns = exchange.peer.late_until_ns
         self.queue.begin_urgent(exchange)
         self._pass_until(self.now + 1000 * S)
-        assert self.queue.granted
-        return self.queue.granted
+        granted = self.queue.granted
+        assert granted
+        granted.c.late_until_ns = late_until_ns  # as md_port_carry_out() does
+        return granted
 
     def _pass_until(self, end_ns: int) -> None:
         is_awaited = self.queue.granted is None

@@ -76,7 +76,14 @@ class SimulatedBus:
     def inherit(self, peer: Peer, before: Peer) -> None:
         peer.inherit(before)
 
-    def carry_out(self, exchange: Exchange, *, not_before_ns: int = 0, expires_ns: int = 0) -> Completion:
+    def carry_out(
+        self,
+        exchange: Exchange,
+        *,
+        not_before_ns: int = 0,
+        expires_ns: int = 0,
+        into: Completion | None = None,
+    ) -> Completion:
         request = exchange.request
         self.seconds += self.queue_time
         is_overtaken = exchange.permit is not None and not exchange.permit.is_good

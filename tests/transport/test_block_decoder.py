@@ -6,15 +6,16 @@ import struct
 from enum import IntEnum
 from typing import Any
 
+from completions import completed
 from hypothesis import given
 from hypothesis import strategies as st
 
-from multidrop.core import NumberFormat
+from multidrop.core import Completion, Message, NumberFormat
 from multidrop.drive import Drive
 from multidrop.drive.declare import reading
 from multidrop.drive.table import HOLDING
 from multidrop.planning.blocks import Block
-from multidrop.transport.block_decoder import BlockDecoder
+from multidrop.transport.block_decoder import BlockDecoder, decoder_of
 
 
 class Mode(IntEnum):
@@ -66,13 +67,18 @@ def expected(data: bytes) -> dict[str, Any]:
     }
 
 
+def reply(data: bytes) -> Completion:
+    """Return the completion of a read whose reply has this data."""
+    return completed(5 + len(data), Message(1, 3, data=data), b"", at_ns=1)
+
+
 def decoder() -> BlockDecoder:
-    return BlockDecoder(Block.of(Mixed(1), REGISTERS))
+    return decoder_of(Block.of(Mixed(1), REGISTERS))
 
 
 @given(st.binary(min_size=2 * WORDS, max_size=2 * WORDS))
 def test_each_value_is_the_one_that_its_bytes_say(data: bytes) -> None:
-    found = decoder().decode(data)
+    found = decoder().decode(reply(data))
     assert found == expected(data)
     assert type(found["pulses"]) is int  # a float would not hold all of it
 
@@ -80,10 +86,15 @@ def test_each_value_is_the_one_that_its_bytes_say(data: bytes) -> None:
 @given(st.binary(max_size=2 * WORDS - 1))
 def test_a_reply_that_ends_too_soon_has_the_values_that_are_whole(data: bytes) -> None:
     block = Block.of(Mixed(1), REGISTERS)
-    found = BlockDecoder(block).decode(data)
+    found = decoder_of(block).decode(reply(data))
     assert found == {one.name: one.value_in(data, one.address - FIRST) for one in REGISTERS}
     assert found["balance"] is None
 
 
 def test_plain_numbers_are_decoded_at_once() -> None:
     assert set(decoder().plain) == {"tenths", "celsius", "energy", "pulses", "drift", "mode", "balance"}
+
+
+def test_drives_of_a_kind_share_a_decoder_and_other_blocks_have_their_own() -> None:
+    assert decoder_of(Block.of(Mixed(2), REGISTERS)) is decoder()
+    assert decoder_of(Block.of(Mixed(2), REGISTERS[1:])) is not decoder()

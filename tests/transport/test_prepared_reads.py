@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from itertools import permutations
+from threading import Barrier
 from typing import Any
 
 import pytest
 from toy import PatientToy, Toy
 
 from multidrop.bus import Bus
+from multidrop.core import Completion, Exchange
 from multidrop.drive.timing import Settings
+from multidrop.errors import NoReply
 from multidrop.planning.bus_time import silence
 from multidrop.sim import SimulatedDrive, Simulator, Wire
 from multidrop.transport import prepared as prepared_reads
@@ -53,6 +57,22 @@ def bus() -> Iterator[Bus]:
     drives = [SimulatedDrive(Toy(address)) for address in (1, 2)]
     with Simulator([Wire(drives, unpaced=True)]) as sim, Bus(sim.wires[0].path) as opened:
         yield opened
+
+
+def given(
+    bus: Bus, monkeypatch: pytest.MonkeyPatch, meet: Callable[[], object] = lambda: None
+) -> list[Completion]:
+    """Return a list that gets the completion which each exchange is given to fill in."""
+    carry_out = bus.line.carry_out
+    asked: list[Completion] = []
+
+    def noting(exchange: Exchange, into: Completion) -> Completion:
+        asked.append(into)
+        meet()
+        return carry_out(exchange, into=into)
+
+    monkeypatch.setattr(bus.line, "carry_out", noting)
+    return asked
 
 
 def test_registers_that_are_read_again_are_planned_once(bus: Bus, counted: Counted) -> None:
@@ -114,3 +134,34 @@ def test_no_more_is_kept_than_there_is_room_for(bus: Bus, monkeypatch: pytest.Mo
         assert set(bus.read_many(drive, wanted)) == {register.name for register in WANTED}
     prepared = bus._exchanges._prepare(drive)
     assert prepared.of.cache_info().currsize == 3
+
+
+def test_reads_go_into_one_completion_after_another(bus: Bus, monkeypatch: pytest.MonkeyPatch) -> None:
+    drive = bus.attach(PatientToy, 1)
+    asked = given(bus, monkeypatch)
+    first = bus.read_many(drive, WANTED)
+    assert [bus.read_many(drive, WANTED) for _ in range(3)] == 3 * [first]
+    assert len(asked) == 8
+    assert len(set(asked)) == 1
+
+
+def test_reads_at_once_go_into_completions_of_their_own(bus: Bus, monkeypatch: pytest.MonkeyPatch) -> None:
+    drives = [bus.attach(PatientToy, address) for address in (1, 2)]
+    both = Barrier(2)
+    asked = given(bus, monkeypatch, lambda: both.wait(60))
+    with ThreadPoolExecutor(2) as threads:
+        found = [*threads.map(lambda drive: bus.read(drive, Toy.acceleration_time), 2 * drives)]
+    assert found[:2] == found[2:]
+    assert len(set(asked)) == 2
+
+
+def test_a_read_that_failed_keeps_its_completion(bus: Bus, monkeypatch: pytest.MonkeyPatch) -> None:
+    there, gone = bus.attach(Toy, 1), bus.attach(Toy, 3)
+    asked = given(bus, monkeypatch)
+    bus.read(there, Toy.acceleration_time)
+    with pytest.raises(NoReply):
+        bus._exchanges.values(gone, [Toy.acceleration_time], 1)
+    bus.read(there, Toy.acceleration_time)
+    before, failed, after = asked
+    assert before is failed
+    assert after is not failed

@@ -17,7 +17,7 @@ from multidrop.core.columns import (
     spell,
 )
 from multidrop.core.counters import DELAY_BUCKETS, Counters, delay_edge
-from multidrop.core.exchange import Completion, Exchange, Peer
+from multidrop.core.exchange import DATA_AT, Completion, Exchange, Peer
 from multidrop.core.frame import (
     MODBUS,
     Framing,
@@ -70,6 +70,7 @@ from multidrop.core.tap import Tap, Wrappings
 
 __all__ = [
     "COLUMNS",
+    "DATA_AT",
     "DELAY_BUCKETS",
     "EXCEPTION_STATUS",
     "LOW_BYTE_FIRST",

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from struct import Struct
 from typing import Any
 
 from multidrop._core import ffi, lib
@@ -179,83 +178,88 @@ class Exchange:
         )
 
 
-_EXCEPTION, _SIZE, _DATA = (
-    ffi.offsetof("struct md_completion", "reply", field) for field in ("exception", "data_len", "data")
-)
-# What every read needs, in one step: with caches that a sleep has cooled each field takes microseconds.
-_HEAD = Struct(f"=i{_EXCEPTION - 4}xB{_SIZE - _EXCEPTION - 1}xH")
+_COMPLETION = ffi.typeof("struct md_completion *")
+DATA_AT: int = ffi.offsetof("struct md_completion", "reply", "data")
 
 
 class Completion:
     """The result of an exchange (struct md_completion), read where it is asked for.
 
-    Times are CLOCK_MONOTONIC, in ns. `result` is the reply's length; 0 after a broadcast, else a Failure or a
-    FrameFault.
+    Times are CLOCK_MONOTONIC, in ns. `size` is the length of the good reply's data in bytes; -1 where there
+    is none, and of an exception. The data is at DATA_AT of `memory`. A read that went well asks for nothing
+    else: with caches that a sleep has cooled each field, and each call, takes microseconds. Where nobody
+    looks at it any more, another exchange may be carried out into it.
     """
 
-    __slots__ = ("_bytes", "_c", "_exception", "_size", "result")
+    __slots__ = ("c", "memory", "size")
 
-    def __init__(self, found: Any) -> None:
-        self._c = found
-        self._bytes = ffi.buffer(found)
-        self.result: int
-        self.result, self._exception, self._size = _HEAD.unpack_from(self._bytes)
+    def __init__(self, found: Any = None, size: int = -1) -> None:
+        self.c = ffi.new(_COMPLETION) if found is None else found
+        self.memory = ffi.buffer(self.c)
+        self.size = size
+
+    @property
+    def result(self) -> int:
+        """The reply's length; 0 after a broadcast, else a Failure or a FrameFault."""
+        return int(self.c.result)
 
     @property
     def error(self) -> int:
         """An errno of a line that was lost, as C numbers it; or the REFUSALS of settings."""
-        return int(self._c.error)
+        return int(self.c.error)
 
     @property
     def begun_ns(self) -> int:
         """The time at which its turn came."""
-        return int(self._c.begun_ns)
+        return int(self.c.begun_ns)
 
     @property
     def sent_ns(self) -> int:
         """The time at which the request began to leave; 0: it never did."""
-        return int(self._c.sent_ns)
+        return int(self.c.sent_ns)
 
     @property
     def first_ns(self) -> int:
         """The time at which the first byte was seen after the request; 0: none came."""
-        return int(self._c.first_ns)
+        return int(self.c.first_ns)
 
     @property
     def last_ns(self) -> int:
         """The same of the last byte."""
-        return int(self._c.last_ns)
+        return int(self.c.last_ns)
+
+    @property
+    def late_until_ns(self) -> int:
+        """The time until which a late reply could come, as was known when it was asked for."""
+        return int(self.c.late_until_ns)
 
     @property
     def stale(self) -> int:
         """Bytes that were thrown away before the request left."""
-        return int(self._c.stale)
+        return int(self.c.stale)
 
     @property
     def skipped(self) -> int:
         """Bytes after the request that were no part of the reply."""
-        return int(self._c.skipped)
+        return int(self.c.skipped)
 
     @property
     def reply(self) -> Message:
         """The good reply, or an exception."""
-        return from_c(self._c.reply)
+        return from_c(self.c.reply)
 
     @property
-    def data(self) -> bytes | None:
-        """Data of the good reply; None where there is none, or an exception."""
-        if self.result <= 0 or self._exception:
-            return None
-        data: bytes = self._bytes[_DATA : _DATA + self._size]
-        return data
+    def data(self) -> bytes:
+        """Data of the good reply; none where there is no such reply."""
+        return bytes(self.memory[DATA_AT : DATA_AT + max(self.size, 0)])
 
     @property
     def raw(self) -> bytes:
         """The reply's bytes; of a failure the end of what came."""
-        return bytes(ffi.buffer(self._c.raw, self._c.raw_len))
+        return bytes(ffi.buffer(self.c.raw, self.c.raw_len))
 
     def unanswered(self) -> Completion:
         """Return the same as one to which nothing came: the reply was the request's echo."""
-        found = ffi.new("struct md_completion *", self._c[0])
+        found = ffi.new("struct md_completion *", self.c[0])
         found.result, found.raw_len = lib.MD_NO_REPLY, 0
         return Completion(found)

@@ -16,7 +16,6 @@ from multidrop.core.mastership import Mastership
 from multidrop.core.row_queue import RowQueue
 from multidrop.core.tap import Tap
 
-_COMPLETION = ffi.typeof("struct md_completion *")
 now_ns = lib.md_now_ns
 utc_minus_monotonic_ns = lib.md_utc_minus_monotonic_ns
 
@@ -252,12 +251,18 @@ class Port:
         """Seconds that a change of baud rate or format takes, on average; 0 before the first one."""
         return float(self._progress.switching_ns) / 1e9 / max(int(self._progress.switches), 1)
 
-    def carry_out(self, exchange: Exchange, *, not_before_ns: int = 0, expires_ns: int = 0) -> Completion:
-        """Carry one out ahead of the queue and wait for it.
+    def carry_out(
+        self,
+        exchange: Exchange,
+        not_before_ns: int = 0,
+        expires_ns: int = 0,
+        into: Completion | None = None,
+    ) -> Completion:
+        """Carry one out ahead of the queue and wait for it; `into`: the completion to fill in.
 
         After `expires_ns` (0: never), or after a stop, it is not sent.
         """
         self._kept.add(exchange.peer)  # a late reply may come
-        found = ffi.new(_COMPLETION)
-        lib.md_port_carry_out(self.c, exchange.c, not_before_ns, expires_ns, found)
-        return Completion(found)
+        found = into or Completion()
+        found.size = lib.md_port_carry_out(self.c, exchange.c, not_before_ns, expires_ns, found.c)
+        return found

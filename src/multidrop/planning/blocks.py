@@ -191,7 +191,7 @@ def _side_by_side(drive: Drive, wanted: list[tuple[range, Register[Any]]]) -> _N
     table = wanted[0][1].table
     behind = accumulate((span.stop for span, _ in wanted), max)
     joined = [
-        may_be_crossed(drive, table, range(stop, other.start))
+        other.start <= stop or may_be_crossed(drive, table, range(stop, other.start))
         for stop, (other, _) in zip(behind, wanted[1:], strict=False)
     ]
     places = {register.name: place for place, (_, register) in enumerate(wanted)}

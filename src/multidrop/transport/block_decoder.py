@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from operator import add, itemgetter, mul
+from functools import lru_cache
+from operator import add, itemgetter, mul, truediv
 from struct import Struct
 from typing import Any
 
-from multidrop.core import NumberFormat
+from multidrop.core import DATA_AT, Completion, NumberFormat
 from multidrop.drive.number_format import ORDERS, WHOLE, WORDS
 from multidrop.drive.register import Register
 from multidrop.planning.blocks import Block
@@ -29,10 +30,10 @@ def _is_plain(register: Register[Any]) -> bool:
 
 
 class BlockDecoder:
-    """The places of a block's registers in its reply, found once."""
+    """The places of registers in the reply of a block that begins at this address, found once."""
 
-    def __init__(self, block: Block) -> None:
-        self._places = [(register, block.offset(register)) for register in block.registers]
+    def __init__(self, registers: tuple[Register[Any], ...], start: int) -> None:
+        self._places = [(register, register.address - start) for register in registers]
         self._others: list[tuple[Register[Any], int]] = []
         plain: list[Register[Any]] = []
         codes, end = ">", 0
@@ -57,22 +58,35 @@ class BlockDecoder:
             if self._divisors[at] == 1 and register.coding.number_format in WHOLE
         ]
         self._named = [(register.name, register.decode) for register in plain if register.values is not None]
+        self._is_scaled = not (self._is_affine or self._whole or self._named or self._others)
 
-    def decode(self, data: bytes) -> dict[str, Any]:
+    def decode(self, reply: Completion) -> dict[str, Any]:
         """Return the values by the registers' names; None where the drive gave none."""
-        if len(data) < self._numbers.size:
+        if reply.size < self._numbers.size:
+            data = reply.data
             return {register.name: register.value_in(data, at) for register, at in self._places}
-        counts = self._numbers.unpack_from(data)
+        counts = self._numbers.unpack_from(reply.memory, DATA_AT)
+        if self._is_scaled:
+            return dict(zip(self.plain, map(truediv, counts, self._divisors), strict=True))
         if self._is_affine:
             counts = tuple(map(add, map(mul, counts, self._multipliers), self._addends))
-        found: dict[str, Any] = {
-            name: count / divisor
-            for name, count, divisor in zip(self.plain, counts, self._divisors, strict=True)
-        }
+        found: dict[str, Any] = dict(zip(self.plain, map(truediv, counts, self._divisors), strict=True))
         for name, at in self._whole:
             found[name] = counts[at]
         for name, decode in self._named:
             found[name] = decode(found[name])
-        for register, at in self._others:
-            found[register.name] = register.value_in(data, at)
+        if self._others:
+            data = reply.data
+            for register, at in self._others:
+                found[register.name] = register.value_in(data, at)
         return found
+
+
+@lru_cache(maxsize=256)
+def _shared(registers: tuple[Register[Any], ...], start: int) -> BlockDecoder:
+    return BlockDecoder(registers, start)
+
+
+def decoder_of(block: Block) -> BlockDecoder:
+    """Return the decoder of a block, which all drives of a kind share."""
+    return _shared(block.registers, block.start)

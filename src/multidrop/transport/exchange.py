@@ -52,6 +52,7 @@ class Exchanges:
         self._known: dict[tuple[object, ...], Peer] = {}  # by what they are; also of those that left
         self._answered_on: dict[Drive, object] = {}  # the open port on which it answered last
         self._prepared: dict[Drive, PreparedReads] = {}
+        self._spare: list[Completion] = []  # of reads whose data was taken
 
     # ---- the drives ----
 
@@ -137,10 +138,22 @@ class Exchanges:
                 if insists:
                     exchange = make_read(drive, read.block, exchange.peer, insists=True, timeout=timeout)
                 try:
-                    found |= read.decode(self._ask(drive, exchange, attempts))
+                    into = self._spare.pop()
+                except IndexError:
+                    into = Completion()
+                try:  # a read that goes well takes few calls: see Completion
+                    reply = self.line.carry_out(exchange, into=into)
+                    if reply.size < 0:
+                        reply = self._good(drive, exchange, attempts, self._settled(drive, exchange, reply))
+                    self._answered_on[drive] = self.line.queue
+                    found |= read.decode(reply)
+                    self._spare.append(reply)
                     if read.may_be_too_long:
                         prepared.answered.add(read.block)
                     continue
+                except PortLost as failure:
+                    self._check_held_back(drive, failure)
+                    raise
                 except (DriveRefused, NoReply, BadReply) as failure:
                     parts = self._parts(drive, prepared, read, failure)
                     if not parts:
@@ -186,7 +199,7 @@ class Exchanges:
         """Return a text, read in as many requests as its family's limit makes it."""
         peer = self.peer(drive)
         reads = [make_read(drive, block, peer, insists=insists) for block in text_blocks(drive, text)]
-        return text.decode(b"".join(self._ask(drive, read, attempts) for read in reads))
+        return text.decode(b"".join(self._ask(drive, read, attempts).data for read in reads))
 
     def _prepare(self, drive: Drive) -> PreparedReads:
         """Return what is prepared for this drive; anew where anything that it depends on has changed."""
@@ -210,7 +223,7 @@ class Exchanges:
         if isinstance(register, Text):
             peer, blocks_of = self.peer(drive), text_blocks(other, register)
             asked = [make_read(other, block, peer, insists=True) for block in blocks_of]
-            return register.decode(b"".join(self._ask(drive, read, 1) for read in asked))
+            return register.decode(b"".join(self._ask(drive, read, 1).data for read in asked))
         (block,) = blocks(other, [register])
         read = PreparedRead(other, block, self.peer(drive))
         insisting = make_read(other, block, self.peer(drive), insists=True)
@@ -237,22 +250,27 @@ class Exchanges:
         if completion.result > 0:  # an exception also says that the drive is there
             self._answered_on[drive] = self.line.queue
 
-    def _ask(self, drive: Drive, exchange: Exchange, attempts: int) -> bytes:
-        """Return the data of the reply to a read, which is sent again where it is lost."""
-        while True:
+    def _ask(self, drive: Drive, exchange: Exchange, attempts: int) -> Completion:
+        """Return the good reply to a read, which is sent again where it is lost."""
+        reply = self._good(drive, exchange, attempts, self._carry_out(drive, exchange))
+        self._note_answer(drive, reply)
+        return reply
+
+    def _good(self, drive: Drive, exchange: Exchange, attempts: int, completion: Completion) -> Completion:
+        """Return the good reply to a read that was sent once, and is sent again where it is lost."""
+        while completion.size < 0:
             attempts -= 1
-            completion = self._carry_out(drive, exchange)
             self._note_answer(drive, completion)
-            if (data := completion.data) is not None:
-                return data
             try:
-                return good_reply(drive, completion).data  # raises
+                good_reply(drive, completion)  # raises
             except (NoReply, BadReply):
                 if not attempts:
                     raise
             except DriveRefused as refusal:
                 if not attempts or refusal.code not in drive.damaged:
                     raise
+            completion = self._carry_out(drive, exchange)
+        return completion
 
     # ---- writing ----
 
@@ -282,23 +300,30 @@ class Exchanges:
         return completion
 
     def _carry_out(self, drive: Drive, made: Exchange, expires_ns: int = 0) -> Completion:
+        """Carry it out once late answers allow that; see `_settled`. Raises NotMaster."""
+        try:
+            completion = self.line.carry_out(made, expires_ns=expires_ns)
+        except PortLost as failure:
+            self._check_held_back(drive, failure)
+            raise
+        return completion if completion.size >= 0 else self._settled(drive, made, completion, expires_ns)
+
+    def _check_held_back(self, drive: Drive, failure: PortLost) -> None:
+        """Raise NotMaster where the port is not opened again because this process is not its master."""
+        if not failure.is_sent and not self.line.may_send:
+            raise NotMaster(drive.name, self.line.port) from None
+
+    def _settled(
+        self, drive: Drive, made: Exchange, completion: Completion, expires_ns: int = 0
+    ) -> Completion:
         """Wait once until no late answer comes in any order; the core then asks for the proof of it.
 
         Where that is after `expires_ns`, so long is enough. Raises NotMaster.
         """
-        late_until_ns = made.peer.late_until_ns
-        try:
+        if completion.result == Failure.LATE_ANSWER_DUE:
+            until_ns = completion.late_until_ns
+            until_ns = min(until_ns, expires_ns + 1) if expires_ns else until_ns
+            clock.sleep(max(0, until_ns - clock.now_ns()) / 1e9)
             completion = self.line.carry_out(made, expires_ns=expires_ns)
-        except PortLost as failure:
-            if failure.is_sent or self.line.may_send:
-                raise
-            raise NotMaster(drive.name, self.line.port) from None
-        if completion.result != Failure.LATE_ANSWER_DUE:
-            if completion.result < 0:
-                check_master(drive, completion)
-            return completion
-        until_ns = min(late_until_ns, expires_ns + 1) if expires_ns else late_until_ns
-        clock.sleep(max(0, until_ns - clock.now_ns()) / 1e9)
-        completion = self.line.carry_out(made, expires_ns=expires_ns)
         check_master(drive, completion)
         return completion

@@ -239,8 +239,18 @@ class Line:
 
     # ---- exchanges ----
 
-    def carry_out(self, exchange: Exchange, *, not_before_ns: int = 0, expires_ns: int = 0) -> Completion:
-        """Carry an exchange out ahead of what is queued, and wait for it; LineError when the port fails."""
+    def carry_out(
+        self,
+        exchange: Exchange,
+        *,
+        not_before_ns: int = 0,
+        expires_ns: int = 0,
+        into: Completion | None = None,
+    ) -> Completion:
+        """Carry an exchange out ahead of what is queued, and wait for it; LineError when the port fails.
+
+        `into` is the completion to fill in, where nobody looks at it any more.
+        """
         if self.queue and self._opened.bridge and self._opened.settings != exchange.settings:
             self.require(exchange.settings)
         self._callers.append(None)  # before the port is looked at: `drop` then waits for this thread
@@ -248,8 +258,8 @@ class Line:
             core = self.queue
             if core is None:
                 raise self._closed()
-            found = core.carry_out(exchange, not_before_ns=not_before_ns, expires_ns=expires_ns)
-            is_lost = found.result < 0 and _is_lost(core, found.result)
+            found = core.carry_out(exchange, not_before_ns, expires_ns, into)
+            is_lost = found.size < 0 and _is_lost(core, found.result)
             if self.mastership is not None:
                 self.note_foreign()
         finally:

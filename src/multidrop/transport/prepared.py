@@ -13,7 +13,7 @@ from multidrop.drive.register import Register
 from multidrop.planning.blocks import Block, blocks
 from multidrop.planning.bus_time import silence
 from multidrop.planning.splitting import may_be_too_long
-from multidrop.transport.block_decoder import BlockDecoder
+from multidrop.transport.block_decoder import decoder_of
 
 MOST_PREPARED = 256  # sets of registers, and blocks, of one drive; the least recently read ones go
 NO_ROWS = core.RowLayout(0, [])  # of a command: a poll's summary counts the values of its rows alone
@@ -55,7 +55,7 @@ class PreparedRead:
         self.block = block
         self.exchange = make_read(drive, block, peer)
         self.may_be_too_long = may_be_too_long(drive, block)
-        self.decode = BlockDecoder(block).decode
+        self.decode = decoder_of(block).decode
 
 
 class ReadPlan(NamedTuple):
