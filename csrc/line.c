@@ -162,7 +162,7 @@ void md_line_sent(struct md_line *line, size_t len, int64_t begun_ns, int64_t no
         return;
     if (line->tx_at == 0) {
         line->completion->sent_ns = begun_ns;
-        line->rx_len = 0;
+        line->rx_len = line->rx_from = 0;
     }
     md_tap_put(line->tap, MD_ASKING, begun_ns, line->tx + line->tx_at, len);
     line->quiet_ns = later(line->quiet_ns, now_ns) + md_wire_ns(exchange, (int64_t)len);
@@ -220,7 +220,7 @@ static void take_stray(struct md_line *line, const uint8_t *bytes, size_t len, i
         md_line_go(line, MD_STRAY_BYTES);
     for (size_t at = 0; at < len;)
         at += keep(line, bytes + at, len - at);
-    md_reply_find_late(line, 0, now_ns);
+    md_reply_find_late(line, line->rx_from, now_ns);
 }
 
 /* Frames of Modbus TCP. What is not awaited puts nothing off where it is told by its id. */

@@ -155,7 +155,7 @@ void md_reply_foresee(struct md_line *line, int64_t now_ns);
 int md_reply_has_begun(const struct md_line *line);
 /* End the exchange at its time-out. */
 struct md_ending md_reply_missed(struct md_line *line);
-/* Recognise late replies among stray bytes, from here on. */
+/* Recognise late replies among stray bytes, from here on; what follows is looked for behind them. */
 void md_reply_find_late(struct md_line *line, size_t from, int64_t now_ns);
 
 /* Take the reply that was found there for this exchange's; 0: it was cut out as a late one. */

@@ -128,8 +128,10 @@ void md_reply_find_late(struct md_line *line, size_t from, int64_t now_ns)
 {
     for (size_t at = from; line->late && at < line->rx_len; at++) {
         int used = md_late_take(line, at, now_ns, NULL);
-        if (used > 0)
+        if (used > 0) {
             at += (size_t)used - 1;
+            line->rx_from = (uint16_t)(at + 1); /* else it would be counted again with what comes behind it */
+        }
     }
 }
 

@@ -103,3 +103,28 @@ def test_a_late_answer_is_known_on_a_port_that_was_opened_again(line: LineDriver
     again.receive(reply(1111))
     assert (again.want, again.completion.result) == ("done", Failure.LATE_ANSWER_DUE)
     assert drive.counters().late == 1
+
+
+@pytest.mark.usefixtures("proof")
+def test_a_late_answer_is_counted_once(line: LineDriver, drive: Peer) -> None:
+    """More comes behind it before the next request leaves: another drive's late answer, or noise."""
+    time_out(line, drive, LONGER)
+    time_out(line, drive, LONGER)
+    line.receive(PROOF_REPLY)
+    assert drive.counters().late == 1
+    line.receive(b"\x07")
+    assert drive.counters().late == 1
+
+
+@pytest.mark.usefixtures("proof")
+def test_a_reply_is_found_where_the_line_babbled_before_its_request(line: LineDriver, drive: Peer) -> None:
+    """A late answer was among what came."""
+    line.begin(exchange(Message(1, 4, 50, 1), drive))
+    while line.want != "write":
+        line.receive(b"\x07")
+        line.now += MS
+    line.receive(reply(1111))
+    assert drive.counters().late == 1
+    line.take()
+    line.receive(build_reply(Framing.RTU, Message(1, 4, data=words(2222))))
+    assert (line.want, line.completion.reply.data) == ("done", words(2222))
