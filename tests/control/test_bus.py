@@ -33,7 +33,7 @@ from multidrop.errors import (
 )
 from multidrop.poller import Poller
 from multidrop.sim import EncodedDrive, SimulatedDrive, Simulator, Wire, simulated
-from multidrop.transport import exchange as exchanges
+from multidrop.transport import peers
 from multidrop.transport.exchange import READ_ATTEMPTS
 from multidrop.transport.prepared import make_exchange
 
@@ -376,7 +376,7 @@ def test_a_verb_of_a_drive_that_is_on_no_bus() -> None:
 @pytest.fixture
 def half_a_second(monkeypatch: pytest.MonkeyPatch) -> None:
     """Wait so long for each reply, though the drive answers at once: the machine may be busy."""
-    monkeypatch.setattr(exchanges, "LEAST_TIMEOUT", 0.5)
+    monkeypatch.setattr(peers, "LEAST_TIMEOUT", 0.5)
     monkeypatch.setattr(Rig, "response_timeout", 0.5)
 
 

@@ -19,7 +19,7 @@ from multidrop.drive import Condition, Drive, read
 from multidrop.drives import YD1000, DelixiModbus, ErmanERG220, InnovertIBD, InvtCHE
 from multidrop.errors import NoReply, NotDone, Refused, Unconfirmed
 from multidrop.sim import MotorDrive, Simulator, Wire, simulated
-from multidrop.transport import exchange as exchanges
+from multidrop.transport import peers
 
 every_family = pytest.mark.parametrize("model", usually(*MAKE))
 GOODRIVE = 0x010A
@@ -28,7 +28,7 @@ PATIENCE = 0.3  # s, with a machine that has much else to do
 
 @pytest.fixture(autouse=True)
 def _patient(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(exchanges, "LEAST_TIMEOUT", PATIENCE)
+    monkeypatch.setattr(peers, "LEAST_TIMEOUT", PATIENCE)
 
 
 @contextmanager

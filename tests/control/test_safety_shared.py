@@ -27,7 +27,7 @@ from multidrop.drive import Condition
 from multidrop.drives import InvtCHE
 from multidrop.errors import BusError, DriveRefused, NotDone, Refused, Unconfirmed
 from multidrop.sim import MotorDrive, Simulator, Wire, simulated
-from multidrop.transport import exchange as exchanges
+from multidrop.transport import peers
 
 RTU_FAMILIES = [model for model in MAKE if model != "delixi-native"]
 ROUNDS, MOST_ROUNDS = 3, 60  # as many as it takes until both have talked at once
@@ -153,7 +153,7 @@ PATIENCE = 0.1  # s, with a machine that has much else to do
 
 @pytest.fixture
 def _patient(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(exchanges, "LEAST_TIMEOUT", PATIENCE)
+    monkeypatch.setattr(peers, "LEAST_TIMEOUT", PATIENCE)
 
 
 patient = pytest.mark.usefixtures("_patient")

@@ -13,7 +13,7 @@ from typing import Any
 
 from multidrop import bus
 from multidrop.core import Peer
-from multidrop.transport import exchange
+from multidrop.transport import peers
 
 PATIENCE = 60.0  # s
 
@@ -25,7 +25,7 @@ def patient_peer(*, interval: float, **timeouts: float) -> Peer:
 
 def be_patient(set_attribute: Callable[..., None], set_item: Callable[..., None]) -> None:
     """Wait for every drive, and for every write's turn: the given functions change what the library has."""
-    set_attribute(exchange, "Peer", patient_peer)
+    set_attribute(peers, "Peer", patient_peer)
     await_turns(set_attribute, set_item)
 
 

@@ -17,7 +17,7 @@ from multidrop.plant.model import PlantLine
 from multidrop.polling.jobs import RowNames
 from multidrop.polling.polled_line import PolledLine
 from multidrop.transport import clock
-from multidrop.transport.opening import check_fencible, unopened
+from multidrop.transport.opening import check_port
 
 OPENING = 32  # ports at a time: one that takes its time holds up no other
 ENDING_NS = 1_000_000_000  # for which exchanges under way are waited for
@@ -144,7 +144,7 @@ class LineSet:
 
     def check_port(self, port: str) -> None:
         """Raise NoSuchPort for a name that no port of these lines can have."""
-        (check_fencible if self._mastership else unopened)(port)
+        check_port(port, self._mastership)
 
     def check_audit(self) -> None:
         """Raise OSError where the audit log of a line that comes cannot be opened."""

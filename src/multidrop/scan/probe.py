@@ -10,7 +10,7 @@ from multidrop.drive.family import Drive
 from multidrop.scan.identify import identify
 from multidrop.scan.results import Found
 from multidrop.scan.sweep import Sweep
-from multidrop.transport.exchange import LEAST_TIMEOUT
+from multidrop.transport.peers import LEAST_TIMEOUT
 from multidrop.transport.replies import good_reply
 
 MOST_TIMEOUT = 1.0  # s: for a drive of which only the address is known

@@ -17,7 +17,7 @@ from multidrop.drive.table import Carrier, Table
 from multidrop.drive.timing import Settings
 from multidrop.planning.blocks import Block
 from multidrop.planning.bus_time import silence
-from multidrop.transport.exchange import LEAST_TIMEOUT
+from multidrop.transport.peers import LEAST_TIMEOUT
 
 Setting = tuple[Settings, Framing]
 
@@ -72,7 +72,7 @@ def sweeps(
     baudrates: Collection[int] = (),
     formats: Collection[str] = (),
 ) -> list[Sweep]:
-    """Return the sweeps of all settings in these families' documents, most likely in least time first.
+    """Return the sweeps of all settings in these families' documents, the likeliest in least time first.
 
     Every setting is swept with the patience that usual response delays need, and then again with the
     longest that the documents allow. Without baud rates and formats, all of the documents are used.
@@ -158,7 +158,7 @@ def _sweeps(
 
 
 def _best(families: Collection[type[Drive]]) -> Register[Any] | None:
-    """Return the register that most families answer to, and most of these with a value of their own."""
+    """Return the register to which most families answer, and of several such one that most of them have."""
     registers = (one for family in families for one in family.registers.values() if one.readable)
     return max(
         registers,

@@ -9,25 +9,21 @@ from multidrop.core import (
     Completion,
     Exchange,
     Failure,
-    Framing,
     Message,
     Peer,
     Permit,
-    TransactionIds,
     build_request,
 )
 from multidrop.drive.family import Drive
-from multidrop.drive.own import check_drive
 from multidrop.drive.register import Register
 from multidrop.drive.request import any_read
 from multidrop.drive.text import Text
-from multidrop.errors import BadReply, DriveRefused, Expired, NoReply, NotAttached, NotMaster, PortLost
+from multidrop.errors import BadReply, DriveRefused, Expired, NoReply, NotMaster, PortLost
 from multidrop.planning.blocks import Block, blocks, text_blocks
-from multidrop.planning.bus_time import silence
-from multidrop.planning.proofs import proofs
 from multidrop.planning.splitting import halves, least
 from multidrop.transport import clock
 from multidrop.transport.line import Line
+from multidrop.transport.peers import Peers
 from multidrop.transport.prepared import (
     NO_ROWS,
     PreparedRead,
@@ -38,7 +34,6 @@ from multidrop.transport.prepared import (
 from multidrop.transport.replies import check_master, good_reply, no_reply, no_value
 
 READ_ATTEMPTS = 3
-LEAST_TIMEOUT = 0.02  # s: what a host and its adapter may add to a drive's own delay
 WRITE_TIMEOUT = 1.0  # s: a write that is wrongly reported as unconfirmed costs more than the wait
 ILLEGAL_FUNCTION = 1  # a shorter request has the same one
 
@@ -48,8 +43,7 @@ class Exchanges:
 
     def __init__(self, line: Line) -> None:
         self.line = line
-        self._peers: dict[Drive, Peer] = {}
-        self._known: dict[tuple[object, ...], Peer] = {}  # by what they are; also of those that left
+        self._peers = Peers(line)
         self._answered_on: dict[Drive, object] = {}  # the open port on which it answered last
         self._prepared: dict[Drive, PreparedReads] = {}
         self._spare: list[Completion] = []  # of reads whose data was taken
@@ -58,51 +52,26 @@ class Exchanges:
 
     def add(self, drive: Drive) -> None:
         """Begin to know a drive; one that comes back is known from before."""
-        documented = max(LEAST_TIMEOUT, drive.answering_time, 4 * drive.response_delay)
-        least = min(drive.response_timeout, documented)
-        asked_as = type(drive), drive.framing, drive.settings, silence(drive), least, drive.response_timeout
-        key = drive.address, *asked_as
-        if key not in self._known:  # the core may be asking a proof of one that has left
-            made = self._known[key] = Peer(
-                least_timeout=least, most_timeout=drive.response_timeout, interval=drive.least_interval
-            )
-            made.prove_by(
-                [
-                    make_exchange(drive, block.request, made, NO_ROWS, answer=answer)
-                    for block, answer in proofs(drive)
-                ]
-                if drive.framing is not Framing.TCP or self.line.ids is TransactionIds.IGNORE
-                else []
-            )
-        # One that comes back may still owe the answer to what it was asked before it left, and one of
-        # another family at its address would get that.
-        peer = self._peers[drive] = self._known[key]
-        for other, known in self._known.items():
-            if other[0] == drive.address and known is not peer:
-                self.line.inherit(peer, known)
+        self._peers.add(drive)
 
     def remember(self, before: Exchanges) -> None:
-        """Know all drives that others knew on the same line."""
-        self._known.update(before._known)
+        """Know all drives that were known before on the same line."""
+        self._peers.remember(before._peers)
 
     def remove(self, drive: Drive) -> None:
         """Exchange nothing more with this drive."""
-        del self._peers[drive]
+        self._peers.remove(drive)
         self._answered_on.pop(drive, None)
         self._prepared.pop(drive, None)
 
     @property
     def peers(self) -> dict[Drive, Peer]:
         """Peers of the drives that are on the line now; a copy, as any thread may add and remove drives."""
-        return dict(self._peers)
+        return dict(self._peers.present)
 
     def peer(self, drive: Drive) -> Peer:
         """Return what is learnt of this drive's answers; NotAttached for a drive that is not on this bus."""
-        peer = self._peers.get(drive)
-        if peer is None:
-            check_drive(drive)
-            raise NotAttached(f"{drive.name} is not attached to this bus: use bus.attach(...)")
-        return peer
+        return self._peers.of(drive)
 
     def has_answered(self, drive: Drive) -> bool:
         """Return True where it has answered a read since the port was opened."""
@@ -121,10 +90,10 @@ class Exchanges:
     ) -> dict[str, Any]:
         """Return registers' values by name, each block asked for up to `attempts` times.
 
-        One that insists waits for no earlier answer, which may then pass for its own; and for its own, where
-        answers are known to be late, for as long as `timeout` seconds. A block that the drive refuses as a
-        whole, or keeps silent to, is asked for in parts from then on, until the port is opened again. Raises
-        NoValue where a register has none.
+        A read that insists does not wait for an earlier answer, which may then pass for its own; for its own
+        it waits, where answers are known to be late, up to `timeout` seconds. A block that the drive refuses
+        as a whole, or keeps silent to, is asked for in parts from then on, until the port is opened again.
+        Raises NoValue where a register has none.
         """
         prepared = self._prepare(drive)
         reads, names = prepared.of(tuple(registers))
@@ -196,14 +165,14 @@ class Exchanges:
         return self.values(drive, [register], attempts, insists=insists)[register.name]
 
     def text(self, drive: Drive, text: Text, attempts: int = READ_ATTEMPTS, *, insists: bool = False) -> str:
-        """Return a text, read in as many requests as its family's limit makes it."""
+        """Return a text, read in as many requests as its family's limit demands."""
         peer = self.peer(drive)
         reads = [make_read(drive, block, peer, insists=insists) for block in text_blocks(drive, text)]
         return text.decode(b"".join(self._ask(drive, read, attempts).data for read in reads))
 
     def _prepare(self, drive: Drive) -> PreparedReads:
         """Return what is prepared for this drive; anew where anything that it depends on has changed."""
-        peer = self._peers.get(drive) or self.peer(drive)
+        peer = self._peers.present.get(drive) or self.peer(drive)
         made_for = (
             peer,
             self.line.queue,
@@ -233,7 +202,7 @@ class Exchanges:
         return found[register.name]
 
     def ask(self, drive: Drive, function: int, start: int, count: int, expiry: float) -> bytes:
-        """Return the data of the reply to any read, sent once, and begun within so many seconds."""
+        """Return the data of the reply to any read, sent once, and begun within `expiry` seconds."""
         request = any_read(drive, function, start, count)
         expires_ns = clock.now_ns() + round(expiry * 1e9)
         asked = make_exchange(drive, request, self.peer(drive), NO_ROWS)
@@ -286,10 +255,10 @@ class Exchanges:
     ) -> Completion:
         """Write once, ahead of any polling; first wait for an answer that may still come late.
 
-        After `expires_ns` (0: never), and without a good permit, it is not sent. Its answer is waited for
-        for `timeout` seconds at least. One that insists waits for no earlier answer, and for its own, where
-        answers are known to be late, for as long as `timeout`. Raises NoReply, and nothing was sent,
-        where answers may still come late and the drive is silent.
+        After `expires_ns` (0: never), and without a good permit, it is not sent. It waits for its answer
+        at least `timeout` seconds. One that insists does not wait for an earlier answer, and for its own,
+        where answers are known to be late, up to `timeout`. Raises NoReply, and nothing was sent, where
+        answers may still come late and the drive is silent.
         """
         made = make_exchange(
             drive, request, self.peer(drive), NO_ROWS, insists=insists, timeout=timeout, permit=permit
@@ -316,9 +285,9 @@ class Exchanges:
     def _settled(
         self, drive: Drive, made: Exchange, completion: Completion, expires_ns: int = 0
     ) -> Completion:
-        """Wait once until no late answer comes in any order; the core then asks for the proof of it.
+        """Wait once until late answers, if any come, come in order; then the core asks for a proof.
 
-        Where that is after `expires_ns`, so long is enough. Raises NotMaster.
+        It waits no longer than until `expires_ns`. Raises NotMaster.
         """
         if completion.result == Failure.LATE_ANSWER_DUE:
             until_ns = completion.late_until_ns

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import errno
-import logging
-import os
 import threading
+from logging import DEBUG
 
 from multidrop.core import (
     RS485,
@@ -24,22 +22,16 @@ from multidrop.core.fork import register_at_fork
 from multidrop.drive.network import speaks_tcp
 from multidrop.errors import LineError, NoSuchPort, PortLost
 from multidrop.transport import clock
-from multidrop.transport.aside_log import flush, log_aside
+from multidrop.transport.aside_log import flush
 from multidrop.transport.bridge import PORT_FAILURES
-from multidrop.transport.frame_log import log_frames
-from multidrop.transport.mixed_up import mixed_up
+from multidrop.transport.line_log import LineLog
 from multidrop.transport.open_port import OpenPort
-from multidrop.transport.opening import check_fencible, reason_of
+from multidrop.transport.opening import check_port, reason_of, why_lost
 
 LEAVING_NS = 1_000_000_000  # for callers to leave a port that was stopped
 LOGGING_S = 1.0  # that closing waits for loggers
-_log = logging.getLogger("multidrop.line")
 
-UNOPENED = "it is not opened: this process is not its master, whose connection that could end"
-FOREIGN = (
-    "%s: another master: %d bytes came before anything was asked; nothing but stops is sent until the "
-    "line has been silent"
-)
+UNOPENED = "it is not opened: this process is not its master, and could end the master's connection"
 
 
 def _is_lost(core: Port, result: int) -> bool:
@@ -52,7 +44,7 @@ class Line:
 
     `port` is a device, any pyserial URL, or tcp://host:port for Modbus TCP, whose replies have their
     requests' transaction ids unless `ids` says otherwise. `rs485` is who switches the transceiver. Where it
-    has a `mastership`, requests leave while that holds. Every failure of the port is a LineError.
+    has a `mastership`, requests leave only while that holds. Every failure of the port is a LineError.
     """
 
     def __init__(
@@ -84,9 +76,7 @@ class Line:
         self, port: str, echo: Echo, ids: TransactionIds, rs485: RS485, mastership: Mastership | None
     ) -> None:
         if mastership is not None:
-            if not isinstance(mastership, Mastership):
-                raise TypeError(f"mastership takes a multidrop.Mastership, not {mastership!r}")
-            check_fencible(port)
+            check_port(port, mastership)
         self.port = port
         self.rs485 = rs485
         self.mastership = mastership
@@ -94,13 +84,11 @@ class Line:
         self.ids = ids
         self._echo = echo
         self._opened = OpenPort(port, ids, rs485, mastership)
-        # Of the core, to queue exchanges on; None while it is closed. Dropped before the descriptor that it
-        # looks at.
+        # The core's port, on which exchanges are queued; None while it is closed. It is dropped before its
+        # descriptor is closed.
         self.queue: Port | None = None
         self._tap: Tap | None = None
-        self._is_loss_logged = False
-        self.foreign = 0  # bytes that came while it was listened to before a request
-        self._foreign_here = 0  # of these on the port that is open now
+        self._log = LineLog(port)
         self._is_over = False
         self._why_closed = "it is closed"
         self.why_closing: str | None = None  # why calls on it fail now, though `close` is yet to come
@@ -109,12 +97,12 @@ class Line:
 
     def _make_locks(self) -> None:
         self._lock = threading.RLock()  # one thread opens or closes at a time
-        self._noting = threading.Lock()
         self._callers: list[None] = []  # in `carry_out`; a list grows and shrinks without a lock
 
     def forked(self) -> None:
-        """Close it in the child at once: a descriptor left open there would keep the port in use."""
+        """Close it in the child at once: a descriptor left open there would keep the port busy."""
         self._make_locks()
+        self._log.forked()
         self._is_over = True
         self._why_closed = "it was opened before this process was forked; open it again here"
         self.queue = None
@@ -137,7 +125,7 @@ class Line:
             core.tell_echo(Echo.OFF if self.is_tcp else self._echo)
             if self._tap:
                 core.tap(self._tap)
-            self._foreign_here = 0
+            self._log.opened(self.identity)
             self.queue = core
         except NoSuchPort:
             raise
@@ -147,9 +135,6 @@ class Line:
         except PORT_FAILURES as failure:
             self._let_go()
             raise LineError(self.port, reason_of(failure)) from failure
-        again = " again" if self._is_loss_logged else ""
-        log_aside(_log, logging.INFO, "%s: opened%s (%s)", self.port, again, self.identity)
-        self._is_loss_logged = False
 
     def drop(self) -> None:
         """Carry out nothing more; what is queued and not yet sent never will be.
@@ -161,7 +146,7 @@ class Line:
             if core is None:
                 return
             if core.lost:
-                self._log_loss("it failed")
+                self._log.lost("it failed")
             core.stop()
             given_up_ns = clock.now_ns() + LEAVING_NS
             while self._callers and clock.now_ns() < given_up_ns:
@@ -173,7 +158,7 @@ class Line:
         """Drop the port and close it; no `regain` opens it any more."""
         with self._lock:
             if not self._is_over:
-                log_aside(_log, logging.INFO, "%s: closed", self.port)
+                self._log.closed()
             self._is_over = True
             self._let_go()
         flush(LOGGING_S)
@@ -264,8 +249,8 @@ class Line:
                 self.note_foreign()
         finally:
             self._callers.pop()
-        if _log.isEnabledFor(logging.DEBUG):
-            log_frames(_log, self.port, exchange, found)
+        if self._log.shows(DEBUG):
+            self._log.frames(exchange, found)
         if is_lost:
             failure = self._failure(found.result, found.error, found.raw)
             failure.is_sent = found.sent_ns > 0
@@ -274,22 +259,13 @@ class Line:
 
     def _failure(self, result: int, error: int, received: bytes) -> LineError:
         if result == Failure.SETTINGS_REFUSED:
-            return LineError(
-                self.port, f"the port does not take the {refused_names(error)} that the drive needs"
-            )
+            names = refused_names(error)
+            return LineError(self.port, f"the port does not take the {names} that the drive needs")
         if self.queue is None or self.why_closing:
             return self._closed()
-        why = os.strerror(error) if error else "hung up"
-        if error == errno.EPROTO:
-            shown = received[:16].hex(" ").upper() or "a damaged header"
-            why = f"what came is no Modbus TCP: {shown}{mixed_up(self.port, received)}"
-        self._log_loss(why)
+        why = why_lost(self.port, error, received)
+        self._log.lost(why)
         return PortLost(self.port, f"the port was lost ({why})")
-
-    def _log_loss(self, why: str) -> None:
-        if not self._is_loss_logged:
-            self._is_loss_logged = True
-            log_aside(_log, logging.WARNING, "%s: lost (%s)", self.port, why)
 
     def _closed(self) -> LineError:
         is_over = self._is_over or self.why_closing
@@ -310,14 +286,13 @@ class Line:
     def note_foreign(self) -> None:
         """Log what came while the line was listened to, where it has a mastership."""
         core = self.queue
-        if self.mastership is None or core is None or core.foreign == self._foreign_here:
-            return
-        with self._noting:
-            now = core.foreign
-            came, self._foreign_here = now - self._foreign_here, now
-            self.foreign += came
-        if came > 0:
-            log_aside(_log, logging.WARNING, FOREIGN, self.port, came)
+        if self.mastership is not None and core is not None:
+            self._log.note_foreign(core)
+
+    @property
+    def foreign(self) -> int:
+        """Bytes that came while it was listened to before a request."""
+        return self._log.foreign
 
     @property
     def has_echo(self) -> bool:

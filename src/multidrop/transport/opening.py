@@ -12,9 +12,11 @@ from urllib.parse import SplitResult
 
 import serial
 
+from multidrop.core import Mastership
 from multidrop.drive.network import MODBUS_PORT, url_of
 from multidrop.errors import NoSuchPort
 from multidrop.transport import port_identity
+from multidrop.transport.mixed_up import mixed_up
 from multidrop.transport.rfc2217 import RFC2217Port
 from multidrop.transport.socket_port import SocketPort
 
@@ -31,13 +33,13 @@ _REASONS = {
 # pyserial keeps an error of Windows in its text alone: could not open port 'COM5': PermissionError(13, ...)
 _WINDOWS_ERROR = re.compile(r"Error\((\d+), ")
 _WINDOWS_REASONS = {
-    errno.EACCES: _REASONS[errno.EBUSY],  # a COM port is had by one program, whoever asks
+    errno.EACCES: _REASONS[errno.EBUSY],  # a COM port is one program's, whoever asks
     errno.EBADF: _REASONS[errno.ENOTTY],
 }
 
 
 def reason_of(failure: BaseException) -> str:
-    """Return the cause in words: pyserial hides the system's error in its own, or behind it."""
+    """Return the cause in words: pyserial hides the system's error in or behind its own."""
     for error in (failure, failure.__context__):
         if isinstance(error, socket.gaierror):
             return error.strerror or str(error)
@@ -48,6 +50,14 @@ def reason_of(failure: BaseException) -> str:
         code = int(windows[1])
         return _WINDOWS_REASONS.get(code) or _REASONS.get(code) or os.strerror(code)
     return str(failure)
+
+
+def why_lost(port: str, error: int, received: bytes) -> str:
+    """Return why a port was lost: by the errno of its descriptor, 0 where that hung up."""
+    if error != errno.EPROTO:
+        return os.strerror(error) if error else "hung up"
+    shown = received[:16].hex(" ").upper() or "a damaged header"
+    return f"what came is no Modbus TCP: {shown}{mixed_up(port, received)}"
 
 
 _URLS = "tcp://10.0.0.7, socket://10.0.0.7:4001 or rfc2217://10.0.0.7:4001"
@@ -78,13 +88,19 @@ def unopened(port: str) -> serial.Serial:
 
 
 def is_bridged(port: serial.SerialBase) -> bool:
-    """Return True for a port that the core cannot write to itself: a thread hands on what it sends."""
+    """Return True for a port that the core cannot write to itself: a thread passes its requests on."""
     return type(port).read is not serial.Serial.read and not isinstance(port, SocketPort)
 
 
-def check_fencible(port: str) -> None:
-    """Raise NoSuchPort for a port that nothing can hold back: what a thread has taken leaves later."""
-    if is_bridged(unopened(port)):
+def check_port(port: str, mastership: Mastership | None) -> None:
+    """Raise NoSuchPort for a name that no port can have, and TypeError for what is no mastership.
+
+    With a mastership requests must be held back, and those that a thread has taken leave all the same: then
+    NoSuchPort is raised for such a port too.
+    """
+    if mastership is not None and not isinstance(mastership, Mastership):
+        raise TypeError(f"mastership takes a multidrop.Mastership, not {mastership!r}")
+    if is_bridged(unopened(port)) and mastership:
         raise NoSuchPort(
             port,
             "a line with a mastership needs a port that the core writes to itself, such as "

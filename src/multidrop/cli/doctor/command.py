@@ -53,9 +53,9 @@ from multidrop.drives.registry import find_model
 from multidrop.errors import LineError
 from multidrop.planning.blocks import Block, blocks
 from multidrop.plant.model import Plant
-from multidrop.transport.exchange import LEAST_TIMEOUT
 from multidrop.transport.line import Line
 from multidrop.transport.mixed_up import other_port
+from multidrop.transport.peers import LEAST_TIMEOUT
 from multidrop.transport.prepared import make_exchange
 
 MOST_S = 5.0  # that the rounds take, where the drive is slow or silent
