@@ -1,4 +1,4 @@
-"""Look the registers of a request up: the plant's by name where they are known, else raw ones."""
+"""Look up the registers of a request: the plant's by name where they are known, else raw ones."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _DELIXI_WRITES = {0x02: (0x02,), 0x04: (0x04,), 0x05: (0x05, 0x06), 0x06: (0x05,
 
 @dataclass(frozen=True)
 class RegisterPlace:
-    """A register and its offset in the data of an exchange, in words or bits; None: an unknown one."""
+    """A register, None for an unknown one, and its offset in an exchange's data, in words or bits."""
 
     name: str
     at: int

@@ -1,7 +1,7 @@
 """Read captures: pcap and pcapng files, ours and others', as streams of bytes on lines.
 
 A capture is read piece by piece: it may be larger than memory, and a file that is cut short meanwhile
-is an error, where a mapped file would end the process.
+is an error; if it were mapped, that would end the process.
 """
 
 from __future__ import annotations

@@ -123,7 +123,7 @@ _PACKETS = {  # side: dissector of a frame that is no text, sender, target, opti
 
 
 def _wrappings(frames: bytes, texts: bytes) -> Wrappings:
-    """Return those of lines whose frames these dissectors take; others begin with ':' and are texts."""
+    """Return a line's wrappings: `frames` is the dissector of frames, `texts` of what begins with ':'."""
     return Wrappings(
         {
             (side, is_text): (

@@ -82,7 +82,7 @@ class Field(NamedTuple):
 
 @lru_cache(maxsize=1024)
 def _shared(fields: tuple[Field, ...]) -> tuple[Any, Any]:
-    """Return arrays of the fields and of their extras for all drives of a kind: they stay in the cache."""
+    """Return arrays of fields and extras, which all drives of a kind share: so they stay in the cache."""
     extras = list(dict.fromkeys(field.extra for field in fields if field.extra is not None))
     places = {extra: place for place, extra in enumerate(extras, 1)}
     return (
@@ -211,7 +211,7 @@ class Spelling(NamedTuple):
 
 
 class Names:
-    """Names, whose numbers columns hold. They only become more: a number's name never changes."""
+    """Names, and the numbers by which columns hold them. Names are only added: a number keeps its name."""
 
     def __init__(self, names: Iterable[str] = ()) -> None:
         self._names = list(names)
@@ -234,7 +234,7 @@ class Names:
 
     @property
     def listed(self) -> tuple[str, ...]:
-        """All names so far, each in the place that its number says; the same tuple while none is added."""
+        """All names so far in the order of their numbers; the same tuple while none is added."""
         if len(self._listed) != len(self._names):
             self._listed = tuple(self._names)
         return self._listed

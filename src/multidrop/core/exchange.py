@@ -47,7 +47,7 @@ class Peer:
 
     @property
     def has_answered(self) -> bool:
-        """True once a reply was good; an exception is."""
+        """True once a good reply came; an exception counts as one."""
         return bool(self.c.counters.answered)
 
     @property
@@ -115,9 +115,10 @@ class Exchange:
     Times are in seconds: `character` of one character, `silence` before the request and after
     its reply, `turnaround` after a broadcast, `period` between its slots in a queue, if it has any.
     One that `insists` is sent even where a late reply may pass for its own. `timeout` is the least
-    time-out; 0: as learnt. The one register of its reply lies between the two of `answer`. `block` has
-    the fields for rows. `echo_probe` is sent first while it is unknown whether the adapter echoes: its
-    reply is never a copy of its request. Once a stop was called, `permit` keeps the request from being sent.
+    time-out; 0: as learnt. `answer` is the least and the greatest raw count of the reply's one register.
+    `block` has the fields for rows. `echo_probe` is sent first while it is unknown whether the adapter
+    echoes: its reply is never a copy of its request. Once a stop was called, `permit` keeps the request
+    from being sent.
     """
 
     __slots__ = ("_memory", "block", "c", "echo_probe", "framing", "peer", "permit", "request", "settings")
@@ -225,7 +226,7 @@ class Completion:
 
     @property
     def last_ns(self) -> int:
-        """The same of the last byte."""
+        """The time at which the last byte was seen; 0: none came."""
         return int(self.c.last_ns)
 
     @property
@@ -259,7 +260,7 @@ class Completion:
         return bytes(ffi.buffer(self.c.raw, self.c.raw_len))
 
     def unanswered(self) -> Completion:
-        """Return the same as one to which nothing came: the reply was the request's echo."""
+        """Return a copy to which nothing came: the reply was the request's echo."""
         found = ffi.new("struct md_completion *", self.c[0])
         found.result, found.raw_len = lib.MD_NO_REPLY, 0
         return Completion(found)

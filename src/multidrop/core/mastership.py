@@ -21,11 +21,11 @@ class Mastership:
     """The right to send on lines that other processes may be masters of, too, until a deadline.
 
     Times are ns of CLOCK_BOOTTIME, as `time.clock_gettime_ns(time.CLOCK_BOOTTIME)` has them. It does not hold
-    before the first `extend`. Ports that have it look at the clock right before each write: a request that is
-    too late is not sent, a stop neither. Where this process stands still and its deadline is over by half of
-    `guard_s`, in s, the kernel kills it with SIGKILL, so that nothing is sent when it goes on. Who takes its
-    lines over sends nothing for `guard_s` after the deadline: each line is listened to for so long at least
-    before its first request, a stop alone goes at once. Any thread may call these.
+    before the first `extend`. Ports that have it look at the clock right before each write: after the
+    deadline nothing is sent, not even a stop. Where this process stands still until half of `guard_s`, in s,
+    after its deadline, the kernel kills it with SIGKILL, so that nothing is sent when it goes on. Whoever
+    takes its lines over listens to each for at least `guard_s` before the first request, and only a stop
+    goes at once. Any thread may call these.
 
     Raises NotImplementedError where the system is not Linux, and ValueError for a guard that is no time.
     """
@@ -67,7 +67,7 @@ class Mastership:
 
     @property
     def holds(self) -> bool:
-        """True while the deadline is to come."""
+        """True until the deadline."""
         return not self._is_inherited and bool(lib.md_mastership_holds(self.c))
 
     def extend(self, until_ns: int) -> None:

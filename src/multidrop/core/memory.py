@@ -1,7 +1,7 @@
 """Memory of what the core touches at every exchange: side by side, and in whole cache lines.
 
-With many lines it has left the caches since a line's last exchange, and the translations of its pages too.
-What belongs to one drive is made together, so that it shares a page or two.
+With many lines it has left the caches since a line's last exchange, and so have the translations of its
+pages. What belongs to one drive is made together, so that it shares a page or two.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class Chunks:
     def take(self, kind: str) -> tuple[Any, Any]:
         """Return a pointer to a struct of zeros, and the owner of its memory."""
         size = -(-ffi.sizeof(kind) // CACHE_LINE) * CACHE_LINE
-        if not self._lock.acquire(blocking=False):  # another thread's, or a signal's handler interrupts this
+        if not self._lock.acquire(blocking=False):  # another thread has it, or this is a signal's handler
             chunk = Chunk(size)
             return chunk.take(kind, size), chunk.owner
         try:

@@ -41,7 +41,7 @@ class CodeTable:
 
 
 def _copy(kind: str, column: bytes | memoryview[Any], size: int) -> Any:
-    """Return a column as an array, which a place in a file need not be aligned for."""
+    """Return a copy of a column as an array: its place in a file may not be aligned."""
     made = ffi.new(kind, max(memoryview(column).nbytes // size, 1))
     ffi.memmove(made, column, memoryview(column).nbytes)
     return made

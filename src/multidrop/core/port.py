@@ -21,7 +21,7 @@ utc_minus_monotonic_ns = lib.md_utc_minus_monotonic_ns
 
 
 class Echo(StrEnum):
-    """An adapter's echo: it repeats to the client what it sends; `AUTO`: that is learnt."""
+    """An adapter's echo: it repeats to the client what the client sends; `AUTO`: that is learnt."""
 
     AUTO = "auto"
     ON = "on"
@@ -33,7 +33,7 @@ class Echo(StrEnum):
 
 
 class RS485(StrEnum):
-    """The switch between sending and receiving: who makes it, where the adapter does not by itself.
+    """The one that switches between sending and receiving, where the adapter does not.
 
     `KERNEL`: the driver's own RS-485 mode; `RTS_UP`: the core, RTS being on while a request leaves;
     `RTS_DOWN`: RTS being off then.
@@ -104,7 +104,7 @@ def _engine() -> _Engine:
 
 
 def _let_go(port: Any, mastership: Mastership | None) -> None:
-    """Free it; the core looks at the mastership until then."""
+    """Free a port; until then the core looks at its mastership."""
     lib.md_port_stop(port)
     lib.md_port_free(port)
 

@@ -1,4 +1,4 @@
-"""Coding: how a quantity stands in the words of a device, and what they mean; the core decodes alike."""
+"""Coding: how a device writes a quantity in its words. The core decodes them by the same rules."""
 
 from __future__ import annotations
 
@@ -65,15 +65,15 @@ class Coding:
 
     @cached_property
     def mask(self) -> int:
-        """Bits of the words that belong to it."""
+        """Bits of the words that belong to the number."""
         return ((1 << self._part_width) - 1) << (self.part[0] if self.part else 0)
 
     @cached_property
     def invalid_patterns(self) -> tuple[tuple[int, int], ...]:
         """Mask and pattern of the bits of each invalid count; a NaN is never a value.
 
-        A count that fits into the part is one of the part, a larger one of the whole number. One beyond the
-        span of the format is the bits themselves: 8000H of a signed number.
+        A count that fits into the part is compared with the part, a larger one with the whole number. A count
+        outside the format's span names the bits themselves, such as 8000H of a signed number.
         """
         return tuple(self._pattern(count) for count in self.invalid if count == count)
 
@@ -119,7 +119,7 @@ class Coding:
     # ---- writing ----
 
     def count_of(self, value: float) -> float:
-        """Return the nearest raw count; of a float the nearest one that is held.
+        """Return the nearest raw count; in a float format, the nearest float of its size.
 
         Raises OverflowError beyond the largest float.
         """
@@ -131,8 +131,8 @@ class Coding:
     def exact_count(self, value: float) -> Fraction:
         """Return the raw count that the value would need.
 
-        A float means the shortest decimal that is it, 0.3 three tenths; but a count that it is exactly, as
-        those of 64 bits are, is not rounded to that.
+        A float stands for the shortest decimal that reads back as it: 0.3 is three tenths. But a float that
+        is a whole count itself, as those of 64 bits may be, is taken exactly.
         """
         count = (Fraction(value) - self.offset) / self.step
         return count if count.denominator == 1 else (Fraction(str(value)) - self.offset) / self.step

@@ -35,7 +35,7 @@ def declaration_errors(
 ) -> list[str]:
     """Return a sentence for each error in a class's registers.
 
-    `taken` are names that drives have for something else, `bounds` the names of the class's options.
+    `taken` are names that every drive uses for something else; `bounds` are those of the class's options.
     """
     found = []
     for name, register in registers.items():
@@ -245,9 +245,9 @@ def _a(name: str) -> str:
 def _shared(registers: list[Register[Any]]) -> Iterator[str]:
     """Find registers that are written at the same address and do not mean the same there.
 
-    A reading may share its address with anything, and different tables may use the same addresses. What
-    commands the motor is reached by no alias in RAM of another register, and by none with other harmless
-    counts: a plain write would send what verbs alone send.
+    A reading may share its address with anything, and different tables may use the same addresses. A register
+    that commands the motor shares its address with no alias in RAM, and with no register that has other
+    harmless counts: a plain write would send what only verbs may send.
     """
     written = [one for one in registers if one.access is not Access.READING and one.table.write is not None]
     at: dict[tuple[object, int], list[Register[Any]]] = {}

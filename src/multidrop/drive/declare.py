@@ -18,13 +18,13 @@ class Details(TypedDict, total=False):
 
     step: float | None  #: value of one raw count; None where the document does not state it
     offset: float  #: value of the raw count 0: value = raw * step + offset
-    #: Raw counts that mean "no value". One beyond the format's span is the bits: 0x8000 of an I16.
+    #: Raw counts that mean "no value". One outside the format's span names the bits: 0x8000 of an I16.
     invalid: float | tuple[float, ...]
-    #: Lowest and highest bit, of the number in its words, of a reading that is a part of it. `invalid` counts
-    #: that do not fit into the part are those of the whole number.
+    #: Lowest and highest bit of a reading that is only a part of the number in its words. `invalid` counts
+    #: that do not fit into the part are compared with the whole number.
     part: tuple[int, int]
     order: str  #: bytes as they come on the wire, A the most significant: ABCD, CDAB, BADC, DCBA; AB, BA
-    scale_register: str  #: reading whose signed count is the power of ten of this one, read in one request
+    scale_register: str  #: reading whose signed count is this one's power of ten; one request reads both
     span: tuple[float, float]  #: smallest and largest value that may be written
     at_least: str  #: register or option whose present value is the least that may be written
     at_most: str  #: register or option whose present value is the most
@@ -35,8 +35,8 @@ class Details(TypedDict, total=False):
     default: float  #: value from the factory
     while_running: bool  #: may be changed while the motor turns; None where not stated
     broadcast: tuple[int, ...]  #: raw counts that are documented and harmless as a broadcast
-    #: A write may start, stop or reset something, and is left to the verbs. Where it is not stated, that
-    #: holds for a command, and for a setting that has `harmless`.
+    #: A write may start, stop or reset something, so only verbs write it. Unless stated, this holds for
+    #: commands, and for settings that have `harmless`.
     moves: bool
     #: Of a register that moves the motor, the raw counts that anyone may write at any time, and again when
     #: the reply is lost. All others are for verbs, which send them once.

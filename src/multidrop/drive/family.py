@@ -31,8 +31,8 @@ _TURNING = (Condition.RUNNING, Condition.ACCELERATING, Condition.DECELERATING)
 class Drive(ManualFacts):
     """One drive on a line; its class is the family, with the manual's tables in the manual's order.
 
-    `address` is 1 to 247, as far as the family goes; on a tcp:// port it is a unit id, which may be 0 to
-    255 where the family has them. Baud rate, format and framing default to the family's; on a tcp:// port
+    `address` is 1 to 247, or fewer in some families; on a tcp:// port it is a unit id, 0 to 255 where the
+    family has all of them. Baud rate, format and framing default to the family's; on a tcp:// port
     the framing is TCP, and baud rate and format are those of the wire behind the gateway. `silence`, in s,
     takes the place of the standard's t3.5 where all drives on the line bear it; what the family's document
     demands is kept all the same. Options are facts that only the owner knows (see `options`); `ram` names
@@ -40,7 +40,7 @@ class Drive(ManualFacts):
     ValueError for anything the family's document does not allow.
     """
 
-    bus: Any = None  # that it is attached to
+    bus: Any = None  # the one that it is attached to
 
     def __init_subclass__(cls) -> None:
         """Collect the registers. Raises DeclarationError with all that is wrong with them."""
@@ -57,7 +57,7 @@ class Drive(ManualFacts):
 
     @classmethod
     def _all_options(cls) -> Mapping[str, Option]:
-        """Return the class's options, and `confirmed` where it commands a motor untested or unidentified."""
+        """Return the class's options, and `confirmed` where a command needs that: see `check_confirmed`."""
         commands = any(
             register.commands or register.access is Access.COMMAND for register in cls.registers.values()
         )
@@ -71,10 +71,11 @@ class Drive(ManualFacts):
         return cls.identify is not Drive.identify
 
     def check_confirmed(self, what: str) -> None:
-        """Raise Refused where nobody has confirmed a drive of a class that needs it.
+        """Raise Refused for a drive that must be confirmed and is not.
 
-        That is a class that cannot identify its drives, since the same address means different things to
-        different makes, and may start their motor; and one from a file, which nobody has tested.
+        It must be where its class cannot identify its drives: the same address means different things to
+        different makes, and may start their motor. It must be too where a file declares the class, which
+        nobody has tested.
         """
         if "confirmed" not in self.options or self.option.get("confirmed"):
             return
@@ -106,7 +107,7 @@ class Drive(ManualFacts):
         self.ram = frozenset(self._in_ram(name) for name in ram)
         self.commanded: float | None = None  # setpoint that set_frequency wrote last
         self.perform: Callable[[Script[Any]], Any] = self._perform_nowhere
-        self.check_identity: Callable[[], None] = lambda: None  # a bus does
+        self.check_identity: Callable[[], None] = lambda: None  # until a bus has its own
         self.begin_call: Callable[[str], Any] = lambda verb: None  # its permit, which a stop ends
         self.carry_out_move: Callable[[Script[Any], Any], Any] = self._move_nowhere
         self.carry_out_stop: Callable[[str, Callable[[], Script[Any]], float | None], Any] = (
@@ -168,7 +169,7 @@ class Drive(ManualFacts):
         return Refused(why, advice=Advice.call("reset_fault"))
 
     def _started(self) -> Script[None]:
-        """Wait until the motor is seen to run; NotDone when the drive trips, Unconfirmed when it is not."""
+        """Wait until the motor is seen to run; NotDone when the drive trips, Unconfirmed when it does not."""
         if not (yield from until(self._runs, limit=START_TIME)):
             reason = f"after {START_TIME:g} s it is not seen to run; {self.remote}"
             raise Unconfirmed(self.name, "the start", reason)
@@ -188,7 +189,7 @@ class Drive(ManualFacts):
         yield from ()
 
     def resembles(self) -> Script[bool]:
-        """Return True where a drive that `identify` refuses reads like the family: good for a guess alone."""
+        """Return True where a drive that `identify` refuses reads like the family: enough for a guess."""
         yield from ()
         return False
 

@@ -1,4 +1,4 @@
-"""Known state: a drive's state, read out of values that somebody has already."""
+"""Known state: a drive's state, worked out from values that were read before."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ MOST_STEPS = 20
 
 
 class StateReader:
-    """Reads a drive's state as its family does, out of values such as those of its polled rows.
+    """Works out a drive's state as its family does, from values such as those of its polled rows.
 
-    Nothing is sent, and what the family notes at a look is noted for this reader alone.
+    Nothing is sent. What the family notes from one look to the next is noted for this reader alone.
     """
 
     def __init__(self, drive: Drive) -> None:
@@ -28,7 +28,7 @@ class StateReader:
         """True where the family's document has a state at all."""
 
     def state(self, values: Mapping[str, float]) -> State | None:
-        """Return the state that these values by register's name show; None where others are needed.
+        """Return the state that these values, by register's name, show; None where they do not suffice.
 
         A value is as in a row: in the register's unit, or the raw count where it has names. The family is
         asked again only where one of the values that it read has changed, or where it noted something.

@@ -1,4 +1,4 @@
-"""LineFacts: how a family is spoken to on a line, and the settings of one drive there."""
+"""LineFacts: what a family needs of a line, and the settings of one drive there."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class LineFacts:
     answering_time: ClassVar[float] = 0.0  # s that the document gives the drive for a reply; 0: not stated
     turnaround_delay: ClassVar[float] = 0.1  # s, after a broadcast
 
-    least_interval: ClassVar[float] = 0.0  # s, from the end of an exchange with it to its next request
+    least_interval: ClassVar[float] = 0.0  # s, from the end of an exchange to the next request to the drive
 
     def __init__(
         self,

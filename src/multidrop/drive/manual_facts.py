@@ -33,9 +33,9 @@ class ManualFacts(LineFacts):
         5: "acknowledged, still working",
         6: "busy",
     }
-    damaged: ClassVar[frozenset[int]] = frozenset()  # of these, codes of a damaged request
-    later: ClassVar[frozenset[int]] = frozenset({5, 6})  # and codes of a drive that will answer later
-    broadcasts: ClassVar[bool] = False  # the document has them; nobody answers one
+    damaged: ClassVar[frozenset[int]] = frozenset()  # those of a request that came damaged
+    later: ClassVar[frozenset[int]] = frozenset({5, 6})  # those of a drive that will answer later
+    broadcasts: ClassVar[bool] = False  # the document has broadcasts, which nobody answers
     identity_is_inferred: ClassVar[bool] = False  # a drive that `identify` refuses may be of the family
     options: ClassVar[Mapping[str, Option]] = {}
     setpoint_name: ClassVar[str] = "frequency"  # the register that set_frequency writes
@@ -89,14 +89,14 @@ class ManualFacts(LineFacts):
 
     @property
     def ledger_name(self) -> str:
-        """Name under which writes to its EEPROM are counted: files of one name are told by their titles."""
+        """Name under which writes to its EEPROM are counted; two files of one name differ by their titles."""
         if self.declared_in:
             return f"{self.model}: {self.title}"
         return self.model or type(self).__name__
 
     @property
     def echo_probe(self) -> Register[Any] | None:
-        """Register whose reply is never a copy of its request, where a family has others; else None.
+        """Register whose reply is never a copy of its request; None where no reply of the family is one.
 
         It is read first while it is unknown whether the adapter echoes.
         """
@@ -105,8 +105,8 @@ class ManualFacts(LineFacts):
     def known_counts(self) -> Mapping[Register[Any], tuple[int, int]]:
         """Return registers that hold raw counts in a known range, from the least to the most.
 
-        Where a family reads one register at a time its replies differ in nothing else: a late reply is told
-        from another register's by its value, so no two of the ranges may overlap.
+        Where a family reads one register at a time, its replies differ in nothing else: only its value tells
+        a late reply from another register's, so no two of the ranges may overlap.
         """
         return {}
 
@@ -122,5 +122,5 @@ class ManualFacts(LineFacts):
         return self.exceptions.get(code, "a code that the document does not explain")
 
     def is_passing(self, code: int) -> bool:
-        """Return True where the request may be right, and came damaged or at a bad time."""
+        """Return True where the request may be right, but came damaged or at a bad time."""
         return code in self.exceptions and code in self.damaged | self.later

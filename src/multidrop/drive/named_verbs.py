@@ -1,4 +1,4 @@
-"""Named verbs: a drive's verbs as programs call them that send a name and options, such as JSON."""
+"""Named verbs: a drive's verbs for programs that send a name and options, as in JSON."""
 
 from __future__ import annotations
 
@@ -49,8 +49,8 @@ def verbs_of(drive: Drive) -> list[str]:
 def verb_arguments(verb: str, options: Mapping[str, object]) -> dict[str, Any]:
     """Return the arguments of a verb: `{"direction": "reverse"}` is Direction.REVERSE, `hz` is in Hz.
 
-    An option that is None is left out. Raises ValueError for one that the verb has not, that it lacks, or
-    that is not right; KeyError for an unknown verb.
+    An option that is None is left out. Raises ValueError for an option that is unknown, missing or wrong;
+    KeyError for an unknown verb.
     """
     takes = _OPTIONS[verb]
     for name in options:

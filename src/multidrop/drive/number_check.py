@@ -61,7 +61,7 @@ def _part(register: Register[Any]) -> Iterator[str]:
 
 
 def _named(register: Register[Any]) -> Iterator[str]:
-    """Find names that the register cannot show: a look for a fault would wait for it in vain."""
+    """Find names of counts that the register cannot hold: who looks for that fault would never see it."""
     if register.values is None or (register.part is not None and register.number_format not in _PARTED):
         return
     flags = _is_flags(register)
@@ -81,14 +81,14 @@ def _is_flags(register: Register[Any]) -> bool:
 
 
 def _counts(register: Register[Any]) -> tuple[Fraction, Fraction]:
-    """Return the least and the greatest count, of bits without a sign."""
-    if _is_flags(register):  # its highest bit too, of a signed number
+    """Return the least and the greatest count; flags have no sign."""
+    if _is_flags(register):  # also in a signed format, whose highest bit may have a name
         return Fraction(0), Fraction((1 << register.coding.mask.bit_count()) - 1)
     return register.coding.raw_span
 
 
 def _written(register: Register[Any]) -> Iterator[str]:
-    """Find counts that no write can have: what they allow or forbid would be something else."""
+    """Find counts that no write can send: they would allow or forbid something else."""
     least, most = _counts(register)
     for key in ("harmless", "broadcast"):
         for count in getattr(register, key) or ():

@@ -104,7 +104,7 @@ def signed(bits: int, count: int) -> int:
 
 
 def bits_of(number: float, number_format: NumberFormat) -> int:
-    """Return the bits that mean this number; of a whole one those that do not fit are lost."""
+    """Return the bits of this number; a whole number loses those that do not fit."""
     if number_format in FLOATS:
         if number_format is NumberFormat.F32:
             number = nearest_or_infinite(number)

@@ -15,7 +15,7 @@ from multidrop.drive.table import Carrier, Table
 
 # The application protocol V1.1b3, 6.1 to 6.4; Delixi's own frames have room for one.
 STANDARD_LIMITS = {Carrier.BIT: 2000, Carrier.WORD: 125, Carrier.LONG: 1, Carrier.NUMBER: 1}
-FUNCTIONS = {1: Carrier.BIT, 2: Carrier.BIT, 3: Carrier.WORD, 4: Carrier.WORD}  # that read, by code
+FUNCTIONS = {1: Carrier.BIT, 2: Carrier.BIT, 3: Carrier.WORD, 4: Carrier.WORD}  # those that read, by code
 LONGEST_INTERVAL = 10.0  # s
 
 
@@ -34,7 +34,7 @@ def read_limit(family: Any, table: Table) -> int:
 def function_limit(family: Any, function: int) -> int:
     """Return how many addresses one read by this function may take, whatever lies there.
 
-    That is the least that the family states for it, but as many as its longest register has.
+    That is the least limit that the family states for it, but enough for its longest register.
     """
     standard = STANDARD_LIMITS[FUNCTIONS[function]]
     stated: list[int] = [most for table, most in family.most_registers.items() if table.read == function]

@@ -61,7 +61,7 @@ class Register(Generic[T]):
     outside: str = ""
     note: str = ""
     name: str = field(default="", init=False)
-    scaled_by: Register[float] | None = field(default=None, init=False)  # of the class that it is in
+    scaled_by: Register[float] | None = field(default=None, init=False)  # its scale register, once found
 
     def __post_init__(self) -> None:
         carrier = getattr(self.table, "carrier", Carrier.WORD)  # the class reports a wrong table
@@ -90,7 +90,7 @@ class Register(Generic[T]):
 
     @cached_property
     def reach(self) -> range:
-        """Addresses that one request reads for its value: its own, and to those of its scale register."""
+        """Addresses that one request reads for its value: from its own to its scale register's."""
         own = range(self.address, self.address + self.words)
         if self.scaled_by is None:
             return own

@@ -1,11 +1,10 @@
 """Back off from drives that stay silent, so that they cost the others little. Time comes in, in ns.
 
-A silent drive rests for longer and longer. When its rest is over it gets its shortest request, in the
-others' spare time or the share of jobs without a period; all silent drives together cost a small part of
-the line. With its first reply it is back, and the next silent one is tried at once: both may have had no
-power. A new drive, which has never answered, gets one request and no other until the outcome of that is
-known; if there was no reply, it rests at once. Once all new drives have had theirs and few were silent,
-these get another.
+A silent drive rests longer each time. After each rest it gets its shortest request, in the others' spare
+time or in the share of jobs without a period; all silent drives together cost a small part of the line. With
+its first reply it is back, and the next silent one is tried at once: both may have been without power. A new
+drive, which has never answered, gets one request, and no other before the outcome of that is known; without
+a reply it rests at once. Once all new drives have had their request and few were silent, these get another.
 """
 
 from __future__ import annotations
@@ -43,7 +42,7 @@ class BackOff:
     _late_until_ns: int = 0  # of all drives
 
     def meet(self, drive: int) -> None:
-        """Take a drive for new: it may not be there."""
+        """Treat a drive as new: it may not be there."""
         self.health[drive].is_new = self.has_silent = True
 
     def forget(self, drive: int) -> None:

@@ -53,14 +53,14 @@ class Planned:
 
 @dataclass(frozen=True)
 class Plan:
-    """Blocks that read a drive's registers, and the response delays, in s, at which none are quicker."""
+    """Blocks that read a drive's registers, and the response delays, in s, at which no others are quicker."""
 
     planned: tuple[Planned, ...]
     least: float  # response delay; with a shorter one more requests of fewer characters would be quicker
     most: float  # with a longer one, fewer requests of more characters
 
     def suits(self, delay: float, margin: float = 0.0) -> bool:
-        """Return True where no other plan is quicker at this response delay, give or take that part of it."""
+        """Return True where no other plan is quicker at this response delay, or within `margin` of it."""
         return self.least * (1 - margin) <= delay <= self.most * (1 + margin)
 
 
@@ -69,12 +69,12 @@ def plan(
 ) -> Plan:
     """Return the quickest plan that reads each of these registers every so many seconds.
 
-    `delay` is the drive's response delay in s, where it was measured. Registers that are read by one
-    function are read together up to the family's limit, or else the standard's, where that is quicker, also
-    across other registers that can be read, and across reserved addresses where the family's document
-    allows that. Registers of different rates never share a request: one would be read more often than it is
-    wanted. Those of a group in `read_together` that have the same rate always share one, and the blocks are
-    in the groups' order. Raises ValueError for a register that cannot be read.
+    `delay` is the drive's response delay in s, where it was measured. Registers that one function reads share
+    a request where that is quicker: up to the family's limit, else the standard's, across other registers
+    that can be read, and across reserved addresses where the family's document allows that. Registers of
+    different rates never share one: some would be read more often than they are wanted. Those of a group in
+    `read_together` that have the same rate always do, and the blocks are in the groups' order. Raises
+    ValueError for a register that cannot be read.
     """
     rates: dict[float | None, list[Register[Any]]] = {}
     for register, every in wanted:
@@ -108,7 +108,7 @@ def in_declared_order(drive: Drive, found: Iterable[Planned]) -> list[Planned]:
 def planned(
     drive: Drive, wanted: Iterable[tuple[Register[Any], float | None]], delay: float | None = None
 ) -> list[Planned]:
-    """Return the blocks of that plan."""
+    """Return the blocks of `plan`."""
     return list(plan(drive, wanted, delay).planned)
 
 
@@ -123,7 +123,8 @@ def all_requests(
 ) -> Iterator[tuple[int, tuple[Register[Any], ...], int, int]]:
     """Yield every request that may read neighbours among these registers.
 
-    Each is the number of addresses, the registers by rising address, and which of them: from and to.
+    Each is a number of addresses, all registers by rising address, and of these the first, and the first that
+    it does not read.
     """
     for neighbours in _neighbours(drive, registers):
         for end in range(1, len(neighbours.registers) + 1):
@@ -154,9 +155,9 @@ class _Neighbours:
     carrier: Carrier
     registers: tuple[Register[Any], ...]
     spans: tuple[tuple[int, int], ...]  # (first address, the one behind the last) of each
-    joined: tuple[bool, ...]  # of each and the next one: all from the one to the other may be read
-    tied: tuple[bool, ...]  # of each and the next one: a request that ends between them parts a group
-    limit: int  # that one request may read; a single register is read whole all the same
+    joined: tuple[bool, ...]  # for each and the next one: what lies between them may be read
+    tied: tuple[bool, ...]  # for each and the next one: a request that ends between them parts a group
+    limit: int  # addresses that one request may read; a single longer register is still read whole
 
     def ending_at(self, end: int) -> Iterator[tuple[int, int]]:
         """Yield (begin, count) of each request that may read registers[begin:end]."""

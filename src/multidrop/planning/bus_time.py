@@ -23,10 +23,10 @@ _FRAMES = {
 
 
 def silence(drive: Drive) -> float:
-    """Return the seconds of silence around a drive's exchanges: one bit more, for its second stop bit.
+    """Return the seconds of silence around a drive's exchanges: one bit more than it needs, for a stop bit.
 
-    ASCII frames need none. They get 1.5 characters, in which it shows whether more is to come, such as a
-    second copy of the reply, which could otherwise be taken for the next one. Modbus TCP has none.
+    ASCII frames need none. They get 1.5 characters, time enough to see whether more comes, such as a second
+    copy of the reply, which could otherwise be taken for the next one. Modbus TCP has none.
     """
     settings = drive.settings
     if drive.framing is Framing.TCP:

@@ -18,7 +18,7 @@ from multidrop.planning.blocks import Planned
 from multidrop.planning.bus_time import gap, in_order, kind, sending, silence, switches
 from multidrop.planning.schedule import TURN_SHARE, Job, Schedule
 
-LATENESS = 100e-6  # s of each exchange in which a common machine wakes up and writes the request
+LATENESS = 100e-6  # s that a common machine adds to each exchange: it wakes up and writes the request
 ENOUGH = 0.97  # of a wanted rate: it counts as kept
 LEAST_EXCHANGES = 1000  # that are scheduled
 LEAST_ROUNDS = 3
@@ -66,7 +66,7 @@ class _PredictedJob(Job):
     """A job, and its exchanges on the simulated clock."""
 
     planned: Planned
-    own: float  # s from the end of the silence to that of the reply
+    own: float  # s from the end of the silence to the end of the reply
     count: int = 0
     first_ns: int = 0
     last_ns: int = 0
@@ -91,7 +91,7 @@ def predict(
     switching: float = 0.0,
     lateness: float = LATENESS,
 ) -> Prediction:
-    """Return what a line reaches on which these are polled.
+    """Return what a line reaches when these are polled on it.
 
     `delays` are the response delays in s that were measured, of drives that have any; `switching` is the
     time in s that the port takes to change baud rate or format, as a poll has measured it; `lateness` is
@@ -130,7 +130,7 @@ def predict(
 
 
 def _rests(jobs: Iterable[_PredictedJob]) -> dict[Drive, float]:
-    """Return the seconds in which each drive can be asked all of its jobs once, given its rests."""
+    """Return the seconds that each drive needs for all of its jobs once, with its rests."""
     found: dict[Drive, float] = {}
     for job in jobs:
         drive = job.planned.drive
@@ -189,8 +189,8 @@ def _run(jobs: Sequence[_PredictedJob], switching: float) -> None:
 def prediction_metadata(exchanges: Sequence[Planned], switching: float = 0.0) -> dict[str, Any]:
     """Return the prediction for a line, and what each drive's blocks take of it, as plain numbers.
 
-    A reader of a recording holds it against what was measured. Characters are those on the wire, of a
-    reply those of a good one.
+    A reader of a recording compares it with what was measured. Characters are those on the wire; those of a
+    reply are those of a good one.
     """
     prediction = predict(exchanges, switching=switching)
     drives = dict.fromkeys(planned.drive for planned in exchanges)

@@ -1,9 +1,9 @@
 """Choose proofs: requests to a drive whose replies cannot be taken for each other's.
 
-After a time-out a reply may still come, at any time and to any request that is outstanding. The reply
-to a request that no outstanding reply could be taken for proves that all of them have come, or never
-will: a line and the path to it keep the order. Replies differ by function, by length, in Delixi's own
-protocol by parameter, and otherwise by the values that two registers are known to hold.
+After a time-out a reply may still come, at any time and to any request that is outstanding. A proof is a
+request for whose reply none of those could be taken: when that has come, all others have come too, or never
+will, because a line and the path to it keep the order. Replies differ by function, by length, in Delixi's
+own protocol by parameter, and otherwise by the values that two registers are known to hold.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ RawRange = tuple[int, int]  # the least and the most that the one register of a 
 def proofs(drive: Drive) -> list[tuple[Block, RawRange | None]]:
     """Return blocks to read from this drive, with the raw counts that the reply is known to hold.
 
-    The last one is the least likely to be polled. There is none where a family can tell no two replies apart.
+    The last one is the least likely to be polled. There are none for a family no two of whose replies differ.
     """
     known = [(Block.of(drive, [register]), counts) for register, counts in drive.known_counts().items()]
     family: Any = type(drive)

@@ -1,11 +1,11 @@
 """Decide which exchange of a line comes next. Time comes in, in ns.
 
 The line is planned ahead, up to a horizon, so that it never waits for Python. A job with a period
-has slots on its own grid, which never drifts. Of the slots that have begun the one goes first that
-ends first; where there is time for all of them, those of one kind go together. A slot that is over
-when its turn comes is counted and left out, never made up for in a burst; from then on, until the
-line has caught up, the job goes first that has waited longest, so that each gets a part. Jobs without
-a period fill what is left, each once in a round, and have a share of the line even where nothing is
+has slots on its own grid, which never drifts. Of the slots that have begun, the one that ends first
+goes first; where there is time for all of them, those of one kind go together. A slot that is over
+when its turn comes is counted and left out, never made up for in a burst. From then on, until the
+line has caught up, the job that has waited longest goes first, so that each gets a part. Jobs without
+a period fill what is left, each once in a round; a share of the line is theirs even where nothing is
 left. Drives that stay silent are left to `BackOff`.
 """
 
@@ -19,7 +19,7 @@ from typing import Generic, NamedTuple, TypeVar
 from multidrop.planning.back_off import BackOff, Health
 
 TURN_SHARE = 0.05  # of the line, for jobs without a period, at least
-CREDIT_NS = 50_000_000  # of it, that they use up in advance
+CREDIT_NS = 50_000_000  # of that share, which they use up in advance
 NEVER_NS = 1 << 63
 
 
@@ -33,8 +33,8 @@ class Job:
     drive: int
     period_ns: int | None
     duration_ns: int
-    silence_ns: int = 0  # of its duration; it passes also while the line has nothing to do
-    interval_ns: int = 0  # from the end of an exchange with its drive to the next request
+    silence_ns: int = 0  # a part of its duration, which passes also while the line has nothing to do
+    interval_ns: int = 0  # from the end of an exchange to the next request to its drive
     kind: Hashable = None
     due_ns: int = 0
     taken_ns: int = 0
@@ -126,7 +126,7 @@ class Schedule(Generic[J]):
     # ---- the next jobs ----
 
     def cycle(self, now_ns: int) -> list[J]:
-        """Return the round where it is all that there is to do: no slots, and all drives answer."""
+        """Return the round where nothing else is to be done: there are no slots, and all drives answer."""
         if self.back_off.may_sleep(now_ns) or self._waiting or self._begun or self._ready:
             return []
         return self._round[self._next :] + self._round[: self._next]
@@ -230,7 +230,7 @@ class Schedule(Generic[J]):
         return not self.back_off.is_asleep(job.drive, at_ns) and not self._health[job.drive].is_pending
 
     def _take(self, job: J, at_ns: int) -> Turn[J]:
-        """Take a job at this time; of its slots the present one, and those that are over are left out."""
+        """Take a job for its present slot; slots of it that are over are counted and left out."""
         health = self._health[job.drive]
         health.is_pending = health.is_new
         ready_ns = self._ready.get(job.drive, 0)
@@ -276,5 +276,5 @@ class Schedule(Generic[J]):
         return passed
 
     def pass_all(self, now_ns: int) -> list[tuple[J, int]]:
-        """Do the same; jobs without a period have one slot now."""
+        """Let pass what `pass_slots` does, and one slot now of each job without a period."""
         return [*((job, now_ns) for job in self._round), *self.pass_slots(now_ns)]

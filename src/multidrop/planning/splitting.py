@@ -11,7 +11,7 @@ from multidrop.planning.blocks import Block
 
 
 def halves(drive: Drive, block: Block) -> tuple[Block, ...]:
-    """Return two blocks that read the same registers; none where one of them would read all the same.
+    """Return two blocks that read these registers between them; none where one would still read them all.
 
     Registers at the same addresses stay together, and so do those of a group in `read_together`. Splitting
     again and again ends: of n registers there are at most 2 n - 1 blocks, the whole included.

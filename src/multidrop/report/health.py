@@ -24,7 +24,7 @@ from multidrop.report.style import (
     set_title,
 )
 
-MOST_REASONS = 6  # in a picture; the rest are one
+MOST_REASONS = 6  # in a picture; the rest are shown as one
 LEAST_IN_BIN = 20  # values, before a share of misses means something
 BINS = 12  # of the output frequency
 FREQUENCY = "output_frequency"
@@ -141,7 +141,7 @@ def miss_shares(recording: Recording, drive: str) -> tuple[Array, Array] | None:
     """Return output frequencies in Hz, and the share of the drive's values missed near each of them.
 
     The frequency at a miss is the last one that was read. Values that were not asked for do not count.
-    None where nothing was missed, and where the drive has no frequency or keeps one.
+    None where nothing was missed, and where the drive has no frequency or always the same.
     """
     (frequency, *_) = (*recording.of(drive, FREQUENCY), None)
     reasons = [reason for reason in reasons_of(recording, drive) if not reason.startswith(UNASKED)]

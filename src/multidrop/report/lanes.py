@@ -40,7 +40,7 @@ class Lane:
 
 
 def lanes_of(series: Sequence[Series]) -> tuple[list[Lane], int]:
-    """Return the lanes of a panel, and how many had no room, first of them bits that were never set."""
+    """Return the lanes of a panel, and how many had no room: bits that were never set are left out first."""
     found = list(chain.from_iterable(map(_lanes, series)))
     if len(found) > MOST_LANES:
         found = [lane for lane in found if lane.state] or found

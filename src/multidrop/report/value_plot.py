@@ -44,7 +44,7 @@ FEW_POINTS = 200  # each has a dot of its own
 FAULTS = "fault"
 
 CURVES_INCHES = 1.9
-Panel = tuple[str, str, bool]  # register, unit, has its counts names
+Panel = tuple[str, str, bool]  # register, unit, and whether its counts have names
 
 
 def plot(

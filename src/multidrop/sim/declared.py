@@ -1,8 +1,8 @@
 """Simulated drives of families' files: a motor that obeys the words of the file's verbs.
 
-The model is the file's own: a word does what the verb that sends it is called, and status registers show the
-looks of [state], from what [shows] says of a drive that stands. So it proves that a file agrees with itself,
-and nothing about the drive that the file describes.
+The model is the file's own: a word does what the name of the verb that sends it says, and status registers
+show the looks of [state], beginning with what [shows] says of a drive that stands. So it proves that a file
+agrees with itself, and nothing about the drive that the file describes.
 """
 
 from __future__ import annotations
@@ -31,18 +31,18 @@ class _Sent(NamedTuple):
 
 
 class SimulatedDeclared(MotorDrive):
-    """A drive of a family's file. The words of a start count in their order alone; others do nothing."""
+    """A drive of a family's file. The words of a start count only in their order; others do nothing."""
 
     def prepare(self) -> None:
         self.declared: DeclaredVerbs = type(self.drive).declared_verbs  # type: ignore[attr-defined]
-        self.unknown_words = 0  # that no verb sends
+        self.unknown_words = 0  # those that no verb sends
         self._sequences = {verb: _sequence(steps) for verb, steps in self.declared.steps.items()}
         self._controls = {sent.step.register for sequence in self._sequences.values() for sent in sequence}
         self._reached: dict[str, int] = {}  # by verb, the words of its sequence that came
         self._ready: Look | None = None  # shown while it stands
         for name, value in self.declared.shows.get(STANDING, {}).items():
             self.memory.set(self.drive.register(name), value)
-        self._following: dict[MemoryCell, list[Register[Any]]] = {}  # that show what the motor does
+        self._following: dict[MemoryCell, list[Register[Any]]] = {}  # those that show what the motor does
         for name in self._shown():
             register = self.drive.register(name)
             if name not in MONITORS and not register.writable:
@@ -62,7 +62,7 @@ class SimulatedDeclared(MotorDrive):
         self.unknown_words += not any(known)
 
     def _advance(self, verb: str, name: str, word: int) -> bool:
-        """Carry out the word where it is the verb's next one, or its first; True where it has this word."""
+        """Carry out the word if it is the verb's next or first one; return True where the verb has it."""
         sequence = self._sequences[verb]
         places = [
             (at, direction)

@@ -18,9 +18,9 @@ EXTERNAL_FAULT = 49  # EF
 
 
 class SimulatedDelta(ProfileDrive):
-    """Delta: a run that comes in a fault is forgotten. The reset bit is held, and resets while it is set.
+    """Delta: a run that comes in a fault is forgotten. The reset bit resets for as long as it is set.
 
-    The manuals do not say that it is: so a client that leaves it set is found out.
+    The manuals do not say so; it is simulated to find a client that leaves the bit set.
     """
 
     def pass_time(self, now: float) -> None:

@@ -40,7 +40,7 @@ class DriveCounters:
     """Counts of one drive since it was made."""
 
     requests: int = 0  # addressed to it alone
-    replies: int = 0  # of which refusals
+    replies: int = 0  # refusals too
     refusals: int = 0
     broadcasts: int = 0
     damaged: int = 0  # frames with its address

@@ -1,4 +1,4 @@
-"""EncodedDrive: a drive whose values name their source, to prove that none is misattributed."""
+"""EncodedDrive: a drive whose values name their source, so that a misattributed one is found."""
 
 from __future__ import annotations
 

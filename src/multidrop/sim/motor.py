@@ -18,7 +18,7 @@ BRAKING_TORQUE = 0.3
 SLIP = 0.04  # at rated torque
 HEATING = 35.0  # degrees above ambient at rated current
 WARMING_TIME = 120.0  # s
-RUN_OUT_TIME = 10.0  # s, of the shaft without voltage, from the rated frequency
+RUN_OUT_TIME = 10.0  # s in which the shaft runs out without voltage, from the rated frequency
 REGENERATION = 0.06  # rise of the DC bus while braking
 SAG = 0.02  # fall of the DC bus at rated current
 

@@ -1,4 +1,4 @@
-"""Log from a thread of its own: a handler, whose disk may hang, holds up no stop and no port."""
+"""Log from a thread of its own, so that a handler whose disk hangs holds up no stop and no port."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def log_aside(logger: logging.Logger, level: int, text: str, *details: object) -
 
 
 def flush(seconds: float) -> None:
-    """Wait until all is logged, for at most so long."""
+    """Wait until all is logged, for `seconds` s at most."""
     if _aside.has_begun:
         done = threading.Event()
         _aside.put(done)

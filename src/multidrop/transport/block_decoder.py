@@ -23,7 +23,7 @@ _CODES = {
 
 
 def _is_plain(register: Register[Any]) -> bool:
-    """Return True where any count of whole words is a value: count times multiplier, plus addend, divided."""
+    """Return True where every count is a value, with no more than a multiplier, an addend and a divisor."""
     coding = register.coding
     is_whole_number = coding.number_format in _CODES and coding.part is None and not ORDERS[coding.order]
     return is_whole_number and not coding.invalid_patterns and register.scaled_by is None
@@ -46,7 +46,7 @@ class BlockDecoder:
             end = at + WORDS[number_format]
             plain.append(register)
         self._numbers = Struct(codes)
-        # side by side, and without the registers: a reading thread comes to them with cold caches
+        # side by side, and not in the registers: a thread that reads finds its caches cold
         self.plain = tuple(register.name for register in plain)
         self._multipliers, self._addends, self._divisors = (
             tuple(register.coding.factors[which] for register in plain) for which in range(3)
@@ -88,5 +88,5 @@ def _shared(registers: tuple[Register[Any], ...], start: int) -> BlockDecoder:
 
 
 def decoder_of(block: Block) -> BlockDecoder:
-    """Return the decoder of a block, which all drives of a kind share."""
+    """Return the block's decoder, which all drives of a kind share."""
     return _shared(block.registers, block.start)

@@ -25,8 +25,8 @@ PORT_FAILURES = (OSError, _terminal_error, serial.SerialException, ValueError, E
 MOST_STALL_MS = 750  # of a network, after which it is sent nothing more
 MOST_AGE = 0.25  # s, of a request that leaves
 MOST_CHUNK = 1024  # bytes that the core reads at once
-LOOK_EVERY = 0.1  # s, between looks of a thread whether the bridge is closed
-CLOSING_TIME = 2.0  # s, that a thread which the port holds up is waited for
+LOOK_EVERY = 0.1  # s, after which a thread looks again whether the bridge is closed
+CLOSING_TIME = 2.0  # s that closing waits for a thread which the port holds up
 
 # On Linux such a socket keeps requests apart, and stamps each with the time at which the core wrote it.
 _STAMPED = sys.platform == "linux"
@@ -73,8 +73,8 @@ def _pair() -> tuple[socket.socket, socket.socket]:
 class Bridge:
     """A descriptor for a port that has none: a socket pair, and a thread for each direction.
 
-    No request waits in it: one that is older than MOST_AGE when its thread takes it was given up by the
-    core, because the process stood still or the port held an earlier one up, and is discarded.
+    No request waits in it: the core has given up one that is older than MOST_AGE when its thread takes it,
+    because the process stood still or the port held an earlier one up. Such a request is discarded.
     """
 
     def __init__(self, port: serial.SerialBase) -> None:

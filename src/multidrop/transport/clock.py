@@ -26,5 +26,5 @@ else:
 
 
 def utc_ns() -> int:
-    """Return the same moment as UTC in ns."""
+    """Return the present time as UTC in ns."""
     return int(now_ns() + utc_minus_monotonic_ns())

@@ -1,7 +1,6 @@
 """Tell Modbus TCP (tcp://) from RTU over TCP (socket://), which are easily taken for each other.
 
-A gateway is set to the one or to the other, and is silent, or says what makes no sense, when asked in the
-other.
+A gateway is set to one of the two. Asked in the other, it is silent or replies with nonsense.
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ _SPOKEN = {"socket": "RTU over TCP", "tcp": "Modbus TCP"}
 
 
 def other_port(port: str) -> str:
-    """Return the same place in the other way; "" for a port that is neither."""
+    """Return the port for the other of the two at the same place; "" for a port that has neither."""
     url = urlsplit(port)
     if url.scheme not in _OTHER:
         return ""
@@ -27,12 +26,12 @@ def other_port(port: str) -> str:
 
 
 def spoken_on(port: str) -> str:
-    """Return the name of what such a port carries."""
+    """Return the name of what such a port speaks."""
     return _SPOKEN[urlsplit(port).scheme]
 
 
 def mixed_up(port: str, received: bytes) -> str:
-    """Return advice where these bytes, received on this port, have the shape of the other way; else ""."""
+    """Return advice where bytes received on this port have the shape of the other of the two; else ""."""
     other = other_port(port)
     is_shaped = other and (_is_tcp(received) if other.startswith("tcp") else _is_rtu(received))
     if not is_shaped:

@@ -16,12 +16,12 @@ _PEER = re.compile(r"(\[[^\]]+\]|[\w.-]+):\d+")
 
 
 def com_name(name: str) -> str:
-    r"""Return a COM port's name as Windows lists it: of com5 and \\.\COM5 alike COM5."""
+    r"""Return a COM port's name as Windows lists it: COM5 for com5, and for \\.\COM5."""
     return name.removeprefix("\\\\.\\").upper()
 
 
 def of_device(path: str) -> str:
-    """Return the link by the adapter's serial number, or where there is none the path with links followed."""
+    """Return the link by the adapter's serial number; where there is none, the path with links followed."""
     if sys.platform == "win32":
         return com_name(path)
     device = os.path.realpath(path)

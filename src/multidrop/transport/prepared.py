@@ -16,7 +16,7 @@ from multidrop.planning.splitting import may_be_too_long
 from multidrop.transport.block_decoder import decoder_of
 
 MOST_PREPARED = 256  # sets of registers, and blocks, of one drive; the least recently read ones go
-NO_ROWS = core.RowLayout(0, [])  # of a command: a poll's summary counts the values of its rows alone
+NO_ROWS = core.RowLayout(0, [])  # for commands: a poll's summary counts only values that have rows
 
 
 def make_exchange(
@@ -66,7 +66,7 @@ class ReadPlan(NamedTuple):
 
 
 class PreparedReads:
-    """Reads of one drive, made once and kept while all that they depend on stays as it was."""
+    """Reads of one drive, made once and kept while nothing that they depend on changes."""
 
     def __init__(self, drive: Drive, peer: Peer, made_for: tuple[object, ...]) -> None:
         self.made_for = made_for

@@ -206,7 +206,7 @@ class LineMeter:
         self._reset_at = self._now()
 
     def freeze(self, overruns: int | None) -> None:
-        """Count nothing more: the line is closed, which had lost so many characters until then."""
+        """Count nothing more: the line is closed, and had lost `overruns` characters until then."""
         self._frozen = self._frozen or self._count(overruns)
 
     def _now(self) -> LineStatistics:
@@ -239,7 +239,7 @@ def _difference(now: Counters, earlier: Counters) -> Counters:
         return now
     found = Counters._make(map(sub, now, earlier))
     longest = now.longest_ns
-    if longest == earlier.longest_ns:  # it may have been before
+    if longest == earlier.longest_ns:  # that one may have been before the span
         longest = min(longest, delay_edge(max(found.delays, default=-1) + 1))
     return found._replace(longest_ns=longest, timeout_ns=now.timeout_ns)
 

@@ -7,7 +7,7 @@ from contextlib import suppress
 
 
 class WakeUp:
-    """A descriptor that is readable from `set` to `clear`: of a socket, since Windows waits for no other."""
+    """A descriptor that is readable from `set` to `clear`: a socket's, as Windows can wait for no other."""
 
     def __init__(self) -> None:
         self._reader, self._writer = socket.socketpair()
