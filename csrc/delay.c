@@ -13,7 +13,7 @@ int64_t md_look_ns(const struct md_drive *drive, int64_t character_ns)
 
 /* ---- how long to wait ---- */
 
-/* The engine's thread learns it, and others read it meanwhile. */
+/* The engine's thread learns these times, and others read them meanwhile. */
 static int64_t learnt(const int64_t *ns)
 {
     return __atomic_load_n(ns, __ATOMIC_RELAXED);

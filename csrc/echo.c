@@ -34,7 +34,7 @@ void md_echo_learn(struct md_line *line, size_t reply_at)
             learn(line, MD_ECHO);
 }
 
-/* Nobody else says it again and no more, but the drive itself where a copy is its reply. */
+/* Only an adapter repeats the request and sends no more, or the drive itself where a copy is its reply. */
 int md_echo_learn_alone(struct md_line *line, int is_reply)
 {
     int is_doubtful = is_reply && line->echo == MD_ECHO_UNKNOWN;

@@ -12,8 +12,8 @@ static const int64_t WORTH_WAITING = 250000; /* ns; before a shorter time a slee
 
 /* ---- the end of an exchange ---- */
 
-/* A network needs none. Where replies have no ids to be told by, it shows whether more is to come, such as a
- * second copy, which could otherwise be taken for the next reply. */
+/* Return the silence around an exchange. A network needs none, but where replies have no ids it shows whether
+ * more is to come, such as a second copy, which could otherwise be taken for the next reply. */
 static int64_t silence_of(const struct md_line *line, const struct md_exchange *exchange)
 {
     enum { CHARACTERS = 4 };
@@ -57,7 +57,7 @@ void md_line_init(struct md_line *line, int64_t now_ns)
     *line = (struct md_line){.state = MD_IDLE, .quiet_ns = now_ns, .transaction = (uint16_t)(now_ns >> 16)};
 }
 
-/* Find the request's bytes: an exchange keeps short ones. 0, or a result. */
+/* Find the request's bytes: an exchange keeps short ones. Return 0, or why there are none. */
 static int load(struct md_line *line, const struct md_exchange *exchange)
 {
     int is_tcp = exchange->framing == MD_TCP;
@@ -195,7 +195,7 @@ static void forget(struct md_line *line)
     memmove(line->rx, line->rx + GONE, line->rx_len);
 }
 
-/* Take in as much as there is room for; how much. */
+/* Take in as much as there is room for, and return how much that is. */
 static size_t keep(struct md_line *line, const uint8_t *bytes, size_t len)
 {
     if (line->rx_len == sizeof line->rx)

@@ -55,7 +55,7 @@ struct md_line {
     int64_t quiet_ns;    /* the line's last activity */
     int64_t silence_ns;  /* demanded after it */
     int64_t listened_ns; /* nothing but a stop is sent before then; 0: the line is not listened to */
-    int64_t listen_ns;   /* so long from the last byte that came */
+    int64_t listen_ns;   /* how long from the last byte that came */
     int64_t wake_ns;
     int64_t give_up_ns;  /* end of the wait for a babbling line to fall silent, or for the reply */
     int64_t begun_by_ns; /* the reply has begun by then, or it does not come in time */

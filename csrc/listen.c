@@ -1,8 +1,8 @@
-/* Listening before the first request: a line has one master, and who comes finds out whether it is alone.
+/* Listening before the first request: a line has one master, and a new one finds out whether it is alone.
  * Bytes that come while nothing was asked are replies to another master, or its requests. Each of them begins
  * the wait anew, so that nothing is asked before the line has been silent for long enough.
- * The wait is the guard at least: a master before us that stood still is ended by its own timer meanwhile. On
- * a connection of Modbus TCP nobody else is heard, and the guard alone is waited for.
+ * The wait lasts for the guard at least: meanwhile a master before us that stands still is ended by its own
+ * timer. On a connection of Modbus TCP no other master can be heard, and only the guard is waited for.
  *
  * A stop is not held up: whoever else is there, the motor must stop. */
 #include "line.h"

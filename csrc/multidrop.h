@@ -13,13 +13,13 @@ enum {
     MD_MOST_DATA = 250,       /* data bytes of a frame: 125 registers */
     MD_MOST_FRAME = 513,      /* ':', 2 * 255 hex digits, CR, LF */
     MD_MOST_TCP = 260,        /* a frame of Modbus TCP */
-    MD_KEPT_FRAME = 24,       /* a frame that its exchange keeps: of any read */
+    MD_KEPT_FRAME = 24,       /* the longest frame that its exchange keeps: that of any read */
     MD_STATUSES = 21,         /* of a row without an exception */
     MD_EXCEPTION_CODES = 256,
     MD_DELAY_BUCKETS = 128,
     MD_MOST_OWED = 12,        /* requests of a drive whose replies may still come */
     MD_MOST_PROOFS = 4,
-    MD_TIMES_KEPT = 6         /* of the same request */
+    MD_TIMES_KEPT = 6         /* when the same request was sent */
 };
 
 /* ---- checksum.c: return the checksum ---- */
@@ -129,7 +129,7 @@ struct md_unanswered {
     uint8_t address;
 };
 
-/* The same in parts, and requests whose replies may still come. */
+/* More counts of a drive, and its requests whose replies may still come. */
 struct md_history {
     uint64_t ended[MD_STATUSES];       /* exchanges without a reply, by status; MD_OK: broadcasts */
     uint64_t missed[MD_STATUSES];      /* values, by status */
@@ -148,7 +148,8 @@ struct md_drive {
     int64_t patience_ns;            /* a longer time-out, learnt from late replies */
     int64_t late_until_ns;          /* until then a late reply may come, in any order */
     int64_t answered_ns;            /* requests that left before then are answered, or never will be */
-    int64_t interval_ns, ready_ns;  /* from the end of an exchange to its next request; not before then */
+    int64_t interval_ns;            /* from the end of an exchange to its next request, at least */
+    int64_t ready_ns;               /* no request leaves for it before then */
     uint32_t failures;              /* in a row */
     uint32_t owed_count, unanswered_count, proof_count;
     const struct md_exchange *const *proofs; /* reads whose replies differ from others' */
@@ -260,9 +261,9 @@ struct md_engine *md_engine_start(void); /* the thread for every line of the pro
  * enum md_transactions. `room` for queued exchanges is a power of two. */
 struct md_port *md_port_open(struct md_engine *engine, int fd, int must_take, int transactions,
                              unsigned room);
-/* Send only while the mastership holds, which must outlive the port: looked at right before each write(2).
- * Where it has not held since the last request, and before the first one, the line is listened to, for the
- * mastership's guard at least; a stop is not held up. */
+/* Send only while the mastership holds: it is looked at right before each write(2), and must outlive the
+ * port. Before the first request, and where it has not held all the time since the last one, the line is
+ * listened to, for the mastership's guard at least; a stop is not held up. */
 void md_port_fence(struct md_port *port, struct md_mastership *mastership);
 /* Say who switches between sending and receiving, before anything is sent; return 0 or -errno. */
 int md_port_rs485(struct md_port *port, int mode);
@@ -288,7 +289,7 @@ void md_port_report(struct md_port *port, struct md_row_queue *row_queue, uint32
 int md_port_submit(struct md_port *port, const struct md_exchange *const *exchanges,
                    const int64_t *not_before_ns, int n);
 /* Repeat these in turn while nothing that is queued is due, until they are replaced, the port is lost, or one
- * of them could not be sent. Return which one of those before would have been next. */
+ * of them could not be sent. Return which one of those that they replace would have been next. */
 unsigned md_port_repeat(struct md_port *port, const struct md_exchange *const *exchanges, unsigned n);
 const struct md_progress *md_port_progress(struct md_port *port);
 /* Count a stop: no urgent exchange made before it begins to leave any more. */

@@ -1,5 +1,5 @@
-/* The requests that go before an exchange where they are needed: proofs that no late reply is taken for its
- * own, and an echo probe. */
+/* The requests that go before an exchange where it needs them: proofs, by which no late reply is taken for
+ * its own, and an echo probe. */
 #include "turn.h"
 
 enum { MOST_PROOFS_SENT = 12 }; /* before one exchange */

@@ -63,9 +63,9 @@ static int may_send(struct md_port *port)
     return !md_listen_begin(line, md_now_ns(), port->mastership->guard_ns);
 }
 
-/* Write; 1: the port took something, or there is something else to do. The request leaves when it is written;
- * where the thread was held up just then, perhaps afterwards: from too early a time on its reply, and a late
- * one, would be waited for too short. */
+/* Write; 1: the port took something, or there is something else to do. The request is taken to leave when the
+ * write begins. Where the thread was held up meanwhile, it is taken to leave when the write ends: a time too
+ * early would make the waits for its reply, and for a late one, too short. */
 static int write_request(struct md_port *port, int64_t begun_ns)
 {
     struct md_line *line = &port->turn.line;

@@ -21,6 +21,15 @@ static void call(struct md_turn *turn)
         md_row_queue_call(turn->row_queue, turn->number);
 }
 
+/* Return 1 when the time has come; else say when it comes. */
+static int is_time(int64_t from_ns, int64_t *wake_ns, int64_t now_ns)
+{
+    if (now_ns >= from_ns)
+        return 1;
+    *wake_ns = sooner(*wake_ns, from_ns);
+    return 0;
+}
+
 /* ---- the beginning of an exchange ---- */
 
 /* Return when its drive may be asked. A broadcast waits for none. */
@@ -29,7 +38,7 @@ static int64_t ready_ns(const struct md_exchange *exchange)
     return exchange->request.address ? exchange->drive->ready_ns : 0;
 }
 
-/* Take it up, or what goes before it: then 0. */
+/* Begin the exchange, or what must go before it: then return 0. */
 static int begin(struct md_turn *turn, int whose, const struct md_exchange *exchange,
                  struct md_completion *completion, int64_t now_ns)
 {
@@ -43,7 +52,7 @@ static int begin(struct md_turn *turn, int whose, const struct md_exchange *exch
 
 /* ---- urgent requests ---- */
 
-/* Nobody wants any more what is under way, and nothing of it has left. */
+/* The urgent exchange under way is not wanted any more, and nothing of it has left. */
 static int is_expired(const struct md_turn *turn, int64_t now_ns)
 {
     if (turn->whose != MD_URGENT || turn->line.tx_at > 0)
@@ -60,30 +69,22 @@ static struct md_urgent *find_urgent(struct md_turn *turn, int *is_held, int64_t
 {
     for (struct md_urgent **at = &turn->urgent; *at; at = &(*at)->next) {
         struct md_urgent *urgent = *at;
-        int64_t from_ns = later(urgent->not_before_ns, ready_ns(urgent->exchange));
         if (*is_held && !urgent->exchange->insists)
             return NULL;
-        if (now_ns >= from_ns) {
+        if (is_time(later(urgent->not_before_ns, ready_ns(urgent->exchange)), wake_ns, now_ns)) {
             *at = urgent->next;
             urgent->next = turn->urgent;
             turn->urgent = urgent;
             return urgent;
         }
-        *wake_ns = sooner(*wake_ns, from_ns);
         *is_held |= urgent->exchange->insists;
     }
     return NULL;
 }
 
-static void take_urgent(struct md_turn *turn, struct md_urgent *urgent, int64_t now_ns)
-{
-    if (begin(turn, MD_URGENT, urgent->exchange, urgent->completion, now_ns) && is_expired(turn, now_ns))
-        md_line_abandon(&turn->line, MD_EXPIRED, 0);
-}
-
 /* ---- what is polled ---- */
 
-/* The line is so late that the same exchange's next slot is due already: none is made up for. */
+/* The line is so late that the same exchange's next slot is due already: then this one is left out. */
 static int is_over(const struct md_turn *turn, const struct md_slot *slot, int64_t now_ns)
 {
     int64_t period_ns = slot->exchange->period_ns;
@@ -98,15 +99,12 @@ static int is_over(const struct md_turn *turn, const struct md_slot *slot, int64
     return 0;
 }
 
-/* Take up what is queued, or say when; 1: there is something to carry out now. */
+/* Begin what is queued, or say when; 1: there is something to carry out now. */
 static int take_queued(struct md_turn *turn, int64_t *wake_ns, int64_t now_ns)
 {
     const struct md_slot *slot = &turn->slots[turn->progress.done & (turn->room - 1)];
-    int64_t from_ns = later(slot->not_before_ns, ready_ns(slot->exchange));
-    if (now_ns < from_ns) {
-        *wake_ns = sooner(*wake_ns, from_ns);
+    if (!is_time(later(slot->not_before_ns, ready_ns(slot->exchange)), wake_ns, now_ns))
         return 0;
-    }
     if (begin(turn, MD_QUEUED, slot->exchange, &turn->completion, now_ns) && is_over(turn, slot, now_ns))
         md_line_abandon(&turn->line, MD_EXPIRED, 0);
     return 1;
@@ -118,13 +116,8 @@ static int take_polled(struct md_turn *turn, int64_t *wake_ns, int64_t now_ns)
         return 0;
     if (pending(turn) && take_queued(turn, wake_ns, now_ns))
         return 1;
-    if (!turn->round_len)
+    if (!turn->round_len || !is_time(ready_ns(turn->round[turn->round_at]), wake_ns, now_ns))
         return 0;
-    int64_t from_ns = ready_ns(turn->round[turn->round_at]);
-    if (now_ns < from_ns) {
-        *wake_ns = sooner(*wake_ns, from_ns);
-        return 0;
-    }
     if (begin(turn, MD_REPEATED, turn->round[turn->round_at], &turn->completion, now_ns))
         turn->round_at = turn->round_at + 1 < turn->round_len ? turn->round_at + 1 : 0;
     return 1;
@@ -170,7 +163,7 @@ static int is_polls_turn(const struct md_turn *turn)
     return !is_stop_waiting(turn) && turn->owed_ns > 0 && turn->last == MD_URGENT;
 }
 
-/* Take up what comes next, or say when; 1: there is something to carry out now. */
+/* Begin what comes next, or say when; 1: there is something to carry out now. */
 static int take(struct md_turn *turn, int64_t *wake_ns, int64_t now_ns)
 {
     int is_held = 0;
@@ -179,7 +172,8 @@ static int take(struct md_turn *turn, int64_t *wake_ns, int64_t now_ns)
     if (!is_held && (!urgent || is_polls_turn(turn)) && take_polled(turn, wake_ns, now_ns))
         return 1;
     if (urgent) {
-        take_urgent(turn, urgent, now_ns);
+        if (begin(turn, MD_URGENT, urgent->exchange, urgent->completion, now_ns) && is_expired(turn, now_ns))
+            md_line_abandon(&turn->line, MD_EXPIRED, 0);
         return 1;
     }
     if (!turn->is_ending && !pending(turn)) {
@@ -190,7 +184,7 @@ static int take(struct md_turn *turn, int64_t *wake_ns, int64_t now_ns)
     return 0;
 }
 
-/* Hand over what became of an exchange that nobody waits for. */
+/* Hand over the result of an exchange that nobody waits for. */
 static void report(struct md_turn *turn)
 {
     const struct md_exchange *exchange = turn->line.exchange;
@@ -202,7 +196,7 @@ static void report(struct md_turn *turn)
         call(turn);
 }
 
-/* Have the repeated exchange that was taken up last as the next one again. */
+/* Go back to the repeated exchange that was begun last: it is the next one again. */
 static void step_back(struct md_turn *turn)
 {
     if (turn->round_len)
@@ -243,7 +237,7 @@ static void finish(struct md_turn *turn)
     }
 }
 
-/* A stop does not wait for an exchange that only listens so far. That one has its turn again. */
+/* A stop does not wait for an exchange that so far only listens: that one has its turn again later. */
 static void give_way(struct md_turn *turn)
 {
     int whose = turn->whose;
@@ -290,7 +284,8 @@ void md_turn_lose(struct md_turn *turn, int error)
     stop_repeating(turn);
 }
 
-/* The client learns whether a request had begun to leave. What was counted just now has its rows. */
+/* A client that waits learns whether its request had begun to leave. An exchange that is over and counted has
+ * its rows. */
 void md_turn_close(struct md_turn *turn)
 {
     int is_told = turn->whose == MD_URGENT || turn->is_ending || turn->line.state == MD_IDLE;

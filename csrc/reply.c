@@ -159,8 +159,6 @@ static struct md_ending end_in_doubt(struct md_line *line, size_t at, int used,
 
 /* ---- the search ---- */
 
-enum found { NOTHING, SKIPPED, ENDED }; /* SKIPPED: look at the same place again, or behind an echo */
-
 int md_reply_judge(struct md_line *line, size_t at, int used, const struct md_message *reply, int64_t now_ns,
                    struct md_ending *ending)
 {
@@ -184,18 +182,6 @@ int md_reply_judge(struct md_line *line, size_t at, int used, const struct md_me
     return 0;
 }
 
-/* The bytes there could be the reply: decide whether they are its echo or a late reply instead. */
-static enum found judge(struct md_line *line, size_t *at, int used, const struct md_message *reply,
-                        int64_t now_ns, struct md_ending *ending)
-{
-    if (line->echo_due && md_echo_is_copy(line, *at)) {
-        line->echo_due = 0; /* the adapter's, or it cannot be told from that */
-        *at += line->tx_len;
-        return SKIPPED;
-    }
-    return md_reply_judge(line, *at, used, reply, now_ns, ending) ? ENDED : SKIPPED;
-}
-
 /* Look at every place where the reply may still begin. A late reply is looked for only where what precedes it
  * cannot be the reply's beginning: it may be the inside of the reply. */
 int md_reply_find(struct md_line *line, int64_t now_ns, struct md_ending *ending)
@@ -206,14 +192,16 @@ int md_reply_find(struct md_line *line, int64_t now_ns, struct md_ending *ending
         int used = md_reply_parse(line, at, &reply);
         if (used > 0 && line->echo_due && md_echo_may_follow(line, at))
             used = MD_INCOMPLETE;
-        if (used > 0) {
-            size_t judged_at = at;
-            if (judge(line, &at, used, &reply, now_ns, ending) == ENDED)
-                return 1;
-            if (at > judged_at)
-                first_open = SIZE_MAX;
+        if (used > 0 && line->echo_due && md_echo_is_copy(line, at)) {
+            line->echo_due = 0; /* the adapter's, or it cannot be told from that */
+            at += line->tx_len;
+            first_open = SIZE_MAX;
             continue;
         }
+        if (used > 0 && md_reply_judge(line, at, used, &reply, now_ns, ending))
+            return 1;
+        if (used > 0) /* a late reply was cut out there */
+            continue;
         if (used != MD_INCOMPLETE && first_open == SIZE_MAX)
             used = md_late_take(line, at, now_ns, NULL);
         if (used > 0) {

@@ -131,24 +131,6 @@ static struct md_columns *begin_chunk(struct md_row_queue *queue)
     return chunk;
 }
 
-/* Have the places of the rows after the next ones brought nearer: unlocking would wait for them. */
-static void prefetch(const struct md_columns *chunk, size_t count)
-{
-    enum { CACHE_LINE = 64, NUMBERS = CACHE_LINE / sizeof(int64_t) };
-    size_t first = chunk->rows + count;
-    if (chunk->room < first + count)
-        return;
-    for (size_t row = first; row < first + count; row += NUMBERS) {
-        __builtin_prefetch(chunk->time + row, 1);
-        __builtin_prefetch(chunk->sent + row, 1);
-        __builtin_prefetch(chunk->uncertainty + row, 1);
-        __builtin_prefetch(chunk->value + row, 1);
-    }
-    __builtin_prefetch(chunk->drive + first, 1);
-    __builtin_prefetch(chunk->reg + first, 1);
-    __builtin_prefetch(chunk->status + first, 1);
-}
-
 void md_row_queue_add(struct md_row_queue *queue, const struct md_block *block,
                       const struct md_completion *completion)
 {
@@ -162,8 +144,6 @@ void md_row_queue_add(struct md_row_queue *queue, const struct md_block *block,
         if (!chunk || !md_columns_add(chunk, block, completion, queue->utc_minus_monotonic_ns))
             queue->dropped += (uint64_t)block->count;
     }
-    if (chunk)
-        prefetch(chunk, (size_t)block->count);
     pthread_mutex_unlock(&queue->mutex);
 }
 
