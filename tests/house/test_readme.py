@@ -28,6 +28,10 @@ def test_it_is_short() -> None:
     assert len(README.splitlines()) <= 120
 
 
+def test_the_benchmarks_page_is_short() -> None:
+    assert len((ROOT / "bench" / "README.md").read_text("utf-8").splitlines()) <= 80
+
+
 def test_setting_up_is_what_ci_does() -> None:
     patterns = re.findall(r"grep -m1 -E '([^']+)' README\.md", (ROOT / ".ci" / "run").read_text("utf-8"))
     found = [next(line for line in README.splitlines() if re.search(pattern, line)) for pattern in patterns]

@@ -62,6 +62,15 @@ CLIENTS = {  # rooms that use public names alone, and the commands that import t
         "cli/support/nats.py",
     },
 }
+MOST_LINES_OF_A_FILE = 300
+LONGER = {  # and why each is not parted
+    "src/multidrop/bus.py": "the public methods of one class, most of it their documentation",
+    "src/multidrop/drives/innovert_ibd.py": "the tables of a manual",
+    "src/multidrop/drives/invt_che.py": "the tables of a manual",
+    "src/multidrop/drives/yd1000.py": "the tables of a manual",
+    "csrc/body.c": "one table of functions, and all that reads it",
+    "csrc/multidrop.h": "the contract with Python",
+}
 IMPORT_OF_A_TEST = re.compile(r"\b(import|from)\b.*\btest_")
 
 
@@ -158,6 +167,15 @@ def _is_public(name: str, client: str) -> bool:
 def test_its_commands_alone_import_a_client(client: str) -> None:
     found = {str(path.relative_to(PACKAGE)) for path in FILES if client in rooms(_imported(path))}
     assert {name for name in found if not name.startswith(f"{client}/")} <= CLIENTS[client]
+
+
+def test_files_are_short() -> None:
+    """A longer one has two jobs, or a reason."""
+    lines = {
+        path.relative_to(ROOT).as_posix(): len(path.read_text("utf-8").splitlines())
+        for path in [*FILES, *files("csrc", suffixes=(".c", ".h"))]
+    }
+    assert {name for name, count in lines.items() if count > MOST_LINES_OF_A_FILE} == set(LONGER)
 
 
 def test_no_test_imports_another_one() -> None:
