@@ -217,7 +217,7 @@ class Bus:
     def remember(self, before: Bus) -> None:
         """Take over what another bus, which is closed, learnt of the drives on the same serial line.
 
-        Their answers to what they were asked there may still come.
+        The drives' answers to requests of that bus may still come.
         """
         self._exchanges.remember(before._exchanges)
 
@@ -323,21 +323,21 @@ class Bus:
     # ---- all drives at once ----
 
     def broadcast(self, register: Register[T], value: T) -> dict[str, State | BusError]:
-        """Write to every drive on the line at once; nobody answers, so each one is looked at afterwards.
+        """Write to every drive on the line at once; nobody answers, so each drive is asked afterwards.
 
-        Refused unless all drives on the line are of one family, share their settings and framing, and
-        its document has this broadcast, because the same address means different things to different
-        families. Returns each drive's state, or why it says none, by name. Raises Refused.
+        The same address means different things to different families. So all drives on the line must be of
+        one family and share their settings and framing, and its document must have this broadcast. Returns
+        each drive's state, or why it says none, by name. Raises Refused.
         """
         return self._broadcaster.write(self.drives, register, value)
 
     def stop_all(self, *, seconds: float | None = None) -> dict[str, Stopped]:
         """Stop every drive, ahead of all that is queued; by drive's name, what is known of it.
 
-        By broadcast where all drives are of one family that has it, and known to be; and then each of
-        them, in turns, again and again until it is seen to stand: for `seconds` s, or without that for 30 s
-        at least, and as long as the motor's ramp may take. Never raises for one drive: the others go on.
-        A call that would move a motor ends with Overtaken, if it came before or comes while this lasts.
+        First by broadcast, where all drives are known to be of one family that has it. Then each drive is
+        sent its stop, in turns, until it is seen to stand: for `seconds` s, or without that for 30 s at
+        least, and for as long as the motor's ramp may take. Never raises for one drive: the others go on. A
+        call that would move a motor ends with Overtaken, if it came before this or comes while it lasts.
         After an interruption each drive that does not stand yet is sent its stop once more.
         """
         peers = self.peers
@@ -380,12 +380,12 @@ class Bus:
         return self._records.audit_trouble
 
     def statistics(self) -> LineStatistics:
-        """Return those of all exchanges since the bus was opened, or `reset_statistics`, also per drive.
+        """Return the statistics of all exchanges since the bus was opened, or reset, also per drive.
 
         Any thread may call it, as often as wanted: it costs the line nothing.
         """
         return self._meter.read()
 
     def reset_statistics(self) -> None:
-        """Count from here on."""
+        """Begin the statistics anew."""
         self._meter.reset()

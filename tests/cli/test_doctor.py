@@ -276,7 +276,7 @@ def test_on_a_port_of_pyserial_s_it_says_what_does_not_apply(run: Run, port: str
     server.close()
     told = " ".join(out.split())
     assert status == 0
-    assert f"{server.url} is a pyserial rfc2217 port, which is copied to by two threads" in told
+    assert f"{server.url} is a pyserial rfc2217 port, whose bytes two threads copy" in told
     assert "at the far end" in told
 
 

@@ -74,7 +74,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _is_plant(file: Path) -> bool:
-    """Return True for a file with lines; what cannot be read is left to who takes it for a family's."""
+    """Return True for a file with lines; one that cannot be read is taken for a family's, which says why."""
     try:
         return "line" in read_document(file, "file")
     except ValueError:

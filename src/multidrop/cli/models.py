@@ -24,7 +24,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "model", metavar="MODEL", nargs="?", help="one family; or path/to/file.toml, or path/to/file.py:Class"
     )
-    parser.add_argument("drive", metavar="DRIVE", nargs="?", help="of the plant file in place of MODEL")
+    parser.add_argument(
+        "drive", metavar="DRIVE", nargs="?", help="where MODEL is a plant file: of which drive"
+    )
     add_json_argument(parser)
 
 

@@ -12,7 +12,9 @@ SUFFIXES = (".png", ".html")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("recording", metavar="RECORDING", type=Path, help="of `multidrop poll --out`")
+    parser.add_argument(
+        "recording", metavar="RECORDING", type=Path, help="as `multidrop poll --out` writes it"
+    )
     parser.add_argument("--drive", action="append", default=[], help="only this one; may be repeated")
     parser.add_argument("--register", action="append", default=[], help="only this one; may be repeated")
     parser.add_argument(

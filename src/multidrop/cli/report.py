@@ -10,7 +10,9 @@ from multidrop.cli.support.output import print_text
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("recording", metavar="RECORDING", type=Path, help="of `multidrop poll --out`")
+    parser.add_argument(
+        "recording", metavar="RECORDING", type=Path, help="as `multidrop poll --out` writes it"
+    )
     parser.add_argument(
         "--out", metavar="PAGE.html", type=Path, help="without it RECORDING with .html in place of its suffix"
     )

@@ -94,7 +94,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _of_plant(plant: Plant, arguments: argparse.Namespace) -> tuple[Drive | None, Settings, RS485]:
-    """Return the drive to measure with, where one is named, its or its line's settings, and who switches.
+    """Return the drive to measure with if one is named, its or its line's settings, and who switches.
 
     `port` is the line's port afterwards. Raises ValueError for what only a port by hand takes.
     """
@@ -165,7 +165,7 @@ def _remote(port: str) -> Iterator[Finding]:
     elif kind == "socket":
         yield Finding("port", f"{port} is a TCP connection; small packets are sent at once (TCP_NODELAY)")
     else:
-        yield Finding("port", f"{port} is a pyserial {kind} port, which is copied to by two threads")
+        yield Finding("port", f"{port} is a pyserial {kind} port, whose bytes two threads copy")
     yield Finding(
         "adapter",
         "it is at the far end: its driver, latency timer and RS-485 mode cannot be seen from here",

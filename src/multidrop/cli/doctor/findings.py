@@ -53,7 +53,7 @@ def low_latency_finding(low: bool | None) -> Finding:
     return Finding(
         "low latency",
         "the flag is not set: the driver did not take it from multidrop",
-        "it may be root's to set: setserial PORT low_latency",
+        "perhaps root alone may set it: setserial PORT low_latency",
     )
 
 

@@ -16,10 +16,16 @@ def add_rotation_arguments(parser: argparse.ArgumentParser) -> None:
         help='begin a new file so often, such as "1 h": run.arrows becomes run.00000001.arrows and so on',
     )
     parser.add_argument(
-        "--keep", metavar="TIME", type=_age, help='with --rotate: remove files older than, such as "30 days"'
+        "--keep",
+        metavar="TIME",
+        type=_age,
+        help='with --rotate: remove files older than so long, such as "30 days"',
     )
     parser.add_argument(
-        "--most", metavar="SIZE", type=_size, help='with --rotate: remove the oldest beyond, such as "20 GB"'
+        "--most",
+        metavar="SIZE",
+        type=_size,
+        help='with --rotate: remove the oldest beyond a size, such as "20 GB"',
     )
 
 

@@ -79,7 +79,7 @@ def size(number: float) -> str:
 
 
 def natural(name: str) -> list[str | int]:
-    """Return what orders names as people do: line-2 before line-10."""
+    """Return a key that orders names as people do: line-2 before line-10."""
     return [int(part) if at % 2 else part for at, part in enumerate(re.split(r"([0-9]+)", name))]
 
 

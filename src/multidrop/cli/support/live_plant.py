@@ -109,7 +109,7 @@ class LivePlant:
             self._by_name[row.drive].add(row)
 
     def tick(self, now: float, statistics: dict[str, LineStatistics]) -> None:
-        """Take the poller's statistics; to be called once a second."""
+        """Take the poller's statistics; call this once a second."""
         self._earlier.append((now, statistics))
         while now - self._earlier[0][0] > LATELY:
             self._earlier.popleft()

@@ -14,7 +14,7 @@ PATIENCE_S = 10.0  # for a child that was asked to end
 
 
 class Children:
-    """Processes by name, each with a log in this folder; in a session of their own, away from Ctrl-C."""
+    """Processes by name, each with a log in this folder and a session of its own, away from Ctrl-C."""
 
     def __init__(self, folder: Path, environment: Mapping[str, str]) -> None:
         self._folder = folder
