@@ -253,7 +253,7 @@ def test_five_mistakes_in_one_file_are_all_reported_at_once(mistakes: Mistakes) 
         (
             HEAD + 'silence = "500 us"\n' + TOY,
             'line "L", drive "D": silence 500 us is shorter than 1.5 characters at 9600 8N1, which may pass '
-            "within a frame: it is to be 1563 us or more",
+            "within a frame: it must be 1563 us or more",
         ),
         (HEAD + 'silence = "2 s"\n' + TOY, 'line "L", drive "D": silence 2.0 is not a time from 0 to 1 s'),
         (HEAD + 'echo = "loud"\n' + TOY, 'line "L": echo \'loud\' is none of "auto", "on" and "off"'),

@@ -20,7 +20,7 @@ class Sink(Protocol):
 
 
 class Tapped:
-    """Taps on these lines, by name; `collect` is to be called some times a second.
+    """Taps on these lines, by name; call `collect` some times a second.
 
         poller = Poller(plant)
         with CaptureWriter("hall.pcapng", list(poller.buses)) as capture:

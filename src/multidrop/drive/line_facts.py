@@ -28,7 +28,7 @@ class LineFacts:
     silence_characters: ClassVar[float] = 0.0  # the same, in characters
     response_delay: float = 0.005  # s, typical, from the request's end to the reply's begin
     response_delay_characters: ClassVar[float] = 0.0  # the same, in characters, where that is more
-    response_timeout: ClassVar[float] = 0.3  # s, after which no reply is to be expected
+    response_timeout: ClassVar[float] = 0.3  # s, after which no reply is expected
     answering_time: ClassVar[float] = 0.0  # s that the document gives the drive for a reply; 0: not stated
     turnaround_delay: ClassVar[float] = 0.1  # s, after a broadcast
 
@@ -111,7 +111,7 @@ class LineFacts:
             )
         if not is_tcp and self.address not in SERIAL_ADDRESSES:
             raise ValueError(
-                f"address {self.address} is a unit id of Modbus TCP; on {port} it is to be "
+                f"address {self.address} is a unit id of Modbus TCP; on {port} it must be "
                 f"{SERIAL_ADDRESSES[0]} to {SERIAL_ADDRESSES[-1]}"
             )
         self.framing = Framing.TCP if is_tcp else declared
@@ -139,5 +139,5 @@ class LineFacts:
         if self.framing is Framing.RTU and self.needed_silence() < least:
             raise ValueError(
                 f"silence {agreed * 1e6:g} us is shorter than 1.5 characters at {self.settings}, which may "
-                f"pass within a frame: it is to be {math.ceil(least * 1e6)} us or more"
+                f"pass within a frame: it must be {math.ceil(least * 1e6)} us or more"
             )

@@ -104,7 +104,7 @@ def _group_errors(family: Any, group: Iterable[Any], seen: set[str]) -> Iterator
     known = [family.registers.get(name) for name in group if isinstance(name, str)]
     registers = [register for register in known if register is not None and register.readable]
     if not registers or len(registers) < len(list(group)):
-        yield f"{shown}: each is to be the name of a register that can be read"
+        yield f"{shown}: each must be the name of a register that can be read"
         return
     if again := seen & set(group):
         yield f"{shown}: {', '.join(sorted(again))} is in another group too; make one of both"
