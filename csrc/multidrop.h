@@ -295,9 +295,9 @@ const struct md_progress *md_port_progress(struct md_port *port);
 /* Count a stop: no urgent exchange made before it begins to leave any more. */
 void md_count_stop(uint32_t *stops);
 /* Carry one out ahead of the queue and wait for it; one that insists goes ahead of those that do not. After
- * `expires_ns` (0: never), or after a stop, it is not sent (MD_EXPIRED). Beside many of these the queue keeps
- * a 20th of the line, one exchange at a time, but none while one that insists waits. Return the length of the
- * good reply's data; -1 where there is none, and of an exception. */
+ * `expires_ns` (of CLOCK_BOOTTIME; 0: never), or a stop, it is not sent (MD_EXPIRED). Beside many of these
+ * the queue keeps a 20th of the line, one exchange at a time, but none while one that insists waits. Return
+ * the length of the good reply's data; -1 where there is none, and of an exception. */
 int md_port_carry_out(struct md_port *port, const struct md_exchange *exchange, int64_t not_before_ns,
                       int64_t expires_ns, struct md_completion *completion);
 

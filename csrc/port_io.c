@@ -63,12 +63,24 @@ static int may_send(struct md_port *port)
     return !md_listen_begin(line, md_now_ns(), port->mastership->guard_ns);
 }
 
+/* Look whether its time is over, by a clock that runs on while the machine sleeps. */
+static int is_expired(const struct md_turn *turn)
+{
+    if (turn->whose != MD_URGENT || turn->line.tx_at > 0)
+        return 0;
+    return turn->urgent->expires_ns && md_boottime_ns() > turn->urgent->expires_ns;
+}
+
 /* Write; 1: the port took something, or there is something else to do. The request is taken to leave when the
  * write begins. Where the thread was held up meanwhile, it is taken to leave when the write ends: a time too
  * early would make the waits for its reply, and for a late one, too short. */
 static int write_request(struct md_port *port, int64_t begun_ns)
 {
     struct md_line *line = &port->turn.line;
+    if (is_expired(&port->turn)) {
+        md_line_abandon(line, MD_EXPIRED, 0);
+        return 1;
+    }
     if (port->mastership && !may_send(port))
         return 1;
     ssize_t written = md_rs485_write(port, line->tx + line->tx_at, (size_t)(line->tx_len - line->tx_at));

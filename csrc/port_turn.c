@@ -52,15 +52,13 @@ static int begin(struct md_turn *turn, int whose, const struct md_exchange *exch
 
 /* ---- urgent requests ---- */
 
-/* The urgent exchange under way is not wanted any more, and nothing of it has left. */
-static int is_expired(const struct md_turn *turn, int64_t now_ns)
+/* A stop was called after what is under way, of which nothing has left. */
+static int is_overtaken(const struct md_turn *turn)
 {
     if (turn->whose != MD_URGENT || turn->line.tx_at > 0)
         return 0;
-    const struct md_urgent *urgent = turn->urgent;
-    const struct md_exchange *exchange = urgent->exchange;
-    int is_overtaken = exchange->stops && md_load(exchange->stops) != exchange->stops_seen;
-    return is_overtaken || (urgent->expires_ns && now_ns > urgent->expires_ns);
+    const struct md_exchange *exchange = turn->urgent->exchange;
+    return exchange->stops && md_load(exchange->stops) != exchange->stops_seen;
 }
 
 /* Put the first one that may be sent now before the others, and return it; else say when one may be. While a
@@ -172,7 +170,7 @@ static int take(struct md_turn *turn, int64_t *wake_ns, int64_t now_ns)
     if (!is_held && (!urgent || is_polls_turn(turn)) && take_polled(turn, wake_ns, now_ns))
         return 1;
     if (urgent) {
-        if (begin(turn, MD_URGENT, urgent->exchange, urgent->completion, now_ns) && is_expired(turn, now_ns))
+        if (begin(turn, MD_URGENT, urgent->exchange, urgent->completion, now_ns) && is_overtaken(turn))
             md_line_abandon(&turn->line, MD_EXPIRED, 0);
         return 1;
     }
@@ -263,7 +261,7 @@ int md_turn_want(struct md_turn *turn, int64_t *wake_ns, int64_t now_ns)
             continue;
         }
         int want = md_line_want(line, now_ns);
-        if (want == MD_WRITE && is_expired(turn, now_ns)) {
+        if (want == MD_WRITE && is_overtaken(turn)) {
             md_line_abandon(line, MD_EXPIRED, 0);
             want = MD_DONE;
         }

@@ -18,7 +18,8 @@ struct md_slot {
 /* An urgent request; it lives where its caller waits. */
 struct md_urgent {
     const struct md_exchange *exchange;
-    int64_t not_before_ns, expires_ns; /* 0: at once; never */
+    int64_t not_before_ns; /* 0: at once */
+    int64_t expires_ns;    /* of CLOCK_BOOTTIME; 0: never */
     struct md_completion *completion;
     struct md_urgent *next;
     int is_done;

@@ -6,7 +6,7 @@ import pytest
 from simulated_bus import SimulatedBus, is_write, one
 
 from multidrop.control.outcome import Effect
-from multidrop.core import build_request
+from multidrop.core import Message, build_request
 from multidrop.drive import Drive
 from multidrop.drives import YD1000, DelixiModbus, DelixiNative, ErmanERG220, InnovertIBD, InvtCHE
 from multidrop.errors import Unconfirmed
@@ -51,6 +51,21 @@ def test_a_setpoint_that_may_be_an_echo_is_not_confirmed(
     for write in (lambda: line.bus.write(drive, drive.frequency, 25.0), lambda: drive.set_frequency(25.0)):
         with pytest.raises(Unconfirmed, match="echo"):
             write()
+
+
+def test_an_echo_that_shows_at_the_next_read_confirmed_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The drive missed the write, and answers what is read after it."""
+    line, drive, _ = one(monkeypatch, InnovertIBD(1))
+    drive.set_frequency(20)
+
+    def echo(request: Message) -> bytes | None:
+        line.has_echo |= not is_write(request)  # the core sees it before a reply that is no copy
+        return build_request(drive.framing, request) if is_write(request) else None
+
+    line.answers = echo
+    outcome = line.bus.try_write(drive, drive.frequency, 25.0)
+    assert outcome.effect is Effect.UNCONFIRMED
+    assert "the reply was the adapter's echo" in str(outcome.failure)
 
 
 def test_a_raw_request_that_may_be_an_echo_is_not_confirmed(monkeypatch: pytest.MonkeyPatch) -> None:

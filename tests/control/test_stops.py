@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from itertools import pairwise
 from pathlib import Path
 from time import sleep
@@ -355,6 +355,15 @@ def test_one_odd_answer_is_no_proof_of_another_family(monkeypatch: pytest.Monkey
     assert first(line, 0, STOPS["invt-che"]) is not None
 
 
+def test_two_odd_answers_that_differ_are_no_proof_of_another_family(monkeypatch: pytest.MonkeyPatch) -> None:
+    line, drive, _ = one(monkeypatch, InvtCHE(1))
+    odd = [build_reply(Framing.RTU, Message(1, 3, data=bytes([0, device]))) for device in (3, 4)]
+    line.answers = lambda request: odd.pop(0) if odd else None
+    drive.stop()
+    assert odd == []
+    assert STOPS["invt-che"](writes(line)[0])
+
+
 def test_a_drive_that_ever_failed_to_answer_proves_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     """Its reply may be the answer to an earlier request."""
     line, drive, sim = one(monkeypatch, InvtCHE(1))
@@ -576,6 +585,23 @@ def test_a_spent_budget_keeps_no_stop_back_and_it_is_counted(
     assert wear.writes == 4
 
 
+def test_a_write_that_a_stop_keeps_back_is_not_counted(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    for frames in range(1, 100):
+        ledger = Ledger(tmp_path / f"wear-{frames}")
+        line, drive, sim = one(monkeypatch, DelixiModbus(1), ledger=ledger)
+        meanwhile = Meanwhile(line, frames, lambda drive=drive: drive.stop())
+        with suppress(Overtaken):
+            line.bus.write(drive, drive.frequency, 12.0)
+        written = sim.counters.eeprom_writes["frequency"]
+        assert sum(wear.writes for wear in ledger.wear(line.seconds)) == written
+        if written:
+            break
+        assert meanwhile.has_come
+    assert frames > 2
+
+
 def test_stop_all_goes_on_past_whatever_a_script_raises(monkeypatch: pytest.MonkeyPatch) -> None:
     class Broken(Own):
         """Its author made a mistake."""
@@ -627,6 +653,27 @@ def test_a_start_that_was_held_up_in_its_looks_is_not_sent(
     for frames in range(1, 100):
         line, _, meanwhile, begun, failure = started_while(
             monkeypatch, tmp_path, model, frames, lambda line, drive: line.sleep(5)
+        )
+        start = first(line, begun, STARTS[model])
+        if not meanwhile.has_come or (start is not None and start < frames):
+            break
+        assert start is None
+        assert isinstance(failure, Expired)
+    assert frames > 2
+
+
+@every_family
+def test_a_start_in_whose_looks_the_machine_slept_is_not_sent(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, model: str
+) -> None:
+    """CLOCK_MONOTONIC stands still meanwhile: for that clock the start is not late."""
+
+    def sleep_for_a_night(line: SimulatedBus, drive: Drive) -> None:
+        line.slept += 8 * 3600
+
+    for frames in range(1, 100):
+        line, _, meanwhile, begun, failure = started_while(
+            monkeypatch, tmp_path, model, frames, sleep_for_a_night
         )
         start = first(line, begun, STARTS[model])
         if not meanwhile.has_come or (start is not None and start < frames):

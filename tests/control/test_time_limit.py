@@ -55,6 +55,20 @@ def test_what_is_held_up_after_the_call_is_not_sent(line: SimulatedBus, seconds:
     assert len(written(line)) == before
 
 
+@pytest.mark.parametrize("slept_before", [0, 3600])
+def test_the_machine_s_sleep_within_the_block_counts_and_no_other(
+    line: SimulatedBus, slept_before: float
+) -> None:
+    line.slept += slept_before
+    before = len(written(line))
+    with within(line, 0.5):
+        line.bus.drives[0].set_frequency(20)
+        line.slept += 1
+        with pytest.raises(Expired):
+            line.bus.drives[0].set_frequency(25)
+    assert len(written(line)) == before + 1
+
+
 class Slow(Drive):
     """A drive that is looked at for long before it is started, and in between."""
 

@@ -40,6 +40,7 @@ from multidrop.core import (
     RowLayout,
     RowQueue,
     Status,
+    boottime_ns,
     build_reply,
     now_ns,
     parse_request,
@@ -417,7 +418,7 @@ def test_an_urgent_exchange_that_expired_is_not_sent(drive: Drive) -> None:
         return echo_start(request)
 
     with closing(Port(drive(answer), NO_SETTINGS)) as port:
-        found = port.carry_out(read(3), expires_ns=now_ns() - 1)
+        found = port.carry_out(read(3), expires_ns=boottime_ns() - 1)
         assert (found.result, found.sent_ns) == (Failure.EXPIRED, 0)
         assert port.carry_out(read(4)).result == 7
     assert requested == [4]
@@ -449,7 +450,7 @@ def test_an_urgent_exchange_that_expires_before_it_can_leave_is_not_sent(drive: 
     fd = drive(lambda request: echo_start(request) if request.address else b"")
     with closing(Port(fd, NO_SETTINGS)) as port:
         assert port.carry_out(written(0, 1, turnaround=0.3)).result == 0
-        found = port.carry_out(read(3), expires_ns=now_ns() + 50_000_000)
+        found = port.carry_out(read(3), expires_ns=boottime_ns() + 50_000_000)
         assert (found.result, found.sent_ns) == (Failure.EXPIRED, 0)
 
 
@@ -502,6 +503,15 @@ def test_a_permit_is_good_until_its_latch_rises_and_never_while_that_is_held() -
     assert latch.permit().is_good
     latch.shut("the bus was left")
     assert not latch.permit().is_good
+
+
+def test_no_permit_is_good_until_the_last_of_several_stops_is_over() -> None:
+    latch = Latch()
+    with latch.held("a stop"):
+        with latch.held("another stop"):
+            pass
+        assert not latch.permit().is_good
+    assert latch.permit().is_good
 
 
 def test_a_port_that_is_closed_tells_whether_what_was_under_way_had_left(drive: Drive) -> None:

@@ -351,3 +351,8 @@ def test_nothing_answers_what_is_no_function(framing: Framing, function: int) ->
 def test_a_number_that_no_frame_has_room_for_is_a_mistake(odd: dict[str, int]) -> None:
     with pytest.raises(ValueError, match="no frame can say this"):
         build_request(Framing.RTU, Message(**({"address": 1, "function": 3, "start": 0, "count": 1} | odd)))
+
+
+@pytest.mark.parametrize("framing", [RTU, ASCII])
+def test_a_broadcast_s_reply_has_no_length(framing: Framing) -> None:
+    assert reply_length(framing, Message(0, 6, 0x2000, 1, data=b"\0\1")) == 0

@@ -20,7 +20,7 @@ from multidrop.gateway.settings import read_settings
 MAY = """[serve.may]
 stop = "anyone"
 write = ["pump-1.setpoint", "pump-2.setpoint", "pump-1.control"]
-verbs = ["pump-1.start", "pump-2.start", "pump-1.set_frequency", "pump-1.jog"]
+verbs = ["pump-1.start", "pump-2.start", "pump-1.set_frequency", "pump-1.jog", "pump-1.coast"]
 """
 BROKEN = f"{MAY}[serve.history]\n[serve.mqtt]\n"
 
@@ -131,6 +131,8 @@ def test_a_stop_waits_for_no_write(tmp_path: Path, monkeypatch: pytest.MonkeyPat
             for write in writes:
                 write.start()
             until(lambda: len(entered) == 8 and len(found) == 4)
+            coast = {"drive": "pump-1", "verb": "coast", "options": {}}
+            assert gateway.post("/api/act", coast).json == {"done": True, "text": "pump-1: coast is done"}
             assert [one["done"] for one in gateway.post("/api/stop").json.values()] == [True, True]
         finally:
             held.set()

@@ -204,6 +204,29 @@ def test_a_stop_is_always_carried_out(broker: Broker, listener: Listener, start:
     assert known.commands.noted[-3:] == [("stop", ["pump-1"]), ("stop", None), ("stop", [FAN.name])]
 
 
+@pytest.mark.parametrize(("after_ms", "is_taken"), [(-3000, False), (0, False), (1900, False), (2500, True)])
+def test_a_command_that_may_be_older_than_a_stop_is_not_carried_out(
+    broker: Broker, listener: Listener, start: Start, after_ms: int, is_taken: bool
+) -> None:
+    """A broker that held it up gives it after the stop; its sender's clock may be fast by 2 s."""
+    known, _ = start(commands=True)
+    listener.wait_for(has("multidrop/gateway", b"online"))
+    sent_ms = now_ms()
+    known.commands.stopped_at["pump-1"] = time.monotonic_ns() - after_ms * 1_000_000
+    for topic, payload in (
+        ("act", {"verb": "start", "drive": "pump-1", "time": sent_ms}),
+        ("set/setpoint", {"value": 25, "time": sent_ms}),
+    ):
+        publish(broker, f"multidrop/pump-1/{topic}", json.dumps(payload).encode())
+        assert told(listener)["text"].startswith(
+            "done" if is_taken else "not sent: it may have been sent before"
+        )
+    act = {"verb": "emergency_stop", "drive": "pump-1", "time": sent_ms}
+    publish(broker, "multidrop/pump-1/act", json.dumps(act).encode())
+    assert told(listener)["text"] == "done"
+    assert len(known.commands.noted) == (3 if is_taken else 1)
+
+
 def test_a_verb_names_its_drive_again(broker: Broker, listener: Listener, start: Start) -> None:
     known, _ = start(commands=True)
     listener.wait_for(has("multidrop/gateway", b"online"))

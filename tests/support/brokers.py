@@ -230,10 +230,14 @@ class NotedCommands:
     def __init__(self) -> None:
         self.may = May(write=frozenset({"pump-1.setpoint"}), verbs=frozenset({"pump-1.start"}))
         self.noted: list[tuple[Any, ...]] = []
+        self.stopped_at: dict[str, int] = {}  # ns of CLOCK_MONOTONIC, by drive
 
     async def stop(self, drives: Sequence[str] | None, caller: Caller) -> dict[str, Told]:
         self.noted.append(("stop", drives))
         return dict.fromkeys(drives or ["pump-1"], Told(True, "stopped"))
+
+    def stopped_ns(self, drive: str) -> int | None:
+        return self.stopped_at.get(drive)
 
     async def write(self, drive: str, register: str, value: float, caller: Caller) -> Told:
         self.noted.append(("write", drive, register, value))

@@ -7,6 +7,7 @@ import os
 import random
 import shutil
 import subprocess
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -55,6 +56,20 @@ def compiled(source: str, objects: Path, sanitizers: Sequence[str]) -> Path:
             _run([CC, *OPTIONS, "-g", "-O0", *STRICT, *sanitizers, "-Icsrc", "-c", source, "-o", half])
             half.rename(made)
     return made
+
+
+def preloaded(name: str, folder: Path) -> str:
+    """Return the path of a library, to be put before the system's by LD_PRELOAD."""
+    if shutil.which(CC) is None:
+        pytest.skip(f"no C compiler ({CC})")
+    library = folder / f"{name}.so"
+    source = ROOT / f"tests/support/programs/{name}.c"
+    _run([CC, "-std=c11", "-shared", "-fPIC", "-O1", *STRICT, "-o", library, source])
+    loaded = [sys.executable, "-c", "print(open('/proc/self/maps').read())"]
+    told = subprocess.check_output(loaded, env=os.environ | {"LD_PRELOAD": str(library)}, text=True)
+    if library.name not in told:
+        pytest.skip("this interpreter is started with libraries of its own alone")
+    return str(library)
 
 
 def _run(command: Sequence[str | Path]) -> None:

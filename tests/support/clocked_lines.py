@@ -320,6 +320,7 @@ class ClockedLines:
         patch = self._patch = pytest.MonkeyPatch()
         patch.setattr(bus, "Line", ClockedOpener(self))
         patch.setattr(clock, "now_ns", lambda: self.now)
+        patch.setattr(clock, "boottime_ns", lambda: self.now)
         patch.setattr(clock, "sleep", self._sleep)
         patch.setattr(poller, "RowQueue", self._row_queue)
         patch.setattr(wire_of_drives, "CHUNK", min(wire.chunk for wire in wires.values()))

@@ -148,6 +148,7 @@ def bus_over(
     line = PathLine(wire)
     monkeypatch.setattr(bus, "Line", lambda port, *facts: line)
     monkeypatch.setattr(clock, "now_ns", lambda: line.now)
+    monkeypatch.setattr(clock, "boottime_ns", lambda: line.now)
     monkeypatch.setattr(clock, "sleep", line.sleep)
     opened = Bus(line.port)
     for sim in sims:

@@ -44,6 +44,7 @@ class SimulatedBus:
     def __init__(self, monkeypatch: pytest.MonkeyPatch, *sims: SimulatedDrive, **details: Any) -> None:
         self.sims = sims
         self.seconds = 1000.0
+        self.slept = 0.0  # s; the machine, and with it CLOCK_MONOTONIC
         self.frames: list[tuple[Message, str]] = []
         self.loses: Callable[[Message], bool] = lambda request: False
         self.deafens: Callable[[Message], bool] = lambda request: False
@@ -55,6 +56,7 @@ class SimulatedBus:
         monkeypatch.setattr(bus, "Line", lambda port, *facts: self)
         monkeypatch.setattr(clock, "sleep", self.sleep)
         monkeypatch.setattr(clock, "now_ns", lambda: round(self.seconds * 1e9))
+        monkeypatch.setattr(clock, "boottime_ns", lambda: round((self.seconds + self.slept) * 1e9))
         monkeypatch.setattr(clock, "utc_minus_monotonic_ns", lambda: 1_700_000_000 * 10**9)
         self.bus = bus.Bus("hall", **details)
 
@@ -87,7 +89,7 @@ class SimulatedBus:
         request = exchange.request
         self.seconds += self.queue_time
         is_overtaken = exchange.permit is not None and not exchange.permit.is_good
-        if is_overtaken or (expires_ns and self.seconds * 1e9 > expires_ns):
+        if is_overtaken or (expires_ns and clock.boottime_ns() > expires_ns):
             return self._completion(int(Failure.EXPIRED))
         frame = build_request(exchange.framing, request)
         self.frames.append((request, text(frame)))

@@ -9,11 +9,13 @@ from pathlib import Path
 
 import checksums
 import pytest
+from completions import completed
 from lines import line, plant, polled, proofs, rows_of, until
 from simulated_bus import SimulatedBus, one
 from toy import Toy
 
 from multidrop.control.audit_log import read_audit
+from multidrop.core import Failure, Message
 from multidrop.drives import DelixiModbus, DelixiNative, InnovertIBD
 from multidrop.errors import BadReply, DriveRefused, Expired, NoReply, NotAttached
 from multidrop.poller import Poller
@@ -61,6 +63,19 @@ def test_it_must_begin_in_time(simulated: SimulatedBus) -> None:
         bus.ask(toy, 3, 1, 2, expiry=0.2)
     assert simulated.frames == []
     assert bus.ask(toy, 3, 1, 2, expiry=0.4) == bytes.fromhex("007B 0096")
+
+
+def test_a_late_answer_is_awaited_no_longer_than_the_read_may_take(
+    monkeypatch: pytest.MonkeyPatch, simulated: SimulatedBus
+) -> None:
+    bus, (toy,) = simulated.bus, simulated.bus.drives
+    found = completed(int(Failure.LATE_ANSWER_DUE), Message(0, 0), b"", at_ns=0)
+    found.c.late_until_ns = round((simulated.seconds + 60) * 1e9)
+    monkeypatch.setattr(simulated, "carry_out", lambda exchange, **times: found)
+    begun = simulated.seconds
+    with pytest.raises(Expired, match=r"was not sent: .* within 0.2 s"):
+        bus.ask(toy, 3, 1, 2, expiry=0.2)
+    assert simulated.seconds - begun < 0.21
 
 
 def test_a_copy_of_the_request_is_no_reply(simulated: SimulatedBus) -> None:

@@ -9,7 +9,6 @@ from __future__ import annotations
 import errno
 import json
 import os
-import shutil
 import subprocess
 import sys
 from dataclasses import replace
@@ -17,7 +16,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import pytest
-from c_programs import CC, ROOT, STRICT
+from c_programs import ROOT, preloaded
 from leftovers import descriptors, threads
 from lines import line, plant, polled
 from toy import Toy
@@ -70,16 +69,7 @@ print(json.dumps(said))
 
 @pytest.fixture(scope="module")
 def driver(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    if shutil.which(CC) is None:
-        pytest.skip(f"no C compiler ({CC})")
-    library = tmp_path_factory.mktemp("driver") / "rs485_driver.so"
-    source = ROOT / "tests/support/programs/rs485_driver.c"
-    subprocess.run([CC, "-std=c11", "-shared", "-fPIC", "-O1", *STRICT, "-o", library, source], check=True)
-    loaded = [sys.executable, "-c", "print(open('/proc/self/maps').read())"]
-    told = subprocess.check_output(loaded, env=os.environ | {"LD_PRELOAD": str(library)}, text=True)
-    if library.name not in told:
-        pytest.skip("this interpreter is started with libraries of its own alone")
-    return library
+    return Path(preloaded("rs485_driver", tmp_path_factory.mktemp("driver")))
 
 
 def play(driver: Path, mode: str, reads: int, **variables: object) -> tuple[list[Any], list[Event]]:

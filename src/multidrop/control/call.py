@@ -23,8 +23,8 @@ class Call:
 
     Nothing of it is written once a stop was called, nor when it is late by more than `expiry` seconds.
     Its lateness is the time since it began, less what its own steps may take: its reads, by the drive's
-    document, and the waits of its script. So a process that was held up sends nothing.
-    Its first write is not sent after `limit_ns` either, a time of CLOCK_MONOTONIC.
+    document, and the waits of its script. So a process that was held up sends nothing, nor does one whose
+    machine slept. Its first write is not sent after `limit_ns` either, a time of CLOCK_BOOTTIME.
     """
 
     def __init__(
@@ -37,7 +37,7 @@ class Call:
         self.is_confirmed = False  # that one
         self.unverified: Outcome | None = None  # of that one, if nothing was read of the drive after it
         self.expiry = expiry
-        self._due_ns = clock.now_ns()
+        self._due_ns = clock.boottime_ns()
         self._limit_ns = limit_ns
 
     def anew(self) -> Call:
@@ -46,18 +46,18 @@ class Call:
 
     @property
     def expires_ns(self) -> int:
-        """The time of CLOCK_MONOTONIC after which nothing is sent; its drive may be given a rest before."""
+        """The time of CLOCK_BOOTTIME after which nothing is sent; its drive may be given a rest before."""
         expires_ns = self._due_ns + round((self.expiry + self.drive.least_interval) * 1e9)
         return expires_ns if self.sent else int(min(expires_ns, self._limit_ns))
 
     @contextmanager
     def step(self, seconds: float) -> Iterator[None]:
         """Account for a step that may take so long; any time beyond that makes the call late."""
-        begun_ns = clock.now_ns()
+        begun_ns = clock.boottime_ns()
         try:
             yield
         finally:
-            self._due_ns += min(clock.now_ns() - begun_ns, round(seconds * 1e9))
+            self._due_ns += min(clock.boottime_ns() - begun_ns, round(seconds * 1e9))
 
     def look(self) -> AbstractContextManager[None]:
         """Account for one exchange with the drive."""
@@ -69,7 +69,7 @@ class Call:
         """Raise Overtaken once a stop was called, and Expired where the limit of its caller is over."""
         if not self.permit.is_good:
             raise self.overtaken(what)
-        if not self.sent and clock.now_ns() >= self._limit_ns:
+        if not self.sent and clock.boottime_ns() >= self._limit_ns:
             raise Expired(self.drive.name, what, self.expiry)
 
     def overtaken(self, what: str) -> Overtaken:

@@ -17,7 +17,7 @@ LEFT = "the bus was left"
 
 
 class Latches:
-    """A latch for each drive of a bus, and the number of stops under way."""
+    """A latch for each drive of a bus, and the stops under way."""
 
     def __init__(self, exchanges: Exchanges) -> None:
         self._exchanges = exchanges
@@ -26,7 +26,7 @@ class Latches:
         self._make_condition()
 
     def _make_condition(self) -> None:
-        self._stops = 0  # under way
+        self._stops: set[object] = set()  # under way
         self._over = threading.Condition()  # one of them is
 
     def forked(self) -> None:
@@ -72,17 +72,15 @@ class Latches:
     @contextmanager
     def stopping(self, drives: Sequence[Drive]) -> Iterator[None]:
         """Within this context nothing that moves these drives begins or goes on, and none of them leaves."""
-        with self._over:
-            self._stops += 1
-        try:
-            latches = [latch for drive in drives if (latch := self._latches.get(drive))]
-            for latch in latches:  # all of them before anything else
-                latch.rise(STOPPED)
+        stop = object()
+        try:  # a signal that raises between any two steps leaves none behind, for which a bus waited for ever
+            self._stops.add(stop)
             with ExitStack() as stack:
-                for latch in latches:
-                    stack.enter_context(latch.held(STOPPED))
+                for drive in drives:
+                    if latch := self._latches.get(drive):
+                        stack.enter_context(latch.held(STOPPED))
                 yield
         finally:
+            self._stops.discard(stop)
             with self._over:
-                self._stops -= 1
                 self._over.notify_all()

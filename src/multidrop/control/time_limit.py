@@ -7,6 +7,8 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from math import inf
 
+from multidrop.transport import clock
+
 Limit = Callable[[], float]
 
 
@@ -18,7 +20,7 @@ _limit: ContextVar[Limit] = ContextVar("multidrop time limit", default=_none)
 
 
 def present_limit_ns() -> float:
-    """Return the time (CLOCK_MONOTONIC, ns) until which what is called now may be sent; inf without one."""
+    """Return the time (CLOCK_BOOTTIME, ns) until which what is called now may be sent; inf without one."""
     return _limit.get()()
 
 
@@ -35,15 +37,16 @@ def written_before(limit: Limit) -> Iterator[None]:
 
     `limit` returns a time of CLOCK_MONOTONIC in ns, as `time.monotonic_ns()` does; 0 is always past. It is
     called when a call begins; from then on a stop ends that call. So whoever notes a stop, and has `limit`
-    return 0 from then on, misses none. A call that is too late sends nothing and raises Expired. The later
-    writes of a verb have the bus's own `expiry`, and are not cut off. Stops are sent at any time. The block
-    is that of this thread and what it calls, or of this task of asyncio and `asyncio.to_thread`. Raises
-    TypeError for what is no function.
+    return 0 from then on, misses none. A call that is too late sends nothing and raises Expired; time for
+    which the machine sleeps within the block counts. The later writes of a verb have the bus's own `expiry`,
+    and are not cut off. Stops are sent at any time. The block is that of this thread and what it calls, or of
+    this task of asyncio and `asyncio.to_thread`. Raises TypeError for what is no function.
     """
     if not callable(limit):
         raise TypeError(f"limit = {limit!r} is no function that returns a time of CLOCK_MONOTONIC in ns")
     outer = _limit.get()
-    token = _limit.set(lambda: min(outer(), limit()))
+    slept_ns = clock.boottime_ns() - clock.now_ns()  # so far; read in this order, it is never too long
+    token = _limit.set(lambda: min(outer(), limit() + slept_ns))
     try:
         yield
     finally:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -21,8 +20,7 @@ class Latch:
         self.c: Any = ffi.new("uint32_t *")
         self.why = ""  # of the last rise
         self._is_shut = False
-        self._holds = 0  # stops under way
-        self._lock = threading.Lock()
+        self._holds: set[object] = set()  # stops under way
 
     def rise(self, why: str) -> None:
         """End every permit that there is."""
@@ -37,14 +35,13 @@ class Latch:
     @contextmanager
     def held(self, why: str) -> Iterator[None]:
         """Rise, and stay so while the context lasts: no permit that is asked for meanwhile is good."""
-        with self._lock:
-            self._holds += 1
-        try:
+        hold = object()
+        try:  # a signal that raises between any two steps leaves no hold behind
+            self._holds.add(hold)
             self.rise(why)
             yield
         finally:
-            with self._lock:
-                self._holds -= 1
+            self._holds.discard(hold)
 
     def permit(self) -> Permit:
         """Return a permit that is good until the latch rises; while a stop is under way it never is."""

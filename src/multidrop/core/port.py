@@ -260,7 +260,7 @@ class Port:
     ) -> Completion:
         """Carry one out ahead of the queue and wait for it; `into`: the completion to fill in.
 
-        After `expires_ns` (0: never), or after a stop, it is not sent.
+        After `expires_ns` (of CLOCK_BOOTTIME; 0: never), or after a stop, it is not sent.
         """
         self._kept.add(exchange.peer)  # a late reply may come
         found = into or Completion()

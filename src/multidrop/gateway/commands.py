@@ -29,7 +29,7 @@ from multidrop import (
 )
 from multidrop.gateway.command_threads import begin_stop, in_thread
 from multidrop.gateway.rights import NEVER_THIS_WAY, NOT_ALLOWED, NOT_LISTED, Caller, May, Right
-from multidrop.gateway.verb_rules import VERBS
+from multidrop.gateway.verb_rules import STOPPING, VERBS
 
 MOST_WRITES = 8  # under way on a line, without stops
 BUSY = "too many writes are under way"  # a rule
@@ -63,7 +63,7 @@ class Commands:
         self._lines = lines
         self.called = 0  # commands that passed all rights, so far
         self._under_way: dict[str, int] = {}  # writes, by line
-        self._stops: dict[str, int] = {}  # that were called so far, by drive
+        self._stopped_ns: dict[str, int] = {}  # when the latest stop was called, by drive
         self._ended_ns: dict[str, int] = {}  # by drive
 
     def ended_ns(self, drive: str) -> int:
@@ -72,6 +72,13 @@ class Commands:
         What was polled before may be old.
         """
         return self._ended_ns.get(drive, 0)
+
+    def stopped_ns(self, drive: str) -> int | None:
+        """Return when the latest stop of a drive was called (CLOCK_MONOTONIC); None without one."""
+        return self._stopped_ns.get(drive)
+
+    def _note_stop(self, drives: Iterable[str]) -> None:
+        self._stopped_ns |= dict.fromkeys(drives, time.monotonic_ns())
 
     def _note_end(self, drives: Iterable[str]) -> None:
         self._ended_ns |= dict.fromkeys(drives, time.monotonic_ns())
@@ -112,8 +119,7 @@ class Commands:
         waited: list[asyncio.Future[dict[str, Told]]] = []
         for line in plant.lines:
             here = {polled.drive.name: polled.drive for polled in line.drives if polled.drive.name in wanted}
-            for name in here:
-                self._stops[name] = self._stops.get(name, 0) + 1
+            self._note_stop(here)
             if here and len(here) == len(line.drives):
                 waited.append(self._begin_stop(partial(self._stop_line, line.name, list(here)), here, caller))
             else:
@@ -176,7 +182,23 @@ class Commands:
             arguments = verb_arguments(verb, options)
         except ValueError as mistake:
             return _failed(mistake)
-        return await self._carry_out(drive, caller, what, partial(_act, verb=verb, arguments=arguments))
+        carry_out = self._carry_out_stop if verb in STOPPING else self._carry_out
+        return await carry_out(drive, caller, what, partial(_act, verb=verb, arguments=arguments))
+
+    async def _carry_out_stop(
+        self, drive: str, caller: Caller, what: str, work: Callable[[Drive], Told]
+    ) -> Told:
+        """Carry out a verb that stops the motor: neither writes under way nor other stops keep it back."""
+        try:
+            _, known = self._lines.plant.find_drive(drive)
+        except ValueError as mistake:
+            return _failed(mistake)
+        self.called += 1
+        self._note_stop([drive])
+        _log.warning("%s, asked for by %s", what, caller.by)
+        future = begin_stop(lambda: work(known), caller)
+        future.add_done_callback(lambda _: self._note_end([drive]))
+        return await asyncio.shield(future)
 
     async def _carry_out(self, drive: str, caller: Caller, what: str, work: Callable[[Drive], Told]) -> Told:
         try:
@@ -187,10 +209,10 @@ class Commands:
             reason = f"{what} was not sent: {MOST_WRITES} others are under way on line {line.name}"
             return _failed(Refused(reason, rule=BUSY))
         self.called += 1
-        stops = self._stops.get(drive, 0)
+        stopped_ns = self.stopped_ns(drive)
 
         def checked() -> Told:
-            if self._stops.get(drive, 0) != stops:
+            if self.stopped_ns(drive) != stopped_ns:
                 return _failed(Refused(f"{what} was not sent: a stop was called", rule="a stop was called"))
             return work(known)
 

@@ -1,19 +1,21 @@
 """Orders: commands that come by a broker, which may hold them up, keep them, and deliver them twice.
 
-A write or a verb is carried out only when it was sent within the last seconds and did not come before; a
-stop is carried out always.
+A write or a verb is carried out only when it was sent within the last seconds, after the latest stop of its
+drive, and did not come before; a stop is carried out always.
 """
 
 from __future__ import annotations
 
 import asyncio
 import logging
+import time
 from collections import deque
 from collections.abc import Callable, Coroutine, Mapping, Sequence
 from typing import Any
 
 from multidrop.gateway.commands import Commands, Told
 from multidrop.gateway.rights import Caller
+from multidrop.gateway.verb_rules import STOPPING
 
 MOST_AGE_MS = 5_000  # of a command; a broker that stood still delivers those of the whole time
 MOST_AHEAD_MS = 2_000  # by which the sender's clock may be fast
@@ -46,12 +48,14 @@ class Orders:
     def write(self, drive: str, register: str, value: float, time_ms: int) -> None:
         """Write a register, if the command is fresh."""
         what = f"{register} = {value!r}"
-        if self._is_taken(drive, what, (drive, register, value, time_ms), time_ms):
+        stopped_ns = self._commands.stopped_ns(drive)
+        if self._is_taken(drive, what, (drive, register, value, time_ms), time_ms, stopped_ns):
             self._begin(self._do(drive, what, self._commands.write(drive, register, value, self._caller)))
 
     def act(self, drive: str, verb: str, options: Mapping[str, object], time_ms: int) -> None:
         """Carry out a verb, if the command is fresh."""
-        if self._is_taken(drive, verb, (drive, verb, repr(options), time_ms), time_ms):
+        stopped_ns = None if verb in STOPPING else self._commands.stopped_ns(drive)
+        if self._is_taken(drive, verb, (drive, verb, repr(options), time_ms), time_ms, stopped_ns):
             self._begin(self._do(drive, verb, self._commands.act(drive, verb, options, self._caller)))
 
     def refuse(self, drive: str, what: str, why: str) -> None:
@@ -59,11 +63,20 @@ class Orders:
         _log.warning("%s of %s was not carried out: %s", what, drive, why)
         self._tell(drive, what, Told(False, f"not sent: {why}"))
 
-    def _is_taken(self, drive: str, what: str, order: object, time_ms: int) -> bool:
+    @staticmethod
+    def _may_be_before(stopped_ns: int | None, age_ms: int) -> bool:
+        """Return True where a command may be older than a stop; the sender's clock may be fast."""
+        if stopped_ns is None:
+            return False
+        return (time.monotonic_ns() - stopped_ns) // 1_000_000 <= age_ms + MOST_AHEAD_MS
+
+    def _is_taken(self, drive: str, what: str, order: object, time_ms: int, stopped_ns: int | None) -> bool:
         age_ms = self._utc_ms() - time_ms
         if not -MOST_AHEAD_MS <= age_ms <= MOST_AGE_MS:
             clocks = "by the clocks of sender and gateway"
             self.refuse(drive, what, f"it was sent {age_ms / 1000:.1f} s ago {clocks}")
+        elif self._may_be_before(stopped_ns, age_ms):
+            self.refuse(drive, what, "it may have been sent before the latest stop: send it again")
         elif order in self._came:
             self.refuse(drive, what, "it came a second time")
         elif self._under_way >= MOST_UNDER_WAY:

@@ -24,3 +24,4 @@ VERBS: Mapping[str, VerbRule] = {
     "emergency_stop": VerbRule(Right.STOP, True),
     "stop": VerbRule(Right.STOP, False),
 }
+STOPPING = frozenset(verb for verb, rule in VERBS.items() if rule.role is Right.STOP)

@@ -1,12 +1,14 @@
 """The clock of all that is polled and written: CLOCK_MONOTONIC, as the core reads it.
 
-Call these through the module, `clock.now_ns()`: a test then replaces them in one place.
+What may be sent until some time has it of CLOCK_BOOTTIME, which runs on while the machine sleeps. Call these
+through the module, `clock.now_ns()`: a test then replaces them in one place.
 """
 
 from __future__ import annotations
 
 import time
 
+from multidrop.core import boottime_ns as boottime_ns
 from multidrop.core import now_ns as core_now_ns
 from multidrop.core import utc_minus_monotonic_ns
 

@@ -204,10 +204,10 @@ class Exchanges:
     def ask(self, drive: Drive, function: int, start: int, count: int, expiry: float) -> bytes:
         """Return the data of the reply to any read, sent once, and begun within `expiry` seconds."""
         request = any_read(drive, function, start, count)
-        expires_ns = clock.now_ns() + round(expiry * 1e9)
+        expires_ns = clock.boottime_ns() + round(expiry * 1e9)
         asked = make_exchange(drive, request, self.peer(drive), NO_ROWS)
         completion = self._carry_out(drive, asked, expires_ns)
-        is_late = completion.result == Failure.LATE_ANSWER_DUE and clock.now_ns() >= expires_ns
+        is_late = completion.result == Failure.LATE_ANSWER_DUE and clock.boottime_ns() >= expires_ns
         if is_late or completion.result == Failure.EXPIRED:
             raise Expired(drive.name, f"a read of {count} from {start} by function {function:02X}H", expiry)
         self._note_answer(drive, completion)
@@ -255,10 +255,10 @@ class Exchanges:
     ) -> Completion:
         """Write once, ahead of any polling; first wait for an answer that may still come late.
 
-        After `expires_ns` (0: never), and without a good permit, it is not sent. It waits for its answer
-        at least `timeout` seconds. One that insists does not wait for an earlier answer, and for its own,
-        where answers are known to be late, up to `timeout`. Raises NoReply, and nothing was sent, where
-        answers may still come late and the drive is silent.
+        After `expires_ns` (of CLOCK_BOOTTIME; 0: never), and without a good permit, it is not sent. It waits
+        for its answer at least `timeout` seconds. One that insists does not wait for an earlier answer, and
+        for its own, where answers are known to be late, up to `timeout`. Raises NoReply, and nothing was
+        sent, where answers may still come late and the drive is silent.
         """
         made = make_exchange(
             drive, request, self.peer(drive), NO_ROWS, insists=insists, timeout=timeout, permit=permit
@@ -290,9 +290,9 @@ class Exchanges:
         It waits no longer than until `expires_ns`. Raises NotMaster.
         """
         if completion.result == Failure.LATE_ANSWER_DUE:
-            until_ns = completion.late_until_ns
-            until_ns = min(until_ns, expires_ns + 1) if expires_ns else until_ns
-            clock.sleep(max(0, until_ns - clock.now_ns()) / 1e9)
+            wait_ns = completion.late_until_ns - clock.now_ns()
+            wait_ns = min(wait_ns, expires_ns + 1 - clock.boottime_ns()) if expires_ns else wait_ns
+            clock.sleep(max(0, wait_ns) / 1e9)
             completion = self.line.carry_out(made, expires_ns=expires_ns)
         check_master(drive, completion)
         return completion
