@@ -21,7 +21,7 @@ from multidrop.fleet.refusals import Denials, failure_to_connect
 OLDEST = (2, 12)  # 2.9.10 grants one revision to several claimants (nats-server issue 4320)
 CONNECT_S = 1.0
 ANSWER_S = 1.0  # for a request; a lease is renewed twice a second
-COLLECT_S = (0.4,)
+COLLECT_S = (0.3, 0.5)  # for the first answers to what may be asked again
 PONG_S = 0.7  # a server that takes longer is left for another one
 KEEP_S = 1.0  # between looks at a connection
 # With 0 for attempts, nats-py knocks at a port where nobody listens until our own time-out.
