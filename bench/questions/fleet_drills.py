@@ -2,8 +2,9 @@
 
 Real processes on this machine: three NATS nodes, three gateways, and lines on sockets that note each request
 with the connection it came by. Then the same with each gateway and each node in a network namespace, whose
-cables are cut for 1 to 8 s; that needs root. A gap is the longest time between two requests of one line, from
-the deed on for 11 s and more.
+cables are cut for 1 to 8 s; that needs root. Then with a gateway and a node in each of three namespaces, as
+on three machines. A gap is the longest time between two requests of one line, from the deed on for 11 s and
+more.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ import tempfile
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 from bench.support import tables
 
@@ -28,14 +30,14 @@ def main() -> None:
     parser.add_argument("--deed", action="append", help="only this one; may be given again")
     arguments = parser.parse_args()
     sys.path.insert(0, str(ROOT / "tests" / "support"))
-    from fleet_cuts import CUTS, cut, drilled_in_network
+    from fleet_cuts import CUTS, MACHINES, cut, drilled_in_network, drilled_on_machines
     from fleet_drills import DEEDS, FleetDrill, drilled
     from namespaces import why_none
 
     tables.heading("How long is a line silent when something of its fleet dies, and do masters overlap?")
     rows: list[tuple[object, ...]] = []
 
-    def repeat(drill: FleetDrill, name: str, deed: Callable[[FleetDrill], object]) -> None:
+    def repeat(drill: FleetDrill, name: str, deed: Callable[[Any], object]) -> None:
         worst: list[float] = []
         before = drill.hall.overlaps()
         for _ in range(arguments.rounds):
@@ -45,7 +47,7 @@ def main() -> None:
         rows.append((name, len(worst), overlaps, f"{statistics.median(worst):.2f}", f"{max(worst):.2f}"))
         print(*rows[-1], sep=", ", file=sys.stderr)
 
-    wanted = arguments.deed or [*DEEDS, *CUTS]
+    wanted = arguments.deed or [*DEEDS, *CUTS, *MACHINES]
     if deeds := [name for name in wanted if name in DEEDS]:
         with tempfile.TemporaryDirectory() as folder, drilled(Path(folder), arguments.lines) as drill:
             for name in deeds:
@@ -58,8 +60,16 @@ def main() -> None:
         ):
             for name in cuts:
                 repeat(drill, name, partial(cut, name=name))
+    machines = [name for name in wanted if name in MACHINES]
+    if machines and not reason:
+        with (
+            tempfile.TemporaryDirectory() as folder,
+            drilled_on_machines(Path(folder), arguments.lines) as drill,
+        ):
+            for name in machines:
+                repeat(drill, name, MACHINES[name])
     tables.show(("deed", "rounds", "overlaps", "median, s", "worst, s"), rows)
-    if cuts and reason:
+    if (cuts or machines) and reason:
         print(f"\nno cables were cut: {reason}")
 
 

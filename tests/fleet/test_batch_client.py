@@ -15,9 +15,10 @@ require_module("nats")
 
 from nats.aio.client import Client  # noqa: E402
 
-from multidrop.fleet import batch_client  # noqa: E402
+from multidrop.fleet import batch_client, servers  # noqa: E402
 from multidrop.fleet.batch_client import BatchClient, DirectMessage, Request, stored_message  # noqa: E402
 from multidrop.fleet.buckets import Bucket, Record  # noqa: E402
+from multidrop.fleet.errors import Unsure  # noqa: E402
 from multidrop.fleet.servers import ServerPath, connect, paths_of  # noqa: E402
 from multidrop.fleet.setup import set_up  # noqa: E402
 
@@ -172,6 +173,39 @@ def test_a_request_without_an_answer_is_told_from_those_that_have_one(one: Clust
         await client.close()
 
     asyncio.run(main())
+
+
+@pytest.mark.parametrize(("deaf_to", "is_told"), [(0, True), (1, True), (2, True), (3, False)])
+def test_what_a_server_that_is_cut_off_got_is_asked_again(
+    one: Cluster, monkeypatch: pytest.MonkeyPatch, deaf_to: int, is_told: bool
+) -> None:
+    monkeypatch.setattr(servers, "COLLECT_S", (0.1, 0.1))
+    monkeypatch.setattr(servers, "ANSWER_S", 5.0 if is_told else 0.1)
+
+    async def work(path: ServerPath) -> None:
+        other = await connect(one.urls[0], {})
+        asked: list[str] = []
+
+        async def answer(message: Any) -> None:
+            asked.append(message.reply)
+            if len(asked) > deaf_to:
+                status = b"NATS/1.0 404 No Messages\r\n\r\n"
+                place = message.reply.encode()
+                await other._send_command(b"HPUB %s %d %d\r\n%s\r\n" % (place, *[len(status)] * 2, status))
+                await other.flush()
+
+        await other.subscribe("moody", cb=answer)
+        await other.flush()  # this ping may leave before the subscription, the next one does not
+        await other.flush()
+        if is_told:
+            assert await path.collect("moody", b"") == []
+        else:
+            with pytest.raises(Unsure, match=r"nothing came for 0.1 s"):
+                await path.collect("moody", b"")
+        assert len(asked) > deaf_to or not is_told
+        await other.close()
+
+    _with_path(one, work)
 
 
 @pytest.mark.usefixtures("way")

@@ -287,6 +287,35 @@ def test_a_dead_gateway_is_ended_after_a_lease_by_the_watchers_clock() -> None:
     asyncio.run(main())
 
 
+@pytest.mark.parametrize("has_rival", [False, True])
+def test_nobody_waits_for_a_path_without_a_leader_to_end_the_dead(has_rival: bool) -> None:
+    """Its server may have died with the gateway. Another observer may have ended one of the others."""
+
+    async def main() -> None:
+        trial = Trial()
+        lease, observer = trial.lease(), trial.observer()
+        assert await lease.try_to_begin()
+        await look(observer)
+        trial.clock.pass_s(USUAL.lease / SECOND)
+        await look(observer)
+        asked: list[str] = []
+
+        async def give_no_answer(key: str, value: Any, revision: int) -> int:
+            asked.append(key)
+            await asyncio.Event().wait()
+            return 0
+
+        trial.buckets[0].put = give_no_answer  # type: ignore[method-assign]
+        if has_rival:
+            trial.buckets[1].store("a", {**trial.values()[1], "ended": True, "by": "c"})
+        assert await asyncio.wait_for(observer.end_the_dead(), 10)
+        assert asked == ["a"]
+        await look(observer)
+        assert observer.is_over("a", 1)
+
+    asyncio.run(main())
+
+
 def test_what_is_judged_is_what_is_ended() -> None:
     """A record that is renewed between the judgement and its end stays, even if it was read meanwhile."""
 

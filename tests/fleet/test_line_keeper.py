@@ -105,6 +105,33 @@ def test_a_line_is_let_go_before_it_is_given_away() -> None:
     asyncio.run(main())
 
 
+def test_a_line_is_not_polled_again_while_it_may_have_been_given_away() -> None:
+    """A write that nobody answered may still be stored, at any time, until a newer record rules that out."""
+
+    async def main() -> None:
+        trial = Trial()
+        await trial.claim()
+        bucket: Any = trial.records.owners[names.owner_bucket("hall")].bucket
+        trial.keeper.releasing = {"hall"}
+        trial.keeper.reconcile()
+        await until(lambda: trial.keeper.is_silent)
+        bucket.is_down = True
+        trial.keeper.reconcile()  # given away, and nobody answers
+        await until(lambda: trial.keeper.is_silent)
+        trial.keeper.releasing = set()  # it is to stay after all
+        for _ in range(3):
+            trial.keeper.reconcile()
+            await until(lambda: trial.keeper.is_silent)
+            assert trial.lines.taken == set()
+        bucket.is_down = False
+        trial.keeper.reconcile()
+        await until(lambda: "hall" in trial.keeper.polled and not trial.keeper._at_work)
+        assert owner_of(bucket.records["hall"]) == ("a", 1)
+        assert bucket.revision("hall") == 2  # what was given away at 1 can be stored no more
+
+    asyncio.run(main())
+
+
 def test_a_line_that_is_not_closed_for_certain_ends_the_gateway() -> None:
     """Its session is not ended: the others wait for as long as if it had died."""
 

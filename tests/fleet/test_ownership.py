@@ -46,6 +46,48 @@ def test_all_gateways_find_the_same_in_any_order() -> None:
     assert Balance().assign(lines, gateways) == Balance().assign(LINES, GATEWAYS)
 
 
+# Each gateway beside one of three servers, each of which leads one bucket.
+BESIDE = {gateway: (names.OWNERS[at % 3],) for at, gateway in enumerate(GATEWAYS)}
+
+
+def in_vain(shares: dict[str, str]) -> list[str]:
+    """Return the lines whose gateway avoids their bucket."""
+    return [line for line, gateway in shares.items() if names.owner_bucket(line) in BESIDE[gateway]]
+
+
+@pytest.mark.parametrize("number", [2, 3, 4, 5, 20])
+@pytest.mark.parametrize("lines", [7, 12, 40, 1000])
+def test_lines_are_where_they_are_not_avoided_and_the_bound_holds(lines: int, number: int) -> None:
+    """One of two gateways alone suits some of the buckets, and may have too little room for all of those."""
+    for at in range(max(1, 300 // lines)):
+        names_of_them = [f"trial-{at}-line-{line}" for line in range(lines)]
+        shares = Balance().assign(names_of_them, GATEWAYS[:number], BESIDE)
+        assert sorted(shares) == sorted(names_of_them)
+        most = -(-lines * 110 // (100 * number))
+        loads = Counter(shares.values())
+        assert max(loads.values()) <= most
+        for bucket in {names.owner_bucket(line) for line in in_vain(shares)}:
+            for gateway in GATEWAYS[:number]:
+                others = {names.owner_bucket(line) for line, name in shares.items() if name == gateway}
+                is_full = loads[gateway] == most and others == {bucket}
+                assert is_full or bucket in BESIDE[gateway], "a line could have been moved on"
+
+
+def test_few_lines_move_where_gateways_avoid_buckets_and_order_does_not_matter() -> None:
+    balance = Balance()
+    all_of_them = balance.assign(LINES, GATEWAYS, BESIDE)
+    without = balance.assign(LINES, GATEWAYS[1:], BESIDE)
+    must = sum(gateway == GATEWAYS[0] for gateway in all_of_them.values())
+    assert must <= moved(all_of_them, without) <= must + len(LINES) // 20
+    assert in_vain(all_of_them) == in_vain(without) == []
+    assert Balance().assign(LINES[::-1], GATEWAYS[::-1], BESIDE) == all_of_them
+
+
+def test_what_all_gateways_avoid_is_shared_as_if_nobody_did() -> None:
+    everything = dict.fromkeys(GATEWAYS, names.OWNERS)
+    assert Balance().assign(LINES, GATEWAYS, everything) == Balance().assign(LINES, GATEWAYS)
+
+
 def test_no_gateway_no_share() -> None:
     assert Balance().assign(LINES, []) == {}
 

@@ -1,6 +1,7 @@
-"""Drills in a network of namespaces: each gateway and each node on a machine of its own, and cables are cut.
+"""Drills in a network of namespaces, whose cables are cut: each gateway and each node has one of its own.
 
-The lines are reached on their own way, unless a gateway is cut off as a whole.
+The lines are reached on their own way, unless a gateway is cut off as a whole. Then the same with machines
+that have a gateway and a node each, and die or are cut off with both.
 """
 
 from __future__ import annotations
@@ -13,6 +14,8 @@ from pathlib import Path
 from fleet_drills import GATEWAYS, FleetDrill
 from namespaces import Namespace, network
 from nats_clusters import cluster
+
+from multidrop.fleet import names
 
 NODES = 3
 
@@ -74,11 +77,11 @@ CUTS: dict[str, Callable[[Cuts], None]] = {
 }
 
 
-def cut(drill: FleetDrill, name: str) -> None:
-    """Cut as this name says, and heal it."""
+def cut(drill: FleetDrill, name: str, seconds: float = 0.0) -> None:
+    """Cut as this name says, and heal it after so long; 0 for 1 to 8 s."""
     cuts = Cuts(drill)
     CUTS[name](cuts)
-    time.sleep(drill.random.uniform(1, 8))
+    time.sleep(seconds or drill.random.uniform(1, 8))
     for one in (*cuts.gateways, *cuts.nodes):
         one.heal([other for other in (*cuts.gateways, *cuts.nodes) if other is not one])
 
@@ -92,6 +95,54 @@ def drilled_in_network(folder: Path, lines: int = 12, seed: int = 1) -> Iterator
     ):
         places = dict(zip(GATEWAYS, made.namespaces[NODES:], strict=True))
         drill = FleetDrill(folder, nats, lines, seed, places, made.address)
+        try:
+            yield drill
+        finally:
+            drill.close()
+
+
+class MachineDrill(FleetDrill):
+    """Machines with a gateway and a node each."""
+
+    def settle(self) -> None:
+        """Wait, moreover, until no line's record dies with the line's master."""
+        super().settle()
+        self.wait(self.are_records_apart, "each gateway has lines whose records are led elsewhere")
+
+    def are_records_apart(self) -> bool:
+        found = self.status()
+        avoids = {name: one["says"] and one["says"]["avoids"] for name, one in found["gateways"].items()}
+        return all(avoids.values()) and not any(
+            names.owner_bucket(line) in avoids.get(one["master"], names.OWNERS)
+            for line, one in found["lines"].items()
+        )
+
+    def kill_machine(self) -> None:
+        name = self.random.choice(GATEWAYS)
+        [node] = [node for node in self.nats.nodes if node.place is self.places[name]]
+        node.kill()
+        self.gateways[name].kill()
+        self.gateways[name].wait()
+
+    def cut_machine(self) -> None:
+        cut(self, "gateway cut off", seconds=self.random.uniform(4, 8))
+
+
+MACHINES: dict[str, Callable[[MachineDrill], None]] = {
+    "machine killed": MachineDrill.kill_machine,
+    "machine cut off": MachineDrill.cut_machine,
+}
+
+
+@contextmanager
+def drilled_on_machines(folder: Path, lines: int = 12, seed: int = 1) -> Iterator[MachineDrill]:
+    """A fleet on three machines; where there can be no namespaces, as `network` says."""
+    with (
+        network(NODES) as made,
+        cluster(folder / "nats", places=made.namespaces) as nats,
+    ):
+        places = dict(zip(GATEWAYS, made.namespaces, strict=True))
+        drill = MachineDrill(folder, nats, lines, seed, places, made.address)
         try:
             yield drill
         finally:

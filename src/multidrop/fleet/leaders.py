@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from contextlib import suppress
 from typing import Any
 
 from multidrop.fleet import names
 from multidrop.fleet.buckets import ask
-from multidrop.fleet.errors import FleetError
+from multidrop.fleet.errors import FleetError, Unsure
 from multidrop.fleet.servers import ServerPath
 
 
@@ -24,13 +24,37 @@ def is_ready(server: str, cluster: Mapping[str, Any]) -> bool:
     return bool(server in peers and peers[server].get("current") and not peers[server].get("offline"))
 
 
-async def have_leaders(path: ServerPath) -> bool:
-    """Say whether each bucket of lines' masters has a leader that answers: else no line can be claimed."""
+async def has_leader(path: ServerPath, bucket: str) -> bool:
+    """Say whether a bucket has a leader that answers: else no record of it can be written."""
     try:
-        infos = [await ask(path, f"STREAM.INFO.KV_{bucket}") for bucket in names.OWNERS]
+        info = await ask(path, f"STREAM.INFO.KV_{bucket}")
     except FleetError:
         return False
-    return all("cluster" not in info or info["cluster"].get("leader") for info in infos)
+    return "cluster" not in info or bool(info["cluster"].get("leader"))
+
+
+async def have_leaders(path: ServerPath) -> bool:
+    """Say whether each bucket of lines' masters has a leader that answers: else no line can be claimed."""
+    for bucket in names.OWNERS:
+        if not await has_leader(path, bucket):
+            return False
+    return True
+
+
+async def owners_led_by(servers: Collection[str], path: ServerPath) -> tuple[str, ...]:
+    """Return the buckets of lines' masters whose leader has one of these servers for its home.
+
+    Raises FleetError where that cannot be said now.
+    """
+    found = []
+    for place, bucket in enumerate(names.OWNERS):
+        info = await ask(path, f"STREAM.INFO.KV_{bucket}")
+        cluster = info.get("cluster", {"leader": path.server_name})
+        if not cluster.get("leader"):
+            raise Unsure(f"the bucket {bucket} has no leader")
+        if home_of(place, cluster) in servers:
+            found.append(bucket)
+    return tuple(found)
 
 
 async def bring_leaders_home(path: ServerPath) -> int:

@@ -64,6 +64,7 @@ class LineKeeper:
         self._records = records
         self._on_change = on_change
         self._is_leaving = False
+        self._offered: dict[str, int] = {}  # the revisions at which lines were given away last, stored or not
         self._at_work: dict[str, asyncio.Task[None]] = {}  # by line: it is taken, let go or claimed
         self._again_at: dict[str, float] = {}
         self._failure: BaseException | None = None
@@ -82,7 +83,9 @@ class LineKeeper:
         return not self.polled and not self._at_work
 
     def is_mine(self, line: str) -> bool:
-        return self._mine(line) is not None
+        """Say whether the line's record names us, and the line was not given away at this very revision."""
+        record = self._mine(line)
+        return record is not None and self._offered.get(line) != record.revision
 
     def _mine(self, line: str) -> Record | None:
         """Return the line's record where it names us and our present session."""
@@ -116,13 +119,17 @@ class LineKeeper:
         self._hand_over(free, self._lease.name, self._lease.session)
 
     def reconcile(self) -> None:
-        """Let go of what is not ours any more, take what is, and give away what was let go."""
+        """Let go of what is not ours any more, take what is, and give away what was let go.
+
+        Where a line is to stay after all, and nobody knows whether it was given away, it is claimed anew.
+        """
         valid = self.may_poll
-        mine = {
-            line: self._records.plant.records[line].revision
+        kept = {
+            line
             for line in (self._owned() if valid else ())
             if line not in self.releasing and self._records.is_in_plant(line)
         }
+        mine = {line: self._records.plant.records[line].revision for line in kept if self.is_mine(line)}
         for line in self.troubles.keys() - mine.keys():
             self._forget_trouble(line)
         now = time.monotonic()
@@ -136,6 +143,7 @@ class LineKeeper:
             left = self.releasing - self.polled.keys() - self._at_work.keys()
             mine_still = {line: record for line in left if (record := self._mine(line))}
             self._hand_over({line: record.revision for line, record in mine_still.items()}, NOBODY, 0)
+            self.claim({line: self._offered[line] for line in kept - mine.keys()})
 
     async def let_all_go(self) -> None:
         """Let go of all lines, whatever is under way. Raises the error of a line that could not be."""
@@ -171,10 +179,14 @@ class LineKeeper:
             if not self.may_poll:
                 return
             stored: list[Record] = []
+            self._offered |= {
+                record.key: record.revision for record in records if owner_of(record)[0] == NOBODY
+            }
             with suppress(FleetError):
                 stored = await follower.bucket.put_all(records)
         for record in stored:
             follower.take(record)
+            self._offered.pop(record.key, None)
             if self.is_mine(record.key) and self._records.is_in_plant(record.key):
                 self._start([record.key], self._take(record.key))
         self.moves += len(stored)

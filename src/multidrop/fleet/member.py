@@ -23,7 +23,6 @@ from functools import partial
 from typing import Any
 
 from multidrop.fleet import names
-from multidrop.fleet.balance import Balance
 from multidrop.fleet.buckets import Record
 from multidrop.fleet.errors import FleetError
 from multidrop.fleet.leaders import bring_leaders_home, have_leaders
@@ -32,9 +31,12 @@ from multidrop.fleet.lease_bucket import LeaseBucket
 from multidrop.fleet.lease_rules import SECOND, USUAL, Terms
 from multidrop.fleet.life_lock import LifeLock
 from multidrop.fleet.line_keeper import LineKeeper, Lines, TakenLine
+from multidrop.fleet.own_machine import OwnMachine, avoided_by
 from multidrop.fleet.ownership import decide, owner_of
+from multidrop.fleet.releases import Releases
 from multidrop.fleet.servers import ServerPath
 from multidrop.fleet.share_records import ShareRecords
+from multidrop.fleet.shares import Sharers, Shares
 from multidrop.fleet.task_end import end_tasks
 
 _log = logging.getLogger("multidrop.fleet")
@@ -43,7 +45,6 @@ GUARD_LOOK_S = 0.02
 STEP_S = 0.05
 TIDY_NS = SECOND // 2  # between looks at all lines of the share, where nothing is known to have changed
 SETTLE_S = 3.0
-QUIET_NS = SECOND // 2  # without a gateway that comes or goes, before shares are made anew while we settle
 HOME_S = 1.0
 WEAK_NS = 10 * SECOND  # from the end of settling on, before a session that lost a path is given up
 
@@ -76,12 +77,10 @@ class Member:
         self.lease = Lease(name, own, mastership, lock=lock, terms=terms, note=self._note)
         self.records = ShareRecords(name, self.best, terms, self._mark_dirty, self._is_mine)
         self.keeper = LineKeeper(lines, self.lease, self.records, self._mark_dirty)
-        self.wanted: dict[str, str] = {}  # each line's gateway, by the balance
+        self.own_machine = OwnMachine()
+        self._shares = Shares()
         self._share: set[str] = set()  # the lines that should be ours
-        self._balance = Balance()
-        self._balanced: tuple[Any, ...] = ()  # gateways and lines
-        self._seen: tuple[Any, ...] = ()  # the same, newest
-        self._seen_at = 0
+        self._releases = Releases(self.best, self._mark_dirty)
         self._settled_at = 0
         self._is_dirty = True
         self._was_valid = False
@@ -110,13 +109,13 @@ class Member:
         return self.keeper.polled
 
     @property
-    def _is_settled(self) -> bool:
-        return self.lease.clock() >= self._settled_at
+    def wanted(self) -> Mapping[str, str]:
+        """Return each line's gateway, by the balance."""
+        return self._shares.wanted
 
     @property
-    def _is_settling_down(self) -> bool:
-        """Say whether more gateways may be about to come, as in a cold start."""
-        return bool(self._balanced) and not self._is_settled
+    def _is_settled(self) -> bool:
+        return self.lease.clock() >= self._settled_at
 
     def _path(self, number: int) -> ServerPath:
         return self.paths[number]
@@ -137,7 +136,12 @@ class Member:
         return owner_of(record) == (self.name, self.lease.session)
 
     def _note(self) -> dict[str, Any]:
-        return {"draining": self.is_draining, "lines": len(self.polled), "margin_ms": self._margin_ms()}
+        return {
+            "draining": self.is_draining,
+            "avoids": [*self.own_machine.avoided],
+            "lines": len(self.polled),
+            "margin_ms": self._margin_ms(),
+        }
 
     def _margin_ms(self) -> int:
         return max(0, round(1000 * self.lease.left_s))
@@ -153,6 +157,7 @@ class Member:
             self._guard(),
             self._home(),
             self._watch_strength(),
+            self._releases.watch(),
             self._live(),
             self.keeper.fail(),
         ]
@@ -175,9 +180,10 @@ class Member:
         while True:
             if not self.lease.session:
                 await self.records.complete()  # of a large plant this takes seconds, in which no lease runs
+                await self._look_at_own_machine()
                 await self.lease.begin()
                 self._settled_at = self.lease.clock() + int(SETTLE_S * SECOND)
-                self._balanced = ()
+                self._shares.begin_anew()
                 self._is_dirty = True
                 _log.info("%s: session %d began", self.name, self.lease.session)
             elif self.lease.is_over:
@@ -209,10 +215,15 @@ class Member:
                     _log.warning("%s: the lease was not renewed in time; no line is polled", self.name)
             await asyncio.sleep(GUARD_LOOK_S)
 
+    async def _look_at_own_machine(self) -> None:
+        with suppress(FleetError):  # it is looked at again, once a second
+            await self.own_machine.look(self.paths, self.best())
+
     async def _home(self) -> None:
         """Bring leaders home; one gateway does it, the first by name."""
         while True:
             await asyncio.sleep(HOME_S)
+            await self._look_at_own_machine()
             if self.lease.is_valid and min(self.records.observer.sessions(), default="") == self.name:
                 with suppress(FleetError):
                     await bring_leaders_home(self.best())
@@ -254,23 +265,17 @@ class Member:
             self.keeper.reconcile()
 
     async def _share_out(self, present: Mapping[str, Mapping[str, Any]]) -> None:
-        """Make the balance anew where gateways or lines came or went; in a thread, for it takes long."""
-        gateways = tuple(
-            name for name, value in present.items() if not value["draining"] and name != self.name
-        )
+        """Make the shares anew where gateways or lines came or went."""
+        sharing = {
+            name: value for name, value in present.items() if not value["draining"] and name != self.name
+        }
         if not self.is_draining and self.lease.session:
-            gateways = tuple(sorted((*gateways, self.name)))
-        lines = self.records.lines()
-        now, wanted = self.lease.clock(), (gateways, lines)
-        if wanted != self._seen:
-            self._seen, self._seen_at = wanted, now
-        if wanted == self._balanced or (self._is_settling_down and now - self._seen_at < QUIET_NS):
-            return
-        loop = asyncio.get_running_loop()
-        self.wanted = await loop.run_in_executor(None, self._balance.assign, lines, gateways)
-        self._share = {line for line, gateway in self.wanted.items() if gateway == self.name}
-        self.records.want(self._share)
-        self._balanced, self._is_dirty = wanted, True
+            sharing[self.name] = self._note()
+        sharers = Sharers(tuple(sorted(sharing)), avoided_by(sharing), self.records.lines())
+        if await self._shares.make(sharers, self.lease.clock(), is_settled=self._is_settled):
+            self._share = self._shares.of(self.name)
+            self.records.want(self._share)
+            self._is_dirty = True
 
     def _claim_and_release(self) -> None:
         me = (self.name, self.lease.session)
@@ -285,5 +290,6 @@ class Member:
             is_settled=self._is_settled,
             is_draining=self.is_draining,
         )
-        self.keeper.releasing = step.releases | {line for line in owned if not self.records.is_in_plant(line)}
+        gone = {line for line in owned if not self.records.is_in_plant(line)}
+        self.keeper.releasing = gone | self._releases.due(step.releases)
         self.keeper.claim(step.claims)

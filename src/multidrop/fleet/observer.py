@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from typing import Any
 
@@ -17,8 +17,11 @@ from multidrop.fleet.buckets import Bucket, Follower, Record
 from multidrop.fleet.errors import Conflict, FleetError
 from multidrop.fleet.lease import boottime_ns
 from multidrop.fleet.lease_rules import SeenRevision, Terms
+from multidrop.fleet.task_end import end_tasks
 
 BELIEVING = lease_rules.USUAL._replace(lease=0, guard=0)  # for who only looks: every end counts at once
+
+ENDING_S = 0.25  # for the answers, when a session is ended
 
 _log = logging.getLogger("multidrop.fleet")
 
@@ -151,21 +154,41 @@ class Observer:
         before = self.ended
         for name, records in self.dead(present).items():
             session = max(record.value["session"] for record in records.values())
-            done = await asyncio.gather(*(self._end(path, record) for path, record in records.items()))
-            if any(done):
+            if await self._end_enough(records):
                 self.ended += 1
                 _log.warning("session %d of %s has run out; ended by %s", session, name, self.me)
         return self.ended > before
 
+    async def _end_enough(self, records: Mapping[int, Record]) -> bool:
+        """End them all at once, and wait for as many answers as it takes: a path may have no leader.
+
+        Return True where any has ended. Another gateway may have ended the others: the next look tells.
+        """
+        ends = [asyncio.create_task(self._end(path, record)) for path, record in records.items()]
+        answers: list[bool] = []
+        try:
+            for done in asyncio.as_completed(ends, timeout=ENDING_S):
+                with suppress(FleetError):
+                    answers.append(await done)
+                if len(answers) >= self.terms.ended:
+                    break
+        except TimeoutError:
+            pass  # the others are judged anew, with what was seen meanwhile
+        finally:
+            await end_tasks(*ends)  # what was sent may still be stored, and is read then
+        return any(answers)
+
     async def _end(self, path: int, record: Record) -> bool:
+        """End a record, unless it has changed. Raises FleetError where nobody says whether it was."""
         value = {**record.value, "ended": True, "by": self.me}
-        with suppress(Conflict, FleetError):
+        try:
             revision = await self.paths[path].bucket.put(record.key, value, record.revision)
-            ended = Record(record.key, revision, value)
-            self.paths[path].take(ended)
-            self._note(path, ended)
-            return True
-        return False
+        except Conflict:
+            return False
+        ended = Record(record.key, revision, value)
+        self.paths[path].take(ended)
+        self._note(path, ended)
+        return True
 
 
 def is_ended_by_another(record: Record) -> bool:

@@ -21,6 +21,7 @@ from multidrop.fleet.refusals import Denials, failure_to_connect
 OLDEST = (2, 12)  # 2.9.10 grants one revision to several claimants (nats-server issue 4320)
 CONNECT_S = 1.0
 ANSWER_S = 1.0  # for a request; a lease is renewed twice a second
+COLLECT_S = (0.3, 0.5)  # for the first answers to what may be asked again
 PONG_S = 0.7  # a server that takes longer is left for another one
 KEEP_S = 1.0  # between looks at a connection
 # With 0 for attempts, nats-py knocks at a port where nobody listens until our own time-out.
@@ -52,6 +53,13 @@ class ServerPath:
     def server_name(self) -> str:
         """Return the name of the server where it is; "" for none."""
         return str(self._client._server_info.get("server_name", "")) if self._client else ""
+
+    @property
+    def is_local(self) -> bool:
+        """Say whether its server runs on this machine: both ends of the connection have one address."""
+        writer = getattr(self._client._transport, "_io_writer", None) if self._client else None
+        here, there = map(writer.get_extra_info, ("sockname", "peername")) if writer else (None, None)
+        return bool(here and there and here[0] == there[0])
 
     @property
     def version(self) -> tuple[int, int]:
@@ -181,10 +189,17 @@ class ServerPath:
             raise Unsure(f"{self.url} gave no answer to {subject}: {failure}") from None
 
     async def collect(self, subject: str, data: bytes) -> list[DirectMessage]:
-        """Return all messages that a direct get gives. Raises Unsure as `request` does."""
+        """Return all messages that a direct get gives. Raises Unsure as `request` does.
+
+        It is asked again where nothing comes soon: any of the servers may have got it, one that is cut off
+        too, and another one may get it the next time.
+        """
         client, denials = self._connected(), self._denials
         before = denials.of_request(subject)
         try:
+            for silence_s in COLLECT_S:
+                with suppress(TimeoutError):
+                    return await client.batch(Request(subject, data), silence_s)
             return await client.batch(Request(subject, data), ANSWER_S)
         except (NatsError, OSError) as failure:
             denials.check_request(subject, self._options.get("inbox_prefix", "_INBOX"), before)
