@@ -58,7 +58,7 @@ class LineFacts:
 
     @classmethod
     def _checked(cls, what: str, value: Any, allowed: Any) -> Any:
-        if value in allowed:
+        if value in allowed and not isinstance(value, bool | float):  # True equals 1, and 1.0 does
             return value
         choices = (
             f"{allowed[0]} to {allowed[-1]}"
