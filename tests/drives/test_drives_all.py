@@ -83,6 +83,12 @@ def test_an_address_is_a_whole_number_that_the_family_has(family: type[Drive], g
         family(given)  # type: ignore[arg-type]
 
 
+@family
+def test_a_framing_by_its_number_is_the_framing(family: type[Drive]) -> None:
+    first = family.framings[0]
+    assert family(1, framing=int(first)).framing is first  # type: ignore[arg-type]
+
+
 def test_the_class_of_all_families_is_none() -> None:
     with pytest.raises(TypeError, match=r"^Drive is no family: take one, such as YD1000, or "):
         Drive(1)

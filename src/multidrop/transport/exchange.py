@@ -98,7 +98,7 @@ class Exchanges:
 
     def peer(self, drive: Drive) -> Peer:
         """Return what is learnt of this drive's answers; NotAttached for a drive that is not on this bus."""
-        peer = self._peers.get(drive)
+        peer = self._peers.get(drive) if isinstance(drive, Drive) else None
         if peer is None:
             check_drive(drive)
             raise NotAttached(f"{drive.name} is not attached to this bus: use bus.attach(...)")
