@@ -21,7 +21,7 @@ from multidrop.control.writer import Writer
 from multidrop.core import RS485, Echo, Mastership, Message, Peer, TransactionIds
 from multidrop.core.fork import register_at_fork
 from multidrop.drive.family import Drive
-from multidrop.drive.own import check_own, check_own_text
+from multidrop.drive.own import check_drive, check_own, check_own_text
 from multidrop.drive.register import Register
 from multidrop.drive.script import Script
 from multidrop.drive.state import State
@@ -297,6 +297,9 @@ class Bus:
         The one deliberate way round: no check of the drive's identity, no span, no budget. It may start a
         motor. Raises Unconfirmed when no answer comes, and DriveRefused; Overtaken and Expired as `write`.
         """
+        check_drive(drive)
+        if not isinstance(data, bytes | bytearray):
+            raise TypeError(f"data = {data!r} is no bytes, such as b'\\x00\\x01'")
         return self._performer.raw(drive, Message(drive.address, function, start, count, data))
 
     def perform(self, drive: Drive, script: Script[Any]) -> Any:
@@ -314,10 +317,12 @@ class Bus:
         The first check also logs what the drive's watchdog does. Raises Refused when it is another drive,
         NoReply when it does not answer.
         """
+        check_drive(drive)
         self._performer.check_identity(drive)
 
     def watchdog(self, drive: Drive) -> str:
         """Say what the motor does when this client dies, as far as the drive can tell."""
+        check_drive(drive)
         return self._performer.watchdog(drive)
 
     # ---- all drives at once ----

@@ -155,7 +155,7 @@ class TomlPlace:
 
 def parse_duration(text: str) -> float:
     """Return the seconds in a duration such as "50 ms"; ValueError if it is none."""
-    match = re.fullmatch(r"(\d+(?:\.\d+)?)\s*(us|ms|s|min|h)", text.strip(), re.ASCII)
+    match = re.fullmatch(r"(\d+(?:\.\d+)?)\s*(us|ms|s|min|h)", str(text).strip(), re.ASCII)
     units = {"us": 1e-6, "ms": 1e-3, "s": 1.0, "min": 60.0, "h": 3600.0}
     seconds = float(match[1]) * units[match[2]] if match else 0
     if not _SHORTEST <= seconds <= _LONGEST:

@@ -241,7 +241,7 @@ def test_what_is_not_collected_in_time_is_counted() -> None:
     assert packets.count(b"\xff" * 4000) == told // 4000 - 1
     assert list(tap.take(WRAPPINGS, 0, 0)) == []
     assert list(tap_text({"untapped_bytes": tap.lost})) == [
-        "4000 bytes were not captured: this machine was too slow"
+        "4000 bytes not captured: this machine was too slow"
     ]
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import signal
 import subprocess
 import sys
@@ -25,6 +26,7 @@ def test_help_lists_every_command(run: Run) -> None:
     status, out, err = run("--help")
     assert (status, err) == (0, "")
     assert all(f"\n  {name} " in out for name in COMMANDS)
+    assert max(map(len, out.splitlines())) <= 80
 
 
 def test_no_command_is_a_mistake_that_gets_the_help(run: Run) -> None:
@@ -453,19 +455,55 @@ def test_a_second_signal_breaks_off_what_the_first_one_asked_to_end() -> None:
 # ---- output that cannot be written ----
 
 
-def test_a_full_disk_under_the_output_is_a_sentence() -> None:
-    code = "import sys; from multidrop.cli import main; sys.exit(main(['models', 'yd1000']))"
+PRINTING = [["models", "yd1000"], ["--help"], ["--version"], []]
+
+
+def in_a_process(words: list[str]) -> list[str]:
+    return [sys.executable, "-c", f"import sys; from multidrop.cli import main; sys.exit(main({words}))"]
+
+
+@pytest.mark.parametrize("words", PRINTING)
+def test_a_full_disk_under_the_output_is_a_sentence(words: list[str]) -> None:
     with Path("/dev/full").open("w") as full:
-        done = subprocess.run([sys.executable, "-c", code], stdout=full, stderr=subprocess.PIPE, text=True)
+        done = subprocess.run(in_a_process(words), stdout=full, stderr=subprocess.PIPE, text=True)
     assert (done.returncode, done.stderr) == (1, "multidrop: No space left on device\n")
 
 
-def test_a_reader_who_has_seen_enough_is_no_failure() -> None:
-    code = "import sys; from multidrop.cli import main; sys.exit(main(['models', 'yd1000']))"
-    words = [sys.executable, "-c", code]
-    with subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as command:
+@pytest.mark.parametrize("words", PRINTING)
+def test_a_reader_who_has_seen_enough_is_no_failure(words: list[str]) -> None:
+    with subprocess.Popen(in_a_process(words), stdout=subprocess.PIPE, stderr=subprocess.PIPE) as command:
         assert command.stdout is not None
         command.stdout.close()
         command.stdout = None
         assert command.communicate()[1] == b""
     assert command.returncode == 0
+
+
+@pytest.mark.parametrize(
+    ("closed", "words", "status"),
+    [
+        (0, ["start", "/dev/ttyX", "yd1000", "1"], 1),
+        (1, ["models", "yd1000"], 0),
+        (2, ["models", "zzz"], 2),
+    ],
+)
+def test_a_stream_that_the_caller_has_closed_is_no_failure(
+    closed: int, words: list[str], status: int
+) -> None:
+    done = subprocess.run(
+        in_a_process(words), capture_output=True, text=True, preexec_fn=lambda: os.close(closed)
+    )
+    assert (done.returncode, done.stdout) == (status, "")
+    assert "Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize("closed", [0, 1, 2])
+def test_no_file_is_opened_in_the_place_of_a_closed_stream(closed: int) -> None:
+    """A serial port there would get what is printed."""
+    code = (
+        "import os, multidrop.cli as cli; cli.main(['--version']); os._exit(os.open(os.devnull, os.O_RDONLY))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, preexec_fn=lambda: os.close(closed)
+    )
+    assert done.returncode > 2

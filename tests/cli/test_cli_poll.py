@@ -268,8 +268,8 @@ def test_that_the_end_of_a_recording_is_missing_is_told(run: Run, tmp_path: Path
     missing = open_reader(path).truncated
     assert 0 < missing < path.stat().st_size
     sentence = (
-        f"multidrop: the end of {path} is missing: {whole} rows were read, and its last {missing} bytes, "
-        "which are no whole rows, were left out\n"
+        f"multidrop: the end of {path} is missing: {whole} rows read, and its last {missing} bytes left "
+        "out, which are no whole rows\n"
     )
     out = tmp_path / "b.parquet"
     assert run("convert", path, out) == (0, f"{whole} rows in {out}\n", sentence)
@@ -368,7 +368,7 @@ def test_on_a_terminal_the_newest_values_stand_in_a_table(plant: Path) -> None:
 @pytest.mark.long
 def test_a_table_is_cut_to_its_terminal(plant: Path) -> None:
     with on_terminal("poll", plant, "--seconds", "1", size=(40, 2)) as terminal:
-        terminal.wait_for("... and 3 drives more")
+        terminal.wait_for("... and 3 more drives")
         terminal.wait_for("utilisation")
         assert terminal.process.wait(timeout=60) == 0
         table = terminal.text.replace("\r\n", "\n").removeprefix(TOY_IS_RUN).partition("hall-1: ")[0]

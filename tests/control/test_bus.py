@@ -320,6 +320,31 @@ MISTAKES: dict[str, tuple[Callable[[Bus, Rig], Any], type[Exception], str]] = {
         TypeError,
         "'pump' is no drive: it is what attach returns",
     ),
+    "a list's watchdog is asked for": (
+        lambda bus, rig: bus.watchdog([rig]),
+        TypeError,
+        "is no drive: it is what attach returns",
+    ),
+    "the identity of a list is checked": (
+        lambda bus, rig: bus.check_identity([rig]),
+        TypeError,
+        "is no drive: it is what attach returns",
+    ),
+    "a frame goes to an address": (
+        lambda bus, rig: bus.raw(1, 3, 0, count=1),
+        TypeError,
+        "1 is no drive: it is what attach returns",
+    ),
+    "a frame has a number in place of its data": (
+        lambda bus, rig: bus.raw(rig, 16, 0, 5),
+        TypeError,
+        r"data = 5 is no bytes, such as b'\x00\x01'",
+    ),
+    "a register is named by its number": (
+        lambda bus, rig: rig.register(5),
+        TypeError,
+        "a register has a name, such as 'speed', and 5 is none",
+    ),
     "a name is attached": (
         lambda bus, rig: bus.attach("innovert-ibd", 2),
         TypeError,

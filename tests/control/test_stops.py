@@ -448,9 +448,12 @@ def test_a_stop_gives_up_when_its_caller_says_so_and_tells_what_is_known(
     with pytest.raises(Unconfirmed):
         drive.stop(seconds=0)  # once, and no more
     assert len(writes(line)) == sent + 1
-    for wrong in (-1, float("nan"), True):
+    wrong: Any
+    for wrong in (-1, float("nan"), True, "5", [5]):
         with pytest.raises(ValueError, match="no time that a stop may take"):
             drive.stop(seconds=wrong)
+        with pytest.raises(ValueError, match="no time that a stop may take"):
+            line.bus.stop_all(seconds=wrong)
 
 
 def test_stop_all_takes_seconds_too(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -700,7 +703,7 @@ def test_looks_that_take_their_time_are_no_delay(monkeypatch: pytest.MonkeyPatch
     assert len(writes(line)) == 1
 
 
-@pytest.mark.parametrize("expiry", [0, -1, float("nan"), float("inf"), True, "1"])
+@pytest.mark.parametrize("expiry", [0, -1, float("nan"), float("inf"), 10**30, True, "1"])
 def test_an_expiry_that_is_none_is_refused(expiry: Any) -> None:
     with pytest.raises(ValueError, match=r"expiry = .* is not a number of seconds above 0"):
         Bus("/dev/none", expiry=expiry)

@@ -77,6 +77,24 @@ def test_a_family_says_what_it_is(family: type[Drive]) -> None:
 
 
 @family
+@pytest.mark.parametrize("given", [True, 1.0, None, "1", 0, 248, -1])
+def test_an_address_is_a_whole_number_that_the_family_has(family: type[Drive], given: object) -> None:
+    with pytest.raises(ValueError, match=rf"^address {given!r} is not one of "):
+        family(given)  # type: ignore[arg-type]
+
+
+@family
+def test_a_framing_by_its_number_is_the_framing(family: type[Drive]) -> None:
+    first = family.framings[0]
+    assert family(1, framing=int(first)).framing is first  # type: ignore[arg-type]
+
+
+def test_the_class_of_all_families_is_none() -> None:
+    with pytest.raises(TypeError, match=r"^Drive is no family: take one, such as YD1000, or "):
+        Drive(1)
+
+
+@family
 @pytest.mark.parametrize("name", ["start", "jog"])
 @pytest.mark.parametrize("given", ["reverse", "forward", True, 25.0, CHEStatus.REVERSE])
 def test_a_direction_is_never_guessed(family: type[Drive], name: str, given: object) -> None:

@@ -466,7 +466,23 @@ def test_a_duration_is_in_seconds(text: str, expected: float) -> None:
 
 @pytest.mark.parametrize(
     "text",
-    ["", "50", "ms", "-5 ms", "0 s", "5 sec", "1e3 s", "nan s", "5 ms 3", "1 us", "25 h", "9" * 400 + " h"],
+    [
+        "",
+        "50",
+        "ms",
+        "-5 ms",
+        "0 s",
+        "5 sec",
+        "1e3 s",
+        "nan s",
+        "5 ms 3",
+        "1 us",
+        "25 h",
+        "9" * 400 + " h",
+        5,
+        None,
+        b"5 s",
+    ],
 )
 def test_what_is_no_duration_is_refused(text: str) -> None:
     with pytest.raises(ValueError, match=r"is not a duration from 100 us to 24 h, such as"):

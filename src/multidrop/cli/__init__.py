@@ -11,8 +11,9 @@ import importlib
 import logging
 import os
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
+from functools import partial
 from typing import Any, NoReturn
 
 from multidrop.errors import BusError, Refused, Unsupported
@@ -30,9 +31,9 @@ COMMANDS = {  # name: module in this package, and help
     "state": ("verbs", "say whether a drive runs, which way, and its fault"),
     "start": ("verbs", "start a drive's motor"),
     "stop": ("verbs", "stop a drive's motor along its deceleration ramp"),
-    "coast": ("verbs", "take the voltage off and let the motor run out"),
-    "emergency-stop": ("verbs", "stop a motor as its drive's own emergency stop does"),
-    "jog": ("verbs", "turn a drive's motor slowly until stopped"),
+    "coast": ("verbs", "take the voltage off a motor and let it run out"),
+    "emergency-stop": ("verbs", "stop a motor by the drive's own emergency stop"),
+    "jog": ("verbs", "turn a drive's motor slowly until it is stopped"),
     "reset-fault": ("verbs", "reset a drive's fault; never starts the motor"),
     "set-frequency": ("verbs", "write a drive's frequency setpoint"),
     "scan": ("scan", "find the drives on a line, by reading only"),
@@ -40,7 +41,7 @@ COMMANDS = {  # name: module in this package, and help
     "wear": ("wear", "list what was written to EEPROMs, and what is left"),
     "poll": ("poll.command", "poll the drives of a plant file, and record them"),
     "doctor": ("doctor.command", "say what is amiss with a port and its adapter"),
-    "serve": ("serve", "poll a plant for a browser, Prometheus, MQTT, Modbus TCP and a history"),
+    "serve": ("serve", "poll a plant for browsers and other programs"),
     "fleet": ("fleet", "share the lines of a plant out to several gateways, by NATS"),
     "hub": ("hub", "keep a fleet's samples in Parquet files or in PostgreSQL"),
     "monitor": ("monitor.command", "show the drives of a plant file live on a terminal"),
@@ -63,8 +64,10 @@ Poll every drive on an RS-485 line as fast as the wire allows.
 
 {_listed(COMMANDS)}
 
-`multidrop COMMAND --help` says what a command takes; --json prints for programs.
-Exit status: 0 done, 1 the line or a drive failed or a rule forbade it, 2 mistaken call.
+`multidrop COMMAND --help` says what a command takes, `multidrop --version`
+which version this is. With --json most commands print for programs.
+Exit status: 0 done; 1 the line or a drive failed, or a rule forbade it;
+2 mistaken call; 130 interrupted.
 """
 
 
@@ -82,28 +85,43 @@ def _help_of(prog: str, text: str, actions: Mapping[str, tuple[str, str]]) -> st
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command and return its exit status."""
     words = list(sys.argv[1:] if argv is None else argv)
-    if not words or words[0] in ("-h", "--help"):
-        print(HELP, end="")
-        return DONE if words else MISTAKE
-    if words[0] == "--version":
-        from importlib.metadata import version
-
-        print(f"multidrop {version('multidrop')}")
-        return DONE
+    _replace_closed_streams()
+    if not words or words[0] in ("-h", "--help", "--version"):
+        return _guarded(partial(_describe_itself, words))
     from multidrop.cli.support.output import logging_to, spell_out_unencodable, warn
     from multidrop.cli.support.signals import sigterm_interrupts
 
     spell_out_unencodable()
     with sigterm_interrupts(), logging_to(warn, "multidrop.drives.registry", logging.INFO):
-        return _guarded(words[0], words[1:])
+        return _guarded(partial(_run, words[0], words[1:]))
 
 
-def _guarded(command: str, words: list[str]) -> int:
-    """Run the command; print every foreseeable failure as a sentence on stderr."""
+def _replace_closed_streams() -> None:
+    """Open the null device for each standard stream that the caller has closed.
+
+    Else a serial port might be opened in its place, and what is printed would go to the line.
+    """
+    for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
+        if getattr(sys, name) is None:
+            setattr(sys, name, os.fdopen(os.open(os.devnull, os.O_RDWR), mode, encoding="utf-8"))
+
+
+def _describe_itself(words: list[str]) -> int:
+    """Print the version or the help, which is also the answer to no words at all."""
+    if words[:1] == ["--version"]:
+        from importlib.metadata import version
+
+        print(f"multidrop {version('multidrop')}")
+    else:
+        print(HELP, end="")
+    return DONE if words else MISTAKE
+
+
+def _guarded(run: Callable[[], int]) -> int:
+    """Run a command; print every foreseeable failure as a sentence on stderr."""
     try:
-        status = _run(command, words)
-        if sys.stdout is not None:  # None: the caller has closed it
-            sys.stdout.flush()
+        status = run()
+        sys.stdout.flush()
     except KeyboardInterrupt as interruption:  # its notes say what was sent
         return _fail("\n".join(["interrupted", *getattr(interruption, "__notes__", ())]), INTERRUPTED)
     except BrokenPipeError:  # such as of `multidrop models | head`

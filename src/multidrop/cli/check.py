@@ -15,7 +15,7 @@ from multidrop.cli.models import facts
 from multidrop.cli.support.arguments import add_json_argument
 from multidrop.cli.support.family_sheet import INDENT, sheet
 from multidrop.cli.support.output import print_text, warn
-from multidrop.cli.support.values import wrapped
+from multidrop.cli.support.values import counted, wrapped
 from multidrop.control.eeprom_ledger import BUDGET, LEAST_INTERVAL
 from multidrop.control.rules import wears
 from multidrop.drive.family import Drive
@@ -93,8 +93,9 @@ def _check_plant(arguments: argparse.Namespace) -> int:
         warn("\n".join(mistakes))
     else:
         drives = sum(len(line.drives) for line in plant.lines)
+        holds = f"{counted(len(plant.lines), 'line')}, {counted(drives, 'drive')}"
         served = "; `multidrop serve --check` checks its [serve]" if plant.serve else ""
-        print_text(f"No mistake found in {plant.path}: {len(plant.lines)} lines, {drives} drives{served}.")
+        print_text(f"No mistake found in {plant.path}: {holds}{served}.")
     return 1 if mistakes else 0
 
 

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from multidrop.cli.support.files import refuse_overwriting, warn_truncated
 from multidrop.cli.support.output import print_text
+from multidrop.cli.support.values import counted
 from multidrop.recording import FORMATS, convert, open_reader
 
 
@@ -19,5 +20,5 @@ def run(arguments: argparse.Namespace) -> int:
     refuse_overwriting(arguments.target)
     rows = convert(arguments.source, arguments.target)
     warn_truncated(arguments.source, rows, open_reader(arguments.source).truncated)
-    print_text(f"{rows} rows in {arguments.target}")
+    print_text(f"{counted(rows, 'row')} in {arguments.target}")
     return 0

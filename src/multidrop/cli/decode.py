@@ -13,15 +13,21 @@ from multidrop.cli.support.arguments import add_json_argument
 from multidrop.cli.support.files import refuse_overwriting
 from multidrop.cli.support.output import print_text, warn
 from multidrop.cli.support.traffic import replay, summary
+from multidrop.cli.support.values import counted
 from multidrop.plant.loader import load_plant
 from multidrop.plant.model import Plant
-from multidrop.recording import open_writer
+from multidrop.recording import FORMATS, open_writer
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("capture", metavar="FILE", type=Path, help="a capture: pcap or pcapng")
     parser.add_argument("--plant", metavar="PLANT.toml", help="for names and engineering units")
-    parser.add_argument("--out", metavar="FILE", type=Path, help="recording, by suffix; without it: text")
+    parser.add_argument(
+        "--out",
+        metavar="FILE",
+        type=Path,
+        help=f"a new recording: {', '.join(FORMATS)}; printed as text if not given",
+    )
     add_json_argument(parser)
 
 
@@ -39,7 +45,7 @@ def run(arguments: argparse.Namespace) -> int:
                 f"{capture.path} is cut: its last {capture.truncated} bytes are no whole packet, "
                 "and were left out"
             )
-    into = f"{counts['rows']} rows in {arguments.out}: " if arguments.out else ""
+    into = f"{counted(counts['rows'], 'row')} in {arguments.out}: " if arguments.out else ""
     print_text(json.dumps({"summary": counts}) if arguments.json else into + summary(counts))
     return 0
 

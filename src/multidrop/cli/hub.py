@@ -13,6 +13,7 @@ from multidrop.cli.support.arguments import add_json_argument, duration
 from multidrop.cli.support.extras import require_extra
 from multidrop.cli.support.nats import add_nats_arguments, nats_options
 from multidrop.cli.support.output import logging_to, print_text, warn
+from multidrop.cli.support.values import counted
 
 if TYPE_CHECKING:
     from multidrop.fleet.hub import HubState, SampleSink
@@ -49,8 +50,9 @@ def run(arguments: argparse.Namespace) -> int:
         print_text(json.dumps(state._asdict()))
     else:
         print_text(
-            f"{state.rows} rows kept, to message {state.place} of the stream; {state.alarms} alarms, "
-            f"{state.missing} messages missing, {state.doubled} left out because they came twice"
+            f"{counted(state.rows, 'row')} kept, to message {state.place} of the stream; "
+            f"{counted(state.alarms, 'alarm')}, {counted(state.missing, 'message')} missing, "
+            f"{state.doubled} left out because they came twice"
         )
     return int(state.alarms > 0)
 

@@ -14,7 +14,7 @@ from typing import Any
 from multidrop.cli.support.arguments import add_json_argument
 from multidrop.cli.support.output import print_text
 from multidrop.cli.support.plants import add_plant_argument
-from multidrop.cli.support.values import Row, aligned, shortened, wrapped
+from multidrop.cli.support.values import Row, aligned, counted, shortened, wrapped
 from multidrop.drives.registry import is_users_own
 from multidrop.planning.prediction import Prediction, Rate, predict
 from multidrop.planning.reading_gain import reading_gain
@@ -93,7 +93,7 @@ def _long_cycle(plan: _PredictedLine) -> list[str]:
     if plan.prediction.cycle <= LONG_CYCLE or not whole:
         return []
     costs = ", ".join(
-        f"{drive.name} ({plan.prediction.requests(drive)} requests for {len(drive.readings())})"
+        f"{drive.name} ({counted(plan.prediction.requests(drive), 'request')} for {len(drive.readings())})"
         for drive in whole
     )
     return [

@@ -14,6 +14,7 @@ from multidrop.cli.support.arguments import add_json_argument
 from multidrop.cli.support.files import check_writable
 from multidrop.cli.support.output import print_text
 from multidrop.cli.support.plants import add_line_arguments, add_rs485_argument, line_of, plant_at, rs485_at
+from multidrop.cli.support.values import counted
 from multidrop.drive.family import Drive
 from multidrop.drive.network import speaks_tcp
 from multidrop.drives import MODELS
@@ -195,7 +196,7 @@ def sentence(finding: Finding) -> str:
 
 
 def _summary(drives: int, seconds: float, addresses: Sequence[int]) -> str:
-    text = f"{drives or 'no'} drive{'s' * (drives != 1)} found in {_duration(seconds)}"
+    text = f"{counted(drives, 'drive') if drives else 'no drives'} found in {_duration(seconds)}"
     if addresses == list(ADDRESSES):
         text += f"; addresses above {ADDRESSES[-1]} were not asked (--addresses 1-247 does)"
     return text

@@ -44,7 +44,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--no-browser", action="store_true", help="open no page, with --demo")
     parser.add_argument("--check", action="store_true", help="check the file and its [serve], and do nothing")
     parser.add_argument("--log", choices=("text", "json"), default="text", help="form of the log on stderr")
-    parser.add_argument("--new-token", metavar="ROLE", choices=ROLES, help=f"one of {', '.join(ROLES)}")
+    parser.add_argument(
+        "--new-token",
+        metavar="ROLE",
+        choices=ROLES,
+        help=f"print a new token for this role: {', '.join(ROLES)}; with --for",
+    )
     parser.add_argument("--for", metavar="NAME", dest="owner", help="who will have the new token")
 
 

@@ -49,7 +49,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
             help="repeat it for so long until the motor stands; for 30 s at least if not given",
         )
     if command != "state":
-        add_writing_arguments(parser)
+        add_writing_arguments(parser, asks=command in _QUESTIONS)
     add_json_argument(parser)
 
 

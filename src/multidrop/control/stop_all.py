@@ -9,7 +9,7 @@ import logging
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
-from math import isnan
+from numbers import Real
 from typing import Any
 
 from multidrop.control.latches import Latches
@@ -147,7 +147,10 @@ def _now() -> float:
 
 
 def _check(seconds: float | None) -> None:
-    if seconds is not None and (isinstance(seconds, bool) or isnan(seconds) or seconds < 0):
+    if seconds is None:
+        return
+    is_number = isinstance(seconds, Real) and not isinstance(seconds, bool)
+    if not is_number or not seconds >= 0:  # a NaN is not
         raise ValueError(f"seconds = {seconds!r} is no time that a stop may take: give 0 or more, or none")
 
 

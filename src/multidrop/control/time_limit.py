@@ -11,6 +11,8 @@ from multidrop.transport import clock
 
 Limit = Callable[[], float]
 
+MOST_EXPIRY_S = 1e6
+
 
 def _none() -> float:
     return inf
@@ -26,8 +28,12 @@ def present_limit_ns() -> float:
 
 def checked_expiry(expiry: float, what: str) -> float:
     """Return it, if it is a time in s that a write's or a read's turn may take; else raise ValueError."""
-    if isinstance(expiry, bool) or not isinstance(expiry, (int, float)) or not 0 < expiry < inf:
-        raise ValueError(f"expiry = {expiry!r} is not a number of seconds above 0 for {what}'s turn to come")
+    is_number = isinstance(expiry, (int, float)) and not isinstance(expiry, bool)
+    if not is_number or not 0 < expiry <= MOST_EXPIRY_S:
+        raise ValueError(
+            f"expiry = {expiry!r} is not a number of seconds above 0 for {what}'s turn to come, "
+            f"{MOST_EXPIRY_S:.0f} at most"
+        )
     return expiry
 
 

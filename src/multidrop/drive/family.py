@@ -99,6 +99,8 @@ class Drive(ManualFacts):
         ram: Iterable[str] = (),
         **options: float,
     ) -> None:
+        if type(self) is Drive:
+            raise TypeError("Drive is no family: take one, such as YD1000, or a class of yours that derives")
         super().__init__(address, framing, baudrate, format, silence)
         self.name = name or f"{self.model or type(self).__name__}@{address}"
         if not self.name.isprintable():  # a truncated line of a text recording must be recognised

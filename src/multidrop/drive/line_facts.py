@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Any, ClassVar, cast
+from typing import Any, ClassVar
 
 from multidrop.core import MODBUS, Framing
 from multidrop.drive.network import speaks_tcp
@@ -58,7 +58,7 @@ class LineFacts:
 
     @classmethod
     def _checked(cls, what: str, value: Any, allowed: Any) -> Any:
-        if value in allowed:
+        if value in allowed and not isinstance(value, bool | float):  # True equals 1, and 1.0 does
             return value
         choices = (
             f"{allowed[0]} to {allowed[-1]}"
@@ -75,7 +75,7 @@ class LineFacts:
             framing = {str(known): known for known in Framing}.get(framing.lower(), framing)
         if framing is Framing.TCP and cls.speaks(framing):
             return framing
-        return cast(Framing, cls._checked("framing", framing, cls.framings))
+        return Framing(cls._checked("framing", framing, cls.framings))
 
     @classmethod
     def speaks(cls, framing: Framing) -> bool:

@@ -71,6 +71,9 @@ class ManualFacts(LineFacts):
     @classmethod
     def register(cls, name: str) -> Register[Any]:
         """Return the register of this name; ValueError with the nearest names when there is none."""
+        if not isinstance(name, str):
+            first = next(iter(cls.registers), "speed")
+            raise TypeError(f"a register has a name, such as {first!r}, and {name!r} is none")
         try:
             return cls.registers[name]
         except KeyError:

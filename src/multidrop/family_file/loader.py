@@ -83,7 +83,8 @@ def _bytes(path: Path, what: str) -> bytes:
     """Return a file's bytes; ValueError, without the path, for what is no file or too long."""
     try:
         if not path.is_file():
-            raise ValueError("there is no such file")
+            other = "is no file, but a directory or a device; name a file" if path.exists() else ""
+            raise ValueError(other or "there is no such file")
         with path.open("rb") as file:
             data = file.read(MOST_BYTES + 1)
     except OSError as failure:

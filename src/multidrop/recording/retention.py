@@ -60,7 +60,7 @@ def _ages(files: Iterable[StoredFile], now: float, longest: float) -> dict[int, 
 
 def parse_age(text: str) -> float:
     """Return the seconds in an age such as "30 days"; ValueError if it is none."""
-    match = re.fullmatch(r"(\d+(?:\.\d+)?)\s*(?:(s|min|h)|(day|week)s?)", text.strip(), re.ASCII)
+    match = re.fullmatch(r"(\d+(?:\.\d+)?)\s*(?:(s|min|h)|(day|week)s?)", str(text).strip(), re.ASCII)
     seconds = float(match[1]) * AGES[match[2] or match[3]] if match else 0.0
     if not 1.0 <= seconds <= 36525 * AGES["day"]:
         raise ValueError(
@@ -71,7 +71,7 @@ def parse_age(text: str) -> float:
 
 def parse_size(text: str) -> int:
     """Return the bytes in a size such as "20 GB"; ValueError if it is none."""
-    match = re.fullmatch(r"(\d+(?:\.\d+)?)\s*(kB|MB|GB|TB)", text.strip(), re.ASCII)
+    match = re.fullmatch(r"(\d+(?:\.\d+)?)\s*(kB|MB|GB|TB)", str(text).strip(), re.ASCII)
     size = round(float(match[1]) * SIZES[match[2]]) if match else 0
     if not SIZES["kB"] <= size <= 10**18:
         raise ValueError(f'{text!r} is not a size from 1 kB on, such as "500 MB" or "20 GB"')

@@ -56,7 +56,7 @@ class Peers:
 
     def of(self, drive: Drive) -> Peer:
         """Return what is learnt of this drive's answers; NotAttached for a drive that is not on this bus."""
-        peer = self.present.get(drive)
+        peer = self.present.get(drive) if isinstance(drive, Drive) else None
         if peer is None:
             check_drive(drive)
             raise NotAttached(f"{drive.name} is not attached to this bus: use bus.attach(...)")

@@ -69,13 +69,17 @@ SETTING_UP = (
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    add_line_arguments(parser, "NAME")
+    add_line_arguments(parser, name="NAME", kind="line or drive")
     parser.add_argument("--model", help="of a drive that answers there: the round trip is measured with it")
     parser.add_argument("--address", type=int, metavar="N", help="its address")
     parser.add_argument(
-        "--baudrate", type=int, metavar="N", help="of the line; the family's default, or 9600, without it"
+        "--baudrate", type=int, metavar="N", help="of the line; the family's default if not given, or 9600"
     )
-    parser.add_argument("--format", metavar="8N1", help="data bits, parity and stop bits; the same, or 8N1")
+    parser.add_argument(
+        "--format",
+        metavar="8N1",
+        help="data bits, parity and stop bits; the family's default if not given, or 8N1",
+    )
     parser.add_argument("--framing", metavar="rtu", help="of the drive, where the family has several")
     add_rs485_argument(parser)
     add_json_argument(parser)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from multidrop.cli.doctor.adapter import Adapter, RS485Mode
+from multidrop.cli.support.values import counted
 from multidrop.core import RS485, Completion
 from multidrop.drive.family import Drive
 from multidrop.drive.timing import Settings
@@ -91,7 +92,7 @@ def echo_finding(found: Completion, sent: bytes, settings: Settings) -> Finding:
         return Finding("echo", f"the adapter hears what it sends at {settings}; multidrop takes it out")
     return Finding(
         "echo",
-        f"{len(received)} bytes came unasked at {settings}: {received[:16].hex(' ').upper()}",
+        f"{counted(len(received), 'byte')} came unasked at {settings}: {received[:16].hex(' ').upper()}",
         "see whether another program or master talks on this line, and whether its ends are terminated",
     )
 
@@ -119,7 +120,7 @@ def round_trip_finding(drive: Drive, delays: list[float], asked: int, wire: floa
     if not delays:
         return Finding(
             "round trip",
-            f"{drive.name} did not answer once in {asked} request{'s' * (asked != 1)}",
+            f"{drive.name} did not answer once in {counted(asked, 'request')}",
             "check its address, baud rate, format, wiring and power; `multidrop scan` looks for it",
             is_failure=True,
         )

@@ -9,7 +9,7 @@ ACTIONS = {  # name: module in this package, and help
     "init": ("init", "make what is missing in the NATS servers, and store the plant"),
     "serve": ("serve", "run the gateway of this name"),
     "drain": ("drain", "let a gateway give all its lines away"),
-    "status": ("look", "say how the gateways are; it fails while a line has no master"),
+    "status": ("look", "say how the gateways are; status 1 while a line has no master"),
     "lines": ("look", "list the lines, and who is master of each since when"),
     "watch": ("watch", "show the fleet live on a terminal"),
     "stop": ("commands", "stop drives, or all of them; asks nobody"),
@@ -18,6 +18,6 @@ ACTIONS = {  # name: module in this package, and help
     "write": ("commands", "write one register of a drive"),
     "set-frequency": ("commands", "write a drive's frequency setpoint"),
     "start": ("commands", "start a drive's motor"),
-    "jog": ("commands", "turn a drive's motor slowly until stopped"),
+    "jog": ("commands", "turn a drive's motor slowly until it is stopped"),
     "reset-fault": ("commands", "reset a drive's fault; never starts the motor"),
 }

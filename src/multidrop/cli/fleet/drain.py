@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 from multidrop.cli.fleet.connection import add_server_arguments, run_with_paths
 from multidrop.cli.support.output import print_text
+from multidrop.cli.support.values import counted
 
 if TYPE_CHECKING:
     from multidrop.fleet.servers import ServerPath
@@ -43,5 +44,7 @@ async def _drain(arguments: argparse.Namespace, paths: list[ServerPath]) -> int:
     if arguments.json:
         print_text(json.dumps(said, indent=2))
     else:
-        print_text(f"{name} has {said['lines']} lines left; it takes none until it is started again")
+        print_text(
+            f"{name} has {counted(said['lines'], 'line')} left; it takes none until it is started again"
+        )
     return 1 if said["lines"] else 0

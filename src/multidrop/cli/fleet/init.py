@@ -18,7 +18,13 @@ if TYPE_CHECKING:
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("plant", metavar="PLANT.toml", nargs="?", type=Path, help="the lines to be stored")
+    parser.add_argument(
+        "plant",
+        metavar="PLANT.toml",
+        nargs="?",
+        type=Path,
+        help="the plant to be stored; the one that is stored stays if not given",
+    )
     add_server_arguments(parser)
 
 

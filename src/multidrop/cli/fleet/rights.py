@@ -19,9 +19,11 @@ FOLDER = Path("nats")
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("gateways", metavar="NAMES", help="all gateways, with commas: gw-1,gw-2,gw-3")
-    parser.add_argument("--folder", metavar="DIR", type=Path, default=FOLDER, help=f"where they go: {FOLDER}")
-    parser.add_argument("--cert", metavar="FILE", type=Path, help="a server's certificate, there")
-    parser.add_argument("--key", metavar="FILE", type=Path, help="its key, there")
+    parser.add_argument(
+        "--folder", metavar="DIR", type=Path, default=FOLDER, help=f"for the files; {FOLDER} if not given"
+    )
+    parser.add_argument("--cert", metavar="FILE", type=Path, help="a server's certificate, by its path there")
+    parser.add_argument("--key", metavar="FILE", type=Path, help="a server's key, by its path there")
     add_server_arguments(parser)
 
 

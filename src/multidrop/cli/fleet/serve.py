@@ -16,8 +16,10 @@ from multidrop.cli.support.signals import on_end_signals
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("gateway", metavar="NAME", help="its name, such as gw-1; each has one of its own")
-    parser.add_argument("--folder", metavar="DIR", type=Path, help="where it keeps its spool, logs and lock")
-    parser.add_argument("--keep", metavar="SIZE", default="10 GB", help="most that the spool takes: 10 GB")
+    parser.add_argument("--folder", metavar="DIR", type=Path, help="for its spool, logs and lock")
+    parser.add_argument(
+        "--keep", metavar="SIZE", default="10 GB", help="most that the spool takes; 10 GB if not given"
+    )
     parser.add_argument("--metrics", metavar="HOST:PORT", help="answer GET /metrics there")
     add_server_arguments(parser)
 

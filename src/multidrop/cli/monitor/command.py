@@ -23,6 +23,7 @@ from multidrop.cli.support.live_plant import LiveDrive, LivePlant
 from multidrop.cli.support.output import logging_to, warn
 from multidrop.cli.support.plants import add_plant_argument, add_port_option, plant_of
 from multidrop.cli.support.polling import PollingSession, polling_session
+from multidrop.cli.support.values import counted
 from multidrop.control.outcome import Seen
 from multidrop.plant.model import Plant
 
@@ -243,8 +244,8 @@ class Monitor:
         self._on_yes = lambda: self._in_background(f"stopping {chosen.name}", lambda: self._stop(chosen))
 
     def _ask_to_stop_all(self) -> None:
-        count = len(self._plant.drives)
-        self._at.question = f"Stop ALL {count} drives? y stops them, any other key does not"
+        drives = counted(len(self._plant.drives), "drive")
+        self._at.question = f"Stop ALL {drives}? y stops them, any other key does not"
         self._on_yes = self._stop_lines
 
     def _stop_lines(self) -> None:

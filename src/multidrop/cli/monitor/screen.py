@@ -14,6 +14,7 @@ from typing import Any
 from rich.text import Text
 
 from multidrop.cli.support.live_plant import CURRENT, FREQUENCY, LiveDrive, LivePlant
+from multidrop.cli.support.values import counted
 from multidrop.drive.register import Register
 from multidrop.printable import printable
 
@@ -121,7 +122,7 @@ def _pace(drive: LiveDrive) -> str:
     if so_far.late_replies:
         parts.append(f"{so_far.late_replies} late")
     if so_far.skipped_bytes:
-        parts.append(f"{so_far.skipped_bytes} bytes skipped")
+        parts.append(f"{counted(so_far.skipped_bytes, 'byte')} skipped")
     return "  ".join(parts)
 
 

@@ -21,9 +21,10 @@ from multidrop.cli.support.output import print_text
 from multidrop.cli.support.plants import add_plant_argument, add_port_option, plant_of
 from multidrop.cli.support.polling import Rotation, polling_session
 from multidrop.cli.support.signals import Interruption
-from multidrop.cli.support.values import aligned
+from multidrop.cli.support.values import aligned, counted
 from multidrop.plant.model import Plant
 from multidrop.poller import Poller
+from multidrop.recording import FORMATS
 
 _TAKE_S = 0.1  # between looks for new rows
 
@@ -42,10 +43,14 @@ def add_polling_arguments(parser: argparse.ArgumentParser, *, out: str | None, s
         metavar="S",
         type=duration,
         default=seconds,
-        help=f"how long; {seconds or 'until Ctrl-C'}",
+        help=f"how long it polls; {f'{seconds:g} s' if seconds else 'until Ctrl-C'} if not given",
     )
     parser.add_argument(
-        "--out", metavar="FILE", type=Path, default=out, help=f"recording, by suffix; {out or 'none'}"
+        "--out",
+        metavar="FILE",
+        type=Path,
+        default=out,
+        help=f"record into this new file: {', '.join(FORMATS)}; {out or 'nothing is recorded'} if not given",
     )
     parser.add_argument(
         "--capture", metavar="FILE.pcapng", type=Path, help="all that goes over the lines, for Wireshark"
@@ -141,7 +146,7 @@ def _text(summary: dict[str, Any]) -> str:
     lines: list[str] = []
     for name, line in summary["lines"].items():
         lines.append(
-            f"{name}: {line['exchanges']} exchanges in {line['seconds']:.1f} s, "
+            f"{name}: {counted(line['exchanges'], 'exchange')} in {line['seconds']:.1f} s, "
             f"utilisation {line['utilisation']:.1%}"
         )
         rows = [("DRIVE", "EXCHANGES/S", "SAMPLES/S", "MISSES")]
@@ -154,7 +159,8 @@ def _text(summary: dict[str, Any]) -> str:
         lines += comparison_text(line["comparison"])
     into = f" in {summary['recording']}" if summary["recording"] else ""
     dropped = f", {summary['dropped']} dropped" if summary["dropped"] else ""
-    lines.append(f"{summary['samples']} samples and {summary['misses']} misses{into}{dropped}")
+    samples, misses = counted(summary["samples"], "sample"), counted(summary["misses"], "miss", "misses")
+    lines.append(f"{samples} and {misses}{into}{dropped}")
     lines += tap_text(summary)
     return "\n".join(lines)
 
@@ -165,4 +171,4 @@ def tap_text(summary: Mapping[str, Any]) -> Iterator[str]:
     for path in summary.get("flight_recordings", ()):
         yield f"trouble: see {path}"
     if summary.get("untapped_bytes"):
-        yield f"{summary['untapped_bytes']} bytes were not captured: this machine was too slow"
+        yield f"{counted(summary['untapped_bytes'], 'byte')} not captured: this machine was too slow"

@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from typing import TextIO
 
 from multidrop.cli.support.live_plant import LiveDrive, LivePlant
+from multidrop.cli.support.values import counted
 from multidrop.plant.model import Plant
 from multidrop.polling.batch import Rows
 
@@ -46,7 +47,7 @@ class LiveTable:
         columns, height = shutil.get_terminal_size()
         lines = [line[: columns - 1] for line in self._lines()]
         if len(lines) > height - 1:
-            lines = [*lines[: height - 2], f"... and {len(lines) - height + 2} drives more"]
+            lines = [*lines[: height - 2], f"... and {counted(len(lines) - height + 2, 'more drive')}"]
         back = _UP_AND_CLEAR.format(self._height) if self._height else ""
         print(back + "\n".join(lines), file=self._terminal, flush=True)
         self._height = len(lines)

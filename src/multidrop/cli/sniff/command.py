@@ -31,9 +31,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--replay", metavar="FILE", type=Path, help="a capture, instead of a port")
     parser.add_argument("--plant", metavar="PLANT.toml", help="for names and engineering units")
     parser.add_argument("--out", metavar="FILE.pcapng", type=Path, help="write a capture, for Wireshark too")
-    parser.add_argument("--baudrate", type=int, metavar="N", help="the plant's, or 9600")
-    parser.add_argument("--format", metavar="8N1", help="the plant's, or 8N1")
-    parser.add_argument("--seconds", type=duration, metavar="S", help="how long; until Ctrl-C")
+    parser.add_argument(
+        "--baudrate", type=int, metavar="N", help="as the plant file says, or 9600, if not given"
+    )
+    parser.add_argument("--format", metavar="8N1", help="as the plant file says, or 8N1, if not given")
+    parser.add_argument("--seconds", type=duration, metavar="S", help="how long; until Ctrl-C if not given")
     add_json_argument(parser)
 
 

@@ -5,9 +5,10 @@ from __future__ import annotations
 import argparse
 
 
-def add_writing_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add --yes and --audit, for commands that may write."""
-    parser.add_argument("--yes", action="store_true", help="do not ask; needed where no terminal is")
+def add_writing_arguments(parser: argparse.ArgumentParser, *, asks: bool = True) -> None:
+    """Add --yes and --audit, for commands that may write; `asks`: this one asks before it does."""
+    yes = "do not ask; needed where no terminal is" if asks else "changes nothing: this command never asks"
+    parser.add_argument("--yes", action="store_true", help=yes)
     parser.add_argument("--audit", metavar="FILE", help="append every write and its outcome to this file")
 
 

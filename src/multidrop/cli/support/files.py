@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from multidrop.cli.support.extras import require_extra
 from multidrop.cli.support.output import warn
+from multidrop.cli.support.values import counted
 from multidrop.recording.append_file import already_there, new_file
 
 if TYPE_CHECKING:
@@ -39,8 +40,8 @@ def warn_truncated(path: Path, rows: int, left_out: int) -> None:
     """Warn of a recording whose last `left_out` bytes are no whole rows."""
     if left_out:
         warn(
-            f"the end of {path} is missing: {rows} rows were read, and its last {left_out} bytes, "
-            "which are no whole rows, were left out"
+            f"the end of {path} is missing: {counted(rows, 'row')} read, and its last "
+            f"{counted(left_out, 'byte')} left out, which are no whole rows"
         )
 
 

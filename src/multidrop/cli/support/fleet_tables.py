@@ -8,7 +8,7 @@ from collections.abc import Iterable, Mapping
 from math import inf
 from typing import Any
 
-from multidrop.cli.support.values import Row, aligned
+from multidrop.cli.support.values import Row, aligned, counted
 
 Told = Mapping[str, Any]  # as `--json` prints it
 GATEWAYS = (
@@ -97,7 +97,7 @@ def free_lines(fleet: Told) -> list[str]:
 
 
 def count_sentence(fleet: Told) -> str:
-    return f"{len(fleet['lines'])} lines, {len(free_lines(fleet))} without a master"
+    return f"{counted(len(fleet['lines']), 'line')}, {len(free_lines(fleet))} without a master"
 
 
 def move_table(moves: Iterable[Told]) -> list[str]:

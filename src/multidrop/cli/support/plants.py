@@ -43,8 +43,11 @@ def is_plant(word: str) -> bool:
     return "://" not in word and word.lower().endswith(".toml")
 
 
-def add_line_arguments(parser: argparse.ArgumentParser, name: str = "LINE") -> None:
-    """Add PORT, or PLANT.toml and the name of a line in it, which may be left out where it has one only."""
+def add_line_arguments(parser: argparse.ArgumentParser, *, name: str = "LINE", kind: str = "line") -> None:
+    """Add PORT, or PLANT.toml and the name of a line in it, which may be left out where it has one only.
+
+    `name` is the argument's, and `kind` says in words what it may name.
+    """
     ways = [f"{parser.prog} PORT [options]", f"{parser.prog} PLANT.toml [{name}] [options]"]
     parser.usage = "\n       ".join(ways)
     parser.add_argument(
@@ -53,7 +56,9 @@ def add_line_arguments(parser: argparse.ArgumentParser, name: str = "LINE") -> N
         nargs="?",
         help="a device such as /dev/ttyUSB0, or a pyserial URL; or a plant file",
     )
-    parser.add_argument("name", metavar=name, nargs="?", help="of the plant file; its only line if not given")
+    parser.add_argument(
+        "name", metavar=name, nargs="?", help=f"a {kind} of the plant file; its only line if not given"
+    )
     add_port_option(parser)
 
 

@@ -41,6 +41,11 @@ def wrapped(text: str, first: str = "", rest: str = "", *, breaks_words: bool = 
     )
 
 
+def counted(count: int, one: str, many: str = "") -> str:
+    """Return the count with its noun, such as "1 drive" and "2 drives"; `many` where no s makes it."""
+    return f"{count} {one if count == 1 else many or f'{one}s'}"
+
+
 def shortened(name: str) -> str:
     return name if len(name) <= LONGEST_NAME else f"{name[: LONGEST_NAME - 3]}..."
 
