@@ -286,6 +286,36 @@ def test_every_write_is_noted_in_the_audit_log(run: Run, port: str, tmp_path: Pa
     ]
 
 
+@pytest.mark.parametrize("log", ["none/audit.jsonl", "."])
+def test_no_log_that_cannot_be_opened_keeps_a_stop_back(
+    run: Run, port: str, toy: SimulatedDrive, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, log: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    status, out, err = run("stop", port, TOY, 1, "--audit", log)
+    assert status == 0
+    assert out.startswith("toy@1: stop done")
+    assert err.startswith(f"multidrop: {log}: ")
+    assert err.endswith(": the stop is sent and not noted there\n")
+    assert toy.counters.writes
+    status, out, err = run("set-frequency", port, TOY, 1, 5, "--yes", "--audit", log)
+    assert (status, out) == (2, "")
+
+
+def test_ctrl_c_at_a_question_sends_nothing(
+    run: Run, port: str, toy: SimulatedDrive, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupted() -> str:
+        raise KeyboardInterrupt
+
+    terminal = io.StringIO()
+    monkeypatch.setattr(terminal, "isatty", lambda: True)
+    monkeypatch.setattr(terminal, "readline", interrupted)
+    monkeypatch.setattr("sys.stdin", terminal)
+    status, _, err = run("start", port, TOY, 1)
+    assert (status, err.splitlines()[1:3]) == (130, ["multidrop: interrupted", "multidrop: nothing was sent"])
+    assert not toy.counters.writes
+
+
 def test_wear_shows_the_ledger(run: Run, port: str, toy: SimulatedDrive) -> None:
     status, out, _ = run("wear")
     assert (status, out.endswith("no register that may be in EEPROM was written yet\n")) == (0, True)

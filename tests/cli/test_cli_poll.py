@@ -82,6 +82,18 @@ def test_poll_in_segments(plant: Path, tmp_path: Path) -> None:
     assert names == [f"run.{number:08d}.arrows" for number in range(1, len(names) + 1)]
     assert len(names) >= 3
     assert sum(len(recorded(tmp_path / name)) for name in names) == counted
+    done = multidrop("poll", plant, "--seconds", 0.5, "--out", tmp_path / "run.arrows", "--rotate", "1 h")
+    assert done.stdout.endswith(f" in segments of {tmp_path}/run.arrows\n")
+
+
+def test_a_segment_is_to_be_named_where_there_is_no_whole_recording(run: Run, tmp_path: Path) -> None:
+    for number in (1, 2):
+        with open_writer(tmp_path / f"run.0000000{number}.arrows", METADATA) as writer:
+            writer.write(counting(100, 0))
+    whole, newest = tmp_path / "run.arrows", tmp_path / "run.00000002.arrows"
+    sentence = f"multidrop: {whole} was recorded in segments: name one of them, such as {newest}\n"
+    assert run("convert", whole, tmp_path / "a.csv") == (2, "", sentence)
+    assert run("report", whole) == (2, "", sentence)
 
 
 @pytest.mark.parametrize(

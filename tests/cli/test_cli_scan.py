@@ -95,6 +95,7 @@ def test_nobody_there_is_a_failure(run: Run, port: str, tmp_path: Path) -> None:
     status, text, _ = run("scan", port, *words)
     assert status == 1
     assert text.startswith("no drives found in ")
+    assert "what `multidrop doctor` says of the port" in text
     assert not out.exists()
 
 

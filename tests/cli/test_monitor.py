@@ -19,7 +19,16 @@ from terminals import Terminal, on_terminal
 import multidrop.cli.support.extras
 from multidrop.cli.monitor.command import PAGE, Monitor
 from multidrop.cli.monitor.keys import DOWN, ENTER, KEYS, PAGE_DOWN, PAGE_UP, UP, next_key
-from multidrop.cli.monitor.screen import BLOCKS, PLAIN_BLOCKS, Position, overview, page, sparkline
+from multidrop.cli.monitor.screen import (
+    BLOCKS,
+    LEAST_HEIGHT,
+    LEAST_WIDTH,
+    PLAIN_BLOCKS,
+    Position,
+    overview,
+    page,
+    sparkline,
+)
 from multidrop.cli.support.live_plant import LivePlant
 from multidrop.cli.support.polling import PollingSession
 from multidrop.cli.support.signals import Interruption
@@ -119,6 +128,17 @@ def test_no_frequency_is_not_called_a_stop(tmp_path: Path) -> None:
     assert live.drives[0].state == "turns"
 
 
+def test_flags_of_which_none_is_set_are_no_state(tmp_path: Path) -> None:
+    path = tmp_path / "hall.toml"
+    path.write_text(
+        '[[line]]\nname = "hall-1"\nport = "/dev/nowhere"\n'
+        '[[line.drive]]\nname = "drive-1"\nmodel = "yd1000"\naddress = 1\npoll = ["status"]\n'
+    )
+    live = LivePlant(load_plant(path))
+    live.add(from_rows([row("drive-1", "status", 0.0)]))
+    assert live.drives[0].state == ""
+
+
 def test_rates_are_those_of_the_last_seconds(watched: LivePlant) -> None:
     lately = watched.lately["hall-1"]
     assert lately.exchanges_per_second == pytest.approx(50)
@@ -179,6 +199,18 @@ def test_it_fills_every_size_and_no_more(tmp_path: Path, size: tuple[int, int], 
                 assert max(len(line) for line in texts(lines)) <= size[0]
         shown = texts(overview(live, Position(chosen), size, NOW, BLOCKS))
         assert any(line.startswith(f">drive-{chosen + 1} ") for line in shown)
+
+
+@pytest.mark.parametrize("name", ["pump", "a-drive-of-a-long-name"])
+def test_the_least_width_has_the_age_and_all_keys(tmp_path: Path, name: str) -> None:
+    live = LivePlant(a_plant(tmp_path, 1))
+    live.drives[0].polled.drive.name = name
+    size = LEAST_WIDTH, LEAST_HEIGHT
+    shown = texts(overview(live, Position(), size, NOW, BLOCKS))
+    assert shown[2].split()[-1] == "AGE"
+    assert shown[3].rstrip().endswith(" never")
+    for lines in (shown, texts(page(live.drives[0], {}, Position(), size, NOW))):
+        assert lines[-1].endswith("s stop   S stop all   q quit")
 
 
 def test_the_page_has_every_register(watched: LivePlant) -> None:

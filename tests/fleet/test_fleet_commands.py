@@ -265,8 +265,18 @@ def test_a_full_disk_keeps_a_command_back_and_no_stop(tmp_path: Path) -> None:
     with patch("multidrop.fleet.command_log.CommandLog._add", full):
         told = asked(tmp_path, path, write)
         assert told.outcome is NOT_SENT
-        assert "asked.jsonl cannot be written" in told.text
+        assert "asked.jsonl: No space left on device" in told.text
         assert asked(tmp_path, path, stop).outcome is DONE
+    assert path.asked == ["stop"]
+
+
+def test_a_log_that_cannot_be_opened_keeps_a_command_back_and_no_stop(tmp_path: Path) -> None:
+    path = ScriptedPath(cmd=[OFFER], do=[IT_IS_DONE], stop=[IT_IS_DONE])
+    (tmp_path / "asked.jsonl").mkdir()
+    told = asked(tmp_path, path, write)
+    assert told.outcome is NOT_SENT
+    assert told.text.endswith("asked.jsonl: Is a directory")
+    assert asked(tmp_path, path, stop).outcome is DONE
     assert path.asked == ["stop"]
 
 

@@ -6,6 +6,7 @@ import base64
 import json
 import re
 from collections.abc import Iterator
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -38,6 +39,19 @@ def _imported() -> None:
     from multidrop.report.lanes import MOST_LANES
     from multidrop.report.utilisation import line_uses
     from multidrop.report.value_plot import MOST_PANELS, MOST_POINTS, thinned
+
+
+@pytest.mark.parametrize("seconds", [0.01, 0.3, 2, 7, 90, 4000, 200_000])
+def test_no_two_ticks_of_the_time_say_the_same(seconds: float) -> None:
+    from multidrop.report.style import day, label_time, new_figure
+
+    figure, (axes,) = new_figure([2.0])
+    axes.set_xlim(day(UTC_0), day(UTC_0 + round(seconds * SECOND)))
+    label_time(axes)
+    figure.canvas.draw()
+    labels = [label.get_text() for label in axes.get_xticklabels()]
+    assert len(labels) > 1
+    assert all(one != other for one, other in pairwise(labels))
 
 
 def noisy_ramp() -> list[Row]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from multidrop.cli.support.files import refuse_overwriting, warn_truncated
+from multidrop.cli.support.files import check_no_segments, refuse_overwriting, warn_truncated
 from multidrop.cli.support.output import print_text
 from multidrop.cli.support.values import counted
 from multidrop.recording import FORMATS, convert, open_reader
@@ -18,6 +18,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     refuse_overwriting(arguments.target)
+    check_no_segments(arguments.source)
     rows = convert(arguments.source, arguments.target)
     warn_truncated(arguments.source, rows, open_reader(arguments.source).truncated)
     print_text(f"{counted(rows, 'row')} in {arguments.target}")

@@ -197,6 +197,8 @@ def sentence(finding: Finding) -> str:
 
 def _summary(drives: int, seconds: float, addresses: Sequence[int]) -> str:
     text = f"{counted(drives, 'drive') if drives else 'no drives'} found in {_duration(seconds)}"
+    if not drives:
+        text += "; look at their power and address, at A and B, and what `multidrop doctor` says of the port"
     if addresses == list(ADDRESSES):
         text += f"; addresses above {ADDRESSES[-1]} were not asked (--addresses 1-247 does)"
     return text

@@ -10,9 +10,10 @@ from typing import Any
 
 from multidrop.cli.support.arguments import add_json_argument, add_writing_arguments, duration
 from multidrop.cli.support.confirm import confirm
-from multidrop.cli.support.output import command_line, print_text
+from multidrop.cli.support.output import command_line, print_text, warn
 from multidrop.cli.support.target import Target, add_target_arguments, check_words, number_of, target_of
 from multidrop.cli.support.values import as_json, nearest_value
+from multidrop.control.audit_log import AuditLog
 from multidrop.drive.family import Drive
 from multidrop.drive.script import Script, Write
 from multidrop.drive.state import Direction, State
@@ -68,8 +69,7 @@ def run(arguments: argparse.Namespace) -> int:
         drive.check_confirmed(arguments.command)
         confirm(f"{_QUESTIONS[arguments.command]} {drive.name} on {target.port}?", arguments)
     limit = {"seconds": arguments.seconds} if arguments.command in _STOPS else {}
-    audit = getattr(arguments, "audit", None)
-    with target.open_bus(audit) as bus, _annotating(arguments.command, target) as known:
+    with target.open_bus(_audit_file(arguments)) as bus, _annotating(arguments.command, target) as known:
         if hz is not None and arguments.command != "set-frequency":
             drive.set_frequency(hz)
         state = verb(*parameters, **limit)
@@ -94,6 +94,18 @@ def run(arguments: argparse.Namespace) -> int:
         done = f"{drive.name}: {arguments.command} done{at}; state: {state or 'the family cannot say'}"
         print_text(done + (f"; watchdog: {watchdog}" if watchdog else ""))
     return 0
+
+
+def _audit_file(arguments: argparse.Namespace) -> str | None:
+    """Return the audit log; None, with a warning, where a stop's cannot be opened: it holds no stop back."""
+    audit: str | None = getattr(arguments, "audit", None)
+    if audit and arguments.command in _STOPS:
+        try:
+            AuditLog(audit).close()
+        except OSError as failure:
+            warn(f"{audit}: {failure.strerror}: the {arguments.command} is sent and not noted there")
+            return None
+    return audit
 
 
 @contextmanager

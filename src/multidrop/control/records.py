@@ -111,8 +111,8 @@ class WriteRecords:
             audit.add(at_ns, record)
             self.audit_trouble = ""
         except (OSError, ValueError) as failure:  # it may be closed meanwhile
-            self.audit_trouble = str(failure)
-            _log.warning("the audit log cannot be written: %s", failure)
+            self.audit_trouble = getattr(failure, "strerror", None) or str(failure)
+            _log.warning("the audit log cannot be written: %s", self.audit_trouble)
 
     def _note(self, cell: LedgerCell) -> None:
         try:

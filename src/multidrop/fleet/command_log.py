@@ -56,3 +56,26 @@ class CommandLog:
         """Close it after what is queued; a record that comes later is not taken."""
         self._disk.submit(self._file.close)
         self._disk.shutdown(wait=False)
+
+
+class UnopenedLog:
+    """A log that could not be opened: each attempt to note something in it says why."""
+
+    def __init__(self, path: Path, failure: OSError) -> None:
+        self.path = path
+        self._failure = failure
+
+    async def note(self, record: Mapping[str, Any]) -> None:
+        """Raise the OSError that kept it from being opened."""
+        raise self._failure
+
+    def close(self) -> None:
+        """Do nothing: there is no file."""
+
+
+def open_log(path: Path) -> CommandLog | UnopenedLog:
+    """Open the log in this file. One that cannot be opened fails when something is to be noted."""
+    try:
+        return CommandLog(path)
+    except OSError as failure:
+        return UnopenedLog(path, failure)

@@ -13,7 +13,7 @@ from typing import Any, Self
 
 from multidrop.fleet import names
 from multidrop.fleet.buckets import Bucket, Follower
-from multidrop.fleet.command_log import CommandLog
+from multidrop.fleet.command_log import open_log
 from multidrop.fleet.command_words import (
     CommandAnswer,
     CommandOutcome,
@@ -46,8 +46,8 @@ class FleetCommands:
     """Somebody who commands drives of a fleet.
 
     `by` says who it is, for the logs of both sides; `log` is the file of this side. Each command is sent
-    once and never again; a stop is sent until a gateway answers. Raises FleetError where no server is
-    reached, OSError for a log that cannot be opened.
+    once and never again; a stop is sent until a gateway answers. What cannot be noted in `log` is not sent,
+    but for stops. Raises FleetError where no server is reached.
     """
 
     def __init__(
@@ -55,7 +55,7 @@ class FleetCommands:
     ) -> None:
         self.by = by
         self._paths = paths_of(urls, options)
-        self._log = CommandLog(log)
+        self._log = open_log(log)
         self._keeping: list[asyncio.Task[None]] = []
         self._plant = Follower(Bucket(names.PLANT, self._path))
 
@@ -109,7 +109,7 @@ class FleetCommands:
         try:
             await self._log.note({"step": "asked", **record})
         except OSError as failure:
-            why = f"{request.words} was not sent: {self._log.path} cannot be written: {failure}"
+            why = f"{request.words} was not sent: {self._log.path}: {failure.strerror or failure}"
             return CommandAnswer(CommandOutcome.NOT_SENT, why)
         offered = await self._offer(line, request)
         if isinstance(offered, CommandAnswer):
@@ -290,4 +290,4 @@ class FleetCommands:
         try:
             await self._log.note({**more, **record})
         except OSError as failure:
-            _log.warning("%s cannot be written: %s", self._log.path, failure)
+            _log.warning("not noted in %s: %s", self._log.path, failure.strerror or failure)

@@ -105,7 +105,7 @@ def label_time(axes: Axes) -> None:
     formatter = _DATES.ConciseDateFormatter(
         locator,
         tz=UTC,
-        formats=["%Y", "%b", "%d %b", "%H:%M", "%H:%M", "%H:%M:%S"],
+        formats=["%Y", "%b", "%d %b", "%H:%M", "%H:%M", "%H:%M:%S.%f"],
         zero_formats=["", "%Y", "%b", "%d %b", "%H:%M", "%H:%M:%S"],
         offset_formats=["", "%Y", "%b %Y", "%d %b %Y", "%d %b %Y", "%d %b %Y"],
     )

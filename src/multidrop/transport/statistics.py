@@ -129,9 +129,10 @@ class Statistics:
         """Part of all time that the answered exchanges had to take of the line.
 
         Silence, request, response delay and reply, at the line's settings. A port that is faster than its
-        settings, such as a network's or a pseudo-terminal, needs no more than it took: never more than 1.
+        settings, such as a network's or a pseudo-terminal, needs no more than it took. An exchange counts
+        whole in the time in which it ends; it is never more than 1 all the same.
         """
-        return self.counters.ideal_ns / 1e9 / self.seconds
+        return min(1.0, self.counters.ideal_ns / 1e9 / self.seconds)
 
     @property
     def delays(self) -> Delays:

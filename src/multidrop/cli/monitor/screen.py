@@ -22,9 +22,10 @@ LEAST_WIDTH, LEAST_HEIGHT = 60, 12
 WIDE = 100  # has room for more columns
 OLD = 5.0  # s: an older value is marked
 BLOCKS, PLAIN_BLOCKS = "▁▂▃▄▅▆▇█", "_.-=+*#@"
-ACKNOWLEDGE = "a acknowledges what FAILED   s stop   S stop all   q quit"
-HELP = "up/down choose   Enter registers   s stop   S stop all   q quit"
-PAGE_HELP = "up/down choose   PgUp/PgDn scroll   Enter back   s stop   S stop all   q quit"
+STOPS = "s stop   S stop all   q quit"
+ACKNOWLEDGE = (f"a acknowledges what FAILED   {STOPS}",)
+HELP = (f"up/down choose   Enter registers   {STOPS}", f"up/down   Enter registers   {STOPS}")
+PAGE_HELP = (f"up/down choose   PgUp/PgDn scroll   Enter back   {STOPS}", f"PgUp/PgDn   Enter back   {STOPS}")
 
 
 @dataclass
@@ -132,15 +133,18 @@ def _ms(seconds: float) -> str:
 
 def _columns(plant: LivePlant, width: int) -> dict[str, int]:
     """Return widths by heading; the rest of the line goes to the fault and the history."""
+    columns = {"DRIVE": 5, "STATE": 10, "FREQUENCY": 9, "CURRENT": 9, "FAULT": 10, "AGE": 7}
     longest = max(len(drive.name) for drive in plant.drives)
-    columns = {"DRIVE": max(5, min(longest, 16)), "STATE": 10, "FREQUENCY": 9, "CURRENT": 9, "FAULT": 10}
-    columns |= {"AGE": 7, "MISSED": 6}
+    columns["DRIVE"] += max(0, min(longest - 5, 11, width - len(columns) - sum(columns.values())))
+    if width > len(columns) + sum(columns.values()) + 6:
+        columns["MISSED"] = 6
     if width >= WIDE:
         columns["DELAY"] = 8
     left = max(0, width - 1 - sum(columns.values()) - len(columns))
-    more = min(left // 3, 26)
+    more = min(left // 3, 26) if left >= len("HISTORY") else left
     columns["FAULT"] += more
-    columns["HISTORY"] = left - more
+    if left > more:
+        columns["HISTORY"] = left - more
     return columns
 
 
@@ -168,7 +172,7 @@ def _drive(
         "AGE": _age(age),
         "DELAY": f"{_ms(drive.so_far.delays.p50)} ms" if drive.so_far.delays.replies else "",
         "MISSED": str(drive.so_far.misses.total() or ""),
-        "HISTORY": sparkline(list(drive.history), columns["HISTORY"], blocks),
+        "HISTORY": sparkline(list(drive.history), columns.get("HISTORY", 0), blocks),
     }
     style = "red" if drive.fault else "yellow" if drive.why_silent or (age is not None and age > OLD) else ""
     text = _row(columns, cells, ">" if chosen else "!" if drive.fault else "")
@@ -215,11 +219,12 @@ def _alarms(at: Position, size: tuple[int, int]) -> list[Text]:
     return [Text(f" ! {line}".ljust(width), style="bold white on red") for line in lines]
 
 
-def _foot(at: Position, width: int, help_text: str, note: str) -> list[Text]:
+def _foot(at: Position, width: int, helps: Sequence[str], note: str) -> list[Text]:
     if at.question:
         return [Text(), Text(_cut(f" {at.question}", width).ljust(width), style="bold reverse")]
     text = f" {at.message}" if at.message else f" {note}"
-    help_text = ACKNOWLEDGE if at.failures else help_text
+    helps = ACKNOWLEDGE if at.failures else helps
+    help_text = next((help_text for help_text in helps if len(help_text) < width), helps[-1])
     return [Text(_cut(text, width), style="bold"), Text(_cut(f" {help_text}", width), style="dim")]
 
 

@@ -131,7 +131,8 @@ def conclude(plant: Plant, polled: Mapping[str, Any], arguments: argparse.Namesp
     summary = {**polled, "recording": str(arguments.out) if arguments.out else None}
     for line in plant.lines:
         summary["lines"][line.name]["comparison"] = compare(line, summary["lines"][line.name])
-    print_text(json.dumps(summary, indent=2) if arguments.json else _text(summary))
+    into = "segments of " if getattr(arguments, "rotate", None) else ""
+    print_text(json.dumps(summary, indent=2) if arguments.json else _text(summary, into))
     return 0 if summary["samples"] else 1
 
 
@@ -142,7 +143,7 @@ def _ticks(seconds: float | None, interruption: Interruption) -> Iterator[None]:
         yield
 
 
-def _text(summary: dict[str, Any]) -> str:
+def _text(summary: dict[str, Any], into: str) -> str:
     lines: list[str] = []
     for name, line in summary["lines"].items():
         lines.append(
@@ -157,7 +158,7 @@ def _text(summary: dict[str, Any]) -> str:
             rows += [("", "", "", reason) for reason in more]
         lines += [f"  {row}" for row in aligned(rows, "<>><")]
         lines += comparison_text(line["comparison"])
-    into = f" in {summary['recording']}" if summary["recording"] else ""
+    into = f" in {into}{summary['recording']}" if summary["recording"] else ""
     dropped = f", {summary['dropped']} dropped" if summary["dropped"] else ""
     samples, misses = counted(summary["samples"], "sample"), counted(summary["misses"], "miss", "misses")
     lines.append(f"{samples} and {misses}{into}{dropped}")

@@ -16,5 +16,14 @@ def confirm(question: str, arguments: argparse.Namespace) -> None:
     if not sys.stdin.isatty():
         raise Refused(f"{question} There is no terminal to ask on: add --yes if it is meant")
     print(f"{printable(question)} [y/N] ", end="", file=sys.stderr, flush=True)
-    if sys.stdin.readline().strip().lower() not in ("y", "yes"):
+    answer = ""
+    try:
+        answer = sys.stdin.readline()
+    except KeyboardInterrupt as interruption:
+        interruption.add_note("nothing was sent")
+        raise
+    finally:
+        if not answer.endswith("\n"):  # the question's line has no end yet
+            print(file=sys.stderr)
+    if answer.strip().lower() not in ("y", "yes"):
         raise Refused("nothing was sent")

@@ -9,6 +9,7 @@ from multidrop.cli.support.extras import require_extra
 from multidrop.cli.support.output import warn
 from multidrop.cli.support.values import counted
 from multidrop.recording.append_file import already_there, new_file
+from multidrop.recording.segments import segments_of
 
 if TYPE_CHECKING:
     from multidrop.report.load import Recording
@@ -45,10 +46,17 @@ def warn_truncated(path: Path, rows: int, left_out: int) -> None:
         )
 
 
+def check_no_segments(path: Path) -> None:
+    """Raise ValueError where there is no recording at this path, but segments of one."""
+    if not path.exists() and path.parent.is_dir() and (segments := segments_of(path)):
+        raise ValueError(f"{path} was recorded in segments: name one of them, such as {segments[-1][1]}")
+
+
 def load_recording(path: Path, out: Path, command: str) -> Recording:
     """Load a recording for a command that draws it into the new file `out`."""
     require_extra("matplotlib", "plot", command)
     refuse_overwriting(out)
+    check_no_segments(path)
     from multidrop.report import load
 
     recording = load(path)

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
+from enum import Flag
 
 from multidrop.cli.support.values import value_text
 from multidrop.core import UNASKED, Counters
@@ -79,12 +80,17 @@ class LiveDrive:
             return "silent"
         if self.fault:
             return "fault"
-        if STATE in self.newest:
+        if STATE in self.newest and not self._is_bare(self.newest[STATE]):
             return self.shown(STATE).lower()
         row = self.newest.get(FREQUENCY)
         if row is None or not row.value:
             return ""  # 0 Hz may be a stop, or a run at a setpoint of 0
         return "turns"
+
+    def _is_bare(self, row: Row) -> bool:
+        """Return True for flags of which none is set: they are no name of a state."""
+        values = self.polled.drive.register(row.register).values
+        return not row.value and values is not None and issubclass(values, Flag)
 
     def remember(self) -> None:
         """Add a point of history: the frequency, or the register polled first."""
