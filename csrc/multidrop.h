@@ -19,6 +19,7 @@ enum {
     MD_DELAY_BUCKETS = 128,
     MD_MOST_OWED = 12,        /* requests of a drive whose replies may still come */
     MD_MOST_PROOFS = 4,
+    MD_PAUSE_S = 10, /* without a reply, in which another drive may take the place of one */
     MD_TIMES_KEPT = 6         /* when the same request was sent */
 };
 
@@ -135,6 +136,7 @@ struct md_history {
     uint64_t missed[MD_STATUSES];      /* values, by status */
     uint64_t exceptions, naks, busies; /* exchanges that ended with an exception; with code 7; with code 6 */
     uint32_t refused[MD_EXCEPTION_CODES]; /* values, by exception code */
+    uint64_t pauses;                      /* replies that came MD_PAUSE_S or more after the one before */
     struct md_owed owed[MD_MOST_OWED];
     struct md_unanswered unanswered[MD_MOST_OWED]; /* the oldest first */
 };

@@ -100,10 +100,17 @@ static void learn_burst(struct md_line *line, size_t at, int reply_len)
         line->burst = line->sight;
 }
 
+static void note_answer(const struct md_line *line, struct md_drive *drive)
+{
+    if (line->quiet_ns - drive->answered_ns >= MD_PAUSE_S * MD_SECOND_NS)
+        drive->history->pauses++;
+    drive->answered_ns = line->quiet_ns;
+}
+
 void md_reply_accept(struct md_line *line, size_t at, int used, const struct md_message *reply)
 {
     if (!line->exchange->insists)
-        line->exchange->drive->answered_ns = line->quiet_ns;
+        note_answer(line, line->exchange->drive);
     md_copy_message(&line->completion->reply, reply);
     line->completion->skipped -= (uint32_t)used;
     if (!line->transactions) {

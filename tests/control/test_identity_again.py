@@ -13,7 +13,9 @@ from motors import MAKE, ReceivedRequests
 
 from multidrop import Bus, InvtCHE, NoReply, Poller, Refused
 from multidrop.control import records
+from multidrop.core import PAUSE_NS
 from multidrop.sim import MotorDrive, Simulator, Wire, simulated
+from multidrop.transport import clock
 
 every_family = pytest.mark.parametrize("model", usually(*MAKE))
 GOODRIVE = 0x010A  # what another of INVT's series says it is, where a CHE says 0101H
@@ -67,6 +69,37 @@ def test_a_drive_that_was_silent_is_looked_at_once_before_the_next_write(
         be_silent(bus, drive, received)
         drive.set_frequency(20)
         assert looks == ["look"]
+
+
+@every_family
+@pytest.mark.parametrize("sleeps", [False, True], ids=["idle", "asleep"])
+def test_a_drive_of_which_nothing_was_heard_for_ten_seconds_is_looked_at_once(
+    model: str, sleeps: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(records, "LEAST_INTERVAL", 0.0)
+    with known(model) as (bus, drive, _received):
+        drive.set_frequency(10)
+        looks: list[str] = []
+        look = type(drive).identify._script
+        monkeypatch.setattr(
+            type(drive).identify, "_script", lambda drive: looks.append("look") or look(drive)
+        )
+        if sleeps:
+            boottime_ns = clock.boottime_ns
+            monkeypatch.setattr(clock, "boottime_ns", lambda: boottime_ns() + 2 * PAUSE_NS)
+        else:
+            bus.peer(drive).c.answered_ns -= 2 * PAUSE_NS
+        drive.set_frequency(20)
+        assert looks == ["look"]
+
+
+@every_family
+def test_a_stop_of_a_drive_that_was_idle_asks_nothing_first(model: str) -> None:
+    with known(model) as (bus, drive, received):
+        bus.peer(drive).c.answered_ns -= 2 * PAUSE_NS
+        received.requests.clear()
+        drive.stop()
+        assert received.requests[0] == received.writes[0]
 
 
 @every_family

@@ -188,7 +188,7 @@ def test_what_is_made_and_shown(run: Run, nats: Cluster, tmp_path: Path) -> None
     assert lines["hall-1"]["master"] is None
     status, out, _ = run("fleet", "status", *servers)
     assert status == 1  # a line without a master
-    assert "1 lines, 1 without a master" in out
+    assert "1 line, 1 without a master" in out
     said = one_sentence(run("fleet", "drain", "gw-9", *servers))
     assert "no gateway called gw-9 answers; `multidrop fleet status` lists them" in said
 

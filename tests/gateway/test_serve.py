@@ -165,7 +165,7 @@ def test_other_commands_leave_the_table_alone(run: Run, tmp_path: Path, command:
     status, out, errors = run(command, plant.path)
     assert (status, errors) == (0, "")
     if command == "check":
-        found = f"No mistake found in {plant.path}: 1 lines, 2 drives"
+        found = f"No mistake found in {plant.path}: 1 line, 2 drives"
         assert out == f"{found}; `multidrop serve --check` checks its [serve].\n"
 
 

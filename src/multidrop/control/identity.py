@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext, suppress
+from typing import NamedTuple
 
 from multidrop.control.echo_check import EchoCheck
+from multidrop.core import PAUSE_NS
 from multidrop.drive.family import Drive
 from multidrop.drive.script import Read, Step, Wait, carry_out
 from multidrop.drives import MODELS
@@ -19,30 +21,40 @@ Timed = Callable[[], AbstractContextManager[None]]
 Suspicion = tuple[str, bool]  # why it is not of its family, and whether it answered every read
 
 
+class _Look(NamedTuple):
+    """The state of things when a drive was found to be of its family."""
+
+    port: object  # as it was opened
+    silences: int  # times that it had not answered before
+    pauses: int  # in which it was not asked, until then
+    slept_ns: int  # for which the machine had slept before
+
+
 class IdentityCheck:
     """The drives that were checked, each on the port as it was opened last."""
 
     def __init__(self, exchanges: Exchanges, echo: EchoCheck) -> None:
         self._exchanges = exchanges
         self._echo = echo
-        self._known: dict[Drive, object] = {}  # the open port on which it was found to be of its family
-        self._silences: dict[Drive, int] = {}  # times that it had not answered before it was found so
-        self._stoppable: dict[Drive, object] = {}  # or on which nothing was found against a stop
+        self._known: dict[Drive, _Look] = {}  # those that were found to be of their families
+        self._stoppable: dict[Drive, object] = {}  # the open port on which nothing was found against a stop
         self._suspected: dict[Drive, tuple[object, Suspicion]] = {}  # the port, and the first suspicion
 
     def is_known(self, drive: Drive) -> bool:
-        return self._known.get(drive, self) is self._exchanges.line.queue
+        look = self._known.get(drive)
+        return look is not None and look.port is self._exchanges.line.queue
 
     def _is_the_same(self, drive: Drive) -> bool:
-        """Return True where it answered all since it was known: whoever changes a drive interrupts it."""
-        return self.is_known(drive) and self._silences.get(drive) == self._exchanges.peer(drive).silences
-
-    def _know(self, drive: Drive, port: object, silences: int) -> None:
-        self._known[drive], self._silences[drive] = port, silences
+        """Return True where it answered all since it was known, without a pause: so nobody has changed it."""
+        look, peer = self._known.get(drive), self._exchanges.peer(drive)
+        if look is None or look.port is not self._exchanges.line.queue:
+            return False
+        if (look.silences, look.pauses) != (peer.silences, peer.pauses):
+            return False
+        return clock.now_ns() - peer.answered_ns + _slept_ns() - look.slept_ns < PAUSE_NS
 
     def forget(self, drive: Drive) -> None:
         self._known.pop(drive, None)
-        self._silences.pop(drive, None)
         self._stoppable.pop(drive, None)
         self._suspected.pop(drive, None)
 
@@ -52,8 +64,9 @@ class IdentityCheck:
         """Check once; Refused when it is of another family, NoReply when it does not answer.
 
         At least one value is read, so that the echo of an adapter is known before it could be taken for
-        the drive's confirmation of a write. After the port was opened again, and after it did not answer, it
-        is checked again, because something else may be there. Each read is within `timed`.
+        the drive's confirmation of a write. After the port was opened again, after it did not answer, and after
+        PAUSE_NS without an answer, it is checked again, because something else may be there. Each read is
+        within `timed`.
         """
         if self._is_the_same(drive):
             return
@@ -77,6 +90,9 @@ class IdentityCheck:
             with timed():
                 self._echo.read_any(drive, READ_ATTEMPTS)
         self._know(drive, port, silences)
+
+    def _know(self, drive: Drive, port: object, silences: int) -> None:
+        self._known[drive] = _Look(port, silences, self._exchanges.peer(drive).pauses, _slept_ns())
 
     def _read(self, drive: Drive, step: Step, attempts: int, *, insists: bool = False) -> object:
         if not isinstance(step, Read):
@@ -171,6 +187,11 @@ class IdentityCheck:
         except (BusError, ValueError):
             return False
         return True
+
+
+def _slept_ns() -> int:
+    """Return for how long the machine has slept so far."""
+    return int(clock.boottime_ns() - clock.now_ns())
 
 
 def _withheld(drive: Drive, why: str, other: Drive | None) -> Refused:

@@ -17,7 +17,7 @@ from multidrop.core.columns import (
     spell,
 )
 from multidrop.core.counters import DELAY_BUCKETS, Counters, delay_edge
-from multidrop.core.exchange import DATA_AT, Completion, Exchange, Peer
+from multidrop.core.exchange import DATA_AT, PAUSE_NS, Completion, Exchange, Peer
 from multidrop.core.frame import (
     MODBUS,
     Framing,
@@ -77,6 +77,7 @@ __all__ = [
     "LOW_WORD_FIRST",
     "MODBUS",
     "MOST_INVALID",
+    "PAUSE_NS",
     "REFUSALS",
     "RS485",
     "STATUSES",

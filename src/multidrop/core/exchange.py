@@ -16,6 +16,7 @@ from multidrop.core.port_settings import settings_to_c
 from multidrop.core.result import Status
 
 MOST_PROOFS: int = lib.MD_MOST_PROOFS
+PAUSE_NS: int = lib.MD_PAUSE_S * 1_000_000_000
 
 
 class Peer:
@@ -64,6 +65,16 @@ class Peer:
     def late_until_ns(self) -> int:
         """The time until which the reply to an earlier request may still come."""
         return int(self.c.late_until_ns)
+
+    @property
+    def answered_ns(self) -> int:
+        """The time of its last reply, or a little earlier; 0 before the first one."""
+        return int(self.c.answered_ns)
+
+    @property
+    def pauses(self) -> int:
+        """Replies that came PAUSE_NS or more after the one before; the first reply is one."""
+        return int(self.c.history.pauses)
 
     @property
     def ready_ns(self) -> int:
