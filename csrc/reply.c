@@ -102,7 +102,7 @@ static void learn_burst(struct md_line *line, size_t at, int reply_len)
 
 static void note_answer(const struct md_line *line, struct md_drive *drive)
 {
-    if (line->quiet_ns - drive->answered_ns >= MD_PAUSE_S * MD_SECOND_NS)
+    if (drive->answered_ns && line->quiet_ns - drive->answered_ns >= MD_PAUSE_S * MD_SECOND_NS)
         drive->history->pauses++;
     drive->answered_ns = line->quiet_ns;
 }

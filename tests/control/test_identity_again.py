@@ -72,9 +72,9 @@ def test_a_drive_that_was_silent_is_looked_at_once_before_the_next_write(
 
 
 @every_family
-@pytest.mark.parametrize("sleeps", [False, True], ids=["idle", "asleep"])
+@pytest.mark.parametrize("pause", ["idle", "asleep", "read since"])
 def test_a_drive_of_which_nothing_was_heard_for_ten_seconds_is_looked_at_once(
-    model: str, sleeps: bool, monkeypatch: pytest.MonkeyPatch
+    model: str, pause: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(records, "LEAST_INTERVAL", 0.0)
     with known(model) as (bus, drive, _received):
@@ -84,11 +84,13 @@ def test_a_drive_of_which_nothing_was_heard_for_ten_seconds_is_looked_at_once(
         monkeypatch.setattr(
             type(drive).identify, "_script", lambda drive: looks.append("look") or look(drive)
         )
-        if sleeps:
-            boottime_ns = clock.boottime_ns
-            monkeypatch.setattr(clock, "boottime_ns", lambda: boottime_ns() + 2 * PAUSE_NS)
-        else:
+        if pause == "read since":  # which says nothing of who answers
             bus.peer(drive).c.answered_ns -= 2 * PAUSE_NS
+            bus.read(drive, next(register for register in drive.registers.values() if register.readable))
+        else:
+            for name in ("boottime_ns", "now_ns")[: 1 + (pause == "idle")]:
+                at_ns = getattr(clock, name)
+                monkeypatch.setattr(clock, name, lambda at_ns=at_ns: at_ns() + 2 * PAUSE_NS)
         drive.set_frequency(20)
         assert looks == ["look"]
 

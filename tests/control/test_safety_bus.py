@@ -14,6 +14,7 @@ from simulated_bus import EXCHANGE_TIME, SimulatedBus, is_write, one
 from toy import Toy
 
 from multidrop.bus import Bus
+from multidrop.control import records
 from multidrop.control.audit_log import read_audit
 from multidrop.control.eeprom_ledger import Ledger
 from multidrop.control.outcome import Effect, Seen
@@ -157,17 +158,18 @@ def test_raw_goes_past_every_rule_and_is_called_that(monkeypatch: pytest.MonkeyP
 def test_the_first_write_is_preceded_by_a_look_and_the_second_is_not(
     monkeypatch: pytest.MonkeyPatch, model: str
 ) -> None:
+    monkeypatch.setattr(records, "LEAST_INTERVAL", 0.0)  # s between writes of one register to an EEPROM
     line, drive, _ = one(monkeypatch, MAKE[model](1))
     drive.set_frequency(20)
     assert line.frames[0][1] not in line.written
     assert line.written
     looks: list[str] = []
     monkeypatch.setattr(type(drive).identify, "_script", lambda drive: iter(looks.append("look") or ()))
-    line.sleep(61)
+    line.sleep(1)
     drive.set_frequency(25)
     assert looks == []
     line.queue = object()  # the port was opened anew: who knows what is on it
-    line.sleep(61)
+    line.sleep(1)
     drive.set_frequency(30)
     assert looks == ["look"]
 
@@ -783,14 +785,14 @@ def test_the_audit_log_has_every_write(monkeypatch: pytest.MonkeyPatch, tmp_path
     with pytest.raises(Unconfirmed):
         drive.start()
     line.bus.close()
-    records = list(read_audit(log))
-    assert [(record["write"], record["sent"][:17], record["outcome"]) for record in records] == [
+    noted = list(read_audit(log))
+    assert [(record["write"], record["sent"][:17], record["outcome"]) for record in noted] == [
         ("setpoint = 40.00 %", "01 06 20 00 0F A0", "done"),
         ("control = FORWARD", "01 06 10 00 00 01", "unconfirmed"),
     ]
-    assert records[0]["held"] == 40
-    assert records[0]["time"].startswith("2023-11-14T22:")
-    assert (records[1]["drive"], records[1]["address"], records[1]["port"]) == ("invt-che@1", 1, "hall")
+    assert noted[0]["held"] == 40
+    assert noted[0]["time"].startswith("2023-11-14T22:")
+    assert (noted[1]["drive"], noted[1]["address"], noted[1]["port"]) == ("invt-che@1", 1, "hall")
 
 
 def test_a_log_that_cannot_be_written_does_not_hinder_a_stop(

@@ -27,6 +27,7 @@ class _Look(NamedTuple):
     port: object  # as it was opened
     silences: int  # times that it had not answered before
     pauses: int  # in which it was not asked, until then
+    at_ns: int
     slept_ns: int  # for which the machine had slept before
 
 
@@ -46,12 +47,14 @@ class IdentityCheck:
 
     def _is_the_same(self, drive: Drive) -> bool:
         """Return True where it answered all since it was known, without a pause: so nobody has changed it."""
-        look, peer = self._known.get(drive), self._exchanges.peer(drive)
+        look = self._known.get(drive)
         if look is None or look.port is not self._exchanges.line.queue:
             return False
+        peer = self._exchanges.peer(drive)
         if (look.silences, look.pauses) != (peer.silences, peer.pauses):
             return False
-        return clock.now_ns() - peer.answered_ns + _slept_ns() - look.slept_ns < PAUSE_NS
+        idle_ns = clock.now_ns() - max(look.at_ns, peer.answered_ns)
+        return idle_ns + _slept_ns() - look.slept_ns < PAUSE_NS
 
     def forget(self, drive: Drive) -> None:
         self._known.pop(drive, None)
@@ -64,8 +67,8 @@ class IdentityCheck:
         """Check once; Refused when it is of another family, NoReply when it does not answer.
 
         At least one value is read, so that the echo of an adapter is known before it could be taken for
-        the drive's confirmation of a write. After the port was opened again, after it did not answer, and after
-        PAUSE_NS without an answer, it is checked again, because something else may be there. Each read is
+        the drive's confirmation of a write. It is checked again after the port was opened again, after it
+        did not answer, and after PAUSE_NS without an answer: something else may be there. Each read is
         within `timed`.
         """
         if self._is_the_same(drive):
@@ -92,7 +95,8 @@ class IdentityCheck:
         self._know(drive, port, silences)
 
     def _know(self, drive: Drive, port: object, silences: int) -> None:
-        self._known[drive] = _Look(port, silences, self._exchanges.peer(drive).pauses, _slept_ns())
+        pauses = self._exchanges.peer(drive).pauses
+        self._known[drive] = _Look(port, silences, pauses, clock.now_ns(), _slept_ns())
 
     def _read(self, drive: Drive, step: Step, attempts: int, *, insists: bool = False) -> object:
         if not isinstance(step, Read):

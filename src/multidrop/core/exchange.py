@@ -73,7 +73,7 @@ class Peer:
 
     @property
     def pauses(self) -> int:
-        """Replies that came PAUSE_NS or more after the one before; the first reply is one."""
+        """Replies that came PAUSE_NS or more after the one before."""
         return int(self.c.history.pauses)
 
     @property
