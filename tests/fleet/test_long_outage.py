@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 from nats_clusters import Cluster, cluster
+from peers import require_module
 from spooled import exchanges_in, numbered
 
 from multidrop import History
@@ -68,6 +69,7 @@ def settled(spool: Spool, most: int) -> SpoolState:
 
 def test_nats_is_away_for_longer_than_the_spool_can_keep(tmp_path: Path, most: int) -> None:
     """Rows that are kept, and rows that the spool counts as lost, are all that there were."""
+    require_module("duckdb")
     with cluster(tmp_path / "nats", 1) as servers:
 
         async def live() -> tuple[HubState, SpoolState]:
