@@ -108,9 +108,9 @@ def test_a_cluster_that_grants_a_key_twice_is_refused(
 def test_servers_that_do_not_look_at_all_writers_records_are_refused(
     nats: Cluster, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Such ones would give a lease to its gateway and to who ends it. On a busy machine some answers are late."""
+    """Such ones would give a lease to its gateway and to who ends it. Some answers may come too late."""
     monkeypatch.setattr(lease_bucket.LeaseBucket, "_all_of", lease_bucket.LeaseBucket._subject)
-    with pytest.raises(FleetError, match="gave one revision of a key to [2-6] of 6 claimants at once"):
+    with pytest.raises(FleetError, match=r"gave one revision of a key to [2-6] of 6 claimants at once"):
         asyncio.run(_init(nats.urls))
 
 
