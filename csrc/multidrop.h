@@ -19,7 +19,7 @@ enum {
     MD_DELAY_BUCKETS = 128,
     MD_MOST_OWED = 12,        /* requests of a drive whose replies may still come */
     MD_MOST_PROOFS = 4,
-    MD_PAUSE_S = 10, /* without a reply, in which another drive may take the place of one */
+    MD_PAUSE_S = 10,          /* without a reply, in which another drive may take the place of one */
     MD_TIMES_KEPT = 6         /* when the same request was sent */
 };
 

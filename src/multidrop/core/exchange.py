@@ -68,7 +68,7 @@ class Peer:
 
     @property
     def answered_ns(self) -> int:
-        """The time of its last reply, or a little earlier; 0 before the first one."""
+        """About the time of its newest reply; 0 before the first one."""
         return int(self.c.answered_ns)
 
     @property
