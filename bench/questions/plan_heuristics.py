@@ -18,8 +18,8 @@ from multidrop.drive import Drive
 from multidrop.drive.register import Register
 from multidrop.drive.table import Table
 from multidrop.drives import MODELS
-from multidrop.planning.blocks import Block, Planned, blocks
-from multidrop.planning.bus_time import gap, sending
+from multidrop.planning.blocks import Block, Planned, blocks, sending
+from multidrop.planning.bus_time import gap
 from multidrop.planning.bus_time import in_order as cycle_order
 
 GAPS = range(40)
