@@ -1,6 +1,6 @@
 """`multidrop check`: says what a family's file declares, what it leaves open, and what will be refused.
 
-A plant file is checked too, without opening a port; its table `[serve]` by `multidrop serve --check`.
+It checks a plant file too, but for its table `[serve]`: `multidrop serve --check` does that.
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _is_plant(file: Path) -> bool:
-    """Return True for a file with lines; one that cannot be read is taken for a family's, which says why."""
+    """Return True for a file with lines. One that cannot be read is none: loading it as a family says why."""
     try:
         return "line" in read_document(file, "file")
     except ValueError:

@@ -97,7 +97,10 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _audit_file(arguments: argparse.Namespace) -> str | None:
-    """Return the audit log; None, with a warning, where a stop's cannot be opened: it holds no stop back."""
+    """Return the audit log's path; None, with a warning, where it cannot be opened for a stop.
+
+    A log that cannot be written holds no stop back.
+    """
     audit: str | None = getattr(arguments, "audit", None)
     if audit and arguments.command in _STOPS:
         try:
@@ -110,7 +113,7 @@ def _audit_file(arguments: argparse.Namespace) -> str | None:
 
 @contextmanager
 def _annotating(command: str, target: Target) -> Iterator[list[str]]:
-    """Add to an interruption what is known of the verb, and the command that stops the motor."""
+    """Add notes to an interruption: what is known of the verb, and the command that stops the motor."""
     known: list[str] = []
     try:
         yield known
@@ -131,7 +134,7 @@ def _setpoint(drive: Drive, hz: float) -> Write | None:
 
 
 def _rehearse(script: Script[Any]) -> None:
-    """Make the first step: raise for what the family lacks or forbids, before a port is opened."""
+    """Make the script's first step: raise for what the family lacks or forbids, before a port is opened."""
     step = next(script)
     if isinstance(step, Write):
         step.register.encode(step.value)
