@@ -30,7 +30,8 @@ static uint32_t number(const struct md_capture *capture, const uint8_t *at)
     return value;
 }
 
-/* Skip what a link type puts before a frame; its tags tell who sent it, and by what rules. */
+/* Return the length of what a link type puts before a frame; tags in it tell who sent the frame, and whether
+ * it is Modbus TCP. */
 static size_t skip_header(struct md_channel *channel, const uint8_t *packet, size_t len, uint8_t *side)
 {
     uint32_t link = channel->link;
@@ -68,7 +69,7 @@ static int put(struct md_channel *channel, const uint8_t *packet, size_t len, ui
         piece.side = MD_EITHER_SIDE;
     uint64_t seconds = ticks / channel->ticks_per_s, rest = ticks % channel->ticks_per_s;
     uint64_t time_ns = seconds * 1000000000u + rest * 1000000000u / channel->ticks_per_s;
-    piece.time_ns = (int64_t)(time_ns + (uint64_t)channel->offset_ns); /* a senseless one may wrap around */
+    piece.time_ns = (int64_t)(time_ns + (uint64_t)channel->offset_ns); /* a nonsensical one may wrap around */
     return md_stream_put(&channel->stream, packet + header, len - header, piece);
 }
 

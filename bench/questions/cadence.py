@@ -35,7 +35,7 @@ def of_multidrop(job: Job) -> tuple[int, numpy.ndarray]:
 
 
 def of_pymodbus(job: Job) -> tuple[int, numpy.ndarray]:
-    """Good exchanges, and how much longer than on the wire each call took, in ms."""
+    """Return the number of good exchanges, and by how much longer than on the wire each call took, in ms."""
     wire = job.wire if job.baudrate else 0.0
     took: list[float] = []
     with rivals.pymodbus(job) as read:
@@ -51,7 +51,7 @@ MASTERS = {"multidrop": of_multidrop, "pymodbus": of_pymodbus}
 
 
 def work(master: str, job: Job) -> None:
-    """First alone, then beside the busy thread."""
+    """Print rate and lateness as JSON: alone, and then beside the busy thread."""
     told = {}
     for when in ("alone", "beside"):
         if when == "beside":

@@ -18,7 +18,7 @@ from bench.support.programs import paced_line
 
 
 def measured(threads: int, baudrate: int, seconds: float) -> dict[str, float]:
-    """Exchanges a second of the polling, of the threads, and the longest that one of these took."""
+    """Return exchanges a second of the polling and of the threads, and the threads' longest call in s."""
     with paced_line(baudrate=baudrate) as line, adapter.polling(Job(line.path, baudrate, seconds)) as poller:
         bus = poller.bus("line")
         stop, took = threading.Event(), []

@@ -19,9 +19,8 @@ from bench.support.tables import heading, show
 from multidrop.importers import SUFFIXES, ImportedDevice, all_devices
 
 MOST_SHOWN = 15  # rows of what is said besides
-_DETAIL = re.compile(
-    r"\b((?<=scale register )\w+|0x[0-9a-fA-F]+|[0-9A-F]{4}H|\d+)\b"
-)  # a number in a reason: equal ones count together
+# A number or a name in a reason: reasons that differ in nothing else count together.
+_DETAIL = re.compile(r"\b((?<=scale register )\w+|0x[0-9a-fA-F]+|[0-9A-F]{4}H|\d+)\b")
 
 
 def load(folder: Path) -> tuple[list[ImportedDevice], list[str]]:
@@ -68,7 +67,7 @@ class Coverage:
             yield words, len(needing), sum(entry.is_whole for entry in needing)
 
     def lacking(self) -> Iterator[tuple[str, int, int]]:
-        """Yield each reason, the entries that lack it, and the devices with one of them."""
+        """Yield each reason, how many entries are not held because of it, and in how many devices."""
         entries, devices = Counter[str](), Counter[str]()
         for _, found in self.by_device:
             reasons = [_lack(entry) for entry in found if entry.lacks]
@@ -77,7 +76,7 @@ class Coverage:
         yield from ((reason, count, devices[reason]) for reason, count in entries.most_common())
 
     def besides(self) -> Iterator[tuple[str, int]]:
-        """Yield what importers say of entries and devices that are held, and how often."""
+        """Yield each remark of the importers on what is held, and how often they make it."""
         said = Counter(
             _DETAIL.sub("N", gap) for entry in self.entries if entry.entry for gap in entry.entry.gaps
         )

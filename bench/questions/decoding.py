@@ -43,7 +43,7 @@ def main() -> None:
 
 
 def write(path: Path, registers: int, least_bytes: float) -> int:
-    """A capture of so many bytes of frames, or a little more; how many exactly."""
+    """Write a capture of at least so many bytes of frames; return how many it has."""
     records, size = [], 0
     for time_us, frame in enumerate(frames(registers)):
         records.append(struct.pack("<IIII", 0, time_us, len(frame), len(frame)) + frame)
@@ -63,7 +63,7 @@ def frames(registers: int) -> Iterator[bytes]:
 
 
 def decoded(path: Path) -> tuple[int, float]:
-    """Values, and seconds of the processor."""
+    """Return the number of values, and the CPU seconds that decoding them took."""
     begun = time.process_time()
     with Capture(path) as capture:
         values = sum(map(len, Decoding(capture)))

@@ -1,8 +1,8 @@
 """Cost of faults on a paced line: stray bytes, silent drives, requests that are refused.
 
-31 drives at 38400, or as many as is said. A rate is held against that of the same plant without the
-fault, measured right before it: without the stray bytes, or without the silent drives. All figures are
-medians. `python -m bench.questions.faults MASTER JOB` is the process of a master whose requests are refused.
+31 drives at 38400 baud, or `--drives` of them. Each rate is divided by that of the same plant without the
+stray bytes, or without the silent drives, which is measured right before. All figures are medians.
+`python -m bench.questions.faults MASTER JOB` is the process of a master whose requests are refused.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ WIRE_MS = CHARACTERS * 10 / BAUDRATE * 1e3 + 2
 
 
 def measured(master: str, drives: int, arguments: argparse.Namespace, **fault: Any) -> tuple[float, float]:
-    """Answers per second that drives gave once the master was settled, and the share that it read."""
+    """Return the drives' answers a second once the master has settled, and its good exchanges of all."""
     settle_ms = round(arguments.settle * 1000)
     with paced_line(baudrate=BAUDRATE, drives=drives, settle_ms=settle_ms, **fault) as line:
         own = rivals.measure(master, Job(line.path, BAUDRATE, arguments.settle + arguments.seconds, drives))
@@ -40,7 +40,7 @@ def measured(master: str, drives: int, arguments: argparse.Namespace, **fault: A
 
 
 def cases(drives: int, silent: list[int]) -> Iterator[tuple[str, int, dict[str, Any]]]:
-    """Each fault's name, how many drives there are without it, and what the line is told."""
+    """Yield each fault's name, the drives of the plant without it, and the line's options for it."""
     yield "00 before every reply", drives, {"stray": True}
     for dead in silent:
         living = drives - dead
@@ -72,7 +72,7 @@ READERS = {"multidrop": of_multidrop, **rivals.READERS}
 
 
 def ask_in_vain(master: str, job: Job) -> None:
-    """Milliseconds until a call has told that the drive refuses, and what it says."""
+    """Print as JSON how many ms each call took to tell that the drive refuses, and its words."""
     took, said = [], "an empty answer"
     with READERS[master](job) as read:
         for at in range(REFUSALS):

@@ -117,7 +117,7 @@ def instructions(lines: int, seconds: float) -> tuple[int, dict[str, Any]]:
 
 @contextmanager
 def talkers(lines: int) -> Iterator[list[str]]:
-    """Play so many paced lines: their ports."""
+    """Play so many paced lines, and give their ports."""
     from bench.players.responders import responders
 
     with responders("pty", lines, "--baudrate", BAUDRATE, "--delay-us", 2000) as (ports, _):

@@ -34,7 +34,7 @@ from multidrop.gateway.gateway import Gateway
 from multidrop.gateway.mbap import ModbusClient, ModbusPort
 from multidrop.gateway.metrics import families_of
 from multidrop.gateway.modbus_server import ModbusServer
-from multidrop.gateway.passing import ModbusSettings
+from multidrop.gateway.modbus_settings import ModbusSettings
 from multidrop.gateway.settings import ServeSettings
 from multidrop.gateway.views import figures_of
 from multidrop.gateway.web import make_app

@@ -1,10 +1,10 @@
 """Measure what a day of 310 series at 10 Hz costs: to take in, to compact, to keep and to plot.
 
 `python -m bench.questions.history DIRECTORY` makes such a day there, in segments of ten minutes. The first is
-recorded as .arrows, in batches of 0.2 s, and compacted by the process that the historian begins; the others
-are made by DuckDB, by the same queries from generated rows; after the first hour of rows at 1 Hz, which
-gives as many tens. The last half of a segment still grows, at 10 Hz. Then it
-asks what a page asks. A directory that has such a day already is asked as it is.
+recorded as .arrows, in batches of 0.2 s, and compacted by the process that a gateway begins for it. The
+others are made by DuckDB from generated rows, by the same queries; after the first hour the rows are at 1 Hz,
+which gives as many tens. Half a segment at 10 Hz still grows at the end. Then the questions of a page are
+asked. A directory that has such a day already is asked as it is.
 """
 
 from __future__ import annotations
@@ -185,7 +185,7 @@ def main() -> None:
 
 
 def _merge(folder: Path, hours: int) -> None:
-    """Let the day be over."""
+    """End the day, so that its tens become one file: add a second of the day after, and compact."""
     with connect("100MB", folder / ".making") as database:
         made(database, 30 * 3600, 30 * 3600 + 1)
         number = hours * 3600 // SEGMENT_S + 5

@@ -59,7 +59,7 @@ def main() -> None:
 
 
 def slow_paths(arguments: argparse.Namespace) -> Iterator[tuple[object, ...]]:
-    """A row for each path, with few drives on few lines: each exchange takes as long as the path."""
+    """Yield a row for each path, of few drives on few lines: each exchange takes as long as the path."""
     from bench.masters import many_adapter
 
     for path_ms in PATHS_MS:

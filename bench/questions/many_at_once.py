@@ -46,7 +46,7 @@ HEAD += ("failed", "memory kB", "descriptors", "threads")
 
 
 def plant(ports: Sequence[str], drives: int) -> Plant:
-    """On each line IBDs from address 1 on, and a YD1000 whose motor is commanded."""
+    """Return a plant with IBDs on each line from address 1 on, and a YD1000 whose motor is commanded."""
     lines = []
     for number, port in enumerate(ports, 1):
         found = [InnovertIBD(at, name=f"ibd-{number}-{at}") for at in range(1, drives)]
@@ -58,7 +58,7 @@ def plant(ports: Sequence[str], drives: int) -> Plant:
 
 
 def wires(lines: int, drives: int) -> list[Wire]:
-    """Without waits, so that there is no processor for their pace."""
+    """Return wires without waits: no processor is left to keep a pace."""
     return [
         Wire(
             [
@@ -176,7 +176,10 @@ class Round:
     # ---- what came of it ----
 
     def told(self) -> tuple[int, int]:
-        """Exchanges, and values that are neither taken nor missed; all drives have come back."""
+        """Return the exchanges, and how many rows the summary counts that nobody took.
+
+        All drives are back by then, so that the summary has every one.
+        """
         summary = self.poller.summary()
         lost = summary["samples"] + summary["misses"] - self.counts["rows"]
         return sum(line["exchanges"] for line in summary["lines"].values()), lost

@@ -21,7 +21,7 @@ PORT = str(CORE / "termios.c")
 
 
 def measured(line: many_adapter.Mixed, seconds: float) -> tuple[dict[str, Any], dict[str, Any]]:
-    """The line as its drives and as the poll saw it."""
+    """Return what the drives and what the poll saw of the line."""
     with talking([compiled("players/mixed_line.c", *FRAMES, PORT), *line.words]) as player:
         told = subprocess.check_output(module("bench.questions.mixed_line", player.said, str(seconds)))
     return player.report, json.loads(told)

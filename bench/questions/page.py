@@ -81,7 +81,7 @@ def until(page: Any, expression: str) -> float:
 
 
 def opened(context: Any, url: str, bytes_a_second: int | None = None) -> Any:
-    """A live page; where it is slowed down, from then on, with its network's handle."""
+    """Return a page that is live; `bytes_a_second` slows its network down from then on."""
     page = context.new_page()
     page.goto(url)
     until(page, LIVE)
@@ -94,7 +94,7 @@ def opened(context: Any, url: str, bytes_a_second: int | None = None) -> Any:
 
 
 def row(what: str, pages: list[Any], seconds: float) -> list[object]:
-    """Look at some pages, one after another while all are open, as a row of the table."""
+    """Look at some pages, one after another while all are open; return a row of the table."""
     arrived: list[float] = []
     frames: list[float] = []
     values: list[float] = []

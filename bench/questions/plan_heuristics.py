@@ -18,8 +18,8 @@ from multidrop.drive import Drive
 from multidrop.drive.register import Register
 from multidrop.drive.table import Table
 from multidrop.drives import MODELS
-from multidrop.planning.blocks import Block, Planned, blocks
-from multidrop.planning.bus_time import gap, sending
+from multidrop.planning.blocks import Block, Planned, blocks, sending
+from multidrop.planning.bus_time import gap
 from multidrop.planning.bus_time import in_order as cycle_order
 
 GAPS = range(40)
@@ -45,7 +45,7 @@ def plant(lot: random.Random) -> Plant:
 
 
 def merged(drive: Drive, registers: Registers, most_gap: int) -> list[Block]:
-    """From below, as long as no more than so many addresses lie between two registers; -1: never."""
+    """Merge registers by rising address while at most `most_gap` addresses lie between two; -1: none."""
     tables: dict[Table, list[Register[Any]]] = {}
     for register in registers:
         tables.setdefault(register.table, []).append(register)
@@ -85,7 +85,7 @@ def end(register: Register[Any]) -> int:
 
 
 def cycle(drives: Iterable[Drive], of_drive: dict[Drive, Iterable[Block]]) -> float:
-    """Seconds for reading everything once, in this order of the drives."""
+    """Return the seconds for reading everything once, in this order of the drives."""
     exchanges = [Planned(drive, block) for drive in drives for block in of_drive[drive]]
     return sum(
         gap(exchanges[at - 1].drive, each.drive) + sending(each.drive, each.block) + each.drive.response_delay

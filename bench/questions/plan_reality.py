@@ -88,14 +88,14 @@ def case(name: str, port: str, wanted: Wanted, seconds: float) -> Case:
 
 
 def middle(times: Sequence[int]) -> float:
-    """Seconds from one of these times, in ns, to the next."""
+    """Return the usual s between two of these times in ns: the median over the seconds of their means."""
     most = len(times) - 1
     step = min(most, max(1, round(1e9 * most / (times[-1] - times[0]))))
     return median(times[at + step] - times[at] for at in range(0, most - step + 1, step)) / step / 1e9
 
 
 def cycle(wanted: Wanted, delays: dict[Drive, float]) -> float:
-    """Seconds from one turn to the next of those drives, as predicted."""
+    """Return the predicted s from one turn to the next of the drives without a rate."""
     return next(1 / rate.reached for rate in predict(exchanges(wanted), delays).rates if rate.every is None)
 
 

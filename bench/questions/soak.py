@@ -178,7 +178,7 @@ class Soak:
         return period
 
     def unexplained(self, overrun: int) -> int:
-        """Values that are neither there nor missed nor counted as left out, since the beginning."""
+        """Return how many values so far are neither there nor missed nor counted as left out."""
         slots = int((time.monotonic() - self.begun) / plants.EVERY) - IN_FLIGHT
         return max(0, sum(max(0, slots - self.slots[key]) for key in self.timed) - overrun)
 

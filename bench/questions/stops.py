@@ -48,7 +48,10 @@ def _in_turn(chance: random.Random) -> Iterator[str]:
 
 
 def signals(number: int, leaving: bool) -> Attack:
-    """So many signals at random moments, while the client waits or leaves; three may cut its stops short."""
+    """Return an attack by signals at random moments, while the client waits or leaves.
+
+    Three of them may cut its stops short.
+    """
 
     def attack(chance: random.Random, rounds: int, is_long: bool) -> Counters:
         counters = Counters()
@@ -125,7 +128,7 @@ def deaf(chance: random.Random, rounds: int, is_long: bool) -> Counters:
 
 
 def two_lines(*, polls: bool) -> Attack:
-    """Each with four motors that take their time to stand; a signal stops both."""
+    """Return an attack on two lines of four motors that take their time to stand: a signal stops both."""
 
     def attack(chance: random.Random, rounds: int, is_long: bool) -> Counters:
         counters = Counters()

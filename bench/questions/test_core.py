@@ -36,7 +36,7 @@ TEN_VALUES = RowLayout(0, [Field(at, NumberFormat.U16, at, 1, 10) for at in rang
 
 
 def unhurried(request: Message) -> Exchange:
-    """An exchange that waits for nothing: what is left is the host's own cost."""
+    """Return an exchange without a silence or a time on the wire: what it costs is the host's."""
     return Exchange(
         Framing.RTU,
         request,

@@ -36,7 +36,7 @@ COLUMNS = (
 
 
 def measured(master: str, baudrate: int, seconds: float) -> dict[str, Any]:
-    """One slice, as the drives and as the master see it."""
+    """Measure one slice, from the drives' and from the master's side."""
     with paced_line(baudrate=baudrate) as line:
         job = Job(line.path, baudrate, seconds)
         if master in (BARE, ASLEEP):

@@ -56,7 +56,7 @@ SYSTEMS: dict[str, Callable[[Job, Path], dict[str, Any]]] = {"Linux": here, "Win
 
 
 def measured(system: str, baudrate: int, seconds: float, folder: Path) -> dict[str, Any]:
-    """One slice, as the drives and as the master see it."""
+    """Measure one slice, from the drives' and from the master's side."""
     with paced_line(baudrate=baudrate) as line:
         own = SYSTEMS[system](Job(line.path, baudrate, seconds), folder)
     report = line.report

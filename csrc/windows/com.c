@@ -1,4 +1,4 @@
-/* COM ports: a byte that is read as it comes, all that is there, and a request that leaves by itself. */
+/* COM ports: wait for one byte, read all that has come, and let a request leave while the thread goes on. */
 #include "file.h"
 
 #include <string.h>
@@ -59,7 +59,7 @@ static ssize_t write_port(struct md_file *file, const void *bytes, size_t len)
     return (ssize_t)most;
 }
 
-/* Nothing ends a read but the byte that it waits for, and nothing a write but its last byte. */
+/* No time-outs: a read ends with its byte alone, and a write with its last byte. */
 int md_port_prepare(HANDLE handle)
 {
     COMMTIMEOUTS none = {0};

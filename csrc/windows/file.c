@@ -1,8 +1,8 @@
 /* Reads and writes COM ports and sockets, all of them on the engine's thread.
  *
- * While a file is watched, one byte of it is being read, overlapped: its completion routine runs while the
- * thread waits, and so the waiter learns that there is something. All else is read at once, as much as has
- * come. Time-outs of a COM port would not do in place of that: they are whole milliseconds. */
+ * While a file is watched, one byte of it is being read, overlapped: the read's completion routine runs while
+ * the thread waits, and so the waiter learns that bytes have come. The rest is read at once, as much as there
+ * is. Time-outs of a COM port would not do instead: they are whole milliseconds. */
 #include "file.h"
 
 #include "../descriptor.h"
@@ -11,7 +11,7 @@
 #include <string.h>
 
 enum {
-    MOST_LEAVING_MS = 100, /* that the end of a file waits for its last request to leave */
+    MOST_LEAVING_MS = 100, /* a file that is removed waits so long for its last request to leave */
     MOST_CANCELLED_MS = 1000,
     MOST_COMPLETING_MS = 5
 };
@@ -57,7 +57,7 @@ void md_file_has_written(struct md_file *file, DWORD error)
     tell(file);
 }
 
-/* Read its byte, unless it is there or on its way. */
+/* Begin to read the file's byte, unless it has come or is on its way. */
 static void begin(struct md_file *file)
 {
     if (file->is_reading || file->is_held || file->is_ended || file->error)
@@ -71,8 +71,8 @@ static void begin(struct md_file *file)
 
 /* ---- for port_io.c ---- */
 
-/* Have its byte, if it came. What Windows completes at once, Wine completes in another process; until then
- * the byte lies in the queue, and must not be taken for missing. */
+/* Complete the read of a byte that has come. Windows completes it at once, Wine in another process: until
+ * then the byte lies in the queue, and must not be taken for missing. */
 static void complete(struct md_file *file)
 {
     if (file->is_reading)
@@ -159,7 +159,7 @@ void md_file_watch(int fd, int is_watched)
     if (!file)
         return;
     file->is_watched = is_watched;
-    if (!is_watched) /* what is being read costs one waking more; to take it back would cost as much */
+    if (!is_watched) /* the read under way costs one more waking; cancelling it would cost as much */
         return;
     begin(file);
     tell(file);
@@ -183,7 +183,7 @@ void md_file_remove(int fd)
     file->is_watched = 0;
     int is_broken = file->error || file->is_ended;
     for (int ms = 0; ms < MOST_LEAVING_MS && file->is_writing && !is_broken; ms++)
-        SleepEx(1, TRUE); /* a stop that leaves must not be cut off */
+        SleepEx(1, TRUE); /* a stop on its way out must not be cut off */
     CancelIoEx(file->handle, NULL);
     for (int ms = 0; ms < MOST_CANCELLED_MS && (file->is_reading || file->is_writing); ms++)
         SleepEx(1, TRUE);

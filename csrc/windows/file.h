@@ -16,10 +16,10 @@ struct md_file {
     const struct md_file_kind *kind;
     void *whose;
     int is_watched;
-    int is_reading, is_writing; /* the system has its byte, or its request */
-    int is_held;                /* its byte has come */
-    int is_ended, error;        /* it hung up; an errno */
-    int is_ready;               /* it is in the list of those */
+    int is_reading, is_writing; /* the system is reading `byte`, or writing `leaving` */
+    int is_held;                /* `byte` has come, and is not taken yet */
+    int is_ended, error;        /* the far end hung up; an errno */
+    int is_ready;               /* it is in the list of ready files */
     struct md_file *next_ready;
     OVERLAPPED reading, writing;
     uint8_t byte;
@@ -30,7 +30,7 @@ struct md_file {
 struct md_file_kind {
     ssize_t (*read)(struct md_file *file, void *bytes, size_t room); /* what is there */
     int (*has_bytes)(struct md_file *file);
-    DWORD (*begin)(struct md_file *file); /* to read its byte; return an error */
+    DWORD (*begin)(struct md_file *file); /* begin to read `byte`; return an error, or 0 */
     ssize_t (*write)(struct md_file *file, const void *bytes, size_t len);
 };
 
@@ -42,17 +42,16 @@ int md_port_prepare(HANDLE handle); /* so that its reads and writes have no time
 
 /* ---- file.c ---- */
 
-/* Completions: of the read of its byte, or of the write. */
+/* Note that the read of `byte`, or the write, is complete. */
 void md_file_has_read(struct md_file *file, DWORD error, DWORD got);
 void md_file_has_written(struct md_file *file, DWORD error);
-
 
 int md_file_add(int fd, void *whose); /* -1: see errno */
 void md_file_watch(int fd, int is_watched);
 void md_file_remove(int fd);
-/* Write whose watched files have something to read, and return how many. */
+/* Write the owners of watched files that can be read into `whose`, and return how many. */
 int md_files_ready(void **whose, int room);
-int md_file_is_writing(int fd); /* what was written last has not left yet */
+int md_file_is_writing(int fd); /* the last request has not left yet */
 
 /* ---- failure.c ---- */
 
@@ -64,7 +63,7 @@ static inline ssize_t md_fail(DWORD error) /* -1, and errno */
     return -1;
 }
 
-/* Have the completion routines run of what is complete. */
+/* Run the completion routines of what is complete. */
 static inline void md_run_completed(void)
 {
     SleepEx(0, TRUE);

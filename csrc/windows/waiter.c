@@ -1,5 +1,5 @@
-/* Waits for many handles at once: in an alertable wait, in which completion routines run, for a timer and for
- * the wake-up. */
+/* Waits for many handles at once: an alertable wait for a timer and for the wake-up, during which completion
+ * routines run. */
 #include "file.h"
 
 #include <stdlib.h>
@@ -37,7 +37,7 @@ void md_waiter_free(struct md_waiter *waiter)
     free(waiter);
 }
 
-/* The wake-up is nobody's. */
+/* Without an owner it is the wake-up. */
 int md_waiter_add(struct md_waiter *waiter, int fd, void *whose)
 {
     if (whose)

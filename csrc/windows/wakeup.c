@@ -5,7 +5,7 @@
 
 int md_wakeup_make(struct md_wakeup *wakeup)
 {
-    HANDLE event = CreateEventW(NULL, FALSE, FALSE, NULL); /* the wait itself takes it back */
+    HANDLE event = CreateEventW(NULL, FALSE, FALSE, NULL); /* resets itself when a wait ends by it */
     *wakeup = (struct md_wakeup){.fd = (int)(intptr_t)event};
     errno = event ? 0 : ENOMEM;
     return event ? 0 : -1;
@@ -22,8 +22,7 @@ void md_wakeup_ring(struct md_wakeup *wakeup)
         SetEvent(handle_of(wakeup->fd));
 }
 
-/* A ring that comes before this is for what the thread is about to look at, and one after it ends the next
- * wait. */
+/* A ring before this announces what the thread is about to look at; one after it ends the next wait. */
 void md_wakeup_silence(struct md_wakeup *wakeup)
 {
     atomic_store(&wakeup->is_rung, 0);

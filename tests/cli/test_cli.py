@@ -44,6 +44,13 @@ def test_every_command_has_help_within_80_columns(
     assert max(map(len, out.splitlines())) <= 80
 
 
+@pytest.mark.parametrize("name", ["read", "write", "state", "start"])
+def test_the_help_says_of_each_word_what_it_is(run: Run, name: str) -> None:
+    words = " ".join(run(name, "--help")[1].split())
+    for word in ("PORT: a device", "MODEL: one of", "ADDRESS: the drive's", "PLANT.toml DRIVE: a plant file"):
+        assert word in words
+
+
 def test_help_imports_no_command_and_nothing_heavy() -> None:
     code = (
         "import sys; before = {*sys.modules}; from multidrop.cli import main; main(['--help']); "

@@ -252,7 +252,7 @@ def test_mistakes_of_verbs_are_told_beside_those_of_a_register(tmp_path: Path) -
         (HEAD + "[readings]\na = { at = 1 }\n", ["t.toml: unknown key 'readings'; did you mean 'reading'?"]),
         (
             '[[line]]\nname = "L"\n',
-            ["is a plant file, as its [[line]] says, which `multidrop plan` checks"],
+            ["is a plant file, as its [[line]] says; name a drive of it, as PLANT.toml DRIVE"],
         ),
         (HEAD + "[reading]\na = 5\n", ["t.toml: [reading] a: 5 is no register; write { at = 0x0010"]),
         (HEAD + "[reading]\na = {}\n", ["t.toml: [reading] a: its address is missing; add at = 0x2000"]),

@@ -18,7 +18,7 @@ from modbus_gateway import FakeCommands, FakeHub, FakeLine, plant_of
 from multidrop.drives import ErmanERG220, InvtCHE
 from multidrop.gateway.mbap import Garbage, MbapRequest, take_request
 from multidrop.gateway.modbus_server import ModbusServer
-from multidrop.gateway.passing import ModbusSettings
+from multidrop.gateway.modbus_settings import ModbusSettings
 
 MOST = 260  # bytes of a frame
 UNITS = {1: InvtCHE(1, name="mill"), 2: ErmanERG220(2, name="well")}

@@ -14,6 +14,7 @@ import shlex
 import subprocess
 import sys
 import tomllib
+from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, redirect_stderr, redirect_stdout
 from importlib.util import find_spec
@@ -363,6 +364,23 @@ def test_every_key_of_a_plant_file_is_in_the_reference() -> None:
 def test_every_family_is_in_the_reference() -> None:
     text = (DOCS / "reference" / "families.md").read_text("utf-8")
     assert re.findall(r"^- `([\w-]+)` ", text, re.MULTILINE) == list(MODELS)
+
+
+def test_no_table_s_head_is_another_table_s_row() -> None:
+    """A row that was copied to be a head leaves the columns below it without a meaning."""
+    for page in PAGES:
+        text = page.read_text("utf-8")
+        heads = re.findall(r"^(\|.*\|)\n\|-", text, re.MULTILINE)
+        rows = Counter(re.findall(r"^\|.*\|$", text, re.MULTILINE))
+        assert [head for head in heads if rows[head] > heads.count(head)] == [], page
+
+
+def test_every_extra_is_in_the_reference() -> None:
+    extras = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]["optional-dependencies"]
+    text = (DOCS / "reference" / "cli.md").read_text("utf-8")
+    rows = text.partition("| for | install |")[2].partition("\n\n")[0].splitlines()[2:]
+    given = {word for row in rows for word in re.findall(r"`(\w+)`", row.split("|")[2])}
+    assert given == set(extras) - {"docs", "test"}
 
 
 def test_the_speed_table_is_readme_s() -> None:

@@ -62,6 +62,12 @@ CLIENTS = {  # rooms that use public names alone, and the commands that import t
         "cli/support/nats.py",
     },
 }
+TIED = (  # files that name each other in annotations, each group understood as one
+    {"drive/family.py", "drive/verbs.py"},
+    {"polling/batch.py", "polling/wide.py"},
+    {"sim/drive.py", "sim/protocol.py"},
+    {f"gateway/{name}.py" for name in ("gateway", "live_parts", "reload", "views", "web")},
+)
 MOST_LINES_OF_A_FILE = 300
 LONGER = {  # and why each is not parted
     "src/multidrop/bus.py": "the public methods of one class, a third of it their documentation",
@@ -141,6 +147,21 @@ def test_imports_for_types_alone_point_downwards_too() -> None:
     """A room whose annotations name what stands above it knows too much."""
     found = {str(path.relative_to(PACKAGE)): upwards(path, type_imports(path)) for path in FILES}
     assert offenders(found) == {}
+
+
+def test_imports_between_files_run_one_way() -> None:
+    """Those for types alone too: what two files need of each other belongs into one, or below both."""
+    ties = {name: min(group) for group in TIED for name in group}
+    graph: dict[str, set[str]] = {}
+    for path in FILES:
+        name = path.relative_to(PACKAGE).as_posix()
+        if path.name != "__init__.py":
+            modules = {module.removeprefix("multidrop.").replace(".", "/") for module in _imported(path)}
+            own = ties.get(name, name)
+            graph.setdefault(own, set()).update(ties.get(f"{one}.py", f"{one}.py") for one in modules)
+            graph[own].discard(own)
+    assert graph["planning/blocks.py"] >= {"planning/bus_time.py"}
+    TopologicalSorter(graph).prepare()
 
 
 @pytest.mark.parametrize("client", CLIENTS)

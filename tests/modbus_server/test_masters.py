@@ -23,8 +23,9 @@ from multidrop import Batch, Bus, BusError, Carrier, Plant, Poller, load_plant
 from multidrop.gateway.commands import Commands
 from multidrop.gateway.hub import Hub
 from multidrop.gateway.modbus_server import ModbusServer
-from multidrop.gateway.passing import MAIN, ModbusSettings
+from multidrop.gateway.modbus_settings import ModbusSettings
 from multidrop.gateway.rights import May
+from multidrop.gateway.units import MAIN
 from multidrop.sim import SimulatedDrive, Simulator, Wire, simulated
 
 MASTERS = ["pyModbusTCP", "mbpoll", "libmodbus"]

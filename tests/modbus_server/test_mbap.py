@@ -17,7 +17,7 @@ from modbus_gateway import RawClient, plant_of, request, serving
 from multidrop.drives import InvtCHE
 from multidrop.gateway import mbap
 from multidrop.gateway.mbap import Garbage, MbapRequest, ModbusClient, ModbusPort, take_request
-from multidrop.gateway.passing import ModbusSettings
+from multidrop.gateway.modbus_settings import ModbusSettings
 
 # MODBUS Messaging on TCP/IP Implementation Guide V1.0b, 4.4.2.1 and the example of section 3.1.3:
 # transaction 1501H, protocol 0, length 6, unit FFH, function 03, start 0004H, count 0001H

@@ -34,7 +34,7 @@ from multidrop import (
 from multidrop.drives import DelixiNative, InnovertIBD, InvtCHE
 from multidrop.gateway.commands import BUSY, Told
 from multidrop.gateway.modbus_server import MOST_STOPS
-from multidrop.gateway.passing import ModbusSettings
+from multidrop.gateway.modbus_settings import ModbusSettings
 from multidrop.gateway.rights import NOT_ALLOWED, NOT_LISTED, Caller, Right
 
 CHE_OUTPUT_VOLTAGE, CHE_SETPOINT, CHE_CONTROL = 0x3003, 0x2000, 0x1000  # CHE100 manual v1.4, p. 117

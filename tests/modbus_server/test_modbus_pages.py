@@ -11,7 +11,7 @@ import pytest
 from multidrop import load_plant
 from multidrop.gateway import common_block, mbap, passing
 from multidrop.gateway.modbus_codes import ModbusCode
-from multidrop.gateway.passing import ModbusSettings
+from multidrop.gateway.modbus_settings import ModbusSettings
 from multidrop.gateway.settings import read_settings
 
 DOCS = Path(__file__).parents[2] / "docs"
@@ -53,7 +53,7 @@ def test_the_common_block_is_laid_out_as_the_page_says() -> None:
         *(layout.AGE, layout.STOP, layout.STOP + 1),
     ]
     sizes = [int(rest.split(" | ")[0]) for rest in rows("The common block").values()]
-    assert sum(sizes) == passing.COMMON_LENGTH
+    assert sum(sizes) == common_block.COMMON_LENGTH
     states = re.findall(r"(\d) (\w+)", next(iter(rows("The common block").values())).partition("state: ")[2])
     assert {name: int(number) for number, name in states} == common_block.STATES
 

@@ -11,7 +11,7 @@ import pytest
 from modbus_gateway import FakeLine, Gateway, RawClient, RawReply, plant_of, request, serving
 
 from multidrop import Drive, reading
-from multidrop.gateway.passing import ModbusSettings
+from multidrop.gateway.modbus_settings import ModbusSettings
 
 POLLED, PASSED = 500, 40  # addresses of each drive
 CLIENTS = 3

@@ -11,8 +11,8 @@ from modbus_gateway import plant_of
 from multidrop import COIL, HOLDING, Carrier, Drive, load_family, reading, setting, text
 from multidrop.drives import MODELS, InnovertIBD, InvtCHE
 from multidrop.drives.registry import find_model
-from multidrop.gateway.passing import MAIN, ModbusSettings
-from multidrop.gateway.units import StopWrite, Unit, Units
+from multidrop.gateway.modbus_settings import ModbusSettings
+from multidrop.gateway.units import MAIN, StopWrite, Unit, Units
 from multidrop.plant.model import Plant, PlantLine, Polled, PolledDrive
 
 FAMILIES = Path(__file__).parents[2] / "src" / "multidrop" / "families"

@@ -16,8 +16,8 @@ from multidrop.drive.register import Register
 from multidrop.drive.request import read_request, write_request
 from multidrop.drive.table import COIL, DISCRETE, HOLDING, INPUT, Table
 from multidrop.drives import MODELS
-from multidrop.planning.blocks import Block, blocks, plan, planned
-from multidrop.planning.bus_time import gap, in_order, sending, silence
+from multidrop.planning.blocks import Block, blocks, plan, planned, sending
+from multidrop.planning.bus_time import gap, in_order, silence
 
 
 class Example(Drive):

@@ -24,7 +24,7 @@ _MISNAMED = (FileNotFoundError, IsADirectoryError, NotADirectoryError)
 COMMANDS = {  # name: module in this package, and help
     "demo": ("demo", "poll simulated drives of every family on one line"),
     "models": ("models", "list the families, or one family's registers"),
-    "check": ("check", "say what a family's file declares, and what it leaves open"),
+    "check": ("check.command", "check a family's file, or a plant file; opens no port"),
     "import": ("import_family", "make a family's file of another program's register table"),
     "read": ("read", "read values from a drive"),
     "write": ("write", "write one register of a drive"),

@@ -86,7 +86,7 @@ async def _read(arguments: argparse.Namespace, sink: SampleSink, options: dict[s
 
 
 async def _tend(folder: Path | None) -> None:
-    """Merge files beside the reading; PostgreSQL needs none of it."""
+    """Merge files of samples while others are read; PostgreSQL needs no merging."""
     if folder:
         from multidrop.fleet.compaction import compact_for_ever
 

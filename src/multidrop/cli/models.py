@@ -25,7 +25,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "model", metavar="MODEL", nargs="?", help="one family; or path/to/file.toml, or path/to/file.py:Class"
     )
     parser.add_argument(
-        "drive", metavar="DRIVE", nargs="?", help="where MODEL is a plant file: of which drive"
+        "drive", metavar="DRIVE", nargs="?", help="of which drive, where MODEL is a plant file"
     )
     add_json_argument(parser)
 

@@ -15,6 +15,7 @@ from multidrop.cli.support.files import check_writable
 from multidrop.cli.support.output import print_text
 from multidrop.cli.support.plants import add_line_arguments, add_rs485_argument, line_of, plant_at, rs485_at
 from multidrop.cli.support.values import counted
+from multidrop.core import RS485
 from multidrop.drive.family import Drive
 from multidrop.drive.network import speaks_tcp
 from multidrop.drives import MODELS
@@ -68,17 +69,8 @@ def run(arguments: argparse.Namespace) -> int:
     rs485 = rs485_at(arguments, declared)
     families = _families(arguments.model)
     planned = _planned(arguments, list(families.values()))
-    found: list[Finding] = []
-    finished = False
     begun = time.monotonic()
-    line = Line(arguments.port, rs485=rs485)
-    try:
-        found.extend(_shown(scan(line.carry_out, planned, list(families.values())), arguments.json))
-        finished = True
-    except KeyboardInterrupt:
-        pass
-    finally:
-        line.close()
+    found, finished = _scan(arguments, rs485, planned, list(families.values()))
     seconds = round(time.monotonic() - begun, 3)
     drives = [finding for finding in found if isinstance(finding, Found)]
     written = None
@@ -95,6 +87,21 @@ def run(arguments: argparse.Namespace) -> int:
     if not finished:
         raise KeyboardInterrupt
     return 0 if drives else 1
+
+
+def _scan(
+    arguments: argparse.Namespace, rs485: RS485, planned: Sequence[Sweep], families: Sequence[type[Drive]]
+) -> tuple[list[Finding], bool]:
+    """Return what was found, and False where Ctrl-C cut it short: what came until then is kept."""
+    found: list[Finding] = []
+    line = Line(arguments.port, rs485=rs485)
+    try:
+        found.extend(_shown(scan(line.carry_out, planned, families), arguments.json))
+    except KeyboardInterrupt:
+        return found, False
+    finally:
+        line.close()
+    return found, True
 
 
 def _families(models: Sequence[str]) -> dict[str, type[Drive]]:

@@ -1,4 +1,4 @@
-"""The `serve` command: polls a plant, and lets everybody else in; the only importer of the gateway."""
+"""The `serve` command: polls a plant, and serves it to others. No other module imports the gateway."""
 
 from __future__ import annotations
 
@@ -121,7 +121,7 @@ def _demo_settings(plant: Plant, folder: Path) -> ServeSettings:
     verbs = [f"{one.name}.{verb}" for one in drives for verb in verbs_of(one)]
     may = May("anyone", Right.WRITE, frozenset(writes), frozenset(verbs))
     parts: dict[str, object] = {}
-    with suppress(ValueError):  # a version without this part
+    with suppress(ValueError):  # this build has no history
         parts["history"] = settings_class(PARTS["history"])()
     audit = folder / "audit.jsonl"
     return ServeSettings(port=DEMO_PORTS[0], may=may, audit=audit, folder=folder, parts=parts, is_demo=True)
@@ -161,7 +161,7 @@ def _url(settings: ServeSettings, port: int) -> str:
 
 
 def _new_token(role: str | None, owner: str | None) -> int:
-    """Print a line for the tokens' file, and on stderr the token, which is nowhere else."""
+    """Print a line for the file of tokens, and on stderr the token itself, which is kept nowhere."""
     from multidrop.gateway.rights import Right, new_token
 
     if not role or not owner:

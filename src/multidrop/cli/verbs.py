@@ -81,23 +81,19 @@ def run(arguments: argparse.Namespace) -> int:
             except Unsupported:
                 state = None
     if arguments.json:
-        record = {"drive": drive.name, "done": arguments.command, "state": _as_json(state)}
-        if setpoint:
-            register, value = setpoint.register, setpoint.value
-            record["setpoint"] = {"register": register.name} | as_json(register, value)
-        print_text(json.dumps(record | ({"watchdog": watchdog} if watchdog else {}), indent=2))
+        print_text(json.dumps(_record(arguments.command, drive, state, setpoint, watchdog), indent=2))
     elif arguments.command == "state":
-        print_text(state)
-        print_text(f"watchdog: {watchdog}")
+        print_text(f"{state}\nwatchdog: {watchdog}")
     else:
-        at = f" at {setpoint.register.name} = {setpoint.register.format(setpoint.value)}" if setpoint else ""
-        done = f"{drive.name}: {arguments.command} done{at}; state: {state or 'the family cannot say'}"
-        print_text(done + (f"; watchdog: {watchdog}" if watchdog else ""))
+        print_text(_sentence(arguments.command, drive, state, setpoint, watchdog))
     return 0
 
 
 def _audit_file(arguments: argparse.Namespace) -> str | None:
-    """Return the audit log; None, with a warning, where a stop's cannot be opened: it holds no stop back."""
+    """Return the audit log's path; None, with a warning, where it cannot be opened for a stop.
+
+    A log that cannot be written holds no stop back.
+    """
     audit: str | None = getattr(arguments, "audit", None)
     if audit and arguments.command in _STOPS:
         try:
@@ -110,7 +106,7 @@ def _audit_file(arguments: argparse.Namespace) -> str | None:
 
 @contextmanager
 def _annotating(command: str, target: Target) -> Iterator[list[str]]:
-    """Add to an interruption what is known of the verb, and the command that stops the motor."""
+    """Add notes to an interruption: what is known of the verb, and the command that stops the motor."""
     known: list[str] = []
     try:
         yield known
@@ -131,7 +127,7 @@ def _setpoint(drive: Drive, hz: float) -> Write | None:
 
 
 def _rehearse(script: Script[Any]) -> None:
-    """Make the first step: raise for what the family lacks or forbids, before a port is opened."""
+    """Make the script's first step: raise for what the family lacks or forbids, before a port is opened."""
     step = next(script)
     if isinstance(step, Write):
         step.register.encode(step.value)
@@ -141,6 +137,25 @@ def _parameters(arguments: argparse.Namespace) -> list[Any]:
     if arguments.command in _DIRECTED:
         return [Direction(arguments.direction) if arguments.direction else None]
     return [arguments.frequency] if arguments.command == "set-frequency" else []
+
+
+# ---- what became of it ----
+
+
+def _sentence(command: str, drive: Drive, state: State | None, setpoint: Write | None, watchdog: str) -> str:
+    at = f" at {setpoint.register.name} = {setpoint.register.format(setpoint.value)}" if setpoint else ""
+    done = f"{drive.name}: {command} done{at}; state: {state or 'the family cannot say'}"
+    return done + (f"; watchdog: {watchdog}" if watchdog else "")
+
+
+def _record(
+    command: str, drive: Drive, state: State | None, setpoint: Write | None, watchdog: str
+) -> dict[str, Any]:
+    record: dict[str, Any] = {"drive": drive.name, "done": command, "state": _as_json(state)}
+    if setpoint:
+        register = setpoint.register
+        record["setpoint"] = {"register": register.name} | as_json(register, setpoint.value)
+    return record | ({"watchdog": watchdog} if watchdog else {})
 
 
 def _as_json(state: State | None) -> dict[str, Any] | None:

@@ -7,7 +7,7 @@ the words themselves and `look_hazards` for what the drive shows.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 from multidrop.drive.family import START_TIME
@@ -161,15 +161,20 @@ def _refuses(steps: Sequence[VerbStep], look: Look) -> bool:
     return any(isinstance(step, RefusesWhen) and look.implies(step.look) for step in _before_sending(steps))
 
 
+def _unrefused(steps: Sequence[VerbStep], looks: Iterable[Look], because: str) -> Iterator[str]:
+    """Yield a sentence for each of these looks at which a call is not refused in time."""
+    for look in looks:
+        if not _refuses(steps, look):
+            yield _REFUSE.format(look=look, because=because)
+
+
 def _start_refuses_on_fault(
     declared: DeclaredVerbs, registers: Registers, name: str, steps: Steps
 ) -> Iterator[str]:
     faults = declared.looks_of(Condition.FAULT)
     if not faults:
         yield 'has no fault to refuse on: [state] calls no look "fault"'
-    for look in faults:
-        if not _refuses(steps, look):
-            yield _REFUSE.format(look=look, because="it has a fault")
+    yield from _unrefused(steps, faults, "it has a fault")
 
 
 def _start_needs_setpoint(
@@ -220,9 +225,7 @@ def _reset_refuses_while_running(
     turning = declared.looks_of(*TURNING)
     if not turning:
         yield 'cannot be refused while the motor turns: [state] calls no look "running"'
-    for look in turning:
-        if not _refuses(steps, look):
-            yield _REFUSE.format(look=look, because="it runs")
+    yield from _unrefused(steps, turning, "it runs")
 
 
 def _reset_only_resets(

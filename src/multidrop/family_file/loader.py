@@ -110,7 +110,7 @@ def _family(
 ) -> type[Drive] | None:
     """Return the class; None where anything is wrong."""
     if "line" in document:
-        place.wrong("is a plant file, as its [[line]] says, which `multidrop plan` checks")
+        place.wrong("is a plant file, as its [[line]] says; name a drive of it, as PLANT.toml DRIVE")
         return None
     _check_sections(document, place)
     of_family = place.within("[family]")

@@ -10,8 +10,8 @@ from typing import Protocol
 
 from multidrop import PolledDrive
 from multidrop.gateway.drive_words import NewestRow, fresh_ns, is_fresh
-from multidrop.gateway.passing import COMMON_LENGTH
 
+COMMON_LENGTH = 16  # words of the block
 STATE, FAULT, FREQUENCY, CURRENT, SETPOINT, AGE, STOP = 0, 1, 2, 4, 6, 8, 10  # words from its begin
 
 STATES = {"unknown": 0, "stands": 1, "runs": 2, "fault": 3, "silent": 4}

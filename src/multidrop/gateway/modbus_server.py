@@ -12,7 +12,7 @@ import time
 from collections import Counter
 from collections.abc import Awaitable, Callable, Sequence
 from functools import partial
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 from multidrop import Batch, BusError, Carrier, Plant, Register
 from multidrop.gateway.commands import Told
@@ -21,10 +21,14 @@ from multidrop.gateway.drive_words import Lack
 from multidrop.gateway.listener import listen
 from multidrop.gateway.mbap import SWEEP_S, Answer, MbapRequest, ModbusClient, ModbusPort
 from multidrop.gateway.modbus_codes import Declined, ModbusCode, code_of
-from multidrop.gateway.passing import MAIN, LineShare, ModbusSettings, PassingBusy
+from multidrop.gateway.modbus_settings import ModbusSettings
+from multidrop.gateway.passing import LineShare, PassingBusy
 from multidrop.gateway.pdu import WRITES, read_range, reply_data
 from multidrop.gateway.rights import Caller, Right
-from multidrop.gateway.units import StopWrite, Unit, Units
+from multidrop.gateway.units import MAIN, StopWrite, Unit, Units
+
+if TYPE_CHECKING:
+    from multidrop.gateway.parts import Inside
 
 STOP_WAIT_S = 0.4  # for which a stop's answer waits for the motor: less than clients wait for a reply
 MOST_STOPS = 8  # of one drive, under way; further requests are acknowledged alone
@@ -40,6 +44,13 @@ class ModbusCommands(Protocol):
     async def stop(self, drives: Sequence[str] | None, caller: Caller) -> dict[str, Told]: ...
     async def write(self, drive: str, register: str, value: float, caller: Caller) -> Told: ...
     def ended_ns(self, drive: str) -> int: ...
+
+
+def build(settings: ModbusSettings, inside: Inside) -> ModbusServer:
+    """Return the server as a part of the gateway, listening. Raises OSError where a port cannot be had."""
+    server = ModbusServer(inside.plant, inside.hub, inside.commands, settings, inside.ask)
+    server.listen()
+    return server
 
 
 class ModbusServer:

@@ -27,7 +27,7 @@ class Part(NamedTuple):
 PARTS: Mapping[str, Part] = {
     "fleet": Part("multidrop.fleet.page_part", "FleetSettings", "build", "fleet"),
     "history": Part("multidrop.gateway.historian", "HistorySettings", "build", "history"),
-    "modbus": Part("multidrop.gateway.passing", "ModbusSettings", "build", ""),
+    "modbus": Part("multidrop.gateway.modbus_server", "ModbusSettings", "build", ""),
     "mqtt": Part("multidrop.gateway.mqtt", "MqttSettings", "build", "mqtt"),
 }
 

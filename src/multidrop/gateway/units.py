@@ -6,12 +6,12 @@ import difflib
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 from multidrop import Carrier, Plant, Polled, PolledDrive, Register
 from multidrop.gateway.drive_words import DriveWords, reading_function
-from multidrop.gateway.passing import MAIN, ModbusSettings
 
+MAIN = ""  # the TCP port of all lines that have none of their own
 UNITS = range(1, 248)  # 0 is a broadcast, and 248 to 255 are reserved
 LAST_UNIT = 255  # some devices have it all the same
 _WRITES = {Carrier.BIT: (0x05, 0x0F), Carrier.WORD: (0x06, 0x10)}
@@ -91,6 +91,17 @@ def _stop_writes(drive: Any) -> Iterator[StopWrite]:
             continue
 
 
+class UnitSettings(Protocol):
+    """The part of the settings that the units need."""
+
+    @property
+    def units(self) -> Mapping[str, int]: ...
+    @property
+    def ports(self) -> Mapping[str, int]: ...
+    @property
+    def common_addresses(self) -> range: ...
+
+
 class Units:
     """All units of a plant, by TCP port (MAIN, or a line's name) and unit id.
 
@@ -98,7 +109,7 @@ class Units:
     mistake, in lines, where a unit id would be two drives' or the settings name what is not there.
     """
 
-    def __init__(self, plant: Plant, settings: ModbusSettings) -> None:
+    def __init__(self, plant: Plant, settings: UnitSettings) -> None:
         self._units: dict[tuple[str, int], Unit] = {}
         wrong = [*_unknown_names(plant, settings)]
         for port, found in _by_port(plant, settings).items():
@@ -118,7 +129,7 @@ class Units:
         return ((port, number, unit) for (port, number), unit in self._units.items())
 
 
-def _by_port(plant: Plant, settings: ModbusSettings) -> Mapping[str, Mapping[int, list[Unit]]]:
+def _by_port(plant: Plant, settings: UnitSettings) -> Mapping[str, Mapping[int, list[Unit]]]:
     found: dict[str, dict[int, list[Unit]]] = defaultdict(lambda: defaultdict(list))
     planned = _cycles(plant)
     for line in plant.lines:
@@ -174,7 +185,7 @@ def _ranges(numbers: Iterable[int]) -> str:
     return ", ".join(" to ".join(str(end) for end in run) for run in runs) or "none"
 
 
-def _overlap(unit: Unit, settings: ModbusSettings) -> Iterator[str]:
+def _overlap(unit: Unit, settings: UnitSettings) -> Iterator[str]:
     """Yield a sentence where the family has registers where the common block is."""
     own = sorted(unit.holding_addresses() & set(settings.common_addresses))
     if own:
@@ -184,7 +195,7 @@ def _overlap(unit: Unit, settings: ModbusSettings) -> Iterator[str]:
         )
 
 
-def _unknown_names(plant: Plant, settings: ModbusSettings) -> Iterator[str]:
+def _unknown_names(plant: Plant, settings: UnitSettings) -> Iterator[str]:
     drives = [polled.drive.name for line in plant.lines for polled in line.drives]
     lines = [line.name for line in plant.lines]
     for key, kind, given, known in (

@@ -142,6 +142,11 @@ def text_blocks(drive: Drive, text: Text) -> tuple[Block, ...]:
     )
 
 
+def sending(drive: Drive, block: Block) -> float:
+    """Return the seconds in which characters of the request and of the reply are on the wire."""
+    return characters(drive.framing, block.table.carrier, block.count) * drive.settings.character
+
+
 # ---- registers that may share a request ----
 
 

@@ -4,14 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from itertools import pairwise
-from typing import TYPE_CHECKING
 
 from multidrop.core import Framing
 from multidrop.drive.family import Drive
 from multidrop.drive.table import Carrier
-
-if TYPE_CHECKING:
-    from multidrop.planning.blocks import Block
 
 # Characters of a read's request and reply without its data, and of each byte of that.
 _FRAMES = {
@@ -39,11 +35,6 @@ def characters(framing: Framing, carrier: Carrier, count: int) -> int:
     """Return the characters of the request that reads so many registers and of its reply."""
     around, each = _FRAMES[framing]
     return around + each * ((count + 7) // 8 if carrier is Carrier.BIT else 2 * count)
-
-
-def sending(drive: Drive, block: Block) -> float:
-    """Return the seconds in which characters of the request and of the reply are on the wire."""
-    return characters(drive.framing, block.table.carrier, block.count) * drive.settings.character
 
 
 def gap(before: Drive, after: Drive, switching: float = 0.0) -> float:

@@ -14,8 +14,8 @@ from typing import Any
 from multidrop.core import build_request, characters_on_wire, reply_length
 from multidrop.drive.family import Drive
 from multidrop.drive.register import Register
-from multidrop.planning.blocks import Planned
-from multidrop.planning.bus_time import gap, in_order, kind, sending, silence, switches
+from multidrop.planning.blocks import Planned, sending
+from multidrop.planning.bus_time import gap, in_order, kind, silence, switches
 from multidrop.planning.schedule import TURN_SHARE, Job, Schedule
 
 LATENESS = 100e-6  # s that a common machine adds to each exchange: it wakes up and writes the request

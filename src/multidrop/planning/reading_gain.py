@@ -11,8 +11,8 @@ from multidrop.drive.family import Drive
 from multidrop.drive.read_limits import readable_addresses, stated_gaps
 from multidrop.drive.register import Register
 from multidrop.drive.table import COIL, DISCRETE, HOLDING, HOLDING_MULTIPLE, INPUT, Table
-from multidrop.planning.blocks import Planned, planned
-from multidrop.planning.bus_time import sending, silence
+from multidrop.planning.blocks import Planned, planned, sending
+from multidrop.planning.bus_time import silence
 
 WORTH_SAYING = 0.02  # of the time
 _NAMES = {

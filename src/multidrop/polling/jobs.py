@@ -10,8 +10,8 @@ from multidrop.core import Exchange, Names, RowLayout
 from multidrop.drive.family import Drive
 from multidrop.drive.own import check_own
 from multidrop.drive.row_field import row_field
-from multidrop.planning.blocks import Block, Plan, plan
-from multidrop.planning.bus_time import kind, sending, silence
+from multidrop.planning.blocks import Block, Plan, plan, sending
+from multidrop.planning.bus_time import kind, silence
 from multidrop.planning.schedule import Job
 from multidrop.planning.splitting import may_be_too_long
 from multidrop.plant.model import PolledDrive

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -11,7 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 
-from multidrop.report.lanes import draw_lanes, lanes_inches, lanes_of, name_bar
+from multidrop.report.lanes import Lane, draw_lanes, lanes_inches, lanes_of, name_bar
 from multidrop.report.load import RAW, Array, Recording, Series
 from multidrop.report.style import (
     FAULT,
@@ -44,7 +46,32 @@ FEW_POINTS = 200  # each has a dot of its own
 FAULTS = "fault"
 
 CURVES_INCHES = 1.9
-Panel = tuple[str, str, bool]  # register, unit, and whether its counts have names
+
+
+class Panel(NamedTuple):
+    """A quantity, which has a panel of its own: amperes and per cent share no axis."""
+
+    register: str
+    unit: str
+    has_names: bool  # its counts have names: they are states
+
+    @property
+    def title(self) -> str:
+        return f"{self.register}, {self.unit}" if self.unit else self.register
+
+
+@dataclass(frozen=True)
+class Content:
+    """The series of a panel, as curves of numbers or as lanes of states."""
+
+    panel: Panel
+    series: list[Series]
+    lanes: list[Lane]  # none: curves
+    hidden: int  # lanes that have no room
+
+    @property
+    def inches(self) -> float:
+        return lanes_inches(self.lanes) if self.lanes else CURVES_INCHES
 
 
 def plot(
@@ -54,56 +81,55 @@ def plot(
 
     Raises ValueError for unknown names, and where there is no value to draw.
     """
-    _check("drive", drives, recording.drives)
-    chosen = [series for series in recording.series if not drives or series.drive in drives]
-    _check("register", registers, tuple(dict.fromkeys(series.register for series in chosen)))
+    chosen = _of_drives(recording, drives, registers)
     wanted = [series for series in chosen if not registers or series.register in registers]
     if not any(series.has_values for series in wanted):
         misses = _reasons(chosen)
         raise ValueError(f"there is no value to draw, only misses: {misses}; `multidrop report` tells more")
     panels = _panels([series for series in wanted if series.register != FAULTS], registers)
-    shown, left = panels[:MOST_PANELS], panels[MOST_PANELS:]
-    if registers:
-        shown, left = panels, []
-    polled = [series for series in chosen if series.register == FAULTS]
-    faults = [series for series in polled if series.faults()] or ([] if shown else polled)
+    shown = panels if registers else panels[:MOST_PANELS]
+    contents = [_content(panel, chosen) for panel in shown]
+    faults = _faults(chosen, is_alone=not shown)
     strip = [0.35 + 0.22 * len(faults)] if faults else []
-    contents = [[series for series in chosen if _panel(series) == panel] for panel in shown]
-    lanes_by_panel = [
-        lanes_of(series) if panel[2] else ([], 0) for panel, series in zip(shown, contents, strict=True)
-    ]
-    heights = [lanes_inches(lanes) if lanes else CURVES_INCHES for lanes, _ in lanes_by_panel]
-    figure, axes = new_figure([*strip, *heights], sharex=True)
-    spans = [span for series in faults for span in series.faults()]
+    figure, axes = new_figure([*strip, *(content.inches for content in contents)], sharex=True)
     if faults:
         _draw_faults(axes[0], faults)
-    for panel, series, (lanes, hidden), one in zip(
-        shown, contents, lanes_by_panel, axes[len(strip) :], strict=True
-    ):
-        if panel[2]:
-            note = f" ({hidden} more lanes: choose with --drive)" if hidden else ""
-            set_title(one, f"{label(_title(panel))}{note}")
-            draw_lanes(one, lanes, recording)
-        else:
-            _draw_panel(one, panel, series, recording)
+    spans = [span for series in faults for span in series.faults()]
+    for content, one in zip(contents, axes[len(strip) :], strict=True):
+        _draw(one, content, recording)
         for span in spans:
             one.axvspan(day(span.begin), day(span.end), color=FAULT, alpha=0.08, lw=0)
     label_time(axes[-1])
     axes[-1].set_xlim(day(recording.begin), day(max(recording.end, recording.begin + 1_000_000)))
-    curves = {series.drive for content in contents for series in content if not series.names}
-    handles = [
-        Line2D([], [], label=label(name), **line_style(number))
-        for number, name in enumerate(recording.drives)
-        if name in curves
-    ]
-    if any(series.missed.any() for series in chosen):
-        handles.append(Line2D([], [], color=TEXT, marker="|", linestyle="", label="missed"))
-    add_legend(figure, handles, min(6, max(1, len(handles))))
-    return figure, [_title(panel) for panel in left]
+    _add_drives(figure, contents, recording, has_misses=any(series.missed.any() for series in chosen))
+    return figure, [panel.title for panel in panels[len(shown) :]]
+
+
+# ---- what is shown ----
+
+
+def _of_drives(recording: Recording, drives: Sequence[str], registers: Sequence[str]) -> list[Series]:
+    """Return the series of these drives, or of all. Raises ValueError for names that it does not have."""
+    _check("drive", drives, recording.drives)
+    chosen = [series for series in recording.series if not drives or series.drive in drives]
+    _check("register", registers, tuple(dict.fromkeys(series.register for series in chosen)))
+    return chosen
+
+
+def _faults(chosen: Sequence[Series], *, is_alone: bool) -> list[Series]:
+    """Return the drives' faults: those that had some, or all where nothing else is shown."""
+    polled = [series for series in chosen if series.register == FAULTS]
+    return [series for series in polled if series.faults()] or (polled if is_alone else [])
+
+
+def _content(panel: Panel, chosen: Sequence[Series]) -> Content:
+    series = [one for one in chosen if _panel(one) == panel]
+    lanes, hidden = lanes_of(series) if panel.has_names else ([], 0)
+    return Content(panel, series, lanes, hidden)
 
 
 def _panel(series: Series) -> Panel:
-    return series.register, series.unit, bool(series.names)
+    return Panel(series.register, series.unit, bool(series.names))
 
 
 def _check(what: str, given: Sequence[str], known: Sequence[str]) -> None:
@@ -118,20 +144,43 @@ def _reasons(series: Sequence[Series]) -> str:
 
 
 def _panels(chosen: Sequence[Series], registers: Sequence[str]) -> list[Panel]:
-    """Return a panel for each register and unit: amperes and per cent share no axis."""
+    """Return a panel for each register and unit, in the order of `registers`, or else of FIRST."""
     found = dict.fromkeys(map(_panel, chosen))
     order = {name: at for at, name in enumerate(registers or FIRST)}
-    return sorted(found, key=lambda panel: (order.get(panel[0], len(order)), panel[1] == RAW))
+    return sorted(found, key=lambda panel: (order.get(panel.register, len(order)), panel.unit == RAW))
 
 
-def _title(panel: Panel) -> str:
-    return f"{panel[0]}, {panel[1]}" if panel[1] else panel[0]
+# ---- how it is drawn ----
 
 
-def _draw_panel(axes: Axes, panel: Panel, series: Sequence[Series], recording: Recording) -> None:
+def _draw(axes: Axes, content: Content, recording: Recording) -> None:
+    if content.panel.has_names:
+        note = f" ({content.hidden} more lanes: choose with --drive)" if content.hidden else ""
+        set_title(axes, f"{label(content.panel.title)}{note}")
+        draw_lanes(axes, content.lanes, recording)
+    else:
+        _draw_curves(axes, content.panel, content.series, recording)
+
+
+def _add_drives(
+    figure: Figure, contents: Sequence[Content], recording: Recording, *, has_misses: bool
+) -> None:
+    """Add a legend of the drives that have curves, and of the mark of a miss."""
+    curves = {series.drive for content in contents for series in content.series if not series.names}
+    handles = [
+        Line2D([], [], label=label(name), **line_style(number))
+        for number, name in enumerate(recording.drives)
+        if name in curves
+    ]
+    if has_misses:
+        handles.append(Line2D([], [], color=TEXT, marker="|", linestyle="", label="missed"))
+    add_legend(figure, handles, min(6, max(1, len(handles))))
+
+
+def _draw_curves(axes: Axes, panel: Panel, series: Sequence[Series], recording: Recording) -> None:
     too_large = sum(int((np.isnan(one.drawable) & ~one.missed).sum()) for one in series)
     note = f" ({too_large} values of 1e150 and more are not drawn)" if too_large else ""
-    set_title(axes, f"{label(_title(panel))}{note}")
+    set_title(axes, f"{label(panel.title)}{note}")
     for one in series:
         time, value = thinned(one.time, one.drawable)
         style = line_style(recording.drives.index(one.drive))

@@ -58,7 +58,7 @@ from multidrop.transport.mixed_up import other_port
 from multidrop.transport.peers import LEAST_TIMEOUT
 from multidrop.transport.prepared import make_exchange
 
-MOST_S = 5.0  # that the rounds take, where the drive is slow or silent
+MOST_S = 5.0  # that all rounds take, where the drive is slow or silent
 LOOK_S = 0.05  # between attempts to send a request that was held back
 NOBODY = 247  # the address of the request that looks for an echo
 SETTING_UP_COM = "while it has the port, multidrop makes it raw, and sets each drive's baud rate and format"
@@ -100,7 +100,7 @@ def run(arguments: argparse.Namespace) -> int:
 def _of_plant(plant: Plant, arguments: argparse.Namespace) -> tuple[Drive | None, Settings, RS485]:
     """Return the drive to measure with if one is named, its or its line's settings, and who switches.
 
-    `port` is the line's port afterwards. Raises ValueError for what only a port by hand takes.
+    Sets `arguments.port` to the line's port. Raises ValueError for options that only a port by hand takes.
     """
     for name in ("model", "address", "baudrate", "format", "framing"):
         if getattr(arguments, name) is not None:
@@ -186,7 +186,7 @@ def _local(port: str, rs485: RS485) -> Iterator[Finding]:
 
 
 def _opened_com(port: str) -> Iterator[Finding]:
-    """Say of a COM port that multidrop has open what Windows tells of it."""
+    """Report what Windows tells of a COM port that multidrop has open."""
     yield Finding("port", f"{port} is a serial port")
     yield Finding("set here", SETTING_UP_COM)
     yield Finding("adapter", com_description(port) or "the system lists none for it")

@@ -1,4 +1,4 @@
-"""Ask a far end that is silent in the other way: Modbus TCP in place of RTU over TCP, or the reverse."""
+"""Ask a silent far end in the other framing: Modbus TCP in place of RTU over TCP, or the reverse."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ TIMEOUT = 2.0  # s: a gateway waits for its drives first
 
 
 def ask_once(port: str, request: Message, settings: Settings) -> Completion:
-    """Return what became of one read, in the framing of this network port. Raises LineError."""
+    """Send one read in the framing of this network port, and return its outcome. Raises LineError."""
     exchange = Exchange(
         Framing.TCP if speaks_tcp(port) else Framing.RTU,
         request,
@@ -32,7 +32,7 @@ def ask_once(port: str, request: Message, settings: Settings) -> Completion:
 
 
 def other_way_finding(port: str, request: Message, settings: Settings) -> Finding:
-    """Report whether the far end answers in the other way."""
+    """Report whether the far end answers in the other framing."""
     other = other_port(port)
     way = spoken_on(other)
     try:

@@ -73,7 +73,7 @@ def _user() -> str:
 
 
 def _what(arguments: argparse.Namespace) -> dict[str, Any]:
-    """Return what is wanted of the drive. Raises ValueError for a frequency that is none."""
+    """Return the command as FleetCommands.request takes it. Raises ValueError for HZ that is no number."""
     action = arguments.command
     if action == "write":
         return {"register": arguments.register, "value": arguments.value}
@@ -89,7 +89,10 @@ def _what(arguments: argparse.Namespace) -> dict[str, Any]:
 
 
 async def _command(arguments: argparse.Namespace) -> int:
-    """Ask what would be done, let a person agree, and have it done by a new offer: the first is too old."""
+    """Show what would be done, let a person agree, and have it done by a new offer.
+
+    The offer that was shown lasts for a second only, and a person takes longer.
+    """
     from multidrop.fleet.command_words import CommandAnswer
 
     what, agreed = _what(arguments), ""
@@ -125,7 +128,7 @@ async def _stop(arguments: argparse.Namespace) -> int:
 
 @contextmanager
 def _annotating(what: str) -> Iterator[None]:
-    """Say what an interruption leaves open: Ctrl-C cancels what waits for the answer."""
+    """Say that the outcome is not known, where Ctrl-C ends the wait for the answer."""
     try:
         yield
     except asyncio.CancelledError:

@@ -31,7 +31,7 @@ def add_server_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def urls_of(arguments: argparse.Namespace) -> list[str]:
-    """Return the servers' addresses. Raises ValueError for what is none."""
+    """Return the servers' URLs. Raises ValueError for one that is not nats:// or tls://."""
     text = arguments.nats or os.environ.get("MULTIDROP_NATS") or URLS
     found = [url.strip() for url in text.split(",") if url.strip()]
     for url in found:
@@ -41,7 +41,7 @@ def urls_of(arguments: argparse.Namespace) -> list[str]:
 
 
 def state_folder() -> Path:
-    """Return the folder of this user's gateways, and of the commands that were asked for."""
+    """Return the folder of this user's gateways, and of the log of commands that this user asked for."""
     state = os.environ.get("XDG_STATE_HOME")
     return (Path(state) if state else Path.home() / ".local" / "state") / "multidrop" / "fleet"
 
@@ -53,7 +53,7 @@ def require_fleet() -> None:
 
 
 def run_action(work: Callable[[], Coroutine[Any, Any, int]], level: int = logging.ERROR) -> int:
-    """Run an action in a loop of its own; what the fleet logs from this level on is printed."""
+    """Run an action in an event loop of its own, and print what the fleet logs from this level on."""
     require_fleet()
     with logging_to(warn, "multidrop.fleet", level):
         return asyncio.run(work())

@@ -1,4 +1,4 @@
-"""`multidrop fleet drain`: let a gateway give all its lines away."""
+"""`multidrop fleet drain`: lets a gateway give all its lines away."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`multidrop fleet init`: what a fleet needs in its NATS servers, and its plant."""
+"""`multidrop fleet init`: makes what a fleet needs in its NATS servers, and stores the plant there."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`multidrop fleet status` and `lines`: a fleet as its records have it, and its gateways say."""
+"""`multidrop fleet status` and `lines`: show what a fleet's records and its gateways say of it."""
 
 from __future__ import annotations
 

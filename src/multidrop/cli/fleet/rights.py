@@ -1,4 +1,4 @@
-"""`fleet rights`: the configuration of a fleet's NATS servers, and a key for each of its users."""
+"""`multidrop fleet rights`: writes the configuration of NATS servers, and a key for each user."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Write the files, and say what is to be done with them; no secret is shown."""
+    """Write the files, and say where each belongs. Secrets are in the files alone, and never printed."""
     require_fleet()
     require_extra("nkeys", "fleet", "fleet rights")
     from multidrop.fleet.server_files import write_files

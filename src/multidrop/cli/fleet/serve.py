@@ -1,4 +1,4 @@
-"""`multidrop fleet serve`: one gateway of a fleet."""
+"""`multidrop fleet serve`: runs one gateway of a fleet."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`multidrop fleet watch`: the fleet live on a terminal, or a line of JSON a second."""
+"""`multidrop fleet watch`: shows the fleet live on a terminal, or a line of JSON a second."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 async def watch(paths: list[ServerPath], *, is_json: bool) -> int:
-    """Show the fleet until Ctrl-C; servers that are away meanwhile are told with the age of what is shown."""
+    """Show the fleet until Ctrl-C. While no server answers, what was seen last stays, with its age."""
     from multidrop.fleet.overview import FleetView
     from multidrop.fleet.setup import open_all
     from multidrop.fleet.task_end import end_tasks
@@ -75,7 +75,10 @@ def _lines() -> Iterator[Callable[[dict[str, Any]], None]]:
 
 @contextmanager
 def drawing(head: str = "multidrop fleet watch") -> Iterator[Callable[[dict[str, Any]], None]]:
-    """Give a function that draws a fleet on the whole terminal, or without cursor control below the last."""
+    """Give a function that draws a fleet on the whole terminal.
+
+    On a terminal without cursor control each picture is printed below the last one.
+    """
     from rich.console import Console
     from rich.control import Control
     from rich.text import Text

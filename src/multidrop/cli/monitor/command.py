@@ -132,7 +132,7 @@ class Monitor:
         self._at.message = text
 
     def left_open(self) -> Iterator[str]:
-        """Return the failures that were not acknowledged, and a warning if a stop is under way."""
+        """Yield the failures that nobody acknowledged, and a warning if a stop is under way."""
         yield from self._at.failures
         if self._is_stopping:
             yield "a stop was under way and is not waited for: look at the motors"

@@ -63,9 +63,10 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _line(arguments: argparse.Namespace, plant: Plant | None) -> PlantLine | None:
-    """Return the line to listen to, where it is known; `port` is its port afterwards.
+    """Return the plant file's line to listen to, or None where none is known.
 
-    Of --plant it is the line at this port; a plant's only line is it at any port.
+    With PLANT.toml in place of PORT, sets `arguments.port` to the line's port. With --plant it is the line
+    that has this port, or else the plant's only line.
     """
     named = plant_at(arguments)
     if named is None:
@@ -84,7 +85,7 @@ def _name(port: str) -> str:
 
 
 def _settings(arguments: argparse.Namespace, line: PlantLine | None) -> Settings:
-    """Return the arguments' settings, else those of most of the line's drives."""
+    """Return the settings that the arguments state, and for the rest those of most of the line's drives."""
     usual = usual_settings(line)
     baudrate = usual.baudrate if arguments.baudrate is None else arguments.baudrate
     return Settings(baudrate, arguments.format or usual.format)

@@ -88,7 +88,7 @@ def simulator(plant: Path, ports: Path) -> Iterator[None]:
 
 
 def simulate(words: Sequence[str]) -> int:
-    """Simulate until standard input ends, which it does when the process that began this one is gone."""
+    """Simulate until standard input ends: it ends when the process that started this one is gone."""
 
     def end_with_parent() -> None:
         os.read(0, 1)

@@ -27,7 +27,7 @@ MOVES = 8  # rows of the moves with their head, where lines need the room
 
 
 def picture(told: Told, size: tuple[int, int], head: str) -> list[Text]:
-    """Draw gateways, lines and moves of what `fleet watch --json` prints; "notes" stand at the foot."""
+    """Draw gateways, lines and moves of what `fleet watch --json` prints, and its "notes" at the foot."""
     width, height = size
     is_old = told["age_s"] is None or told["age_s"] > OLD_S
     top = [_title(told, head, width), _warning(told, width)]

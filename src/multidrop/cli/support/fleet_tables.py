@@ -38,7 +38,7 @@ def moment(ms: int) -> str:
 
 
 def gateway_table(fleet: Told, width: float = inf) -> list[str]:
-    """Return the gateways; where they are wider than that, without some of the columns."""
+    """Return the table of gateways, without some columns where it would be wider than `width`."""
     table = [GATEWAYS, *(_gateway_row(name, gateway) for name, gateway in fleet["gateways"].items())]
     sides = "<<><<>>>>>>"
     for column in LEFT_OUT:
@@ -112,7 +112,7 @@ def _from_to(move: Told) -> tuple[str, str]:
 
 
 def trouble_sentences(fleet: Told) -> list[str]:
-    """Return what gateways say that is not well with them."""
+    """Return the troubles that gateways report, a sentence for each."""
     found = []
     for name, gateway in fleet["gateways"].items():
         says = gateway["says"] or {}

@@ -1,4 +1,4 @@
-"""Options of commands that speak with a fleet's NATS servers: who they are, and whom they believe."""
+"""Options of commands that speak with a fleet's NATS servers: credentials, and the servers' certificate."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def add_nats_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def nats_options(arguments: argparse.Namespace, urls: Sequence[str]) -> dict[str, Any]:
-    """Return the options of a connection. Raises OSError or ValueError for a file that is none."""
+    """Return the options of a connection. Raises OSError or ValueError for a file that holds no key."""
     from multidrop.fleet.credentials import connect_options
 
     logging.getLogger("asyncio").addFilter(_is_news)

@@ -20,12 +20,12 @@ def spell_out_unencodable() -> None:
 
 
 def print_text(text: object, *, file: TextIO | None = None, flush: bool = False) -> None:
-    """Print the text. Only \\n ends a line."""
+    """Print the text; of its control characters only \\n has its effect, and the others are spelt out."""
     print("\n".join(map(printable, str(text).split("\n"))), file=file, flush=flush)
 
 
 def command_line(words: Sequence[str]) -> str:
-    """Return the words as they are typed: a console of Windows knows no other quotes than its own."""
+    """Return the words as one types them, quoted as this system's shell wants it."""
     if sys.platform == "win32":
         from subprocess import list2cmdline
 

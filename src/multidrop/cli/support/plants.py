@@ -39,14 +39,14 @@ def plant_of(path: str, arguments: argparse.Namespace) -> Plant:
 
 
 def is_plant(word: str) -> bool:
-    """Return True where a word that is a port or a plant file is the latter, by its suffix."""
+    """Return True where a word in place of PORT is a plant file, by its suffix."""
     return "://" not in word and word.lower().endswith(".toml")
 
 
 def add_line_arguments(parser: argparse.ArgumentParser, *, name: str = "LINE", kind: str = "line") -> None:
-    """Add PORT, or PLANT.toml and the name of a line in it, which may be left out where it has one only.
+    """Add PORT, or PLANT.toml and the name of a line, which may be left out where the plant has one line.
 
-    `name` is the argument's, and `kind` says in words what it may name.
+    `name` is how the help calls that second argument, and `kind` says what it may be the name of.
     """
     ways = [f"{parser.prog} PORT [options]", f"{parser.prog} PLANT.toml [{name}] [options]"]
     parser.usage = "\n       ".join(ways)
@@ -84,9 +84,9 @@ def rs485_at(arguments: argparse.Namespace, line: PlantLine | None) -> RS485:
 
 
 def plant_at(arguments: argparse.Namespace) -> Plant | None:
-    """Return the plant where one stands in place of PORT.
+    """Return the plant where a plant file stands in place of PORT; None where a port does.
 
-    Raises ValueError for whatever is wrong with it, and for what belongs to one where there is none.
+    Raises ValueError for mistakes in the plant file, and beside a port for arguments that belong to a plant.
     """
     if arguments.port is None:
         raise ValueError(

@@ -45,9 +45,9 @@ def add_target_arguments(parser: argparse.ArgumentParser, *further: str) -> None
         "words",
         metavar="PORT MODEL ADDRESS",
         nargs="*",
-        help="a device such as /dev/ttyUSB0 or a pyserial URL; see `multidrop models`, or file.toml, or "
-        "file.py:Class; the drive's address. In their place PLANT.toml DRIVE: a plant file and "
-        "the name of a drive in it",
+        help="PORT: a device such as /dev/ttyUSB0, or a pyserial URL. MODEL: one of `multidrop models`, or "
+        "file.toml, or file.py:Class. ADDRESS: the drive's. In their place PLANT.toml DRIVE: a plant file "
+        "and the name of a drive in it",
     )
     parser.add_argument("--baudrate", type=int, metavar="N", help="where it is not the family's default")
     parser.add_argument("--format", metavar="8N1", help="data bits, parity and stop bits")

@@ -44,7 +44,7 @@ class TrafficPrinter:
         self._print(self.pairing.pair(spans))
 
     def finish(self) -> None:
-        """Print what still waits for a reply: none will come."""
+        """Print the requests that still wait for a reply: none will come."""
         self._print(self.pairing.flush())
 
     def _write(self, spans: list[FrameSpan], out: CaptureWriter) -> None:
@@ -63,7 +63,7 @@ class TrafficPrinter:
 def replay(
     capture: Capture, plant: Plant | None, *, as_json: bool, out: CaptureWriter | None = None
 ) -> Counter[str]:
-    """Print all that a capture holds; return how many exchanges and other things it held."""
+    """Print all that a capture holds; return its counts, as `summary` takes them."""
     printers: list[TrafficPrinter] = []
     for _ in capture:
         printers += [

@@ -42,7 +42,7 @@ def wrapped(text: str, first: str = "", rest: str = "", *, breaks_words: bool = 
 
 
 def counted(count: int, one: str, many: str = "") -> str:
-    """Return the count with its noun, such as "1 drive" and "2 drives"; `many` where no s makes it."""
+    """Return the count with its noun, such as "1 drive" and "2 drives"; `many`: a plural without s."""
     return f"{count} {one if count == 1 else many or f'{one}s'}"
 
 

@@ -1,0 +1,95 @@
+"""Remarks on a family: what its file leaves open, and what will be refused."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+from multidrop.control.eeprom_ledger import BUDGET, LEAST_INTERVAL
+from multidrop.control.rules import wears
+from multidrop.drive.family import Drive
+from multidrop.drive.register import Access, Register
+from multidrop.drive.table import Kept
+from multidrop.drive.verbs import MOVING
+
+Remark = tuple[str, str]  # a register or a key, and the sentence about it
+
+_OF_A_MOTOR = {
+    "remote": "what to set on the keypad so that the line commands it",
+    "watchdog": "whether the motor stops when nobody asks any more; it is taken to run on",
+}
+
+
+def unknown(family: type[Drive]) -> Iterator[Remark]:
+    """Yield what the file leaves open, with the key that would say it."""
+    drive = family(family.addresses[0])
+    registers = family.registers.values()
+    for register in registers:
+        yield from ((register.name, sentence) for sentence in _unknown_of(drive, register))
+    placeless = [one.name for one in registers if one.access is Access.READING and not one.place]
+    if placeless:
+        yield "place", f"the manual's place of {_some(placeless)}"
+    if family.identify is Drive.identify:
+        yield "identify", "how to tell this device from another; look at its name plate"
+    if not family.most_registers:
+        yield "together", "how many neighbours one request may read; together = { holding = 20 }"
+    if "confirmed" in family.options:
+        for key in ("remote", "watchdog"):
+            if getattr(family, key) == getattr(Drive, key):
+                yield key, _OF_A_MOTOR[key]
+
+
+def _unknown_of(drive: Drive, register: Register[Any]) -> Iterator[str]:
+    if wears(drive, register) is Kept.UNKNOWN and register.writable:
+        where = 'each write is counted as wear; kept = "ram" or "eeprom"'
+        yield f"whether it is kept in EEPROM: {where}"
+    if register.step is None:
+        yield "the value of one count: its counts are shown as they are"
+    if register.access is Access.SETTING and register.values is None and register.span is None:
+        yield "its span: all that fits is written; span = [0, 50]"
+    if register.access is not Access.READING and not register.place:
+        yield 'its place in the manual, to be compared; place = "table 3"'
+
+
+def _some(names: list[str]) -> str:
+    return (
+        ", ".join(names) if len(names) <= 4 else f"{', '.join(names[:3])} and {len(names) - 3} more readings"
+    )
+
+
+def refused(family: type[Drive]) -> Iterator[Remark]:
+    """Yield what is not sent to a drive of this family, and why."""
+    drive = family(family.addresses[0])
+    for register in family.registers.values():
+        if register.access is not Access.READING:
+            yield from ((register.name, sentence) for sentence in _refused_of(drive, register))
+    moving = [name for name in MOVING if getattr(family, name) is not getattr(Drive, name)]
+    if "confirmed" in family.options:
+        writes = "every write that is not called harmless" if moving else "every write"
+        yield "confirmed", f"{', '.join([*moving, writes])}, until the drive has confirmed = 1"
+    if not moving:
+        yield "verbs", "start, stop and the like: it has none"
+    if not family.broadcasts:
+        yield "broadcast", "all: no register has counts that are documented for it"
+
+
+def _refused_of(drive: Drive, register: Register[Any]) -> Iterator[str]:
+    if register.never:
+        yield f"every write: {register.never}"
+        return
+    if not register.writable:
+        yield f"every write: a {register.table.name} cannot be written"
+    elif register.commands:
+        harmless = ", ".join(f"{raw:04X}H" for raw in register.harmless or ())
+        yield f"every write but by verbs, and of {harmless}" if harmless else "every write but by verbs"
+    if register.while_running is False:
+        stands = "while the motor does not stand"
+        unsure = type(drive).state is Drive.state
+        yield (
+            "every write: nothing says whether the motor stands ([state])" if unsure else f"a write {stands}"
+        )
+    kept = wears(drive, register)
+    if register.writable and kept is Kept.EEPROM:
+        yield f"more than one write in {LEAST_INTERVAL:.0f} s, and than {BUDGET} a year: it is in EEPROM"
+    elif register.writable and kept is Kept.UNKNOWN:
+        yield f"more than {BUDGET} writes a year: it may be in EEPROM"
