@@ -93,6 +93,7 @@ def test_a_plant_s_motor_is_started_and_stopped(plant: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("_patient")
 def test_a_motor_is_commanded_from_the_command_line(run: Run, plant: Path) -> None:
     sims = sims_of(plant)
     with Simulator([Wire(sims, port=str(plant.parent / "hall"), unpaced=True)]):
