@@ -1,4 +1,7 @@
-"""Changes of this machine's network: a browser breaks off its requests at each, so the two take turns."""
+"""Changes of a network: a browser breaks off its requests at each, so the two take turns.
+
+Each of Linux's network namespaces is a network of its own.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +12,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-LOCK = Path(tempfile.gettempdir()) / f"multidrop-network-{os.getuid()}"
+_NAMESPACE = Path("/proc/self/ns/net")
+_NETWORK = _NAMESPACE.stat().st_ino if _NAMESPACE.exists() else 0
+LOCK = Path(tempfile.gettempdir()) / f"multidrop-network-{os.getuid()}-{_NETWORK}"
 
 
 @contextmanager
