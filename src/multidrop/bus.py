@@ -225,6 +225,10 @@ class Bus:
         """Return what is learnt of this drive's answers; ValueError for a drive that is not on this bus."""
         return self._exchanges.peer(drive)
 
+    def is_asking(self, peer: Peer) -> bool:
+        """Return True while an exchange with this peer is queued, under way or about to be."""
+        return self._exchanges.is_asking(peer)
+
     @property
     def peers(self) -> dict[Drive, Peer]:
         """Learnt answers of each drive that is on this bus now."""

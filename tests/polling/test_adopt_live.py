@@ -369,7 +369,7 @@ class SlowToy(Toy):
 
 def _is_asking(poller: Poller, of: PolledDrive) -> bool:
     bus = poller.bus("yard")
-    return bool(bus.line.queue and bus.line.queue.is_asking(bus.peer(of.drive)))
+    return bus.is_asking(bus.peer(of.drive))
 
 
 def test_closing_waits_for_an_adoption(both: TwoLines, monkeypatch: pytest.MonkeyPatch) -> None:

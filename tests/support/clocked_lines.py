@@ -246,6 +246,9 @@ class ClockedLine:
     def inherit(self, peer: Peer, before: Peer) -> None:
         peer.inherit(before)
 
+    def is_asking(self, peer: Peer) -> bool:
+        return self.queue is not None and self.queue.is_asking(peer)
+
     def note_foreign(self) -> None:
         pass
 

@@ -137,10 +137,7 @@ class Line:
             raise LineError(self.port, reason_of(failure)) from failure
 
     def drop(self) -> None:
-        """Carry out nothing more; what is queued and not yet sent never will be.
-
-        The port itself, which may take its time, is closed by `close` or `reopen`.
-        """
+        """Carry out nothing more; what is queued and not yet sent never will be. `close` closes the port."""
         with self._lock:
             core, self.queue = self.queue, None
             if core is None:
@@ -257,6 +254,11 @@ class Line:
             raise failure
         return found
 
+    def is_asking(self, peer: Peer) -> bool:
+        """Return True while the port has an exchange with this peer, queued or under way."""
+        with self._lock:
+            return self.queue is not None and self.queue.is_asking(peer)
+
     def _failure(self, result: int, error: int, received: bytes) -> LineError:
         if result == Failure.SETTINGS_REFUSED:
             names = refused_names(error)
@@ -272,10 +274,7 @@ class Line:
         return (LineError if is_over else PortLost)(self.port, self.why_closing or self._why_closed)
 
     def overruns(self) -> int | None:
-        """Return how many characters came too fast for the port, since its driver was loaded.
-
-        None while it is closed, and where the driver does not count them.
-        """
+        """Return how many characters came too fast since the driver was loaded; None where it is unknown."""
         return self._opened.overruns()
 
     @property
