@@ -26,17 +26,12 @@ from multidrop.transport.aside_log import flush
 from multidrop.transport.bridge import PORT_FAILURES
 from multidrop.transport.line_log import LineLog
 from multidrop.transport.open_port import OpenPort
-from multidrop.transport.opening import check_port, reason_of, why_lost
+from multidrop.transport.opening import check_port, is_lost_by, reason_of, why_lost
 
 LEAVING_NS = 1_000_000_000  # for callers to leave a port that was stopped
 LOGGING_S = 1.0  # that closing waits for loggers
 
 UNOPENED = "it is not opened: this process is not its master, and could end the master's connection"
-
-
-def _is_lost(core: Port, result: int) -> bool:
-    is_lost = result in (Failure.LINE_LOST, Failure.SETTINGS_REFUSED)
-    return is_lost or (result == Failure.LATE_ANSWER_DUE and core.lost)
 
 
 class Line:
@@ -199,10 +194,7 @@ class Line:
                 self.queue.tap(tap)
 
     def require(self, settings: tuple[int, str]) -> None:
-        """Prepare for exchanges with these settings: a bridged port can have only one kind of them.
-
-        Raises LineError when it has others already, or does not take these.
-        """
+        """Prepare for these settings. Raises LineError where a bridged port has others, or takes them not."""
         with self._lock:
             self._opened.require(settings)
 
@@ -241,7 +233,7 @@ class Line:
             if core is None:
                 raise self._closed()
             found = core.carry_out(exchange, not_before_ns, expires_ns, into)
-            is_lost = found.size < 0 and _is_lost(core, found.result)
+            is_lost = found.size < 0 and is_lost_by(found.result, core)
             if self.mastership is not None:
                 self.note_foreign()
         finally:
@@ -272,6 +264,15 @@ class Line:
     def _closed(self) -> LineError:
         is_over = self._is_over or self.why_closing
         return (LineError if is_over else PortLost)(self.port, self.why_closing or self._why_closed)
+
+    def counted_ns(self, now_ns: int) -> int:
+        """Return until when its time is over and counted: now, or the beginning of what is under way."""
+        self._callers.append(None)  # as in `carry_out`
+        try:
+            core = self.queue
+            return now_ns if core is None else min(now_ns, core.counted_ns())
+        finally:
+            self._callers.pop()
 
     def overruns(self) -> int | None:
         """Return how many characters came too fast since the driver was loaded; None where it is unknown."""
