@@ -137,6 +137,30 @@ def test_a_drive_that_leaves_is_not_started_behind_its_stop(both: TwoLines) -> N
         assert not runs(both.pumps[2])
 
 
+def test_a_line_that_is_being_opened_has_its_drives_stopped_at_exit_too(
+    both: TwoLines, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    opening, go_on = threading.Event(), threading.Event()
+    open_bus = Bus.__init__
+
+    def slow(bus: Bus, *arguments: object, **details: object) -> None:
+        opening.set()
+        assert go_on.wait(PATIENCE)
+        open_bus(bus, *arguments, **details)  # type: ignore[arg-type]
+
+    with Poller(plant(both.hall())) as poller:
+        monkeypatch.setattr(Bus, "__init__", slow)
+        adopting = threading.Thread(target=poller.adopt, args=[plant(both.hall(), both.yard())])
+        adopting.start()
+        try:
+            assert opening.wait(PATIENCE)
+            poller.stop_on_exit()
+        finally:
+            go_on.set()
+            adopting.join(PATIENCE)
+        assert {name: bus.stops_on_exit for name, bus in poller.buses.items()} == {"hall": True, "yard": True}
+
+
 class Other(Quick):
     """Another family, whose manual has a start where the first one has a stop."""
 

@@ -71,10 +71,9 @@ class Coming:
 class Adoption:
     """A plant that a poller's lines are to become. Raises ValueError where that cannot be."""
 
-    def __init__(self, lines: LineSet, plant: Plant, *, stops_on_exit: bool) -> None:
+    def __init__(self, lines: LineSet, plant: Plant) -> None:
         self._lines = lines
         self._plant = plant
-        self._stops_on_exit = stops_on_exit
         buses = {line.bus for line in lines}
         check_plant(plant, is_free=lambda drive: _is_free(drive, buses))
         self._pair()
@@ -123,7 +122,7 @@ class Adoption:
             self._lines.check_port(coming.wanted.port)
         if self._coming:
             self._lines.check_audit()
-        if self._coming and self._stops_on_exit:
+        if self._coming and self._lines.stops_on_exit:
             exit_hook().take_signals()
 
     # ---- carrying it out ----
@@ -178,8 +177,6 @@ class Adoption:
         """Poll a line on this bus. Raises LineError where the port cannot have a drive's settings."""
         if coming.before:
             bus.remember(coming.before.bus)
-        if self._stops_on_exit:
-            bus.stop_on_exit()
         line = self._lines.add(replace(coming.wanted, drives=()), bus)
         try:
             for polled in coming.wanted.drives:
