@@ -276,6 +276,9 @@ void md_port_tap(struct md_port *port, struct md_tap *tap);
 int md_port_end(struct md_port *port);
 /* Return 1 while an exchange with this drive is queued, repeated, urgent or under way. */
 int md_port_is_asking(struct md_port *port, const struct md_drive *drive);
+/* Return until when the port's time is over and counted: no exchange that ends from now on needed the line
+ * before then. While one is under way that is its beginning. */
+int64_t md_port_counted_ns(struct md_port *port);
 /* md_late_inherit() while the engine looks at neither drive. */
 void md_port_inherit(struct md_port *port, struct md_drive *drive, const struct md_drive *before);
 /* Carry out nothing more, and give the descriptor back. What is under way after md_port_end() becomes

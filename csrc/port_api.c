@@ -82,6 +82,14 @@ int md_port_is_asking(struct md_port *port, const struct md_drive *drive)
     return is_asking;
 }
 
+int64_t md_port_counted_ns(struct md_port *port)
+{
+    md_engine_enter(port->engine);
+    int64_t counted_ns = md_turn_counted_ns(&port->turn, md_now_ns());
+    md_engine_leave(port->engine);
+    return counted_ns;
+}
+
 void md_port_fence(struct md_port *port, struct md_mastership *mastership)
 {
     md_engine_enter(port->engine);

@@ -56,6 +56,16 @@ int md_turn_end(struct md_turn *turn)
     return !is_waiting && turn->whose != MD_URGENT;
 }
 
+/* What an exchange needs of the line begins with the silence before it, and never before the line's last
+ * activity (measure() in reply.c). */
+int64_t md_turn_counted_ns(const struct md_turn *turn, int64_t now_ns)
+{
+    const struct md_line *line = &turn->line;
+    if (md_line_is_under_way(line))
+        return line->completion->sent_ns - line->silence_ns;
+    return sooner(now_ns, later(line->quiet_ns, now_ns - line->silence_ns));
+}
+
 int md_turn_is_asking(const struct md_turn *turn, const struct md_drive *drive)
 {
     if (turn->whose != MD_NOBODYS && turn->line.exchange->drive == drive)

@@ -62,6 +62,7 @@ void md_turn_add_urgent(struct md_turn *turn, struct md_urgent *urgent);
 void md_turn_tell_echo(struct md_turn *turn, int echo);
 int md_turn_end(struct md_turn *turn);
 int md_turn_is_asking(const struct md_turn *turn, const struct md_drive *drive);
+int64_t md_turn_counted_ns(const struct md_turn *turn, int64_t now_ns);
 /* Return what the line wants (enum md_want); MD_DONE: there is nothing to carry out before wake_ns. */
 int md_turn_want(struct md_turn *turn, int64_t *wake_ns, int64_t now_ns);
 void md_turn_lose(struct md_turn *turn, int error); /* the port failed */

@@ -207,7 +207,7 @@ class Bus:
         """Take a drive off the bus: nothing is asked of it any more, and its verbs raise ValueError.
 
         Nothing is sent: its motor goes on as it is. Ends what would move it with Overtaken, or Unconfirmed
-        where it was sent, and waits until the stops that are under way are done.
+        where it was sent, and waits until its stops that are under way are done.
         """
         self._latches.remove(drive)
         with self._attached.lock:
@@ -224,6 +224,10 @@ class Bus:
     def peer(self, drive: Drive) -> Peer:
         """Return what is learnt of this drive's answers; ValueError for a drive that is not on this bus."""
         return self._exchanges.peer(drive)
+
+    def is_asking(self, peer: Peer) -> bool:
+        """Return True while an exchange with this peer is queued, under way or about to be."""
+        return self._exchanges.is_asking(peer)
 
     @property
     def peers(self) -> dict[Drive, Peer]:
@@ -373,9 +377,12 @@ class Bus:
         """True once `stop_on_exit` was called."""
         return self._leaving.stops
 
-    def stop_leaving(self, drives: Sequence[Drive]) -> None:
-        """Stop these if `stop_on_exit` was called: once they are detached, nobody would."""
-        self._leaving.stop(drives)
+    def part_with(self, drives: Sequence[Drive], to_stop: Sequence[Drive]) -> None:
+        """End all that moves these drives, which are about to be detached, and wait for their stops.
+
+        Those `to_stop` are stopped if `stop_on_exit` was called: once they are detached, nobody would.
+        """
+        self._leaving.part_with(drives, to_stop)
 
     # ---- how it went ----
 

@@ -57,7 +57,6 @@ class Poller(RowSource):
         self._lines = LineSet(row_queue, ledger, audit, mastership)
         super().__init__(row_queue, self._lines.names)
         self._path = plant.path
-        self._stops_on_exit = False
         self._thread = threading.Thread(target=self._poll, name="multidrop poller", daemon=True)
         register_at_fork(self)
         try:
@@ -167,7 +166,7 @@ class Poller(RowSource):
             raise TypeError(f"adopt takes a Plant, such as load_plant('plant.toml') gives, not {plant!r}")
         with self._changing:
             self._check_polling()
-            adoption = Adoption(self._lines, plant, stops_on_exit=self._stops_on_exit)
+            adoption = Adoption(self._lines, plant)
             self._path = plant.path
             return adoption.carry_out(start=self._thread.is_alive())
 
@@ -181,7 +180,7 @@ class Poller(RowSource):
             self._check_polling()
             plant = self.plant
             wanted = replace(plant, lines=(*plant.lines, line))
-            adoption = Adoption(self._lines, wanted, stops_on_exit=self._stops_on_exit)
+            adoption = Adoption(self._lines, wanted)
             failures = adoption.carry_out(start=False)
             added = self._lines.find(line.name)
             if failures:
@@ -262,7 +261,7 @@ class Poller(RowSource):
         Also those of lines that come later, and of lines and drives that leave by `adopt` or `remove_line`.
         """
         exit_hook().take_signals()
-        self._stops_on_exit = True
+        self._lines.stops_on_exit = True
         for line in self._lines:
             line.bus.stop_on_exit()
 

@@ -9,7 +9,7 @@ from typing import Any, cast
 
 import checksums
 import pytest
-from lines import Faulty, patient, proof, until
+from lines import PATIENCE, Faulty, patient, proof, until
 from toy import Fault, Toy
 
 from multidrop.bus import Bus
@@ -636,3 +636,63 @@ def test_a_bus_that_is_closed_while_others_use_it() -> None:
             bus.close()
             for thread in threads:
                 thread.join()
+
+
+# ---- drives that leave while a thread reads them ----
+
+
+class Single(Toy):
+    """Asked for one register at a time."""
+
+    most_registers = {HOLDING: 1}
+
+
+class Successor(Single):
+    """Another family."""
+
+    model = "successor"
+
+
+def when_asked(bus: Bus, act: Callable[[], object]) -> None:
+    """Do this once, as a thread is about to give an exchange to the line."""
+    carry_out = bus.line.carry_out
+
+    def act_and_carry_out(*arguments: Any, **details: Any) -> Any:
+        vars(bus.line)["carry_out"] = carry_out
+        act()
+        return carry_out(*arguments, **details)
+
+    vars(bus.line)["carry_out"] = act_and_carry_out
+
+
+def test_a_read_of_several_requests_ends_where_its_drive_leaves() -> None:
+    with Simulator([Wire([simulated(Single(1))], unpaced=True)]) as sim, Bus(sim.wires[0].path) as bus:
+        pump = bus.attach(Single, 1)
+        peer = bus.peer(pump)
+        when_asked(bus, lambda: bus.detach(pump))
+        with pytest.raises(NotAttached):
+            bus.read_many(pump, [Single.output_frequency, Single.output_current, Single.fault])
+        assert peer.exchanges == 1  # at its address may be another family now
+
+
+def test_a_drive_that_takes_another_s_place_knows_what_a_thread_has_asked_that() -> None:
+    """Else the late reply to that would be taken for its own."""
+    sim = simulated(Single(1))
+    with Simulator([Wire([sim], unpaced=True)]) as simulator, Bus(simulator.wires[0].path) as bus:
+        pump = bus.attach(Single, 1)
+        bus.read(pump, Single.output_current)
+        sim.deaf_until = float("inf")
+        taken: list[Drive] = []
+        taking = threading.Thread(target=lambda: taken.append(bus.attach(Successor, 1)))
+
+        def exchange_it() -> None:
+            bus.detach(pump)
+            taking.start()
+            taking.join(0.1)  # it would be over at once
+            assert not taken
+
+        when_asked(bus, exchange_it)
+        with pytest.raises((NoReply, NotAttached)):
+            bus.read(pump, Single.mystery)
+        taking.join(PATIENCE)
+        assert bus.peer(taken[0]).late_until_ns

@@ -805,6 +805,10 @@ def test_a_log_that_cannot_be_written_does_not_hinder_a_stop(
     assert "the audit log cannot be written" in caplog.text
 
 
+LOST = LineError("hall", "the port was lost")
+LOST.is_sent = True
+
+
 def test_a_port_that_fails_in_a_write_is_noted_as_unconfirmed(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
@@ -815,11 +819,11 @@ def test_a_port_that_fails_in_a_write_is_noted_as_unconfirmed(
 
     def fail(exchange: Exchange, **times: Any) -> Completion:
         if exchange.request.function == 6:
-            raise LineError("hall", "the port was lost")
+            raise LOST
         return carry_out(exchange, **times)
 
     monkeypatch.setattr(line, "carry_out", fail)
-    with pytest.raises(LineError):
+    with pytest.raises(Unconfirmed):
         drive.start()
     line.bus.close()
     assert [(each["write"], each["outcome"]) for each in read_audit(log)][1:] == [
@@ -827,7 +831,6 @@ def test_a_port_that_fails_in_a_write_is_noted_as_unconfirmed(
     ]
 
 
-LOST = LineError("hall", "the port was lost")
 ENDINGS: dict[str, tuple[BaseException, int, Callable[[SimulatedBus, Any], object], str]] = {
     "port lost at the reading back": (
         LOST,

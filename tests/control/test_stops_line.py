@@ -15,9 +15,10 @@ from lines import line as declared_line
 from motors import MAKE, ReceivedRequests
 
 from multidrop.bus import Bus
+from multidrop.control.audit_log import read_audit
 from multidrop.core import Message
 from multidrop.drive import Condition
-from multidrop.errors import BusError, LineError, NoReply, Overtaken, Unconfirmed
+from multidrop.errors import BusError, LineError, NoReply, Overtaken, PortLost, Unconfirmed
 from multidrop.poller import Poller
 from multidrop.polling.polled_line import PolledLine
 from multidrop.sim import MotorDrive, Simulator, Wire, simulated
@@ -261,3 +262,18 @@ def test_nothing_is_sent_to_a_drive_while_its_stop_is_repeated() -> None:
                 call()
         stopping.join(PATIENCE)
         assert received.starts == []
+
+
+def test_a_stop_that_never_left_is_no_sent_write_in_the_audit_log(tmp_path: Path) -> None:
+    """It is repeated while the poller, which opens the port again, has not done so."""
+    audit = tmp_path / "audit.jsonl"
+    wire = Wire([simulated(MAKE["invt-che"](1))], unpaced=True)
+    with Simulator([wire]), Bus(wire.path, audit=audit) as bus:
+        drive = bus.attach(MAKE["invt-che"](1))
+        drive.set_frequency(20)
+        sent = [record["write"] for record in read_audit(audit)]
+        bus.tended(True)
+        bus.line.drop()
+        with pytest.raises(PortLost):
+            drive.stop(seconds=0)
+        assert [record["write"] for record in read_audit(audit)] == sent != []

@@ -10,9 +10,11 @@ import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
+from pathlib import Path
 from typing import Any
 
 import pytest
+import toy
 from lines import PATIENCE, plant, polled, rows_of, until
 from lines import line as declared
 from serial_server import SerialServer
@@ -259,6 +261,29 @@ def test_rows_that_wait_are_the_parent_s_to_take() -> None:
     found = row_queue.take()
     assert found is not None
     assert len(found) == 1
+
+
+LEFT = """
+import os, sys
+sys.path[:0] = [{support!r}]
+from toy import Toy
+from multidrop import Bus
+from multidrop.sim import Simulator, Wire, simulated
+with Simulator([Wire([simulated(Toy(1))], unpaced=True)]) as simulator:
+    child = os.fork()
+    if child == 0:
+        sys.exit(0)  # leaves the simulator's block
+    os.waitpid(child, 0)
+    assert simulator._thread.is_alive()
+    with Bus(simulator.wires[0].path) as bus:
+        print(bus.read(bus.attach(Toy, 1), Toy.status))
+"""
+
+
+def test_a_child_ends_no_simulator() -> None:
+    words = [sys.executable, "-W", "ignore", "-c", LEFT.format(support=str(Path(toy.__file__).parent))]
+    done = subprocess.run(words, capture_output=True, text=True, timeout=PATIENCE, check=False)
+    assert (done.stdout, done.stderr, done.returncode) == ("0\n", "", 0)
 
 
 PARENT = """

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -15,7 +15,7 @@ from broken_part import BrokenFeed
 from gateways import Answer, Served, plant_text, running, served, tokens
 from lines import HOST_LATE, PATIENCE, until
 
-from multidrop import Batch, InvtCHE, LineError, Plant, load_plant
+from multidrop import Batch, Bus, InvtCHE, LineError, Plant, load_plant
 from multidrop.gateway.gateway import Gateway
 from multidrop.gateway.rights import Right
 from multidrop.gateway.settings import ServeSettings, read_settings
@@ -58,8 +58,10 @@ class Rows:
 
 
 @contextmanager
-def two_lines(folder: Path, serve: str = MAY) -> Iterator[tuple[Served, Rows]]:
-    """A gateway of hall with pump-1 and of roof with fan-1, and its rows."""
+def two_lines(
+    folder: Path, serve: str = MAY, fans: Sequence[str] = ("fan-1",)
+) -> Iterator[tuple[Served, Rows]]:
+    """A gateway of hall with pump-1 and of roof with fan-1, and its rows; other fans do not answer."""
     secrets, known = tokens()
     sims = {name: simulated(InvtCHE(1, name=name, baudrate=38400)) for name in ("pump-1", "fan-1")}
     path = folder / "plant.toml"
@@ -72,7 +74,7 @@ def two_lines(folder: Path, serve: str = MAY) -> Iterator[tuple[Served, Rows]]:
         hall, roof = (wire.path for wire in simulator.wires)
         path.write_text(
             plant_text(hall, ["pump-1"])
-            + plant_text(roof, ["fan-1"], serve).replace('name = "hall"', 'name = "roof"')
+            + plant_text(roof, fans, serve).replace('name = "hall"', 'name = "roof"')
         )
         gateway, rows = Gateway(*read(), read=read), Rows()
         gateway.feeds["rows"] = rows
@@ -267,6 +269,50 @@ def test_a_stop_of_a_drive_that_a_reload_exchanges_is_sent_to_the_new_one(
         assert [one["fan-1"]["done"] for one in stops] == [True, True]
         assert not fan.goal
         assert gateway.gateway.revision == revision + 1
+
+
+@pytest.mark.parametrize("way", ["stop", "coast"])
+def test_a_stop_waits_for_no_port_that_a_reload_opens(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, way: str
+) -> None:
+    """The drive has been exchanged already, and another line takes its time."""
+    verbs = '"fan-1.start", "fan-1.coast"'
+    may = MAY.replace("pump-1", "fan-1").replace('"fan-1.start"', verbs)
+    with two_lines(tmp_path, may, ("fan-1", "fan-2")) as (gateway, _):
+        writer = {"authorization": gateway.bearer(Right.WRITE)}
+        fan = gateway.sims["fan-1"].motor  # type: ignore[attr-defined]
+        gateway.post("/api/write", {"drive": "fan-1", "register": "setpoint", "value": 2.0}, **writer)
+        gateway.post("/api/act", {"drive": "fan-1", "verb": "start", "options": {}}, **writer)
+        assert fan.goal
+        opening, go_on = threading.Event(), threading.Event()
+        open_bus = Bus.__init__
+
+        def slow(bus: Bus, *arguments: Any, **details: Any) -> None:
+            opening.set()
+            assert go_on.wait(PATIENCE)
+            open_bus(bus, *arguments, **details)
+
+        monkeypatch.setattr(Bus, "__init__", slow)
+        edit(gateway, 'name = "fan-1"', 'name = "fan-1"\nmaximum_frequency = 50.0')
+        edit(gateway, 'name = "hall"', 'name = "hall"\necho = "off"')  # opened anew
+        told: list[Any] = []
+        reloading = threading.Thread(target=lambda: told.append(reload(gateway)))
+        reloading.start()
+        try:
+            assert opening.wait(PATIENCE)
+            if way == "coast":
+                asked = "/api/act", {"drive": "fan-1", "verb": way, "options": {}}
+            else:
+                asked = "/api/stop", {"drives": ["fan-1"]}
+            stopping = threading.Thread(target=lambda: gateway.post(*asked, **writer))
+            stopping.start()
+            until(lambda: not fan.goal)
+            assert reloading.is_alive()
+        finally:
+            go_on.set()
+            reloading.join(PATIENCE)
+            stopping.join(PATIENCE)
+        assert told[0]["done"]
 
 
 def test_a_stop_that_is_under_way_goes_on(tmp_path: Path) -> None:

@@ -45,8 +45,13 @@ class Lines(NamedTuple):
     def bus(self, line: str) -> Bus:
         return self.poller.bus(line)
 
-    async def settled(self) -> None:
-        pass  # nothing is reloaded
+    @property
+    def plant_now(self) -> Plant:
+        return self.plant
+
+    @property
+    def is_settled(self) -> bool:
+        return True  # nothing is reloaded
 
     async def ask(self, drive: str, function: int, start: int, count: int, expiry: float) -> list[int]:
         line, known = self.plant.find_drive(drive)

@@ -6,7 +6,7 @@ import gc
 import socket
 import threading
 import tracemalloc
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import suppress
 from typing import Any
 
@@ -19,6 +19,9 @@ from toy import Toy
 
 from multidrop.bus import Bus
 from multidrop.control.outcome import Seen, Stopped
+from multidrop.control.stop_attempt import StopAttempt
+from multidrop.drive import Drive
+from multidrop.drive.script import Step
 from multidrop.errors import LineError, NoReply, NotAttached, Overtaken
 from multidrop.plant.model import PlantLine, PolledDrive
 from multidrop.poller import Poller
@@ -115,6 +118,49 @@ def test_motors_that_are_to_stop_at_exit_are_stopped_before_they_leave(both: Two
     assert not runs(both.fans[1])
 
 
+def test_a_drive_that_leaves_is_not_started_behind_its_stop(both: TwoLines) -> None:
+    """Nobody would stop it any more."""
+    with Poller(plant(both.hall())) as poller:
+        poller.stop_on_exit()
+        bus = poller.bus("hall")
+        pump_1, pump_2 = bus.drives
+        detach = bus.detach
+
+        def start_the_other(drive: Drive) -> None:
+            if drive is pump_1:
+                with pytest.raises(Overtaken):
+                    pump_2.start()
+            detach(drive)
+
+        vars(bus)["detach"] = start_the_other
+        poller.adopt(plant(line(both.hall().port, name="hall")))
+        assert not runs(both.pumps[2])
+
+
+def test_a_line_that_is_being_opened_has_its_drives_stopped_at_exit_too(
+    both: TwoLines, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    opening, go_on = threading.Event(), threading.Event()
+    open_bus = Bus.__init__
+
+    def slow(bus: Bus, *arguments: object, **details: object) -> None:
+        opening.set()
+        assert go_on.wait(PATIENCE)
+        open_bus(bus, *arguments, **details)  # type: ignore[arg-type]
+
+    with Poller(plant(both.hall())) as poller:
+        monkeypatch.setattr(Bus, "__init__", slow)
+        adopting = threading.Thread(target=poller.adopt, args=[plant(both.hall(), both.yard())])
+        adopting.start()
+        try:
+            assert opening.wait(PATIENCE)
+            poller.stop_on_exit()
+        finally:
+            go_on.set()
+            adopting.join(PATIENCE)
+        assert {name: bus.stops_on_exit for name, bus in poller.buses.items()} == {"hall": True, "yard": True}
+
+
 class Other(Quick):
     """Another family, whose manual has a start where the first one has a stop."""
 
@@ -155,15 +201,21 @@ def _note_writes(sim: SimulatedDrive, writes: list[int]) -> None:
 # ---- calls under way ----
 
 
-def _held_up(bus: Bus, monkeypatch: pytest.MonkeyPatch) -> tuple[threading.Event, threading.Event]:
-    """Hold up each step of a stop; return what tells that one has begun, and what lets them go on."""
+def _held_up(
+    bus: Bus, monkeypatch: pytest.MonkeyPatch, of: Drive | None = None
+) -> tuple[threading.Event, threading.Event]:
+    """Hold up each step of stops, of any drive or of this one.
+
+    Return what tells that one has begun, and what lets them go on.
+    """
     begun, go_on = threading.Event(), threading.Event()
     step = bus._stopper._do
 
-    def slow(*arguments: object) -> object:
-        begun.set()
-        assert go_on.wait(PATIENCE)
-        return step(*arguments)
+    def slow(stop: StopAttempt, next_step: Step) -> object:
+        if of in (None, stop.drive):
+            begun.set()
+            assert go_on.wait(PATIENCE)
+        return step(stop, next_step)
 
     monkeypatch.setattr(bus._stopper, "_do", slow)
     return begun, go_on
@@ -193,6 +245,60 @@ def test_a_stop_goes_on_while_its_line_is_to_go(both: TwoLines, monkeypatch: pyt
         }
         assert not runs(both.fans[1])
         assert list(poller.buses) == ["hall"]
+
+
+def test_a_drive_leaves_beside_another_s_stop(both: TwoLines, monkeypatch: pytest.MonkeyPatch) -> None:
+    with Poller(plant(both.hall())) as poller:
+        pump_1, _ = poller.bus("hall").drives
+        begun, go_on = _held_up(poller.bus("hall"), monkeypatch)
+        stopping = threading.Thread(target=pump_1.stop)
+        stopping.start()
+        assert begun.wait(PATIENCE)
+        adopting = threading.Thread(target=poller.adopt, args=[plant(both.hall(1))])
+        adopting.start()
+        try:
+            until(lambda: not adopting.is_alive())
+            assert stopping.is_alive()
+        finally:
+            go_on.set()
+            stopping.join(PATIENCE)
+        assert poller.bus("hall").drives == [pump_1]
+
+
+def test_no_drive_is_off_its_line_while_another_is_waited_for(
+    both: TwoLines, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Both are exchanged for others of the same names: until then the old ones can be stopped."""
+    exchanged = [polled(Quick(address, name=f"pump-{address}", silence=0.01), []) for address in (1, 2)]
+    with Poller(plant(both.hall())) as poller:
+        bus = poller.bus("hall")
+        pump_1, pump_2 = bus.drives
+        pump_1.start()
+        begun, go_on = _held_up(bus, monkeypatch, pump_2)
+        stopping = threading.Thread(target=pump_2.stop)
+        stopping.start()
+        assert begun.wait(PATIENCE)
+        is_waited_for, await_stops = threading.Event(), bus._latches.await_stops
+
+        def tell_and_wait(drives: Collection[Drive] | None = None) -> None:
+            if pump_2 in (drives or ()):
+                is_waited_for.set()
+            await_stops(drives)
+
+        monkeypatch.setattr(bus._latches, "await_stops", tell_and_wait)
+        anew = plant(line(both.hall().port, *exchanged, name="hall"))
+        adopting = threading.Thread(target=poller.adopt, args=[anew])
+        adopting.start()
+        try:
+            assert is_waited_for.wait(PATIENCE)
+            pump_1.stop()
+            assert not runs(both.pumps[1])
+        finally:
+            go_on.set()
+            stopping.join(PATIENCE)
+            adopting.join(PATIENCE)
+        assert [drive.name for drive in bus.drives] == ["pump-1", "pump-2"]
+        assert not {pump_1, pump_2} & {*bus.drives}
 
 
 def test_a_stop_on_a_line_that_goes_holds_no_other_line_up(
@@ -287,7 +393,7 @@ class SlowToy(Toy):
 
 def _is_asking(poller: Poller, of: PolledDrive) -> bool:
     bus = poller.bus("yard")
-    return bool(bus.line.queue and bus.line.queue.is_asking(bus.peer(of.drive)))
+    return bus.is_asking(bus.peer(of.drive))
 
 
 def test_closing_waits_for_an_adoption(both: TwoLines, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -369,6 +475,34 @@ def test_a_port_that_takes_its_time_holds_up_no_other_one(
     assert {name: str(failure) for name, failure in found.items()} == {
         "far": "socket://127.0.0.1:1: nothing listens there"
     }
+
+
+def test_a_drive_that_is_exchanged_can_be_stopped_while_a_port_takes_its_time(
+    both: TwoLines, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    opening, go_on = threading.Event(), threading.Event()
+    open_bus = Bus.__init__
+
+    def slow(bus: Bus, port: str, **details: object) -> None:
+        opening.set()
+        assert go_on.wait(PATIENCE)
+        open_bus(bus, port, **details)  # type: ignore[arg-type]
+
+    exchanged = polled(Quick(1, name="pump-1", silence=0.01), [])
+    with Poller(plant(both.hall())) as poller:
+        poller.bus("hall").drives[0].start()
+        monkeypatch.setattr(Bus, "__init__", slow)
+        anew = plant(line(both.hall().port, exchanged, name="hall"), both.yard())
+        adopting = threading.Thread(target=poller.adopt, args=[anew])
+        adopting.start()
+        try:
+            assert opening.wait(PATIENCE)
+            poller.bus("hall").drives[0].stop()
+            assert not runs(both.pumps[1])
+            assert adopting.is_alive()
+        finally:
+            go_on.set()
+            adopting.join(PATIENCE)
 
 
 def until_sampled(poller: Poller, drive: str) -> None:

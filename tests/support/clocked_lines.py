@@ -138,6 +138,10 @@ class ClockedPort:
         with self._guard:
             return bool(lib.md_turn_is_asking(self._turn, peer.c))
 
+    def counted_ns(self, now_ns: int) -> int:
+        with self._guard:
+            return min(now_ns, int(lib.md_turn_counted_ns(self._turn, now_ns)))
+
     def report_to(self, row_queue: RowQueue, number: int) -> None:
         self._kept.append(row_queue)
         self._turn.row_queue, self._turn.number = row_queue.c, number
@@ -245,6 +249,12 @@ class ClockedLine:
 
     def inherit(self, peer: Peer, before: Peer) -> None:
         peer.inherit(before)
+
+    def is_asking(self, peer: Peer) -> bool:
+        return self.queue is not None and self.queue.is_asking(peer)
+
+    def counted_ns(self, now_ns: int) -> int:
+        return self.queue.counted_ns(now_ns) if self.queue else now_ns
 
     def note_foreign(self) -> None:
         pass

@@ -75,6 +75,9 @@ class SimulatedBus:
     def overruns(self) -> None:
         return None
 
+    def counted_ns(self, now_ns: int) -> int:
+        return now_ns
+
     def inherit(self, peer: Peer, before: Peer) -> None:
         peer.inherit(before)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 
 from multidrop.core import Latch
@@ -26,7 +26,7 @@ class Latches:
         self._make_condition()
 
     def _make_condition(self) -> None:
-        self._stops: set[object] = set()  # under way
+        self._stops: dict[object, frozenset[Drive]] = {}  # under way, with the drives of each
         self._over = threading.Condition()  # one of them is
 
     def forked(self) -> None:
@@ -39,10 +39,15 @@ class Latches:
         if self._is_shut:  # looked at afterwards: a thread that shuts them later sees this latch
             latch.shut(LEFT)
 
+    def end(self, drives: Iterable[Drive]) -> None:
+        """End what moves these drives, which are about to leave: from now on nothing of it begins."""
+        for drive in drives:
+            self.latch(drive).shut(REMOVED)
+
     def remove(self, drive: Drive) -> None:
-        """End what moves this drive, and wait for the stops that are under way."""
-        self.latch(drive).shut(REMOVED)
-        self.await_stops()
+        """End what moves this drive, and wait for its stops that are under way."""
+        self.end([drive])
+        self.await_stops([drive])
         self._latches.pop(drive, None)
 
     def shut(self) -> None:
@@ -51,10 +56,15 @@ class Latches:
         for latch in list(self._latches.values()):
             latch.shut(LEFT)
 
-    def await_stops(self) -> None:
-        """Wait until no stop is under way."""
+    def await_stops(self, drives: Collection[Drive] | None = None) -> None:
+        """Wait until no stop is under way, of these drives or of any."""
+
+        def is_over() -> bool:
+            under_way = self._stops.copy().values()
+            return not under_way if drives is None else all(map(frozenset(drives).isdisjoint, under_way))
+
         with self._over:
-            self._over.wait_for(lambda: not self._stops)
+            self._over.wait_for(is_over)
 
     def latch(self, drive: Drive) -> Latch:
         """Return a drive's latch; NotAttached for one that is not on this bus."""
@@ -74,13 +84,13 @@ class Latches:
         """Within this context nothing that moves these drives begins or goes on, and none of them leaves."""
         stop = object()
         try:  # a signal that raises between any two steps leaves none behind, for which a bus waited for ever
-            self._stops.add(stop)
+            self._stops[stop] = frozenset(drives)
             with ExitStack() as stack:
                 for drive in drives:
                     if latch := self._latches.get(drive):
                         stack.enter_context(latch.held(STOPPED))
                 yield
         finally:
-            self._stops.discard(stop)
+            self._stops.pop(stop, None)
             with self._over:
                 self._over.notify_all()

@@ -49,10 +49,15 @@ class Leaving:
         if self._last_act is None or not self._last_act.is_cut_short:
             self._latches.await_stops()
 
-    def stop(self, drives: Sequence[Drive]) -> None:
-        """Stop drives that are about to be detached, if all were to be stopped at the end."""
-        if drives and self.stops:
-            _warn_of(self._stopper.stop_all(drives, lambda: False, None))
+    def part_with(self, drives: Sequence[Drive], to_stop: Sequence[Drive]) -> None:
+        """End all that moves drives which are about to be detached, and wait for their stops.
+
+        First some of them are stopped, if all were to be stopped at the end.
+        """
+        self._latches.end(drives)  # before the stops: a start after its drive's would not be stopped
+        if to_stop and self.stops:
+            _warn_of(self._stopper.stop_all(to_stop, lambda: False, None))
+        self._latches.await_stops(drives)
 
 
 def _warn_of(found: Mapping[str, Stopped]) -> None:

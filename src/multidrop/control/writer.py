@@ -224,12 +224,13 @@ class Writer:
             yield
         except (Expired, Overtaken, NotAttached, NoReply):  # it was not sent
             raise
-        except BaseException as failure:
-            if isinstance(failure, NotMaster) and not failure.is_sent:
+        except (LineError, NotMaster) as failure:
+            if not failure.is_sent:
                 raise
+            log(drive, request, what, Effect.UNCONFIRMED, str(failure))
+            raise Unconfirmed(drive.name, what, failure.reason) from failure
+        except BaseException as failure:
             log(drive, request, what, Effect.UNCONFIRMED, str(failure) or type(failure).__name__)
-            if isinstance(failure, (LineError, NotMaster)) and failure.is_sent:
-                raise Unconfirmed(drive.name, what, failure.reason) from failure
             raise
 
 

@@ -167,6 +167,10 @@ class Port:
         """Return True while an exchange with this peer is queued, repeated, urgent or under way."""
         return bool(lib.md_port_is_asking(self.c, peer.c))
 
+    def counted_ns(self) -> int:
+        """Return until when the port's time is over and counted: where it stands still in an exchange."""
+        return int(lib.md_port_counted_ns(self.c))
+
     def inherit(self, peer: Peer, before: Peer) -> None:
         """Have a peer take the place of another, which may be on the line."""
         self._kept.update((peer, before))

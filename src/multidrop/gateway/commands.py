@@ -29,6 +29,7 @@ from multidrop import (
 )
 from multidrop.gateway.command_threads import begin_stop, in_thread
 from multidrop.gateway.rights import NEVER_THIS_WAY, NOT_ALLOWED, NOT_LISTED, Caller, May, Right
+from multidrop.gateway.stops_amid_reload import ChangingLines, drives_of, stop_as_changed
 from multidrop.gateway.verb_rules import STOPPING, VERBS
 
 MOST_WRITES = 8  # under way on a line, without stops
@@ -46,13 +47,12 @@ class Told(NamedTuple):
     error: BusError | ValueError | None = None  # that the library raised
 
 
-class PolledLines(Protocol):
+class PolledLines(ChangingLines, Protocol):
     """The part of a Poller that commands need."""
 
     @property
     def plant(self) -> Plant: ...
     def bus(self, line: str) -> Bus: ...
-    async def settled(self) -> None: ...
 
 
 class Commands:
@@ -92,29 +92,16 @@ class Commands:
         Nothing but the role is looked at, and nothing is waited for before it is sent. What a reload of the
         plant changed meanwhile is stopped again as it is now.
         """
-        plant = self._lines.plant
-        there = _drives(plant)
-        wanted = dict.fromkeys(there if drives is None else drives)
         if caller.role < Right.STOP:
+            wanted = drives_of(self._lines.plant) if drives is None else drives
             return dict.fromkeys(wanted, _denied(caller, Right.STOP, "stop"))
         self.called += 1
-        _log.warning(
-            "stop of %s, asked for by %s", "all drives" if drives is None else list(wanted), caller.by
-        )
-        told = await self._stop(plant, wanted, caller)
-        await self._lines.settled()
-        while self._lines.plant is not plant:
-            plant, before = self._lines.plant, there
-            there = _drives(plant)
-            stopped = [name for name in told if told[name].is_done and before.get(name) is there.get(name)]
-            left = [name for name in (there if drives is None else wanted) if name not in stopped]
-            told |= await self._stop(plant, [name for name in left if name in there], caller)
-            await self._lines.settled()
-        return told
+        _log.warning("stop of %s, asked for by %s", "all drives" if drives is None else drives, caller.by)
+        return await stop_as_changed(self._lines, drives, partial(self._stop, caller=caller))
 
     async def _stop(self, plant: Plant, wanted: Iterable[str], caller: Caller) -> dict[str, Told]:
         """Stop these drives of a plant."""
-        there, wanted = _drives(plant), dict.fromkeys(wanted)
+        there, wanted = drives_of(plant), dict.fromkeys(wanted)
         told: dict[str, Told] = {}
         waited: list[asyncio.Future[dict[str, Told]]] = []
         for line in plant.lines:
@@ -189,16 +176,18 @@ class Commands:
         self, drive: str, caller: Caller, what: str, work: Callable[[Drive], Told]
     ) -> Told:
         """Carry out a verb that stops the motor: neither writes under way nor other stops keep it back."""
-        try:
-            _, known = self._lines.plant.find_drive(drive)
-        except ValueError as mistake:
-            return _failed(mistake)
         self.called += 1
-        self._note_stop([drive])
         _log.warning("%s, asked for by %s", what, caller.by)
-        future = begin_stop(lambda: work(known), caller)
-        future.add_done_callback(lambda _: self._note_end([drive]))
-        return await asyncio.shield(future)
+
+        async def stop(plant: Plant, names: list[str]) -> dict[str, Told]:
+            try:
+                _, known = plant.find_drive(drive)
+            except ValueError as mistake:
+                return {drive: _failed(mistake)}
+            self._note_stop([drive])
+            return await asyncio.shield(self._begin_stop(lambda: {drive: work(known)}, [drive], caller))
+
+        return (await stop_as_changed(self._lines, [drive], stop))[drive]
 
     async def _carry_out(self, drive: str, caller: Caller, what: str, work: Callable[[Drive], Told]) -> Told:
         try:
@@ -230,10 +219,6 @@ class Commands:
     def _end(self, line: str, drive: str) -> None:
         self._under_way[line] -= 1
         self._note_end([drive])
-
-
-def _drives(plant: Plant) -> dict[str, Drive]:
-    return {polled.drive.name: polled.drive for line in plant.lines for polled in line.drives}
 
 
 def _stop_one(drive: Drive) -> dict[str, Told]:

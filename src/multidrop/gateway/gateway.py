@@ -237,9 +237,15 @@ class Gateway:
         lost = len(self.hub.unopened)
         return f"STATUS=polling {len(self.plant.lines) - lost} lines" + (f"; {lost} lost" if lost else "")
 
-    async def settled(self) -> None:
-        """Return as soon as no drive is on its way from one plant to another; see `Reload`."""
-        await self.reload.settled()
+    @property
+    def is_settled(self) -> bool:
+        """True unless drives are on their way from one plant to another."""
+        return self.reload.is_settled
+
+    @property
+    def plant_now(self) -> Plant:
+        """The plant as it is polled at this moment, amid a reload too."""
+        return self.plant if self.poller is None or self.is_settled else self.poller.plant
 
     # ---- for commands, parts and pages ----
 

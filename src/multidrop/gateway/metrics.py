@@ -83,7 +83,7 @@ def _line_families(statistics: Mapping[str, LineStatistics]) -> Iterator[MetricF
         "multidrop_line_samples": ("Values that came.", lambda line: line.samples),
         "multidrop_line_used_seconds": (
             "Time that answered exchanges had to take of the line.",
-            lambda line: line.utilisation * line.seconds,
+            lambda line: line.used_s,
         ),
     }
     for name, (text, count) in counters.items():

@@ -47,8 +47,7 @@ class Reload:
         self._turn = asyncio.Lock()
         self._soon: asyncio.Task[None] | None = None
         self._is_wanted = False
-        self._is_settled = asyncio.Event()
-        self._is_settled.set()
+        self.is_settled = True  # the lines are those of `plant`: no drive is on its way from one to the other
 
     @property
     def has_file(self) -> bool:
@@ -72,10 +71,6 @@ class Reload:
             self._soon.cancel()
             await asyncio.gather(self._soon, return_exceptions=True)
 
-    async def settled(self) -> None:
-        """Return as soon as the lines are those of `plant`: no drive is on its way from one to the other."""
-        await self._is_settled.wait()
-
     async def carry_out(self, by: str) -> Reloaded:
         """Read the file, and poll what it says now, or go on as before and say why."""
         async with self._turn:
@@ -95,7 +90,7 @@ class Reload:
         plant, settings = await beside(self._read)
         planned = await beside(lambda: plant.metadata()["planned"])  # long work, which the loop must not do
         replaced = await gateway.parts.replace(settings.parts, plant)
-        self._is_settled.clear()
+        self.is_settled = False
         try:
             unopened = await beside(partial(poller.adopt, plant))
             self._take_up(poller, settings, planned)
@@ -106,7 +101,7 @@ class Reload:
             await gateway.parts.take_back(replaced)
             raise
         finally:
-            self._is_settled.set()
+            self.is_settled = True
         gateway.note_unopened(unopened)
         self.mistakes, self.restart = (), tuple(_after_restart(self._begun_with, plant.serve))
         for sentence in self.restart:

@@ -1,7 +1,7 @@
 """Adoption: how the lines of a poller become those of another plant, while they are polled.
 
-All that can be known to be wrong is found before anything changes. Then what goes leaves, ports are opened,
-and what is new comes. A line that stays is not touched where nothing of it changes.
+All that can be known to be wrong is found before anything changes. Then what goes leaves, the lines that stay
+change, and ports are opened. A line that stays is not touched where nothing of it changes.
 """
 
 from __future__ import annotations
@@ -33,14 +33,21 @@ class Staying:
         """Let the drives go that are not wanted any more.
 
         Those whose address nobody takes are stopped first, where the bus has `stop_on_exit`. At an address
-        that is declared as another drive now, the old family's stop may mean something else.
+        that is declared as another drive now, the old family's stop may mean something else. All stops of
+        theirs are waited for before one leaves: else it could not be stopped while another's motor runs out.
         """
         taken = {polled.drive.address for polled in self.drives.joining}
         leaving = [polled.drive for polled in self.drives.leaving]
-        self.line.bus.stop_leaving([drive for drive in leaving if drive.address not in taken])
+        self.line.bus.part_with(leaving, [drive for drive in leaving if drive.address not in taken])
         for drive in leaving:
             self.line.remove(drive)
             self.line.forget(drive)
+
+    @property
+    def is_free(self) -> bool:
+        """True unless one of the drives that join is still on another line."""
+        joining = [polled.drive for polled in self.drives.joining]
+        return all(drive.bus is None or not drive.bus.is_open for drive in joining)
 
     def take_in(self) -> None:
         """Poll what is new. Raises LineError where the port cannot have a drive's settings."""
@@ -64,10 +71,9 @@ class Coming:
 class Adoption:
     """A plant that a poller's lines are to become. Raises ValueError where that cannot be."""
 
-    def __init__(self, lines: LineSet, plant: Plant, *, stops_on_exit: bool) -> None:
+    def __init__(self, lines: LineSet, plant: Plant) -> None:
         self._lines = lines
         self._plant = plant
-        self._stops_on_exit = stops_on_exit
         buses = {line.bus for line in lines}
         check_plant(plant, is_free=lambda drive: _is_free(drive, buses))
         self._pair()
@@ -116,7 +122,7 @@ class Adoption:
             self._lines.check_port(coming.wanted.port)
         if self._coming:
             self._lines.check_audit()
-        if self._coming and self._stops_on_exit:
+        if self._coming and self._lines.stops_on_exit:
             exit_hook().take_signals()
 
     # ---- carrying it out ----
@@ -124,14 +130,7 @@ class Adoption:
     def carry_out(self, *, start: bool) -> dict[str, LineError]:
         """Change the lines; by name, those whose port is not there, and why."""
         self._let_go()
-        for staying in self._staying:
-            staying.part_with()
-        failures = self._open(start)
-        for staying in self._staying:
-            try:
-                staying.take_in()
-            except LineError as failure:
-                failures[staying.wanted.name] = failure
+        failures = self._change() | self._open(start)
         self._lines.put_in_order([line.name for line in self._plant.lines])
         return failures
 
@@ -142,6 +141,21 @@ class Adoption:
                 if line in wanted and _is_another(drive, wanted[line]):
                     line.remove(drive)
         self._lines.let_go(self._going, GONE)
+
+    def _change(self) -> dict[str, LineError]:
+        """Change the lines that stay, each in one go: an exchanged drive can be stopped whatever opens."""
+        failures: dict[str, LineError] = {}
+        parted: list[Staying] = []
+        for staying in self._staying:
+            staying.part_with()
+            parted.append(staying)
+            for free in [each for each in parted if each.is_free]:
+                parted.remove(free)
+                try:
+                    free.take_in()
+                except LineError as failure:
+                    failures[free.wanted.name] = failure
+        return failures
 
     def _open(self, start: bool) -> dict[str, LineError]:
         """Open the lines that are new; those whose port is not there wait for it, as lost ones do."""
@@ -163,8 +177,6 @@ class Adoption:
         """Poll a line on this bus. Raises LineError where the port cannot have a drive's settings."""
         if coming.before:
             bus.remember(coming.before.bus)
-        if self._stops_on_exit:
-            bus.stop_on_exit()
         line = self._lines.add(replace(coming.wanted, drives=()), bus)
         try:
             for polled in coming.wanted.drives:

@@ -40,6 +40,7 @@ class LineSet:
         self._ledger = ledger
         self._audit = audit
         self._mastership = mastership
+        self.stops_on_exit = False  # of lines that come, too
         self._lines: tuple[PolledLine, ...] = ()  # another one when they change: others go through them
         self._numbered: dict[int, PolledLine] = {}
         self._free: list[int] = []  # numbers that lines had
@@ -135,6 +136,8 @@ class LineSet:
             self._free.pop()
         self._numbered[number] = line
         self._lines = (*self._lines, line)
+        if self.stops_on_exit:  # looked at afterwards: a thread that sets it later sees this line
+            bus.stop_on_exit()
         return line
 
     def put_in_order(self, names: Sequence[str]) -> None:

@@ -21,10 +21,10 @@ from multidrop.polling.port_queue import PortQueue, Slot
 from multidrop.polling.refusals import Refusals
 from multidrop.polling.summary import line_summary
 from multidrop.transport import clock
+from multidrop.transport.peers import GONE_S
 
 LEARN_NS = 1_000_000_000  # between looks at how long exchanges take
 RELEARN_NS = 2_000_000_000  # the same, where the core repeats the bus cycle
-GONE_S = 0.001  # between looks whether a drive that left is asked yet
 REOPEN_NS = 500_000_000  # between attempts to open a port that was lost
 STANDBY_NS = 500_000_000  # between rows of a line that this process is not master of
 
@@ -102,7 +102,7 @@ class PolledLine:
 
     def _await_gone(self, address: int) -> None:
         peer = self._drives.take_gone(address)
-        while peer and not self._is_left and (port := self.bus.line.queue) and port.is_asking(peer):
+        while peer and not self._is_left and self.bus.is_asking(peer):
             clock.sleep(GONE_S)
 
     def remove(self, drive: Drive) -> None:

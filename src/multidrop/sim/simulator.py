@@ -13,6 +13,7 @@ from collections.abc import Callable, Sequence
 from time import monotonic
 from typing import Self
 
+from multidrop.core.fork import register_at_fork
 from multidrop.sim.port import SimulatedEnd
 from multidrop.sim.wire import Wire
 
@@ -52,6 +53,7 @@ class Simulator:
         self._interrupted, self._interrupter = socket.socketpair()
         self._interrupter.setblocking(False)
         self._selector.register(self._interrupted, selectors.EVENT_READ, None)
+        register_at_fork(self)
         try:
             for number, wire in enumerate(self.wires):
                 wire.open()
@@ -59,6 +61,10 @@ class Simulator:
         except (OSError, ValueError):
             self.close()
             raise
+
+    def forked(self) -> None:
+        """Interrupt nothing of the parent's in the child, whose end of the pair is the same."""
+        self._interrupted, self._interrupter = socket.socketpair()
 
     def close(self) -> None:
         for wire in self.wires:

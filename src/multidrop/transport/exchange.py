@@ -73,6 +73,10 @@ class Exchanges:
         """Return what is learnt of this drive's answers; NotAttached for a drive that is not on this bus."""
         return self._peers.of(drive)
 
+    def is_asking(self, peer: Peer) -> bool:
+        """Return True while an exchange with this peer is queued, under way or about to be."""
+        return self._peers.is_asking(peer)
+
     def has_answered(self, drive: Drive) -> bool:
         """Return True where it has answered a read since the port was opened."""
         return self._answered_on.get(drive, self) is self.line.queue
@@ -111,7 +115,7 @@ class Exchanges:
                 except IndexError:
                     into = Completion()
                 try:  # a read that goes well takes few calls: see Completion
-                    reply = self.line.carry_out(exchange, into=into)
+                    reply = self._peers.carry_out(drive, exchange, into=into)
                     if reply.size < 0:
                         reply = self._good(drive, exchange, attempts, self._settled(drive, exchange, reply))
                     self._answered_on[drive] = self.line.queue
@@ -173,15 +177,8 @@ class Exchanges:
     def _prepare(self, drive: Drive) -> PreparedReads:
         """Return what is prepared for this drive; anew where anything that it depends on has changed."""
         peer = self._peers.present.get(drive) or self.peer(drive)
-        made_for = (
-            peer,
-            self.line.queue,
-            drive.address,
-            drive.framing,
-            drive.settings,
-            drive.agreed_silence,
-            drive.response_delay,
-        )
+        asked_as = (drive.address, drive.framing, drive.settings, drive.agreed_silence, drive.response_delay)
+        made_for = (peer, self.line.queue, *asked_as)
         prepared = self._prepared.get(drive)
         if prepared is None or prepared.made_for != made_for:
             prepared = self._prepared[drive] = PreparedReads(drive, peer, made_for)
@@ -271,7 +268,7 @@ class Exchanges:
     def _carry_out(self, drive: Drive, made: Exchange, expires_ns: int = 0) -> Completion:
         """Carry it out once late answers allow that; see `_settled`. Raises NotMaster."""
         try:
-            completion = self.line.carry_out(made, expires_ns=expires_ns)
+            completion = self._peers.carry_out(drive, made, expires_ns=expires_ns)
         except PortLost as failure:
             self._check_held_back(drive, failure)
             raise
@@ -293,6 +290,6 @@ class Exchanges:
             wait_ns = completion.late_until_ns - clock.now_ns()
             wait_ns = min(wait_ns, expires_ns + 1 - clock.boottime_ns()) if expires_ns else wait_ns
             clock.sleep(max(0, wait_ns) / 1e9)
-            completion = self.line.carry_out(made, expires_ns=expires_ns)
+            completion = self._peers.carry_out(drive, made, expires_ns=expires_ns)
         check_master(drive, completion)
         return completion

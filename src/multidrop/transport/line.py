@@ -26,17 +26,12 @@ from multidrop.transport.aside_log import flush
 from multidrop.transport.bridge import PORT_FAILURES
 from multidrop.transport.line_log import LineLog
 from multidrop.transport.open_port import OpenPort
-from multidrop.transport.opening import check_port, reason_of, why_lost
+from multidrop.transport.opening import check_port, is_lost_by, reason_of, why_lost
 
 LEAVING_NS = 1_000_000_000  # for callers to leave a port that was stopped
 LOGGING_S = 1.0  # that closing waits for loggers
 
 UNOPENED = "it is not opened: this process is not its master, and could end the master's connection"
-
-
-def _is_lost(core: Port, result: int) -> bool:
-    is_lost = result in (Failure.LINE_LOST, Failure.SETTINGS_REFUSED)
-    return is_lost or (result == Failure.LATE_ANSWER_DUE and core.lost)
 
 
 class Line:
@@ -137,10 +132,7 @@ class Line:
             raise LineError(self.port, reason_of(failure)) from failure
 
     def drop(self) -> None:
-        """Carry out nothing more; what is queued and not yet sent never will be.
-
-        The port itself, which may take its time, is closed by `close` or `reopen`.
-        """
+        """Carry out nothing more; what is queued and not yet sent never will be. `close` closes the port."""
         with self._lock:
             core, self.queue = self.queue, None
             if core is None:
@@ -202,10 +194,7 @@ class Line:
                 self.queue.tap(tap)
 
     def require(self, settings: tuple[int, str]) -> None:
-        """Prepare for exchanges with these settings: a bridged port can have only one kind of them.
-
-        Raises LineError when it has others already, or does not take these.
-        """
+        """Prepare for these settings. Raises LineError where a bridged port has others, or takes them not."""
         with self._lock:
             self._opened.require(settings)
 
@@ -244,7 +233,7 @@ class Line:
             if core is None:
                 raise self._closed()
             found = core.carry_out(exchange, not_before_ns, expires_ns, into)
-            is_lost = found.size < 0 and _is_lost(core, found.result)
+            is_lost = found.size < 0 and is_lost_by(found.result, core)
             if self.mastership is not None:
                 self.note_foreign()
         finally:
@@ -256,6 +245,11 @@ class Line:
             failure.is_sent = found.sent_ns > 0
             raise failure
         return found
+
+    def is_asking(self, peer: Peer) -> bool:
+        """Return True while the port has an exchange with this peer, queued or under way."""
+        with self._lock:
+            return self.queue is not None and self.queue.is_asking(peer)
 
     def _failure(self, result: int, error: int, received: bytes) -> LineError:
         if result == Failure.SETTINGS_REFUSED:
@@ -271,11 +265,17 @@ class Line:
         is_over = self._is_over or self.why_closing
         return (LineError if is_over else PortLost)(self.port, self.why_closing or self._why_closed)
 
-    def overruns(self) -> int | None:
-        """Return how many characters came too fast for the port, since its driver was loaded.
+    def counted_ns(self, now_ns: int) -> int:
+        """Return until when its time is over and counted: now, or the beginning of what is under way."""
+        self._callers.append(None)  # as in `carry_out`
+        try:
+            core = self.queue
+            return now_ns if core is None else min(now_ns, core.counted_ns())
+        finally:
+            self._callers.pop()
 
-        None while it is closed, and where the driver does not count them.
-        """
+    def overruns(self) -> int | None:
+        """Return how many characters came too fast since the driver was loaded; None where it is unknown."""
         return self._opened.overruns()
 
     @property

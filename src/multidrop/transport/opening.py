@@ -12,7 +12,7 @@ from urllib.parse import SplitResult
 
 import serial
 
-from multidrop.core import Mastership
+from multidrop.core import Failure, Mastership, Port
 from multidrop.drive.network import MODBUS_PORT, url_of
 from multidrop.errors import NoSuchPort
 from multidrop.transport import port_identity
@@ -50,6 +50,12 @@ def reason_of(failure: BaseException) -> str:
         code = int(windows[1])
         return _WINDOWS_REASONS.get(code) or _REASONS.get(code) or os.strerror(code)
     return str(failure)
+
+
+def is_lost_by(result: int, port: Port) -> bool:
+    """Return True where an exchange with this result ended because its port was lost."""
+    is_lost = result in (Failure.LINE_LOST, Failure.SETTINGS_REFUSED)
+    return is_lost or (result == Failure.LATE_ANSWER_DUE and port.lost)
 
 
 def why_lost(port: str, error: int, received: bytes) -> str:

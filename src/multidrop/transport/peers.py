@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
-from multidrop.core import Framing, Peer, TransactionIds
+from typing import Any
+
+from multidrop.core import Completion, Exchange, Framing, Peer, TransactionIds
 from multidrop.drive.family import Drive
 from multidrop.drive.own import check_drive
 from multidrop.errors import NotAttached
 from multidrop.planning.bus_time import silence
 from multidrop.planning.proofs import proofs
+from multidrop.transport import clock
 from multidrop.transport.line import Line
 from multidrop.transport.prepared import NO_ROWS, make_exchange
 
+GONE_S = 0.001  # between looks whether a drive that left is asked yet
 LEAST_TIMEOUT = 0.02  # s: what a host and its adapter may add to a drive's own delay
 
 
@@ -20,10 +24,17 @@ class Peers:
     def __init__(self, line: Line) -> None:
         self._line = line
         self.present: dict[Drive, Peer] = {}  # of the drives that are on the line now
+        self._asked: dict[object, Peer] = {}  # by threads, each with a key of its own
         self._known: dict[tuple[object, ...], Peer] = {}  # by what they are; also of those that left
 
     def add(self, drive: Drive) -> None:
-        """Begin to know a drive; one that comes back is known from before."""
+        """Begin to know a drive; one that comes back is known from before.
+
+        A thread that still asks another, which left its address, is waited for: what that owes then is known.
+        """
+        for other, known in self._known.items():
+            while other[0] == drive.address and self._is_asked(known):
+                clock.sleep(GONE_S)
         documented = max(LEAST_TIMEOUT, drive.answering_time, 4 * drive.response_delay)
         least = min(drive.response_timeout, documented)
         asked_as = type(drive), drive.framing, drive.settings, silence(drive), least, drive.response_timeout
@@ -59,5 +70,27 @@ class Peers:
         peer = self.present.get(drive) if isinstance(drive, Drive) else None
         if peer is None:
             check_drive(drive)
-            raise NotAttached(f"{drive.name} is not attached to this bus: use bus.attach(...)")
+            raise _not_attached(drive)
         return peer
+
+    def carry_out(self, drive: Drive, made: Exchange, **details: Any) -> Completion:
+        """Have the line carry it out; NotAttached where the drive has left since the exchange was made."""
+        asking = object()
+        try:  # a signal that raises between any two steps leaves none behind, for which `add` waited for ever
+            self._asked[asking] = made.peer  # before the look: what takes the drive's place waits for it
+            if self.present.get(drive) is not made.peer:
+                raise _not_attached(drive)
+            return self._line.carry_out(made, **details)
+        finally:
+            self._asked.pop(asking, None)
+
+    def is_asking(self, peer: Peer) -> bool:
+        """Return True while an exchange with this peer is queued, under way or about to be."""
+        return self._is_asked(peer) or self._line.is_asking(peer)
+
+    def _is_asked(self, peer: Peer) -> bool:
+        return peer in self._asked.copy().values()
+
+
+def _not_attached(drive: Drive) -> NotAttached:
+    return NotAttached(f"{drive.name} is not attached to this bus: use bus.attach(...)")

@@ -18,6 +18,8 @@ from multidrop.core import DELAY_BUCKETS, EXCEPTION_STATUS, STATUSES, Counters, 
 from multidrop.transport import clock
 from multidrop.transport.exchange import Exchanges
 
+LOOKS = 3  # at counters that must be of one moment
+
 # Bytes came instead of the reply, and no good frame among them.
 _DAMAGED = (Status.BAD_CHECKSUM, Status.BAD_CHARACTER, Status.CUT_SHORT, Status.NO_START)
 
@@ -85,6 +87,9 @@ class Statistics:
     seconds: float
     counters: Counters
     overruns: int | None = None
+    counted_s: float | None = None
+    """Time in s of the exchanges that are counted. It ends, as it begins, where an exchange under way began:
+    that one counts in the time after it. None: `seconds`."""
 
     @property
     def exchanges(self) -> int:
@@ -130,9 +135,14 @@ class Statistics:
 
         Silence, request, response delay and reply, at the line's settings. A port that is faster than its
         settings, such as a network's or a pseudo-terminal, needs no more than it took. An exchange counts
-        whole in the time in which it ends; it is never more than 1 all the same.
+        whole where it ends, and so does its time: see `counted_s`.
         """
-        return min(1.0, self.counters.ideal_ns / 1e9 / self.seconds)
+        return self.used_s / (self.seconds if self.counted_s is None else self.counted_s)
+
+    @property
+    def used_s(self) -> float:
+        """Time in s that the answered exchanges had to take of the line."""
+        return self.counters.ideal_ns / 1e9
 
     @property
     def delays(self) -> Delays:
@@ -180,15 +190,24 @@ class LineStatistics(Statistics):
             name: _difference(drive.counters, before.get(name, _NOTHING))
             for name, drive in self.drives.items()
         }
-        return line_statistics(seconds, counters_by_drive, lost)
+        counted_s = None
+        if self.counted_s is not None and earlier.counted_s is not None:
+            counted_s = max(self.counted_s - earlier.counted_s, 1e-9)
+        return line_statistics(seconds, counters_by_drive, lost, counted_s)
 
 
 def line_statistics(
-    seconds: float, counters_by_drive: Mapping[str, Counters], overruns: int | None
+    seconds: float,
+    counters_by_drive: Mapping[str, Counters],
+    overruns: int | None,
+    counted_s: float | None = None,
 ) -> LineStatistics:
     """Return the statistics that drives' counters, by their names, amount to after so many seconds."""
-    drives = {name: Statistics(seconds, counters) for name, counters in counters_by_drive.items()}
-    return LineStatistics(seconds, _sum(counters_by_drive.values()), overruns, drives)
+    drives = {
+        name: Statistics(seconds, counters, counted_s=counted_s)
+        for name, counters in counters_by_drive.items()
+    }
+    return LineStatistics(seconds, _sum(counters_by_drive.values()), overruns, counted_s, drives)
 
 
 class LineMeter:
@@ -198,7 +217,7 @@ class LineMeter:
         self._exchanges = exchanges
         self._opened_ns = clock.now_ns()
         self._frozen: LineStatistics | None = None
-        self._reset_at = line_statistics(0.0, {}, exchanges.line.overruns())
+        self._reset_at = line_statistics(0.0, {}, exchanges.line.overruns(), 0.0)
 
     def read(self) -> LineStatistics:
         return self._now().since(self._reset_at)
@@ -214,8 +233,16 @@ class LineMeter:
         return self._frozen or self._count(self._exchanges.line.overruns())
 
     def _count(self, overruns: int | None) -> LineStatistics:
-        counters_by_drive = {drive.name: peer.counters() for drive, peer in self._exchanges.peers.items()}
-        return line_statistics((clock.now_ns() - self._opened_ns) / 1e9, counters_by_drive, overruns)
+        peers = self._exchanges.peers
+        for _ in range(LOOKS):
+            counters_by_drive = {drive.name: peer.counters() for drive, peer in peers.items()}
+            now_ns = clock.now_ns()
+            counted_ns = self._exchanges.line.counted_ns(now_ns)
+            counted = sum(counters.exchanges for counters in counters_by_drive.values())
+            if counted == sum(peer.exchanges for peer in peers.values()):  # none ended meanwhile
+                break
+        seconds, counted_s = ((at_ns - self._opened_ns) / 1e9 for at_ns in (now_ns, counted_ns))
+        return line_statistics(seconds, counters_by_drive, overruns, counted_s)
 
 
 def _sum(counters_by_drive: Iterable[Counters]) -> Counters:

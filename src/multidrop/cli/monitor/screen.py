@@ -99,8 +99,7 @@ def _line_states(plant: LivePlant, width: int) -> list[Text]:
     lines = []
     for line in plant.plant.lines:
         lately = plant.lately[line.name]
-        used = min(1.0, lately.utilisation)  # an exchange counts whole in the second in which it ends
-        text = f" {line.name}  {used:4.0%} of the wire used  "
+        text = f" {line.name}  {lately.utilisation:4.0%} of the wire used  "
         text += f"{lately.exchanges_per_second:.1f} exchanges/s  {_misses(plant.so_far[line.name].misses)}"
         lines.append(Text(_cut(text, width)))
     return lines

@@ -1,0 +1,35 @@
+"""The use of a line between any two looks at its statistics, on a clock that only the test lets pass."""
+
+from __future__ import annotations
+
+import pytest
+from clocked_lines import ClockedLines, ClockedWire
+from lines import polled
+from toy import Toy
+
+from multidrop.sim import EncodedDrive, Faults
+
+STEPS = 400
+
+
+@pytest.mark.parametrize("seconds", [0.001, 0.003, 0.01, 0.03, 0.1], ids="{:g} s".format)
+def test_a_line_is_never_used_for_longer_than_there_is(seconds: float) -> None:
+    """An exchange that was under way at a look counts in the time after it, and so does all of its time."""
+    pumps = [Toy(address, name=f"pump-{address}") for address in (1, 2)]
+    wire = ClockedWire([EncodedDrive(pump) for pump in pumps], Faults())
+    drives = [polled(pump, [Toy.output_frequency, Toy.acceleration_time]) for pump in pumps]
+    with ClockedLines(wire, drives) as made:
+        made.run(2)
+        (before,) = made.poller.statistics().values()
+        begun, found = before, []
+        for _ in range(STEPS):
+            made.run(seconds)
+            (now,) = made.poller.statistics().values()
+            found.append(now.since(before))
+            before = now
+        assert max(span.utilisation for span in found) <= 1 + 1e-6
+        assert max(sum(each.utilisation for each in span.drives.values()) for span in found) <= 1 + 1e-6
+        whole = before.since(begun)
+        assert whole.utilisation > 0.9
+        assert sum(span.used_s for span in found) == pytest.approx(whole.used_s)
+        assert sum(span.counted_s or 0 for span in found) == pytest.approx(whole.counted_s, abs=STEPS * 1e-9)
