@@ -49,3 +49,21 @@ void md_widen_codes(const uint8_t *codes, size_t n, uint16_t *out)
     for (size_t i = 0; i < n; i++)
         out[i] = codes[i];
 }
+
+uint16_t md_greatest_code(const uint16_t *codes, size_t n)
+{
+    uint16_t greatest = 0;
+    for (size_t i = 0; i < n; i++)
+        greatest = codes[i] > greatest ? codes[i] : greatest;
+    return greatest;
+}
+
+size_t md_find_codes(const uint16_t *drives, const uint16_t *registers, size_t n, uint16_t drive,
+                     uint16_t reg, uint32_t *places)
+{
+    size_t found = 0;
+    for (size_t i = 0; i < n; i++)
+        if (drives[i] == drive && registers[i] == reg)
+            places[found++] = (uint32_t)i;
+    return found;
+}

@@ -90,7 +90,7 @@ void md_columns_free(struct md_columns *columns);
 int64_t md_spell(const uint16_t *codes, size_t n, const uint8_t *bytes, const int32_t *offsets, size_t names,
                  int32_t *out_offsets, uint8_t *out, size_t room);
 
-/* ---- narrow.c, columns as recordings hold them: return 0 or -1; md_narrow_codes a place ---- */
+/* ---- narrow.c, columns as recordings hold them: return 0 or -1, a place, or a code ---- */
 
 /* The next float that is no less. */
 void md_narrow_up(const int64_t *numbers, size_t n, float *out);
@@ -99,6 +99,10 @@ int md_widen(const float *numbers, const uint8_t *valid, size_t n, int64_t *out)
 /* The numbers of codes below `known`; return the place of the first code whose number is negative, else n. */
 size_t md_narrow_codes(const uint16_t *codes, size_t n, const int16_t *numbers, size_t known, uint8_t *out);
 void md_widen_codes(const uint8_t *codes, size_t n, uint16_t *out);
+uint16_t md_greatest_code(const uint16_t *codes, size_t n);
+/* The places of a series' rows, of which there may be `n`; return how many there are. */
+size_t md_find_codes(const uint16_t *drives, const uint16_t *registers, size_t n, uint16_t drive,
+                     uint16_t reg, uint32_t *places);
 
 /* ---- row_queue.c: return NULL where there is nothing, or no memory; else a number ---- */
 

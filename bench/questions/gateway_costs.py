@@ -127,6 +127,14 @@ class Worker:
         frames._build()
         frames._since(frames._remembered[-2]["n"] if len(frames._remembered) > 1 else WHOLE)
 
+    def next_viewer(self) -> Callable[[], Any]:
+        """Return what tells a viewer what changed, where another one was told the same."""
+        frames = self.gateway.frames
+        for _ in range(2):
+            self.take_rows()
+            frames._build()
+        return partial(frames._since, frames._remembered[0]["n"])
+
     def whole_frame(self) -> None:
         self.gateway.frames._build()
         self.gateway.frames._since(WHOLE)
@@ -197,6 +205,7 @@ WORKS: dict[str, Callable[[Worker], Callable[[], Any]]] = {
     "310 rows": lambda worker: worker.take_given,
     "events": lambda worker: worker.events,
     "a frame, as what changed": lambda worker: worker.frame,
+    "the same, to a next viewer": Worker.next_viewer,
     "a frame, whole": lambda worker: worker.whole_frame,
     "a frame over HTTP": Worker.viewer,
     "31 x ten words by Modbus": lambda worker: worker.masters(FIRST_READING, WORDS),

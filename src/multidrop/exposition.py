@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from functools import lru_cache
 from math import isfinite
 from typing import NamedTuple
 
@@ -11,6 +12,7 @@ OPEN_METRICS_TYPE = f"{OPEN_METRICS}; version=1.0.0; charset=utf-8"
 PLAIN_TYPE = "text/plain; version=0.0.4; charset=utf-8"  # Prometheus' own form, which promtool reads
 PLAIN_KINDS = {"info": "gauge", "stateset": "gauge"}  # kinds that the plain form lacks
 NAMED_WITH_SUFFIX = {"info": "_info", "counter": "_total"}  # by the plain form, the family too
+MOST_LABELS = 16_384  # texts of labels that are kept: 5 MB
 
 Labels = Mapping[str, str]
 Sample = tuple[str, Labels, float]  # the name's suffix, labels, value
@@ -49,10 +51,15 @@ def _written(family: MetricFamily, name: str, kind: str) -> str:
     lines = [f"# TYPE {name} {kind}\n# HELP {name} {family.text}\n"]
     for suffix, labels, value in family.samples:
         if isfinite(value):
-            inside = ",".join(f'{label}="{_escaped(said)}"' for label, said in labels.items())
-            braced = f"{{{inside}}}" if inside else ""
-            lines.append(f"{family.name}{suffix}{braced} {float(value)!r}\n")
+            lines.append(f"{family.name}{suffix}{_braced(*labels.items())} {float(value)!r}\n")
     return "".join(lines)
+
+
+@lru_cache(maxsize=MOST_LABELS)
+def _braced(*labels: tuple[str, str]) -> str:
+    """Return labels as they stand behind a name; those of a scrape come again with the next one."""
+    inside = ",".join(f'{label}="{_escaped(said)}"' for label, said in labels)
+    return f"{{{inside}}}" if inside else ""
 
 
 def _escaped(text: str) -> str:

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from multidrop.core.narrow import CodeTable, narrow_up, wide_codes, widen
+from multidrop.core.narrow import CodeTable, find_codes, greatest_code, narrow_up, wide_codes, widen
 
 EDGES = [0, 1, -1, 2**24, 2**24 + 1, 2**53 + 1, 2**63 - 1, -(2**63), -(2**63) + 1, 2**63 - 2**38]
 
@@ -64,3 +64,21 @@ def test_codes_are_widened() -> None:
     assert list(wide_codes(memoryview(b"x" + struct.pack("=2H", 1, 65535))[1:], 2, 2)) == [1, 65535]
     with pytest.raises(ValueError, match="lengths do not fit"):
         wide_codes(memoryview(b"123"), 2, 2)
+
+
+codes = st.integers(0, 65535)
+
+
+@given(st.lists(codes))
+def test_the_greatest_code_is_found(given_codes: list[int]) -> None:
+    assert greatest_code(memoryview(array("H", given_codes))) == max(given_codes, default=0)
+
+
+@given(st.lists(st.tuples(codes, codes) | st.just((7, 65535))), st.frozensets(st.tuples(codes, codes)))
+def test_rows_are_found_by_their_codes(
+    rows: list[tuple[int, int]], others: frozenset[tuple[int, int]]
+) -> None:
+    wanted = frozenset({(7, 65535), *rows[::3], *others})
+    drives, registers = (memoryview(array("H", [row[side] for row in rows])) for side in (0, 1))
+    assert find_codes(drives, registers, wanted) == [at for at, row in enumerate(rows) if row in wanted]
+    assert find_codes(drives, registers, ()) == []

@@ -54,6 +54,30 @@ def test_a_hundred_viewers_share_one_frame(frames: Frames, clock: Clock, made: l
     assert made == [1, 2]
 
 
+def test_what_changed_is_found_once_for_all_who_have_the_same_frame(
+    frames: Frames, clock: Clock, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    compared: list[int] = []
+
+    def compare(before: dict[str, Any], now: dict[str, Any]) -> dict[str, Any]:
+        compared.append(before["n"])
+        return changes(before, now)
+
+    monkeypatch.setattr(module, "changes", compare)
+
+    async def watch() -> None:
+        first = await frames.after(WHOLE)
+        assert first is not None
+        viewers = [asyncio.create_task(frames.after(first.n)) for _ in range(5)]
+        await asyncio.sleep(0)
+        clock.now += 0.25
+        frames.note_news()
+        assert [told(frame) for frame in await asyncio.gather(*viewers)] == [{"n": 2, "since": 1}] * 5
+
+    asyncio.run(watch())
+    assert compared == [1]
+
+
 def test_five_frames_a_second_at_most(frames: Frames, clock: Clock, made: list[int]) -> None:
     async def watch() -> None:
         seen = -1

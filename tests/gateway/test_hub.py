@@ -48,7 +48,7 @@ def all_of(at: int, status: int, frequency: int = 0, fault: int = 0) -> Batch:
 
 def test_nothing_is_known_before_it_was_asked(hub: Hub) -> None:
     assert hub.newest("pump-1", "status") is None
-    assert hub.last_good("pump-1", "status") is None
+    assert {known.good for known in hub.known("pump-1")} == {None}
     assert hub.state("pump-1") == "unknown"
     assert hub.seen_at("pump-1") is None
     assert hub.newest("pump-9", "status") is None
@@ -58,7 +58,8 @@ def test_nothing_is_known_before_it_was_asked(hub: Hub) -> None:
 def test_a_miss_is_newest_and_the_value_before_it_is_the_last_good_one(hub: Hub) -> None:
     hub.take(rows((10, FREQUENCY, 25), (11, FREQUENCY, Status.NO_REPLY)))
     sent, missed = 10 * PERIOD, 11 * PERIOD
-    assert hub.last_good("pump-1", "output_frequency") == Newest(UTC_0 + sent, sent, 25.0, "ok")
+    good = next(known.good for known in hub.known("pump-1") if known.register == "output_frequency")
+    assert good == (UTC_0 + sent, sent, 25.0, 0)
     assert hub.newest("pump-1", "output_frequency") == Newest(UTC_0 + missed, missed, None, "no reply")
     assert hub.is_fresh("pump-1", "output_frequency")
 

@@ -34,7 +34,7 @@ def test_no_more_than_the_bound_is_under_way_and_the_newest_of_a_topic_is_sent()
     number = 0
     while number < len(wire.sent):
         number += 1
-        outbox.acknowledge(number)
+        outbox.acknowledge([number])
     assert wire.sent[MOST_UNDER_WAY:] == [
         (f"{at % 50}", b"99") for at in range(MOST_UNDER_WAY, MOST_UNDER_WAY + 50)
     ]
@@ -60,3 +60,14 @@ def test_a_lost_connection_forgets_what_waits_and_counts_it() -> None:
     assert (outbox.dropped, outbox.is_idle) == (MOST_UNDER_WAY + 3, True)
     outbox.put(said("next"))
     assert wire.sent[-1] == ("next", b"")
+
+
+def test_messages_that_arrive_together_make_room_at_once() -> None:
+    wire = Wire()
+    outbox = Outbox(wire.send)
+    for topic in range(3 * MOST_UNDER_WAY):
+        outbox.put(said(f"{topic}"))
+    outbox.acknowledge(range(1, MOST_UNDER_WAY + 1))
+    assert len(wire.sent) == 2 * MOST_UNDER_WAY
+    outbox.acknowledge([1, 2, 3 * MOST_UNDER_WAY])  # of a connection before
+    assert len(wire.sent) == 2 * MOST_UNDER_WAY

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 from multidrop._core import ffi, lib
@@ -78,3 +78,20 @@ def wide_codes(codes: bytes | memoryview[Any], rows: int, size: int) -> memoryvi
         out = ffi.new("uint16_t[]", max(rows, 1))
         lib.md_widen_codes(ffi.from_buffer("uint8_t[]", codes), rows, out)
     return memoryview(ffi.buffer(out, 2 * rows)).cast("H")
+
+
+def greatest_code(codes: memoryview[Any]) -> int:
+    """Return the greatest of uint16 codes; 0 where there are none."""
+    return int(lib.md_greatest_code(ffi.from_buffer("uint16_t[]", codes), len(codes)))
+
+
+def find_codes(
+    drives: memoryview[Any], registers: memoryview[Any], series: Iterable[tuple[int, int]]
+) -> list[int]:
+    """Return the places of the rows that have one of these pairs of codes, in their order."""
+    rows = len(drives)
+    given = ffi.from_buffer("uint16_t[]", drives), ffi.from_buffer("uint16_t[]", registers), rows
+    out, found = ffi.new("uint32_t[]", max(rows, 1)), list[int]()
+    for drive, register in series:
+        found += ffi.unpack(out, lib.md_find_codes(*given, drive, register, out))
+    return sorted(found)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import ssl
+from collections import deque
 from collections.abc import Callable
 from typing import Any, NamedTuple, Protocol
 from urllib.parse import urlsplit
@@ -90,8 +91,9 @@ class Broker:
         self._client.on_connect = self._on_connect
         self._client.on_connect_fail = lambda *_: self._call(self._failed, "it does not answer")
         self._client.on_disconnect = lambda *given: self._call(self._lost, str(given[3]))
-        self._client.on_publish = lambda *given: self._call(self.outbox.acknowledge, given[2])
+        self._client.on_publish = self._on_publish
         self._client.on_message = self._on_message
+        self._arrived: deque[int] = deque()  # numbers of messages that the loop does not know of yet
         self._why = ""
 
     def open(self) -> None:
@@ -141,6 +143,12 @@ class Broker:
             self._client.subscribe(topic, qos)
         self._speaker.connected()
 
+    def _acknowledge(self) -> None:
+        numbers = []
+        while self._arrived:
+            numbers.append(self._arrived.popleft())
+        self.outbox.acknowledge(numbers)
+
     def _failed(self, why: str) -> None:
         if why != self._why:
             self._why = why
@@ -164,6 +172,11 @@ class Broker:
             self._call(self._failed, str(reason))
         else:
             self._call(self._greet)
+
+    def _on_publish(self, _client: Any, _data: Any, number: int, *_more: Any) -> None:
+        self._arrived.append(number)
+        if len(self._arrived) == 1:  # else the loop is woken already: they come many at a time
+            self._call(self._acknowledge)
 
     def _on_message(self, _client: Any, _data: Any, message: Any) -> None:
         if len(message.payload) > MOST_COMMAND:

@@ -211,10 +211,9 @@ class Frames:
         newest = self._remembered[-1]
         known = next((one for one in self._remembered if one["n"] == n), None)
         if known is None or known["revision"] != newest["revision"]:  # another plant has other keys
-            n, told = WHOLE, newest
-        else:
-            told = {"n": newest["n"], "since": n, **changes(known, newest)}
+            n, known = WHOLE, None
         if n not in self._encoded:
+            told = newest if known is None else {"n": newest["n"], "since": n, **changes(known, newest)}
             plain = json.dumps(told, separators=(",", ":"), allow_nan=False).encode()
             self._encoded[n] = Encoded(newest["n"], plain, gzip.compress(plain, 6, mtime=0))
         return self._encoded[n]

@@ -34,7 +34,7 @@ from multidrop.gateway.side_reads import SideReads
 from multidrop.gateway.views import troubles_of
 from multidrop.gateway.web import make_app
 
-TAKE_S = 0.05  # between looks for new rows
+TAKE_S = 0.1  # between looks for new rows: half of the time between two frames
 EVENTS_S = 0.2  # between looks for faults and silence
 TICK_S = 1.0  # between readings of the statistics
 LOG_S = 60.0  # between log lines of a part that goes on failing

@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
 
 from multidrop import Batch, Condition, Plant, PolledDrive, Register, StateReader
-from multidrop.gateway.kept_rows import FreshValues, KeptRow, Known, RegisterRows
+from multidrop.gateway.kept_rows import FreshValues, Known, RegisterRows
 
 RUNS, STANDS, FAULT, SILENT, UNKNOWN = "runs", "stands", "fault", "silent", "unknown"
 
@@ -151,11 +151,6 @@ class Hub:
         time, monotonic_ns, value, status = cell.newest
         return Newest(time, monotonic_ns, None if status else value, self._statuses[status])
 
-    def last_good(self, drive: str, register: str) -> Newest | None:
-        """Return the newest row with a value, however old it is; None when there never was one."""
-        cell = self._known(drive, register)
-        return self._row(cell.good) if cell and cell.good else None
-
     def is_fresh(self, drive: str, register: str) -> bool:
         """Return True while the newest value is young: a single miss after it makes it no older."""
         cell = self._known(drive, register)
@@ -202,10 +197,6 @@ class Hub:
     def _known(self, drive: str, register: str) -> RegisterRows | None:
         watched = self._watched.get(drive)
         return watched.cells.get(register) if watched else None
-
-    def _row(self, row: KeptRow) -> Newest:
-        time, monotonic_ns, value, status = row
-        return Newest(time, monotonic_ns, None if status else value, self._statuses[status])
 
     # ---- what they say of the drive ----
 

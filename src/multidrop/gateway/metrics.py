@@ -55,12 +55,11 @@ def _values(hub: Hub) -> Iterator[Sample]:
     for line in hub.plant.lines:
         for polled in line.drives:
             name = polled.drive.name
-            for register in hub.polled(name):
-                row = hub.last_good(name, register.name)
-                if row is None or row.value is None or not hub.is_fresh(name, register.name):
+            for register, known in zip(hub.polled(name), hub.known(name), strict=True):
+                if known.good is None or not known.is_fresh:
                     continue
                 labels = {"line": line.name, "drive": name, "register": register.name, "unit": register.unit}
-                yield "", labels, row.value
+                yield "", labels, known.good[2]
 
 
 def _states(hub: Hub) -> Iterator[Sample]:

@@ -6,7 +6,7 @@ made when it is sent. Pure: `send` does the sending.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import NamedTuple
 
 MOST_UNDER_WAY = 20  # messages that were sent, and not acknowledged
@@ -58,9 +58,9 @@ class Outbox:
             self._under_way.add(number)
             self.sent += 1
 
-    def acknowledge(self, number: int) -> None:
-        """Note that a message has arrived."""
-        self._under_way.discard(number)
+    def acknowledge(self, numbers: Iterable[int]) -> None:
+        """Note that messages have arrived."""
+        self._under_way.difference_update(numbers)
         self.flush()
 
     def forget(self) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 import threading
 from collections.abc import Iterator, Mapping, Sequence
 from functools import lru_cache
@@ -10,6 +9,7 @@ from itertools import repeat
 from pathlib import Path
 from typing import NamedTuple
 
+from multidrop.core.narrow import find_codes
 from multidrop.history.buckets import Accumulator, Grid
 from multidrop.history.folder import TEN_NS
 from multidrop.history.kept_series import KeptSeries, Series, SeriesRow
@@ -165,34 +165,27 @@ def _is_valid(columns: RecordedColumns, at: int) -> bool:
 @lru_cache(maxsize=64)
 def _codes(
     drives: tuple[str, ...], registers: tuple[str, ...], series: frozenset[Series]
-) -> Mapping[int, frozenset[int]]:
-    """Return the codes of the series' registers by those of their drives."""
-    return {
-        drive: frozenset(code for code, other in enumerate(registers) if (name, other) in series)
-        for drive, name in enumerate(drives)
-        if any(name == wanted for wanted, _ in series)
-    }
+) -> frozenset[tuple[int, int]]:
+    """Return the codes of drive and register of each series."""
+    known = {drive for drive, _ in series}
+    return frozenset(
+        (drive_code, code)
+        for drive_code, drive in enumerate(drives)
+        if drive in known
+        for code, register in enumerate(registers)
+        if (drive, register) in series
+    )
 
 
-def _places(columns: RecordedColumns, wanted: Mapping[int, frozenset[int]] | None) -> Sequence[int]:
-    """Return the places of the wanted rows: found by search, since they are a few of many."""
+def _places(columns: RecordedColumns, wanted: frozenset[tuple[int, int]] | None) -> Sequence[int]:
+    """Return the places of the wanted rows, or of all."""
     if wanted is None:
         return range(len(columns.time))
-    found: list[int] = []
-    drives, size = columns.drive.tobytes(), columns.drive.itemsize
-    for drive, registers in wanted.items():
-        code = drive.to_bytes(size, sys.byteorder)
-        at = drives.find(code)
-        while at >= 0:
-            place, rest = divmod(at, size)
-            if rest == 0 and columns.register[place] in registers:
-                found.append(place)
-            at = drives.find(code, at + 1)
-    return sorted(found)
+    return find_codes(columns.drive, columns.register, wanted)
 
 
 def _rows(
-    columns: RecordedColumns, wanted: Mapping[int, frozenset[int]] | None, begin: int, end: int
+    columns: RecordedColumns, wanted: frozenset[tuple[int, int]] | None, begin: int, end: int
 ) -> Iterator[Row]:
     for at in _places(columns, wanted):
         time = columns.time[at]

@@ -22,7 +22,7 @@ from multidrop.recording.segments import SegmentWriter, segments_of
 from multidrop.transport import clock
 
 MOST_WAITING = 250_000  # rows, for a disk that is slow: 12 MB
-WRITING_S = 0.2  # between writes
+WRITING_S = 0.4  # between writes: each is a batch, and a question reads all batches of its time
 TENDING_S = 60.0  # between looks at what is too old
 ENDING_S = 10.0  # for which `close` waits for the disk
 

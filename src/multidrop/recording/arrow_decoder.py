@@ -10,7 +10,7 @@ from itertools import islice, pairwise
 from typing import Any, NamedTuple
 
 from multidrop.core import Names, spell
-from multidrop.core.narrow import wide_codes, widen
+from multidrop.core.narrow import greatest_code, wide_codes, widen
 from multidrop.polling.batch import assemble
 from multidrop.recording.arrow_ipc import DICTIONARY_BATCH, RECORD_BATCH, FlatTable, IpcMessage
 from multidrop.recording.arrow_schema import FLOAT, SINGLE, UTF8, FileColumn
@@ -89,7 +89,7 @@ class BatchDecoder:
                 valid = bits or None
             if identity is not None:
                 codes, known = wide_codes(data, rows, column.code_bits // 8), names_of.get(identity)
-                if known is None or (rows and max(codes) >= len(known)):
+                if known is None or (rows and greatest_code(codes) >= len(known)):
                     raise ValueError("there are rows before the names of their codes")
                 found.append(codes)
                 names.append(known.listed)
