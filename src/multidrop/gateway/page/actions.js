@@ -1,10 +1,11 @@
 // Writes and verbs of one drive: each confirmed by name, sent once, and told of as the gateway says.
 
+import { Refused } from "./api.js";
 import { confirm, confirmForm, send } from "./ask.js";
 import * as clock from "./clock.js";
 import { fill, find, glyph, make, named, say } from "./dom.js";
 import { now } from "./link.js";
-import { mayAct, reading } from "./store.js";
+import { mayAct, reading, stops, store } from "./store.js";
 import { text, unit, withUnit, words } from "./values.js";
 
 const MOST = 20; // outcomes that are kept on the page; the log has all
@@ -61,9 +62,15 @@ function note(drive, what, done, told) {
   dispatchEvent(new Event("written"));
 }
 
-async function deliver(drive, what, path, body) {
+// Send what was confirmed, with the frame that was seen then. A stop that was called since it was asked, of
+// which there had been `stopped`, is seen behind a dialog by nobody: then it is not sent.
+async function deliver(drive, what, path, body, stopped) {
+  const confirmed = () => {
+    if (stops(drive) !== stopped) throw new Refused(409, "A stop of it was called meanwhile.");
+    return { ...body, seen: store.frame?.n };
+  };
   try {
-    const { done, text: told } = await send(path, body);
+    const { done, text: told } = await send(path, confirmed);
     note(drive, what, done === true, told);
   } catch (error) {
     const isRefused = error.status >= 400 && error.status < 500;
@@ -81,7 +88,8 @@ async function deliver(drive, what, path, body) {
 // Ask, and give a verb: with a frequency where it takes one.
 export async function act(drive, verb) {
   const turns = TURNS.some(word => verb.includes(word)),
-    field = WITH_HZ.has(verb) ? hertz() : null;
+    field = WITH_HZ.has(verb) ? hertz() : null,
+    stopped = stops(drive);
   const warning = turns
     ? "The motor will turn. Make sure that nobody is near what it drives."
     : "It is sent once.";
@@ -91,11 +99,8 @@ export async function act(drive, verb) {
   if (!(await asks([`${words(verb)}: `, named(drive), "?"], contents, [`${words(verb)} `, named(drive)])))
     return;
   const options = field ? { hz: Number(field.value) } : {};
-  await deliver(drive, field ? `${words(verb)} ${options.hz} Hz` : words(verb), "api/act", {
-    drive,
-    verb,
-    options,
-  });
+  const what = field ? `${words(verb)} ${options.hz} Hz` : words(verb);
+  await deliver(drive, what, "api/act", { drive, verb, options }, stopped);
 }
 
 const hertz = () =>
@@ -111,8 +116,9 @@ const hertz = () =>
 // Ask for a value, and write it.
 export async function change(drive, register) {
   const current = reading(drive, register.name, now()),
-    name = words(register.name);
-  const field = editor(register, current);
+    name = words(register.name),
+    stopped = stops(drive);
+  const field = editor(register);
   const held =
     current?.value === null || !current ? null : withUnit(text(current.value, register), register);
   const past = current?.isOld ? `not known now; ${clock.lasting(current.age)} ago it was ` : "";
@@ -135,16 +141,14 @@ export async function change(drive, register) {
     return;
   const value = Number(field.value);
   if (field.value === "" || !Number.isFinite(value)) return;
-  await deliver(drive, `${name} = ${text(value, register)} ${unit(register)}`.trim(), "api/write", {
-    drive,
-    register: register.name,
-    value,
-  });
+  const what = `${name} = ${text(value, register)} ${unit(register)}`.trim();
+  await deliver(drive, what, "api/write", { drive, register: register.name, value }, stopped);
 }
 
 const isLimited = ({ least, most }) => typeof least === "number" && typeof most === "number";
 
-function editor(register, current) {
+// It begins empty: Enter alone sends nothing, least of all a value that is no longer true.
+function editor(register) {
   const common = { id: "new-value", required: true, "data-first": true };
   if (register.kind === "words" && register.words) {
     return make(
@@ -156,7 +160,7 @@ function editor(register, current) {
       ),
     );
   }
-  const field = make("input", {
+  return make("input", {
     ...common,
     type: "number",
     inputmode: "decimal",
@@ -165,7 +169,4 @@ function editor(register, current) {
     min: register.least ?? null,
     max: register.most ?? null,
   });
-  if (current?.value !== null && current?.value !== undefined)
-    field.value = text(current.value, { ...register, kind: "number" });
-  return field;
 }
