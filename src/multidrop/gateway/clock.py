@@ -25,3 +25,8 @@ if hasattr(time, "CLOCK_BOOTTIME"):
 
 else:  # on macOS and Windows the other one runs on, too
     boottime_ns = monotonic_ns
+
+
+def slept_ns() -> int:
+    """Return for how long the machine slept so far: never too much, where a pause comes in between."""
+    return boottime_ns() - monotonic_ns()

@@ -17,7 +17,7 @@ import uvicorn
 
 import multidrop
 from multidrop import Bus, Ledger, LineError, Plant, Poller
-from multidrop.gateway.clock import boottime_ns
+from multidrop.gateway.clock import boottime_ns, monotonic_ns, slept_ns
 from multidrop.gateway.commands import Commands
 from multidrop.gateway.connections import Connections, Watched
 from multidrop.gateway.events import Events
@@ -78,7 +78,7 @@ class Gateway:
         self.port: int = self.listener.getsockname()[1]
         self.own_names = OwnNames(settings.names, settings.host, self.port)
         self.tokens = Tokens(settings.tokens)
-        self.hub = Hub(plant)
+        self.hub = Hub(plant, lambda: (monotonic_ns(), slept_ns()))
         self.events = Events()
         self.lately = Lately(plant)
         self.notifier = Notifier()
@@ -175,7 +175,7 @@ class Gateway:
     def hand_out(self, poller: Poller) -> None:
         """Give each batch to the hub and to all parts; where one fails, the others get it all the same."""
         is_new = False
-        self.hub.pass_time(time.monotonic_ns())
+        self.hub.pass_time(monotonic_ns())
         while batch := poller.take():
             is_new = True
             self.guarded("hub", self.hub.take, batch)
