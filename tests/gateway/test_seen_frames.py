@@ -238,7 +238,7 @@ def test_what_may_move_a_motor_says_what_was_seen(tmp_path: Path, verb: str) -> 
         writer = {"authorization": gateway.bearer(Right.WRITE)}
         options = {"hz": 20.0} if verb == "set_frequency" else {}
         body = {"drive": "pump-1", "verb": verb, "options": options}
-        for wrong in ({}, {"seen": None}, {"seen": "7"}, {"seen": True}, {"seen": 1.5}):
+        for wrong in ({}, {"seen": None}, {"seen": "7"}, {"seen": True}, {"seen": 1.5}, {"seen": 10**300}):
             found = gateway.post("/api/act", {**body, **wrong}, **writer)
             assert (found.status, found.json["error"].partition(",")[0]) == (400, "seen is missing")
             assert gateway.post("/api/write", {**WRITE, **wrong}, **writer).status == 400

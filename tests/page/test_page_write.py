@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import time
+
 import pytest
 from conftest import Opener
 from fake_gateway import FakeGateway
@@ -161,6 +163,27 @@ def test_a_stop_that_is_called_behind_the_dialog_ends_a_start(opened: Opener, ga
     page.get_by_role("button", name="start", exact=True).click()
     page.get_by_role("button", name="start pump-1").click()
     until_met(page, lambda: gateway.posts)
+
+
+def test_a_verb_that_stops_is_sent_whatever_came_before(opened: Opener, gateway: FakeGateway) -> None:
+    page = opened("#/drives/pump-1")
+    page.get_by_role("button", name="emergency stop").click()
+    gateway.stops = {"pump-1": 1}
+    until(page, "import('/page/store.js').then(m => m.stops('pump-1') === 1)")
+    page.get_by_role("button", name="emergency stop pump-1").click()
+    until_met(page, lambda: gateway.posts)
+    body = {"drive": "pump-1", "verb": "emergency_stop", "options": {}}
+    assert gateway.posts == [("/api/act", body)]
+    assert gateway.seen == []
+
+
+def test_no_button_moves_when_values_grow_old(opened: Opener, gateway: FakeGateway) -> None:
+    page = opened("#/drives/pump-1")
+    start = page.get_by_role("button", name="start", exact=True)
+    before = start.bounding_box()
+    gateway.stuck["pump-1"] = time.time()
+    page.locator(".keys .dated", has_text="old").first.wait_for()
+    assert start.bounding_box() == before
 
 
 def test_what_may_not_be_done_is_not_offered(opened: Opener) -> None:

@@ -1,7 +1,7 @@
 // Writes and verbs of one drive: each confirmed by name, sent once, and told of as the gateway says.
 
 import { Refused } from "./api.js";
-import { confirm, confirmForm, send } from "./ask.js";
+import { DANGER, STOP, confirm, confirmForm, send } from "./ask.js";
 import * as clock from "./clock.js";
 import { fill, find, glyph, make, named, say } from "./dom.js";
 import { now } from "./link.js";
@@ -11,6 +11,7 @@ import { text, unit, withUnit, words } from "./values.js";
 const MOST = 20; // outcomes that are kept on the page; the log has all
 const outcomes = [];
 const WITH_HZ = new Set(["set_frequency"]);
+const STOPS = new Set(["coast", "emergency_stop"]); // are sent whatever came before
 const TURNS = ["start", "jog", "run", "forward", "reverse"];
 
 // Make the verbs that the page's user may give, and the place where outcomes stand.
@@ -62,13 +63,14 @@ function note(drive, what, done, told) {
   dispatchEvent(new Event("written"));
 }
 
-// Send what was confirmed, with the frame that was seen then. A stop that was called since it was asked, of
-// which there had been `stopped`, is seen behind a dialog by nobody: then it is not sent.
-async function deliver(drive, what, path, body, stopped) {
-  const confirmed = () => {
-    if (stops(drive) !== stopped) throw new Refused(409, "A stop of it was called meanwhile.");
-    return { ...body, seen: store.frame?.n };
-  };
+// Return what makes the body at its confirmation, with the frame that was seen then. A stop that was called
+// since it was asked, of which there had been `stopped`, is seen behind a dialog by nobody: then it fails.
+const seen = (drive, body, stopped) => () => {
+  if (stops(drive) !== stopped) throw new Refused(409, "A stop of it was called meanwhile.");
+  return { ...body, seen: store.frame?.n };
+};
+
+async function deliver(drive, what, path, confirmed) {
   try {
     const { done, text: told } = await send(path, confirmed);
     note(drive, what, done === true, told);
@@ -96,11 +98,13 @@ export async function act(drive, verb) {
   const contents = [make("p", { class: turns ? "bad" : "" }, warning)];
   if (field) contents.push(make("label", { class: "field", for: field.id }, "Frequency, Hz", field));
   const asks = field ? confirmForm : confirm;
-  if (!(await asks([`${words(verb)}: `, named(drive), "?"], contents, [`${words(verb)} `, named(drive)])))
-    return;
+  const title = [`${words(verb)}: `, named(drive), "?"],
+    yes = [`${words(verb)} `, named(drive)];
+  if (!(await asks(title, contents, yes, STOPS.has(verb) ? STOP : DANGER))) return;
   const options = field ? { hz: Number(field.value) } : {};
   const what = field ? `${words(verb)} ${options.hz} Hz` : words(verb);
-  await deliver(drive, what, "api/act", { drive, verb, options }, stopped);
+  const body = { drive, verb, options };
+  await deliver(drive, what, "api/act", STOPS.has(verb) ? () => body : seen(drive, body, stopped));
 }
 
 const hertz = () =>
@@ -142,7 +146,7 @@ export async function change(drive, register) {
   const value = Number(field.value);
   if (field.value === "" || !Number.isFinite(value)) return;
   const what = `${name} = ${text(value, register)} ${unit(register)}`.trim();
-  await deliver(drive, what, "api/write", { drive, register: register.name, value }, stopped);
+  await deliver(drive, what, "api/write", seen(drive, { drive, register: register.name, value }, stopped));
 }
 
 const isLimited = ({ least, most }) => typeof least === "number" && typeof most === "number";

@@ -12,6 +12,8 @@ const dialog = () => find("#ask");
 const TWICE_MS = 500,
   NEAR_PX = 30,
   AT_ONCE = "#stopall, .stop";
+export const DANGER = "danger",
+  STOP = "danger stop"; // classes of buttons
 let changes = 0, // how often the dialog opened or closed
   last = { x: 0, y: 0, time: -Infinity, changes }; // the latest click that was taken
 
@@ -32,6 +34,7 @@ addEventListener(
 addEventListener(
   "keydown",
   event => {
+    last.time = -Infinity; // a click after a key is a click of its own
     if (event.repeat && (event.key === "Enter" || event.key === " ")) event.preventDefault();
   },
   true,
@@ -89,12 +92,12 @@ function open(title, contents, buttons, cancel = "Cancel") {
 }
 
 // Ask for a confirmation. Return true where it is given.
-export const confirm = async (title, contents, yes, kind = "danger") =>
+export const confirm = async (title, contents, yes, kind = DANGER) =>
   (await open(title, contents, [["yes", yes, kind]])) === "yes";
 
 // Ask for what a form in `contents` holds. Return true where it is to be sent.
 export const confirmForm = async (title, contents, yes) =>
-  (await open(title, contents, [["submit", yes, "danger"]])) === "submit";
+  (await open(title, contents, [["submit", yes, DANGER]])) === "submit";
 
 // Show something until it is closed. Return the name of the other button where that was pressed.
 export const tell = (title, contents, buttons = []) => open(title, contents, buttons, "Close");

@@ -1,10 +1,9 @@
 // Stops: of all drives and of one. This file needs the dialog and nothing else of the page.
 
-import { confirm, retell, send, tell } from "./ask.js";
+import { STOP, confirm, retell, send, tell } from "./ask.js";
 import { find, glyph, make, named } from "./dom.js";
 
 const PATIENCE_MS = 20000;
-const STOP = "danger stop"; // the class of buttons that take every click
 let asked = null; // the question whether to stop that was asked last: no outcome takes its place
 const HOW =
   "A stop goes ahead of all polling and is repeated until the drive confirms it. " +
