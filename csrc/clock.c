@@ -1,7 +1,10 @@
 /* Reads the monotonic clock, and by how much the time of day is ahead of it. */
 #include "internal.h"
 
-enum { WRONG_NS = 100000 }; /* a kept difference that is off by more is replaced */
+enum {
+    WRONG_NS = 100000, /* a kept difference that is off by more is replaced */
+    MOST_TRIES = 4     /* to read two clocks at once */
+};
 
 static int64_t read_clock(clockid_t clock)
 {
@@ -15,15 +18,26 @@ int64_t md_now_ns(void)
     return read_clock(CLOCK_MONOTONIC);
 }
 
-int64_t md_utc_minus_monotonic_ns(void)
+int64_t md_utc_ahead_ns(int64_t now_ns)
 {
     static _Atomic int64_t kept;
-    int64_t before_ns = md_now_ns(), utc_ns = read_clock(CLOCK_REALTIME), after_ns = md_now_ns();
-    int64_t known = atomic_load(&kept), found = utc_ns - before_ns;
-    int is_known = after_ns - before_ns < WRONG_NS; /* else this thread was interrupted between the two */
-    int is_right = found - known <= WRONG_NS && known - found <= WRONG_NS;
-    if (known && (is_right || !is_known))
+    int64_t known = atomic_load(&kept), found = 0;
+    int is_interrupted = 1;
+    for (int i = 0; i < MOST_TRIES && is_interrupted; i++) {
+        found = read_clock(CLOCK_REALTIME) - now_ns;
+        if (known && found - known <= WRONG_NS && known - found <= WRONG_NS)
+            return known;
+        int64_t after_ns = md_now_ns();
+        is_interrupted = after_ns - now_ns >= WRONG_NS;
+        now_ns = is_interrupted ? after_ns : now_ns;
+    }
+    if (known && is_interrupted)
         return known;
     /* Where two threads replace it at once, both return what the first one kept. */
     return atomic_compare_exchange_strong(&kept, &known, found) ? found : known;
+}
+
+int64_t md_utc_minus_monotonic_ns(void)
+{
+    return md_utc_ahead_ns(md_now_ns());
 }

@@ -18,6 +18,11 @@ void md_counters_end(const struct md_exchange *exchange, const struct md_complet
 void md_counters_answer(struct md_drive *drive, int64_t delay_ns, int64_t ideal_ns);
 const uint64_t *md_usual_delays(const struct md_drive *drive); /* replies of the usual delay */
 
+/* ---- clock.c ---- */
+
+/* Return UTC - CLOCK_MONOTONIC as md_utc_minus_monotonic_ns() does, where the latter was `now_ns` just now. */
+int64_t md_utc_ahead_ns(int64_t now_ns);
+
 /* ---- columns.c, row_queue.c ---- */
 
 /* Append one row for each of the block's fields; return how many, 0 when there is no room. */

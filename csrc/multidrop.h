@@ -232,6 +232,7 @@ struct md_completion {
     int error;                 /* MD_LINE_LOST: errno; MD_SETTINGS_REFUSED: enum md_refusal */
     int64_t begun_ns;          /* its turn came: the line's silence may not have been over */
     int64_t sent_ns;           /* the request began to leave; 0: it never did */
+    int64_t utc_ahead_ns;      /* UTC - CLOCK_MONOTONIC then, before the machine may have slept; 0: not known */
     int64_t first_ns, last_ns; /* first and last byte after the request were seen */
     int64_t late_until_ns;     /* of an urgent one: its drive's, when its caller asked for it */
     uint32_t stale;            /* bytes thrown away before the request left: late replies, noise */

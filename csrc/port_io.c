@@ -85,9 +85,11 @@ static int write_request(struct md_port *port, int64_t begun_ns)
         return 1;
     ssize_t written = md_rs485_write(port, line->tx + line->tx_at, (size_t)(line->tx_len - line->tx_at));
     int64_t done_ns = md_now_ns();
-    if (written > 0)
+    if (written > 0) {
+        if (!line->completion->sent_ns)
+            line->completion->utc_ahead_ns = md_utc_ahead_ns(done_ns);
         md_line_sent(line, (size_t)written, begun_ns, done_ns - begun_ns > HELD_UP_NS ? done_ns : begun_ns);
-    else if (written < 0 && !is_transient(errno))
+    } else if (written < 0 && !is_transient(errno))
         lose(port, errno);
     return written != 0 && (written > 0 || port->turn.progress.lost);
 }

@@ -9,8 +9,6 @@
 #include <stdlib.h>
 #include <string.h>
 
-static const int64_t CLOCK_HOLDS_NS = 50000000; /* until the difference to UTC is read again */
-
 enum { MOST_SPARE = 64, WORDS = MD_MOST_NUMBERS / 64 };
 
 struct md_row_queue {
@@ -24,7 +22,6 @@ struct md_row_queue {
     size_t lent;                /* chunks that were taken and not given back yet */
     int is_done;                /* its client has freed it */
     uint64_t dropped;
-    int64_t utc_minus_monotonic_ns, read_ns;
     uint64_t called[WORDS];     /* a bit for each number */
     uint32_t calls;             /* bits that are set */
 };
@@ -103,14 +100,6 @@ void md_row_queue_free(struct md_row_queue *queue)
 
 /* ---- rows ---- */
 
-static void read_utc(struct md_row_queue *queue, int64_t now_ns)
-{
-    if (queue->read_ns && now_ns - queue->read_ns < CLOCK_HOLDS_NS)
-        return;
-    queue->read_ns = now_ns;
-    queue->utc_minus_monotonic_ns = md_utc_minus_monotonic_ns();
-}
-
 static struct md_columns *newest(struct md_row_queue *queue)
 {
     return queue->count ? queue->chunks[(queue->first + queue->count - 1) % queue->most_chunks] : NULL;
@@ -136,12 +125,12 @@ void md_row_queue_add(struct md_row_queue *queue, const struct md_block *block,
 {
     if (!block || block->count == 0)
         return;
+    int64_t ahead_ns = completion->utc_ahead_ns ? completion->utc_ahead_ns : md_utc_minus_monotonic_ns();
     pthread_mutex_lock(&queue->mutex);
-    read_utc(queue, completion->begun_ns);
     struct md_columns *chunk = newest(queue);
-    if (!chunk || !md_columns_add(chunk, block, completion, queue->utc_minus_monotonic_ns)) {
+    if (!chunk || !md_columns_add(chunk, block, completion, ahead_ns)) {
         chunk = begin_chunk(queue);
-        if (!chunk || !md_columns_add(chunk, block, completion, queue->utc_minus_monotonic_ns))
+        if (!chunk || !md_columns_add(chunk, block, completion, ahead_ns))
             queue->dropped += (uint64_t)block->count;
     }
     pthread_mutex_unlock(&queue->mutex);

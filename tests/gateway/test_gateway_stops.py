@@ -37,8 +37,8 @@ def start(gateway: Served, *drives: str) -> None:
     writer = {"authorization": gateway.bearer(Right.WRITE)}
     for drive in drives:
         value = {"drive": drive, "register": "setpoint", "value": 50.0}
-        assert gateway.post("/api/write", value, **writer).json["done"] is True
-        told = gateway.post("/api/act", {"drive": drive, "verb": "start", "options": {}}, **writer).json
+        assert gateway.command("/api/write", value, **writer).json["done"] is True
+        told = gateway.command("/api/act", {"drive": drive, "verb": "start", "options": {}}, **writer).json
         assert told == {"done": True, "text": f"{drive}: start is done"}
         assert gateway.sims[drive].motor.goal  # type: ignore[attr-defined]
 
@@ -101,6 +101,7 @@ def test_a_stop_works_while_the_hub_and_the_frames_are_broken(
             name, method = broken.split(".")
             monkeypatch.setattr(getattr(gateway.gateway, name), method, fail)
         until(lambda: gateway.gateway.failures.get("hub", 0) > 3)
+        gateway.gateway.frames._has_news = True  # or else the frame of the last command is the newest
         assert gateway.get("/api/frame").status == 500
         assert [one["done"] for one in gateway.post("/api/stop").json.values()] == [True, True]
 
@@ -119,14 +120,13 @@ def test_a_stop_waits_for_no_write(tmp_path: Path, monkeypatch: pytest.MonkeyPat
 
         monkeypatch.setattr(bus, "try_write", hang)
         writer = {"authorization": gateway.bearer(Right.WRITE)}
-        body = {"drive": "pump-1", "register": "setpoint", "value": 10.0}
         found: list[str] = []
-        writes = [
-            threading.Thread(
-                target=lambda: found.append(gateway.post("/api/write", body, **writer).json["text"])
-            )
-            for _ in range(12)
-        ]
+
+        def write(value: float) -> None:
+            body = {"drive": "pump-1", "register": "setpoint", "value": value}
+            found.append(gateway.command("/api/write", body, **writer).json["text"])
+
+        writes = [threading.Thread(target=write, args=(float(value),)) for value in range(12)]
         try:
             for write in writes:
                 write.start()
@@ -138,10 +138,9 @@ def test_a_stop_waits_for_no_write(tmp_path: Path, monkeypatch: pytest.MonkeyPat
             held.set()
         for write in writes:
             write.join()
-        assert sorted(found) == [
-            *["it was held up"] * 8,
-            *["pump-1.setpoint = 10.0 was not sent: 8 others are under way on line hall"] * 4,
-        ]
+        refused = [text for text in found if text != "it was held up"]
+        assert len(refused) == 4
+        assert all(text.endswith(" was not sent: 8 others are under way on line hall") for text in refused)
 
 
 def test_what_was_asked_for_before_a_stop_is_not_sent_after_it(tmp_path: Path) -> None:
@@ -159,7 +158,7 @@ def test_what_was_asked_for_before_a_stop_is_not_sent_after_it(tmp_path: Path) -
         body = {"drive": "pump-1", "verb": "start", "options": {}}
         told: list[str] = []
         asked = threading.Thread(
-            target=lambda: told.append(gateway.post("/api/act", body, **writer).json["text"])
+            target=lambda: told.append(gateway.command("/api/act", body, **writer).json["text"])
         )
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr("multidrop.gateway.command_threads.threading", SimpleNamespace(Thread=Late))
@@ -184,7 +183,7 @@ def test_a_stop_is_sent_where_the_system_gives_no_thread(tmp_path: Path) -> None
             patch.setattr("multidrop.gateway.command_threads.threading", SimpleNamespace(Thread=NoThread))
             writer = {"authorization": gateway.bearer(Right.WRITE)}
             body = {"drive": "pump-1", "register": "setpoint", "value": 10.0}
-            told = gateway.post("/api/write", body, **writer).json
+            told = gateway.command("/api/write", body, **writer).json
             assert told == {"done": False, "text": "can't start new thread"}
             assert gateway.post("/api/stop").json["pump-1"]["done"] is True
         assert stands(gateway, "pump-1")
@@ -211,12 +210,12 @@ def test_verbs_and_writes_say_what_became_of_them(tmp_path: Path) -> None:
 
         def act(verb: str, **options: object) -> str:
             body = {"drive": "pump-1", "verb": verb, "options": options}
-            text: str = gateway.post("/api/act", body, **writer).json["text"]
+            text: str = gateway.command("/api/act", body, **writer).json["text"]
             return text
 
         def write(value: float) -> str:
             body = {"drive": "pump-1", "register": "setpoint", "value": value}
-            text: str = gateway.post("/api/write", body, **writer).json["text"]
+            text: str = gateway.command("/api/write", body, **writer).json["text"]
             return text
 
         assert write(50.0) == "pump-1: setpoint = 50.00 %: done (read back)"
@@ -224,11 +223,11 @@ def test_verbs_and_writes_say_what_became_of_them(tmp_path: Path) -> None:
             "pump-1: setpoint = 150 is outside 0 to 100 % (manual: CHE100 manual v1.4, p. 117)"
         )
         assert "takes a finite number, not nan" in write(float("nan"))
-        told = gateway.post(
+        told = gateway.command(
             "/api/write", {"drive": "pump-1", "register": "control", "value": 1.5}, **writer
         ).json
         assert told["text"] == "control takes the number of a choice, not 1.5"
-        told = gateway.post(
+        told = gateway.command(
             "/api/write", {"drive": "pump-1", "register": "control", "value": 1}, **writer
         ).json
         assert told["done"] is False

@@ -15,7 +15,7 @@ from multidrop import load_plant
 from multidrop.core import Columns, Field, Names, NumberFormat, RowLayout, Status
 from multidrop.gateway.events import Events
 from multidrop.gateway.frames import lost_of
-from multidrop.gateway.hub import NOT_ASKED, Hub, Newest, Shown
+from multidrop.gateway.hub import LEAST_SLEEP_NS, NOT_ASKED, Hub, Newest, Shown
 from multidrop.polling.batch import Batch
 
 REGISTERS = ("status", "output_frequency", "output_current", "fault")
@@ -122,6 +122,39 @@ def test_values_grow_old_where_no_row_comes(hub: Hub) -> None:
     hub.pass_time(10 * PERIOD + SECOND + 1)
     assert not hub.is_fresh("pump-1", "output_frequency")
     assert hub.state("pump-1") == "unknown"
+
+
+def test_what_was_read_before_the_machine_slept_is_not_fresh(tmp_path: Path) -> None:
+    """The monotonic clock, and so each row's age by it, stood still meanwhile."""
+    clock = [10 * PERIOD, 0]
+    hub = Hub(written(tmp_path), lambda: (clock[0], clock[1]))
+    hub.take(all_of(10, FORWARD, 25))
+    assert hub.state("pump-1") == "runs"
+    clock[:] = [11 * PERIOD + 1, 8 * 3600 * SECOND]  # no row, and no look at the time, came in between
+    assert not hub.is_fresh("pump-1", "output_frequency")
+    assert hub.seen("pump-1") == Shown("unknown", NOT_ASKED)
+    assert not any(known.is_fresh for known in hub.known("pump-1"))
+    hub.take(all_of(11, FORWARD, 25))  # just before it slept, and not taken until now
+    assert not hub.is_fresh("pump-1", "output_frequency")
+    clock[0] = 12 * PERIOD
+    hub.take(all_of(12, FORWARD, 25))
+    assert hub.is_fresh("pump-1", "output_frequency")
+    assert hub.state("pump-1") == "runs"
+
+
+def test_a_machine_that_slept_before_it_began_is_awake(tmp_path: Path) -> None:
+    hub = Hub(written(tmp_path), lambda: (20 * PERIOD, 8 * 3600 * SECOND))
+    hub.take(all_of(19, FORWARD, 25))
+    assert hub.is_fresh("pump-1", "output_frequency")
+    assert hub.woke_ns() == 0
+
+
+def test_two_clocks_that_are_not_read_at_once_are_no_sleep(tmp_path: Path) -> None:
+    slept = [0]
+    hub = Hub(written(tmp_path), lambda: (20 * PERIOD, slept[0]))
+    hub.take(all_of(19, FORWARD, 25))
+    for slept[0] in (-SECOND, 0, -PERIOD, LEAST_SLEEP_NS):
+        assert hub.is_fresh("pump-1", "output_frequency")
 
 
 def test_a_value_that_is_overdue_is_not_fresh(hub: Hub) -> None:

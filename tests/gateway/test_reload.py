@@ -198,7 +198,7 @@ def test_rights_names_and_tokens_take_effect_at_once_and_the_rest_after_a_restar
 
         def write(drive: str) -> Answer:
             body = {"drive": drive, "register": "setpoint", "value": 10.0}
-            return gateway.post("/api/write", body, **writer)
+            return gateway.command("/api/write", body, **writer)
 
         assert write("pump-1").status == 403
         assert write("pump-2").json["done"] is True
@@ -233,8 +233,8 @@ def test_a_stop_of_a_drive_that_a_reload_exchanges_is_sent_to_the_new_one(
         revision = gateway.gateway.revision
         writer = {"authorization": gateway.bearer(Right.WRITE)}
         fan = gateway.sims["fan-1"].motor  # type: ignore[attr-defined]
-        gateway.post("/api/write", {"drive": "fan-1", "register": "setpoint", "value": 50.0}, **writer)
-        gateway.post("/api/act", {"drive": "fan-1", "verb": "start", "options": {}}, **writer)
+        gateway.command("/api/write", {"drive": "fan-1", "register": "setpoint", "value": 50.0}, **writer)
+        gateway.command("/api/act", {"drive": "fan-1", "verb": "start", "options": {}}, **writer)
         assert fan.goal
         poller = gateway.gateway.poller
         assert poller is not None

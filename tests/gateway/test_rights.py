@@ -59,7 +59,7 @@ def test_each_caller_may_what_the_table_says(
             )
         until(lambda: gateway.gateway.hub.taken > 0)
         assert {path: gateway.get(path, **headers).status for path in LOOKS} == dict.fromkeys(LOOKS, look)
-        found = tuple(gateway.post(path, body, **headers).status for path, body in ACTS)
+        found = tuple(gateway.command(path, body, **headers).status for path, body in ACTS)
         assert found == acts
         assert gateway.get("/", **headers).status in (200, 404)  # the page itself is nobody's secret
 
@@ -161,7 +161,7 @@ def test_the_page_keeps_its_token_where_no_script_sees_it(open_gateway: Served) 
     assert "Secure" not in cookie  # no TLS here
     kept = cookie.partition(";")[0]
     assert open_gateway.get("/api/plant", cookie=kept).json["may"]["role"] == "write"
-    assert open_gateway.post(*WRITE, cookie=kept).status == 200
+    assert open_gateway.command(*WRITE, cookie=kept).status == 200
     gone = open_gateway.post("/api/forget", cookie=kept).headers["set-cookie"]
     assert 'multidrop=""' in gone
     assert "Max-Age=0" in gone
@@ -197,7 +197,7 @@ def test_the_audit_log_says_who_and_by_which_way(tmp_path: Path) -> None:
     with served(tmp_path, LOOPBACK_STOPS) as gateway:
         until(lambda: gateway.gateway.hub.taken > 0)
         writer = {"authorization": gateway.bearer(Right.WRITE)}
-        assert gateway.post(*WRITE, **writer).json["done"] is True
+        assert gateway.command(*WRITE, **writer).json["done"] is True
         assert gateway.post(*STOP, origin=f"http://127.0.0.1:{gateway.gateway.port}").status == 200
         records = gateway.get("/api/audit").json["entries"]
         assert [(one["drive"], one["by"], one["way"]) for one in records[-1:]] == [

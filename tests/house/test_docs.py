@@ -71,6 +71,8 @@ NOT_RUN = {
     "multidrop hub nats://": "needs servers: tests/fleet/test_hub_command.py runs it",
     "multidrop hub tls://": "needs servers: tests/fleet/test_secured_fleet.py runs it",
     "systemctl": "is another program: tests/gateway/test_serve.py sends the same signal",
+    "frame=$(curl": "is another program: tests/gateway/test_seen_frames.py runs it",
+    "start=$(echo": "the same",
     "curl": "is another program: tests/gateway/test_gateway_stops.py sends the same",
     "multidrop doctor": "is about a real adapter: tests/cli/test_doctor.py",
     "multidrop sniff /dev/ttyUSB1": "needs a line that somebody else masters: tests/cli/test_cli_sniff.py",

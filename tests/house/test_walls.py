@@ -43,6 +43,7 @@ FILES_TOUCHING_THE_SYSTEM = {
     "control/eeprom_ledger.py",
     "control/audit_log.py",
     "control/exit_hook.py",
+    "gateway/clock.py",
     "gateway/connections.py",
     "gateway/gateway.py",
     "gateway/listener.py",

@@ -85,13 +85,15 @@ def test_a_polled_value_costs_the_line_nothing(gateway: Gateway) -> None:
     assert gateway.line.asked == []
 
 
-@pytest.mark.parametrize("why", ["a miss", "old", "never asked"])
+@pytest.mark.parametrize("why", ["a miss", "old", "never asked", "from before the machine slept"])
 def test_what_is_not_fresh_is_asked_of_the_drive(gateway: Gateway, why: str) -> None:
     key = "mill", "output_voltage"
     if why == "a miss":
         gateway.hub.values[key] = None
     elif why == "old":
         gateway.hub.ages[key] = 60.0
+    elif why == "from before the machine slept":
+        gateway.hub.woken_ns = time.monotonic_ns() + 3600 * 10**9
     else:
         del gateway.hub.values[key]
     with gateway.client() as client:
@@ -515,6 +517,14 @@ def test_what_is_not_known_is_never_0(gateway: Gateway) -> None:
     found = block(gateway)
     assert found[:4] == [4, 0xFFFF, *UNKNOWN]
     assert 69_990 <= found[8] << 16 | found[9] < 80_000
+
+
+def test_what_was_read_before_the_machine_slept_is_not_known(gateway: Gateway) -> None:
+    gateway.hub.values["mill", "output_frequency"] = 49.99
+    gateway.hub.woken_ns = time.monotonic_ns() + 3600 * 10**9
+    found = block(gateway)
+    assert found[2:4] == UNKNOWN
+    assert found[8:10] == [0xFFFF, 0xFFFE]  # ms, at least
 
 
 @pytest.mark.parametrize(("number", "expected"), [(5.0, 5), (None, 0xFFFE), (0.0, 0xFFFE)])

@@ -57,7 +57,7 @@ def test_a_start_that_a_broker_held_up_does_not_follow_a_stop(tmp_path: Path) ->
             listener.wait_for(lambda one: one.topic == "multidrop/gateway" and one.payload == b"online")
             value = {"drive": "pump-1", "register": "setpoint", "value": 50.0}
             writer = {"authorization": gateway.bearer(Right.WRITE)}
-            assert gateway.post("/api/write", value, **writer).json["done"] is True
+            assert gateway.command("/api/write", value, **writer).json["done"] is True
             start()
             assert told() == "pump-1: start is done"
             until(lambda: motor.goal)

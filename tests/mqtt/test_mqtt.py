@@ -18,6 +18,7 @@ from lines import until
 from peers import require_module
 
 from multidrop import InvtCHE, PolledDrive
+from multidrop.gateway.clock import boottime_ns
 from multidrop.gateway.homeassistant import discovery_topic
 from multidrop.gateway.mqtt import MqttSettings, build
 from multidrop.gateway.outbox import MOST_UNDER_WAY
@@ -212,7 +213,7 @@ def test_a_command_that_may_be_older_than_a_stop_is_not_carried_out(
     known, _ = start(commands=True)
     listener.wait_for(has("multidrop/gateway", b"online"))
     sent_ms = now_ms()
-    known.commands.stopped_at["pump-1"] = time.monotonic_ns() - after_ms * 1_000_000
+    known.commands.stopped_at["pump-1"] = boottime_ns() - after_ms * 1_000_000
     for topic, payload in (
         ("act", {"verb": "start", "drive": "pump-1", "time": sent_ms}),
         ("set/setpoint", {"value": 25, "time": sent_ms}),

@@ -43,7 +43,10 @@ class FakeGateway:
         self.clocked: str | None = None  # a drive whose frequency is the time
         self.plant_changes: dict[str, Any] = {}  # keys of the plant with other values
         self.changes: dict[str, Any] = {}  # keys of the frame with other values
-        self.posts: list[tuple[str, Any]] = []
+        self.posts: list[tuple[str, Any]] = []  # without what they had seen
+        self.seen: list[int] = []  # the frames that commands named
+        self.stops: dict[str, int] = {}  # that were called, by drive
+        self.is_held: threading.Event | None = None  # for which answers to stops wait
         self.token: str | None = None  # POST wants it where it is set
         self.has_history = True
         self.fleet: dict[str, Any] = {}  # keys of /api/fleet with other values
@@ -86,6 +89,8 @@ class FakeGateway:
                 told = fake_plant.frame(number, self.began, self.renamed, self.stuck)
                 if self.clocked:
                     told["drives"][self.clocked]["values"]["output_frequency"][0] = time.time() % 1000
+                for name, drive in told["drives"].items():
+                    drive["stops"] = self.stops.get(name, 0)
                 newest = [*self._made.items()][-REMEMBERED:]
                 self._made = dict([*newest, (number, {**told, **self.changes})])
             told = self._made[number]
@@ -174,10 +179,14 @@ def _handler(gateway: FakeGateway) -> type[BaseHTTPRequestHandler]:
             if gateway.token and "token=1" not in self.headers.get("Cookie", ""):
                 self.tell({"error": "This wants a token."}, 401)
                 return
+            if "seen" in body:
+                gateway.seen.append(body.pop("seen"))
             gateway.posts.append((self.path, body))
             if self.path == "/api/reload":
                 self.tell(gateway.reloaded)
             elif self.path == "/api/stop":
+                if gateway.is_held is not None:
+                    gateway.is_held.wait()
                 names = body["drives"] or [
                     d["name"] for line in fake_plant.plant(gateway.renamed)["lines"] for d in line["drives"]
                 ]

@@ -51,7 +51,7 @@ def plant(renamed: dict[str, str]) -> dict[str, Any]:
                 {
                     "name": renamed.get(name, name), "family": FAMILIES[(2 * n + (i > 5)) % 5],
                     "address": i + 1, "key": KEY, "registers": REGISTERS,
-                    "verbs": ["start", "stop", "reset_fault"],
+                    "verbs": ["start", "stop", "reset_fault", "emergency_stop"],
                 }
                 for i, name in enumerate(names.split())
             ],
@@ -64,7 +64,7 @@ def plant(renamed: dict[str, str]) -> dict[str, Any]:
         "may": {
             "role": "write",
             "write": ["pump-1.frequency_setpoint"],
-            "verbs": ["pump-1.start", "pump-1.reset_fault"],
+            "verbs": ["pump-1.start", "pump-1.reset_fault", "pump-1.emergency_stop"],
         },
     }  # fmt: skip
 

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from typing import Any
 
 import pytest
 from conftest import SIZES, Opener
 from fake_gateway import FakeGateway
-from watching import AT_ITS_PLACE, LIVE, VIEWS, until
+from watching import AT_ITS_PLACE, LIVE, VIEWS, until, until_met
 
 pytestmark = pytest.mark.long  # Chromium is started for each file
 
@@ -93,6 +94,51 @@ def test_the_key_is_taken_as_soon_as_the_dialog_is_closed(opened: Opener) -> Non
         document.activeElement.dispatchEvent(new KeyboardEvent('keydown', key));
         return isClosed && document.querySelector('#ask').open;
     }""")
+
+
+def test_stop_all_takes_every_click_right_after_a_dialog_closed(opened: Opener, gateway: FakeGateway) -> None:
+    """Also the second click of a double click: it asks, and no more."""
+    page = opened("#/drives/pump-1")
+    box = page.locator("#stopall").bounding_box()
+    x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+    page.get_by_role("button", name="start", exact=True).click()
+    page.evaluate(
+        """([x, y]) => Object.assign(document.querySelector('#ask button.calm').style, {
+            position: 'fixed', left: `${x - 20}px`, top: `${y - 20}px`, width: '40px', height: '40px' })""",
+        [x, y],
+    )
+    page.mouse.dblclick(x, y)  # Cancel, and what lies behind it
+    assert title(page).inner_text() == "Stop all 31 drives?"
+    assert gateway.posts == []
+
+
+def test_stop_all_is_at_hand_behind_a_dialog(opened: Opener, gateway: FakeGateway) -> None:
+    page = opened("#/drives/pump-1")
+    box = page.locator("#stopall").bounding_box()
+    page.get_by_role("button", name="Change frequency setpoint").click()
+    page.mouse.click(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
+    assert title(page).inner_text() == "Stop all 31 drives?"
+    page.get_by_role("button", name="Stop all 31 drives").click()
+    told(page, "All 31 drives are stopped")
+    assert gateway.posts == [("/api/stop", {"drives": None})]
+
+
+def test_an_outcome_takes_no_question_away(opened: Opener, gateway: FakeGateway) -> None:
+    """Stop all while the stop of one drive is under way: its outcome comes after the answer."""
+    page = opened("#/drives/pump-1")
+    gateway.is_held = threading.Event()
+    page.get_by_role("button", name="Stop pump-1").click()
+    page.get_by_role("button", name="Stop pump-1").last.click()
+    until_met(page, lambda: gateway.posts)
+    box = page.locator("#stopall").bounding_box()
+    page.mouse.click(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
+    with page.expect_response("**/api/stop"):
+        gateway.is_held.set()
+    page.wait_for_timeout(100)
+    assert title(page).inner_text() == "Stop all 31 drives?"
+    page.get_by_role("button", name="Stop all 31 drives").click()
+    told(page, "All 31 drives are stopped")
+    assert [body for _, body in gateway.posts] == [{"drives": ["pump-1"]}, {"drives": None}]
 
 
 def test_a_stop_needs_nothing_of_the_other_parts(opened: Opener, gateway: FakeGateway) -> None:

@@ -2,11 +2,21 @@
 
 from __future__ import annotations
 
+import time
+
 import pytest
 from conftest import Opener
 from fake_gateway import FakeGateway
+from watching import until, until_met, until_still
 
 pytestmark = pytest.mark.long  # Chromium is started for each file
+
+# From then on the button that confirms lies here.
+CONFIRMED_AT = """([x, y]) => new MutationObserver(() => {
+  const yes = document.querySelector('#ask button.danger');
+  const place = { position: 'fixed', left: `${x - 20}px`, top: `${y - 20}px`, width: '40px', height: '40px' };
+  if (yes) Object.assign(yes.style, place);
+}).observe(document.querySelector('#ask'), { childList: true })"""
 
 
 def test_a_write_is_confirmed_by_name_and_sent_once(opened: Opener, gateway: FakeGateway) -> None:
@@ -21,6 +31,7 @@ def test_a_write_is_confirmed_by_name_and_sent_once(opened: Opener, gateway: Fak
     assert gateway.posts == [
         ("/api/write", {"drive": "pump-1", "register": "frequency_setpoint", "value": 31.5})
     ]
+    assert page.evaluate("location.hash") == "#/drives/pump-1"
     assert "frequency setpoint = 31.5 Hz: held by the drive" in page.locator("#outcomes").inner_text()
 
 
@@ -67,6 +78,112 @@ def test_a_start_warns_and_enter_alone_sends_nothing(opened: Opener, gateway: Fa
     page.get_by_role("button", name="start pump-1").click()
     page.locator("#outcomes li").wait_for()
     assert gateway.posts == [("/api/act", {"drive": "pump-1", "verb": "start", "options": {}})]
+
+
+def test_enter_alone_writes_no_value_that_was_read(opened: Opener, gateway: FakeGateway) -> None:
+    page = opened("#/drives/pump-1")
+    page.get_by_role("button", name="Change frequency setpoint").click()
+    page.keyboard.press("Enter")
+    assert page.locator("#ask").evaluate("dialog => dialog.open")
+    assert gateway.posts == []
+
+
+def test_a_key_that_is_held_down_is_one_press(opened: Opener, gateway: FakeGateway) -> None:
+    page = opened("#/drives/pump-1")
+    change = page.get_by_role("button", name="Change frequency setpoint")
+    change.click()
+    page.get_by_label("New value, Hz").fill("31.5")
+    for _ in range(9):
+        page.keyboard.down("Enter")  # the first press, and what the system makes of it
+    page.keyboard.up("Enter")
+    page.locator("#outcomes li").wait_for()
+    assert len(gateway.posts) == 1
+    assert not page.locator("#ask").evaluate("dialog => dialog.open")
+    change.press("Enter")  # a press of its own is taken at once
+    assert page.locator("#ask").evaluate("dialog => dialog.open")
+
+
+@pytest.mark.parametrize("size", ["desk", "phone"])
+def test_a_double_click_on_start_does_not_confirm_it(opened: Opener, gateway: FakeGateway, size: str) -> None:
+    """The dialog's button is put where the button of the panel is, as a scrolled phone may have it."""
+    page = opened("#/drives/pump-1", size)
+    until_still(page)
+    start = page.get_by_role("button", name="start", exact=True)
+    start.scroll_into_view_if_needed()
+    box = start.bounding_box()
+    x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+    page.evaluate(CONFIRMED_AT, [x, y])
+    start.dblclick()
+    assert page.locator("#ask").evaluate("dialog => dialog.open")
+    assert gateway.posts == []
+    page.wait_for_timeout(600)  # a click of its own
+    page.mouse.click(x, y)
+    page.locator("#outcomes li").wait_for()
+    assert gateway.posts == [("/api/act", {"drive": "pump-1", "verb": "start", "options": {}})]
+
+
+def test_a_second_tap_on_start_does_not_confirm_it(opened: Opener, gateway: FakeGateway) -> None:
+    page = opened("#/drives/pump-1", "phone", has_touch=True)
+    until_still(page)
+    start = page.get_by_role("button", name="start", exact=True)
+    start.scroll_into_view_if_needed()
+    box = start.bounding_box()
+    x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+    page.evaluate(CONFIRMED_AT, [x, y])
+    page.touchscreen.tap(x, y)
+    page.touchscreen.tap(x, y)
+    assert page.locator("#ask").evaluate("dialog => dialog.open")
+    assert gateway.posts == []
+
+
+def test_a_command_names_the_frame_that_was_seen_at_its_confirmation(
+    opened: Opener, gateway: FakeGateway
+) -> None:
+    page = opened("#/drives/pump-1")
+    newest = "import('/page/store.js').then(m => m.store.frame.n)"
+    page.get_by_role("button", name="start").click()
+    asked = page.evaluate(newest)
+    until_met(page, lambda: page.evaluate(newest) > asked + 5)
+    before = page.evaluate(newest)
+    page.get_by_role("button", name="start pump-1").click()
+    page.locator("#outcomes li").wait_for()
+    assert before <= gateway.seen[0] <= page.evaluate(newest)
+
+
+def test_a_stop_that_is_called_behind_the_dialog_ends_a_start(opened: Opener, gateway: FakeGateway) -> None:
+    page = opened("#/drives/pump-1")
+    page.get_by_role("button", name="start").click()
+    gateway.stops = {"pump-1": 1}
+    until(page, "import('/page/store.js').then(m => m.stops('pump-1') === 1)")
+    page.get_by_role("button", name="start pump-1").click()
+    page.locator("#outcomes li").wait_for()
+    said = page.locator("#outcomes").inner_text()
+    assert "start: not sent. A stop of it was called meanwhile." in said
+    assert gateway.posts == []
+    page.get_by_role("button", name="start", exact=True).click()
+    page.get_by_role("button", name="start pump-1").click()
+    until_met(page, lambda: gateway.posts)
+
+
+def test_a_verb_that_stops_is_sent_whatever_came_before(opened: Opener, gateway: FakeGateway) -> None:
+    page = opened("#/drives/pump-1")
+    page.get_by_role("button", name="emergency stop").click()
+    gateway.stops = {"pump-1": 1}
+    until(page, "import('/page/store.js').then(m => m.stops('pump-1') === 1)")
+    page.get_by_role("button", name="emergency stop pump-1").click()
+    until_met(page, lambda: gateway.posts)
+    body = {"drive": "pump-1", "verb": "emergency_stop", "options": {}}
+    assert gateway.posts == [("/api/act", body)]
+    assert gateway.seen == []
+
+
+def test_no_button_moves_when_values_grow_old(opened: Opener, gateway: FakeGateway) -> None:
+    page = opened("#/drives/pump-1")
+    start = page.get_by_role("button", name="start", exact=True)
+    before = start.bounding_box()
+    gateway.stuck["pump-1"] = time.time()
+    page.locator(".keys .dated", has_text="old").first.wait_for()
+    assert start.bounding_box() == before
 
 
 def test_what_may_not_be_done_is_not_offered(opened: Opener) -> None:

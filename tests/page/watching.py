@@ -20,8 +20,17 @@ AT_ITS_PLACE = """() => {
 
 
 def until(page: Any, expression: str) -> None:
-    """Wait until this is true on the page. Raises AssertionError."""
-    until_met(page, lambda: page.evaluate(expression), expression)
+    """Wait until this is true on the page, which may load itself anew meanwhile. Raises AssertionError."""
+
+    def met() -> object:
+        try:
+            return page.evaluate(expression)
+        except Exception as failure:
+            if "Execution context was destroyed" not in str(failure):
+                raise
+            return False
+
+    until_met(page, met, expression)
 
 
 def until_met(page: Any, met: Callable[[], object], what: str = "") -> None:

@@ -48,6 +48,7 @@ class Served:
         self.gateway = gateway
         self.sims = sims
         self.secrets = secrets
+        self._seen = -1  # the newest frame that was asked for
 
     def request(self, method: str, path: str, body: object = None, **headers: str) -> Answer:
         """Send one request on a connection of its own; a header's _ is a -."""
@@ -69,6 +70,16 @@ class Served:
 
     def post(self, path: str, body: object = None, **headers: str) -> Answer:
         return self.request("POST", path, body, **headers)
+
+    def command(self, path: str, body: Mapping[str, object], **headers: str) -> Answer:
+        """Send a write or a verb, as one who has seen the newest frame."""
+        return self.post(path, {**body, "seen": self.frame_number()}, **headers)
+
+    def frame_number(self) -> int:
+        """Return the number of a frame that it never returned before."""
+        writer = {"authorization": self.bearer(Right.WRITE)}
+        self._seen = int(self.get(f"/api/frame?after={self._seen}", **writer).json["n"])
+        return self._seen
 
     def bearer(self, right: Right) -> str:
         return f"Bearer {self.secrets[right]}"

@@ -35,6 +35,7 @@ class FakeHub:
         self.values: dict[tuple[str, str], float | None] = {}
         self.ages: dict[tuple[str, str], float] = {}  # s
         self.states: dict[str, str] = {}
+        self.woken_ns = 0
 
     def newest(self, drive: str, register: str) -> FakeRow | None:
         key = drive, register
@@ -46,6 +47,9 @@ class FakeHub:
     def answered_ns(self, drive: str) -> int | None:
         rows = [self.newest(*key) for key in self.values if key[0] == drive]
         return max((row.monotonic_ns for row in rows if row and row.value is not None), default=None)
+
+    def woke_ns(self) -> int:
+        return self.woken_ns
 
     def state(self, drive: str) -> str:
         return self.states.get(drive, "unknown")

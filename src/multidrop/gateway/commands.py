@@ -9,11 +9,11 @@ from __future__ import annotations
 
 import asyncio
 import logging
-import time
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
-from math import isfinite
-from typing import Any, NamedTuple, Protocol
+from math import inf, isfinite
+from typing import Any, Protocol
 
 from multidrop import (
     Bus,
@@ -23,28 +23,26 @@ from multidrop import (
     Plant,
     Refused,
     Register,
-    Seen,
-    Stopped,
     verb_arguments,
+    written_before,
 )
+from multidrop.gateway.clock import boottime_ns, monotonic_ns
 from multidrop.gateway.command_threads import begin_stop, in_thread
-from multidrop.gateway.rights import NEVER_THIS_WAY, NOT_ALLOWED, NOT_LISTED, Caller, May, Right
+from multidrop.gateway.rights import NEVER_THIS_WAY, Caller, May, Right
 from multidrop.gateway.stops_amid_reload import ChangingLines, drives_of, stop_as_changed
+from multidrop.gateway.told import Told as Told
+from multidrop.gateway.told import denied, failed, not_listed, of_stop
 from multidrop.gateway.verb_rules import STOPPING, VERBS
 
+MOST_AGE_S = 5.0  # of a write or a verb that a network held up; a stop is never too old
 MOST_WRITES = 8  # under way on a line, without stops
 BUSY = "too many writes are under way"  # a rule
 WAYS_WITHOUT_VERBS = frozenset({"modbus"})
 
+# Returns until when a command may be sent (CLOCK_BOOTTIME, ns), as it is called in words, or raises Refused.
+Admit = Callable[[str], float]
+
 _log = logging.getLogger("multidrop.gateway")
-
-
-class Told(NamedTuple):
-    """The end of a command: what became of it, in the library's words."""
-
-    is_done: bool
-    text: str  # one sentence for a person
-    error: BusError | ValueError | None = None  # that the library raised
 
 
 class PolledLines(ChangingLines, Protocol):
@@ -63,7 +61,8 @@ class Commands:
         self._lines = lines
         self.called = 0  # commands that passed all rights, so far
         self._under_way: dict[str, int] = {}  # writes, by line
-        self._stopped_ns: dict[str, int] = {}  # when the latest stop was called, by drive
+        self.stops: Counter[str] = Counter()  # that were called, by drive
+        self._stopped_ns: dict[str, int] = {}  # when the latest one was
         self._ended_ns: dict[str, int] = {}  # by drive
 
     def ended_ns(self, drive: str) -> int:
@@ -74,14 +73,16 @@ class Commands:
         return self._ended_ns.get(drive, 0)
 
     def stopped_ns(self, drive: str) -> int | None:
-        """Return when the latest stop of a drive was called (CLOCK_MONOTONIC); None without one."""
+        """Return when the latest stop of a drive was called (CLOCK_BOOTTIME); None without one."""
         return self._stopped_ns.get(drive)
 
     def _note_stop(self, drives: Iterable[str]) -> None:
-        self._stopped_ns |= dict.fromkeys(drives, time.monotonic_ns())
+        drives = [*drives]
+        self.stops.update(drives)
+        self._stopped_ns |= dict.fromkeys(drives, boottime_ns())
 
     def _note_end(self, drives: Iterable[str]) -> None:
-        self._ended_ns |= dict.fromkeys(drives, time.monotonic_ns())
+        self._ended_ns |= dict.fromkeys(drives, monotonic_ns())
 
     # ---- stops ----
 
@@ -94,7 +95,7 @@ class Commands:
         """
         if caller.role < Right.STOP:
             wanted = drives_of(self._lines.plant) if drives is None else drives
-            return dict.fromkeys(wanted, _denied(caller, Right.STOP, "stop"))
+            return dict.fromkeys(wanted, denied(caller, Right.STOP, "stop"))
         self.called += 1
         _log.warning("stop of %s, asked for by %s", "all drives" if drives is None else drives, caller.by)
         return await stop_as_changed(self._lines, drives, partial(self._stop, caller=caller))
@@ -116,7 +117,7 @@ class Commands:
                 ]
         for name in wanted:
             if name not in there:
-                told[name] = _failed(ValueError(f"there is no drive {name!r}"))
+                told[name] = failed(ValueError(f"there is no drive {name!r}"))
         for found in await asyncio.gather(*waited):
             told |= found
         return {name: told[name] for name in wanted if name in told}
@@ -133,44 +134,54 @@ class Commands:
             found = self._lines.bus(line).stop_all()
         except Exception as failure:  # whatever it is: everybody must see it
             _log.exception("stop_all of line %s", line)
-            return dict.fromkeys(names, _failed(failure))
-        left = _failed(ValueError(f"it is no longer on line {line}"))
-        return {name: _of_stop(found[name]) if name in found else left for name in names}
+            return dict.fromkeys(names, failed(failure))
+        left = failed(ValueError(f"it is no longer on line {line}"))
+        return {name: of_stop(found[name]) if name in found else left for name in names}
 
     # ---- writes and verbs ----
 
-    async def write(self, drive: str, register: str, value: float, caller: Caller) -> Told:
+    async def write(
+        self, drive: str, register: str, value: float, caller: Caller, admit: Admit = lambda what: inf
+    ) -> Told:
         """Write a register that the plant file lists, once; never raises for what becomes of it."""
         what = f"{drive}.{register}"
         if caller.role < Right.WRITE:
-            return _denied(caller, Right.WRITE, f"a write of {what}")
+            return denied(caller, Right.WRITE, f"a write of {what}")
         if what not in self.may.write:
-            return _failed(_not_listed(what, "write"))
-        return await self._carry_out(
-            drive, caller, f"{what} = {value!r}", lambda known: _write(known, register, value)
-        )
+            return failed(not_listed(what, "write"))
+        work = partial(_write, register=register, value=value)
+        return await self._carry_out(drive, caller, f"{what} = {value!r}", work, admit)
 
-    async def act(self, drive: str, verb: str, options: Mapping[str, object], caller: Caller) -> Told:
+    async def act(
+        self,
+        drive: str,
+        verb: str,
+        options: Mapping[str, object],
+        caller: Caller,
+        admit: Admit = lambda what: inf,
+    ) -> Told:
         """Carry out a verb that the plant file lists, once; refused by a way that cannot ask a person."""
         what = f"{drive}.{verb}"
         rule = VERBS.get(verb)
         if rule is None:
-            return _failed(ValueError(f"there is no verb {verb!r}; there are {', '.join(VERBS)}"))
+            return failed(ValueError(f"there is no verb {verb!r}; there are {', '.join(VERBS)}"))
         if caller.way in WAYS_WITHOUT_VERBS:
             refusal = f"{verb} is never carried out by way of {caller.way}"
-            return _failed(Refused(refusal, rule=NEVER_THIS_WAY))
+            return failed(Refused(refusal, rule=NEVER_THIS_WAY))
         if caller.role < rule.role:
-            return _denied(caller, rule.role, what)
+            return denied(caller, rule.role, what)
         if rule.is_listed and what not in self.may.verbs:
-            return _failed(_not_listed(what, "verbs"))
+            return failed(not_listed(what, "verbs"))
         if verb == "stop":
             return (await self.stop([drive], caller))[drive]
         try:
             arguments = verb_arguments(verb, options)
         except ValueError as mistake:
-            return _failed(mistake)
-        carry_out = self._carry_out_stop if verb in STOPPING else self._carry_out
-        return await carry_out(drive, caller, what, partial(_act, verb=verb, arguments=arguments))
+            return failed(mistake)
+        work = partial(_act, verb=verb, arguments=arguments)
+        if verb in STOPPING:
+            return await self._carry_out_stop(drive, caller, what, work)
+        return await self._carry_out(drive, caller, what, work, admit)
 
     async def _carry_out_stop(
         self, drive: str, caller: Caller, what: str, work: Callable[[Drive], Told]
@@ -183,34 +194,45 @@ class Commands:
             try:
                 _, known = plant.find_drive(drive)
             except ValueError as mistake:
-                return {drive: _failed(mistake)}
+                return {drive: failed(mistake)}
             self._note_stop([drive])
             return await asyncio.shield(self._begin_stop(lambda: {drive: work(known)}, [drive], caller))
 
         return (await stop_as_changed(self._lines, [drive], stop))[drive]
 
-    async def _carry_out(self, drive: str, caller: Caller, what: str, work: Callable[[Drive], Told]) -> Told:
+    async def _carry_out(
+        self, drive: str, caller: Caller, what: str, work: Callable[[Drive], Told], admit: Admit
+    ) -> Told:
         try:
             line, known = self._lines.plant.find_drive(drive)
         except ValueError as mistake:
-            return _failed(mistake)
+            return failed(mistake)
         if self._under_way.get(line.name, 0) >= MOST_WRITES:
             reason = f"{what} was not sent: {MOST_WRITES} others are under way on line {line.name}"
-            return _failed(Refused(reason, rule=BUSY))
+            return failed(Refused(reason, rule=BUSY))
+        try:
+            until_ns = admit(what)
+        except Refused as refusal:
+            return failed(refusal)
         self.called += 1
-        stopped_ns = self.stopped_ns(drive)
+        stops = self.stops[drive]
+
+        def limit_ns() -> float:
+            """Return until when it may be sent, as rows have times; 0 once a stop was called."""
+            return until_ns - boottime_ns() + monotonic_ns() if self.stops[drive] == stops else 0
 
         def checked() -> Told:
-            if self.stopped_ns(drive) != stopped_ns:
-                return _failed(Refused(f"{what} was not sent: a stop was called", rule="a stop was called"))
-            return work(known)
+            if self.stops[drive] != stops:
+                return failed(Refused(f"{what} was not sent: a stop was called", rule="a stop was called"))
+            with written_before(limit_ns):
+                return work(known)
 
         self._under_way[line.name] = self._under_way.get(line.name, 0) + 1
         try:
             future = in_thread(checked, caller)
         except RuntimeError as failure:
             self._end(line.name, drive)
-            return _failed(failure)
+            return failed(failure)
         future.add_done_callback(lambda _: self._end(line.name, drive))
         told = await asyncio.shield(future)
         _log.info("%s, asked for by %s: %s", what, caller.by, told.text)
@@ -225,25 +247,19 @@ def _stop_one(drive: Drive) -> dict[str, Told]:
     try:
         drive.stop()
     except Exception as failure:  # whatever it is: everybody must see it
-        return {drive.name: _failed(failure)}
+        return {drive.name: failed(failure)}
     return {drive.name: Told(True, "stopped: seen to stand")}
-
-
-def _of_stop(stopped: Stopped) -> Told:
-    if stopped.seen is Seen.STOPPED:
-        return Told(True, f"stopped: seen to stand after {stopped.seconds:.1f} s")
-    return Told(False, f"{stopped.seen.value}: {stopped.why}", BusError(stopped.why))
 
 
 def _write(drive: Drive, register: str, value: float) -> Told:
     bus: Bus | None = drive.bus
     if bus is None:
-        return _failed(ValueError(f"{drive.name} is on no line any more"))
+        return failed(ValueError(f"{drive.name} is on no line any more"))
     try:
         known = drive.register(register)
         outcome = bus.try_write(drive, known, _typed(known, value))
     except Exception as failure:  # whatever it is: its caller must see it
-        return _failed(failure)
+        return failed(failure)
     if outcome.effect is Effect.DONE:
         return Told(True, str(outcome))
     return Told(False, str(outcome), outcome.failure or BusError(str(outcome)))
@@ -262,24 +278,5 @@ def _act(drive: Drive, verb: str, arguments: Mapping[str, Any]) -> Told:
     try:
         getattr(drive, verb)(**arguments)
     except Exception as failure:  # whatever it is: its caller must see it
-        return _failed(failure)
+        return failed(failure)
     return Told(True, f"{drive.name}: {verb} is done")
-
-
-def _failed(failure: BaseException) -> Told:
-    if not isinstance(failure, (BusError, ValueError)):
-        failure = ValueError(str(failure) or type(failure).__name__)
-    return Told(False, str(failure), failure)
-
-
-def _denied(caller: Caller, role: Right, what: str) -> Told:
-    needed = role.name.lower()
-    sentence = f"{what} needs the role {needed}, and {caller.name} has {caller.role.name.lower()}"
-    return _failed(Refused(sentence, rule=NOT_ALLOWED))
-
-
-def _not_listed(what: str, key: str) -> Refused:
-    return Refused(
-        f'{what} is not in the plant file\'s list; add it to {key} = ["{what}"] of [serve.may]',
-        rule=NOT_LISTED,
-    )

@@ -27,6 +27,7 @@ class CommonSource(Protocol):
 
     def newest(self, drive: str, register: str) -> NewestRow | None: ...
     def answered_ns(self, drive: str) -> int | None: ...
+    def woke_ns(self) -> int: ...
     def state(self, drive: str) -> str: ...
 
 
@@ -56,7 +57,7 @@ def _fresh_value(
         register = poll.register
         if register.name == name and (unit is None or register.unit == unit):
             row = hub.newest(polled.drive.name, name)
-            if row is not None and is_fresh(row, fresh_ns(poll.every), now_ns):
+            if row is not None and is_fresh(row, fresh_ns(poll.every), now_ns, hub.woke_ns()):
                 return row.value
     return None
 
@@ -74,7 +75,11 @@ def _fault(polled: PolledDrive, hub: CommonSource, now_ns: int, state: str) -> i
 def _age(polled: PolledDrive, hub: CommonSource, now_ns: int) -> int:
     """Return the ms since the newest value of the drive was asked for."""
     newest = hub.answered_ns(polled.drive.name)
-    return NEVER if newest is None else min(max(now_ns - newest, 0) // 1_000_000, LONGEST_AGE)
+    if newest is None:
+        return NEVER
+    if newest < hub.woke_ns():  # nothing here counts the time for which the machine slept
+        return LONGEST_AGE
+    return min(max(now_ns - newest, 0) // 1_000_000, LONGEST_AGE)
 
 
 def _hundredths(value: float) -> int:

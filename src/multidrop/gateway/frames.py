@@ -10,7 +10,7 @@ import asyncio
 import gzip
 import json
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from math import isfinite
 from typing import Any, NamedTuple
 
@@ -37,15 +37,23 @@ class Encoded(NamedTuple):
 
 
 def frame_of(
-    hub: Hub, events: Events, lately: Lately, *, n: int, revision: int, time_ns: int
+    hub: Hub,
+    events: Events,
+    lately: Lately,
+    stops: Mapping[str, int],
+    *,
+    n: int,
+    revision: int,
+    time_ns: int,
 ) -> dict[str, Any]:
-    """Return the frame of this moment."""
+    """Return the frame of this moment; `stops` counts those that were called, by drive."""
     return {
         "n": n,
         "revision": revision,
         "time": str(time_ns),
         "drives": {
             polled.drive.name: _drive(hub, polled.drive.name, time_ns)
+            | {"stops": stops.get(polled.drive.name, 0)}
             | lately.drive_figures(polled.drive.name)
             for line in hub.plant.lines
             for polled in line.drives

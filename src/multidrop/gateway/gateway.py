@@ -17,6 +17,7 @@ import uvicorn
 
 import multidrop
 from multidrop import Bus, Ledger, LineError, Plant, Poller
+from multidrop.gateway.clock import boottime_ns, monotonic_ns, slept_ns
 from multidrop.gateway.commands import Commands
 from multidrop.gateway.connections import Connections, Watched
 from multidrop.gateway.events import Events
@@ -29,6 +30,7 @@ from multidrop.gateway.live_parts import END_S, LiveParts
 from multidrop.gateway.reload import Read, Reload
 from multidrop.gateway.rights import OwnNames, Tokens
 from multidrop.gateway.sd_notify import Notifier
+from multidrop.gateway.seen_frames import SeenFrames
 from multidrop.gateway.settings import ServeSettings
 from multidrop.gateway.side_reads import SideReads
 from multidrop.gateway.views import troubles_of
@@ -76,13 +78,14 @@ class Gateway:
         self.port: int = self.listener.getsockname()[1]
         self.own_names = OwnNames(settings.names, settings.host, self.port)
         self.tokens = Tokens(settings.tokens)
-        self.hub = Hub(plant)
+        self.hub = Hub(plant, lambda: (monotonic_ns(), slept_ns()))
         self.events = Events()
         self.lately = Lately(plant)
         self.notifier = Notifier()
         self.reload = Reload(self, read)
-        self.frames = Frames(self._frame, self.clock, begin=secrets.randbits(32))
         self.commands = Commands(self, settings.may)
+        self.seen_frames = SeenFrames(boottime_ns, self.commands.stopped_ns)
+        self.frames = Frames(self._frame, self.clock, begin=secrets.randbits(48))
         self.side_reads = SideReads(self.bus, self._is_there, self.clock, _utc_ms)
         self.identities = Identities(
             lambda: self.plant, self.bus, self._is_there, lambda: self.note_failure("identities")
@@ -172,7 +175,7 @@ class Gateway:
     def hand_out(self, poller: Poller) -> None:
         """Give each batch to the hub and to all parts; where one fails, the others get it all the same."""
         is_new = False
-        self.hub.pass_time(time.monotonic_ns())
+        self.hub.pass_time(monotonic_ns())
         while batch := poller.take():
             is_new = True
             self.guarded("hub", self.hub.take, batch)
@@ -271,8 +274,10 @@ class Gateway:
         return list(struct.unpack(f">{count}H", data))
 
     def _frame(self, n: int) -> dict[str, Any]:
+        self.seen_frames.note(n)
+        stops = self.commands.stops
         frame = frame_of(
-            self.hub, self.events, self.lately, n=n, revision=self.revision, time_ns=time.time_ns()
+            self.hub, self.events, self.lately, stops, n=n, revision=self.revision, time_ns=time.time_ns()
         )
         return frame | {"troubles": troubles_of(self)}
 

@@ -1,11 +1,12 @@
 """Hub: the newest row of every register of every drive, and what they say of the drive's state.
 
-Pure: rows come in, and their times are the only time there is.
+Pure: rows and times come in. Rows have times of CLOCK_MONOTONIC, which stands still while the machine sleeps:
+what was read before it slept is old when it wakes.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any, NamedTuple
 
 from multidrop import Batch, Condition, Plant, PolledDrive, Register, StateReader
@@ -23,6 +24,8 @@ _STATES = {
     Condition.FAULT: FAULT,
     Condition.UNKNOWN: UNKNOWN,
 }
+LEAST_SLEEP_NS = 100_000_000  # less is two clocks that were not read at once
+
 _TURNING = ("output_frequency", "motor_speed")  # other than 0: the motor turns
 _ANSWERED = ("exception ", "no valid value")  # begin the statuses of misses that are replies all the same
 
@@ -64,11 +67,17 @@ class _Watched:
 
 
 class Hub:
-    """The newest rows of a plant; `take` is given every batch."""
+    """The newest rows of a plant; `take` is given every batch.
 
-    def __init__(self, plant: Plant) -> None:
+    `clock` returns CLOCK_MONOTONIC, and for how long the machine slept so far, both in ns.
+    """
+
+    def __init__(self, plant: Plant, clock: Callable[[], tuple[int, int]] = lambda: (0, 0)) -> None:
         self.plant = plant
         self.now_ns = 0  # of the monotonic clock
+        self._clock = clock
+        _, self._slept_ns = clock()
+        self._woke_ns = 0  # when a sleep was noticed, by the monotonic clock
         self.time = 0  # of the newest row, UTC in ns
         self.taken = 0  # batches
         self.unopened: dict[str, str] = {}  # lines whose port could not be opened, and why
@@ -140,6 +149,17 @@ class Hub:
         """Take the present time: values grow old even where no row comes."""
         self.now_ns = max(self.now_ns, monotonic_ns)
 
+    def woke_ns(self) -> int:
+        """Return when the latest sleep of the machine was noticed (CLOCK_MONOTONIC); 0 without one.
+
+        What was asked for before is no longer the present.
+        """
+        now_ns, slept_ns = self._clock()
+        if slept_ns > self._slept_ns + LEAST_SLEEP_NS:
+            self._woke_ns = self.now_ns = max(now_ns, self.now_ns + 1)
+        self._slept_ns = max(slept_ns, self._slept_ns)
+        return self._woke_ns
+
     # ---- values ----
 
     def newest(self, drive: str, register: str) -> Newest | None:
@@ -154,7 +174,7 @@ class Hub:
     def is_fresh(self, drive: str, register: str) -> bool:
         """Return True while the newest value is young: a single miss after it makes it no older."""
         cell = self._known(drive, register)
-        return cell is not None and cell.is_fresh(self.now_ns)
+        return cell is not None and cell.is_fresh(self.now_ns, self.woke_ns())
 
     def polled(self, drive: str) -> tuple[Register[Any], ...]:
         """Return the registers of a drive that are polled, in the plant file's order."""
@@ -171,12 +191,13 @@ class Hub:
         watched = self._watched.get(drive)
         if watched is None:
             return
+        woke_ns = self.woke_ns()
         for name in watched.names:
             cell = watched.cells.get(name)
             if cell is None:
                 yield Known(name, None, None, False)
             else:
-                yield Known(name, cell.newest, cell.good, cell.is_fresh(self.now_ns))
+                yield Known(name, cell.newest, cell.good, cell.is_fresh(self.now_ns, woke_ns))
 
     def status(self, code: int) -> str:
         """Return the words of a row's status."""
@@ -214,12 +235,13 @@ class Hub:
         watched = self._watched.get(drive)
         if watched is None:
             return Shown(UNKNOWN, None)
+        self.woke_ns()  # which is another time, if it slept
         if watched.seen is None or watched.seen[:2] != (self.taken, self.now_ns):
             watched.seen = (self.taken, self.now_ns, self._look(watched))
         return watched.seen[2]
 
     def _look(self, watched: _Watched) -> Shown:
-        fresh = FreshValues(watched.cells, self.now_ns)
+        fresh = FreshValues(watched.cells, self.now_ns, self._woke_ns)
         found = watched.reader.state(fresh)
         if found is not None and found.condition is not Condition.UNKNOWN:
             fault = found.fault or "it shows a fault"

@@ -27,9 +27,9 @@ class RegisterRows:
         """The age from which its value is no longer the present one."""
         return max(STALE_NS, STALE_PERIODS * max(self.least_ns, self.interval_ns))
 
-    def is_fresh(self, now_ns: int) -> bool:
-        """Return True while its newest value is the present one."""
-        if self.good is None:
+    def is_fresh(self, now_ns: int, woke_ns: int) -> bool:
+        """Return True while its newest value is the present one, and from after the machine woke."""
+        if self.good is None or self.good[1] < woke_ns:
             return False
         age = now_ns - self.good[1]
         return age <= STALE_NS or age <= self.stale_ns
@@ -38,13 +38,14 @@ class RegisterRows:
 class FreshValues(Mapping[str, float]):
     """Values of one drive's registers that are young enough, looked up when they are asked for."""
 
-    def __init__(self, cells: Mapping[str, RegisterRows], now_ns: int) -> None:
+    def __init__(self, cells: Mapping[str, RegisterRows], now_ns: int, woke_ns: int) -> None:
         self._cells = cells
         self._now_ns = now_ns
+        self._woke_ns = woke_ns
 
     def __getitem__(self, register: str) -> float:
         cell = self._cells[register]
-        if cell.good is None or not cell.is_fresh(self._now_ns):
+        if cell.good is None or not cell.is_fresh(self._now_ns, self._woke_ns):
             raise KeyError(register)
         return cell.good[2]
 

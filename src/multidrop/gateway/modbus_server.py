@@ -8,13 +8,13 @@ from __future__ import annotations
 
 import asyncio
 import logging
-import time
 from collections import Counter
 from collections.abc import Awaitable, Callable, Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Any, Protocol
 
 from multidrop import Batch, BusError, Carrier, Plant, Register
+from multidrop.gateway.clock import monotonic_ns
 from multidrop.gateway.commands import Told
 from multidrop.gateway.common_block import STOP, CommonSource, common_words
 from multidrop.gateway.drive_words import Lack
@@ -177,8 +177,8 @@ class ModbusServer:
                 function,
                 addresses,
                 partial(self._hub.newest, unit.drive.name),
-                self._now_ns(),
-                self._commands.ended_ns(unit.drive.name),
+                monotonic_ns(),
+                max(self._commands.ended_ns(unit.drive.name), self._hub.woke_ns()),
             )
             if isinstance(found, Lack):
                 return self._pass(unit, request, addresses, found, client)
@@ -190,7 +190,7 @@ class ModbusServer:
         common = self.settings.common_addresses
         if addresses[-1] not in common or addresses.start not in common:
             raise Declined(ModbusCode.ILLEGAL_ADDRESS)
-        words = common_words(unit.polled, self._hub, self._now_ns())
+        words = common_words(unit.polled, self._hub, monotonic_ns())
         return words[addresses.start - common.start : addresses.stop - common.start]
 
     def _pass(
@@ -290,8 +290,3 @@ class ModbusServer:
 
     def _caller(self, client: ModbusClient) -> Caller:
         return Caller("anyone", "modbus", client.address, self._role)
-
-    @staticmethod
-    def _now_ns() -> int:
-        """Return the time of CLOCK_MONOTONIC, as rows have it."""
-        return time.monotonic_ns()

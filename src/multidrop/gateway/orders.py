@@ -8,16 +8,16 @@ from __future__ import annotations
 
 import asyncio
 import logging
-import time
 from collections import deque
 from collections.abc import Callable, Coroutine, Mapping, Sequence
 from typing import Any
 
-from multidrop.gateway.commands import Commands, Told
+from multidrop.gateway.clock import boottime_ns
+from multidrop.gateway.commands import MOST_AGE_S, Commands, Told
 from multidrop.gateway.rights import Caller
 from multidrop.gateway.verb_rules import STOPPING
 
-MOST_AGE_MS = 5_000  # of a command; a broker that stood still delivers those of the whole time
+MOST_AGE_MS = round(MOST_AGE_S * 1e3)  # a broker that stood still delivers those of the whole time
 MOST_AHEAD_MS = 2_000  # by which the sender's clock may be fast
 MOST_UNDER_WAY = 16  # without stops
 REMEMBERED = 1_000
@@ -68,7 +68,7 @@ class Orders:
         """Return True where a command may be older than a stop; the sender's clock may be fast."""
         if stopped_ns is None:
             return False
-        return (time.monotonic_ns() - stopped_ns) // 1_000_000 <= age_ms + MOST_AHEAD_MS
+        return (boottime_ns() - stopped_ns) // 1_000_000 <= age_ms + MOST_AHEAD_MS
 
     def _is_taken(self, drive: str, what: str, order: object, time_ms: int, stopped_ns: int | None) -> bool:
         age_ms = self._utc_ms() - time_ms

@@ -50,6 +50,14 @@ def text_in(body: Mapping[str, Any], key: str) -> str:
     return value
 
 
+def frame_in(body: Mapping[str, Any]) -> int:
+    """Return the number of the frame that the sender of a command had seen."""
+    seen = body.get("seen")
+    if isinstance(seen, bool) or not isinstance(seen, int) or not 0 <= seen < 1 << 63:
+        raise Denied(400, "seen is missing, or no whole number: it is the n of the newest frame you have")
+    return seen
+
+
 def number_in(text: str, key: str) -> int:
     try:
         return int(text)

@@ -17,12 +17,12 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 
 from multidrop import Refused, expose_metrics
 from multidrop.gateway.audit import MOST_RECORDS, newest_records
-from multidrop.gateway.commands import Told
+from multidrop.gateway.commands import Admit, Told
 from multidrop.gateway.describe import describe
 from multidrop.gateway.frame_route import FrameRoute
 from multidrop.gateway.guard import COOKIE, Denied, Guard, Needed
 from multidrop.gateway.metrics import families_of
-from multidrop.gateway.request_fields import body_of, caller_of, number_in, text_in
+from multidrop.gateway.request_fields import body_of, caller_of, frame_in, number_in, text_in
 from multidrop.gateway.rights import NEVER_THIS_WAY, NOT_ALLOWED, NOT_LISTED, Right
 from multidrop.gateway.views import figures_of, health_of, look_at, look_at_lines
 
@@ -236,7 +236,9 @@ class _Pages:
         if isinstance(value, bool) or not isinstance(value, (int, float)):
             raise Denied(400, "value is missing, or is no number")
         drive, register = text_in(body, "drive"), text_in(body, "register")
-        return _answer(await self._gateway.commands.write(drive, register, value, caller_of(request)))
+        caller = caller_of(request)
+        admit = self._admission(drive, (register, value, caller), body)
+        return _answer(await self._gateway.commands.write(drive, register, value, caller, admit))
 
     async def act(self, request: Request) -> Response:
         body = await body_of(request)
@@ -244,7 +246,14 @@ class _Pages:
         if not isinstance(options, dict):
             raise Denied(400, "options is no JSON object")
         drive, verb = text_in(body, "drive"), text_in(body, "verb")
-        return _answer(await self._gateway.commands.act(drive, verb, options, caller_of(request)))
+        caller = caller_of(request)
+        admit = self._admission(drive, (verb, repr(options), caller), body)
+        return _answer(await self._gateway.commands.act(drive, verb, options, caller, admit))
+
+    def _admission(self, drive: str, command: object, body: Mapping[str, Any]) -> Admit:
+        """Return what admits a command by the frame that its sender had seen; stops need none."""
+        frames = self._gateway.seen_frames
+        return lambda what: frames.admit(drive, what, (drive, command), frame_in(body))
 
     async def reload(self, request: Request) -> Response:
         if (await body_of(request)).get("confirm") is not True:

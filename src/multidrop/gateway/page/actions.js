@@ -1,15 +1,17 @@
 // Writes and verbs of one drive: each confirmed by name, sent once, and told of as the gateway says.
 
-import { confirm, confirmForm, send } from "./ask.js";
+import { Refused } from "./api.js";
+import { DANGER, STOP, confirm, confirmForm, send } from "./ask.js";
 import * as clock from "./clock.js";
 import { fill, find, glyph, make, named, say } from "./dom.js";
 import { now } from "./link.js";
-import { mayAct, reading } from "./store.js";
+import { mayAct, reading, stops, store } from "./store.js";
 import { text, unit, withUnit, words } from "./values.js";
 
 const MOST = 20; // outcomes that are kept on the page; the log has all
 const outcomes = [];
 const WITH_HZ = new Set(["set_frequency"]);
+const STOPS = new Set(["coast", "emergency_stop"]); // are sent whatever came before
 const TURNS = ["start", "jog", "run", "forward", "reverse"];
 
 // Make the verbs that the page's user may give, and the place where outcomes stand.
@@ -61,9 +63,16 @@ function note(drive, what, done, told) {
   dispatchEvent(new Event("written"));
 }
 
-async function deliver(drive, what, path, body) {
+// Return what makes the body at its confirmation, with the frame that was seen then. A stop that was called
+// since it was asked, of which there had been `stopped`, is seen behind a dialog by nobody: then it fails.
+const seen = (drive, body, stopped) => () => {
+  if (stops(drive) !== stopped) throw new Refused(409, "A stop of it was called meanwhile.");
+  return { ...body, seen: store.frame?.n };
+};
+
+async function deliver(drive, what, path, confirmed) {
   try {
-    const { done, text: told } = await send(path, body);
+    const { done, text: told } = await send(path, confirmed);
     note(drive, what, done === true, told);
   } catch (error) {
     const isRefused = error.status >= 400 && error.status < 500;
@@ -81,21 +90,21 @@ async function deliver(drive, what, path, body) {
 // Ask, and give a verb: with a frequency where it takes one.
 export async function act(drive, verb) {
   const turns = TURNS.some(word => verb.includes(word)),
-    field = WITH_HZ.has(verb) ? hertz() : null;
+    field = WITH_HZ.has(verb) ? hertz() : null,
+    stopped = stops(drive);
   const warning = turns
     ? "The motor will turn. Make sure that nobody is near what it drives."
     : "It is sent once.";
   const contents = [make("p", { class: turns ? "bad" : "" }, warning)];
   if (field) contents.push(make("label", { class: "field", for: field.id }, "Frequency, Hz", field));
   const asks = field ? confirmForm : confirm;
-  if (!(await asks([`${words(verb)}: `, named(drive), "?"], contents, [`${words(verb)} `, named(drive)])))
-    return;
+  const title = [`${words(verb)}: `, named(drive), "?"],
+    yes = [`${words(verb)} `, named(drive)];
+  if (!(await asks(title, contents, yes, STOPS.has(verb) ? STOP : DANGER))) return;
   const options = field ? { hz: Number(field.value) } : {};
-  await deliver(drive, field ? `${words(verb)} ${options.hz} Hz` : words(verb), "api/act", {
-    drive,
-    verb,
-    options,
-  });
+  const what = field ? `${words(verb)} ${options.hz} Hz` : words(verb);
+  const body = { drive, verb, options };
+  await deliver(drive, what, "api/act", STOPS.has(verb) ? () => body : seen(drive, body, stopped));
 }
 
 const hertz = () =>
@@ -111,8 +120,9 @@ const hertz = () =>
 // Ask for a value, and write it.
 export async function change(drive, register) {
   const current = reading(drive, register.name, now()),
-    name = words(register.name);
-  const field = editor(register, current);
+    name = words(register.name),
+    stopped = stops(drive);
+  const field = editor(register);
   const held =
     current?.value === null || !current ? null : withUnit(text(current.value, register), register);
   const past = current?.isOld ? `not known now; ${clock.lasting(current.age)} ago it was ` : "";
@@ -135,16 +145,14 @@ export async function change(drive, register) {
     return;
   const value = Number(field.value);
   if (field.value === "" || !Number.isFinite(value)) return;
-  await deliver(drive, `${name} = ${text(value, register)} ${unit(register)}`.trim(), "api/write", {
-    drive,
-    register: register.name,
-    value,
-  });
+  const what = `${name} = ${text(value, register)} ${unit(register)}`.trim();
+  await deliver(drive, what, "api/write", seen(drive, { drive, register: register.name, value }, stopped));
 }
 
 const isLimited = ({ least, most }) => typeof least === "number" && typeof most === "number";
 
-function editor(register, current) {
+// It begins empty: Enter alone sends nothing, least of all a value that is no longer true.
+function editor(register) {
   const common = { id: "new-value", required: true, "data-first": true };
   if (register.kind === "words" && register.words) {
     return make(
@@ -156,7 +164,7 @@ function editor(register, current) {
       ),
     );
   }
-  const field = make("input", {
+  return make("input", {
     ...common,
     type: "number",
     inputmode: "decimal",
@@ -165,7 +173,4 @@ function editor(register, current) {
     min: register.least ?? null,
     max: register.most ?? null,
   });
-  if (current?.value !== null && current?.value !== undefined)
-    field.value = text(current.value, { ...register, kind: "number" });
-  return field;
 }

@@ -7,11 +7,45 @@ let answer = null; // settles the question that stands now
 
 const dialog = () => find("#ask");
 
+// The second click of a double click means what the first one pressed. Where the dialog opened or closed in
+// between it would press what nobody looked at, so it is not taken, but for a stop. Nor is a key that is held.
+const TWICE_MS = 500,
+  NEAR_PX = 30,
+  AT_ONCE = "#stopall, .stop";
+export const DANGER = "danger",
+  STOP = "danger stop"; // classes of buttons
+let changes = 0, // how often the dialog opened or closed
+  last = { x: 0, y: 0, time: -Infinity, changes }; // the latest click that was taken
+
+addEventListener(
+  "click",
+  event => {
+    const { clientX: x, clientY: y, timeStamp: time, detail } = event;
+    if (detail === 0) return; // by a key
+    const isNear = Math.hypot(x - last.x, y - last.y) < NEAR_PX,
+      isSecond = isNear && (detail > 1 || time - last.time < TWICE_MS);
+    if (isSecond && changes !== last.changes && !event.target.closest(AT_ONCE)) {
+      event.preventDefault();
+      event.stopImmediatePropagation();
+    } else last = { x, y, time, changes };
+  },
+  true,
+);
+addEventListener(
+  "keydown",
+  event => {
+    last.time = -Infinity; // a click after a key is a click of its own
+    if (event.repeat && (event.key === "Enter" || event.key === " ")) event.preventDefault();
+  },
+  true,
+);
+
 // Show the dialog and return what was chosen: a button's name, or null for cancelled. `buttons` are
 // [name, text, class]; Cancel comes first and has the focus, so that Enter alone does nothing.
 function open(title, contents, buttons, cancel = "Cancel") {
   answer?.(null);
   const close = choice => {
+    changes++;
     answer?.(choice);
     answer = null;
     if (dialog().open) dialog().close();
@@ -48,6 +82,7 @@ function open(title, contents, buttons, cancel = "Cancel") {
     event.preventDefault();
     close(null);
   };
+  changes++;
   if (dialog().open) dialog().close(); // opened anew, it is read out
   dialog().showModal();
   (find("[data-first]", form) ?? first).focus();
@@ -57,12 +92,12 @@ function open(title, contents, buttons, cancel = "Cancel") {
 }
 
 // Ask for a confirmation. Return true where it is given.
-export const confirm = async (title, contents, yes) =>
-  (await open(title, contents, [["yes", yes, "danger"]])) === "yes";
+export const confirm = async (title, contents, yes, kind = DANGER) =>
+  (await open(title, contents, [["yes", yes, kind]])) === "yes";
 
 // Ask for what a form in `contents` holds. Return true where it is to be sent.
 export const confirmForm = async (title, contents, yes) =>
-  (await open(title, contents, [["submit", yes, "danger"]])) === "submit";
+  (await open(title, contents, [["submit", yes, DANGER]])) === "submit";
 
 // Show something until it is closed. Return the name of the other button where that was pressed.
 export const tell = (title, contents, buttons = []) => open(title, contents, buttons, "Close");
@@ -100,18 +135,18 @@ export async function askToken(why, yes = "Sign in") {
   }
 }
 
-// Send what the person confirmed, and once more after a sign-in where the right to it was missing.
-// Return the answer. Raises Refused.
+// Send what the person confirmed, and once more after a sign-in where the right to it was missing: `body`
+// is called at each confirmation. Return the answer. Raises Refused.
 export async function send(path, body, patience) {
   dispatchEvent(new Event("command"));
   try {
-    return await post(path, body, patience);
+    return await post(path, body(), patience);
   } catch (error) {
     if (error.status !== 401 && error.status !== 403) throw error;
     if (
       !(await askToken(`${error.message} A token with the right to it is needed.`, "Sign in and send it"))
     )
       throw error;
-    return await post(path, body, patience);
+    return await post(path, body(), patience);
   }
 }

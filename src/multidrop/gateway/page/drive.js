@@ -78,7 +78,7 @@ function build({ spec, line }) {
           "button",
           {
             type: "button",
-            class: "danger",
+            class: "danger stop",
             onclick: () => stopOne(spec.name),
             "aria-label": `Stop ${spec.name}`,
           },

@@ -1,9 +1,10 @@
 // Stops: of all drives and of one. This file needs the dialog and nothing else of the page.
 
-import { confirm, retell, send, tell } from "./ask.js";
+import { STOP, confirm, retell, send, tell } from "./ask.js";
 import { find, glyph, make, named } from "./dom.js";
 
 const PATIENCE_MS = 20000;
+let asked = null; // the question whether to stop that was asked last: no outcome takes its place
 const HOW =
   "A stop goes ahead of all polling and is repeated until the drive confirms it. " +
   "Motors come down as their drives are set.";
@@ -14,14 +15,14 @@ export async function stopAll() {
   const { drives, lines } = find("#stopall").dataset;
   const all = drives ? `all ${drives} drives` : "all drives";
   const where = lines > 1 ? `All ${lines} lines at once. ` : "";
-  if (await confirm(`Stop ${all}?`, [make("p", {}, where + HOW)], `Stop ${all}`))
-    await stop(null, "all drives");
+  asked = confirm(`Stop ${all}?`, [make("p", {}, where + HOW)], `Stop ${all}`, STOP);
+  if (await asked) await stop(null, "all drives");
 }
 
 // Ask, and stop this drive.
 export async function stopOne(name) {
-  if (await confirm(["Stop ", named(name), "?"], [make("p", {}, HOW)], ["Stop ", named(name)]))
-    await stop([name], name);
+  asked = confirm(["Stop ", named(name), "?"], [make("p", {}, HOW)], ["Stop ", named(name)], STOP);
+  if (await asked) await stop([name], name);
 }
 
 async function stop(drives, what) {
@@ -31,7 +32,7 @@ async function stop(drives, what) {
     closed.catch(() => {});
     let shown;
     try {
-      const told = await send("api/stop", { drives }, PATIENCE_MS);
+      const told = await send("api/stop", () => ({ drives }), PATIENCE_MS);
       shown = outcome(told);
     } catch (error) {
       const isRefused = error.status >= 400 && error.status < 500;
@@ -41,10 +42,11 @@ async function stop(drives, what) {
         contents: [make("p", { class: "bad" }, glyph("fault"), ` ${error.message} ${HARD}`)],
       };
     }
+    await asked;
     again = await retell(
       shown.title,
       shown.contents,
-      shown.isWhole ? [] : [["again", "Send the stop again", "danger"]],
+      shown.isWhole ? [] : [["again", "Send the stop again", STOP]],
     );
   }
 }
@@ -90,6 +92,15 @@ setTimeout(() => {
 }, WHOLE_MS);
 
 find("#stopall").addEventListener("click", stopAll);
+// Stop all lies behind an open dialog, and is at hand all the same: in place of what else is asked.
+find("#ask").addEventListener("click", event => {
+  const isIn = element => {
+    const { left, right, top, bottom } = element.getBoundingClientRect();
+    return left <= event.clientX && event.clientX <= right && top <= event.clientY && event.clientY <= bottom;
+  };
+  const ask = find("#ask");
+  if (event.target === ask && !isIn(ask) && isIn(find("#stopall"))) stopAll();
+});
 find("#stopall").disabled = false;
 find("#notice").hidden = true;
 find("#notice").classList.remove("loading", "bad");

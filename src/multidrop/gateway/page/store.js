@@ -117,6 +117,9 @@ export function driveAge(name, now) {
   return seen === null ? null : Math.max(0, (isLive(now) ? store.time : now) - seen);
 }
 
+// Return how many stops of a drive were called so far.
+export const stops = name => store.frame?.drives[name]?.stops ?? 0;
+
 export const state = name => store.frame?.drives[name]?.state ?? "unknown";
 
 // Return the register that has this part in the drive, "frequency" for one, or null.

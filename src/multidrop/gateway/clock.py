@@ -1,0 +1,32 @@
+"""Clock: the times by which the gateway judges ages, which nobody sets."""
+
+from __future__ import annotations
+
+import time
+
+if hasattr(time, "CLOCK_MONOTONIC"):
+
+    def monotonic_ns() -> int:
+        """Return the time of CLOCK_MONOTONIC, as rows have it."""
+        return time.clock_gettime_ns(time.CLOCK_MONOTONIC)
+
+else:
+
+    def monotonic_ns() -> int:
+        """Return the time of the clock that never steps, as rows have it."""
+        return time.monotonic_ns()
+
+
+if hasattr(time, "CLOCK_BOOTTIME"):
+
+    def boottime_ns() -> int:
+        """Return the time of CLOCK_BOOTTIME, which runs on while the machine sleeps."""
+        return time.clock_gettime_ns(time.CLOCK_BOOTTIME)
+
+else:  # on macOS and Windows the other one runs on, too
+    boottime_ns = monotonic_ns
+
+
+def slept_ns() -> int:
+    """Return for how long the machine slept so far: never too much, where a pause comes in between."""
+    return boottime_ns() - monotonic_ns()

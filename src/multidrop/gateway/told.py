@@ -1,0 +1,45 @@
+"""Told: what is said of a command. Pure."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from multidrop import BusError, Refused, Seen, Stopped
+from multidrop.gateway.rights import NOT_ALLOWED, NOT_LISTED, Caller, Right
+
+
+class Told(NamedTuple):
+    """The end of a command: what became of it, in the library's words."""
+
+    is_done: bool
+    text: str  # one sentence for a person
+    error: BusError | ValueError | None = None  # that the library raised
+
+
+def failed(failure: BaseException) -> Told:
+    """Return the end of a command that failed so."""
+    if not isinstance(failure, (BusError, ValueError)):
+        failure = ValueError(str(failure) or type(failure).__name__)
+    return Told(False, str(failure), failure)
+
+
+def of_stop(stopped: Stopped) -> Told:
+    """Return what became of a stop."""
+    if stopped.seen is Seen.STOPPED:
+        return Told(True, f"stopped: seen to stand after {stopped.seconds:.1f} s")
+    return Told(False, f"{stopped.seen.value}: {stopped.why}", BusError(stopped.why))
+
+
+def denied(caller: Caller, role: Right, what: str) -> Told:
+    """Return the end of a command whose caller lacks this role."""
+    needed = role.name.lower()
+    sentence = f"{what} needs the role {needed}, and {caller.name} has {caller.role.name.lower()}"
+    return failed(Refused(sentence, rule=NOT_ALLOWED))
+
+
+def not_listed(what: str, key: str) -> Refused:
+    """Return the reason why a write or a verb that the plant file does not list is refused."""
+    return Refused(
+        f'{what} is not in the plant file\'s list; add it to {key} = ["{what}"] of [serve.may]',
+        rule=NOT_LISTED,
+    )

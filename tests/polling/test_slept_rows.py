@@ -1,0 +1,73 @@
+"""Rows of a machine that sleeps while it polls: each has the time of its exchange.
+
+No machine here can be put to sleep: a library put before the system's has the clocks of one that was.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from c_programs import preloaded
+
+from multidrop.core import Message
+from multidrop.drives import InvtCHE
+from multidrop.sim import Simulator, Wire, simulated
+
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="CLOCK_BOOTTIME is Linux's")
+
+HOUR_NS = 3600 * 10**9
+PLANT = """
+[[line]]
+name = "hall"
+port = "{}"
+baudrate = 38400
+[[line.drive]]
+name = "pump-1"
+model = "invt-che"
+address = 1
+poll = ["output_frequency"]
+"""
+CLIENT = """
+import json, sys, time
+from multidrop import Poller, load_plant
+rows = []
+with Poller(load_plant(sys.argv[1])) as poller:
+    while sum(row.status == "ok" and row.time > int(sys.argv[2]) for row in rows) < 300:
+        rows += poller.take() or ()
+        time.sleep(0.001)
+print(json.dumps([[row.time, row.monotonic_ns] for row in rows if row.status == "ok"]))
+"""
+
+
+def test_rows_have_the_time_of_their_exchange(tmp_path: Path) -> None:
+    sim = simulated(InvtCHE(1, baudrate=38400))
+    answer, slept, asked_ns = sim.answer, tmp_path / "slept", list[int]()
+
+    def answer_and_sleep(request: Message, now: float) -> Message | None:
+        asked_ns.append(time.monotonic_ns())
+        if len(asked_ns) == 50:
+            slept.touch()
+        return answer(request, now)
+
+    sim.answer = answer_and_sleep  # type: ignore[method-assign]
+    with Simulator([Wire([sim], unpaced=True)]) as simulator:
+        (tmp_path / "plant.toml").write_text(PLANT.format(simulator.wires[0].path))
+        ahead_ns = time.time_ns() - time.monotonic_ns()
+        ran = subprocess.run(
+            [sys.executable, "-c", CLIENT, str(tmp_path / "plant.toml"), str(time.time_ns() + HOUR_NS)],
+            env=os.environ | {"LD_PRELOAD": preloaded("sleeping_clock", tmp_path), "SLEPT": str(slept)},
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+    assert ran.returncode == 0, ran.stderr
+    slept_for = {True: set[int](), False: set[int]()}  # hours, by whether it was asked before the sleep
+    for time_ns, monotonic_ns in json.loads(ran.stdout):
+        slept_for[monotonic_ns <= asked_ns[49]].add(round((time_ns - monotonic_ns - ahead_ns) / HOUR_NS))
+    assert slept_for == {True: {0}, False: {8}}
