@@ -189,6 +189,16 @@ uint64_t md_count_lacking(const struct md_block *block, const struct md_message 
     return lacking;
 }
 
+int md_values(const struct md_block *block, const struct md_message *reply, double *values)
+{
+    int found = 0;
+    for (int i = 0; i < block->count; i++) {
+        values[i] = (double)NAN;
+        found += find_value(reply, block, &block->fields[i], &values[i]) == MD_OK;
+    }
+    return found;
+}
+
 /* ---- rows ---- */
 
 struct md_columns *md_columns_new(size_t room)

@@ -210,6 +210,7 @@ struct md_exchange {
     int64_t period_ns;     /* between its slots in a queue; 0: it has none */
     const uint32_t *stops; /* of its drive: sent only while they are stops_seen; NULL: always */
     uint32_t stops_seen;
+    const struct md_block *values; /* fields whose values the caller of md_port_carry_out() gets; NULL: none */
 };
 
 /* The reason why an exchange has no reply; an enum md_frame_fault where something came in its place. */
@@ -302,10 +303,17 @@ const struct md_progress *md_port_progress(struct md_port *port);
 void md_count_stop(uint32_t *stops);
 /* Carry one out ahead of the queue and wait for it; one that insists goes ahead of those that do not. After
  * `expires_ns` (of CLOCK_BOOTTIME; 0: never), or a stop, it is not sent (MD_EXPIRED). Beside many of these
- * the queue keeps a 20th of the line, one exchange at a time, but none while one that insists waits. Return
- * the length of the good reply's data; -1 where there is none, and of an exception. */
+ * the queue keeps a 20th of the line, one exchange at a time, but none while one that insists waits. Write
+ * the exchange's values, NaN where the reply has none, and return how many it has; -1 where there is no good
+ * reply, or an exception. */
 int md_port_carry_out(struct md_port *port, const struct md_exchange *exchange, int64_t not_before_ns,
-                      int64_t expires_ns, struct md_completion *completion);
+                      int64_t expires_ns, struct md_completion *completion, double *values);
+
+/* ---- columns.c: return a count ---- */
+
+/* Write the value of each of the block's fields in a good reply, NaN where it has none; return how many it
+ * has. */
+int md_values(const struct md_block *block, const struct md_message *reply, double *values);
 
 /* ---- mastership.c, port_api.c: return NULL or -1 and set errno on failure; else a time, or a flag ---- */
 

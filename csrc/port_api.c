@@ -170,7 +170,7 @@ static int is_attended(const struct md_port *port)
 }
 
 int md_port_carry_out(struct md_port *port, const struct md_exchange *exchange, int64_t not_before_ns,
-                      int64_t expires_ns, struct md_completion *completion)
+                      int64_t expires_ns, struct md_completion *completion, double *values)
 {
     struct md_engine *engine = port->engine; /* the port may be gone at the end */
     struct md_urgent urgent = {.exchange = exchange, .not_before_ns = not_before_ns, .expires_ns = expires_ns,
@@ -187,7 +187,9 @@ int md_port_carry_out(struct md_port *port, const struct md_exchange *exchange, 
     }
     md_engine_leave(engine);
     completion->late_until_ns = late_until_ns;
-    return completion->result > 0 && !completion->reply.exception ? completion->reply.data_len : -1;
+    if (completion->result <= 0 || completion->reply.exception)
+        return -1;
+    return exchange->values ? md_values(exchange->values, &completion->reply, values) : 0;
 }
 
 /* The engine's thread has its mutex from the look to the end of write(2): who had it after the deadline was

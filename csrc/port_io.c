@@ -130,10 +130,16 @@ static int is_sent(const struct md_port *port)
 
 /* A sleeping processor wakes late, and by much the same time again and again. So the sleep before a
  * request is shortened by what is usual, and the rest is spun away: with few lines some 20 us of each
- * exchange. A look at a reply may be early, and is not spun for. */
+ * exchange. That is not worth it for a client that waits, whose own share of an exchange is longer and may
+ * be late by more. A look at a reply may be early, and is not spun for. */
+static int is_worth_spinning(const struct md_port *port)
+{
+    return port->engine->count <= MOST_SPINNING && port->turn.whose != MD_URGENT;
+}
+
 static int spin_until(struct md_port *port, int64_t until_ns, int64_t *now_ns)
 {
-    int64_t most_ns = port->engine->count > MOST_SPINNING ? NO_SLEEP_NS : MD_MOST_LATENESS;
+    int64_t most_ns = is_worth_spinning(port) ? MD_MOST_LATENESS : NO_SLEEP_NS;
     if (until_ns - *now_ns > most_ns || port->turn.progress.lost)
         return 0;
     if (!port->is_empty) /* what came meanwhile is looked for now, not when the request must leave */
@@ -214,7 +220,7 @@ int64_t md_port_advance(struct md_port *port, int64_t now_ns)
     else if (!port->is_blind)
         watch(port, 1);
     int is_early = wake_ns != MD_NEVER && (port->is_blind || turn->whose == MD_NOBODYS) &&
-                   (is_sent(port) || engine->count <= MOST_SPINNING);
+                   (is_sent(port) || (is_worth_spinning(port) && !is_expected));
     wake_ns -= is_early ? engine->lateness_ns : 0;
     engine->wakes[port->index] = sooner(wake_ns, direction_ns(port));
     return now_ns;

@@ -57,7 +57,7 @@ static void *come_and_go(void *argument)
         md_port_repeat(port, round, 1);
         struct md_completion found;
         if (i % 2)
-            md_port_carry_out(port, &second.exchange, 0, 0, &found);
+            md_port_carry_out(port, &second.exchange, 0, 0, &found, NULL);
         md_port_repeat(port, NULL, 0);
         while (i % 5 == 0 && md_port_is_asking(port, &second.drive))
             usleep(100);

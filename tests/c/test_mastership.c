@@ -70,7 +70,7 @@ static struct md_completion carry_out(const struct md_exchange *exchange)
     drive.late_until_ns = 0;
     md_engine_leave(port->engine);
     atomic_store(&written, 0);
-    md_port_carry_out(port, exchange, 0, 0, &found);
+    md_port_carry_out(port, exchange, 0, 0, &found, NULL);
     return found;
 }
 
@@ -203,7 +203,7 @@ static void *babble(void *argument)
 static void *read_meanwhile(void *argument)
 {
     struct md_completion *found = argument;
-    md_port_carry_out(port, &reading, 0, 0, found);
+    md_port_carry_out(port, &reading, 0, 0, found, NULL);
     return NULL;
 }
 

@@ -59,7 +59,7 @@ static void *answer(void *argument)
 static int asked(struct md_port *port, const struct md_exchange *exchange, struct md_completion *found)
 {
     int before = atomic_load(&rings);
-    md_port_carry_out(port, exchange, 0, 0, found);
+    md_port_carry_out(port, exchange, 0, 0, found, NULL);
     assert(found->result > 0);
     return atomic_load(&rings) - before;
 }

@@ -64,6 +64,15 @@ def test_a_client_that_is_back_soon_wakes_nobody(build: Callable[..., None]) -> 
 @pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="others wait by poll")
+def test_nothing_is_spun_for_a_client_that_waits(build: Callable[..., None]) -> None:
+    replaced = ("waiter_poll", "clock")
+    core = [path.stem for path in (ROOT / "csrc").glob("*.c") if path.stem not in replaced]
+    build("test_spinning", *core)
+
+
+@pytest.mark.long
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform != "linux", reason="others wait by poll")
 def test_a_port_is_read_once_for_an_exchange(build: Callable[..., None]) -> None:
     replaced = ("waiter_poll", "port_io")
     core = [path.stem for path in (ROOT / "csrc").glob("*.c") if path.stem not in replaced]

@@ -28,6 +28,7 @@ from multidrop.core import (
     Completion,
     Echo,
     Exchange,
+    Extra,
     Failure,
     Field,
     Framing,
@@ -62,6 +63,7 @@ def read(
     period: float = 0.0,
     insists: bool = False,
     echo_probe: Exchange | None = None,
+    values: RowLayout | None = None,
 ) -> Exchange:
     """A read of one register; without a reply it takes `timeout`, which no passing test waits for."""
     return Exchange(
@@ -77,6 +79,7 @@ def read(
         insists=insists,
         block=ONE_VALUE,
         echo_probe=echo_probe,
+        values=values,
     )
 
 
@@ -408,6 +411,29 @@ def test_an_urgent_exchange_goes_ahead_of_the_queue(drive: Drive) -> None:
         found = port.carry_out(read(7))
         assert (found.result, found.reply.data) == (7, words(7))
         assert pending(port) == 1
+
+
+def test_a_caller_gets_the_values_of_its_exchange(drive: Drive) -> None:
+    lacking = Extra(invalid=((0xFFFF, 8),))
+    tenths, eight = (Field(0, NumberFormat.U16, 0, 1, 10, extra) for extra in (None, lacking))
+    values = RowLayout(0, [tenths, eight])
+    with closing(Port(drive(echo_start), NO_SETTINGS)) as port:
+        first = port.carry_out(read(7, values=values))
+        assert (first.count, first.numbers.tolist()) == (2, [0.7, 0.7])
+        again = port.carry_out(read(8, values=values), into=first)
+        assert again is first
+        assert again.count == 1
+        assert again.values_of(values) == [0.8, None]
+        assert again.numbers[1] != again.numbers[1]
+
+
+def test_a_completion_without_room_for_the_values_is_left_alone(drive: Drive) -> None:
+    with closing(Port(drive(echo_start), NO_SETTINGS)) as port:
+        short = Completion()
+        found = port.carry_out(read(7, values=ONE_VALUE), into=short)
+        assert found is not short
+        assert found.numbers.tolist() == [7]
+        assert short.result == 0
 
 
 def test_an_urgent_exchange_that_expired_is_not_sent(drive: Drive) -> None:

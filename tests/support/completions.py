@@ -18,7 +18,7 @@ def new_completion(**fields: object) -> Any:
 def completion_of(found: Any) -> Completion:
     """Return the same as md_port_carry_out() would fill in."""
     is_good = found.result > 0 and not found.reply.exception
-    return Completion(found, found.reply.data_len if is_good else -1)
+    return Completion(found, 0 if is_good else -1)
 
 
 def copied(found: Any) -> Completion:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import struct
 from enum import IntEnum
+from fractions import Fraction
 from typing import Any
 
 from completions import completed
@@ -42,16 +43,22 @@ class Mixed(Drive):
     again = reading(18, "")
     perhaps = reading(19, "V", invalid=0xFFFF)
     balance = reading(20, "J", number_format=NumberFormat.I32)
+    flow = reading(22, "m3/h", scale_register="flow_power")
+    flow_power = reading(23, "", number_format=NumberFormat.I16)
+    nibble = reading(24, "", part=(4, 7))
+    decimal = reading(25, "rpm", number_format=NumberFormat.BCD16)
+    fine = reading(26, "J", number_format=NumberFormat.U32, step=12345678.9)
 
 
 REGISTERS = tuple(Mixed.registers.values())
-FIRST, WORDS = 1, 21
+FIRST, WORDS = 1, 27
 
 
 def expected(data: bytes) -> dict[str, Any]:
     """Return the values as `struct` and the table's own words tell them."""
     tenths, celsius, energy, low, high, power = struct.unpack_from(">HhIHHf", data)
-    pulses, drift, mode, perhaps, balance = struct.unpack_from(">QqHHi", data, 18)
+    pulses, drift, mode, perhaps, balance, flow, power_of_ten = struct.unpack_from(">QqHHiHh", data, 18)
+    part, digits, fine = struct.unpack_from(">HHI", data, 46)
     return {
         "tenths": tenths / 10,
         "celsius": celsius - 40,
@@ -64,6 +71,11 @@ def expected(data: bytes) -> dict[str, Any]:
         "again": mode,
         "perhaps": None if perhaps == 0xFFFF else perhaps,
         "balance": balance,
+        "flow": float(flow * Fraction(10) ** power_of_ten) if abs(power_of_ten) <= 22 else None,
+        "flow_power": power_of_ten,
+        "nibble": part >> 4 & 0xF,
+        "decimal": int(f"{digits:x}") if f"{digits:x}".isdecimal() else None,
+        "fine": fine * 123456789 / 10,  # more than a float holds before it is divided
     }
 
 
@@ -91,8 +103,8 @@ def test_a_reply_that_ends_too_soon_has_the_values_that_are_whole(data: bytes) -
     assert found["balance"] is None
 
 
-def test_plain_numbers_are_decoded_at_once() -> None:
-    assert set(decoder().plain) == {"tenths", "celsius", "energy", "pulses", "drift", "mode", "balance"}
+def test_the_core_reads_what_a_float_holds() -> None:
+    assert set(decoder().names) == {one.name for one in REGISTERS} - {"pulses", "drift", "flow", "fine"}
 
 
 def test_drives_of_a_kind_share_a_decoder_and_other_blocks_have_their_own() -> None:

@@ -16,8 +16,9 @@ from multidrop.core.columns import (
     raw_value,
     spell,
 )
+from multidrop.core.completion import Completion
 from multidrop.core.counters import DELAY_BUCKETS, Counters, delay_edge
-from multidrop.core.exchange import DATA_AT, PAUSE_NS, Completion, Exchange, Peer
+from multidrop.core.exchange import PAUSE_NS, Exchange, Peer
 from multidrop.core.frame import (
     MODBUS,
     Framing,
@@ -70,7 +71,6 @@ from multidrop.core.tap import Tap, Wrappings
 
 __all__ = [
     "COLUMNS",
-    "DATA_AT",
     "DELAY_BUCKETS",
     "EXCEPTION_STATUS",
     "LOW_BYTE_FIRST",

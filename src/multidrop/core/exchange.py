@@ -1,4 +1,4 @@
-"""An exchange: the peer, the request, and what became of it."""
+"""An exchange: the peer and the request."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 from multidrop._core import ffi, lib
 from multidrop.core.columns import RowLayout
 from multidrop.core.counters import Counters, read_counters
-from multidrop.core.frame import Framing, Message, build_request, from_c, to_c
+from multidrop.core.frame import Framing, Message, build_request, to_c
 from multidrop.core.latch import Permit
 from multidrop.core.memory import new_apart, new_beside
 from multidrop.core.port_settings import settings_to_c
@@ -127,12 +127,24 @@ class Exchange:
     its reply, `turnaround` after a broadcast, `period` between its slots in a queue, if it has any.
     One that `insists` is sent even where a late reply may pass for its own. `timeout` is the least
     time-out; 0: as learnt. `answer` is the least and the greatest raw count of the reply's one register.
-    `block` has the fields for rows. `echo_probe` is sent first while it is unknown whether the adapter
-    echoes: its reply is never a copy of its request. Once a stop was called, `permit` keeps the request
-    from being sent.
+    `block` has the fields for rows, `values` those whose values its caller gets. `echo_probe` is sent first
+    while it is unknown whether the adapter echoes: its reply is never a copy of its request. Once a stop was
+    called, `permit` keeps the request from being sent.
     """
 
-    __slots__ = ("_memory", "block", "c", "echo_probe", "framing", "peer", "permit", "request", "settings")
+    __slots__ = (
+        "_memory",
+        "block",
+        "c",
+        "echo_probe",
+        "framing",
+        "peer",
+        "permit",
+        "request",
+        "room",
+        "settings",
+        "values",
+    )
 
     def __init__(
         self,
@@ -150,6 +162,7 @@ class Exchange:
         timeout: float = 0.0,
         answer: tuple[int, int] | None = None,
         block: RowLayout | None = None,
+        values: RowLayout | None = None,
         echo_probe: Exchange | None = None,
         permit: Permit | None = None,
     ) -> None:
@@ -160,6 +173,8 @@ class Exchange:
         self.request = request
         self.peer = peer
         self.block = block
+        self.values = values
+        self.room = values.count if values else 0  # for them, in a completion
         self.echo_probe = echo_probe
         self.permit = permit
         self.settings = (baudrate, format)
@@ -186,92 +201,6 @@ class Exchange:
                 "echo_probe": echo_probe.c if echo_probe else ffi.NULL,
                 "stops": permit.latch.c if permit else ffi.NULL,
                 "stops_seen": permit.seen if permit else 0,
+                "values": values.c if values else ffi.NULL,
             },
         )
-
-
-_COMPLETION = ffi.typeof("struct md_completion *")
-DATA_AT: int = ffi.offsetof("struct md_completion", "reply", "data")
-
-
-class Completion:
-    """The result of an exchange (struct md_completion), read where it is asked for.
-
-    Times are CLOCK_MONOTONIC, in ns. `size` is the length of the good reply's data in bytes; -1 where there
-    is none, and of an exception. The data is at DATA_AT of `memory`. A read that went well asks for nothing
-    else: with caches that a sleep has cooled each field, and each call, takes microseconds. Where nobody
-    looks at it any more, another exchange may be carried out into it.
-    """
-
-    __slots__ = ("c", "memory", "size")
-
-    def __init__(self, found: Any = None, size: int = -1) -> None:
-        self.c = ffi.new(_COMPLETION) if found is None else found
-        self.memory = ffi.buffer(self.c)
-        self.size = size
-
-    @property
-    def result(self) -> int:
-        """The reply's length; 0 after a broadcast, else a Failure or a FrameFault."""
-        return int(self.c.result)
-
-    @property
-    def error(self) -> int:
-        """An errno of a line that was lost, as C numbers it; or the REFUSALS of settings."""
-        return int(self.c.error)
-
-    @property
-    def begun_ns(self) -> int:
-        """The time at which its turn came."""
-        return int(self.c.begun_ns)
-
-    @property
-    def sent_ns(self) -> int:
-        """The time at which the request began to leave; 0: it never did."""
-        return int(self.c.sent_ns)
-
-    @property
-    def first_ns(self) -> int:
-        """The time at which the first byte was seen after the request; 0: none came."""
-        return int(self.c.first_ns)
-
-    @property
-    def last_ns(self) -> int:
-        """The time at which the last byte was seen; 0: none came."""
-        return int(self.c.last_ns)
-
-    @property
-    def late_until_ns(self) -> int:
-        """The time until which a late reply could come, as was known when it was asked for."""
-        return int(self.c.late_until_ns)
-
-    @property
-    def stale(self) -> int:
-        """Bytes that were thrown away before the request left."""
-        return int(self.c.stale)
-
-    @property
-    def skipped(self) -> int:
-        """Bytes after the request that were no part of the reply."""
-        return int(self.c.skipped)
-
-    @property
-    def reply(self) -> Message:
-        """The good reply, or an exception."""
-        return from_c(self.c.reply)
-
-    @property
-    def data(self) -> bytes:
-        """Data of the good reply; none where there is no such reply."""
-        return bytes(self.memory[DATA_AT : DATA_AT + max(self.size, 0)])
-
-    @property
-    def raw(self) -> bytes:
-        """The reply's bytes; of a failure the end of what came."""
-        return bytes(ffi.buffer(self.c.raw, self.c.raw_len))
-
-    def unanswered(self) -> Completion:
-        """Return a copy to which nothing came: the reply was the request's echo."""
-        found = ffi.new("struct md_completion *", self.c[0])
-        found.result, found.raw_len = lib.MD_NO_REPLY, 0
-        return Completion(found)

@@ -10,7 +10,8 @@ from typing import Any
 from weakref import finalize
 
 from multidrop._core import ffi, lib
-from multidrop.core.exchange import Completion, Exchange, Peer
+from multidrop.core.completion import Completion
+from multidrop.core.exchange import Exchange, Peer
 from multidrop.core.fork import register_at_fork
 from multidrop.core.mastership import Mastership
 from multidrop.core.row_queue import RowQueue
@@ -262,11 +263,13 @@ class Port:
         expires_ns: int = 0,
         into: Completion | None = None,
     ) -> Completion:
-        """Carry one out ahead of the queue and wait for it; `into`: the completion to fill in.
+        """Carry one out ahead of the queue and wait for it; `into`: the completion to fill in, where it fits.
 
         After `expires_ns` (of CLOCK_BOOTTIME; 0: never), or after a stop, it is not sent.
         """
         self._kept.add(exchange.peer)  # a late reply may come
-        found = into or Completion()
-        found.size = lib.md_port_carry_out(self.c, exchange.c, not_before_ns, expires_ns, found.c)
+        found = into if into is not None and into.room == exchange.room else Completion(room=exchange.room)
+        found.count = lib.md_port_carry_out(
+            self.c, exchange.c, not_before_ns, expires_ns, found.c, found.values
+        )
         return found

@@ -46,7 +46,6 @@ class Exchanges:
         self._peers = Peers(line)
         self._answered_on: dict[Drive, object] = {}  # the open port on which it answered last
         self._prepared: dict[Drive, PreparedReads] = {}
-        self._spare: list[Completion] = []  # of reads whose data was taken
 
     # ---- the drives ----
 
@@ -100,29 +99,32 @@ class Exchanges:
         Raises NoValue where a register has none.
         """
         prepared = self._prepare(drive)
-        reads, names = prepared.of(tuple(registers))
+        plan = prepared.newest
+        if plan.registers is not registers:
+            plan = prepared.newest = prepared.of(tuple(registers))
         found: dict[str, Any] = {}
-        wanted = list(reads)
+        wanted = [*plan.reads]
         while wanted:
             read = wanted.pop()
             parts = prepared.parts.get(read.block) if prepared.parts else None
             if parts is None:
-                exchange = read.exchange
-                if insists:
-                    exchange = make_read(drive, read.block, exchange.peer, insists=True, timeout=timeout)
+                exchange = read.insisting(drive, timeout) if insists else read.exchange
                 try:
-                    into = self._spare.pop()
+                    into = read.spare.pop()
                 except IndexError:
-                    into = Completion()
+                    into = None
                 try:  # a read that goes well takes few calls: see Completion
                     reply = self._peers.carry_out(drive, exchange, into=into)
-                    if reply.size < 0:
+                    if reply.count < 0:
                         reply = self._good(drive, exchange, attempts, self._settled(drive, exchange, reply))
+                    values = read.decode(reply)
+                    read.spare.append(reply)
                     self._answered_on[drive] = self.line.queue
-                    found |= read.decode(reply)
-                    self._spare.append(reply)
                     if read.may_be_too_long:
                         prepared.answered.add(read.block)
+                    if plan.is_one and reply.count == read.whole:
+                        return values
+                    found |= values
                     continue
                 except PortLost as failure:
                     self._check_held_back(drive, failure)
@@ -134,8 +136,8 @@ class Exchanges:
                 prepared.parts[read.block] = parts
             wanted += [prepared.prepare(part) for part in reversed(parts)]
         if None in found.values():
-            raise no_value(drive, {name: found[name] for name in names})
-        return found if tuple(found) == names else {name: found[name] for name in names}
+            raise no_value(drive, {name: found[name] for name in plan.names})
+        return {name: found[name] for name in plan.names}
 
     def _parts(
         self, drive: Drive, prepared: PreparedReads, read: PreparedRead, failure: Exception
@@ -224,7 +226,7 @@ class Exchanges:
 
     def _good(self, drive: Drive, exchange: Exchange, attempts: int, completion: Completion) -> Completion:
         """Return the good reply to a read that was sent once, and is sent again where it is lost."""
-        while completion.size < 0:
+        while completion.count < 0:
             attempts -= 1
             self._note_answer(drive, completion)
             try:
@@ -272,7 +274,7 @@ class Exchanges:
         except PortLost as failure:
             self._check_held_back(drive, failure)
             raise
-        return completion if completion.size >= 0 else self._settled(drive, made, completion, expires_ns)
+        return completion if completion.count >= 0 else self._settled(drive, made, completion, expires_ns)
 
     def _check_held_back(self, drive: Drive, failure: PortLost) -> None:
         """Raise NotMaster where the port is not opened again because this process is not its master."""

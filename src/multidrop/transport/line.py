@@ -225,7 +225,7 @@ class Line:
 
         `into` is the completion to fill in, where nobody looks at it any more.
         """
-        if self.queue and self._opened.bridge and self._opened.settings != exchange.settings:
+        if self._opened.bridge and self.queue and self._opened.settings != exchange.settings:
             self.require(exchange.settings)
         self._callers.append(None)  # before the port is looked at: `drop` then waits for this thread
         try:
@@ -233,7 +233,7 @@ class Line:
             if core is None:
                 raise self._closed()
             found = core.carry_out(exchange, not_before_ns, expires_ns, into)
-            is_lost = found.size < 0 and is_lost_by(found.result, core)
+            is_lost = found.count < 0 and is_lost_by(found.result, core)
             if self.mastership is not None:
                 self.note_foreign()
         finally:

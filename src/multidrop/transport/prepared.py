@@ -6,7 +6,7 @@ from functools import lru_cache
 from typing import Any, NamedTuple
 
 from multidrop import core
-from multidrop.core import Exchange, Message, Peer
+from multidrop.core import Completion, Exchange, Message, Peer
 from multidrop.drive.family import Drive
 from multidrop.drive.own import check_own
 from multidrop.drive.register import Register
@@ -52,17 +52,34 @@ class PreparedRead:
     """A block of one drive's registers, the exchange that reads it, and what its reply's data means."""
 
     def __init__(self, drive: Drive, block: Block, peer: Peer) -> None:
+        decoder = decoder_of(block)
         self.block = block
-        self.exchange = make_read(drive, block, peer)
+        self.exchange = make_read(drive, block, peer, values=decoder.layout)
         self.may_be_too_long = may_be_too_long(drive, block)
-        self.decode = decoder_of(block).decode
+        self.decode = decoder.decode
+        self.names = decoder.names
+        self.whole = decoder.count if decoder.is_plain else None  # values of a reply that lacks none
+        self.spare: list[Completion] = []  # whose values were taken
+
+    def insisting(self, drive: Drive, timeout: float) -> Exchange:
+        """Return an exchange that insists, and reads the same."""
+        peer, values = self.exchange.peer, self.exchange.values
+        return make_read(drive, self.block, peer, values=values, insists=True, timeout=timeout)
 
 
 class ReadPlan(NamedTuple):
-    """Reads of a set of registers, the last one first, and the registers' names as they were asked for."""
+    """Reads of a set of registers, the last one first, and the registers' names as they were asked for.
 
+    `is_one`: there is but one read, which has the names in that order.
+    """
+
+    registers: tuple[Register[Any], ...]
     reads: tuple[PreparedRead, ...]
     names: tuple[str, ...]
+    is_one: bool
+
+
+NOTHING = ReadPlan((), (), (), False)
 
 
 class PreparedReads:
@@ -80,9 +97,12 @@ class PreparedReads:
             for register in registers:
                 check_own(drive, register)
             reads = tuple(prepare(block) for block in reversed(blocks(drive, registers)))
-            return ReadPlan(reads, tuple(register.name for register in registers))
+            names = tuple(register.name for register in registers)
+            is_one = len(reads) == 1 and reads[0].names == names
+            return ReadPlan(registers, reads, names, is_one)
 
         self.of = of
+        self.newest = NOTHING  # the plan that was used last: found again without a look at each register
         self.prepare = prepare
         self.parts: dict[Block, tuple[Block, ...]] = {}  # of blocks that the drive does not answer as a whole
         self.answered: set[Block] = set()  # blocks that may have been too long, and are not
