@@ -174,7 +174,7 @@ class Bus:
         finally:
             self._is_closed = True
             overruns = self.line.overruns()
-            self.line.close()
+            self._exchanges.close()
             self._meter.freeze(overruns)
             self._records.close()
             self._attached.free()

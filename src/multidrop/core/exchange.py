@@ -67,6 +67,11 @@ class Peer:
         return int(self.c.late_until_ns)
 
     @property
+    def owes(self) -> bool:
+        """True while replies to earlier requests may still come, on however slow a path."""
+        return bool(self.c.owed_count)
+
+    @property
     def answered_ns(self) -> int:
         """About the time of its newest reply; 0 before the first one."""
         return int(self.c.answered_ns)

@@ -5,15 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from multidrop.core import (
-    Completion,
-    Exchange,
-    Failure,
-    Message,
-    Peer,
-    Permit,
-    build_request,
-)
+from multidrop.core import Completion, Exchange, Failure, Message, Peer, Permit, build_request
 from multidrop.drive.family import Drive
 from multidrop.drive.register import Register
 from multidrop.drive.request import any_read
@@ -52,6 +44,10 @@ class Exchanges:
     def add(self, drive: Drive) -> None:
         """Begin to know a drive; one that comes back is known from before."""
         self._peers.add(drive)
+
+    def close(self) -> None:
+        """Close the line; what its drives owe is left to whoever opens the port again."""
+        self._peers.close()
 
     def remember(self, before: Exchanges) -> None:
         """Know all drives that were known before on the same line."""
@@ -284,9 +280,9 @@ class Exchanges:
     def _settled(
         self, drive: Drive, made: Exchange, completion: Completion, expires_ns: int = 0
     ) -> Completion:
-        """Wait once until late answers, if any come, come in order; then the core asks for a proof.
+        """Wait once until late answers come in order, or it expires; then the core asks for a proof.
 
-        It waits no longer than until `expires_ns`. Raises NotMaster.
+        Raises NotMaster.
         """
         if completion.result == Failure.LATE_ANSWER_DUE:
             wait_ns = completion.late_until_ns - clock.now_ns()

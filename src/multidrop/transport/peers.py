@@ -10,7 +10,7 @@ from multidrop.drive.own import check_drive
 from multidrop.errors import NotAttached
 from multidrop.planning.bus_time import silence
 from multidrop.planning.proofs import proofs
-from multidrop.transport import clock
+from multidrop.transport import clock, former_peers
 from multidrop.transport.line import Line
 from multidrop.transport.prepared import NO_ROWS, make_exchange
 
@@ -25,7 +25,8 @@ class Peers:
         self._line = line
         self.present: dict[Drive, Peer] = {}  # of the drives that are on the line now
         self._asked: dict[object, Peer] = {}  # by threads, each with a key of its own
-        self._known: dict[tuple[object, ...], Peer] = {}  # by what they are; also of those that left
+        # By address, and what else they are; also of those that left.
+        self._known: dict[tuple[int, *tuple[object, ...]], Peer] = {}
 
     def add(self, drive: Drive) -> None:
         """Begin to know a drive; one that comes back is known from before.
@@ -47,6 +48,8 @@ class Peers:
         for other, known in self._known.items():
             if other[0] == drive.address and known is not peer:
                 self._line.inherit(peer, known)
+        for former in former_peers.left_at(self._names(), drive.address):
+            self._line.inherit(peer, former)
 
     def _new(self, drive: Drive, least: float) -> Peer:
         peer = Peer(least_timeout=least, most_timeout=drive.response_timeout, interval=drive.least_interval)
@@ -56,6 +59,15 @@ class Peers:
             [make_exchange(drive, block.request, peer, NO_ROWS, answer=answer) for block, answer in found]
         )
         return peer
+
+    def close(self) -> None:
+        """Close the line; what its drives owe is left to whoever opens the port again."""
+        names = self._names()
+        self._line.close()
+        former_peers.leave(names, [(address, peer) for (address, *_), peer in self._known.items()])
+
+    def _names(self) -> set[str]:
+        return former_peers.names_of(self._line.identity, self._line.port)
 
     def remember(self, before: Peers) -> None:
         """Know all drives that were known before on the same line."""

@@ -1,0 +1,127 @@
+"""Former peers: a port is closed while replies are on their way, and opened again."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+from lines import line, plant, polled, rows_of, until
+from toy import Toy
+
+from multidrop import Bus, NoReply, Poller
+from multidrop.sim import SimulatedDrive, Simulator, Wire, simulated
+from multidrop.transport import former_peers
+
+
+class Quick(Toy):
+    """It is given up soon."""
+
+    response_timeout = 0.05
+
+
+class Successor(Quick):
+    """Another family."""
+
+    model = "successor"
+
+
+class HoldingWire(Wire):
+    """A path that keeps the next reply, once `holds`, until the one after it."""
+
+    holds = False
+    _kept = b""
+
+    def distort(self, reply: bytes) -> bytes:
+        if self.holds:
+            self.holds = False
+            self._kept = reply
+            return b""
+        kept, self._kept = self._kept, b""
+        return kept + reply
+
+
+@pytest.fixture
+def sim() -> SimulatedDrive:
+    sim = simulated(Quick(1))
+    sim["output_current"], sim["mystery"] = 1.11, 7777
+    return sim
+
+
+@pytest.fixture
+def wire(sim: SimulatedDrive) -> Iterator[HoldingWire]:
+    wire = HoldingWire([sim], unpaced=True)
+    with Simulator([wire]):
+        yield wire
+
+
+def leave_a_reply_behind(wire: HoldingWire, port: str) -> None:
+    """Close a bus whose drive has yet to answer what it was asked."""
+    with Bus(port) as bus:
+        pump = bus.attach(Quick, 1)
+        assert bus.read(pump, Quick.output_current) == 1.11
+        wire.holds = True
+        with pytest.raises(NoReply):
+            bus._exchanges.values(pump, [Quick.mystery], 1)
+        assert bus.peer(pump).owes
+
+
+@pytest.mark.parametrize("family", [Quick, Successor])
+def test_a_port_that_is_opened_again_gives_no_value_of_another_register(
+    wire: HoldingWire, family: type[Toy]
+) -> None:
+    leave_a_reply_behind(wire, wire.path)
+    with Bus(wire.path) as bus:
+        pump = bus.attach(family, 1)
+        assert bus.peer(pump).owes
+        assert bus.read(pump, family.output_current) == 1.11
+        assert bus.peer(pump).late == 1
+
+
+def test_a_poller_that_opens_it_again_gives_none_either(wire: HoldingWire) -> None:
+    leave_a_reply_behind(wire, wire.path)
+    drive = Quick(1, name="pump")
+    values: set[float] = set()
+    with Poller(plant(line(wire.path, polled(drive, [Quick.output_current])))) as poller:
+        until(lambda: values.update(row.value for row in rows_of(poller) if row.value is not None) or values)
+    assert values == {1.11}
+
+
+def test_another_way_to_spell_the_port_is_the_same_port(wire: HoldingWire, tmp_path: Path) -> None:
+    link = tmp_path / "hall"
+    link.symlink_to(wire.path)
+    leave_a_reply_behind(wire, str(link))
+    with Bus(wire.path) as bus:
+        assert bus.peer(bus.attach(Quick, 1)).owes
+
+
+def test_a_pseudo_terminal_of_the_same_number_is_another_port() -> None:
+    def made() -> set[str]:
+        ours, theirs = os.openpty()
+        try:
+            return former_peers.names_of(os.ttyname(theirs))
+        finally:
+            os.close(theirs)
+            os.close(ours)
+
+    first = made()
+    until(lambda: made() != first)  # their times are some ms apart, and less than any time-out
+
+
+def test_what_nobody_owes_is_not_kept(wire: HoldingWire) -> None:
+    before = dict(former_peers._former)
+    with Bus(wire.path) as bus:
+        bus.read(bus.attach(Quick, 1), Quick.output_current)
+    assert former_peers._former == before
+
+
+def test_it_is_forgotten_as_the_core_forgets_it(wire: HoldingWire, monkeypatch: pytest.MonkeyPatch) -> None:
+    leave_a_reply_behind(wire, wire.path)
+    names = former_peers.names_of(wire.path)
+    assert names <= former_peers._former.keys()
+    now_ns = former_peers.clock.now_ns
+    later: Callable[[], int] = lambda: now_ns() + former_peers.KEPT_NS  # noqa: E731
+    monkeypatch.setattr(former_peers.clock, "now_ns", later)
+    former_peers.leave(["elsewhere"], [])
+    assert not names & former_peers._former.keys()
