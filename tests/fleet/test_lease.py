@@ -361,6 +361,56 @@ def test_who_was_cut_off_itself_ends_nobody_for_what_it_saw_meanwhile() -> None:
     asyncio.run(main())
 
 
+def test_what_was_over_stays_over_for_who_was_cut_off_itself() -> None:
+    """Else it counts a dead gateway among the living for a while, and gives lines away to it."""
+
+    async def main() -> None:
+        trial = Trial()
+        lease, observer = trial.lease(), trial.observer()
+        assert await lease.try_to_begin()
+        await look(observer)
+        trial.clock.pass_s(USUAL.lease / SECOND)
+        await look(observer)
+        assert await observer.end_the_dead()
+        await observer.end_the_dead()
+        trial.clock.pass_s(60)
+        observer.begin_anew()
+        await look(observer)
+        assert observer.is_over("a", 1)
+        assert observer.sessions() == {}
+        second = trial.lease()
+        assert not await second.try_to_begin()  # others wrote the end, and it did not see for how long
+        trial.clock.pass_s(USUAL.lease / SECOND)
+        assert await second.try_to_begin()
+        await look(observer)
+        assert not observer.is_over("a", second.session)
+        assert observer.sessions().keys() == {"a"}
+
+    asyncio.run(main())
+
+
+def test_what_others_ended_unseen_is_not_over_for_who_was_cut_off() -> None:
+    """Its last renewal may have been a moment ago."""
+
+    async def main() -> None:
+        trial = Trial()
+        lease, observer = trial.lease(), trial.observer()
+        assert await lease.try_to_begin()
+        await look(observer)
+        await observer.end_the_dead()
+        trial.clock.pass_s(60)
+        for bucket in trial.buckets:
+            bucket.store("a", {**bucket.records["a"].value, "ended": True, "by": "rogue"})
+        await look(observer)  # its last renewal that was seen is long past
+        observer.begin_anew()
+        await observer.end_the_dead()
+        assert not observer.is_over("a", 1)
+        trial.clock.pass_s(USUAL.lease / SECOND)
+        assert observer.is_over("a", 1)
+
+    asyncio.run(main())
+
+
 def test_who_gets_no_answer_judges_nobody() -> None:
     """The server that it reads from may stand still, while the leases are renewed by others."""
 
