@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from controlled_loop import run_controlled
 from fleets import HandClock, MemoryBucket, NotedMastership
 from peers import require_module
 
@@ -409,6 +410,43 @@ def test_what_others_ended_unseen_is_not_over_for_who_was_cut_off() -> None:
         assert observer.is_over("a", 1)
 
     asyncio.run(main())
+
+
+def test_a_look_tells_when_a_session_may_be_ended_and_when_it_has_ended() -> None:
+    async def main() -> None:
+        trial = Trial()
+        lease, observer = trial.lease(), trial.observer()
+        assert await lease.try_to_begin()
+        assert [await observer.look(path) for path in range(3)] == [False, False, False]
+        await renew(lease)
+        assert [await observer.look(path) for path in range(3)] == [False, False, False]
+        trial.clock.pass_s(USUAL.lease / SECOND)
+        assert [await observer.look(path) for path in range(3)] == [False, True, True]  # two are enough
+        await observer.end_the_dead()
+        assert [await observer.look(path) for path in range(3)] == [False, False, False]
+        other = trial.observer("c")
+        assert [await other.look(path) for path in range(3)] == [True, True, True]
+
+    asyncio.run(main())
+
+
+@pytest.mark.parametrize(
+    ("since_s", "rests_s"), [(0.0, 0.1), (2.2, 0.1), (2.27, 0.03), (2.3, 0.1), (60.0, 0.1)]
+)
+def test_who_may_be_dead_is_looked_at_in_that_very_moment(since_s: float, rests_s: float) -> None:
+    async def main() -> None:
+        loop = asyncio.get_running_loop()
+        trial = Trial()
+        assert await trial.lease().try_to_begin()
+        buckets: Any = trial.buckets
+        observer = Observer("b", buckets, USUAL, lambda: round(loop.time() * SECOND))
+        await observer.look(0)
+        await asyncio.sleep(since_s)
+        begun = loop.time()
+        await observer.rest(0)
+        assert loop.time() - begun == pytest.approx(rests_s, abs=1e-6)
+
+    run_controlled(main())
 
 
 def test_who_gets_no_answer_judges_nobody() -> None:

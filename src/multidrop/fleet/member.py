@@ -42,7 +42,8 @@ from multidrop.fleet.task_end import end_tasks
 _log = logging.getLogger("multidrop.fleet")
 
 GUARD_LOOK_S = 0.02
-STEP_S = 0.05
+STEP_S = 0.05  # between steps; at once where records have changed
+LEAST_STEP_S = 0.01  # between any two
 TIDY_NS = SECOND // 2  # between looks at all lines of the share, where nothing is known to have changed
 SETTLE_S = 3.0
 HOME_S = 1.0
@@ -73,9 +74,12 @@ class Member:
         self.paths = paths
         self.mastership = mastership
         self.is_draining = False
-        own = [LeaseBucket(bucket, partial(self._path, at), name) for at, bucket in enumerate(names.LEASES)]
+        own = [
+            LeaseBucket(bucket, partial(paths.__getitem__, at), name)
+            for at, bucket in enumerate(names.LEASES)
+        ]
         self.lease = Lease(name, own, mastership, lock=lock, terms=terms, note=self._note)
-        self.records = ShareRecords(name, self.best, terms, self._mark_dirty, self._is_mine)
+        self.records = ShareRecords(name, self.best, terms, self._wake, self._is_mine)
         self.keeper = LineKeeper(lines, self.lease, self.records, self._mark_dirty)
         self.own_machine = OwnMachine()
         self._shares = Shares()
@@ -83,6 +87,7 @@ class Member:
         self._releases = Releases(self.best, self._mark_dirty)
         self._settled_at = 0
         self._is_dirty = True
+        self._woken = asyncio.Event()
         self._was_valid = False
         self._is_too_weak = False
         self._stepped: tuple[Any, ...] = ()
@@ -117,9 +122,6 @@ class Member:
     def _is_settled(self) -> bool:
         return self.lease.clock() >= self._settled_at
 
-    def _path(self, number: int) -> ServerPath:
-        return self.paths[number]
-
     def best(self) -> ServerPath:
         """Return the path whose lease was renewed last; before there is a lease, any open path."""
         path = self.paths[self.lease.best]
@@ -127,6 +129,11 @@ class Member:
 
     def _mark_dirty(self) -> None:
         self._is_dirty = True
+
+    def _wake(self) -> None:
+        """Take the next step at once."""
+        self._is_dirty = True
+        self._woken.set()
 
     def drain(self) -> None:
         """Give all lines away, and take none from now on."""
@@ -140,11 +147,8 @@ class Member:
             "draining": self.is_draining,
             "avoids": [*self.own_machine.avoided],
             "lines": len(self.polled),
-            "margin_ms": self._margin_ms(),
+            "margin_ms": max(0, round(1000 * self.lease.left_s)),
         }
-
-    def _margin_ms(self) -> int:
-        return max(0, round(1000 * self.lease.left_s))
 
     # ---- life ----
 
@@ -192,8 +196,11 @@ class Member:
             elif self._is_too_weak:
                 _log.warning("%s: session %d lost a path; a new one begins", self.name, self.lease.session)
                 await self._begin_anew()
+            self._woken.clear()
             await self.step()
-            await asyncio.sleep(STEP_S)
+            await asyncio.sleep(LEAST_STEP_S)
+            with suppress(TimeoutError):
+                await asyncio.wait_for(self._woken.wait(), STEP_S - LEAST_STEP_S)
 
     async def _begin_anew(self) -> None:
         await self._leave()

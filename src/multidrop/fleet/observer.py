@@ -21,7 +21,8 @@ from multidrop.fleet.task_end import end_tasks
 
 BELIEVING = lease_rules.USUAL._replace(lease=0, guard=0)  # for who only looks: every end counts at once
 
-ENDING_S = 0.25  # for the answers, when a session is ended
+LOOK_S = 0.1  # between looks at a path: the silence of a dead gateway's lines is longer by it
+ENDING_S = 0.1  # for the answers, when a session is ended; later ones are read
 
 _log = logging.getLogger("multidrop.fleet")
 
@@ -50,12 +51,23 @@ class Observer:
         for seen in self._watched:
             seen.update({name: one._replace(since=now) for name, one in seen.items()})
 
-    async def look(self, path: int) -> None:
-        """Read what changed on a path. Raises FleetError where it is not reached."""
+    async def look(self, path: int) -> bool:
+        """Read what changed on a path. Raises FleetError where it is not reached.
+
+        Return True where a session has ended, or may be ended now.
+        """
         begun = self._clock()
-        for record in await self.paths[path].look():
+        found = await self.paths[path].look()
+        for record in found:
             self._note(path, record)
         self._looked[path] = begun
+        return any(record.value and record.value["ended"] for record in found) or bool(self.dead())
+
+    async def rest(self, path: int) -> None:
+        """Wait until the next look: until a record may be stale, if that comes first."""
+        begins = self._clock() - self.terms.lease
+        due = ((one.since - begins) / lease_rules.SECOND for one in self._watched[path].values())
+        await asyncio.sleep(min([LOOK_S, *(left for left in due if left > 0)]))
 
     def _note(self, path: int, record: Record) -> None:
         watched = self._watched[path]
