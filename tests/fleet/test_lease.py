@@ -106,6 +106,30 @@ def test_one_path_that_is_down_costs_nothing_and_two_cost_the_lease() -> None:
     asyncio.run(main())
 
 
+def test_a_renewal_that_failed_is_tried_again_soon() -> None:
+    """Where a bucket gets a leader, nothing is waited for any more."""
+
+    async def main() -> None:
+        loop = asyncio.get_running_loop()
+        trial = Trial()
+        lease = trial.lease()
+        assert await lease.try_to_begin()
+        lease.clock = lambda: round(loop.time() * SECOND)
+        tried: list[float] = []
+        begun = loop.time()
+        trial.buckets[0].before_put = lambda key: tried.append(round(loop.time() - begun, 3))
+        renewing = asyncio.create_task(lease.renew(0))
+        await asyncio.sleep(0.7)
+        trial.buckets[0].is_down = True
+        await asyncio.sleep(0.55)
+        trial.buckets[0].is_down = False
+        await asyncio.sleep(0.8)
+        renewing.cancel()
+        assert tried == [0.0, 0.5, 1.0, 1.1, 1.2, 1.3, 1.8]
+
+    run_controlled(main())
+
+
 def test_a_renewal_without_an_answer_is_found_again_and_not_counted() -> None:
     async def main() -> None:
         trial = Trial()
