@@ -46,6 +46,7 @@ STEP_S = 0.05  # between steps; at once where records have changed
 LEAST_STEP_S = 0.01  # between any two
 TIDY_NS = SECOND // 2  # between looks at all lines of the share, where nothing is known to have changed
 SETTLE_S = 3.0
+SOUND_S = 1.0  # of our lease, to end others': where less is left the servers may fail all of us alike
 HOME_S = 1.0
 WEAK_NS = 10 * SECOND  # from the end of settling on, before a session that lost a path is given up
 
@@ -190,21 +191,16 @@ class Member:
                 self._shares.begin_anew()
                 self._is_dirty = True
                 _log.info("%s: session %d began", self.name, self.lease.session)
-            elif self.lease.is_over:
-                _log.warning("%s: session %d is over", self.name, self.lease.session)
-                await self._begin_anew()
-            elif self._is_too_weak:
-                _log.warning("%s: session %d lost a path; a new one begins", self.name, self.lease.session)
-                await self._begin_anew()
+            elif self.lease.is_over or self._is_too_weak:
+                what = "is over" if self.lease.is_over else "lost a path; a new one begins"
+                _log.warning("%s: session %d %s", self.name, self.lease.session, what)
+                await self._leave()
+                self._is_dirty, self._is_too_weak = True, False
             self._woken.clear()
             await self.step()
             await asyncio.sleep(LEAST_STEP_S)
             with suppress(TimeoutError):
                 await asyncio.wait_for(self._woken.wait(), STEP_S - LEAST_STEP_S)
-
-    async def _begin_anew(self) -> None:
-        await self._leave()
-        self._is_dirty, self._is_too_weak = True, False
 
     async def _guard(self) -> None:
         """Close the lines before the lease has run out; only then is the kernel's timer called off."""
@@ -260,7 +256,7 @@ class Member:
         elif not self._was_valid:
             self._was_valid = True
             observer.begin_anew()
-        elif await observer.end_the_dead(present):
+        elif self.lease.left_s > SOUND_S and await observer.end_the_dead(present):
             present = observer.sessions()
         await self._share_out(present)
         sessions = tuple((name, value["session"]) for name, value in present.items())
