@@ -96,7 +96,7 @@ class Node:
             others = ", ".join(f"nats://{route}" for route in routes)
             group = f"fleet-{routes[0].replace(':', '-')}"
             text += f"cluster {{ name: {group}, listen: {self.host}:{cluster}, routes: [{others}]\n"
-            text += f"  {PINGS} }}\n"
+            text += f"  {PINGS if _version(program) >= OLDEST else ''} }}\n"
         (folder / f"{name}.conf").write_text(text)
         self.start()
 

@@ -29,6 +29,7 @@ from multidrop.fleet.leaders import bring_leaders_home, have_leaders
 from multidrop.fleet.lease import Lease, MayPoll
 from multidrop.fleet.lease_bucket import LeaseBucket
 from multidrop.fleet.lease_rules import SECOND, USUAL, Terms
+from multidrop.fleet.lease_terms import LeaseTerms
 from multidrop.fleet.life_lock import LifeLock
 from multidrop.fleet.line_keeper import LineKeeper, Lines, TakenLine
 from multidrop.fleet.own_machine import OwnMachine, avoided_by
@@ -89,8 +90,7 @@ class Member:
         self._settled_at = 0
         self._is_dirty = True
         self._woken = asyncio.Event()
-        self._was_valid = False
-        self._is_too_weak = False
+        self._was_valid = self._is_too_weak = False
         self._stepped: tuple[Any, ...] = ()
 
     # ---- what others ask ----
@@ -223,12 +223,14 @@ class Member:
             await self.own_machine.look(self.paths, self.best())
 
     async def _home(self) -> None:
-        """Bring leaders home; one gateway does it, the first by name."""
+        """Keep leaders ahead, and bring them home; one gateway does it, the first by name."""
+        terms = LeaseTerms()
         while True:
             await asyncio.sleep(HOME_S)
             await self._look_at_own_machine()
             if self.lease.is_valid and min(self.records.observer.sessions(), default="") == self.name:
                 with suppress(FleetError):
+                    await terms.keep_ahead(self.best())
                     await bring_leaders_home(self.best())
 
     async def _watch_strength(self) -> None:
