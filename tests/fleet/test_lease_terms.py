@@ -26,6 +26,8 @@ class Servers:
         self.leaders = dict(zip(names.LEASES, SERVERS, strict=True))
         self.terms = dict.fromkeys(names.LEASES, 1)
         self.silent: set[str] = set()
+        self.unheard_ns = 0  # never, by this leader
+        self.lagging: set[str] = set()
         self.stuck: set[str] = set()  # buckets that nobody leads after they were handed over
         self.under_way = 0
         self.now = 0.0
@@ -46,7 +48,15 @@ class Servers:
             self.leaders[bucket] = "" if bucket in self.stuck else data["placement"]["preferred"]
             self.terms[bucket] += 1
             return {}
-        peers = [{"name": one, "current": one not in self.silent} for one in SERVERS if one != leader]
+        peers = [
+            {
+                "name": one,
+                "current": not {one} & (self.silent | self.lagging),
+                "active": self.unheard_ns if one in self.silent else 700_000_000,
+            }
+            for one in SERVERS
+            if one != leader
+        ]
         return {"cluster": {"leader": leader, "replicas": peers}}
 
     def pass_s(self, seconds: int) -> None:
@@ -68,6 +78,21 @@ def servers(monkeypatch: pytest.MonkeyPatch) -> Servers:
 def test_nothing_is_handed_over_while_all_servers_are_there(servers: Servers) -> None:
     servers.pass_s(100)
     assert set(servers.terms.values()) == {1}
+
+
+def test_nothing_is_handed_over_for_a_server_that_lags(servers: Servers) -> None:
+    servers.lagging = {"n3"}
+    servers.pass_s(10)
+    assert set(servers.terms.values()) == {1}
+
+
+@pytest.mark.parametrize(("unheard_ns", "is_due"), [(1_900_000_000, False), (2_100_000_000, True), (0, True)])
+def test_a_server_is_silent_when_it_was_not_heard_for_two_heartbeats(
+    servers: Servers, unheard_ns: int, is_due: bool
+) -> None:
+    servers.silent, servers.unheard_ns = {"n3"}, unheard_ns
+    servers.pass_s(1)
+    assert (servers.terms[names.LEASES[0]] > 1) is is_due
 
 
 def test_terms_grow_faster_than_a_silent_server_can_ask_for_votes(servers: Servers) -> None:

@@ -23,6 +23,7 @@ from multidrop.fleet.servers import ServerPath
 from multidrop.fleet.task_end import end_tasks
 
 EVERY_S = 3.0  # less than the shortest time between two requests for votes
+SILENT_NS = 2_000_000_000  # a follower answers its leader's heartbeat once a second
 FOR_S = 60.0  # a server that is silent for longer is not waited for
 DONE_S = 1.0  # it takes 0.03 to 0.3 s
 LOOK_S = 0.02
@@ -43,10 +44,10 @@ class LeaseTerms:
         try:
             for look in asyncio.as_completed(looks):
                 bucket, cluster = await look
-                peers = [peer["name"] for peer in cluster.get("replicas", [])]
-                ready = [peer for peer in peers if is_ready(peer, cluster)]
+                peers = cluster.get("replicas", [])
+                ready = [peer["name"] for peer in peers if is_ready(peer["name"], cluster)]
                 found += bool(cluster.get("leader"))
-                if cluster.get("leader") and len(ready) < len(peers):
+                if cluster.get("leader") and any(map(is_silent, peers)):
                     has_silent = True
                     if ready and self._is_due(bucket) and not await _hand_over(path, bucket, ready[0]):
                         return
@@ -63,6 +64,11 @@ class LeaseTerms:
             return False
         self._handed_at[bucket] = now
         return True
+
+
+def is_silent(peer: Mapping[str, Any]) -> bool:
+    """Say whether a follower was not heard for long, or never; one that lags is heard."""
+    return not peer.get("current") and not 0 < peer.get("active", 0) < SILENT_NS
 
 
 async def _cluster(path: ServerPath, bucket: str) -> tuple[str, Mapping[str, Any]]:
