@@ -15,8 +15,14 @@ require_module("nats")
 
 from nats.aio.client import Client  # noqa: E402
 
-from multidrop.fleet import batch_client, servers  # noqa: E402
-from multidrop.fleet.batch_client import BatchClient, DirectMessage, Request, stored_message  # noqa: E402
+from multidrop.fleet import batch_client, direct_gets  # noqa: E402
+from multidrop.fleet.batch_client import (  # noqa: E402
+    BatchClient,
+    DirectGet,
+    DirectMessage,
+    Request,
+    stored_message,
+)
 from multidrop.fleet.buckets import Bucket, Record  # noqa: E402
 from multidrop.fleet.errors import Unsure  # noqa: E402
 from multidrop.fleet.servers import ServerPath, connect, paths_of  # noqa: E402
@@ -165,9 +171,9 @@ def test_a_request_without_an_answer_is_told_from_those_that_have_one(one: Clust
         assert found[2] is not None
         assert found[2].startswith(b"{")
         with pytest.raises(TimeoutError, match=r"nothing came for 0.2 s"):
-            await client.batch(mute, 0.2)
+            await client.batch(mute, DirectGet(), 0.2)
         with pytest.raises(OSError, match="it ended with 503"):
-            await client.batch(nobody, 5.0)
+            await client.batch(nobody, DirectGet(), 5.0)
         assert client._takers == {}
         await deaf.unsubscribe()
         await client.close()
@@ -175,14 +181,14 @@ def test_a_request_without_an_answer_is_told_from_those_that_have_one(one: Clust
     asyncio.run(main())
 
 
-@pytest.mark.parametrize(("deaf_to", "is_told"), [(0, True), (1, True), (2, True), (3, False)])
+@pytest.mark.parametrize(("deaf_to", "is_told"), [(0, True), (1, True), (4, True), (5, False)])
 def test_what_a_server_that_is_cut_off_got_is_asked_again(
     one: Cluster, monkeypatch: pytest.MonkeyPatch, deaf_to: int, is_told: bool
 ) -> None:
-    monkeypatch.setattr(servers, "COLLECT_S", (0.1, 0.1))
-    monkeypatch.setattr(servers, "ANSWER_S", 5.0 if is_told else 0.1)
+    monkeypatch.setattr(direct_gets, "AGAIN_S", (0.1,) * 4 + (30.0 if is_told else 0.1,))
 
     async def work(path: ServerPath) -> None:
+        path.others = []
         other = await connect(one.urls[0], {})
         asked: list[str] = []
 
@@ -200,12 +206,33 @@ def test_what_a_server_that_is_cut_off_got_is_asked_again(
         if is_told:
             assert await path.collect("moody", b"") == []
         else:
-            with pytest.raises(Unsure, match=r"nothing came for 0.1 s"):
+            with pytest.raises(Unsure, match="nothing came to moody"):
                 await path.collect("moody", b"")
         assert len(asked) > deaf_to or not is_told
         await other.close()
 
     _with_path(one, work)
+
+
+def test_a_path_whose_server_is_cut_off_has_its_questions_asked_by_the_others(one: Cluster) -> None:
+    async def main() -> None:
+        paths = paths_of(one.urls)
+        await asyncio.gather(*(path.open() for path in paths))
+        asked: list[Request] = []
+
+        async def swallow(request: Request, get: DirectGet, silence_s: float) -> None:
+            asked.append(request)
+            await asyncio.Event().wait()
+
+        deaf = paths[0]._client
+        assert deaf
+        deaf.batch = swallow  # type: ignore[method-assign]
+        bucket = Bucket("plant", lambda: paths[0])
+        assert await asyncio.wait_for(bucket.changes(0), 60) == []
+        assert asked
+        await asyncio.gather(*(path.close() for path in paths))
+
+    asyncio.run(main())
 
 
 @pytest.mark.usefixtures("way")

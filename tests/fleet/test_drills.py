@@ -96,3 +96,9 @@ def test_no_line_waits_for_an_election_where_a_gateway_dies_with_the_node_on_its
     assert machine_drill.hall.overlaps() == 0
     moved = [line for line, one in machine_drill.status()["lines"].items() if one != before[line]]
     assert moved
+
+
+def test_no_cut_of_a_whole_machine_makes_two_masters(machine_drill: MachineDrill) -> None:
+    machine_drill.settle()
+    machine_drill.judge(machine_drill.cut_machine)
+    assert machine_drill.hall.overlaps() == 0

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from controlled_loop import run_controlled
 from fleets import HandClock, MemoryBucket, NotedMastership
 from peers import require_module
 
@@ -103,6 +104,30 @@ def test_one_path_that_is_down_costs_nothing_and_two_cost_the_lease() -> None:
         assert lease.session == 1
 
     asyncio.run(main())
+
+
+def test_a_renewal_that_failed_is_tried_again_soon() -> None:
+    """Where a bucket gets a leader, nothing is waited for any more."""
+
+    async def main() -> None:
+        loop = asyncio.get_running_loop()
+        trial = Trial()
+        lease = trial.lease()
+        assert await lease.try_to_begin()
+        lease.clock = lambda: round(loop.time() * SECOND)
+        tried: list[float] = []
+        begun = loop.time()
+        trial.buckets[0].before_put = lambda key: tried.append(round(loop.time() - begun, 3))
+        renewing = asyncio.create_task(lease.renew(0))
+        await asyncio.sleep(0.7)
+        trial.buckets[0].is_down = True
+        await asyncio.sleep(0.55)
+        trial.buckets[0].is_down = False
+        await asyncio.sleep(0.8)
+        renewing.cancel()
+        assert tried == [0.0, 0.5, 1.0, 1.1, 1.2, 1.3, 1.8]
+
+    run_controlled(main())
 
 
 def test_a_renewal_without_an_answer_is_found_again_and_not_counted() -> None:
@@ -359,6 +384,93 @@ def test_who_was_cut_off_itself_ends_nobody_for_what_it_saw_meanwhile() -> None:
         assert observer.is_over("a", 1)
 
     asyncio.run(main())
+
+
+def test_what_was_over_stays_over_for_who_was_cut_off_itself() -> None:
+    """Else it counts a dead gateway among the living for a while, and gives lines away to it."""
+
+    async def main() -> None:
+        trial = Trial()
+        lease, observer = trial.lease(), trial.observer()
+        assert await lease.try_to_begin()
+        await look(observer)
+        trial.clock.pass_s(USUAL.lease / SECOND)
+        await look(observer)
+        assert await observer.end_the_dead()
+        await observer.end_the_dead()
+        trial.clock.pass_s(60)
+        observer.begin_anew()
+        await look(observer)
+        assert observer.is_over("a", 1)
+        assert observer.sessions() == {}
+        second = trial.lease()
+        assert not await second.try_to_begin()  # others wrote the end, and it did not see for how long
+        trial.clock.pass_s(USUAL.lease / SECOND)
+        assert await second.try_to_begin()
+        await look(observer)
+        assert not observer.is_over("a", second.session)
+        assert observer.sessions().keys() == {"a"}
+
+    asyncio.run(main())
+
+
+def test_what_others_ended_unseen_is_not_over_for_who_was_cut_off() -> None:
+    """Its last renewal may have been a moment ago."""
+
+    async def main() -> None:
+        trial = Trial()
+        lease, observer = trial.lease(), trial.observer()
+        assert await lease.try_to_begin()
+        await look(observer)
+        await observer.end_the_dead()
+        trial.clock.pass_s(60)
+        for bucket in trial.buckets:
+            bucket.store("a", {**bucket.records["a"].value, "ended": True, "by": "rogue"})
+        await look(observer)  # its last renewal that was seen is long past
+        observer.begin_anew()
+        await observer.end_the_dead()
+        assert not observer.is_over("a", 1)
+        trial.clock.pass_s(USUAL.lease / SECOND)
+        assert observer.is_over("a", 1)
+
+    asyncio.run(main())
+
+
+def test_a_look_tells_when_a_session_may_be_ended_and_when_it_has_ended() -> None:
+    async def main() -> None:
+        trial = Trial()
+        lease, observer = trial.lease(), trial.observer()
+        assert await lease.try_to_begin()
+        assert [await observer.look(path) for path in range(3)] == [False, False, False]
+        await renew(lease)
+        assert [await observer.look(path) for path in range(3)] == [False, False, False]
+        trial.clock.pass_s(USUAL.lease / SECOND)
+        assert [await observer.look(path) for path in range(3)] == [False, True, True]  # two are enough
+        await observer.end_the_dead()
+        assert [await observer.look(path) for path in range(3)] == [False, False, False]
+        other = trial.observer("c")
+        assert [await other.look(path) for path in range(3)] == [True, True, True]
+
+    asyncio.run(main())
+
+
+@pytest.mark.parametrize(
+    ("since_s", "rests_s"), [(0.0, 0.1), (2.2, 0.1), (2.27, 0.03), (2.3, 0.1), (60.0, 0.1)]
+)
+def test_who_may_be_dead_is_looked_at_in_that_very_moment(since_s: float, rests_s: float) -> None:
+    async def main() -> None:
+        loop = asyncio.get_running_loop()
+        trial = Trial()
+        assert await trial.lease().try_to_begin()
+        buckets: Any = trial.buckets
+        observer = Observer("b", buckets, USUAL, lambda: round(loop.time() * SECOND))
+        await observer.look(0)
+        await asyncio.sleep(since_s)
+        begun = loop.time()
+        await observer.rest(0)
+        assert loop.time() - begun == pytest.approx(rests_s, abs=1e-6)
+
+    run_controlled(main())
 
 
 def test_who_gets_no_answer_judges_nobody() -> None:

@@ -7,6 +7,8 @@ import json
 import ssl
 import subprocess
 import sys
+import time
+import urllib.request
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
@@ -20,7 +22,7 @@ require_module("nats")
 require_module("nkeys")
 require_module("pyarrow")
 
-from secured_clusters import GATEWAYS, SecuredCluster, certificates, secured_cluster  # noqa: E402
+from secured_clusters import GATEWAYS, SecuredCluster, SecuredNode, certificates, secured_cluster  # noqa: E402
 from secured_fleets import PATIENCE_S, SecuredFleet, multidrop, secured_fleet, until  # noqa: E402
 
 from multidrop.fleet import names  # noqa: E402
@@ -62,6 +64,24 @@ def told(servers: SecuredCluster, user: str, *words: str) -> str:
     lines = said.stderr.splitlines()
     assert len(lines) <= 2, lines  # `serve` tells of a denial when the server does, and then ends
     return lines[-1]
+
+
+def test_a_route_to_a_server_that_is_silent_is_left_soon(tmp_path: Path) -> None:
+    """By itself NATS takes a minute and more, and hands that server questions for so long."""
+
+    def routes(node: SecuredNode) -> int:
+        with urllib.request.urlopen(f"http://127.0.0.1:{node.monitor}/routez", timeout=5) as answer:
+            return int(json.load(answer)["num_routes"])
+
+    with secured_cluster(tmp_path, 2) as running:
+        one, other = running.nodes
+        until(lambda: routes(one) > 0, "there are routes")
+        begun = time.monotonic()
+        other.pause()
+        until(lambda: routes(one) == 0, "its routes are left")
+        assert time.monotonic() - begun < 30
+        other.go_on()
+        until(lambda: routes(one) > 0, "there are routes again")
 
 
 NO_RIGHT = "these credentials do not allow to "

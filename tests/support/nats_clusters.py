@@ -19,6 +19,8 @@ from typing import TypeVar
 from namespaces import Namespace
 from peers import require_program
 
+from multidrop.fleet.server_files import PINGS
+
 PATIENCE_S = 60.0
 ATTEMPTS = 4
 OLDEST = (2, 12)
@@ -93,7 +95,8 @@ class Node:
         if len(routes) > 1:
             others = ", ".join(f"nats://{route}" for route in routes)
             group = f"fleet-{routes[0].replace(':', '-')}"
-            text += f"cluster {{ name: {group}, listen: {self.host}:{cluster}, routes: [{others}] }}\n"
+            text += f"cluster {{ name: {group}, listen: {self.host}:{cluster}, routes: [{others}]\n"
+            text += f"  {PINGS if _version(program) >= OLDEST else ''} }}\n"
         (folder / f"{name}.conf").write_text(text)
         self.start()
 

@@ -100,15 +100,13 @@ class BatchClient(Client):
         self._batch_sid = 0
         self._subscribing = asyncio.Lock()
 
-    async def batch(self, request: Request, silence_s: float) -> list[DirectMessage]:
-        """Return what a direct get gives. Raises OSError for less than that, and what nats-py raises."""
-        batch = DirectGet()
-        await self._ask([request], [batch.take], batch, silence_s)
-        if not batch.last.done():
+    async def batch(self, request: Request, get: DirectGet, silence_s: float) -> None:
+        """Gather what a direct get gives. Raises OSError for less than that, and what nats-py raises."""
+        await self._ask([request], [get.take], get, silence_s)
+        if not get.last.done():
             raise TimeoutError(f"nothing came for {silence_s:g} s")
-        if batch.last.result() not in WHOLE:
-            raise OSError(f"it ended with {batch.last.result() or 'no status'}")
-        return batch.messages
+        if get.last.result() not in WHOLE:
+            raise OSError(f"it ended with {get.last.result() or 'no status'}")
 
     async def replies(self, requests: Sequence[Request], silence_s: float) -> list[bytes | None]:
         """Send all requests, one behind the other, and return their answers; None where none came in time."""

@@ -18,13 +18,11 @@ from multidrop.fleet.observer import Observer
 from multidrop.fleet.ownership import owner_of
 from multidrop.fleet.servers import ServerPath
 
-LEASES_S = 0.1  # the same of leases: the silence of a dead gateway's lines is longer by this
-
 
 class FleetRecords:
     """The records of all buckets, as far as they were read.
 
-    `on_change` is called when lines or their masters have changed. Leases change all the time.
+    `on_change` is called when lines or their masters have changed, or a session has come to its end, or may.
     """
 
     def __init__(
@@ -83,7 +81,7 @@ class FleetRecords:
     def works(self) -> list[Coroutine[Any, Any, None]]:
         """Return a coroutine for each bucket, which reads it for ever: none waits for another."""
         rests = {name: follower.rest for name, follower in {**self.owners, names.PLANT: self.plant}.items()}
-        rests |= {name: partial(asyncio.sleep, LEASES_S) for name in names.LEASES}
+        rests |= {name: partial(self.observer.rest, at) for at, name in enumerate(names.LEASES)}
         return [self._follow(name, rests[name]) for name in self._looks]
 
     async def _follow(self, name: str, rest: Callable[[], Awaitable[object]]) -> None:
@@ -93,7 +91,7 @@ class FleetRecords:
             await rest()
 
     async def _look(self, name: str) -> None:
-        if (await self._looks[name]() and name not in names.LEASES) or name not in self._read:
+        if await self._looks[name]() or name not in self._read:
             self._on_change()
         self._read.add(name)
         if len(self._read) == len(names.BUCKETS):

@@ -20,6 +20,7 @@ from multidrop.fleet.life_lock import LifeLock
 _log = logging.getLogger("multidrop.fleet")
 
 JOIN_S = 0.25  # between tries to begin a session
+AGAIN_S = 0.1  # after a renewal that failed
 
 
 def boottime_ns() -> int:
@@ -193,13 +194,18 @@ class Lease:
     # ---- and goes on ----
 
     async def renew(self, path: int) -> None:
-        """Renew one path, for ever; one task for each, so that none waits for another."""
+        """Renew one path, for ever; one task for each, so that none waits for another.
+
+        What failed is tried again soon: a bucket may get a leader at any moment, and two of them may be all
+        that the lines wait for.
+        """
         while True:
-            begun = self.clock()
+            begun, before = self.clock(), self.held[path]
             if self.session:
                 await self.renew_once(path)
-            rest = RENEW_S - (self.clock() - begun) / SECOND
-            await asyncio.sleep(max(rest, RENEW_S / 5))
+            has_failed = self.session and self.held[path] is before
+            rest = 0 if has_failed else RENEW_S - (self.clock() - begun) / SECOND
+            await asyncio.sleep(max(rest, AGAIN_S))
 
     async def renew_once(self, path: int) -> None:
         """Renew one path. What is counted is the moment before the request was sent."""

@@ -29,6 +29,7 @@ from multidrop.fleet.leaders import bring_leaders_home, have_leaders
 from multidrop.fleet.lease import Lease, MayPoll
 from multidrop.fleet.lease_bucket import LeaseBucket
 from multidrop.fleet.lease_rules import SECOND, USUAL, Terms
+from multidrop.fleet.lease_terms import LeaseTerms
 from multidrop.fleet.life_lock import LifeLock
 from multidrop.fleet.line_keeper import LineKeeper, Lines, TakenLine
 from multidrop.fleet.own_machine import OwnMachine, avoided_by
@@ -42,9 +43,11 @@ from multidrop.fleet.task_end import end_tasks
 _log = logging.getLogger("multidrop.fleet")
 
 GUARD_LOOK_S = 0.02
-STEP_S = 0.05
+STEP_S = 0.05  # between steps; at once where records have changed
+LEAST_STEP_S = 0.01  # between any two
 TIDY_NS = SECOND // 2  # between looks at all lines of the share, where nothing is known to have changed
 SETTLE_S = 3.0
+SOUND_S = 1.0  # of our lease, to end others': where less is left the servers may fail all of us alike
 HOME_S = 1.0
 WEAK_NS = 10 * SECOND  # from the end of settling on, before a session that lost a path is given up
 
@@ -73,9 +76,12 @@ class Member:
         self.paths = paths
         self.mastership = mastership
         self.is_draining = False
-        own = [LeaseBucket(bucket, partial(self._path, at), name) for at, bucket in enumerate(names.LEASES)]
+        own = [
+            LeaseBucket(bucket, partial(paths.__getitem__, at), name)
+            for at, bucket in enumerate(names.LEASES)
+        ]
         self.lease = Lease(name, own, mastership, lock=lock, terms=terms, note=self._note)
-        self.records = ShareRecords(name, self.best, terms, self._mark_dirty, self._is_mine)
+        self.records = ShareRecords(name, self.best, terms, self._wake, self._is_mine)
         self.keeper = LineKeeper(lines, self.lease, self.records, self._mark_dirty)
         self.own_machine = OwnMachine()
         self._shares = Shares()
@@ -83,8 +89,8 @@ class Member:
         self._releases = Releases(self.best, self._mark_dirty)
         self._settled_at = 0
         self._is_dirty = True
-        self._was_valid = False
-        self._is_too_weak = False
+        self._woken = asyncio.Event()
+        self._was_valid = self._is_too_weak = False
         self._stepped: tuple[Any, ...] = ()
 
     # ---- what others ask ----
@@ -117,9 +123,6 @@ class Member:
     def _is_settled(self) -> bool:
         return self.lease.clock() >= self._settled_at
 
-    def _path(self, number: int) -> ServerPath:
-        return self.paths[number]
-
     def best(self) -> ServerPath:
         """Return the path whose lease was renewed last; before there is a lease, any open path."""
         path = self.paths[self.lease.best]
@@ -127,6 +130,11 @@ class Member:
 
     def _mark_dirty(self) -> None:
         self._is_dirty = True
+
+    def _wake(self) -> None:
+        """Take the next step at once."""
+        self._is_dirty = True
+        self._woken.set()
 
     def drain(self) -> None:
         """Give all lines away, and take none from now on."""
@@ -140,11 +148,8 @@ class Member:
             "draining": self.is_draining,
             "avoids": [*self.own_machine.avoided],
             "lines": len(self.polled),
-            "margin_ms": self._margin_ms(),
+            "margin_ms": max(0, round(1000 * self.lease.left_s)),
         }
-
-    def _margin_ms(self) -> int:
-        return max(0, round(1000 * self.lease.left_s))
 
     # ---- life ----
 
@@ -186,18 +191,16 @@ class Member:
                 self._shares.begin_anew()
                 self._is_dirty = True
                 _log.info("%s: session %d began", self.name, self.lease.session)
-            elif self.lease.is_over:
-                _log.warning("%s: session %d is over", self.name, self.lease.session)
-                await self._begin_anew()
-            elif self._is_too_weak:
-                _log.warning("%s: session %d lost a path; a new one begins", self.name, self.lease.session)
-                await self._begin_anew()
+            elif self.lease.is_over or self._is_too_weak:
+                what = "is over" if self.lease.is_over else "lost a path; a new one begins"
+                _log.warning("%s: session %d %s", self.name, self.lease.session, what)
+                await self._leave()
+                self._is_dirty, self._is_too_weak = True, False
+            self._woken.clear()
             await self.step()
-            await asyncio.sleep(STEP_S)
-
-    async def _begin_anew(self) -> None:
-        await self._leave()
-        self._is_dirty, self._is_too_weak = True, False
+            await asyncio.sleep(LEAST_STEP_S)
+            with suppress(TimeoutError):
+                await asyncio.wait_for(self._woken.wait(), STEP_S - LEAST_STEP_S)
 
     async def _guard(self) -> None:
         """Close the lines before the lease has run out; only then is the kernel's timer called off."""
@@ -220,12 +223,14 @@ class Member:
             await self.own_machine.look(self.paths, self.best())
 
     async def _home(self) -> None:
-        """Bring leaders home; one gateway does it, the first by name."""
+        """Keep leaders ahead, and bring them home; one gateway does it, the first by name."""
+        terms = LeaseTerms()
         while True:
             await asyncio.sleep(HOME_S)
             await self._look_at_own_machine()
             if self.lease.is_valid and min(self.records.observer.sessions(), default="") == self.name:
                 with suppress(FleetError):
+                    await terms.keep_ahead(self.best())
                     await bring_leaders_home(self.best())
 
     async def _watch_strength(self) -> None:
@@ -253,7 +258,7 @@ class Member:
         elif not self._was_valid:
             self._was_valid = True
             observer.begin_anew()
-        elif await observer.end_the_dead(present):
+        elif self.lease.left_s > SOUND_S and await observer.end_the_dead(present):
             present = observer.sessions()
         await self._share_out(present)
         sessions = tuple((name, value["session"]) for name, value in present.items())

@@ -21,7 +21,8 @@ from multidrop.fleet.task_end import end_tasks
 
 BELIEVING = lease_rules.USUAL._replace(lease=0, guard=0)  # for who only looks: every end counts at once
 
-ENDING_S = 0.25  # for the answers, when a session is ended
+LOOK_S = 0.1  # between looks at a path: the silence of a dead gateway's lines is longer by it
+ENDING_S = 0.1  # for the answers, when a session is ended; later ones are read
 
 _log = logging.getLogger("multidrop.fleet")
 
@@ -38,20 +39,35 @@ class Observer:
         self.ended = 0  # sessions that this one ended
         self._watched: list[dict[str, SeenRevision]] = [{} for _ in buckets]
         self._looked = [0] * len(self.paths)  # when the newest look that had an answer began
+        self._over: dict[str, int] = {}  # each gateway's newest session that is over for certain
         self._clock = clock
 
     def begin_anew(self) -> None:
-        """Count from now on: while we were cut off we saw nothing of the others."""
+        """Count from now on: while we were cut off we saw nothing of the others.
+
+        What was over before that stays over: nobody renews it.
+        """
         now = self._clock()
         for seen in self._watched:
             seen.update({name: one._replace(since=now) for name, one in seen.items()})
 
-    async def look(self, path: int) -> None:
-        """Read what changed on a path. Raises FleetError where it is not reached."""
+    async def look(self, path: int) -> bool:
+        """Read what changed on a path. Raises FleetError where it is not reached.
+
+        Return True where a session has ended, or may be ended now.
+        """
         begun = self._clock()
-        for record in await self.paths[path].look():
+        found = await self.paths[path].look()
+        for record in found:
             self._note(path, record)
         self._looked[path] = begun
+        return any(record.value and record.value["ended"] for record in found) or bool(self.dead())
+
+    async def rest(self, path: int) -> None:
+        """Wait until the next look: until a record may be stale, if that comes first."""
+        begins = self._clock() - self.terms.lease
+        due = ((one.since - begins) / lease_rules.SECOND for one in self._watched[path].values())
+        await asyncio.sleep(min([LOOK_S, *(left for left in due if left > 0)]))
 
     def _note(self, path: int, record: Record) -> None:
         watched = self._watched[path]
@@ -66,6 +82,8 @@ class Observer:
 
     def is_over(self, gateway: str, session: int) -> bool:
         """Say whether this session was ended on as many paths as it takes."""
+        if session <= self._over.get(gateway, 0):
+            return True
         now = self._clock()
         ended = [self._has_ended(path, record, session, now) for path, record in self._of(gateway)]
         return lease_rules.is_over(sum(ended), self.terms)
@@ -152,12 +170,20 @@ class Observer:
         Return True where one was ended.
         """
         before = self.ended
+        self._keep_what_is_over()
         for name, records in self.dead(present).items():
             session = max(record.value["session"] for record in records.values())
             if await self._end_enough(records):
                 self.ended += 1
                 _log.warning("session %d of %s has run out; ended by %s", session, name, self.me)
         return self.ended > before
+
+    def _keep_what_is_over(self) -> None:
+        """Keep which sessions are over, as they were judged without a gap in what we saw."""
+        for name in {name for follower in self.paths for name in follower.records}:
+            session = max((record.value["session"] for _, record in self._of(name)), default=0)
+            if self.is_over(name, session):
+                self._over[name] = max(session, self._over.get(name, 0))
 
     async def _end_enough(self, records: Mapping[int, Record]) -> bool:
         """End them all at once, and wait for as many answers as it takes: a path may have no leader.

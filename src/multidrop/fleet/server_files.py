@@ -27,6 +27,7 @@ ROUTE_PORTS = 2000  # from a server's port to that of its routes: 4222 and 6222,
 MOST_PORTS = 65535
 ANSWER = '{ max: 1, expires: "1m" }'  # of a request: a stop of many drives takes its time
 STORE = Path("/var/lib/nats")
+PINGS = 'ping_interval: "1s", ping_max: 2'  # of routes: a dead one is left after 3 s, and not after 60 to 90
 
 
 class TlsFiles(NamedTuple):
@@ -142,6 +143,7 @@ def _server(
             f'cluster {{ name: {ACCOUNT}, listen: "{one.host}:{one.routes}"',
             f"  authorization {user}",
             f"  routes: {json.dumps(routes)}",
+            f"  {PINGS}",
             *([f"  tls {{ {_files(tls)}, verify: true }}"] if tls else []),
             "}",
         ]

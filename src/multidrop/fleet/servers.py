@@ -13,7 +13,8 @@ from nats.aio.msg import Msg
 from nats.aio.subscription import Subscription
 from nats.errors import Error as NatsError
 
-from multidrop.fleet.batch_client import BatchClient, DirectMessage, Request
+from multidrop.fleet.batch_client import BatchClient, DirectGet, DirectMessage, Request
+from multidrop.fleet.direct_gets import first_answer
 from multidrop.fleet.errors import FleetError, NobodyThere, NotAdmitted, NotDelivered, TooOld, Unsure
 from multidrop.fleet.lease_rules import PATHS
 from multidrop.fleet.refusals import Denials, failure_to_connect
@@ -21,7 +22,6 @@ from multidrop.fleet.refusals import Denials, failure_to_connect
 OLDEST = (2, 12)  # 2.9.10 grants one revision to several claimants (nats-server issue 4320)
 CONNECT_S = 1.0
 ANSWER_S = 1.0  # for a request; a lease is renewed twice a second
-COLLECT_S = (0.3, 0.5)  # for the first answers to what may be asked again
 PONG_S = 0.7  # a server that takes longer is left for another one
 KEEP_S = 1.0  # between looks at a connection
 # With 0 for attempts, nats-py knocks at a port where nobody listens until our own time-out.
@@ -36,6 +36,7 @@ class ServerPath:
     def __init__(self, urls: Sequence[str], options: Mapping[str, Any] | None = None) -> None:
         self.urls = list(urls)  # the first is home
         self.url = ""  # where it is
+        self.others: Sequence[ServerPath] = ()  # of the same process
         self._options = options or {}
         self._client: BatchClient | None = None
         self._denials = Denials()
@@ -189,21 +190,22 @@ class ServerPath:
             raise Unsure(f"{self.url} gave no answer to {subject}: {failure}") from None
 
     async def collect(self, subject: str, data: bytes) -> list[DirectMessage]:
-        """Return all messages that a direct get gives. Raises Unsure as `request` does.
+        """Return all messages that a direct get gives; the other paths are asked too where this one is slow.
 
-        It is asked again where nothing comes soon: any of the servers may have got it, one that is cut off
-        too, and another one may get it the next time.
+        Raises Unsure as `request` does.
         """
+        ways = [self, *(other for other in self.others if other.is_open)]
+        return await first_answer(ways, Request(subject, data))
+
+    async def gather(self, request: Request, get: DirectGet) -> None:
+        """Gather the messages of a direct get by this path alone. Raises Unsure as `request` does."""
         client, denials = self._connected(), self._denials
-        before = denials.of_request(subject)
+        before = denials.of_request(request.subject)
         try:
-            for silence_s in COLLECT_S:
-                with suppress(TimeoutError):
-                    return await client.batch(Request(subject, data), silence_s)
-            return await client.batch(Request(subject, data), ANSWER_S)
+            await client.batch(request, get, ANSWER_S)
         except (NatsError, OSError) as failure:
-            denials.check_request(subject, self._options.get("inbox_prefix", "_INBOX"), before)
-            raise Unsure(f"{self.url} gave no whole answer to {subject}: {failure}") from None
+            denials.check_request(request.subject, self._options.get("inbox_prefix", "_INBOX"), before)
+            raise Unsure(f"{self.url} gave no whole answer to {request.subject}: {failure}") from None
 
     async def request_all(self, requests: Sequence[Request]) -> list[bytes | None]:
         """Return the answer to each request, or None where it is unsure whether it was carried out."""
@@ -278,4 +280,7 @@ def _cut(client: BatchClient) -> None:
 
 def paths_of(urls: Sequence[str], options: Mapping[str, Any] | None = None) -> list[ServerPath]:
     """Return three paths: each has another of the servers as its home, where there are so many."""
-    return [ServerPath([*urls[at % len(urls) :], *urls[: at % len(urls)]], options) for at in range(PATHS)]
+    paths = [ServerPath([*urls[at % len(urls) :], *urls[: at % len(urls)]], options) for at in range(PATHS)]
+    for path in paths:
+        path.others = [other for other in paths if other is not path]
+    return paths

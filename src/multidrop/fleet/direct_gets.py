@@ -1,0 +1,62 @@
+"""Direct gets: reads that any of the servers answers, and that go on while one of them is cut off.
+
+A server hands such a question to any server that has the records: itself, or one behind a route, by chance.
+One that is cut off gets its share of them until the others notice, which takes them 10 s or more. So what is
+not answered soon is asked again, by all paths at once. Each answer may be old, as ever: whoever writes upon
+it names the revision that he read.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Mapping, Sequence
+from typing import Protocol
+
+from multidrop.fleet.batch_client import DirectGet, DirectMessage, Request
+from multidrop.fleet.errors import NoRight, Unsure
+from multidrop.fleet.task_end import end_tasks
+
+AGAIN_S = (0.1, 0.1, 0.2, 0.4, 1.0)  # without a message, before it is asked again; then it is given up
+
+
+class Way(Protocol):
+    """A path to servers that may be asked."""
+
+    async def gather(self, request: Request, get: DirectGet) -> None:
+        """Gather what a direct get gives. Raises FleetError."""
+
+
+async def first_answer(ways: Sequence[Way], request: Request) -> list[DirectMessage]:
+    """Return the messages of the first whole answer. Raises FleetError where there is none.
+
+    The first of the ways is asked alone: at rest it answers in an instant.
+    """
+    gets: dict[asyncio.Task[None], DirectGet] = {}
+    failure: BaseException = Unsure(f"nothing came to {request.subject}")
+    try:
+        for number, silence_s in enumerate(AGAIN_S):
+            for way in ways[:1] if number == 0 else ways[1:] if number == 1 and ways[1:] else ways:
+                get = DirectGet()
+                gets[asyncio.create_task(way.gather(request, get))] = get
+            while await _is_one_over(gets, silence_s):
+                for task in [task for task in gets if task.done()]:
+                    get = gets.pop(task)
+                    if not (failed := task.exception()):
+                        return get.messages
+                    failure = failed
+            is_refused = isinstance(failure, NoRight)  # by each of the servers, then
+            if not gets and (number or not ways[1:] or is_refused):
+                break
+        raise failure
+    finally:
+        await end_tasks(*gets)
+
+
+async def _is_one_over(gets: Mapping[asyncio.Task[None], DirectGet], silence_s: float) -> bool:
+    """Wait until one of them is over. Return False where nothing comes for so long, or none is left."""
+    while gets:
+        before = sum(get.count for get in gets.values())
+        done, _ = await asyncio.wait(gets, timeout=silence_s, return_when=asyncio.FIRST_COMPLETED)
+        if done or sum(get.count for get in gets.values()) == before:
+            return bool(done)
+    return False

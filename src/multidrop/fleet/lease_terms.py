@@ -1,0 +1,91 @@
+"""Lease terms: the leases' leaders keep ahead of a server that is silent, so that it unseats none later.
+
+A server that hears no leader asks for votes every 4 to 9 s, each time in a newer term, though nobody hears
+it. When its cut heals, a leader whose term is older steps down, and the bucket waits for 4 to 9 s, by chance.
+Where two of the leases' buckets wait, no line is polled. A leader that hands over makes the term newer too,
+and takes an instant. So while a server is silent, the others hand the leases' buckets to each other more
+often than it asks. Who may poll is decided by revisions alone, whoever leads.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from typing import Any
+
+from multidrop.fleet import names
+from multidrop.fleet.buckets import ask
+from multidrop.fleet.errors import FleetError
+from multidrop.fleet.leaders import is_ready
+from multidrop.fleet.servers import ServerPath
+from multidrop.fleet.task_end import end_tasks
+
+EVERY_S = 3.0  # less than the shortest time between two requests for votes
+SILENT_NS = 2_000_000_000  # a follower answers its leader's heartbeat once a second
+FOR_S = 60.0  # a server that is silent for longer is not waited for
+DONE_S = 1.0  # it takes 0.03 to 0.3 s
+LOOK_S = 0.02
+
+
+class LeaseTerms:
+    """What was handed over when, and since when a server is silent."""
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        self._clock = clock
+        self._silent_since: float | None = None
+        self._handed_at: dict[str, float] = {}  # by bucket
+
+    async def keep_ahead(self, path: ServerPath) -> None:
+        """Hand over what is due, one bucket after the other: through us at most one waits for an election."""
+        looks = [asyncio.create_task(_cluster(path, bucket)) for bucket in names.LEASES]
+        has_silent, found = False, 0
+        try:
+            for look in asyncio.as_completed(looks):
+                bucket, cluster = await look
+                peers = cluster.get("replicas", [])
+                ready = [peer["name"] for peer in peers if is_ready(peer["name"], cluster)]
+                found += bool(cluster.get("leader"))
+                if cluster.get("leader") and any(map(is_silent, peers)):
+                    has_silent = True
+                    if ready and self._is_due(bucket) and not await _hand_over(path, bucket, ready[0]):
+                        return
+        finally:
+            await end_tasks(*looks)
+        if found == len(looks) and not has_silent:
+            self._silent_since = None
+
+    def _is_due(self, bucket: str) -> bool:
+        now = self._clock()
+        if self._silent_since is None:
+            self._silent_since = now
+        if now - self._silent_since > FOR_S or now - self._handed_at.get(bucket, -EVERY_S) < EVERY_S:
+            return False
+        self._handed_at[bucket] = now
+        return True
+
+
+def is_silent(peer: Mapping[str, Any]) -> bool:
+    """Say whether a follower was not heard for long, or never; one that lags is heard."""
+    return not peer.get("current") and not 0 < peer.get("active", 0) < SILENT_NS
+
+
+async def _cluster(path: ServerPath, bucket: str) -> tuple[str, Mapping[str, Any]]:
+    """Return what is known of the servers of a bucket; nothing where none answers."""
+    with suppress(FleetError):
+        return bucket, (await ask(path, f"STREAM.INFO.KV_{bucket}")).get("cluster") or {}
+    return bucket, {}
+
+
+async def _hand_over(path: ServerPath, bucket: str, server: str) -> bool:
+    """Hand a bucket over, and return True once this server leads it."""
+    wanted = {"placement": {"preferred": server}}
+    with suppress(FleetError):
+        await ask(path, f"STREAM.LEADER.STEPDOWN.KV_{bucket}", wanted)
+    with suppress(TimeoutError):
+        async with asyncio.timeout(DONE_S):
+            while (await _cluster(path, bucket))[1].get("leader") != server:
+                await asyncio.sleep(LOOK_S)
+            return True
+    return False

@@ -1,0 +1,97 @@
+"""When a gateway takes its steps: on a loop whose time is its own, without a server."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+from itertools import pairwise
+
+import pytest
+from controlled_loop import run_controlled
+from fleets import Hall, HandClock, NotedMastership
+from peers import require_module
+
+require_module("nats")
+
+from multidrop.fleet.lease import Held, boottime_ns  # noqa: E402
+from multidrop.fleet.lease_rules import SECOND  # noqa: E402
+from multidrop.fleet.member import Member  # noqa: E402
+from multidrop.fleet.servers import paths_of  # noqa: E402
+
+
+def a_member() -> Member:
+    """Return a gateway with a session, and without a server."""
+    mastership = NotedMastership(boottime_ns)
+    lines = Hall().add("a", mastership)
+    member = Member("a", paths_of(["nats://nowhere.invalid:4222"]), lines, mastership)
+    member.lease.session, member.lease.held = 1, [Held(1, 0)] * 3
+    return member
+
+
+def steps(wake: Callable[[Member], object]) -> list[float]:
+    """Return when steps were taken (s) from the first to 0.12 s on; after 0.06 s `wake` is called."""
+
+    async def main() -> list[float]:
+        loop = asyncio.get_running_loop()
+        member = a_member()
+        taken: list[float] = []
+
+        async def step() -> None:
+            taken.append(round(loop.time() - 1000.0, 3))
+
+        member.step = step  # type: ignore[method-assign]
+        living = asyncio.create_task(member._live())
+        loop.call_later(0.06, wake, member)
+        await asyncio.sleep(0.12)
+        living.cancel()
+        return taken
+
+    return run_controlled(main())
+
+
+def test_steps_are_taken_again_and_again() -> None:
+    assert steps(lambda member: None) == pytest.approx([0.0, 0.05, 0.1])
+
+
+@pytest.mark.parametrize("times", [1, 100])
+def test_a_step_is_taken_at_once_where_records_have_changed(times: int) -> None:
+    def wake(member: Member) -> None:
+        for _ in range(times):
+            member.records._on_change()
+
+    assert steps(wake) == pytest.approx([0.0, 0.05, 0.06, 0.11])
+
+
+def test_steps_are_never_taken_without_a_pause() -> None:
+    def wake(member: Member) -> None:
+        member.records._on_change()
+        if len(asyncio.all_tasks()) > 1:
+            asyncio.get_running_loop().call_later(0.001, wake, member)
+
+    taken = steps(wake)
+    assert min(after - before for before, after in pairwise(taken)) == pytest.approx(0.01, abs=0.001)
+    assert len(taken) > 6
+
+
+@pytest.mark.parametrize(("left_s", "ends"), [(2.0, True), (0.9, False), (-1.0, False)])
+def test_nobody_ends_others_whose_own_lease_is_not_renewed_either(left_s: float, ends: bool) -> None:
+    """The servers fail all alike then; who was ended could not go on when they are back."""
+
+    async def main() -> bool:
+        member = a_member()
+        clock = HandClock()
+        member.lease.clock = clock
+        member.lease.until = clock.now + 2 * SECOND
+        await member.step()  # what was seen before is counted anew
+        asked: list[object] = []
+
+        async def note(present: object) -> bool:
+            asked.append(present)
+            return False
+
+        member.records.observer.end_the_dead = note  # type: ignore[method-assign, assignment]
+        member.lease.until = clock.now + round(left_s * SECOND)
+        await member.step()
+        return bool(asked)
+
+    assert asyncio.run(main()) is ends
