@@ -281,8 +281,8 @@ def test_a_stop_waits_for_no_port_that_a_reload_opens(
     with two_lines(tmp_path, may, ("fan-1", "fan-2")) as (gateway, _):
         writer = {"authorization": gateway.bearer(Right.WRITE)}
         fan = gateway.sims["fan-1"].motor  # type: ignore[attr-defined]
-        gateway.post("/api/write", {"drive": "fan-1", "register": "setpoint", "value": 2.0}, **writer)
-        gateway.post("/api/act", {"drive": "fan-1", "verb": "start", "options": {}}, **writer)
+        gateway.command("/api/write", {"drive": "fan-1", "register": "setpoint", "value": 2.0}, **writer)
+        gateway.command("/api/act", {"drive": "fan-1", "verb": "start", "options": {}}, **writer)
         assert fan.goal
         opening, go_on = threading.Event(), threading.Event()
         open_bus = Bus.__init__

@@ -37,7 +37,7 @@ from multidrop.poller import Poller
 from multidrop.polling.batch import Row
 from multidrop.sim import FaultyWire
 from multidrop.sim import wire as wire_of_drives
-from multidrop.transport import clock
+from multidrop.transport import clock, former_peers
 from multidrop.transport.prepared import NO_ROWS, make_exchange
 
 S = 1_000_000_000
@@ -231,7 +231,7 @@ class ClockedLine:
     may_send = True
 
     def __init__(self, clocked: ClockedLines, port: str, ids: TransactionIds) -> None:
-        self.port = port
+        self.port = self.identity = port
         self.is_tcp = speaks_tcp(port)
         self.ids = ids
         self._clocked = clocked
@@ -329,6 +329,7 @@ class ClockedLines:
         self._beside: set[threading.Thread] = set()
         patch = self._patch = pytest.MonkeyPatch()
         patch.setattr(bus, "Line", ClockedOpener(self))
+        patch.setattr(former_peers, "_former", {})  # they are another clock's
         patch.setattr(clock, "now_ns", lambda: self.now)
         patch.setattr(clock, "boottime_ns", lambda: self.now)
         patch.setattr(clock, "sleep", self._sleep)
@@ -355,8 +356,10 @@ class ClockedLines:
         with self._turn:
             self._leaving = True
             self._turn.notify_all()
-        self.poller.close()
-        self._patch.undo()
+        try:
+            self.poller.close()
+        finally:
+            self._patch.undo()
 
     @property
     def seconds(self) -> float:

@@ -19,7 +19,7 @@ from multidrop.drive import Drive
 from multidrop.drive.network import speaks_tcp
 from multidrop.errors import BusError
 from multidrop.sim import SimulatedDrive
-from multidrop.transport import clock
+from multidrop.transport import clock, former_peers
 
 Delay = Callable[[float], float]  # in s, of what enters the path at a time in s
 
@@ -109,6 +109,9 @@ class PathLine:
     def overruns(self) -> None:
         pass
 
+    def counted_ns(self, now_ns: int) -> int:
+        return now_ns
+
     def close(self) -> None:
         pass
 
@@ -147,6 +150,7 @@ def bus_over(
     wire.open()
     line = PathLine(wire)
     monkeypatch.setattr(bus, "Line", lambda port, *facts: line)
+    monkeypatch.setattr(former_peers, "_former", {})  # they are another clock's
     monkeypatch.setattr(clock, "now_ns", lambda: line.now)
     monkeypatch.setattr(clock, "boottime_ns", lambda: line.now)
     monkeypatch.setattr(clock, "sleep", line.sleep)

@@ -8,7 +8,7 @@ let answer = null; // settles the question that stands now
 const dialog = () => find("#ask");
 
 // The second click of a double click means what the first one pressed. Where the dialog opened or closed in
-// between it would press what nobody looked at, so it is not taken, but for a stop. Nor is a key that is held.
+// between it would press what nobody looked at, so it is not taken, but for a stop. Nor is a held key.
 const TWICE_MS = 500,
   NEAR_PX = 30,
   AT_ONCE = "#stopall, .stop";
