@@ -91,7 +91,7 @@ def test_no_wait_is_rounded(build: Callable[..., None], program: str) -> None:
     build(program, "waiter_epoll")
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.skipif(sys.platform != "linux", reason="masterships are Linux's")
 def test_nothing_is_sent_but_by_a_look_at_the_deadline(build: Callable[..., None]) -> None:
     replaced = ("waiter_poll", "port_io", "port_rs485", "mastership")
