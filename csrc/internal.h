@@ -20,7 +20,7 @@ const uint64_t *md_usual_delays(const struct md_drive *drive); /* replies of the
 
 /* ---- clock.c ---- */
 
-/* Return UTC - CLOCK_MONOTONIC as md_utc_minus_monotonic_ns() does, where the latter was `now_ns` just now. */
+/* Return UTC - CLOCK_MONOTONIC as md_utc_minus_monotonic_ns() does, where the latter is `now_ns` by now. */
 int64_t md_utc_ahead_ns(int64_t now_ns);
 
 /* ---- columns.c, row_queue.c ---- */

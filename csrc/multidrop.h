@@ -210,7 +210,7 @@ struct md_exchange {
     int64_t period_ns;     /* between its slots in a queue; 0: it has none */
     const uint32_t *stops; /* of its drive: sent only while they are stops_seen; NULL: always */
     uint32_t stops_seen;
-    const struct md_block *values; /* fields whose values the caller of md_port_carry_out() gets; NULL: none */
+    const struct md_block *values; /* what the caller of md_port_carry_out() gets; NULL: nothing */
 };
 
 /* The reason why an exchange has no reply; an enum md_frame_fault where something came in its place. */
@@ -233,7 +233,7 @@ struct md_completion {
     int error;                 /* MD_LINE_LOST: errno; MD_SETTINGS_REFUSED: enum md_refusal */
     int64_t begun_ns;          /* its turn came: the line's silence may not have been over */
     int64_t sent_ns;           /* the request began to leave; 0: it never did */
-    int64_t utc_ahead_ns;      /* UTC - CLOCK_MONOTONIC then, before the machine may have slept; 0: not known */
+    int64_t utc_ahead_ns;      /* UTC - CLOCK_MONOTONIC then, before any sleep of the machine; 0: not known */
     int64_t first_ns, last_ns; /* first and last byte after the request were seen */
     int64_t late_until_ns;     /* of an urgent one: its drive's, when its caller asked for it */
     uint32_t stale;            /* bytes thrown away before the request left: late replies, noise */

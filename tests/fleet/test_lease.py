@@ -107,7 +107,7 @@ def test_one_path_that_is_down_costs_nothing_and_two_cost_the_lease() -> None:
 
 
 def test_a_renewal_that_failed_is_tried_again_soon() -> None:
-    """Where a bucket gets a leader, nothing is waited for any more."""
+    """Nothing is waited for any more once its bucket has a leader."""
 
     async def main() -> None:
         loop = asyncio.get_running_loop()

@@ -22,7 +22,13 @@ require_module("nats")
 require_module("nkeys")
 require_module("pyarrow")
 
-from secured_clusters import GATEWAYS, SecuredCluster, SecuredNode, certificates, secured_cluster  # noqa: E402
+from secured_clusters import (  # noqa: E402
+    GATEWAYS,
+    SecuredCluster,
+    SecuredNode,
+    certificates,
+    secured_cluster,
+)
 from secured_fleets import PATIENCE_S, SecuredFleet, multidrop, secured_fleet, until  # noqa: E402
 
 from multidrop.fleet import names  # noqa: E402

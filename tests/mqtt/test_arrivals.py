@@ -1,4 +1,4 @@
-"""What paho's thread tells the loop of messages that have arrived."""
+"""Messages that have arrived, and what paho's thread tells the loop of them."""
 
 from __future__ import annotations
 

@@ -30,7 +30,7 @@ LOOK_S = 0.02
 
 
 class LeaseTerms:
-    """What was handed over when, and since when a server is silent."""
+    """The times of the hand-overs, and since when a server is silent."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock

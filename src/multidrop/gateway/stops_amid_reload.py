@@ -11,14 +11,14 @@ from multidrop import Drive, Plant
 LOOK_S = 0.02  # between looks at what a reload changes
 
 
-class Told(Protocol):
+class StopEnd(Protocol):
     """The end of a stop."""
 
     @property
     def is_done(self) -> bool: ...
 
 
-T = TypeVar("T", bound=Told)
+T = TypeVar("T", bound=StopEnd)
 
 
 class ChangingLines(Protocol):

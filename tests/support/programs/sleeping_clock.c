@@ -1,5 +1,5 @@
-/* Clocks of a machine that has slept for eight hours once the file SLEPT is there. For a library put before the
- * system's: CLOCK_MONOTONIC stood still meanwhile. */
+/* Clocks of a machine that has slept for eight hours once the file SLEPT is there: CLOCK_MONOTONIC stood
+ * still meanwhile. For a library that is put before the system's. */
 #define _GNU_SOURCE
 #include <stdlib.h>
 #include <sys/syscall.h>
