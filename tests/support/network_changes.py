@@ -1,7 +1,4 @@
-"""Changes of a network: a browser breaks off its requests at each, so the two take turns.
-
-Each of Linux's network namespaces is a network of its own.
-"""
+"""Changes of this machine's network: a browser breaks off its requests at each, so the two take turns."""
 
 from __future__ import annotations
 
@@ -12,9 +9,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-_NAMESPACE = Path("/proc/self/ns/net")
-_NETWORK = _NAMESPACE.stat().st_ino if _NAMESPACE.exists() else 0
-LOCK = Path(tempfile.gettempdir()) / f"multidrop-network-{os.getuid()}-{_NETWORK}"
+LOCK = Path(tempfile.gettempdir()) / f"multidrop-network-{os.getuid()}"
 
 
 @contextmanager
