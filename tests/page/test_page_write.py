@@ -67,6 +67,21 @@ def test_a_write_whose_answer_is_lost_is_not_called_sent_nor_sent_again(
     assert gateway.posts == []
 
 
+CUT_SHORT = '{"done": tr'
+
+
+def test_an_answer_that_breaks_off_is_no_answer(opened: Opener, gateway: FakeGateway) -> None:
+    page = opened("#/drives/pump-1")
+    page.route("**/api/act", lambda route: route.fulfill(status=200, body=CUT_SHORT))
+    page.route("**/api/audit*", lambda route: route.fulfill(status=200, body=CUT_SHORT))
+    page.get_by_role("button", name="start").click()
+    page.get_by_role("button", name="start pump-1").click()
+    outcome = page.locator("#outcomes li").inner_text()
+    assert "The daemon's answer broke off." in outcome
+    assert "not known whether it was carried out" in outcome
+    page.locator("#writes").get_by_text("The daemon's answer broke off.").wait_for()
+
+
 def test_a_start_warns_and_enter_alone_sends_nothing(opened: Opener, gateway: FakeGateway) -> None:
     page = opened("#/drives/pump-1")
     page.get_by_role("button", name="start").click()

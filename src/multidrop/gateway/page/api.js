@@ -24,6 +24,7 @@ async function ask(path, options, patience) {
   const body = await response.json().catch(() => null);
   if (!response.ok)
     throw new Refused(response.status, body?.error ?? `The daemon answers ${response.status}.`);
+  if (body === null) throw new Refused(0, "The daemon's answer broke off.");
   return body;
 }
 
