@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import shutil
 import subprocess
@@ -13,6 +14,7 @@ from network_changes import changing_network
 
 NOBODYS_CARD = "02:00:00:00:00:00"
 BRIDGES_CARD = "02:00:00:00:02:00"
+_BRIDGES = itertools.count()  # of this process, which may have several at a time
 
 
 def _ip(*words: str) -> None:
@@ -67,8 +69,9 @@ class Network:
     """A bridge here, whose address is `address`, and the namespaces on it, all of which know each other."""
 
     def __init__(self, number: int) -> None:
-        self._bridge = f"md{os.getpid() % 100_000}"
-        net = f"10.{100 + os.getpid() % 50}.{os.getpid() // 50 % 250}"
+        nth = next(_BRIDGES)
+        self._bridge = f"md{os.getpid() % 100_000}-{nth}"
+        net = f"10.{100 + os.getpid() % 50}.{(os.getpid() // 50 + 25 * nth) % 250}"
         self.address = f"{net}.1"
         self.namespaces: list[Namespace] = []
         # A bridge without a card of its own has a port's: a cut of that port would hold up all others.
