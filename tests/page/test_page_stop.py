@@ -203,6 +203,39 @@ def test_a_stop_without_the_right_asks_for_a_token_and_goes_on(opened: Opener, g
     assert gateway.posts == [("/api/stop", {"drives": None})]
 
 
+SECOND_CLICK = """([x, y]) => document.querySelector('#ask form button:not(.calm)').dispatchEvent(
+    new MouseEvent('click', { clientX: x, clientY: y, detail: 2, bubbles: true, cancelable: true }))"""
+
+
+@pytest.mark.parametrize(
+    ("view", "asks", "confirms", "sent"),
+    [
+        ("", "#stopall", "Stop all 31 drives", [("/api/stop", {"drives": None})]),
+        (
+            "#/drives/pump-1",
+            "button:text-is('emergency stop')",
+            "emergency stop pump-1",
+            [("/api/act", {"drive": "pump-1", "verb": "emergency_stop", "options": {}})],
+        ),
+        ("#/drives/pump-1", "button:text-is('start')", "start pump-1", []),
+    ],
+)
+def test_a_second_click_signs_in_for_a_stop_alone(
+    opened: Opener, gateway: FakeGateway, view: str, asks: str, confirms: str, sent: list[Any]
+) -> None:
+    """A keeper of passwords fills the token in at once."""
+    gateway.token = "right"
+    page = opened(view)
+    page.locator(asks).click()
+    button = page.get_by_role("button", name=confirms, exact=True)
+    box = button.bounding_box()
+    button.click()
+    page.get_by_label("Token").fill("right")
+    page.evaluate(SECOND_CLICK, [box["x"] + box["width"] / 2, box["y"] + box["height"] / 2])
+    page.wait_for_timeout(300)
+    assert gateway.posts == sent
+
+
 def test_a_stop_that_is_refused_was_not_sent(opened: Opener, gateway: FakeGateway) -> None:
     gateway.token = "right"
     page = opened()

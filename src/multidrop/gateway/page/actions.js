@@ -70,9 +70,9 @@ const seen = (drive, body, stopped) => () => {
   return { ...body, seen: store.frame?.n };
 };
 
-async function deliver(drive, what, path, confirmed) {
+async function deliver(drive, what, path, confirmed, kind = DANGER) {
   try {
-    const { done, text: told } = await send(path, confirmed);
+    const { done, text: told } = await send(path, confirmed, { kind });
     note(drive, what, done === true, told);
   } catch (error) {
     const isRefused = error.status >= 400 && error.status < 500;
@@ -91,7 +91,9 @@ async function deliver(drive, what, path, confirmed) {
 export async function act(drive, verb) {
   const turns = TURNS.some(word => verb.includes(word)),
     field = WITH_HZ.has(verb) ? hertz() : null,
-    stopped = stops(drive);
+    stopped = stops(drive),
+    isStop = STOPS.has(verb),
+    kind = isStop ? STOP : DANGER;
   const warning = turns
     ? "The motor will turn. Make sure that nobody is near what it drives."
     : "It is sent once.";
@@ -100,11 +102,11 @@ export async function act(drive, verb) {
   const asks = field ? confirmForm : confirm;
   const title = [`${words(verb)}: `, named(drive), "?"],
     yes = [`${words(verb)} `, named(drive)];
-  if (!(await asks(title, contents, yes, STOPS.has(verb) ? STOP : DANGER))) return;
+  if (!(await asks(title, contents, yes, kind))) return;
   const options = field ? { hz: Number(field.value) } : {};
   const what = field ? `${words(verb)} ${options.hz} Hz` : words(verb);
   const body = { drive, verb, options };
-  await deliver(drive, what, "api/act", STOPS.has(verb) ? () => body : seen(drive, body, stopped));
+  await deliver(drive, what, "api/act", isStop ? () => body : seen(drive, body, stopped), kind);
 }
 
 const hertz = () =>

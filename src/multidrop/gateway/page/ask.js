@@ -96,8 +96,8 @@ export const confirm = async (title, contents, yes, kind = DANGER) =>
   (await open(title, contents, [["yes", yes, kind]])) === "yes";
 
 // Ask for what a form in `contents` holds. Return true where it is to be sent.
-export const confirmForm = async (title, contents, yes) =>
-  (await open(title, contents, [["submit", yes, DANGER]])) === "submit";
+export const confirmForm = async (title, contents, yes, kind = DANGER) =>
+  (await open(title, contents, [["submit", yes, kind]])) === "submit";
 
 // Show something until it is closed. Return the name of the other button where that was pressed.
 export const tell = (title, contents, buttons = []) => open(title, contents, buttons, "Close");
@@ -108,7 +108,7 @@ export function retell(title, contents, buttons = []) {
 }
 
 // Ask for a token until one is right. Return true where the gateway took it.
-export async function askToken(why, yes = "Sign in") {
+export async function askToken(why, yes = "Sign in", kind = DANGER) {
   let wrong = null;
   for (;;) {
     const field = make("input", {
@@ -124,7 +124,7 @@ export async function askToken(why, yes = "Sign in") {
       make("label", { for: "token", class: "field" }, "Token", field),
       wrong && make("p", { id: "token-wrong", class: "bad" }, wrong),
     ];
-    if (!(await confirmForm("Who are you?", contents, yes))) return false;
+    if (!(await confirmForm("Who are you?", contents, yes, kind))) return false;
     try {
       await post("api/token", { token: field.value });
       dispatchEvent(new Event("signed"));
@@ -136,17 +136,15 @@ export async function askToken(why, yes = "Sign in") {
 }
 
 // Send what the person confirmed, and once more after a sign-in where the right to it was missing: `body`
-// is called at each confirmation. Return the answer. Raises Refused.
-export async function send(path, body, patience) {
+// is called at each confirmation, and `kind` is the class of its button. Return the answer. Raises Refused.
+export async function send(path, body, { kind = DANGER, patience } = {}) {
   dispatchEvent(new Event("command"));
   try {
     return await post(path, body(), patience);
   } catch (error) {
     if (error.status !== 401 && error.status !== 403) throw error;
-    if (
-      !(await askToken(`${error.message} A token with the right to it is needed.`, "Sign in and send it"))
-    )
-      throw error;
+    const why = `${error.message} A token with the right to it is needed.`;
+    if (!(await askToken(why, "Sign in and send it", kind))) throw error;
     return await post(path, body(), patience);
   }
 }

@@ -19,7 +19,7 @@ export async function reload() {
   tell(["Reading ", file(), " …"], [make("p", {}, "The plant is polled meanwhile.")]);
   let shown;
   try {
-    shown = outcome(await send("api/reload", () => ({ confirm: true }), PATIENCE_MS));
+    shown = outcome(await send("api/reload", () => ({ confirm: true }), { patience: PATIENCE_MS }));
   } catch (error) {
     const isRefused = error.status >= 400 && error.status < 500;
     const title = isRefused ? "The file was not read" : "It is not known that the file was read";

@@ -32,7 +32,7 @@ async function stop(drives, what) {
     closed.catch(() => {});
     let shown;
     try {
-      const told = await send("api/stop", () => ({ drives }), PATIENCE_MS);
+      const told = await send("api/stop", () => ({ drives }), { kind: STOP, patience: PATIENCE_MS });
       shown = outcome(told);
     } catch (error) {
       const isRefused = error.status >= 400 && error.status < 500;
