@@ -128,6 +128,33 @@ def test_trends_are_exported_as_they_are_shown(opened: Opener) -> None:
     assert download.value.suggested_filename == "history.csv"
 
 
+DOTS = """async values => {
+    const { makePlot, line } = await import('/page/plots.js');
+    const place = document.body.appendChild(document.createElement('div'));
+    const plot = makePlot(place, [values.map((_, i) => 1700000000 + i), values], {
+        series: [line(0, 'speed')], height: 150 });
+    await new Promise(requestAnimationFrame);
+    const canvas = place.querySelector('canvas');
+    const { data } = canvas.getContext('2d').getImageData(0, 0, canvas.width, canvas.height);
+    let coloured = 0;  // the axes are grey
+    for (let i = 0; i < data.length; i += 4) {
+        const rgb = data.slice(i, i + 3);
+        coloured += data[i + 3] > 200 && Math.max(...rgb) - Math.min(...rgb) > 60;
+    }
+    plot.destroy();
+    place.remove();
+    return coloured;
+}"""
+
+
+def test_a_value_between_gaps_is_drawn(opened: Opener) -> None:
+    """Of a register that is read each second, three values of a plot with ten points a second."""
+    page = opened()
+    nothing = [None] * 9
+    assert page.evaluate(DOTS, [None, *nothing, None, *nothing, None]) == 0
+    assert page.evaluate(DOTS, [20, *nothing, 21, *nothing, 20]) > 3 * 9  # pixels
+
+
 def test_without_history_the_page_says_so_and_goes_on(opened: Opener, gateway: FakeGateway) -> None:
     gateway.has_history = False
     page = opened("#/trends")

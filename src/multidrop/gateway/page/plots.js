@@ -52,14 +52,21 @@ export function makePlot(
   );
 }
 
+// Return the places of values that no line leads to: between two gaps, as where a register is read less often
+// than the plot has points.
+export function alone({ data }, k) {
+  const places = [...data[k].keys()].filter(i => data[k][i] !== undefined), // other series have the rest
+    isGap = n => (data[k][places[n]] ?? null) === null;
+  return places.filter((_, n) => !isGap(n) && isGap(n - 1) && isGap(n + 1));
+}
+
 // Return a visible line. `index` gives colour and dashes.
-export const line = (index, label, extra = {}) => ({
+export const line = (index, label) => ({
   label,
   stroke: colour(COLOURS[index % COLOURS.length]),
   width: 1.5,
   dash: DASHES[Math.floor(index / COLOURS.length) % DASHES.length],
-  points: { show: false },
-  ...extra,
+  points: { show: false, filter: alone, size: 4, fill: (u, k) => u.series[k].stroke(u, k) },
 });
 
 // Return one table of times (s) and columns from several [times in ms, column, column …].

@@ -37,7 +37,7 @@ export function makeTrend(place, register, told, { view, set, count }) {
       index = picker.index(name),
       k = series.length + 1;
     const bare = { stroke: "transparent", points: { show: false } };
-    series.push(bare, bare, line(index, name, { points: { show: time.length < 3 } }));
+    series.push(bare, bare, line(index, name));
     bands.push({
       series: [k, k + 1],
       fill: colour(COLOURS[index % COLOURS.length])
