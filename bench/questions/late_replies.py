@@ -1,8 +1,9 @@
 """Late, doubled and lost replies: count those that were taken for another request's reply.
 
 Several drives on each line, four blocks of one length per drive; a value names its drive and its
-register. Replies are late by up to three times the time-out, lost, or doubled; then all of them come
-over a path that holds them up for longer, and keeps their order.
+register. Replies are late by up to three times the time-out, lost, or doubled: first so that a drive's later
+reply may come before an earlier one, as no line has it, then in their order. Last, all of them come over a
+path that holds them up for longer, and keeps their order.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ import argparse
 import time
 from collections.abc import Iterator
 
+from bench.masters import many_adapter
 from bench.players.responders import responders
 from bench.support import tables
 
@@ -27,27 +29,22 @@ def main() -> None:
     parser.add_argument("--drives", type=int, default=8, help="on each line")
     parser.add_argument("--seconds", type=float, default=20, help="of each slow path")
     arguments = parser.parse_args()
-    from bench.masters import many_adapter
-
     tables.heading(
         f"{arguments.lines} lines without waits, {arguments.drives} drives each, 4 blocks of 10 registers; "
         f"time-out {TIMEOUT_MS} ms."
     )
-    options: tuple[object, ...] = "--late-us", 3 * TIMEOUT_MS * 1000, "--late-permille", LATE_PERMILLE
-    options += "--lost-permille", LOST_PERMILLE, "--twice-permille", TWICE_PERMILLE
-    begun = time.monotonic()
-    with responders("socketpair", arguments.lines, *options) as (ports, _):
-        judged = many_adapter.judge(ports, arguments.exchanges, arguments.drives)
-    rows = [
-        ("seconds", f"{time.monotonic() - begun:.0f}"),
-        ("exchanges", judged.exchanges),
-        ("values", judged.samples),
-        ("values that are another register's", judged.wrong - judged.beyond),
-        ("the same, by answers later than that", judged.beyond),
-        ("late replies that were recognised", judged.late),
-        *((f"missed: {why}", count) for why, count in judged.misses.most_common()),
-    ]
-    tables.show(("what", "number"), rows)
+    replies: tuple[object, ...] = "--late-us", 3 * TIMEOUT_MS * 1000, "--late-permille", LATE_PERMILLE
+    replies += "--lost-permille", LOST_PERMILLE, "--twice-permille", TWICE_PERMILLE
+    columns = []
+    for order in ((), ("--path-us", 1)):
+        begun = time.monotonic()
+        with responders("socketpair", arguments.lines, *replies, *order) as (ports, _):
+            judged = many_adapter.judge(ports, arguments.exchanges, arguments.drives)
+        columns.append(_told(judged, time.monotonic() - begun))
+    tables.show(
+        ("what", "in any order", "in their order"),
+        [(what, *(column.get(what, 0) for column in columns)) for what in columns[0] | columns[1]],
+    )
     print(
         f"\nOf the replies {LATE_PERMILLE / 10:g} % come up to {3 * TIMEOUT_MS} ms late, "
         f"{LOST_PERMILLE / 10:g} % never, {TWICE_PERMILLE / 10:g} % twice; missed: values, 10 in an exchange."
@@ -58,10 +55,20 @@ def main() -> None:
     print("\nStalls come every five times their length. Late: replies that were recognised as such.")
 
 
+def _told(judged: many_adapter.Judged, seconds: float) -> dict[str, object]:
+    return {
+        "seconds": f"{seconds:.0f}",
+        "exchanges": judged.exchanges,
+        "values": judged.samples,
+        "values that are another register's": judged.wrong - judged.beyond,
+        "the same, by answers later than that": judged.beyond,
+        "late replies that were recognised": judged.late,
+        **{f"missed: {why}": count for why, count in judged.misses.most_common()},
+    }
+
+
 def slow_paths(arguments: argparse.Namespace) -> Iterator[tuple[object, ...]]:
     """Yield a row for each path, of few drives on few lines: each exchange takes as long as the path."""
-    from bench.masters import many_adapter
-
     for path_ms in PATHS_MS:
         constant = "--path-us", 1000 * path_ms
         stalls = "--stall-us", 1000 * path_ms, "--stall-every-us", 5000 * path_ms
