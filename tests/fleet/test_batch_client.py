@@ -91,6 +91,12 @@ def _with_path(running: Cluster, work: Callable[[ServerPath], Awaitable[None]]) 
     asyncio.run(main())
 
 
+def _rested(path: ServerPath) -> None:
+    """Let a path have all there is to spare, as after some time at rest."""
+    for _ in range(round(direct_gets.MOST_SPARE / direct_gets.EARNED)):
+        path._spare.note(is_late=False)
+
+
 @pytest.mark.parametrize(
     "writers",
     [
@@ -189,6 +195,7 @@ def test_what_a_server_that_is_cut_off_got_is_asked_again(
 
     async def work(path: ServerPath) -> None:
         path.others = []
+        _rested(path)
         other = await connect(one.urls[0], {})
         asked: list[str] = []
 
@@ -224,6 +231,7 @@ def test_a_path_whose_server_is_cut_off_has_its_questions_asked_by_the_others(on
             asked.append(request)
             await asyncio.Event().wait()
 
+        _rested(paths[0])
         deaf = paths[0]._client
         assert deaf
         deaf.batch = swallow  # type: ignore[method-assign]
