@@ -270,6 +270,36 @@ def test_an_answer_that_comes_too_late_is_none_to_another_request(one: Cluster) 
     asyncio.run(main())
 
 
+def test_a_pong_that_comes_too_late_ends_no_reading(one: Cluster) -> None:
+    async def main() -> None:
+        client = await connect(one.urls[0], {})
+        given_up = asyncio.get_running_loop().create_future()
+        given_up.cancel()  # as a flush leaves it that timed out
+        await client._send_ping(given_up)
+        await client.flush(30)
+        assert client.is_reading
+        assert None not in await client.replies([Request("$JS.API.INFO", b"")], 30.0)
+        await client.close()
+
+    asyncio.run(main())
+
+
+def test_a_connection_that_is_not_read_any_more_is_left_for_a_new_one(one: Cluster) -> None:
+    async def work(path: ServerPath) -> None:
+        former = path._client
+        assert former
+        assert former._reading_task
+        former._reading_task.cancel()
+        await asyncio.wait([former._reading_task])
+        assert former.is_connected
+        assert not path.is_open
+        await path.look_after()
+        assert path.is_open
+        assert path._client is not former
+
+    _with_path(one, work)
+
+
 @pytest.mark.usefixtures("way")
 def test_other_messages_go_where_they_went(one: Cluster) -> None:
     async def main() -> None:

@@ -49,7 +49,7 @@ class ServerPath:
 
     @property
     def is_open(self) -> bool:
-        return self._client is not None and self._client.is_connected
+        return self._client is not None and self._client.is_connected and self._client.is_reading
 
     @property
     def server_name(self) -> str:
