@@ -94,7 +94,7 @@ def _with_path(running: Cluster, work: Callable[[ServerPath], Awaitable[None]]) 
 def _rested(path: ServerPath) -> None:
     """Let a path have all there is to spare, as after some time at rest."""
     for _ in range(round(direct_gets.MOST_SPARE / direct_gets.EARNED)):
-        path._spare.note(is_late=False)
+        path.spare.note(is_late=False)
 
 
 @pytest.mark.parametrize(

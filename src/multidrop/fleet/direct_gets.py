@@ -21,8 +21,8 @@ from multidrop.fleet.errors import NoRight, Unsure
 from multidrop.fleet.task_end import end_tasks
 
 AGAIN_S = (0.1, 0.1, 0.2, 0.4, 1.0)  # without a message, before it is asked again; then it is given up
-MOST_SPARE = 100.0  # questions: what a gateway loses in the 3 s until servers leave a dead route, and more
-EARNED = 0.25  # of a question, by an answer in time
+MOST_SPARE = 300.0  # questions: twice what a gateway asks again in the 3 s until servers leave a dead route
+EARNED = 0.5  # of a question, by an answer in time
 
 
 class Way(Protocol):
@@ -33,7 +33,7 @@ class Way(Protocol):
 
 
 class Spare:
-    """The number of questions that may be asked again."""
+    """The number of questions that one process may ask again."""
 
     def __init__(self) -> None:
         self._left = 0.0

@@ -37,7 +37,7 @@ class ServerPath:
         self.urls = list(urls)  # the first is home
         self.url = ""  # where it is
         self.others: Sequence[ServerPath] = ()  # of the same process
-        self._spare = Spare()
+        self.spare = Spare()  # of the same process too
         self._options = options or {}
         self._client: BatchClient | None = None
         self._denials = Denials()
@@ -196,7 +196,7 @@ class ServerPath:
         Raises Unsure as `request` does.
         """
         ways = [self, *(other for other in self.others if other.is_open)]
-        return await first_answer(ways, Request(subject, data), self._spare)
+        return await first_answer(ways, Request(subject, data), self.spare)
 
     async def gather(self, request: Request, get: DirectGet) -> None:
         """Gather the messages of a direct get by this path alone. Raises Unsure as `request` does."""
@@ -283,5 +283,5 @@ def paths_of(urls: Sequence[str], options: Mapping[str, Any] | None = None) -> l
     """Return three paths: each has another of the servers as its home, where there are so many."""
     paths = [ServerPath([*urls[at % len(urls) :], *urls[: at % len(urls)]], options) for at in range(PATHS)]
     for path in paths:
-        path.others = [other for other in paths if other is not path]
+        path.others, path.spare = [other for other in paths if other is not path], paths[0].spare
     return paths
