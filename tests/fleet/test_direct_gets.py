@@ -154,7 +154,7 @@ def questions(reads: int, ways: Sequence[LateWay], spare: Spare) -> int:
 
 
 def test_nothing_is_asked_again_before_answers_came_in_time() -> None:
-    """Where many gateways begin at a time, each has much to read."""
+    """Each of many gateways that begin at a time has much to read."""
     assert questions(100, [LateWay(0.9) for _ in range(3)], Spare()) == 100
 
 
