@@ -91,6 +91,12 @@ def _with_path(running: Cluster, work: Callable[[ServerPath], Awaitable[None]]) 
     asyncio.run(main())
 
 
+def _rested(path: ServerPath) -> None:
+    """Let a path have all there is to spare, as after some time at rest."""
+    for _ in range(round(direct_gets.MOST_SPARE / direct_gets.EARNED)):
+        path.spare.note(is_late=False)
+
+
 @pytest.mark.parametrize(
     "writers",
     [
@@ -189,6 +195,7 @@ def test_what_a_server_that_is_cut_off_got_is_asked_again(
 
     async def work(path: ServerPath) -> None:
         path.others = []
+        _rested(path)
         other = await connect(one.urls[0], {})
         asked: list[str] = []
 
@@ -224,6 +231,7 @@ def test_a_path_whose_server_is_cut_off_has_its_questions_asked_by_the_others(on
             asked.append(request)
             await asyncio.Event().wait()
 
+        _rested(paths[0])
         deaf = paths[0]._client
         assert deaf
         deaf.batch = swallow  # type: ignore[method-assign]
@@ -260,6 +268,36 @@ def test_an_answer_that_comes_too_late_is_none_to_another_request(one: Cluster) 
             await one_of.close()
 
     asyncio.run(main())
+
+
+def test_a_pong_that_comes_too_late_ends_no_reading(one: Cluster) -> None:
+    async def main() -> None:
+        client = await connect(one.urls[0], {})
+        given_up = asyncio.get_running_loop().create_future()
+        given_up.cancel()  # as a flush leaves it that timed out
+        await client._send_ping(given_up)
+        await client.flush(30)
+        assert client.is_reading
+        assert None not in await client.replies([Request("$JS.API.INFO", b"")], 30.0)
+        await client.close()
+
+    asyncio.run(main())
+
+
+def test_a_connection_that_is_not_read_any_more_is_left_for_a_new_one(one: Cluster) -> None:
+    async def work(path: ServerPath) -> None:
+        former = path._client
+        assert former
+        assert former._reading_task
+        former._reading_task.cancel()
+        await asyncio.wait([former._reading_task])
+        assert former.is_connected
+        assert not path.is_open
+        await path.look_after()
+        assert path.is_open
+        assert path._client is not former
+
+    _with_path(one, work)
 
 
 @pytest.mark.usefixtures("way")

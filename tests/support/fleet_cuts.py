@@ -124,6 +124,14 @@ class MachineDrill(FleetDrill):
         self.gateways[name].kill()
         self.gateways[name].wait()
 
+    def kill_gateway_and_another_node(self) -> None:
+        """Kill a gateway, and in the same instant a node on another machine."""
+        name = self.random.choice(GATEWAYS)
+        others = [node for node in self.nats.nodes if node.place is not self.places[name]]
+        self.random.choice(others).kill()
+        self.gateways[name].kill()
+        self.gateways[name].wait()
+
     def cut_machine(self) -> None:
         cut(self, "gateway cut off", seconds=self.random.uniform(4, 8))
 
@@ -131,6 +139,7 @@ class MachineDrill(FleetDrill):
 MACHINES: dict[str, Callable[[MachineDrill], None]] = {
     "machine killed": MachineDrill.kill_machine,
     "machine cut off": MachineDrill.cut_machine,
+    "gateway and another machine's node killed": MachineDrill.kill_gateway_and_another_node,
 }
 
 

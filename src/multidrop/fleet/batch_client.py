@@ -140,6 +140,17 @@ class BatchClient(Client):
                 self._inboxes = self.new_inbox()
                 self._batch_sid = (await self.subscribe(f"{self._inboxes}.*", cb=self._take_message))._id
 
+    @property
+    def is_reading(self) -> bool:
+        """Say whether answers are read: after an error of its own nats-py ends that, and flushes are good."""
+        return self._reading_task is not None and not self._reading_task.done()
+
+    async def _process_pong(self) -> None:
+        """Take a pong whose flush was given up, too: to nats-py it is an error that ends its reading."""
+        if self._pongs and self._pongs[0].done():
+            self._pongs[0] = asyncio.get_running_loop().create_future()
+        await super()._process_pong()
+
     async def _process_msg(self, sid: int, *rest: Any) -> None:
         """Take an answer out of nats-py's own way; its subject, reply, data and headers are the rest."""
         if sid != self._batch_sid or len(rest) != PROCESSED:

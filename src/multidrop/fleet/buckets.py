@@ -7,6 +7,7 @@ import base64
 import json
 import logging
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from typing import Any, NamedTuple
 
 from multidrop.fleet.batch_client import Request
@@ -63,16 +64,34 @@ def bucket_settings(name: str, replicas: int) -> dict[str, Any]:
 async def ask(path: ServerPath, subject: str, data: Mapping[str, Any] | None = None) -> dict[str, Any]:
     """Return what JetStream says to a request about streams.
 
-    Raises FleetError with its own words for an error, Unsure where the servers cannot decide.
+    Raises FleetError with its own words for an error, Unsure where the servers cannot decide, or answer
+    something else.
     """
     message = await path.request(f"$JS.API.{subject}", json.dumps(data).encode() if data else b"")
-    said: dict[str, Any] = json.loads(message.data)
+    said = _table(message.data)
     error = said.get("error")
     if error and error.get("err_code") == _UNAVAILABLE:
         raise Unsure(f"{path.url} says: {error.get('description')}")
     if error:
         raise ServerError(error)
     return said
+
+
+def _table(data: bytes) -> dict[str, Any]:
+    """Return the table that an answer is. Raises Unsure for anything else: nobody knows what was done."""
+    with suppress(ValueError, RecursionError):
+        found = json.loads(data)
+        if isinstance(found, dict) and isinstance(found.get("error") or {}, dict):
+            return found
+    raise Unsure("what NATS answers is no answer of JetStream")
+
+
+def _revision(said: Mapping[str, Any]) -> int:
+    """Return the sequence at which a record was stored. Raises Unsure where the answer has none."""
+    revision = said.get("seq")
+    if type(revision) is not int:
+        raise Unsure("what NATS answers has no sequence")
+    return revision
 
 
 class ServerError(FleetError):
@@ -101,10 +120,10 @@ class Bucket:
         Raises Conflict where it has another, Unsure where it may or may not have been replaced.
         """
         message = await self.path().request(*self._put(Record(key, revision, value)))
-        said = json.loads(message.data)
+        said = _table(message.data)
         error = said.get("error")
-        if error is None:
-            return int(said["seq"])
+        if not error:
+            return _revision(said)
         if error.get("err_code") in _WRONG_REVISION:
             raise Conflict(f"{self.name}.{key} has another revision than {revision}")
         raise Unsure(f"NATS did not store {self.name}.{key}: {error.get('description')}")
@@ -116,12 +135,12 @@ class Bucket:
         returned may have been replaced or not: read it.
         """
         answers = await self.path().request_all([self._put(record) for record in records])
-        said = [json.loads(answer) if answer else {} for answer in answers]
-        return [
-            record._replace(revision=int(one["seq"]))
-            for record, one in zip(records, said, strict=True)
-            if "seq" in one and "error" not in one
-        ]
+        stored = []
+        for record, answer in zip(records, answers, strict=True):
+            with suppress(Unsure):
+                if answer and not (said := _table(answer)).get("error"):
+                    stored.append(record._replace(revision=_revision(said)))
+        return stored
 
     def _put(self, record: Record) -> Request:
         value = record.value
@@ -143,8 +162,12 @@ class Bucket:
             if failure.code == _NO_MESSAGE:
                 return Record(key, NONE_YET, None)
             raise
-        found = said["message"]
-        return self._record(found["subject"], int(found["seq"]), base64.b64decode(found.get("data", "")))
+        try:
+            found = said["message"]
+            subject, data = str(found["subject"]), base64.b64decode(found.get("data", ""))
+        except (AttributeError, KeyError, TypeError, ValueError):
+            raise Unsure(f"what NATS answers of {self.name}.{key} is no record") from None
+        return self._record(subject, _revision(found), data)
 
     async def changes(self, after: int) -> list[Record]:
         """Return the records with a higher revision, as any of the servers has them: some may be old.

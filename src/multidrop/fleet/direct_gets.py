@@ -1,9 +1,13 @@
 """Direct gets: reads that any of the servers answers, and that go on while one of them is cut off.
 
 A server hands such a question to any server that has the records: itself, or one behind a route, by chance.
-One that is cut off gets its share of them until the others notice, which takes them 10 s or more. So what is
+One that is cut off gets its share of them until the others notice, which takes them some seconds. So what is
 not answered soon is asked again, by all paths at once. Each answer may be old, as ever: whoever writes upon
 it names the revision that he read.
+
+Where all are slow, asking again makes them slower, until nobody has an answer in time. So there are so many
+questions to spare and no more: at first none, and a read that is answered in time earns a part of one. An
+answer that comes to the first question after all, which was late and not lost, halves what is left.
 """
 
 from __future__ import annotations
@@ -17,6 +21,8 @@ from multidrop.fleet.errors import NoRight, Unsure
 from multidrop.fleet.task_end import end_tasks
 
 AGAIN_S = (0.1, 0.1, 0.2, 0.4, 1.0)  # without a message, before it is asked again; then it is given up
+MOST_SPARE = 300.0  # questions: twice what a gateway asks again in the 3 s until servers leave a dead route
+EARNED = 0.5  # of a question, by an answer in time
 
 
 class Way(Protocol):
@@ -26,22 +32,44 @@ class Way(Protocol):
         """Gather what a direct get gives. Raises FleetError."""
 
 
-async def first_answer(ways: Sequence[Way], request: Request) -> list[DirectMessage]:
+class Spare:
+    """The number of questions that one process may ask again."""
+
+    def __init__(self) -> None:
+        self._left = 0.0
+
+    def note(self, *, is_late: bool) -> None:
+        """Learn that the first question was answered."""
+        self._left = self._left / 2 if is_late else min(self._left + EARNED, MOST_SPARE)
+
+    def spend(self, ways: Sequence[Way]) -> Sequence[Way]:
+        """Return those of the ways that may be asked again."""
+        asked = ways[: int(self._left)]
+        self._left -= len(asked)
+        return asked
+
+
+async def first_answer(ways: Sequence[Way], request: Request, spare: Spare) -> list[DirectMessage]:
     """Return the messages of the first whole answer. Raises FleetError where there is none.
 
     The first of the ways is asked alone: at rest it answers in an instant.
     """
     gets: dict[asyncio.Task[None], DirectGet] = {}
+    first: DirectGet | None = None
     failure: BaseException = Unsure(f"nothing came to {request.subject}")
     try:
         for number, silence_s in enumerate(AGAIN_S):
-            for way in ways[:1] if number == 0 else ways[1:] if number == 1 and ways[1:] else ways:
+            again = ways[1:] if number == 1 and ways[1:] else ways
+            for way in spare.spend(again) if number else ways[:1]:
                 get = DirectGet()
+                first = first or get
                 gets[asyncio.create_task(way.gather(request, get))] = get
             while await _is_one_over(gets, silence_s):
                 for task in [task for task in gets if task.done()]:
                     get = gets.pop(task)
                     if not (failed := task.exception()):
+                        if get is first:
+                            spare.note(is_late=number > 0)
                         return get.messages
                     failure = failed
             is_refused = isinstance(failure, NoRight)  # by each of the servers, then

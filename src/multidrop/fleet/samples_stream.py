@@ -10,8 +10,8 @@ import asyncio
 import base64
 import hashlib
 import json
-from collections.abc import Mapping
-from contextlib import suppress
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
 from typing import Any, NamedTuple
 
 from nats.aio.client import Client
@@ -124,10 +124,11 @@ async def create_stream(client: Client, *, replicas: int = 3, most_bytes: int = 
 async def about(client: Client) -> StreamAbout:
     """Return the stream's identity and extent. Raises StreamError."""
     found = await _ask(client, f"STREAM.INFO.{STREAM}", {})
-    config, state = found["config"], found["state"]
-    if not config.get("allow_direct"):
-        raise StreamError(f"the stream {STREAM!r} allows no direct gets: set allow_direct")
-    return StreamAbout(str(found["created"]), int(state["first_seq"]), int(state["last_seq"]))
+    with _as_wanted():
+        config, state = found["config"], found["state"]
+        if not config.get("allow_direct"):
+            raise StreamError(f"the stream {STREAM!r} allows no direct gets: set allow_direct")
+        return StreamAbout(str(found["created"]), int(state["first_seq"]), int(state["last_seq"]))
 
 
 async def last_of(client: Client, subject: str) -> LastMessage | None:
@@ -135,10 +136,11 @@ async def last_of(client: Client, subject: str) -> LastMessage | None:
     found = await _ask(client, f"STREAM.MSG.GET.{STREAM}", {"last_by_subj": subject}, NO_MESSAGE)
     if found is None:
         return None
-    message = found["message"]
-    lines = base64.b64decode(message.get("hdrs", "")).decode("utf-8", "replace").splitlines()
-    headers = {name.strip(): value.strip() for name, _, value in (line.partition(":") for line in lines)}
-    return LastMessage(int(message["seq"]), _number(headers.get(SEQUENCE)), headers.get(DIGEST, ""))
+    with _as_wanted():
+        message = found["message"]
+        lines = base64.b64decode(message.get("hdrs", "")).decode("utf-8", "replace").splitlines()
+        headers = {name.strip(): value.strip() for name, _, value in (line.partition(":") for line in lines)}
+        return LastMessage(int(message["seq"]), _number(headers.get(SEQUENCE)), headers.get(DIGEST, ""))
 
 
 async def publish(client: Client, subject: str, data: bytes, headers: dict[str, str]) -> int | None:
@@ -157,7 +159,8 @@ async def publish(client: Client, subject: str, data: bytes, headers: dict[str, 
         if error.get("err_code") == WRONG_SEQUENCE:
             return None
         raise StreamError(f"the stream {STREAM!r} refuses a message: {error.get('description')}")
-    return int(found["seq"])
+    with _as_wanted():
+        return int(found["seq"])
 
 
 async def read_after(client: Client, place: int, messages: int, size: int) -> list[StreamMessage]:
@@ -237,11 +240,20 @@ async def _ask(client: Client, subject: str, what: Mapping[str, Any], *none: int
 def _parsed(data: bytes) -> dict[str, Any]:
     try:
         found = json.loads(data)
-    except ValueError:
+    except (ValueError, RecursionError):
         found = None
-    if not isinstance(found, dict):
+    if not isinstance(found, dict) or not isinstance(found.get("error") or {}, dict):
         raise StreamError("NATS answers something else than JSON")
     return found
+
+
+@contextmanager
+def _as_wanted() -> Iterator[None]:
+    """Raise StreamError where an answer lacks what is taken from it."""
+    try:
+        yield
+    except (AttributeError, KeyError, TypeError, ValueError):
+        raise StreamError("NATS answers something else than it was asked for") from None
 
 
 def _silent(client: Client, failure: Exception) -> StreamError:

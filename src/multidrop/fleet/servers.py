@@ -14,7 +14,7 @@ from nats.aio.subscription import Subscription
 from nats.errors import Error as NatsError
 
 from multidrop.fleet.batch_client import BatchClient, DirectGet, DirectMessage, Request
-from multidrop.fleet.direct_gets import first_answer
+from multidrop.fleet.direct_gets import Spare, first_answer
 from multidrop.fleet.errors import FleetError, NobodyThere, NotAdmitted, NotDelivered, TooOld, Unsure
 from multidrop.fleet.lease_rules import PATHS
 from multidrop.fleet.refusals import Denials, failure_to_connect
@@ -37,6 +37,7 @@ class ServerPath:
         self.urls = list(urls)  # the first is home
         self.url = ""  # where it is
         self.others: Sequence[ServerPath] = ()  # of the same process
+        self.spare = Spare()  # of the same process too
         self._options = options or {}
         self._client: BatchClient | None = None
         self._denials = Denials()
@@ -48,7 +49,7 @@ class ServerPath:
 
     @property
     def is_open(self) -> bool:
-        return self._client is not None and self._client.is_connected
+        return self._client is not None and self._client.is_connected and self._client.is_reading
 
     @property
     def server_name(self) -> str:
@@ -195,7 +196,7 @@ class ServerPath:
         Raises Unsure as `request` does.
         """
         ways = [self, *(other for other in self.others if other.is_open)]
-        return await first_answer(ways, Request(subject, data))
+        return await first_answer(ways, Request(subject, data), self.spare)
 
     async def gather(self, request: Request, get: DirectGet) -> None:
         """Gather the messages of a direct get by this path alone. Raises Unsure as `request` does."""
@@ -282,5 +283,5 @@ def paths_of(urls: Sequence[str], options: Mapping[str, Any] | None = None) -> l
     """Return three paths: each has another of the servers as its home, where there are so many."""
     paths = [ServerPath([*urls[at % len(urls) :], *urls[: at % len(urls)]], options) for at in range(PATHS)]
     for path in paths:
-        path.others = [other for other in paths if other is not path]
+        path.others, path.spare = [other for other in paths if other is not path], paths[0].spare
     return paths
