@@ -180,7 +180,9 @@ def test_a_stop_that_is_called_behind_the_dialog_ends_a_start(opened: Opener, ga
     until_met(page, lambda: gateway.posts)
 
 
-def test_a_plant_that_is_read_anew_behind_the_dialog_ends_a_start(opened: Opener, gateway: FakeGateway) -> None:
+def test_a_plant_that_is_read_anew_behind_the_dialog_ends_a_start(
+    opened: Opener, gateway: FakeGateway
+) -> None:
     """Under the name that was confirmed may be another drive now."""
     page = opened("#/drives/pump-1")
     page.get_by_role("button", name="start", exact=True).click()
