@@ -64,6 +64,11 @@ class Commands:
         self.stops: Counter[str] = Counter()  # that were called, by drive
         self._stopped_ns: dict[str, int] = {}  # when the latest one was
         self._ended_ns: dict[str, int] = {}  # by drive
+        self.plant_ns: int | None = None  # when the plant was read anew (CLOCK_BOOTTIME)
+
+    def begin_anew(self) -> None:
+        """Note that there is another plant, in which a name may be another drive's."""
+        self.plant_ns = boottime_ns()
 
     def ended_ns(self, drive: str) -> int:
         """Return when the latest command of a drive ended (CLOCK_MONOTONIC); 0 without one.
