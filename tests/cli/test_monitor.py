@@ -269,7 +269,7 @@ def test_the_page_scrolls_as_far_as_there_is_something(watched: LivePlant) -> No
         (b"\x1bOBsy", [DOWN, "s", "y"]),
         (b"\x1b[5~\x1b", ["page up", "escape"]),
         ("ыЫнй".encode(), ["s", "S", "y", "q"]),  # the same keys with a Russian layout
-        ("іос".encode(), ["s", DOWN, "с"]),
+        ("\u0456\u043e\u0441".encode(), ["s", DOWN, "\u0441"]),  # and a Ukrainian one
         (b"\xd1s\xff", ["\ufffd", "s", "\ufffd"]),
     ],
 )

@@ -11,6 +11,8 @@ from conftest import SIZES, Opener
 from fake_gateway import FakeGateway
 from watching import AT_ITS_PLACE, LIVE, VIEWS, until, until_met
 
+from multidrop.control.stop_attempt import LEAST_S
+
 pytestmark = pytest.mark.long  # Chromium is started for each file
 
 
@@ -341,3 +343,20 @@ def test_the_key_is_at_hand_behind_a_dialog_but_where_something_is_typed(opened:
     page.get_by_role("button", name="Cancel").focus()
     page.keyboard.press("Shift+S")
     assert title(page).inner_text() == "Stop all 31 drives?"
+
+
+@pytest.mark.parametrize("verb", ["stop", "emergency stop"])
+def test_the_page_waits_for_longer_than_a_stop_is_repeated(
+    opened: Opener, gateway: FakeGateway, verb: str
+) -> None:
+    """Else it would never say which drives stand where one of them is dead."""
+    page = opened("#/drives/pump-1")
+    page.evaluate("""() => {
+        const make = AbortSignal.timeout;
+        window.patience = [];
+        AbortSignal.timeout = ms => (window.patience.push(ms), make.call(AbortSignal, ms));
+    }""")
+    page.get_by_role("button", name="Stop pump-1" if verb == "stop" else verb, exact=True).click()
+    page.locator("#ask button.stop").click()
+    until_met(page, lambda: gateway.posts)
+    assert max(page.evaluate("window.patience")) > (LEAST_S + 10) * 1e3

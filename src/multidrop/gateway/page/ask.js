@@ -15,6 +15,7 @@ const TWICE_MS = 500,
   AT_ONCE = "#stopall, .stop";
 export const DANGER = "danger",
   STOP = "danger stop"; // classes of buttons
+const STOP_PATIENCE_MS = 45000; // a drive that does not answer is sent its stop for 30 s
 let changes = 0, // how often the dialog opened or closed
   last = { x: 0, y: 0, time: -Infinity, changes }; // the latest click that was taken
 
@@ -139,9 +140,11 @@ export async function askToken(why, yes = "Sign in", kind = DANGER) {
   }
 }
 
+const patienceOf = kind => (kind === STOP ? STOP_PATIENCE_MS : undefined);
+
 // Send what the person confirmed, and once more after a sign-in where the right to it was missing: `body`
 // is called at each confirmation, and `kind` is the class of its button. Return the answer. Raises Refused.
-export async function send(path, body, { kind = DANGER, patience } = {}) {
+export async function send(path, body, { kind = DANGER, patience = patienceOf(kind) } = {}) {
   dispatchEvent(new Event("command"));
   try {
     return await post(path, body(), patience);

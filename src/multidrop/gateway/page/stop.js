@@ -3,10 +3,11 @@
 import { STOP, confirm, send, tell } from "./ask.js";
 import { find, glyph, make, named } from "./dom.js";
 
-const PATIENCE_MS = 20000;
 const HOW =
   "A stop goes ahead of all polling and is repeated until the drive confirms it. " +
   "Motors come down as their drives are set.";
+const WAITING =
+  "The stop is on its way. Where a drive does not answer it is repeated for 30 s, and told of after that.";
 const HARD = "Use the hard stop at the machine if a motor must stand now.";
 
 // Ask, and stop all drives.
@@ -27,11 +28,11 @@ export async function stopOne(name) {
 async function stop(drives, what) {
   let again = "again";
   while (again === "again") {
-    const closed = tell(["Stopping ", named(what), " …"], [make("p", {}, "The stop is on its way.")]);
+    const closed = tell(["Stopping ", named(what), " …"], [make("p", {}, `${WAITING} ${HARD}`)]);
     closed.catch(() => {});
     let shown;
     try {
-      const told = await send("api/stop", () => ({ drives }), { kind: STOP, patience: PATIENCE_MS });
+      const told = await send("api/stop", () => ({ drives }), { kind: STOP });
       shown = outcome(told);
     } catch (error) {
       const isRefused = error.status >= 400 && error.status < 500;
