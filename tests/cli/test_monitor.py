@@ -268,6 +268,9 @@ def test_the_page_scrolls_as_far_as_there_is_something(watched: LivePlant) -> No
         (b"\x1b[A\x1b[B\r", [UP, DOWN, ENTER]),
         (b"\x1bOBsy", [DOWN, "s", "y"]),
         (b"\x1b[5~\x1b", ["page up", "escape"]),
+        ("ыЫнй".encode(), ["s", "S", "y", "q"]),  # the same keys with a Russian layout
+        ("\u0456\u043e\u0441".encode(), ["s", DOWN, "\u0441"]),  # and a Ukrainian one
+        (b"\xd1s\xff", ["\ufffd", "s", "\ufffd"]),
     ],
 )
 def test_keys_that_come_together_are_told_apart(pressed: bytes, keys: list[str]) -> None:
@@ -318,7 +321,8 @@ def test_a_stop_needs_a_yes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     for keys, asked in (
         (["s", "n"], []),
         (["s", ENTER], []),
-        (["s", "Y"], []),
+        (["s", "Y"], ["drive-1 control STOP"]),  # with caps lock on
+        (["s", "S", "y"], ["stop all"]),  # the question is another one
         (["y"], []),
         ([DOWN, "s", "y"], ["drive-2 control STOP"]),
         (["S", "n"], []),
@@ -328,6 +332,21 @@ def test_a_stop_needs_a_yes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
         for key in keys:
             monitor._obey(key)
         assert poller.asked == asked
+
+
+def test_a_stop_is_sent_where_the_system_gives_no_thread(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def none(thread: object) -> None:
+        raise RuntimeError("can't start new thread")
+
+    monitor, poller = a_monitor(tmp_path, monkeypatch)
+    del monitor._in_background
+    monkeypatch.setattr("threading.Thread.start", none)
+    for key in "Sy":
+        monitor._obey(key)
+    assert poller.asked == ["stop all"]
+    assert not monitor._is_stopping
 
 
 def seen(monitor: Any) -> str:

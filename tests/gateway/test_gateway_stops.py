@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import asyncio
 import threading
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -13,8 +15,9 @@ from lines import until
 
 from multidrop import PlantError
 from multidrop.gateway import parts
+from multidrop.gateway.command_threads import begin_stops
 from multidrop.gateway.parts import Part
-from multidrop.gateway.rights import Right
+from multidrop.gateway.rights import Caller, Right
 from multidrop.gateway.settings import read_settings
 
 MAY = """[serve.may]
@@ -187,6 +190,29 @@ def test_a_stop_is_sent_where_the_system_gives_no_thread(tmp_path: Path) -> None
             assert told == {"done": False, "text": "can't start new thread"}
             assert gateway.post("/api/stop").json["pump-1"]["done"] is True
         assert stands(gateway, "pump-1")
+
+
+def test_without_threads_all_stops_are_sent_before_one_is_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The system gives one thread more."""
+    done: list[tuple[str, float | None]] = []
+    caller = Caller("anna", "page", "10.0.0.1", Right.STOP)
+
+    class LastThread(threading.Thread):
+        def start(self) -> None:
+            if done:
+                raise RuntimeError("can't start new thread")
+            self.run()
+
+    def work(seconds: float | None, line: str) -> str:
+        done.append((line, seconds))
+        return f"{line} stands"
+
+    async def begin() -> list[str]:
+        return await asyncio.gather(*begin_stops([partial(work, line=line) for line in "abc"], caller))
+
+    monkeypatch.setattr("multidrop.gateway.command_threads.threading", SimpleNamespace(Thread=LastThread))
+    assert asyncio.run(begin()) == ["a stands", "b stands", "c stands"]
+    assert done == [("a", None), ("b", 0.0), ("c", 0.0), ("b", None), ("c", None)]
 
 
 def test_a_silent_drives_stop_says_so_and_holds_no_other_up(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import threading
 import time
 from collections.abc import Iterator, Sequence
@@ -224,6 +225,23 @@ def test_a_reload_needs_the_right_to_write_and_a_confirmation(tmp_path: Path) ->
             "error": 'a reload changes what is polled: confirm it with {"confirm": true}'
         }
         assert gateway.gateway.revision == revision
+
+
+def test_a_start_of_before_a_reload_does_not_go_to_what_has_its_drive_s_name_now(tmp_path: Path) -> None:
+    with served(tmp_path, MAY) as gateway:
+        seen = gateway.frame()["n"]
+        path = gateway.gateway.plant.path
+        names = {"pump-1": "pump-2", "pump-2": "pump-1"}
+        path.write_text(
+            re.sub(r'name = "(pump-.)"', lambda found: f'name = "{names[found[1]]}"', path.read_text())
+        )
+        assert reload(gateway)["done"] is True
+        start = {"drive": "pump-1", "verb": "start", "options": {}, "seen": seen}
+        told = gateway.post("/api/act", start, authorization=gateway.bearer(Right.WRITE)).json
+        assert told["text"].startswith(
+            f"pump-1.start was not sent: the plant was read anew after frame {seen}"
+        )
+        assert not any(sim.motor.goal for sim in gateway.sims.values())  # type: ignore[attr-defined]
 
 
 def test_a_stop_of_a_drive_that_a_reload_exchanges_is_sent_to_the_new_one(

@@ -185,16 +185,33 @@ def test_wrong_tokens_are_looked_at_five_times_a_minute(tmp_path: Path) -> None:
         anna = {"x_forwarded_for": "10.0.0.1"}
         wrong = {**anna, "authorization": "Bearer wrong"}
         right = {**anna, "authorization": gateway.bearer(Right.STOP)}
-        assert [gateway.get("/api/plant", **wrong).status for _ in range(MOST_WRONG)] == [401] * MOST_WRONG
+        for at in range(MOST_WRONG):
+            assert gateway.get("/api/plant", **anna, authorization=f"Bearer wrong-{at}").status == 401
         assert gateway.get("/api/plant", **wrong).status == 429
         assert gateway.get("/api/plant", **right).status == 429  # not even looked at
         assert gateway.post("/api/token", {"token": gateway.secrets[Right.STOP]}, **anna).status == 429
         assert gateway.post(*STOP, **right).json["pump-1"]["done"] is True
         assert gateway.post(*STOP, **wrong).status == 401
+        signed = {"token": gateway.secrets[Right.STOP], "to": "stop"}  # which a stop from the page needs
+        assert gateway.post("/api/token", signed, **anna).status == 200
+        assert gateway.post("/api/token", {**signed, "token": "wrong"}, **anna).status == 401
         elsewhere = {"x_forwarded_for": "10.0.0.2", "authorization": gateway.bearer(Right.STOP)}
         assert gateway.get("/api/plant", **elsewhere).status == 200
         now[0] += 60.0
         assert gateway.get("/api/plant", **right).status == 200
+
+
+def test_a_token_that_was_taken_away_shuts_nobody_out(tmp_path: Path) -> None:
+    """A browser goes on sending its cookie with every frame."""
+    with served(tmp_path, CLOSED) as gateway:
+        old = {"cookie": "multidrop=taken-away"}
+        for _ in range(2 * MOST_WRONG):
+            assert gateway.get("/api/frame", **old).status == 401
+        assert gateway.post(*STOP, **old).status == 401
+        signed = gateway.post("/api/token", {"token": gateway.secrets[Right.STOP]}, **old)
+        assert signed.status == 200
+        kept = signed.headers["set-cookie"].partition(";")[0]
+        assert gateway.post(*STOP, cookie=kept).json["pump-1"]["done"] is True
 
 
 def guard_clock(gateway: Served, now: list[float]) -> None:

@@ -23,7 +23,7 @@ from multidrop.gateway import commands as commands_module
 from multidrop.gateway.clock import boottime_ns
 from multidrop.gateway.commands import Told
 from multidrop.gateway.rights import Right
-from multidrop.gateway.seen_frames import DOUBLED, MOST_AGE_NS, OVERTAKEN, TOO_LATE, SeenFrames
+from multidrop.gateway.seen_frames import ANOTHER_PLANT, DOUBLED, MOST_AGE_NS, OVERTAKEN, TOO_LATE, SeenFrames
 
 MAY = """[serve.may]
 stop = "anyone"
@@ -78,6 +78,15 @@ def test_what_a_stop_overtook_counts_for_its_drive_alone(times: Times) -> None:
     times.now_ns += 1
     times.frames.note(8)
     assert times.rule(8) == ""
+
+
+def test_frames_of_another_plant_count_for_nothing(times: Times) -> None:
+    times.frames.note(7)
+    times.frames.begin_anew()
+    assert times.rule(7) == times.rule(7, "pump-2") == ANOTHER_PLANT
+    times.frames.note(8)
+    assert times.rule(8) == ""
+    assert times.rule(7) == ANOTHER_PLANT
 
 
 def test_a_command_comes_once_for_each_frame(times: Times) -> None:

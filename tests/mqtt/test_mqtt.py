@@ -205,6 +205,54 @@ def test_a_stop_is_always_carried_out(broker: Broker, listener: Listener, start:
     assert known.commands.noted[-3:] == [("stop", ["pump-1"]), ("stop", None), ("stop", [FAN.name])]
 
 
+@pytest.mark.parametrize("verb", ["coast", "emergency_stop", "stop"])
+@pytest.mark.parametrize("more", [{"time": 1}, {"time": 10**15}, {"time": "now"}, {"drive": "pump-1"}, {}])
+def test_a_stop_by_a_verb_is_carried_out_whenever_it_was_sent(
+    broker: Broker, listener: Listener, start: Start, verb: str, more: dict[str, Any]
+) -> None:
+    known, _ = start(commands=True)
+    listener.wait_for(has("multidrop/gateway", b"online"))
+    known.commands.stopped_at["pump-1"] = known.commands.plant_ns = boottime_ns()
+    for _ in range(2):
+        publish(broker, "multidrop/pump-1/act", json.dumps({"verb": verb, **more}).encode())
+        assert told(listener) == {"what": verb, "done": True, "text": "done"}
+    assert known.commands.noted == [("act", "pump-1", verb, {})] * 2
+
+
+def test_a_stop_by_a_verb_that_the_broker_keeps_is_carried_out(
+    broker: Broker, listener: Listener, start: Start
+) -> None:
+    publish(broker, "multidrop/pump-1/act", b'{"verb": "coast", "drive": "pump-1", "time": 1}', "-r")
+    known, _ = start(commands=True)
+    assert told(listener)["done"]
+    assert known.commands.noted == [("act", "pump-1", "coast", {})]
+
+
+def test_a_stop_by_a_verb_that_names_another_drive_stops_none(
+    broker: Broker, listener: Listener, start: Start
+) -> None:
+    known, _ = start(commands=True)
+    listener.wait_for(has("multidrop/gateway", b"online"))
+    publish(broker, "multidrop/pump-1/act", b'{"verb": "coast", "drive": "fan-1", "time": 1}')
+    assert "it names drive 'fan-1'" in told(listener)["text"]
+    publish(broker, "multidrop/pump-1/act", b'{"verb": ["coast"], "drive": "pump-1", "time": 1}')
+    assert not told(listener)["done"]
+    assert known.commands.noted == []
+
+
+def test_a_command_that_may_be_older_than_a_reload_is_not_carried_out(
+    broker: Broker, listener: Listener, start: Start
+) -> None:
+    """Its drive's name may be that of another one now."""
+    known, _ = start(commands=True)
+    listener.wait_for(has("multidrop/gateway", b"online"))
+    sent_ms = now_ms()
+    for after_ms, text in ((1900, "not sent: it may have been sent before the plant"), (2500, "done")):
+        known.commands.plant_ns = boottime_ns() - after_ms * 1_000_000
+        publish(broker, "multidrop/pump-1/set/setpoint", write_of(25, sent_ms))
+        assert told(listener)["text"].startswith(text)
+
+
 @pytest.mark.parametrize(("after_ms", "is_taken"), [(-3000, False), (0, False), (1900, False), (2500, True)])
 def test_a_command_that_may_be_older_than_a_stop_is_not_carried_out(
     broker: Broker, listener: Listener, start: Start, after_ms: int, is_taken: bool

@@ -208,3 +208,31 @@ def test_a_page_whose_scripts_do_not_come_says_that_it_stops_nothing(opened: Ope
     page.locator("#notice").get_by_text("Stop all does nothing").wait_for()
     assert page.locator("#link.stale").inner_text() == "connecting"
     assert page.locator("#stopall").is_disabled()
+
+
+TAKEN_ANEW = """change => import('/page/store.js').then(({ store, takePlant }) => {
+  const plant = structuredClone(store.plant);
+  const drive = plant.lines[0].drives.find(one => one.name === 'pump-1');
+  Object.assign(drive, change.drive);
+  for (const register of drive.registers) Object.assign(register, change.registers?.[register.name]);
+  takePlant(plant);
+  const { good, pasts } = store.drives.get('pump-1');
+  return ['output_frequency', 'output_current'].map(name => good.has(name) && pasts.has(name));
+})"""
+
+
+@pytest.mark.parametrize(
+    ("change", "kept"),
+    [
+        ({}, [True, True]),
+        ({"drive": {"family": "delixi-modbus"}}, [False, False]),
+        ({"drive": {"address": 99}}, [False, False]),
+        ({"registers": {"output_frequency": {"step": 0.5}}}, [False, True]),
+        ({"registers": {"output_current": {"unit": "%"}}}, [True, False]),
+    ],
+)
+def test_no_value_of_another_drive_or_in_another_unit_goes_on_under_its_name(
+    opened: Opener, change: dict[str, Any], kept: list[bool]
+) -> None:
+    page = opened("#/drives/pump-1")
+    assert page.evaluate(TAKEN_ANEW, change) == kept

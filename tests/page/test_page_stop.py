@@ -11,6 +11,8 @@ from conftest import SIZES, Opener
 from fake_gateway import FakeGateway
 from watching import AT_ITS_PLACE, LIVE, VIEWS, until, until_met
 
+from multidrop.control.stop_attempt import LEAST_S
+
 pytestmark = pytest.mark.long  # Chromium is started for each file
 
 
@@ -266,3 +268,95 @@ def test_a_stop_waits_for_no_other_tab(browser: Any, gateway: FakeGateway) -> No
     told(page, "All 31 drives are stopped")
     assert time.monotonic() - began < 20.0
     context.close()
+
+
+@pytest.mark.parametrize("case", ["a write that wants a token", "a reload"])
+def test_nothing_that_comes_later_takes_the_place_of_a_stop_s_question(
+    opened: Opener, gateway: FakeGateway, case: str
+) -> None:
+    """The answer to what was asked before comes while a person is about to press the stop."""
+    path = "api/reload" if case == "a reload" else "api/write"
+    held: list[Any] = []
+    if case == "a reload":
+        gateway.plant_changes = {
+            "file": True,
+            "may": {"role": "write", "write": ["pump-1.frequency_setpoint"], "verbs": []},
+        }
+    page = opened("#/drives/pump-1")
+    page.route(f"**/{path}", lambda route: held.append(route))
+    if case == "a reload":
+        page.locator("#more").click()
+        page.get_by_role("button", name="Read the plant file again").click()
+        page.get_by_role("button", name="Read bottling plant.toml").click()
+    else:
+        page.get_by_role("button", name="Change frequency setpoint").click()
+        page.get_by_label("New value, Hz").fill("31.5")
+        page.get_by_role("button", name="Write to pump-1").click()
+    until_met(page, lambda: held)
+    page.evaluate("document.querySelector('#stopall').click()")  # wherever a dialog is
+    assert title(page).inner_text() == "Stop all 31 drives?"
+    with page.expect_response(f"**/{path}"):
+        held[0].fulfill(status=401, json={"error": "This wants a token."})
+    page.wait_for_timeout(300)
+    assert title(page).inner_text() == "Stop all 31 drives?"
+    page.get_by_role("button", name="Stop all 31 drives").click()
+    told(page, "All 31 drives are stopped")
+    assert gateway.posts == [("/api/stop", {"drives": None})]
+
+
+@pytest.mark.parametrize(
+    ("key", "code", "shift", "asks"),
+    [
+        ("S", "KeyS", True, "Stop all 31 drives?"),
+        ("s", "KeyS", False, "Stop pump-1?"),
+        ("s", "KeyS", True, "Stop all 31 drives?"),  # with caps lock on
+        ("S", "KeyS", False, "Stop all 31 drives?"),
+        ("Ы", "KeyS", True, "Stop all 31 drives?"),  # a Russian layout
+        ("ы", "KeyS", False, "Stop pump-1?"),
+        ("Process", "KeyS", True, "Stop all 31 drives?"),  # a Chinese input method
+        ("S", "Semicolon", True, "Stop all 31 drives?"),  # Dvorak
+        ("o", "KeyS", False, None),
+        ("O", "KeyS", True, None),
+        ("ж", "Semicolon", False, None),
+    ],
+)
+def test_the_keys_that_stop_are_the_same_on_every_layout(
+    opened: Opener, key: str, code: str, shift: bool, asks: str | None
+) -> None:
+    page = opened("#/drives/pump-1")
+    page.evaluate(
+        """([key, code, shiftKey]) => document.querySelector('h1, body').dispatchEvent(
+            new KeyboardEvent('keydown', { key, code, shiftKey, bubbles: true }))""",
+        [key, code, shift],
+    )
+    if asks is None:
+        assert not page.locator("#ask").evaluate("dialog => dialog.open")
+    else:
+        assert title(page).inner_text() == asks
+
+
+def test_the_key_is_at_hand_behind_a_dialog_but_where_something_is_typed(opened: Opener) -> None:
+    page = opened("#/drives/pump-1")
+    page.get_by_role("button", name="Change frequency setpoint").click()
+    page.keyboard.press("Shift+S")  # in the field
+    assert title(page).inner_text() == "Change frequency setpoint of pump-1?"
+    page.get_by_role("button", name="Cancel").focus()
+    page.keyboard.press("Shift+S")
+    assert title(page).inner_text() == "Stop all 31 drives?"
+
+
+@pytest.mark.parametrize("verb", ["stop", "emergency stop"])
+def test_the_page_waits_for_longer_than_a_stop_is_repeated(
+    opened: Opener, gateway: FakeGateway, verb: str
+) -> None:
+    """Else it would never say which drives stand where one of them is dead."""
+    page = opened("#/drives/pump-1")
+    page.evaluate("""() => {
+        const make = AbortSignal.timeout;
+        window.patience = [];
+        AbortSignal.timeout = ms => (window.patience.push(ms), make.call(AbortSignal, ms));
+    }""")
+    page.get_by_role("button", name="Stop pump-1" if verb == "stop" else verb, exact=True).click()
+    page.locator("#ask button.stop").click()
+    until_met(page, lambda: gateway.posts)
+    assert max(page.evaluate("window.patience")) > (LEAST_S + 10) * 1e3

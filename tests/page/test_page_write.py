@@ -180,6 +180,24 @@ def test_a_stop_that_is_called_behind_the_dialog_ends_a_start(opened: Opener, ga
     until_met(page, lambda: gateway.posts)
 
 
+def test_a_plant_that_is_read_anew_behind_the_dialog_ends_a_start(
+    opened: Opener, gateway: FakeGateway
+) -> None:
+    """Under the name that was confirmed may be another drive now."""
+    page = opened("#/drives/pump-1")
+    page.get_by_role("button", name="start", exact=True).click()
+    gateway.changes = gateway.plant_changes = {"revision": 2}
+    until(page, "import('/page/store.js').then(m => m.store.plant.revision === 2)")
+    page.get_by_role("button", name="start pump-1").click()
+    page.locator("#outcomes li").wait_for()
+    said = page.locator("#outcomes").inner_text()
+    assert "start: not sent. The plant was read anew meanwhile." in said
+    assert gateway.posts == []
+    page.get_by_role("button", name="start", exact=True).click()
+    page.get_by_role("button", name="start pump-1").click()
+    until_met(page, lambda: gateway.posts)
+
+
 def test_a_verb_that_stops_is_sent_whatever_came_before(opened: Opener, gateway: FakeGateway) -> None:
     page = opened("#/drives/pump-1")
     page.get_by_role("button", name="emergency stop").click()

@@ -231,6 +231,7 @@ class NotedCommands:
         self.may = May(write=frozenset({"pump-1.setpoint"}), verbs=frozenset({"pump-1.start"}))
         self.noted: list[tuple[Any, ...]] = []
         self.stopped_at: dict[str, int] = {}  # ns of CLOCK_MONOTONIC, by drive
+        self.plant_ns: int | None = None
 
     async def stop(self, drives: Sequence[str] | None, caller: Caller) -> dict[str, Told]:
         self.noted.append(("stop", drives))

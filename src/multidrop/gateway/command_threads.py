@@ -5,7 +5,8 @@ from __future__ import annotations
 import asyncio
 import logging
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from contextlib import suppress
 from functools import partial
 from typing import TypeVar
 
@@ -16,15 +17,25 @@ R = TypeVar("R")
 _log = logging.getLogger("multidrop.gateway")
 
 
-def begin_stop(work: Callable[[], R], caller: Caller) -> asyncio.Future[R]:
-    """Begin a stop in a thread, or here and now where the system gives none: a stop is always sent."""
-    try:
-        return in_thread(work, caller)
-    except RuntimeError:
-        future: asyncio.Future[R] = asyncio.get_running_loop().create_future()
-        with written_by(*_author(caller)):
-            future.set_result(work())
-        return future
+def begin_stops(works: Sequence[Callable[[float | None], R]], caller: Caller) -> list[asyncio.Future[R]]:
+    """Begin stops, each in a thread of its own; `works` take for how many seconds a stop is repeated.
+
+    Where the system gives no more threads they are carried out here and now: a stop is always sent. All of
+    them are sent before any motor is waited for.
+    """
+    begun: list[asyncio.Future[R]] = []
+    with suppress(RuntimeError):
+        for work in works:
+            future = in_thread(partial(work, None), caller)
+            begun.append(future)
+    left = works[len(begun) :]
+    with written_by(*_author(caller)):
+        for work in left if len(left) > 1 else ():
+            work(0.0)
+        for work in left:
+            begun.append(asyncio.get_running_loop().create_future())
+            begun[-1].set_result(work(None))
+    return begun
 
 
 def in_thread(work: Callable[[], R], caller: Caller) -> asyncio.Future[R]:

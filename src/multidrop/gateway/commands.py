@@ -27,7 +27,7 @@ from multidrop import (
     written_before,
 )
 from multidrop.gateway.clock import boottime_ns, monotonic_ns
-from multidrop.gateway.command_threads import begin_stop, in_thread
+from multidrop.gateway.command_threads import begin_stops, in_thread
 from multidrop.gateway.rights import NEVER_THIS_WAY, Caller, May, Right
 from multidrop.gateway.stops_amid_reload import ChangingLines, drives_of, stop_as_changed
 from multidrop.gateway.told import Told as Told
@@ -41,6 +41,8 @@ WAYS_WITHOUT_VERBS = frozenset({"modbus"})
 
 # Returns until when a command may be sent (CLOCK_BOOTTIME, ns), as it is called in words, or raises Refused.
 Admit = Callable[[str], float]
+
+StopWork = Callable[[float | None], dict[str, Told]]  # takes for how long a stop is repeated
 
 _log = logging.getLogger("multidrop.gateway")
 
@@ -64,6 +66,11 @@ class Commands:
         self.stops: Counter[str] = Counter()  # that were called, by drive
         self._stopped_ns: dict[str, int] = {}  # when the latest one was
         self._ended_ns: dict[str, int] = {}  # by drive
+        self.plant_ns: int | None = None  # when the plant was read anew (CLOCK_BOOTTIME)
+
+    def begin_anew(self) -> None:
+        """Note that there is another plant, in which a name may be another drive's."""
+        self.plant_ns = boottime_ns()
 
     def ended_ns(self, drive: str) -> int:
         """Return when the latest command of a drive ended (CLOCK_MONOTONIC); 0 without one.
@@ -80,6 +87,9 @@ class Commands:
         drives = [*drives]
         self.stops.update(drives)
         self._stopped_ns |= dict.fromkeys(drives, boottime_ns())
+
+    def _note_stop_end(self, drives: Iterable[str], future: object) -> None:
+        self._note_end(drives)
 
     def _note_end(self, drives: Iterable[str]) -> None:
         self._ended_ns |= dict.fromkeys(drives, monotonic_ns())
@@ -104,34 +114,32 @@ class Commands:
         """Stop these drives of a plant."""
         there, wanted = drives_of(plant), dict.fromkeys(wanted)
         told: dict[str, Told] = {}
-        waited: list[asyncio.Future[dict[str, Told]]] = []
+        works: list[tuple[StopWork, list[str]]] = []
         for line in plant.lines:
             here = {polled.drive.name: polled.drive for polled in line.drives if polled.drive.name in wanted}
             self._note_stop(here)
             if here and len(here) == len(line.drives):
-                waited.append(self._begin_stop(partial(self._stop_line, line.name, list(here)), here, caller))
+                works.append((partial(self._stop_line, line.name, list(here)), list(here)))
             else:
-                waited += [
-                    self._begin_stop(partial(_stop_one, drive), [name], caller)
-                    for name, drive in here.items()
-                ]
+                works += [(partial(_stop_one, drive), [name]) for name, drive in here.items()]
         for name in wanted:
             if name not in there:
                 told[name] = failed(ValueError(f"there is no drive {name!r}"))
-        for found in await asyncio.gather(*waited):
+        for found in await asyncio.gather(*self._begin_stops(works, caller)):
             told |= found
         return {name: told[name] for name in wanted if name in told}
 
-    def _begin_stop(
-        self, work: Callable[[], dict[str, Told]], drives: Iterable[str], caller: Caller
-    ) -> asyncio.Future[dict[str, Told]]:
-        future = begin_stop(work, caller)
-        future.add_done_callback(lambda _: self._note_end(drives))
-        return future
+    def _begin_stops(
+        self, works: Sequence[tuple[StopWork, list[str]]], caller: Caller
+    ) -> list[asyncio.Future[dict[str, Told]]]:
+        begun = begin_stops([work for work, _ in works], caller)
+        for future, (_, drives) in zip(begun, works, strict=True):
+            future.add_done_callback(partial(self._note_stop_end, drives))
+        return begun
 
-    def _stop_line(self, line: str, names: list[str]) -> dict[str, Told]:
+    def _stop_line(self, line: str, names: list[str], seconds: float | None) -> dict[str, Told]:
         try:
-            found = self._lines.bus(line).stop_all()
+            found = self._lines.bus(line).stop_all(seconds=seconds)
         except Exception as failure:  # whatever it is: everybody must see it
             _log.exception("stop_all of line %s", line)
             return dict.fromkeys(names, failed(failure))
@@ -196,7 +204,8 @@ class Commands:
             except ValueError as mistake:
                 return {drive: failed(mistake)}
             self._note_stop([drive])
-            return await asyncio.shield(self._begin_stop(lambda: {drive: work(known)}, [drive], caller))
+            (future,) = self._begin_stops([(lambda _: {drive: work(known)}, [drive])], caller)
+            return await asyncio.shield(future)
 
         return (await stop_as_changed(self._lines, [drive], stop))[drive]
 
@@ -243,9 +252,9 @@ class Commands:
         self._note_end([drive])
 
 
-def _stop_one(drive: Drive) -> dict[str, Told]:
+def _stop_one(drive: Drive, seconds: float | None) -> dict[str, Told]:
     try:
-        drive.stop()
+        drive.stop(seconds=seconds)
     except Exception as failure:  # whatever it is: everybody must see it
         return {drive.name: failed(failure)}
     return {drive.name: Told(True, "stopped: seen to stand")}

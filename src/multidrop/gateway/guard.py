@@ -154,7 +154,7 @@ class Guard:
         if secret and not is_shut:
             token = self._tokens.find(secret)
             if token is None:
-                self._tokens.note_wrong(address, self._clock())
+                self._tokens.note_wrong(address, secret, self._clock())
                 _log.warning("wrong token from %s", address)
         if token is not None and (free is None or token.right >= free):
             caller = Caller(token.name, way, address, token.right)

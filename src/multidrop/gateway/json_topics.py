@@ -6,7 +6,7 @@ PREFIX/DRIVE/available and PREFIX/gateway say who is there; PREFIX/DRIVE/told sa
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
 
@@ -18,6 +18,7 @@ from multidrop.gateway.mqtt_settings import MqttSettings, fresh_values
 from multidrop.gateway.orders import Orders
 from multidrop.gateway.outbox import Publication
 from multidrop.gateway.parts import Inside
+from multidrop.gateway.verb_rules import STOPPING
 
 EXAMPLES = {
     "set": '{"value": 25.0, "time": UTC in ms}',
@@ -74,18 +75,22 @@ class JsonTopics:
             self._orders.stop(None)
         elif levels[-1] == "stop":
             self._orders.stop([levels[0]])
-        elif is_retained:  # it comes at every connection
-            self._orders.refuse(levels[0], topic, "the broker had kept it; publish it without retain")
         else:
-            self._order(levels, payload)
+            self._order(levels, payload, is_retained=is_retained)
 
-    def _order(self, levels: list[str], payload: bytes) -> None:
+    def _order(self, levels: list[str], payload: bytes, *, is_retained: bool) -> None:
         drive, *what = levels
         try:
-            if what[0] == "set":
-                self._orders.write(drive, what[1], *_read_write(payload))
+            given = _read(payload)
+            if what[0] == "act" and str(given.get("verb")) in STOPPING:
+                self._orders.stop_by(drive, given["verb"], _options(drive, given))
+            elif is_retained:  # it comes at every connection
+                kept = "the broker had kept it; publish it without retain"
+                self._orders.refuse(drive, "/".join(what), kept)
+            elif what[0] == "set":
+                self._orders.write(drive, what[1], *_read_write(given))
             else:
-                self._orders.act(drive, *_read_act(drive, payload))
+                self._orders.act(drive, *_read_act(drive, given))
         except ValueError as mistake:
             self._orders.refuse(drive, "/".join(what), f"it is no {EXAMPLES[what[0]]}: {mistake}")
 
@@ -163,37 +168,48 @@ def _drives(plant: Plant) -> set[str]:
     return {polled.drive.name for line in plant.lines for polled in line.drives}
 
 
-def _read_write(payload: bytes) -> tuple[float, int]:
+def _read_write(given: Mapping[str, Any]) -> tuple[float, int]:
     """Return value and time of a write. Raises ValueError for what is none."""
-    given = _read(payload, "value")
+    _check_keys(given, "value", "time")
     value = given["value"]
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         raise ValueError(f"value is {value!r}, and not a number")
-    return value, given["time"]
+    return value, _time(given)
 
 
-def _read_act(drive: str, payload: bytes) -> tuple[str, dict[str, object], int]:
+def _read_act(drive: str, given: Mapping[str, Any]) -> tuple[str, dict[str, object], int]:
     """Return verb, options and time. Raises ValueError for what is none, or names another drive."""
-    given = _read(payload, "verb", "drive")
+    _check_keys(given, "verb", "drive", "time")
+    return str(given["verb"]), _options(drive, given), _time(given)
+
+
+def _options(drive: str, given: Mapping[str, Any]) -> dict[str, object]:
     options = given.get("options", {})
-    if given["drive"] != drive:
+    if given.get("drive", drive) != drive:
         raise ValueError(f"it names drive {given['drive']!r}, and its topic {drive!r}")
     if not isinstance(options, dict):
         raise ValueError("options is no table")
-    return str(given["verb"]), options, given["time"]
+    return options
 
 
-def _read(payload: bytes, *keys: str) -> dict[str, Any]:
-    """Return an object with these keys and a time."""
+def _time(given: Mapping[str, Any]) -> int:
+    time: object = given["time"]
+    if isinstance(time, bool) or not isinstance(time, int):
+        raise ValueError("time is no whole number of ms")
+    return time
+
+
+def _read(payload: bytes) -> dict[str, Any]:
     try:
         given = json.loads(payload)
     except RecursionError:
         raise ValueError("it is nested too deeply") from None
     if not isinstance(given, dict):
         raise ValueError("it is no JSON object")
-    for key in (*keys, "time"):
+    return given
+
+
+def _check_keys(given: Mapping[str, Any], *keys: str) -> None:
+    for key in keys:
         if key not in given:
             raise ValueError(f"{key} is missing")
-    if isinstance(given["time"], bool) or not isinstance(given["time"], int):
-        raise ValueError("time is no whole number of ms")
-    return given

@@ -1,7 +1,7 @@
 """Orders: commands that come by a broker, which may hold them up, keep them, and deliver them twice.
 
 A write or a verb is carried out only when it was sent within the last seconds, after the latest stop of its
-drive, and did not come before; a stop is carried out always.
+drive and the latest reload of the plant, and did not come before; a stop by any verb is carried out always.
 """
 
 from __future__ import annotations
@@ -15,7 +15,6 @@ from typing import Any
 from multidrop.gateway.clock import boottime_ns
 from multidrop.gateway.commands import MOST_AGE_S, Commands, Told
 from multidrop.gateway.rights import Caller
-from multidrop.gateway.verb_rules import STOPPING
 
 MOST_AGE_MS = round(MOST_AGE_S * 1e3)  # a broker that stood still delivers those of the whole time
 MOST_AHEAD_MS = 2_000  # by which the sender's clock may be fast
@@ -45,18 +44,24 @@ class Orders:
         """Stop these drives, or all."""
         self._begin(self._stop(drives))
 
+    def stop_by(self, drive: str, verb: str, options: Mapping[str, object]) -> None:
+        """Carry out a verb that stops the motor, whenever it was sent."""
+        self._begin(self._do(drive, verb, self._commands.act(drive, verb, options, self._caller)))
+
     def write(self, drive: str, register: str, value: float, time_ms: int) -> None:
         """Write a register, if the command is fresh."""
         what = f"{register} = {value!r}"
         stopped_ns = self._commands.stopped_ns(drive)
         if self._is_taken(drive, what, (drive, register, value, time_ms), time_ms, stopped_ns):
-            self._begin(self._do(drive, what, self._commands.write(drive, register, value, self._caller)))
+            work = self._commands.write(drive, register, value, self._caller)
+            self._begin(self._counted(self._do(drive, what, work)))
 
     def act(self, drive: str, verb: str, options: Mapping[str, object], time_ms: int) -> None:
         """Carry out a verb, if the command is fresh."""
-        stopped_ns = None if verb in STOPPING else self._commands.stopped_ns(drive)
+        stopped_ns = self._commands.stopped_ns(drive)
         if self._is_taken(drive, verb, (drive, verb, repr(options), time_ms), time_ms, stopped_ns):
-            self._begin(self._do(drive, verb, self._commands.act(drive, verb, options, self._caller)))
+            work = self._commands.act(drive, verb, options, self._caller)
+            self._begin(self._counted(self._do(drive, verb, work)))
 
     def refuse(self, drive: str, what: str, why: str) -> None:
         """Tell that a command was not carried out."""
@@ -64,11 +69,11 @@ class Orders:
         self._tell(drive, what, Told(False, f"not sent: {why}"))
 
     @staticmethod
-    def _may_be_before(stopped_ns: int | None, age_ms: int) -> bool:
-        """Return True where a command may be older than a stop; the sender's clock may be fast."""
-        if stopped_ns is None:
+    def _may_be_before(at_ns: int | None, age_ms: int) -> bool:
+        """Return True where a command may be older than that time; the sender's clock may be fast."""
+        if at_ns is None:
             return False
-        return (boottime_ns() - stopped_ns) // 1_000_000 <= age_ms + MOST_AHEAD_MS
+        return (boottime_ns() - at_ns) // 1_000_000 <= age_ms + MOST_AHEAD_MS
 
     def _is_taken(self, drive: str, what: str, order: object, time_ms: int, stopped_ns: int | None) -> bool:
         age_ms = self._utc_ms() - time_ms
@@ -77,6 +82,8 @@ class Orders:
             self.refuse(drive, what, f"it was sent {age_ms / 1000:.1f} s ago {clocks}")
         elif self._may_be_before(stopped_ns, age_ms):
             self.refuse(drive, what, "it may have been sent before the latest stop: send it again")
+        elif self._may_be_before(self._commands.plant_ns, age_ms):
+            self.refuse(drive, what, "it may have been sent before the plant was read anew: send it again")
         elif order in self._came:
             self.refuse(drive, what, "it came a second time")
         elif self._under_way >= MOST_UNDER_WAY:
@@ -91,9 +98,12 @@ class Orders:
             self._tell(drive, "stop", told)
 
     async def _do(self, drive: str, what: str, work: Coroutine[Any, Any, Told]) -> None:
+        self._tell(drive, what, await work)
+
+    async def _counted(self, work: Coroutine[Any, Any, None]) -> None:
         self._under_way += 1
         try:
-            self._tell(drive, what, await work)
+            await work
         finally:
             self._under_way -= 1
 

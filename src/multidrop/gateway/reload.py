@@ -118,6 +118,8 @@ class Reload:
             gateway.forget(name)
         gateway.plant = plant
         gateway.revision += 1
+        gateway.seen_frames.begin_anew()
+        gateway.commands.begin_anew()
         self._take_up_rights(settings)
         gateway.side_reads.begin_anew()
         gateway.guarded("hub", gateway.hub.adopt, plant, planned)

@@ -90,11 +90,15 @@ def read_tokens(text: str) -> tuple[list[Token], list[str]]:
 
 
 class Tokens:
-    """The valid tokens, and how often each address came with a wrong one."""
+    """The valid tokens, and the wrong ones with which each address came.
+
+    A wrong one that comes again is no further guess: a browser sends a token that was taken away with every
+    request.
+    """
 
     def __init__(self, tokens: Iterable[Token] = ()) -> None:
         self._tokens = tuple(tokens)
-        self._wrong: dict[str, deque[float]] = {}
+        self._wrong: dict[str, deque[tuple[float, str]]] = {}  # when, and its digest
 
     def __len__(self) -> int:
         return len(self._tokens)
@@ -114,17 +118,20 @@ class Tokens:
     def is_shut(self, address: str, now: float) -> bool:
         """Return True where no more wrong tokens are looked at from this address for now."""
         came = self._wrong.get(address)
-        while came and now - came[0] >= WINDOW_S:
+        while came and now - came[0][0] >= WINDOW_S:
             came.popleft()
         if came is not None and not came:
             del self._wrong[address]
         return came is not None and len(came) >= MOST_WRONG
 
-    def note_wrong(self, address: str, now: float) -> None:
+    def note_wrong(self, address: str, secret: str, now: float) -> None:
         """Count a wrong token; the addresses that came first are forgotten where there are very many."""
+        given = digest(secret)
         if address not in self._wrong and len(self._wrong) >= MOST_ADDRESSES:
             del self._wrong[next(iter(self._wrong))]
-        self._wrong.setdefault(address, deque(maxlen=MOST_WRONG)).append(now)
+        came = self._wrong.setdefault(address, deque(maxlen=MOST_WRONG))
+        if all(given != wrong for _, wrong in came):
+            came.append((now, given))
 
 
 class May(NamedTuple):

@@ -1,8 +1,9 @@
 """Seen frames: commands that come over HTTP, which a network may hold up, and deliver twice.
 
 A write, or a verb that may move a motor, names the newest frame that its sender had seen. It is carried out
-only within some seconds of that frame, once, and only where no stop of its drive was called since. No clock
-of another machine is looked at, and no frame of an earlier process has a number of one of ours. Pure.
+only within some seconds of that frame, once, and only where no stop of its drive was called since, nor the
+plant read anew. No clock of another machine is looked at, and no frame of an earlier process has a number of
+one of ours. Pure.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from multidrop.gateway.commands import MOST_AGE_S
 
 MOST_AGE_NS = round(MOST_AGE_S * 1e9)
 TOO_LATE, OVERTAKEN, DOUBLED = "too late", "a stop was called", "it came before"  # rules of a Refused
+ANOTHER_PLANT = "the plant was read anew"
 
 
 class SeenFrames:
@@ -28,14 +30,20 @@ class SeenFrames:
         self._stopped_ns = stopped_ns
         self._made: dict[int, int] = {}  # when, by the frame's number
         self._came: dict[int, set[object]] = {}  # commands, by the frame that they named
+        self._newest = -1
+        self._newest_before = -1  # the last one that showed another plant
 
     def note(self, n: int) -> None:
         """Note that a frame of this number is made now."""
         now_ns = self.clock()
-        self._made[n] = now_ns
+        self._newest, self._made[n] = n, now_ns
         for old in [one for one, made_ns in self._made.items() if now_ns - made_ns > MOST_AGE_NS]:
             del self._made[old]
             self._came.pop(old, None)
+
+    def begin_anew(self) -> None:
+        """Note that there is another plant: a name of a frame before may be another drive's now."""
+        self._newest_before = self._newest
 
     def admit(self, drive: str, what: str, command: object, seen: int) -> int:
         """Return until when a command may be sent whose sender had seen this frame, by the clock.
@@ -47,6 +55,11 @@ class SeenFrames:
         if made_ns is None or self.clock() > until_ns:
             last = f"frame {seen} is none of the last {MOST_AGE_S:g} s"
             raise Refused(f"{what} was not sent: {last}: look again, and confirm it anew", rule=TOO_LATE)
+        if seen <= self._newest_before:
+            since = f"the plant was read anew after frame {seen}"
+            raise Refused(
+                f"{what} was not sent: {since}: look again, and confirm it anew", rule=ANOTHER_PLANT
+            )
         if (self._stopped_ns(drive) or 0) >= made_ns:
             since = f"a stop was called after frame {seen}"
             raise Refused(f"{what} was not sent: {since}: look again, and confirm it anew", rule=OVERTAKEN)

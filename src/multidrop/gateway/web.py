@@ -266,14 +266,21 @@ class _Pages:
     # ---- tokens ----
 
     async def token(self, request: Request) -> Response:
-        """Keep a token in a cookie that no script can read."""
+        """Keep a token in a cookie that no script can read.
+
+        After several wrong ones from an address none is looked at for a while, but to send a stop.
+        """
         gateway, caller = self._gateway, caller_of(request)
-        secret = text_in(await body_of(request), "token")
-        if gateway.tokens.is_shut(caller.address, gateway.guard_clock()):
+        body = await body_of(request)
+        secret, is_shut = (
+            text_in(body, "token"),
+            gateway.tokens.is_shut(caller.address, gateway.guard_clock()),
+        )
+        if is_shut and body.get("to") != "stop":
             raise Denied(429, "too many wrong tokens came from this address: try again in a minute")
         token = gateway.tokens.find(secret)
         if token is None:
-            gateway.tokens.note_wrong(caller.address, gateway.guard_clock())
+            gateway.tokens.note_wrong(caller.address, secret, gateway.guard_clock())
             _log.warning("wrong token from %s", caller.address)
             raise Denied(401, "the token is wrong")
         response = JSONResponse({"name": token.name, "role": token.right.name.lower()})

@@ -30,6 +30,7 @@ from multidrop.plant.model import Plant
 DRAW_S = 0.25
 SCROLL_S = 2.0  # between two pictures that scroll
 PAGE = 10  # lines
+_STOP_KEYS = ("s", "S")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -181,9 +182,9 @@ class Monitor:
     # ---- keys ----
 
     def _obey(self, key: str) -> None:
-        if self._on_yes:
+        if self._on_yes and key not in _STOP_KEYS:  # these ask anew
             on_yes, self._on_yes, self._at.question = self._on_yes, None, ""
-            if key == "y":
+            if key in ("y", "Y"):  # with caps lock on
                 on_yes()
             else:
                 self._at.message = "nothing was sent"
@@ -258,8 +259,12 @@ class Monitor:
         """Carry out a stop in a thread: it waits until the motor stands."""
         self._at.message = what
         thread = threading.Thread(target=self._carry_out, args=(what, work), daemon=True)
-        self._stops = [*filter(threading.Thread.is_alive, self._stops), thread]
-        thread.start()
+        try:
+            thread.start()
+        except RuntimeError:  # the system gives no thread: a stop is always sent
+            self._carry_out(what, work)
+        else:
+            self._stops = [*filter(threading.Thread.is_alive, self._stops), thread]
 
     def _carry_out(self, what: str, work: Callable[[], tuple[str, list[str]]]) -> None:
         """Carry out a stop; its failures stay on the screen until they are acknowledged."""

@@ -6,7 +6,7 @@ import os
 import select
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 
 UP, DOWN, PAGE_UP, PAGE_DOWN, ENTER, ESCAPE = "up", "down", "page up", "page down", "enter", "escape"
 KEYS = {  # as terminals send them
@@ -23,6 +23,9 @@ KEYS = {  # as terminals send them
     b"\n": ENTER,
     b"\x1b": ESCAPE,
 }
+MOST_BYTES = 4  # of a character in UTF-8
+# Letters of the Russian and the Ukrainian layout, and those of the same keys on a Latin one.
+LATIN = str.maketrans("йыіфнолЙЫІФНОЛ", "qssayjkQSSAYJK")
 
 
 @contextmanager
@@ -59,4 +62,12 @@ def next_key(pressed: bytes) -> tuple[str, bytes]:
     for code in sorted(KEYS, key=len, reverse=True):
         if pressed.startswith(code):
             return KEYS[code], pressed[len(code) :]
-    return pressed[:1].decode("ascii", "replace"), pressed[1:]
+    letter, rest = _first_letter(pressed)
+    return KEYS.get(letter.encode(), letter), rest
+
+
+def _first_letter(pressed: bytes) -> tuple[str, bytes]:
+    for length in range(1, MOST_BYTES + 1):
+        with suppress(UnicodeDecodeError):
+            return pressed[:length].decode().translate(LATIN), pressed[length:]
+    return "\ufffd", pressed[1:]

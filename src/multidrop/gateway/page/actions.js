@@ -63,12 +63,18 @@ function note(drive, what, done, told) {
   dispatchEvent(new Event("written"));
 }
 
-// Return what makes the body at its confirmation, with the frame that was seen then. A stop that was called
-// since it was asked, of which there had been `stopped`, is seen behind a dialog by nobody: then it fails.
-const seen = (drive, body, stopped) => () => {
-  if (stops(drive) !== stopped) throw new Refused(409, "A stop of it was called meanwhile.");
-  return { ...body, seen: store.frame?.n };
-};
+// Return what makes the body at its confirmation, with the frame that was seen then; to be called as it is
+// asked for. What comes behind the dialog is seen by nobody: after a stop of the drive, or with another plant,
+// whose drives may have each other's names, it fails.
+function seen(drive) {
+  const stopped = stops(drive),
+    { revision } = store.plant;
+  return body => () => {
+    if (stops(drive) !== stopped) throw new Refused(409, "A stop of it was called meanwhile.");
+    if (store.frame?.revision !== revision) throw new Refused(409, "The plant was read anew meanwhile.");
+    return { ...body, seen: store.frame.n };
+  };
+}
 
 async function deliver(drive, what, path, confirmed, kind = DANGER) {
   try {
@@ -91,7 +97,7 @@ async function deliver(drive, what, path, confirmed, kind = DANGER) {
 export async function act(drive, verb) {
   const turns = TURNS.some(word => verb.includes(word)),
     field = WITH_HZ.has(verb) ? hertz() : null,
-    stopped = stops(drive),
+    withSeen = seen(drive),
     isStop = STOPS.has(verb),
     kind = isStop ? STOP : DANGER;
   const warning = turns
@@ -106,7 +112,7 @@ export async function act(drive, verb) {
   const options = field ? { hz: Number(field.value) } : {};
   const what = field ? `${words(verb)} ${options.hz} Hz` : words(verb);
   const body = { drive, verb, options };
-  await deliver(drive, what, "api/act", isStop ? () => body : seen(drive, body, stopped), kind);
+  await deliver(drive, what, "api/act", isStop ? () => body : withSeen(body), kind);
 }
 
 const hertz = () =>
@@ -123,7 +129,7 @@ const hertz = () =>
 export async function change(drive, register) {
   const current = reading(drive, register.name, now()),
     name = words(register.name),
-    stopped = stops(drive);
+    withSeen = seen(drive);
   const field = editor(register);
   const held =
     current?.value === null || !current ? null : withUnit(text(current.value, register), register);
@@ -148,7 +154,7 @@ export async function change(drive, register) {
   const value = Number(field.value);
   if (field.value === "" || !Number.isFinite(value)) return;
   const what = `${name} = ${text(value, register)} ${unit(register)}`.trim();
-  await deliver(drive, what, "api/write", seen(drive, { drive, register: register.name, value }, stopped));
+  await deliver(drive, what, "api/write", withSeen({ drive, register: register.name, value }));
 }
 
 const isLimited = ({ least, most }) => typeof least === "number" && typeof most === "number";

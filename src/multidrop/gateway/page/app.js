@@ -13,7 +13,7 @@ import { run } from "./link.js";
 import * as markers from "./markers.js";
 import * as plots from "./panel_plots.js";
 import * as settings from "./settings.js";
-import { stopOne } from "./stop.js";
+import { stopKey, stopOne } from "./stop.js";
 import { onPlant, store, takePlant } from "./store.js";
 import * as table from "./table.js";
 import { drawTop, showPlant } from "./top.js";
@@ -128,7 +128,7 @@ function driveKeys(event) {
   } else if (event.key === "/") {
     find("#filter").focus();
     event.preventDefault();
-  } else if (event.key === "s" && chosen !== null) stopOne(chosen);
+  } else if (stopKey(event) === "one" && chosen !== null) stopOne(chosen);
   else if (event.key === "Escape" && find("#panel").classList.contains("open")) location.hash = "#/drives";
 }
 

@@ -3,7 +3,8 @@
 import { post } from "./api.js";
 import { find, fill, make } from "./dom.js";
 
-let answer = null; // settles the question that stands now
+let answer = null, // settles the question that stands now
+  stopAsked = null; // that question's answer, where it asks for a stop
 
 const dialog = () => find("#ask");
 
@@ -14,6 +15,7 @@ const TWICE_MS = 500,
   AT_ONCE = "#stopall, .stop";
 export const DANGER = "danger",
   STOP = "danger stop"; // classes of buttons
+const STOP_PATIENCE_MS = 45000; // a drive that does not answer is sent its stop for 30 s
 let changes = 0, // how often the dialog opened or closed
   last = { x: 0, y: 0, time: -Infinity, changes }; // the latest click that was taken
 
@@ -40,14 +42,22 @@ addEventListener(
   true,
 );
 
+// Show the dialog and return what was chosen, as `show` does. A question whether to stop is asked at once, and
+// what else there is to ask or tell comes after its answer: it takes no stop from under the hand that gives it.
+async function open(title, contents, buttons, { cancel = "Cancel", kind } = {}) {
+  if (kind === STOP) return (stopAsked = show(title, contents, buttons, cancel));
+  while (stopAsked) await stopAsked;
+  return show(title, contents, buttons, cancel);
+}
+
 // Show the dialog and return what was chosen: a button's name, or null for cancelled. `buttons` are
 // [name, text, class]; Cancel comes first and has the focus, so that Enter alone does nothing.
-function open(title, contents, buttons, cancel = "Cancel") {
+function show(title, contents, buttons, cancel) {
   answer?.(null);
   const close = choice => {
     changes++;
     answer?.(choice);
-    answer = null;
+    answer = stopAsked = null;
     if (dialog().open) dialog().close();
   };
   const first = make("button", { type: "button", class: "calm", onclick: () => close(null) }, cancel);
@@ -93,19 +103,14 @@ function open(title, contents, buttons, cancel = "Cancel") {
 
 // Ask for a confirmation. Return true where it is given.
 export const confirm = async (title, contents, yes, kind = DANGER) =>
-  (await open(title, contents, [["yes", yes, kind]])) === "yes";
+  (await open(title, contents, [["yes", yes, kind]], { kind })) === "yes";
 
 // Ask for what a form in `contents` holds. Return true where it is to be sent.
 export const confirmForm = async (title, contents, yes, kind = DANGER) =>
-  (await open(title, contents, [["submit", yes, kind]])) === "submit";
+  (await open(title, contents, [["submit", yes, kind]], { kind })) === "submit";
 
 // Show something until it is closed. Return the name of the other button where that was pressed.
-export const tell = (title, contents, buttons = []) => open(title, contents, buttons, "Close");
-
-// Put other contents into the dialog that `tell` opened.
-export function retell(title, contents, buttons = []) {
-  return open(title, contents, buttons, "Close");
-}
+export const tell = (title, contents, buttons = []) => open(title, contents, buttons, { cancel: "Close" });
 
 // Ask for a token until one is right. Return true where the gateway took it.
 export async function askToken(why, yes = "Sign in", kind = DANGER) {
@@ -126,7 +131,7 @@ export async function askToken(why, yes = "Sign in", kind = DANGER) {
     ];
     if (!(await confirmForm("Who are you?", contents, yes, kind))) return false;
     try {
-      await post("api/token", { token: field.value });
+      await post("api/token", { token: field.value, ...(kind === STOP ? { to: "stop" } : {}) });
       dispatchEvent(new Event("signed"));
       return true;
     } catch (error) {
@@ -135,9 +140,11 @@ export async function askToken(why, yes = "Sign in", kind = DANGER) {
   }
 }
 
+const patienceOf = kind => (kind === STOP ? STOP_PATIENCE_MS : undefined);
+
 // Send what the person confirmed, and once more after a sign-in where the right to it was missing: `body`
 // is called at each confirmation, and `kind` is the class of its button. Return the answer. Raises Refused.
-export async function send(path, body, { kind = DANGER, patience } = {}) {
+export async function send(path, body, { kind = DANGER, patience = patienceOf(kind) } = {}) {
   dispatchEvent(new Event("command"));
   try {
     return await post(path, body(), patience);

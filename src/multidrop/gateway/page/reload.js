@@ -1,6 +1,6 @@
 // The plant file, read again: asked for first, and told of with every mistake that is in it.
 
-import { confirm, retell, send, tell } from "./ask.js";
+import { confirm, send, tell } from "./ask.js";
 import { glyph, make, named } from "./dom.js";
 import { store } from "./store.js";
 
@@ -26,7 +26,7 @@ export async function reload() {
     shown = [title, make("p", { class: "bad" }, glyph("fault"), ` ${error.message}`)];
   }
   dispatchEvent(new Event("reloaded"));
-  await retell(...shown);
+  await tell(...shown);
 }
 
 // Return a title, and what to show of the gateway's answer.

@@ -1,13 +1,13 @@
 // Stops: of all drives and of one. This file needs the dialog and nothing else of the page.
 
-import { STOP, confirm, retell, send, tell } from "./ask.js";
+import { STOP, confirm, send, tell } from "./ask.js";
 import { find, glyph, make, named } from "./dom.js";
 
-const PATIENCE_MS = 20000;
-let asked = null; // the question whether to stop that was asked last: no outcome takes its place
 const HOW =
   "A stop goes ahead of all polling and is repeated until the drive confirms it. " +
   "Motors come down as their drives are set.";
+const WAITING =
+  "The stop is on its way. Where a drive does not answer it is repeated for 30 s, and told of after that.";
 const HARD = "Use the hard stop at the machine if a motor must stand now.";
 
 // Ask, and stop all drives.
@@ -15,24 +15,24 @@ export async function stopAll() {
   const { drives, lines } = find("#stopall").dataset;
   const all = drives ? `all ${drives} drives` : "all drives";
   const where = lines > 1 ? `All ${lines} lines at once. ` : "";
-  asked = confirm(`Stop ${all}?`, [make("p", {}, where + HOW)], `Stop ${all}`, STOP);
-  if (await asked) await stop(null, "all drives");
+  const isSure = await confirm(`Stop ${all}?`, [make("p", {}, where + HOW)], `Stop ${all}`, STOP);
+  if (isSure) await stop(null, "all drives");
 }
 
 // Ask, and stop this drive.
 export async function stopOne(name) {
-  asked = confirm(["Stop ", named(name), "?"], [make("p", {}, HOW)], ["Stop ", named(name)], STOP);
-  if (await asked) await stop([name], name);
+  const [title, yes] = [["Stop ", named(name), "?"], ["Stop ", named(name)]];
+  if (await confirm(title, [make("p", {}, HOW)], yes, STOP)) await stop([name], name);
 }
 
 async function stop(drives, what) {
   let again = "again";
   while (again === "again") {
-    const closed = tell(["Stopping ", named(what), " …"], [make("p", {}, "The stop is on its way.")]);
+    const closed = tell(["Stopping ", named(what), " …"], [make("p", {}, `${WAITING} ${HARD}`)]);
     closed.catch(() => {});
     let shown;
     try {
-      const told = await send("api/stop", () => ({ drives }), { kind: STOP, patience: PATIENCE_MS });
+      const told = await send("api/stop", () => ({ drives }), { kind: STOP });
       shown = outcome(told);
     } catch (error) {
       const isRefused = error.status >= 400 && error.status < 500;
@@ -42,8 +42,7 @@ async function stop(drives, what) {
         contents: [make("p", { class: "bad" }, glyph("fault"), ` ${error.message} ${HARD}`)],
       };
     }
-    await asked;
-    again = await retell(
+    again = await tell(
       shown.title,
       shown.contents,
       shown.isWhole ? [] : [["again", "Send the stop again", STOP]],
@@ -104,8 +103,17 @@ find("#ask").addEventListener("click", event => {
 find("#stopall").disabled = false;
 find("#notice").hidden = true;
 find("#notice").classList.remove("loading", "bad");
+
+// Return "one" or "all" for the keys that ask for a stop, S and Shift S, else null. Where a layout has no such
+// letter it is that key; with caps lock on, S is "all" with Shift or without.
+export function stopKey({ key, code, shiftKey }) {
+  const isStop = /^[a-z]$/i.test(key) ? key.toLowerCase() === "s" : code === "KeyS";
+  return !isStop ? null : shiftKey || key === "S" ? "all" : "one";
+}
+
 addEventListener("keydown", event => {
-  // The focus is still in the dialog for some milliseconds after that was closed.
-  const isElsewhere = find("#ask").open || event.target.closest?.("input, select, textarea");
-  if (event.key === "S" && !event.ctrlKey && !event.metaKey && !event.altKey && !isElsewhere) stopAll();
+  // Where nothing is typed the key is at hand like the button, behind a dialog too.
+  const isTyped = event.target.closest?.("input, select, textarea");
+  const isOther = event.ctrlKey || event.metaKey || event.altKey || event.repeat;
+  if (stopKey(event) === "all" && !isOther && !isTyped) stopAll();
 });

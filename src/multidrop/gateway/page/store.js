@@ -18,7 +18,8 @@ export function onPlant(what) {
   if (store.plant) what();
 }
 
-// Take a plant description. Pasts go on where drive and register still exist.
+// Take a plant description. Values and pasts go on where drive and register are the same ones: under the same
+// name may be another drive now, or the same number in another unit.
 export function takePlant(plant) {
   const before = store.drives;
   store.plant = plant;
@@ -27,19 +28,31 @@ export function takePlant(plant) {
   for (const line of plant.lines) {
     for (const spec of line.drives) {
       const registers = new Map(spec.registers.map(r => [r.name, r]));
-      const old = before.get(spec.name);
+      const old = sameDrive(before.get(spec.name), spec, line);
+      const known = what => new Map([...(old?.[what] ?? [])].filter(([r]) => isSame(old, registers, r)));
       store.drives.set(spec.name, {
         spec,
         line,
         registers,
-        good: old?.good ?? new Map(),
-        pasts: old?.pasts ?? new Map(),
+        good: known("good"),
+        pasts: known("pasts"),
         newest: new Map(), // {ms, status} of each register's newest request
         seen: null, // when its newest value was asked for, in ms
       });
     }
   }
   for (const watcher of watchers) watcher();
+}
+
+function sameDrive(old, { family, address }, { port }) {
+  const isSame = old?.spec.family === family && old.spec.address === address && old.line.port === port;
+  return isSame ? old : null;
+}
+
+// Return whether a register of a drive has the same unit, step and words as it had before.
+function isSame(before, registers, name) {
+  const meaning = ({ unit, step, kind, words } = {}) => JSON.stringify([unit, step, kind, words]);
+  return meaning(before.registers.get(name)) === meaning(registers.get(name));
 }
 
 // Take a frame, or what changed since the one before: keep each value that is newer than its last one.
