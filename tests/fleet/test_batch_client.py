@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 from nats_clusters import Cluster, cluster
 from peers import require_module
+from tables import table
 
 require_module("nats")
 
@@ -91,7 +92,7 @@ def _with_path(running: Cluster, work: Callable[[ServerPath], Awaitable[None]]) 
     asyncio.run(main())
 
 
-@pytest.mark.parametrize(
+@table(
     "writers",
     [
         b"NATS/1.0\r\n",
@@ -105,7 +106,7 @@ def test_the_servers_headers_count_whatever_the_writer_has_sent(writers: bytes) 
     assert stored_message(writers + SERVERS, b"x") == DirectMessage("$KV.own_0.a", 7, b"x")
 
 
-@pytest.mark.parametrize(
+@table(
     "headers",
     [
         b"",
