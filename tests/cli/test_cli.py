@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 from commands import TOY, Run
+from tables import table
 
 from multidrop.cli import COMMANDS, main
 from multidrop.cli.fleet import ACTIONS as FLEET
@@ -33,7 +34,7 @@ def test_no_command_is_a_mistake_that_gets_the_help(run: Run) -> None:
     assert run()[0] == 2
 
 
-@pytest.mark.parametrize("name", [*COMMANDS, *(f"fleet {action}" for action in FLEET)])
+@table("name", [*COMMANDS, *(f"fleet {action}" for action in FLEET)])
 def test_every_command_has_help_within_80_columns(
     run: Run, name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -70,7 +71,7 @@ def test_help_imports_no_command_and_nothing_heavy() -> None:
     assert not {name for name in loaded if name.startswith("multidrop.cli.")}
 
 
-@pytest.mark.parametrize(
+@table(
     ("words", "sentence"),
     [
         (["raed"], "there is no command 'raed'; did you mean read?"),
@@ -469,14 +470,14 @@ def in_a_process(words: list[str]) -> list[str]:
     return [sys.executable, "-c", f"import sys; from multidrop.cli import main; sys.exit(main({words}))"]
 
 
-@pytest.mark.parametrize("words", PRINTING)
+@table("words", PRINTING)
 def test_a_full_disk_under_the_output_is_a_sentence(words: list[str]) -> None:
     with Path("/dev/full").open("w") as full:
         done = subprocess.run(in_a_process(words), stdout=full, stderr=subprocess.PIPE, text=True)
     assert (done.returncode, done.stderr) == (1, "multidrop: No space left on device\n")
 
 
-@pytest.mark.parametrize("words", PRINTING)
+@table("words", PRINTING)
 def test_a_reader_who_has_seen_enough_is_no_failure(words: list[str]) -> None:
     with subprocess.Popen(in_a_process(words), stdout=subprocess.PIPE, stderr=subprocess.PIPE) as command:
         assert command.stdout is not None

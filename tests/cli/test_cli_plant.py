@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 from commands import TOY, Run
 from own_fan import Fan
+from tables import table
 from toy import Status, Toy
 
 from multidrop.bus import Bus
@@ -92,7 +93,7 @@ def test_what_a_plant_says_of_a_drive_holds_for_a_command(run: Run, plant: Path,
     assert (status, err.startswith("multidrop: pump-1 does not answer")) == (1, True)
 
 
-@pytest.mark.parametrize(
+@table(
     ("words", "sentence"),
     [
         (["pmp-1"], "PLANT has no drive 'pmp-1'; did you mean pump-1 or pump-2?"),

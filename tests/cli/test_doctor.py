@@ -17,6 +17,7 @@ from commands import Run
 from completions import completed
 from examples import usually
 from serial_server import SerialServer, pyserials_own, vanishing_pty
+from tables import table
 
 from multidrop.cli.doctor.adapter import (
     RS485_ENABLED,
@@ -137,7 +138,7 @@ def test_a_long_latency_timer_is_to_be_changed(sysfs: Path) -> None:
     assert 'ATTR{latency_timer}="1"' in finding.advice
 
 
-@pytest.mark.parametrize(
+@table(
     ("finding", "what", "advised"),
     [
         (latency_finding(Adapter("ttyUSB0", latency_timer=1)), "1 ms: the shortest there is", False),

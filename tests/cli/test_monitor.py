@@ -14,6 +14,7 @@ import pytest
 from commands import Run, plant_file
 from lines import PATIENCE
 from rich.console import Console
+from tables import table
 from terminals import Terminal, on_terminal
 
 import multidrop.cli.support.extras
@@ -261,7 +262,7 @@ def test_the_page_scrolls_as_far_as_there_is_something(watched: LivePlant) -> No
 # ---- its keys ----
 
 
-@pytest.mark.parametrize(
+@table(
     ("pressed", "keys"),
     [
         (b"q", ["q"]),

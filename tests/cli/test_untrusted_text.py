@@ -13,6 +13,7 @@ from commands import Run
 from examples import usually
 from frames import PRINTED
 from recordings import record, row
+from tables import table
 from terminals import MULTIDROP
 
 import multidrop.cli
@@ -50,7 +51,7 @@ def test_a_plant_file_has_no_names_and_ports_that_do_not_print(tmp_path: Path, t
     assert is_harmless(str(found.value))
 
 
-@pytest.mark.parametrize(
+@table(
     "words",
     [
         ("doctor", TRAP),

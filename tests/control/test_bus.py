@@ -10,6 +10,7 @@ from typing import Any, cast
 import checksums
 import pytest
 from lines import PATIENCE, Faulty, patient, proof, until
+from tables import table
 from toy import Fault, Toy
 
 from multidrop.bus import Bus
@@ -378,7 +379,7 @@ MISTAKES: dict[str, tuple[Callable[[Bus, Rig], Any], type[Exception], str]] = {
 }
 
 
-@pytest.mark.parametrize("mistake", MISTAKES)
+@table("mistake", MISTAKES)
 def test_a_mistake_is_told_before_anything_is_sent(mistake: str) -> None:
     call, kind, sentence = MISTAKES[mistake]
     rig = simulated(Rig(1))
@@ -534,7 +535,7 @@ def test_a_refusal_has_its_family_s_meaning(
     assert there.counters.requests == 1  # an answer, which asking again would not change
 
 
-@pytest.mark.parametrize(
+@table(
     ("drive", "least_ms", "most_ms"),
     [
         (InvtCHE(1), 20, 400),
@@ -542,7 +543,6 @@ def test_a_refusal_has_its_family_s_meaning(
         (YD1000(1, baudrate=2400), 440, 500),
         (YD1000(1, baudrate=1200), 500, 500),
     ],
-    ids=lambda each: f"{each.name} {each.settings}" if isinstance(each, Drive) else None,
 )
 def test_a_drive_s_document_bounds_its_time_out(drive: Drive, least_ms: int, most_ms: int) -> None:
     with unpaced(simulated(drive)) as sim, Bus(path(sim)) as bus:
@@ -563,7 +563,7 @@ def test_a_stop_to_all_of_one_family() -> None:
     assert [drive.counters.broadcasts for drive in drives] == [1, 1]
 
 
-@pytest.mark.parametrize(
+@table(
     ("drives", "value"),
     [
         ([InnovertIBD(1), InnovertIBD(2)], IBDControl.RUN),

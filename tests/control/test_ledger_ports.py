@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 from lines import PATIENCE
 from simulated_bus import SimulatedBus
+from tables import table
 from toy import Status, Toy
 
 from multidrop.bus import Bus
@@ -92,7 +93,7 @@ def test_an_adapter_is_known_by_its_serial_number(tmp_path: Path, monkeypatch: p
     assert "was written 5 s ago" in ledger.enter(moved, 1005.0, 60.0)
 
 
-@pytest.mark.parametrize(
+@table(
     ("name", "identity"),
     [
         ("socket://10.0.0.7:4001", "10.0.0.7:4001"),

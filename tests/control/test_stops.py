@@ -14,6 +14,7 @@ from typing import Any
 import pytest
 from motors import MAKE, STARTS
 from simulated_bus import SimulatedBus, is_write, one
+from tables import table
 
 from multidrop.bus import Bus
 from multidrop.control.eeprom_ledger import Ledger
@@ -701,7 +702,7 @@ def test_looks_that_take_their_time_are_no_delay(monkeypatch: pytest.MonkeyPatch
     assert len(writes(line)) == 1
 
 
-@pytest.mark.parametrize("expiry", [0, -1, float("nan"), float("inf"), 10**30, True, "1"])
+@table("expiry", [0, -1, float("nan"), float("inf"), 10**30, True, "1"])
 def test_an_expiry_that_is_none_is_refused(expiry: Any) -> None:
     with pytest.raises(ValueError, match=r"expiry = .* is not a number of seconds above 0"):
         Bus("/dev/none", expiry=expiry)

@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 from simulated_bus import SimulatedBus, one
+from tables import table
 
 from multidrop.control.time_limit import written_before
 from multidrop.drive import Direction, Drive, Script, read, wait, write
@@ -138,7 +139,7 @@ def test_the_limit_is_asked_for_when_a_stop_would_end_the_call(line: SimulatedBu
     assert written(line)[before:] == written(line)[-1:]  # the stop
 
 
-@pytest.mark.parametrize("limit", [0.5, True, "1", None])
+@table("limit", [0.5, True, "1", None])
 def test_what_is_no_function_is_refused(limit: Any) -> None:
     with pytest.raises(TypeError, match=r"is no function that returns a time"), written_before(limit):
         pass

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import checksums
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from tables import table
 
 from multidrop.core import crc16, lrc, sum8
 
@@ -17,7 +17,7 @@ def crc(data: bytes) -> int:
     return checksum
 
 
-@pytest.mark.parametrize(
+@table(
     ("data", "checksum"),
     [
         (CHECK, 0x4B37),  # CRC-16/MODBUS in the catalogue of parametrised CRC algorithms
@@ -32,7 +32,7 @@ def test_crc16(data: bytes, checksum: int) -> None:
     assert crc(data) == checksum
 
 
-@pytest.mark.parametrize(
+@table(
     ("data", "checksum"),
     [
         (b"", 0),
@@ -45,7 +45,7 @@ def test_lrc(data: bytes, checksum: int) -> None:
     assert lrc(data, len(data)) == checksum
 
 
-@pytest.mark.parametrize(
+@table(
     ("data", "checksum"),
     [
         (b"", 0),
@@ -59,8 +59,8 @@ def test_delixi_s_sum(data: bytes, checksum: int) -> None:
     assert sum8(data, len(data)) == checksum
 
 
-@pytest.mark.parametrize("at", range(4))
-@pytest.mark.parametrize("more", range(4))
+@table("at", range(4))
+@table("more", range(4))
 def test_crc16_is_what_is_defined_bit_by_bit(at: int, more: int) -> None:
     """Every byte value at every place among the four that are taken at once, and single ones behind."""
     for byte in range(256):

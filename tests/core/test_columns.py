@@ -12,6 +12,7 @@ import pytest
 from completions import add_miss, add_rows
 from frames import words
 from line_driver import MS, LineDriver
+from tables import table
 
 from multidrop.core import (
     EXCEPTION_STATUS,
@@ -63,7 +64,7 @@ NUMBERS = [
 ]
 
 
-@pytest.mark.parametrize(("wire", "data", "value"), NUMBERS)
+@table(("wire", "data", "value"), NUMBERS)
 def test_number(wire: int, data: str, value: float) -> None:
     assert raw_value(bytes.fromhex(data), 0, wire) == value
 
@@ -78,7 +79,7 @@ def test_coils_count_from_the_least_significant_bit_of_the_first_byte() -> None:
     assert coils == [1, 0, 1, 1, 0, 0, 1, 1, 1, 1, 0, 1, 0, 1, 1, 0, 1, 0, 1]
 
 
-@pytest.mark.parametrize("wire", list(NumberFormat))
+@table("wire", list(NumberFormat))
 def test_beyond_the_data_there_is_no_number(wire: NumberFormat) -> None:
     for at in (8, 9, 2**15, sys.maxsize, sys.maxsize + 1, 2 * sys.maxsize + 1):
         assert math.isnan(raw_value(b"\xff", at, wire))
@@ -134,7 +135,7 @@ def test_rows_of_a_block() -> None:
     assert columns.array("valid")[0] & 0b111 == 0b111
 
 
-@pytest.mark.parametrize(("raw", "divisor"), [(3, 10), (7, 100), (5000, 100), (65535, 1000), (1, 3)])
+@table(("raw", "divisor"), [(3, 10), (7, 100), (5000, 100), (65535, 1000), (1, 3)])
 def test_scaling_gives_the_nearest_number(raw: int, divisor: int) -> None:
     """3 steps of 0.1 are 0.3, not 0.30000000000000004."""
     columns = Columns(1)
@@ -145,7 +146,7 @@ def test_scaling_gives_the_nearest_number(raw: int, divisor: int) -> None:
 ONE = RowLayout(1, [Field(0, NumberFormat.U16, 2, 1, 1)])
 
 
-@pytest.mark.parametrize(
+@table(
     ("received", "status", "text"),
     [
         (b"", Status.NO_REPLY, "no reply"),

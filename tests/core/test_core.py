@@ -19,6 +19,7 @@ from completions import pending, status_of
 from frames import words
 from lines import until
 from multidrop._core import ffi
+from tables import table
 
 from multidrop.core import (
     EXCEPTION_STATUS,
@@ -881,7 +882,7 @@ def test_memory_is_flat_over_many_exchanges(drive: Drive, exchanges: int) -> Non
         assert resident_after(exchanges) - before < 1_000_000  # that is 20 bytes each, or 100
 
 
-@pytest.mark.parametrize("status", list(Status))
+@table("status", list(Status))
 def test_every_status_has_its_words(status: Status) -> None:
     assert str(status)
     assert STATUSES[status] == str(status)

@@ -11,6 +11,7 @@ import pytest
 from frames import PRINTED, Printed, words
 from line_driver import LineDriver
 from multidrop._core import lib
+from tables import table
 
 from multidrop.core import (
     Completion,
@@ -237,10 +238,9 @@ WRONG = [
 ]
 
 
-@pytest.mark.parametrize(
+@table(
     ("framing", "request_", "received", "reason"),
     [each[1:] for each in WRONG],
-    ids=[each[0] for each in WRONG],
 )
 def test_wrong_reply_is_never_data(
     framing: Framing, request_: Message, received: bytes, reason: FrameFault
@@ -263,7 +263,7 @@ def test_stray_zero_before_every_reply_loses_nothing() -> None:
         assert (line.completion.result, line.completion.skipped, line.completion.stale) == (9, 1, 0)
 
 
-@pytest.mark.parametrize("code", [0xF0, 0xFC, 0xFD, 0xFE, 0xFF])
+@table("code", [0xF0, 0xFC, 0xFD, 0xFE, 0xFF])
 def test_delixi_s_refusals(code: int) -> None:
     frame = build_reply(DELIXI, Message(1, RUN_FORWARD.function, exception=code))
     assert parse_reply(DELIXI, frame, RUN_FORWARD) == (21, Message(1, 2, exception=code))
@@ -278,7 +278,7 @@ def test_delixi_s_state_is_the_reply_s_parameter_number() -> None:
 # ---- what cannot be said ----
 
 
-@pytest.mark.parametrize(
+@table(
     "message",
     [
         Message(1, 0x03, 0, 126),
@@ -291,7 +291,6 @@ def test_delixi_s_state_is_the_reply_s_parameter_number() -> None:
         Message(1, 0x10, 0, 2, b"\x00" * 5),
         Message(1, 0x2B, 0, 1),
     ],
-    ids=str,
 )
 def test_request_out_of_bounds(message: Message) -> None:
     with pytest.raises(ValueError, match=re.escape(f"no rtu frame can say {message}")):
@@ -307,7 +306,7 @@ def test_the_last_address_and_the_one_behind_it() -> None:
         build_reply(RTU, Message(248, 0x03, data=words(7)))
 
 
-@pytest.mark.parametrize("function", [0x00, 0x07, 0x2B, 0xFF])
+@table("function", [0x00, 0x07, 0x2B, 0xFF])
 def test_nobody_replies_to_what_is_no_function(function: int) -> None:
     reply = Message(1, function, data=words(7))
     with pytest.raises(ValueError, match=re.escape(f"no rtu frame can say {reply}")):
@@ -319,7 +318,7 @@ def test_request_with_too_much_data() -> None:
         build_request(RTU, Message(1, 0x10, 0, 123, bytes(251)))
 
 
-@pytest.mark.parametrize("count", [0, 126, 127, 128, 0xFFFF])
+@table("count", [0, 126, 127, 128, 0xFFFF])
 def test_impossible_count_may_be_refused_but_never_answered(count: int) -> None:
     """An sniffed master may ask for anything; exceptions are replies to that too."""
     request = Message(1, 0x03, 0, count)
@@ -333,8 +332,8 @@ def test_drive_s_side_hears_of_a_count_that_it_cannot_answer() -> None:
     assert parse_request(RTU, frame) == (8, Message(1, 0x03, 0, 126))
 
 
-@pytest.mark.parametrize("function", [0x83, 0xFF, 0x2B])
-@pytest.mark.parametrize("framing", [RTU, ASCII])
+@table("function", [0x83, 0xFF, 0x2B])
+@table("framing", [RTU, ASCII])
 def test_nothing_answers_what_is_no_function(framing: Framing, function: int) -> None:
     body = bytes([1, function, 1])
     frames = {
@@ -347,7 +346,7 @@ def test_nothing_answers_what_is_no_function(framing: Framing, function: int) ->
     )
 
 
-@pytest.mark.parametrize("odd", [{"start": 10**400}, {"start": -1}, {"count": 1 << 16}, {"function": 300}])
+@table("odd", [{"start": 10**400}, {"start": -1}, {"count": 1 << 16}, {"function": 300}])
 def test_a_number_that_no_frame_has_room_for_is_a_mistake(odd: dict[str, int]) -> None:
     with pytest.raises(ValueError, match="no frame can say this"):
         build_request(Framing.RTU, Message(**({"address": 1, "function": 3, "start": 0, "count": 1} | odd)))

@@ -8,10 +8,10 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import pytest
 from frames import words
 from line_driver import MS, LineDriver
 from multidrop._core import ffi, lib
+from tables import table
 
 from multidrop.core import Exchange, Framing, Message, Peer, build_reply
 
@@ -124,7 +124,7 @@ class Walk:
             self.line.lose(5)
 
 
-@pytest.mark.parametrize("seed", range(5))
+@table("seed", range(5))
 def test_no_walk_leaves_the_table(seed: int) -> None:
     ways = {state: {state} | after({state}) for state in STATES.values()}
     for _ in range(MOST_EVENTS - 1):

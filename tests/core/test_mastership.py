@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 import pytest
+from tables import table
 
 import multidrop
 from multidrop import Mastership
@@ -120,7 +121,7 @@ def test_a_time_that_is_past_is_refused_and_arms_nothing() -> None:
     mastership.end()
 
 
-@pytest.mark.parametrize("wrong", [1.5, "now", None, True])
+@table("wrong", [1.5, "now", None, True])
 def test_a_deadline_is_a_whole_number(wrong: object) -> None:
     with pytest.raises(TypeError, match=r"^until_ns is a whole number of ns of CLOCK_BOOTTIME, not "):
         Mastership().extend(wrong)  # type: ignore[arg-type]
@@ -131,7 +132,7 @@ def test_a_deadline_beyond_all_time_is_refused() -> None:
         Mastership().extend(1 << 63)
 
 
-@pytest.mark.parametrize("wrong", [0, -1, float("nan"), float("inf"), 3601])
+@table("wrong", [0, -1, float("nan"), float("inf"), 3601])
 def test_a_guard_is_a_time(wrong: float) -> None:
     with pytest.raises(ValueError, match=r"^guard_s = .* must be above 0 and at most 3600, in s$"):
         Mastership(wrong)

@@ -10,6 +10,7 @@ import pytest
 from frames import PRINTED, Printed
 from hypothesis import given
 from hypothesis import strategies as st
+from tables import table
 
 from multidrop.core import STREAM_ROOM, FrameSpan, Framing, Kind, Message, Side, Splitter, Stream
 
@@ -38,7 +39,7 @@ def raw(spans: Iterable[FrameSpan]) -> list[tuple[Kind, bytes]]:
     return [(span.kind, span.raw) for span in spans]
 
 
-@pytest.mark.parametrize("reply", REPLIES, ids=str)
+@table("reply", REPLIES)
 def test_a_printed_exchange_is_a_request_and_its_reply(reply: Printed) -> None:
     asked, answered = split(reply.request_frame, reply.frame)
     assert (answered.kind, answered.framing) == (Kind.REPLY, reply.framing)
@@ -188,7 +189,7 @@ def damaged(frame: bytes, chance: random.Random) -> bytes:
     return bytes(found)
 
 
-@pytest.mark.parametrize("seed", range(5))
+@table("seed", range(5))
 def test_every_exchange_that_is_not_next_to_damage_is_seen(seed: int) -> None:
     chance = random.Random(seed)
     line = chance.choices(REPLIES, k=2000)

@@ -18,6 +18,7 @@ from judges import Pymodbus
 from line_driver import MS, LineDriver
 from line_exchanges import CHARACTER, LEAST, MOST, READ, WRITE
 from line_exchanges import exchange as over_rtu
+from tables import table
 
 from multidrop.core import (
     Exchange,
@@ -107,7 +108,7 @@ def test_frames_are_pymodbus_s_byte_by_byte(replies: bool) -> None:
     assert count > NUMBER / 5
 
 
-@pytest.mark.parametrize("unit", [0, 1, 247, 248, 255])
+@table("unit", [0, 1, 247, 248, 255])
 def test_every_unit_id_is_asked_and_answers(unit: int) -> None:
     for request in (Message(unit, 3, 0, 2), Message(unit, 6, 1, data=words(2))):
         assert parse_request(TCP, build_request(TCP, request)) == (12, request)
@@ -123,7 +124,7 @@ def test_the_longest_frame_has_its_place() -> None:
     assert parse_reply(TCP, reply, request)[0] == 259
 
 
-@pytest.mark.parametrize(
+@table(
     ("damaged", "fault"),
     [
         ("00 00 00 01 00 05 01 03 02 00 07", FrameFault.NO_START),  # protocol 1

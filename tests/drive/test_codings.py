@@ -17,6 +17,7 @@ from examples import examples
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 from simulated_bus import SimulatedBus
+from tables import table
 
 from multidrop.capture.lookup import RegisterLookup
 from multidrop.control.outcome import Effect
@@ -299,7 +300,7 @@ def test_an_invalid_count_is_no_value_and_its_neighbour_is_one(
         assert (register.value_in(wire, 0) is not None) == is_value
 
 
-@pytest.mark.parametrize(
+@table(
     ("number_format", "part", "invalid", "wire"),
     [
         (NumberFormat.I16, None, 0x8000, "80 00"),  # its bits

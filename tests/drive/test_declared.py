@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from tables import table
 
 from multidrop.core import NumberFormat
 from multidrop.drive import Drive
@@ -91,7 +92,7 @@ WRONG: dict[str, dict[str, Any]] = {
 }
 
 
-@pytest.mark.parametrize("mistake", WRONG)
+@table("mistake", WRONG)
 def test_a_mistake_is_told_with_the_register_s_name(mistake: str) -> None:
     (sentence,) = told(speed=setting(5, "rpm", **WRONG[mistake]))
     assert sentence.startswith(f"speed: {mistake}")
@@ -127,7 +128,7 @@ PARTS: dict[str, dict[str, Any]] = {
 }
 
 
-@pytest.mark.parametrize("mistake", PARTS)
+@table("mistake", PARTS)
 def test_a_mistake_of_a_reading_is_told(mistake: str) -> None:
     details = dict(PARTS[mistake])
     (sentence,) = told(level=reading(5, details.pop("what", ""), **details))
@@ -151,7 +152,7 @@ WRITTEN: dict[str, dict[str, Any]] = {
 }
 
 
-@pytest.mark.parametrize("mistake", WRITTEN)
+@table("mistake", WRITTEN)
 def test_a_count_that_no_write_can_have_is_told(mistake: str) -> None:
     details = dict(WRITTEN[mistake])
     (sentence,) = told(level=setting(5, details.pop("what", ""), **details))
@@ -183,7 +184,7 @@ SCALED: dict[str, dict[str, Register[Any]]] = {
 }
 
 
-@pytest.mark.parametrize("mistake", SCALED)
+@table("mistake", SCALED)
 def test_a_scale_register_that_no_request_reads_with_it_is_told(mistake: str) -> None:
     (sentence,) = told(level=reading(10, scale_register="power"), **SCALED[mistake])
     assert sentence.startswith(f"level: {mistake}")

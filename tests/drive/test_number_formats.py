@@ -11,6 +11,7 @@ from examples import examples
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from simulated_bus import SimulatedBus
+from tables import table
 
 from multidrop.cli.support.values import as_json, nearest_value, value_text
 from multidrop.control.outcome import Effect
@@ -123,10 +124,8 @@ def test_the_nearest_float32_is_what_was_taken(attached: Any, value: float) -> N
     assert Meter.f32.encode(value) == nearest
 
 
-@pytest.mark.parametrize("name", ["f32", "f32_swapped", "scaled", "unscaled", "u16"])
-@pytest.mark.parametrize(
-    "value", [math.nan, math.inf, -math.inf, 3.5e38, -1e300, 10**400, -(10**5000)], ids=range(7)
-)
+@table("name", ["f32", "f32_swapped", "scaled", "unscaled", "u16"])
+@table("value", [math.nan, math.inf, -math.inf, 3.5e38, -1e300, 10**400, -(10**5000)], ids=range(7))
 def test_what_no_number_format_holds_is_refused(attached: Any, name: str, value: float) -> None:
     line, meter, _ = attached
     before = len(line.written)
@@ -144,7 +143,7 @@ def test_a_float_is_shown_as_what_it_holds(register: Register[float], raw: float
     assert len(shown.lstrip("-").replace(".", "").partition("e")[0].strip("0")) <= 9
 
 
-@pytest.mark.parametrize(
+@table(
     ("value", "text"),
     [(12.5, "12.5 V"), (12.0, "12 V"), (12.1, "12.1 V"), (0.1, "0.1 V"), (-0.0, "0 V"),
      (1 / 3, "0.33333334 V"), (1e20, "1e+20 V"), (math.nan, "nan V"), (math.inf, "inf V"),
@@ -237,7 +236,7 @@ def test_a_step_may_be_negative(attached: Any) -> None:
         line.bus.write(meter, Meter.downwards, 5)
 
 
-@pytest.mark.parametrize(
+@table(
     ("step", "decimals"), [(1, 0), (0.1, 1), (0.01, 2), (100, 0), (1e-7, 7), (-0.05, 2), (2.5, 1), (1e6, 0)]
 )
 def test_a_step_says_how_many_digits_there_are(step: float, decimals: int) -> None:

@@ -6,6 +6,7 @@ from typing import Any
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from tables import table
 
 from multidrop.core import NumberFormat
 from multidrop.drive import Drive
@@ -40,7 +41,7 @@ class Example(Drive):
     choice = setting(10, span=(0, 2))
 
 
-@pytest.mark.parametrize(("raw", "value"), [(3, 0.3), (7, 0.7), (285, 28.5), (65535, 6553.5)])
+@table(("raw", "value"), [(3, 0.3), (7, 0.7), (285, 28.5), (65535, 6553.5)])
 def test_a_raw_count_times_a_step_is_the_nearest_number(raw: int, value: float) -> None:
     assert Example.current.decode(raw) == value
 
@@ -56,7 +57,7 @@ def test_an_enumeration_decodes_to_its_member_and_a_stranger_to_its_number() -> 
     assert Example.bits.decode(9) == Bits.RUN | Bits.FAULT
 
 
-@pytest.mark.parametrize(
+@table(
     ("register", "value", "error"),
     [
         (Example.frequency, 400.01, ValueError),
@@ -91,7 +92,7 @@ def test_encoding_takes_the_nearest_count(value: float) -> None:
     assert abs(Example.frequency.decode(Example.frequency.encode(value)) - value) <= 0.00501
 
 
-@pytest.mark.parametrize(
+@table(
     ("register", "value", "text"),
     [
         (Example.current, 2.5, "2.5 A"),
@@ -133,8 +134,8 @@ def test_an_address_outside_the_protocol_is_refused() -> None:
         type("Far", (Drive,), {"frequency": reading(0x10000, "Hz")})
 
 
-@pytest.mark.parametrize("number", [10**400, -(10**400), 1 << 64])
-@pytest.mark.parametrize("name", ["current", "energy", "frequency", "choice", "unknown"])
+@table("number", [10**400, -(10**400), 1 << 64])
+@table("name", ["current", "energy", "frequency", "choice", "unknown"])
 def test_a_number_that_no_float_can_hold_is_refused(name: str, number: int) -> None:
     with pytest.raises(ValueError, match=rf"^{name} "):
         Example.register(name).encode(number)

@@ -11,6 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from lines import ANY_PORT
 from simulated_bus import SimulatedBus
+from tables import table
 
 from multidrop.core import Message
 from multidrop.drive import Drive, Refused, Script, read, verb
@@ -127,7 +128,7 @@ def test_a_text_is_never_polled_nor_another_s(monkeypatch: pytest.MonkeyPatch) -
         line.sims[0]["maker"] = "1234567"
 
 
-@pytest.mark.parametrize(
+@table(
     ("details", "sentence"),
     [
         ((1, 0), "a text of 0 registers"),

@@ -1,11 +1,12 @@
 """Character times and silences against the serial-line guide's own figures."""
 
 import pytest
+from tables import table
 
 from multidrop.drive.timing import Settings
 
 
-@pytest.mark.parametrize(
+@table(
     ("baudrate", "format", "bits"),
     [
         (9600, "8N1", 10),
@@ -20,7 +21,7 @@ def test_a_character_has_its_bits(baudrate: int, format: str, bits: int) -> None
     assert Settings(baudrate, format).character == pytest.approx(bits / baudrate)
 
 
-@pytest.mark.parametrize(
+@table(
     ("baudrate", "format", "seconds"),
     [
         (9600, "8E1", 4.0104e-3),  # 3.5 characters of 11 bits
@@ -33,7 +34,7 @@ def test_t3_5(baudrate: int, format: str, seconds: float) -> None:
     assert Settings(baudrate, format).t3_5 == pytest.approx(seconds, rel=1e-4)
 
 
-@pytest.mark.parametrize("format", ["8X1", "9N1", "8N3", "8n1", "", "8N1 "])
+@table("format", ["8X1", "9N1", "8N3", "8n1", "", "8N1 "])
 def test_a_format_that_is_none_is_refused(format: str) -> None:
     with pytest.raises(ValueError, match="format"):
         Settings(9600, format)

@@ -15,6 +15,7 @@ import pytest
 from examples import examples
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from tables import table
 
 import multidrop.drives
 from multidrop.core import (
@@ -41,16 +42,13 @@ FAMILIES = list(MODELS.values())
 family = pytest.mark.parametrize("family", FAMILIES, ids=lambda each: each.model)
 
 
-def registers(wanted: Callable[[Register[Any]], object] = lambda each: True) -> pytest.MarkDecorator:
-    """Runs a test for each register of each family that is wanted."""
-    found = [
-        (family, register)
-        for family in FAMILIES
-        for register in family.registers.values()
-        if wanted(register)
-    ]
-    ids = [f"{family.model}-{each.name}" for family, each in found]
-    return pytest.mark.parametrize(("family", "register"), found, ids=ids)
+def registers(wanted: Callable[[Register[Any]], object]) -> list[tuple[type[Drive], Register[Any]]]:
+    """Return each register of each family that is wanted."""
+    return [(family, each) for family in FAMILIES for each in family.registers.values() if wanted(each)]
+
+
+def told(one: type[Drive] | Register[Any]) -> str:
+    return one.name if isinstance(one, Register) else one.model
 
 
 def test_the_models_by_name() -> None:
@@ -77,7 +75,7 @@ def test_a_family_says_what_it_is(family: type[Drive]) -> None:
 
 
 @family
-@pytest.mark.parametrize("given", [True, 1.0, None, "1", 0, 248, -1])
+@table("given", [True, 1.0, None, "1", 0, 248, -1])
 def test_an_address_is_a_whole_number_that_the_family_has(family: type[Drive], given: object) -> None:
     with pytest.raises(ValueError, match=rf"^address {given!r} is not one of "):
         family(given)  # type: ignore[arg-type]
@@ -95,8 +93,8 @@ def test_the_class_of_all_families_is_none() -> None:
 
 
 @family
-@pytest.mark.parametrize("name", ["start", "jog"])
-@pytest.mark.parametrize("given", ["reverse", "forward", True, 25.0, CHEStatus.REVERSE])
+@table("name", ["start", "jog"])
+@table("given", ["reverse", "forward", True, 25.0, CHEStatus.REVERSE])
 def test_a_direction_is_never_guessed(family: type[Drive], name: str, given: object) -> None:
     """A word that is no Direction must not turn the motor the other way; nothing is sent."""
     drive = family(family.addresses[0], name="pump")
@@ -110,7 +108,7 @@ def test_a_direction_is_never_guessed(family: type[Drive], name: str, given: obj
 
 
 @family
-@pytest.mark.parametrize("given", ["25", None, True, Direction.FORWARD])
+@table("given", ["25", None, True, Direction.FORWARD])
 def test_a_frequency_is_a_number(family: type[Drive], given: object) -> None:
     drive = family(family.addresses[0], name="pump")
     drive.perform = drive.check_identity = pytest.fail
@@ -163,7 +161,7 @@ def test_each_register_says_where_it_comes_from(family: type[Drive]) -> None:
         assert getattr(family, name) is register
 
 
-@registers(lambda each: each.span)
+@table("family, register", registers(lambda each: each.span))
 def test_the_ends_of_the_span_can_be_encoded_and_nothing_beyond(
     family: type[Drive], register: Register[Any]
 ) -> None:
@@ -177,12 +175,12 @@ def test_the_ends_of_the_span_can_be_encoded_and_nothing_beyond(
             register.encode(beyond)
 
 
-@registers(lambda each: each.span and each.default is not None)
+@table("family, register", registers(lambda each: each.span and each.default is not None))
 def test_the_default_is_inside_the_span(family: type[Drive], register: Register[Any]) -> None:
     assert register.decode(register.encode(register.default)) == register.default
 
 
-@registers(lambda each: each.values)
+@table("family, register", registers(lambda each: each.values))
 def test_names_go_to_the_wire_and_back(family: type[Drive], register: Register[Any]) -> None:
     assert register.values
     for member in register.values:
@@ -205,7 +203,7 @@ def test_what_is_never_written_is_not_writable(family: type[Drive]) -> None:
     assert not [register for register in family.registers.values() if register.never and register.writable]
 
 
-@registers(lambda each: each.broadcast)
+@table("family, register", registers(lambda each: each.broadcast))
 def test_a_broadcast_is_a_stop_or_a_setpoint_of_zero(family: type[Drive], register: Register[Any]) -> None:
     for raw in register.broadcast:
         assert family.broadcasts
@@ -223,7 +221,7 @@ def test_an_unknown_scale_is_not_written(family: type[Drive]) -> None:
     ]
 
 
-@registers(lambda each: not each.values)
+@table("family, register", registers(lambda each: not each.values))
 def test_a_raw_count_survives_its_value(family: type[Drive], register: Register[Any]) -> None:
     low, high = (0, 1) if register.number_format is NumberFormat.BIT else (0, 0xFFFF)
     if register.number_format is NumberFormat.I16:
@@ -240,7 +238,7 @@ def test_a_raw_count_survives_its_value(family: type[Drive], register: Register[
         assert register.format(value).startswith(f"{value:.{register.decimals}f}")
 
 
-@registers(lambda each: each.writable)
+@pytest.mark.parametrize(("family", "register"), registers(lambda each: each.writable), ids=told)
 @settings(max_examples=examples(10))
 @given(data=st.data())
 def test_a_value_survives_the_wire(family: type[Drive], register: Register[Any], data: st.DataObject) -> None:
@@ -287,7 +285,10 @@ def _values(register: Register[Any]) -> st.SearchStrategy[Any]:
     return st.integers(low, high).map(register.decode)
 
 
-@registers(lambda each: each.values is None and each.writable)
+NUMBERS = registers(lambda each: each.values is None and each.writable)
+
+
+@pytest.mark.parametrize(("family", "register"), NUMBERS, ids=told)
 @settings(max_examples=examples(10))
 @given(data=st.data())
 def test_what_is_shown_can_be_typed(

@@ -8,6 +8,7 @@ import checksums
 import pytest
 from scripts import Wire, rows, typed
 from simulated_bus import one
+from tables import table
 
 from multidrop.control.eeprom_ledger import Ledger
 from multidrop.core import NumberFormat
@@ -204,7 +205,7 @@ def test_a_negative_setpoint_cannot_be_written_at_all() -> None:
         InvtCHE.setpoint.encode(-1)
 
 
-@pytest.mark.parametrize(
+@table(
     ("says", "state"),
     [
         (STANDBY, State(Condition.STOPPED)),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 from delixi_tables import MONITORS
 from scripts import Wire, frame, rows, typed
+from tables import table
 
 from multidrop.drive import Condition, Direction, Framing, NotDone, Refused, State, Unconfirmed, Unsupported
 from multidrop.drive.table import HOLDING, Kept
@@ -155,7 +156,7 @@ def test_identify() -> None:
             Wire(DelixiModbus(1), {**STANDING, name: other}).drive.identify()
 
 
-@pytest.mark.parametrize(
+@table(
     ("name", "held", "sentence"),
     [
         ("run_source", DelixiRunSource.KEYPAD, r"P00\.00 must be 2"),

@@ -8,6 +8,7 @@ import pytest
 from delixi_tables import MONITORS
 from scripts import Wire, frame, rows, typed
 from simulated_bus import one
+from tables import table
 
 from multidrop.control.eeprom_ledger import Ledger
 from multidrop.drive import Condition, Direction, Framing, NotDone, Refused, State, Unconfirmed, Unsupported
@@ -123,7 +124,7 @@ def test_stop_waits_for_state_and_frequency() -> None:
         wire.drive.stop()
 
 
-@pytest.mark.parametrize(
+@table(
     ("raw", "fault"),
     [
         (0x00, DelixiFault.NONE),
@@ -145,7 +146,7 @@ def test_faults_are_read_as_decimal_and_as_hex_digits(raw: int, fault: int) -> N
     assert isinstance(decoded, DelixiFault) == isinstance(fault, DelixiFault)
 
 
-@pytest.mark.parametrize(
+@table(
     ("says", "state"),
     [
         (STANDING, State(Condition.STOPPED)),

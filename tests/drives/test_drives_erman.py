@@ -6,6 +6,7 @@ import checksums
 import pytest
 from scripts import Wire, frame, rows, typed
 from simulated_bus import one
+from tables import table
 
 from multidrop.core import NumberFormat
 from multidrop.drive import Condition, Direction, DriveRefused, NotDone, Refused, Unconfirmed, Unsupported
@@ -231,7 +232,7 @@ def test_the_setpoint_is_0002h_and_below_the_maximum() -> None:
         wire.drive.set_frequency(28.5)
 
 
-@pytest.mark.parametrize(
+@table(
     ("status", "fault", "condition", "note"),
     [
         (0, 0, Condition.STOPPED, ""),

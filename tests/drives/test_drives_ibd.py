@@ -6,6 +6,7 @@ import checksums
 import pytest
 from scripts import Wire, frame, rows, typed
 from simulated_bus import one
+from tables import table
 
 from multidrop.drive import Condition, Direction, DriveRefused, Framing, Refused, Unconfirmed, Unsupported
 from multidrop.drive.table import HOLDING
@@ -65,7 +66,7 @@ def test_the_registers_are_those_of_appendix_2() -> None:
     assert rows(InnovertIBD) == typed(TABLE)
 
 
-@pytest.mark.parametrize(
+@table(
     ("name", "address"),
     [("PrA.03", 3), ("PrA.04", 4), ("Prb.00", 0x64), ("Prb.01", 0x65), ("Prb.07", 0x6B), ("Prb.08", 0x6C)],
 )
@@ -165,7 +166,7 @@ def test_a_start_after_a_jog_is_at_the_setpoint(monkeypatch: pytest.MonkeyPatch)
     assert sim.motor.frequency == 50
 
 
-@pytest.mark.parametrize(
+@table(
     ("says", "sentence"),
     [
         ({"frequency_source": FrequencySource.PARAMETER}, r"Prb\.01 to 5"),
@@ -235,7 +236,7 @@ def test_the_state_is_unknown_unless_the_outputs_are_programmed() -> None:
         assert "Prd.23" in state.note
 
 
-@pytest.mark.parametrize(
+@table(
     ("raw", "condition"),
     [
         (0x1800, Condition.STOPPED),  # the reply that is printed, with its reserved bits

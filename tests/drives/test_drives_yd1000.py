@@ -6,6 +6,7 @@ import checksums
 import pytest
 from scripts import Wire, frame, rows, typed
 from simulated_bus import one
+from tables import table
 
 from multidrop.drive import Condition, Direction, DriveRefused, NotDone, Refused, State, Unconfirmed
 from multidrop.drive.table import HOLDING, Kept
@@ -109,7 +110,7 @@ def test_the_registers_are_those_of_sections_6_and_7() -> None:
     assert rows(YD1000) == typed(basic + OTHERS)
 
 
-@pytest.mark.parametrize("row", parameters(), ids=lambda row: row[1])
+@table("row", parameters())
 def test_factory_settings_and_what_may_be_changed_while_running(row: tuple[str, ...]) -> None:
     register = YD1000.registers[row[1]]
     assert register.default == (None if row[-2] == "X" else float(row[-2]))
@@ -229,7 +230,7 @@ def test_the_line_and_its_limits() -> None:
     assert "F803" in YD1000.watchdog
 
 
-@pytest.mark.parametrize(
+@table(
     ("word", "printed"),
     [
         (YD1000Control.COMMAND_VALID | YD1000Control.RUN, "01 06 10 00 84 00 EE 0A"),
@@ -264,7 +265,7 @@ def yd_word(word: int) -> str:
     return checksums.rtu(f"01 06 10 00 {word:04X}").hex(" ").upper()
 
 
-@pytest.mark.parametrize(
+@table(
     ("options", "forward", "reverse"),
     [
         ({"setpoint_by_fnod": 1}, 0x8400, 0x8600),  # both printed in section 8.1
@@ -297,9 +298,7 @@ AT_PRESET = {
 }
 
 
-@pytest.mark.parametrize(
-    ("number", "bits"), [(1, 0x8), (2, 0x4), (3, 0xC), (4, 0x2), (5, 0xA), (6, 0x6), (7, 0xE)]
-)
+@table(("number", "bits"), [(1, 0x8), (2, 0x4), (3, 0xC), (4, 0x2), (5, 0xA), (6, 0x6), (7, 0xE)])
 def test_a_preset_speed_is_seen_at_rest_before_the_motor_is_started(number: int, bits: int) -> None:
     select, run = yd_word(0xC000 | bits), yd_word(0xC600 | bits)
     wire = Wire(
@@ -311,7 +310,7 @@ def test_a_preset_speed_is_seen_at_rest_before_the_motor_is_started(number: int,
     assert wire.sent == [STOP, select, run]
 
 
-@pytest.mark.parametrize(
+@table(
     ("says", "sent", "sentence"),
     [
         ({}, [STOP, yd_word(0xC00C), STOP], "does not take 15 Hz, preset speed 3"),

@@ -6,11 +6,12 @@ import tomllib
 from typing import Any
 
 import pytest
+from tables import table
 
 from multidrop.family_file.addresses import Counting, sent_as
 
 
-@pytest.mark.parametrize(
+@table(
     ("given", "counts_from", "table", "sent"),
     [
         (0x2000, 0, None, (0x2000, "holding")),
@@ -38,7 +39,7 @@ def test_what_is_sent(given: Any, counts_from: int | None, table: str | None, se
     assert Counting(counts_from).address(given, table, "holding") == sent
 
 
-@pytest.mark.parametrize(
+@table(
     ("cell", "counts_from", "sent"),
     [
         ("8192", 0, (8192, "holding")),
@@ -55,7 +56,7 @@ def test_what_is_sent_of_a_cell(cell: str, counts_from: int | None, sent: tuple[
     assert Counting(counts_from).address_in_cell(cell, None, "holding") == sent
 
 
-@pytest.mark.parametrize(
+@table(
     ("given", "sentence"),
     [
         (True, "True is no address; write 0x2000"),
@@ -80,7 +81,7 @@ def test_what_is_refused(given: Any, sentence: str) -> None:
     assert sentence in str(refused.value)
 
 
-@pytest.mark.parametrize("table", ["holding", "input", "coil", "discrete"])
+@table("table", ["holding", "input", "coil", "discrete"])
 def test_every_address_can_be_written_as_it_is_sent(table: str) -> None:
     for address in (0, 9, 10_000, 10_001, 19_999, 30_001, 39_999, 40_000, 40_017, 49_999, 0xFFFF):
         written = tomllib.loads(f"at = {sent_as(address, table)}")["at"]
@@ -94,7 +95,7 @@ def test_a_digit_that_contradicts_its_table() -> None:
         Counting(0).address("30001", "holding", "holding")
 
 
-@pytest.mark.parametrize(
+@table(
     ("cell", "sentence"),
     [
         ("1E10", "1E10 is a power of ten, which a spreadsheet makes of hex; write 1E10H"),

@@ -21,6 +21,7 @@ from declared_families import NAMES, class_of, document_of, mistakes_of
 from examples import PART, in_turn
 from nasty_drives import RESETS, NastyDrive
 from simulated_bus import SimulatedBus
+from tables import table
 from verb_edits import KINDS, Document
 
 from multidrop.drive import Condition, Drive
@@ -298,7 +299,7 @@ EDITS: dict[str, tuple[Change, str]] = {
 }
 
 
-@pytest.mark.parametrize("name", EDITS)
+@table("name", EDITS)
 def test_a_dangerous_edit_is_refused(name: str) -> None:
     document = document_of("abb")
     change, said = EDITS[name]
@@ -309,7 +310,7 @@ def test_a_dangerous_edit_is_refused(name: str) -> None:
     assert all(mistake.startswith("file.toml: ") and "\n" not in mistake for mistake in mistakes)
 
 
-@pytest.mark.parametrize("name", NAMES)
+@table("name", NAMES)
 def test_the_unchanged_files_are_right(name: str) -> None:
     assert mistakes_of(document_of(name)) == []
 

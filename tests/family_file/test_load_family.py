@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 from families import METER, METER_CSV, Meter, write_meter
+from tables import table
 
 from multidrop import Drive, FamilyError, Kept, load_family
 from multidrop.core import NumberFormat
@@ -243,7 +244,7 @@ def test_mistakes_of_verbs_are_told_beside_those_of_a_register(tmp_path: Path) -
     ]
 
 
-@pytest.mark.parametrize(
+@table(
     ("text", "told"),
     [
         ("", ["t.toml: has no [family]; add it, with the title and the manual"]),
@@ -324,7 +325,7 @@ def test_a_mistake_is_told_with_its_place(tmp_path: Path, text: str, told: list[
         assert any(sentence in mistake for mistake in found), found
 
 
-@pytest.mark.parametrize(
+@table(
     ("data", "told"),
     [
         (b"", "c.csv: is empty; its first line names the columns"),

@@ -12,6 +12,7 @@ from commands import Run
 from declared_families import FAMILIES, NAMES, class_of, document_of
 from lines import ANY_PORT
 from simulated_bus import one
+from tables import table
 
 from multidrop import Bus, Condition, Direction, FamilyError, Refused, load_family, load_plant
 from multidrop.errors import NotDone, Unconfirmed
@@ -59,7 +60,7 @@ def sims_of(plant: Path) -> list[Any]:
     return sims
 
 
-@pytest.mark.parametrize("name", NAMES)
+@table("name", NAMES)
 def test_a_file_is_the_class_that_these_tests_make(name: str) -> None:
     """So what is tested of the one holds for the other."""
     loaded, made = load_family(FAMILIES / f"{name}.toml"), class_of(document_of(name))

@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 from nats_clusters import Cluster, cluster
 from peers import require_module
+from tables import table
 
 require_module("nats")
 
@@ -97,7 +98,7 @@ def _rested(path: ServerPath) -> None:
         path.spare.note(is_late=False)
 
 
-@pytest.mark.parametrize(
+@table(
     "writers",
     [
         b"NATS/1.0\r\n",
@@ -111,7 +112,7 @@ def test_the_servers_headers_count_whatever_the_writer_has_sent(writers: bytes) 
     assert stored_message(writers + SERVERS, b"x") == DirectMessage("$KV.own_0.a", 7, b"x")
 
 
-@pytest.mark.parametrize(
+@table(
     "headers",
     [
         b"",

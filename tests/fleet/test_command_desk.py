@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 from command_desks import LINE, PATIENCE_S, Desks, desks
 from peers import require_module
+from tables import table
 
 from multidrop import Seen, Stopped, read_audit
 
@@ -394,7 +395,7 @@ def test_a_stop_of_an_unknown_drive_says_so_and_stops_the_others(desk: Desks) ->
     assert {name: one.outcome for name, one in answer.drives.items()} == {"pump": DONE, "fan": REFUSED}
 
 
-@pytest.mark.parametrize("data", [b"", b"[]", b'{"outcome": "maybe", "text": ""}', b'{"outcome": "done"}'])
+@table("data", [b"", b"[]", b'{"outcome": "maybe", "text": ""}', b'{"outcome": "done"}'])
 def test_an_asker_believes_no_answer_that_is_none(data: bytes) -> None:
     with pytest.raises(ValueError, match=r"is not|is no text"):
         read_answer(data) if data.startswith((b"{", b"[")) else read_offer(data)

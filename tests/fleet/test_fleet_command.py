@@ -16,6 +16,7 @@ from commands import Run
 from examples import usually
 from nats_clusters import Cluster, cluster, free_ports, old_server_program
 from peers import require_module
+from tables import table
 
 LINE = """
 [[line]]
@@ -132,7 +133,7 @@ def test_a_list_with_a_mistake(run: Run, nobody: str, tmp_path: Path, lists: str
     assert LISTS[lists] in said
 
 
-@pytest.mark.parametrize(
+@table(
     ("words", "sentence"),
     [
         (["serve"], "are required: NAME; see `multidrop fleet serve --help`"),

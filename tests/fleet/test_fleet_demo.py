@@ -14,6 +14,7 @@ import pytest
 from commands import MULTIDROP, Run
 from lines import until
 from peers import require_module
+from tables import table
 from terminals import on_terminal
 
 require_module("nats")
@@ -41,7 +42,7 @@ def rows(*numbers: int | None, begin: int = 1) -> list[KeptRow]:
     return [KeptRow(100 * at, number) for at, number in enumerate(numbers, begin) if number != 0]
 
 
-@pytest.mark.parametrize(
+@table(
     ("found", "answered", "kill", "expected"),
     [
         (rows(1, 2, 3), 3, None, Answers(3, 3)),

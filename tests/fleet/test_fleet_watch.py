@@ -16,6 +16,7 @@ import pytest
 from commands import Run
 from nats_clusters import Cluster
 from peers import require_module
+from tables import table
 from terminals import on_terminal
 
 require_module("nats")
@@ -64,7 +65,7 @@ def test_what_is_shown() -> None:
     assert "1970-01-01 01:02:03  line-1  from gw-1  to gw-2" in text
 
 
-@pytest.mark.parametrize("height", range(1, 60))
+@table("height", range(1, 60))
 def test_each_size_has_its_picture(height: int) -> None:
     for width in (20, 80, 200):
         drawn(told(trouble="no server", lines=500), width, height)
@@ -88,7 +89,7 @@ def test_a_narrow_terminal_has_the_columns_that_matter_whole() -> None:
     ]
 
 
-@pytest.mark.parametrize("height", range(1, 60))
+@table("height", range(1, 60))
 def test_no_head_stands_without_a_row(height: int) -> None:
     rows = drawn(told(lines=12), 80, height).splitlines()
     for row, next_row in pairwise(rows):
@@ -124,7 +125,7 @@ def test_moves_whose_beginning_nobody_saw() -> None:
     ]
 
 
-@pytest.mark.parametrize(
+@table(
     ("number", "text"),
     [(0, "0 B"), (999, "999 B"), (1000, "1.0 kB"), (81234, "81 kB"), (5e9, "5.0 GB"), (3e15, "3000 TB")],
 )
@@ -199,7 +200,7 @@ def test_on_a_terminal_it_draws_until_it_is_interrupted(fleet: Cluster) -> None:
         assert b"Traceback" not in terminal.written
 
 
-@pytest.mark.parametrize(
+@table(
     ("state", "is_one"),
     [
         (SAYS, True),

@@ -11,6 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from peers import require_module, require_program
+from tables import table
 
 require_module("nats")
 
@@ -107,7 +108,7 @@ def test_both_forms_are_given() -> None:
     assert text.endswith("# EOF\n")
 
 
-@pytest.mark.parametrize(
+@table(
     ("head", "status"),
     [
         (asked("GET / HTTP/1.1"), 404),
@@ -131,13 +132,13 @@ def test_any_bytes_have_an_answer(data: bytes) -> None:
     assert said(data + b"\r\n\r\n")[0] in (400, 403, 404, 405)
 
 
-@pytest.mark.parametrize("address", ["0.0.0.0:9464", "192.0.2.1:9464", "plant.example:9464", "[::]:9464"])
+@table("address", ["0.0.0.0:9464", "192.0.2.1:9464", "plant.example:9464", "[::]:9464"])
 def test_no_address_that_others_reach(address: str) -> None:
     with pytest.raises(ValueError, match="is open to other machines, and there are neither tokens nor TLS"):
         listen(address)
 
 
-@pytest.mark.parametrize("address", ["9464", "127.0.0.1", "127.0.0.1:x", ":9464", "127.0.0.1:99999"])
+@table("address", ["9464", "127.0.0.1", "127.0.0.1:x", ":9464", "127.0.0.1:99999"])
 def test_what_is_no_address(address: str) -> None:
     with pytest.raises(ValueError, match=r"is no address and port; write --metrics 127\.0\.0\.1:9464"):
         listen(address)

@@ -11,6 +11,7 @@ import pytest
 from controlled_loop import run_controlled
 from fleets import HandClock, MemoryBucket, NotedMastership
 from peers import require_module
+from tables import table
 
 require_module("nats")
 
@@ -454,9 +455,7 @@ def test_a_look_tells_when_a_session_may_be_ended_and_when_it_has_ended() -> Non
     asyncio.run(main())
 
 
-@pytest.mark.parametrize(
-    ("since_s", "rests_s"), [(0.0, 0.1), (2.2, 0.1), (2.27, 0.03), (2.3, 0.1), (60.0, 0.1)]
-)
+@table(("since_s", "rests_s"), [(0.0, 0.1), (2.2, 0.1), (2.27, 0.03), (2.3, 0.1), (60.0, 0.1)])
 def test_who_may_be_dead_is_looked_at_in_that_very_moment(since_s: float, rests_s: float) -> None:
     async def main() -> None:
         loop = asyncio.get_running_loop()

@@ -11,6 +11,7 @@ import pytest
 from batches import DRIVES, EXAMPLE, REGISTERS, SECOND, UTC_0, block, completion, example
 from completions import add_rows
 from spooled import numbered, rows_of
+from tables import table
 
 from multidrop import Batch
 from multidrop.core import Columns, Field, Names, NumberFormat, RowLayout
@@ -70,9 +71,7 @@ def test_values_are_kept_bit_for_bit() -> None:
     assert got == numbers
 
 
-@pytest.mark.parametrize(
-    ("ns", "told"), [(1, 1000), (1000, 1000), (1001, 2000), (3 * 10**12, (2**31 - 1) * 1000)]
-)
+@table(("ns", "told"), [(1, 1000), (1000, 1000), (1001, 2000), (3 * 10**12, (2**31 - 1) * 1000)])
 def test_an_uncertainty_is_rounded_up(ns: int, told: int) -> None:
     """Fifty minutes are more than 32 bits of microseconds hold, and than any request lasts."""
     columns = Columns(1)

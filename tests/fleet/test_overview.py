@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 from fleets import MemoryBucket
 from peers import require_module
+from tables import table
 
 require_module("nats")
 
@@ -95,7 +96,7 @@ def test_who_does_not_answer_says_nothing() -> None:
     assert looked(made)["gateways"]["gw-1"]["says"] is None  # what it said before is not the present
 
 
-@pytest.mark.parametrize("moves", [[{}], [5], "text", None, [MOVE | {"at_ms": "now"}]])
+@table("moves", [[{}], [5], "text", None, [MOVE | {"at_ms": "now"}]])
 def test_moves_that_are_none_harm_nothing(moves: Any) -> None:
     found = looked(view({"gw-1": STATE | {"last_moves": moves}}))
     assert found["gateways"]["gw-1"]["says"] == STATE

@@ -7,6 +7,7 @@ from collections import Counter
 
 import pytest
 from peers import require_module
+from tables import table
 
 require_module("nats")
 
@@ -55,8 +56,8 @@ def in_vain(shares: dict[str, str]) -> list[str]:
     return [line for line, gateway in shares.items() if names.owner_bucket(line) in BESIDE[gateway]]
 
 
-@pytest.mark.parametrize("number", [2, 3, 4, 5, 20])
-@pytest.mark.parametrize("lines", [7, 12, 40, 1000])
+@table("number", [2, 3, 4, 5, 20])
+@table("lines", [7, 12, 40, 1000])
 def test_lines_are_where_they_are_not_avoided_and_the_bound_holds(lines: int, number: int) -> None:
     """One of two gateways alone suits some of the buckets, and may have too little room for all of those."""
     for at in range(max(1, 300 // lines)):
@@ -129,13 +130,13 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize("case", CASES)
+@table("case", CASES)
 def test_claims_and_releases(case: str) -> None:
     found, wanted = CASES[case]
     assert found == wanted
 
 
-@pytest.mark.parametrize("name", ["", "hall.1", "hall 1", "hall*", ">", "Größe", "a/b", "x\n"])
+@table("name", ["", "hall.1", "hall 1", "hall*", ">", "Größe", "a/b", "x\n"])
 def test_names_that_cannot_be_in_a_subject(name: str) -> None:
     with pytest.raises(ValueError, match="may have letters, digits, _ and - alone"):
         names.checked_name("line", name)

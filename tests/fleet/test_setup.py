@@ -12,6 +12,7 @@ from typing import Any
 
 import pytest
 from nats_clusters import Cluster, cluster, free_ports, old_server_program, server_program
+from tables import table
 
 from multidrop.fleet import lease_bucket, servers, setup
 from multidrop.fleet.batch_client import DirectMessage
@@ -71,7 +72,7 @@ class OneDeaf:
         return SimpleNamespace(data=self.said)
 
 
-@pytest.mark.parametrize(
+@table(
     ("said", "has"),
     [(b'{"cluster":{"leader":"n2"}}', True), (b"{}", True), (b'{"cluster":{}}', False), (None, False)],
 )

@@ -13,6 +13,7 @@ import pytest
 from fleets import Hall, NotedMastership
 from nats_clusters import Cluster, cluster
 from peers import require_module
+from tables import table
 
 require_module("nats")
 
@@ -95,7 +96,7 @@ STRANGE: dict[str, tuple[str, str, bytes, str]] = {
 }
 
 
-@pytest.mark.parametrize("name", STRANGE)
+@table("name", STRANGE)
 def test_what_is_none_of_ours_is_no_record(name: str) -> None:
     bucket, key, data, mistake = STRANGE[name]
     assert parsed(bucket, key, data) == (None, mistake)

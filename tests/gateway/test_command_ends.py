@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 from modbus_gateway import plant_of
 from simulated_bus import one
+from tables import table
 
 from multidrop import Bus, InvtCHE, Plant
 from multidrop.gateway.commands import Commands, Told
@@ -36,7 +37,7 @@ class UnopenedLines:
         return True  # nothing is reloaded
 
 
-@pytest.mark.parametrize(
+@table(
     "command",
     [
         lambda commands: commands.write("mill", "setpoint", 10.0, CALLER),

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 from gateways import certificate, written
+from tables import table
 
 from multidrop import PlantError
 from multidrop.gateway.listener import listen
@@ -105,7 +106,7 @@ verbs = ["pump-1.fly"]
     assert sorted(found) == sorted(expected)
 
 
-@pytest.mark.parametrize(
+@table(
     ("keys", "is_right"),
     [
         ("", False),
@@ -115,7 +116,7 @@ verbs = ["pump-1.fly"]
         ("behind_proxy = true", True),
     ],
 )
-@pytest.mark.parametrize("address", ["0.0.0.0:80", "[::]:80", "10.0.0.7:80", "plant.example:80"])
+@table("address", ["0.0.0.0:80", "[::]:80", "10.0.0.7:80", "plant.example:80"])
 def test_other_machines_need_tokens_and_tls(
     tmp_path: Path, certificates: Path, address: str, keys: str, is_right: bool
 ) -> None:

@@ -24,6 +24,7 @@ from typing import Any, NamedTuple
 
 import pytest
 from examples import usually
+from tables import table
 
 from multidrop import core, load_plant
 from multidrop.cli import COMMANDS, main
@@ -281,7 +282,7 @@ MENTIONED = sorted(
 )
 
 
-@pytest.mark.parametrize("mentioned", MENTIONED)
+@table("mentioned", MENTIONED)
 def test_a_command_that_is_mentioned_is_a_command(mentioned: str, monkeypatch: pytest.MonkeyPatch) -> None:
     words = [PLACEHOLDERS.get(word, word) for word in shlex.split(mentioned)]
     if words[0].startswith("--"):

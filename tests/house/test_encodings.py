@@ -6,7 +6,7 @@ import ast
 from collections.abc import Iterator
 from pathlib import Path
 
-import pytest
+from tables import table
 
 import multidrop
 
@@ -49,7 +49,7 @@ def test_every_text_that_is_opened_says_its_encoding() -> None:
     assert found == []
 
 
-@pytest.mark.parametrize(
+@table(
     "call",
     ["p.read_text()", "p.write_text(text)", "open(name)", 'p.open("w")', "subprocess.run([], text=True)"],
 )
@@ -57,7 +57,7 @@ def test_a_call_without_one_is_found(call: str) -> None:
     assert list(lacking(call)) == [1]
 
 
-@pytest.mark.parametrize(
+@table(
     "call",
     [
         'p.read_text("utf-8")',

@@ -10,6 +10,7 @@ from pathlib import Path
 import patient
 import pytest
 from lines import PATIENCE
+from tables import table
 
 from multidrop import open_reader, read_audit
 from multidrop.cli import main
@@ -33,7 +34,7 @@ def run(directory: Path, name: str, *words: str, through: tuple[str, ...] = (pat
     return done.stdout
 
 
-@pytest.mark.parametrize("path", sorted(EXAMPLES.glob("*.py")), ids=lambda path: path.name)
+@table("path", sorted(EXAMPLES.glob("*.py")))
 def test_an_example_is_linked_from_the_pages_and_run_here(path: Path) -> None:
     if path.name != "simulated_plant.py":  # which the others import
         assert f"examples/{path.name}" in PAGES

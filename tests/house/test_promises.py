@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-import pytest
+from tables import table
 
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "tests" / "README.md").read_text("utf-8")
@@ -50,7 +50,7 @@ def test_files_that_are_named_exist() -> None:
     assert [path for path in paths if not (ROOT / path).exists()] == []
 
 
-@pytest.mark.parametrize("name", named(r"test_\w+(?![\w.])"))
+@table("name", named(r"test_\w+(?![\w.])"))
 def test_tests_that_are_named_exist(name: str) -> None:
     """In the file that was named last before it."""
     for before in re.findall(rf"^(.*)`{name}`", PAGE, re.MULTILINE):

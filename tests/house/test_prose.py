@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 from sources import ROOMS, ROOT, comments, docstrings, files, loop_variables, parsed, place
+from tables import table
 
 import multidrop
 
@@ -50,7 +51,7 @@ def test_no_comment_of_a_header_begins_with_a_question() -> None:
     assert found == []
 
 
-@pytest.mark.parametrize("room", [*ROOMS, "."])
+@table("room", [*ROOMS, "."])
 def test_no_line_is_too_long(room: str) -> None:
     """A row of a Markdown table may be longer, because Markdown cannot break it."""
     found = [

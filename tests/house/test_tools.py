@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from tables import table
 
 pytestmark = pytest.mark.long
 
@@ -79,7 +80,7 @@ def test_a_mistake_is_one_sentence_and_nothing_is_begun(tmp_path: Path, words: s
     assert sorted(tmp_path.rglob("*")) == there
 
 
-@pytest.mark.parametrize("tool", ["bare", "booted", "foreign", "musl", "wheels", "wine"])
+@table("tool", ["bare", "booted", "foreign", "musl", "wheels", "wine"])
 def test_help_is_its_own_head(tool: str) -> None:
     ran = subprocess.run([TOOLS / tool, "--help"], capture_output=True, text=True, check=True, timeout=60)
     assert f"tools/{tool} " in ran.stdout

@@ -10,12 +10,12 @@ import struct
 from enum import IntEnum
 from typing import Any, NamedTuple
 
-import pytest
 from batches import UTC_0, completion
 from completions import add_rows
 from examples import PART
 from hypothesis import example, given
 from hypothesis import strategies as st
+from tables import table
 
 from multidrop.core import Columns, Names, NumberFormat, RowLayout
 from multidrop.drive import Drive
@@ -128,12 +128,12 @@ def test_floats_have_words_but_for_zero(number: float, order: str) -> None:
     assert exact_data(register, 0.0) is None
 
 
-@pytest.mark.parametrize("value", [math.inf, -math.inf, math.nan, 1e300, 0.3, -1, 65536, 2**70])
+@table("value", [math.inf, -math.inf, math.nan, 1e300, 0.3, -1, 65536, 2**70])
 def test_a_value_that_no_count_has_is_not_rounded(value: float) -> None:
     assert exact_data(declared(), value) is None
 
 
-@pytest.mark.parametrize(
+@table(
     "details",
     [
         {"part": (0, 3)},

@@ -13,6 +13,7 @@ from controlled_loop import ControlledLoop, run_controlled
 from hypothesis import given
 from hypothesis import strategies as st
 from modbus_gateway import RawClient, plant_of, request, serving
+from tables import table
 
 from multidrop.drives import InvtCHE
 from multidrop.gateway import mbap
@@ -42,7 +43,7 @@ def test_each_byte_may_come_alone() -> None:
     assert take_request(buffer) is not None
 
 
-@pytest.mark.parametrize(
+@table(
     "header",
     [
         "00 01 00 01",  # of another protocol

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import pytest
+from tables import table
 
 from multidrop.gateway.modbus_settings import ModbusSettings
 
 
-@pytest.mark.parametrize(
+@table(
     ("settings", "sentence"),
     [
         ({"listen": "1502"}, "is not ADDRESS:PORT"),

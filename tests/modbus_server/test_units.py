@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 from modbus_gateway import plant_of
+from tables import table
 
 from multidrop import COIL, HOLDING, Carrier, Drive, load_family, reading, setting, text
 from multidrop.drives import MODELS, InnovertIBD, InvtCHE
@@ -115,7 +116,7 @@ class Stop:
     raw: int
 
 
-@pytest.mark.parametrize(
+@table(
     "stop",
     [  # as the manuals print them
         Stop("erman-er-g-220", "stop_coil", 1),
@@ -127,7 +128,6 @@ class Stop:
         Stop("optidrive-e3", "control", 0),
         Stop("delta-ms300", "control", 1),
     ],
-    ids=lambda stop: f"{stop.model} {stop.raw:X}",
 )
 def test_a_unit_knows_its_family_s_own_ways_to_stop(stop: Stop) -> None:
     family = find_model(stop.model)

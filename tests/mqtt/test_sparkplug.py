@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 from typing import Any
 
-import pytest
 from brokers import sparkplug_messages
 from hypothesis import given
 from hypothesis import strategies as st
+from tables import table
 
 from multidrop.gateway.sparkplug import DataType, Given, Metric, payload, read_command
 
@@ -55,7 +55,7 @@ def test_a_host_reads_what_was_said(time_ms: int, said: list[Metric], seq: int |
             assert found == metric.value
 
 
-@pytest.mark.parametrize(
+@table(
     ("field", "value"),
     [
         ("int_value", 7),

@@ -8,6 +8,7 @@ import pytest
 from examples import examples
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from tables import table
 
 from multidrop.core import Framing, Message, NumberFormat, build_request, reply_length
 from multidrop.drive import Drive
@@ -240,8 +241,8 @@ def test_a_plan_of_several_rates_suits_the_delays_that_suit_each() -> None:
     assert together.most == min(one.most for one in apart)
 
 
-@pytest.mark.parametrize("framing", list(Framing))
-@pytest.mark.parametrize("table", [HOLDING, INPUT, COIL, DISCRETE])
+@table("framing", list(Framing))
+@table("table", [HOLDING, INPUT, COIL, DISCRETE])
 def test_characters_are_counted_as_frames_are_built(framing: Framing, table: Table) -> None:
     drive = Example(1)
     drive.framing = framing

@@ -9,6 +9,7 @@ from examples import examples, usually
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from meter import ADDRESSES, Meter, StatedMeter
+from tables import table
 
 from multidrop import HOLDING_MULTIPLE
 from multidrop.core import Message, NumberFormat
@@ -88,7 +89,7 @@ REQUESTS = {
 }
 
 
-@pytest.mark.parametrize("model", REQUESTS)
+@table("model", REQUESTS)
 def test_no_built_in_family_s_requests_have_changed(model: str) -> None:
     drive = MODELS[model](3)
     found = [(block.request.function, block.start, block.count) for block in blocks(drive, drive.readings())]
@@ -253,7 +254,7 @@ def test_groups_are_asked_in_the_declared_order_and_before_all_else() -> None:
     assert order[-1] == "other"
 
 
-@pytest.mark.parametrize(
+@table(
     ("details", "sentence"),
     [
         ({"read_together": (("a", "far"),)}, "between them are addresses that are not declared"),

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from tables import table
 
 from multidrop.core import Echo
 from multidrop.drive import Framing
@@ -226,7 +227,7 @@ def test_five_mistakes_in_one_file_are_all_reported_at_once(mistakes: Mistakes) 
     ]
 
 
-@pytest.mark.parametrize(
+@table(
     ("text", "sentence"),
     [
         ("", "'line' is missing; add [[line]], in two brackets, with its name, port and drives"),
@@ -456,7 +457,7 @@ def test_a_model_s_file_whose_name_is_too_long_is_a_sentence(mistakes: Mistakes)
     assert sentence.endswith((".py: File name too long", ".py to take a model from"))  # the latter on Windows
 
 
-@pytest.mark.parametrize(
+@table(
     ("text", "expected"),
     [("500 us", 500e-6), ("50ms", 0.05), ("2 s", 2), ("1.5 min", 90), (" 1 h ", 3600)],
 )
@@ -464,7 +465,7 @@ def test_a_duration_is_in_seconds(text: str, expected: float) -> None:
     assert parse_duration(text) == pytest.approx(expected)
 
 
-@pytest.mark.parametrize(
+@table(
     "text",
     [
         "",

@@ -11,6 +11,7 @@ import pytest
 from clocked_lines import ClockedLines, ClockedWire, S
 from examples import usually
 from lines import line, plant, polled, rows_of
+from tables import table
 from toy import Toy
 
 from multidrop.core import Echo
@@ -380,7 +381,7 @@ def broken() -> dict[str, tuple[Plant, str]]:
     }
 
 
-@pytest.mark.parametrize("mistake", broken())
+@table("mistake", broken())
 def test_a_broken_plant_changes_nothing(mistake: str) -> None:
     wrong, sentence = broken()[mistake]
     with clocked(hall(*pumps()), yard(*fans())) as made:

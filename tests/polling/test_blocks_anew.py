@@ -7,6 +7,7 @@ from collections import Counter
 import pytest
 from clocked_lines import ClockedLines, ClockedWire, S
 from lines import polled
+from tables import table
 from toy import Toy
 
 from multidrop.drive.declare import reading
@@ -37,8 +38,8 @@ def asked_together(rows: list[Row]) -> set[bool]:
     return {count == len(NAMES) for count in Counter(row.monotonic_ns for row in rows).values()}
 
 
-@pytest.mark.parametrize(("document", "truth"), [(SOON, LATE), (LATE, SOON)], ids=["later", "sooner"])
-@pytest.mark.parametrize("every", [None, 0.75], ids=["in turn", "at a rate"])
+@table(("document", "truth"), [(SOON, LATE), (LATE, SOON)], ids=["later", "sooner"])
+@table("every", [None, 0.75], ids=["in turn", "at a rate"])
 def test_blocks_are_those_of_the_response_delay_that_was_measured(
     document: float, truth: float, every: float | None
 ) -> None:

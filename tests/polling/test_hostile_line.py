@@ -18,6 +18,7 @@ from examples import usually
 from leftovers import descriptors, threads
 from lines import polled, rows_of
 from stories import HEALTHY, Story
+from tables import table
 from variants import LINES, VARIANTS, of_all_variants, of_one_variant
 
 from multidrop.core import Framing
@@ -83,7 +84,7 @@ def test_a_fault_and_its_end(name: str, kind: str) -> None:
     assert any(story.wire.struck[rate] for rate in RATES if getattr(KINDS[kind], rate))
 
 
-@pytest.mark.parametrize("name", LINES)
+@table("name", LINES)
 def test_an_adapter_that_always_echoes_is_known_for_it(name: str) -> None:
     story = Story(of_one_variant(LINES[name]))
     story.wire.faults = KINDS["echo"]
@@ -94,8 +95,8 @@ def test_an_adapter_that_always_echoes_is_known_for_it(name: str) -> None:
     assert {row.status for row in story.rows} <= {"ok", "poll ended"}
 
 
-@pytest.mark.parametrize("echo", [0, 1], ids=["no echo", "an echo"])
-@pytest.mark.parametrize("register", ["dc_bus_voltage", "output_frequency"], ids=["a value", "a zero"])
+@table("echo", [0, 1], ids=["no echo", "an echo"])
+@table("register", ["dc_bus_voltage", "output_frequency"], ids=["a value", "a zero"])
 def test_a_delixi_parameter_is_no_echo_of_its_query(register: str, echo: int) -> None:
     """Nothing else is polled on the line: what is asked for may have the value that its query says."""
     drive = DelixiNative(1, name="drive-1")

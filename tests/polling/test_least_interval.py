@@ -9,6 +9,7 @@ from clocked_lines import ClockedLines, ClockedWire, S
 from lines import polled
 from picky import Picky, family
 from simulated_bus import SimulatedBus
+from tables import table
 from toy import Toy
 
 from multidrop.control.call import Call
@@ -57,8 +58,8 @@ def quick(address: int) -> tuple[Drive, Picky]:
     return drive, Picky(drive)
 
 
-@pytest.mark.parametrize("every", [None, 0.01, 0.5])
-@pytest.mark.parametrize("others", [0, 2])
+@table("every", [None, 0.01, 0.5])
+@table("others", [0, 2])
 def test_it_is_asked_no_sooner_and_all_its_registers_share_its_turns(
     every: float | None, others: int
 ) -> None:

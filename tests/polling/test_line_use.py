@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 from clocked_lines import ClockedLines, ClockedWire
 from lines import polled
+from tables import table
 from toy import Toy
 
 from multidrop.sim import EncodedDrive, Faults
@@ -12,7 +13,7 @@ from multidrop.sim import EncodedDrive, Faults
 STEPS = 400
 
 
-@pytest.mark.parametrize("seconds", [0.001, 0.003, 0.01, 0.03, 0.1], ids="{:g} s".format)
+@table("seconds", [0.001, 0.003, 0.01, 0.03, 0.1])
 def test_a_line_is_never_used_for_longer_than_there_is(seconds: float) -> None:
     """An exchange that was under way at a look counts in the time after it, and so does all of its time."""
     pumps = [Toy(address, name=f"pump-{address}") for address in (1, 2)]

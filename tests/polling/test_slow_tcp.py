@@ -24,6 +24,7 @@ from paths import (
     read_truly,
     stalling,
 )
+from tables import table
 
 from multidrop.bus import Bus
 from multidrop.control.outcome import Effect
@@ -143,7 +144,7 @@ def test_what_a_bus_reads_over_a_slow_path_is_true(
     read_truly(opened, line, drives)
 
 
-@pytest.mark.parametrize("seconds", [0.0, 0.6, 4.0])
+@table("seconds", [0.0, 0.6, 4.0])
 def test_what_became_of_a_write_over_a_slow_path_is_true(
     seconds: float, path_of: Callable[..., tuple[Bus, PathLine]]
 ) -> None:
@@ -167,8 +168,8 @@ def test_what_became_of_a_write_over_a_slow_path_is_true(
     assert done > 10
 
 
-@pytest.mark.parametrize("seconds", [0.0, 0.6])
-@pytest.mark.parametrize("model", FAMILIES)
+@table("seconds", [0.0, 0.6])
+@table("model", FAMILIES)
 def test_a_stop_over_a_slow_path_is_seen_to_be_done(
     model: str, seconds: float, path_of: Callable[..., tuple[Bus, PathLine]]
 ) -> None:

@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 from profile_families import MAKE, V20, Acs355, Atv320, Fc51, Goodrive, VfdEl
 from scripts import Wire
+from tables import table
 
 from multidrop.core import NumberFormat
 from multidrop.drive import Drive, DriveRefused, Refused
@@ -172,7 +173,7 @@ def identify(model: str, **says: Any) -> Wire:
     return wire
 
 
-@pytest.mark.parametrize("model", WELL)
+@table("model", WELL)
 def test_a_drive_of_the_family_is_taken_for_one(model: str) -> None:
     wire = identify(model)
     assert set(wire.reads) == set(WELL[model])
@@ -196,7 +197,7 @@ STRANGERS: list[tuple[str, dict[str, Any], str]] = [
 ]
 
 
-@pytest.mark.parametrize(("model", "says", "sentence"), STRANGERS)
+@table(("model", "says", "sentence"), STRANGERS)
 def test_a_drive_that_shows_something_else_is_refused(
     model: str, says: dict[str, Any], sentence: str
 ) -> None:

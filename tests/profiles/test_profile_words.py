@@ -9,6 +9,7 @@ import checksums
 import pytest
 from profile_families import MAKE
 from scripts import Wire
+from tables import table
 
 from multidrop.drive import (
     Condition,
@@ -76,7 +77,7 @@ STARTS: dict[str, tuple[list[int], tuple[str, ...]]] = {
 }
 
 
-@pytest.mark.parametrize("model", STARTS)
+@table("model", STARTS)
 def test_a_start(model: str) -> None:
     status, words = STARTS[model]
     found = wire(model, status)
@@ -108,7 +109,7 @@ STOPS = {
 }
 
 
-@pytest.mark.parametrize("model", STOPS)
+@table("model", STOPS)
 def test_a_stop_and_a_coast(model: str) -> None:
     status, stop, coast = STOPS[model]
     found = wire(model, status, output_frequency=[12.0, 0.0])
@@ -143,7 +144,7 @@ RESETS: Mapping[str, tuple[list[int], dict[str, Any], tuple[str, ...]]] = {
 }
 
 
-@pytest.mark.parametrize("model", RESETS)
+@table("model", RESETS)
 def test_a_reset(model: str) -> None:
     status, says, words = RESETS[model]
     found = wire(model, status, **says)
@@ -166,7 +167,7 @@ REVERSES = {
 }
 
 
-@pytest.mark.parametrize("model", REVERSES)
+@table("model", REVERSES)
 def test_reverse(model: str) -> None:
     status, word = REVERSES[model]
     found = wire(model, status)
@@ -210,7 +211,7 @@ SETPOINTS = {
 }
 
 
-@pytest.mark.parametrize("model", SETPOINTS)
+@table("model", SETPOINTS)
 def test_a_setpoint(model: str) -> None:
     drive: Drive = MAKE[model](1)
     found = Wire(drive)
@@ -231,7 +232,7 @@ HINDRANCES = [
 ]
 
 
-@pytest.mark.parametrize(("model", "status", "sentence"), HINDRANCES)
+@table(("model", "status", "sentence"), HINDRANCES)
 def test_a_hindrance_is_named_and_nothing_starts(model: str, status: int, sentence: str) -> None:
     found = wire(model, status)
     with pytest.raises(Refused, match=sentence):
@@ -265,7 +266,7 @@ STATES = [
 ]
 
 
-@pytest.mark.parametrize(("model", "status", "says", "condition"), STATES)
+@table(("model", "status", "says", "condition"), STATES)
 def test_a_state(model: str, status: int, says: dict[str, Any], condition: Condition) -> None:
     assert wire(model, status, **says).drive.state().condition is condition
 
@@ -273,7 +274,7 @@ def test_a_state(model: str, status: int, says: dict[str, Any], condition: Condi
 # ---- what only one profile has ----
 
 
-@pytest.mark.parametrize(
+@table(
     ("model", "running"),
     [
         ("abb-acs355", ABB_RUNS),

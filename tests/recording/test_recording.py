@@ -20,6 +20,7 @@ from examples import examples
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from recordings import FILE_SCHEMA, SCHEMA, is_kept, record_as_before, rows_of
+from tables import table
 
 from multidrop.core import Columns, Names, Status
 from multidrop.polling.batch import Batch, Row, Rows
@@ -410,8 +411,8 @@ def test_a_conversion_that_is_broken_off_leaves_nothing(
 # ---- mistakes ----
 
 
-@pytest.mark.parametrize("act", [lambda path: open_writer(path, {}), open_reader, repair])
-@pytest.mark.parametrize("name", ["a.xlsx", "a", "arrows", "a.arrow"])
+@table("act", [lambda path: open_writer(path, {}), open_reader, repair])
+@table("name", ["a.xlsx", "a", "arrows", "a.arrow"])
 def test_unknown_suffix(tmp_path: Path, act: object, name: str) -> None:
     assert callable(act)
     with pytest.raises(ValueError, match=rf"{name}: a recording's name ends in \.arrows, \.csv, \.parquet"):

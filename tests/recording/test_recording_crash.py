@@ -21,6 +21,7 @@ from completions import add_rows
 from disks import full_at, read_only_directory
 from examples import examples, usually
 from recordings import rows_of
+from tables import table
 from toy import Toy
 
 from multidrop.core import Columns, Names
@@ -444,8 +445,8 @@ GARBAGE = {
 }
 
 
-@pytest.mark.parametrize("suffix", FORMATS)
-@pytest.mark.parametrize("content", GARBAGE.values(), ids=GARBAGE)
+@table("suffix", FORMATS)
+@table("content", GARBAGE.values(), ids=GARBAGE)
 def test_garbage(tmp_path: Path, suffix: str, content: bytes) -> None:
     path = tmp_path / f"a{suffix}"
     path.write_bytes(content)

@@ -9,6 +9,7 @@ import pyarrow as pa
 import pytest
 from disks import full_at
 from recordings import ABOUT, row
+from tables import table
 
 from multidrop.polling.batch import Row
 from multidrop.recording import RecordingError, open_reader
@@ -226,7 +227,7 @@ def test_a_clock_that_jumps_empties_nothing() -> None:
     assert left(8 * DAY, sorted(week + two, key=lambda file: file.number)) == [3, 3, 4, 4, 5, 5, 6, 6, 7, 7]
 
 
-@pytest.mark.parametrize(
+@table(
     ("text", "seconds"),
     [("30 days", 30 * DAY), ("1 day", DAY), ("1.5 h", 5400.0), ("10min", 600.0), ("2 weeks", 14 * DAY)],
 )
@@ -234,7 +235,7 @@ def test_ages(text: str, seconds: float) -> None:
     assert parse_age(text) == seconds
 
 
-@pytest.mark.parametrize(
+@table(
     "text", ["", "30", "-1 h", "1 month", "0.5 s", "1 hs", "\u0661 h", "nan s", "1e9 weeks", 30, None, b"1 h"]
 )
 def test_no_ages(text: str) -> None:
@@ -247,7 +248,7 @@ def test_sizes(text: str, size: int) -> None:
     assert parse_size(text) == size
 
 
-@pytest.mark.parametrize("text", ["", "20", "20 gb", "-1 GB", "0.5 kB", "1 GiB", 20, None, b"1 GB"])
+@table("text", ["", "20", "20 gb", "-1 GB", "0.5 kB", "1 GiB", 20, None, b"1 GB"])
 def test_no_sizes(text: str) -> None:
     with pytest.raises(ValueError, match='is not a size from 1 kB on, such as "500 MB"'):
         parse_size(text)

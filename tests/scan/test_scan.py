@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 
 import pytest
 from line_driver import LineDriver
+from tables import table
 from toy import Toy, Unsure
 
 from multidrop.core import Completion, Exchange, Framing, build_reply, build_request, parse_request
@@ -453,7 +454,7 @@ def test_a_port_that_takes_nothing_is_an_error() -> None:
         found(line, sweeps([InvtCHE], baudrates=[9600], formats=["8E1"]))
 
 
-@pytest.mark.parametrize(
+@table(
     ("asked", "sentence"),
     [
         ({"baudrates": [300]}, "baud rate 300 is none that these families have: 1200, 2400, "),

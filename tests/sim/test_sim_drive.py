@@ -3,6 +3,7 @@
 import math
 
 import pytest
+from tables import table
 
 from multidrop.core import Message, NumberFormat
 from multidrop.drive import Drive
@@ -214,7 +215,7 @@ def every_register() -> list[tuple[Register[float], int]]:
     ]
 
 
-@pytest.mark.parametrize(("register", "at"), every_register(), ids=str)
+@table(("register", "at"), every_register())
 def test_an_encoded_drive_says_who_and_where_it_is(register: Register[float], at: int) -> None:
     sim = EncodedDrive(Own(7))
     table, where = register.table, register.address + at

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import checksums
 import pytest
+from tables import table
 
 from multidrop.core import Framing, Message, build_request, parse_reply
 from multidrop.drive import Drive
@@ -876,7 +877,7 @@ def test_yd_watches_the_line_if_it_is_told_to(yd: Bench) -> None:
 # ---- all ----
 
 
-@pytest.mark.parametrize("family", [ErmanERG220, InvtCHE, InnovertIBD, DelixiModbus, DelixiNative, YD1000])
+@table("family", [ErmanERG220, InvtCHE, InnovertIBD, DelixiModbus, DelixiNative, YD1000])
 def test_every_declared_register_can_be_read_or_written_as_declared(family: type[Drive]) -> None:
     bench = Bench(family(1))
     for register in family.registers.values():
@@ -890,7 +891,7 @@ def test_every_declared_register_can_be_read_or_written_as_declared(family: type
             assert bench.sim.memory.writable(register.table.write or 0, register.address)
 
 
-@pytest.mark.parametrize("family", [ErmanERG220, InvtCHE, InnovertIBD, DelixiModbus, DelixiNative, YD1000])
+@table("family", [ErmanERG220, InvtCHE, InnovertIBD, DelixiModbus, DelixiNative, YD1000])
 def test_every_family_can_be_encoded(family: type[Drive]) -> None:
     """A register reads as `encoded` says, or its document, through whole frames."""
     drive = family(5)

@@ -15,6 +15,7 @@ import checksums
 import pytest
 from leftovers import descriptors, threads
 from raw_client import PATIENCE, opened, receive
+from tables import table
 
 from multidrop.core import Framing, Message, build_request, parse_reply, reply_length, set_settings
 from multidrop.drives.delixi_native import DelixiNative
@@ -44,8 +45,8 @@ def exchange(fd: int, request: Message, framing: Framing = Framing.RTU) -> Messa
     return reply
 
 
-@pytest.mark.parametrize("port", ["pty", "socket://127.0.0.1:0"])
-@pytest.mark.parametrize("unpaced", [True, False], ids=["unpaced", "paced"])
+@table("port", ["pty", "socket://127.0.0.1:0"])
+@table("unpaced", [True, False], ids=["unpaced", "paced"])
 def test_a_line_is_read_and_opened_again(port: str, unpaced: bool) -> None:
     with Simulator([wire(port=port, unpaced=unpaced)]) as sim:
         for _ in range(3):

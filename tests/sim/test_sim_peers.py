@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import subprocess
 
-import pytest
 from peers import require_module, require_program
+from tables import table
 
 from multidrop.drive import Drive
 from multidrop.drives.erman_er_g_220 import ErmanERG220
@@ -34,7 +34,7 @@ def values(done: subprocess.CompletedProcess[str]) -> list[str]:
     return [line.split()[1] for line in done.stdout.splitlines() if line.startswith("[")]
 
 
-@pytest.mark.parametrize(
+@table(
     ("drive", "name", "value", "options", "shown"),
     [
         (ErmanERG220(1), "output_frequency", 28.5, "-r 1 -c 1 -t 3 -1", ["285"]),
@@ -42,7 +42,6 @@ def values(done: subprocess.CompletedProcess[str]) -> list[str]:
         (InvtCHE(247), "output_voltage", 231, "-r 12291 -c 1 -t 4 -1", ["231"]),
         (InnovertIBD(1), "output_current", 2.5, "-r 3 -c 1 -t 4 -1", ["25"]),
     ],
-    ids=lambda each: each.name if isinstance(each, Drive) else str(each),
 )
 def test_mbpoll_reads(drive: Drive, name: str, value: float, options: str, shown: list[str]) -> None:
     sim = simulated(drive)
@@ -50,7 +49,7 @@ def test_mbpoll_reads(drive: Drive, name: str, value: float, options: str, shown
     assert values(mbpoll(sim, options)) == shown
 
 
-@pytest.mark.parametrize(
+@table(
     ("drive", "options", "raw", "name", "value"),
     [
         (ErmanERG220(1), "-r 2 -t 4", [285], "frequency", 28.5),
@@ -59,7 +58,6 @@ def test_mbpoll_reads(drive: Drive, name: str, value: float, options: str, shown
         (MyCHE(1), "-r 11 -t 4", [70], "acceleration_time", 7),
         (InnovertIBD(1), "-r 107 -t 4", [200], "acceleration_time", 20),
     ],
-    ids=lambda each: each.name if isinstance(each, Drive) else str(each),
 )
 def test_mbpoll_writes(drive: Drive, options: str, raw: list[int], name: str, value: float) -> None:
     sim = simulated(drive)

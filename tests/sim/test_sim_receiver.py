@@ -4,6 +4,7 @@ import random
 
 import checksums
 import pytest
+from tables import table
 
 from multidrop.core import Framing
 from multidrop.sim.receiver import Frame, Receiver
@@ -111,14 +112,12 @@ def test_text_with_a_wrong_checksum_is_a_damaged_frame() -> None:
     assert (frame.intact, frame.message, frame.address) == (False, None, 1)
 
 
-@pytest.mark.parametrize(
-    "text", [b":\r\n", b":0\r\n", b":01\r\n", b":0101\n", b"\n", b":XX0620\r\n", b"::\n"]
-)
+@table("text", [b":\r\n", b":0\r\n", b":01\r\n", b":0101\n", b"\n", b":XX0620\r\n", b"::\n"])
 def test_scraps_of_text_are_nothing(text: bytes) -> None:
     assert Receiver(Framing.ASCII, CHARACTER, 1.0).feed(text, 0.0) == []
 
 
-@pytest.mark.parametrize("framing", list(Framing))
+@table("framing", list(Framing))
 def test_anything_at_all_is_survived_within_bounds(framing: Framing) -> None:
     randomness = random.Random(1)
     good = {Framing.RTU: READ, Framing.ASCII: RUN, Framing.DELIXI: NATIVE, Framing.TCP: OVER_TCP}[framing]

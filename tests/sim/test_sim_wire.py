@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import checksums
 import pytest
+from tables import table
 from wire_time import Own, timeline
 
 from multidrop.drive import Drive
@@ -34,7 +35,7 @@ def test_the_reply_waits_for_the_request_s_last_bit_and_the_drive() -> None:
     assert received[-1][0] == pytest.approx(begin + 7 * CHARACTER_8N1)
 
 
-@pytest.mark.parametrize("baudrate", [1200, 9600, 19200, 38400, 115200])
+@table("baudrate", [1200, 9600, 19200, 38400, 115200])
 def test_no_byte_comes_before_its_last_bit_and_none_much_later(baudrate: int) -> None:
     drive = Own(1, baudrate=baudrate)
     wire = Wire([SimulatedDrive(drive, response_delay=0.05)])

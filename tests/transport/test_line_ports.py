@@ -15,6 +15,7 @@ from leftovers import descriptors, threads
 from lines import line, plant, polled, rows_of, until
 from serial import Serial
 from serial_server import SerialServer, pyserials_own, vanishing_pty
+from tables import table
 from toy import PatientToy, Toy
 
 from multidrop.bus import Bus
@@ -161,7 +162,7 @@ def os_words_of_an_unknown_zone() -> str:
     return str(failure.value.strerror)
 
 
-@pytest.mark.parametrize(
+@table(
     ("port", "reason"),
     [
         ("{tmp}/absent", "there is no such port"),

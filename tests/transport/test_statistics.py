@@ -17,6 +17,7 @@ from line_exchanges import CHARACTER, READ, SILENCE, WRITE, answer, ask, drive, 
 from lines import line as a_line
 from lines import plant, polled, rows_of, until
 from multidrop._core import lib
+from tables import table
 from toy import Toy
 
 from multidrop import Bus, Poller
@@ -49,7 +50,7 @@ def test_quantiles_are_within_a_part_in_16(delays_ns: list[int]) -> None:
     assert found.replies == len(delays_ns)
 
 
-@pytest.mark.parametrize("delay_ns", [0, 1, LEAST_NS - 1, MOST_NS, 10 * MOST_NS, (1 << 63) - 1])
+@table("delay_ns", [0, 1, LEAST_NS - 1, MOST_NS, 10 * MOST_NS, (1 << 63) - 1])
 def test_delays_outside_of_the_buckets_are_counted_too(delay_ns: int) -> None:
     found = Statistics(1.0, counters_of([delay_ns])).delays
     assert (found.replies, found.longest) == (1, delay_ns / 1e9)

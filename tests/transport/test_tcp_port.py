@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 from lines import PATIENCE, rows_of, until
+from tables import table
 
 from multidrop.bus import Bus
 from multidrop.core import Framing, Message, build_reply, build_request, parse_request
@@ -77,7 +78,7 @@ def test_a_port_without_a_number_is_502(name: str, opened: str, identity: str) -
     assert of_name(name) == identity
 
 
-@pytest.mark.parametrize("name", ["tcp://", "tcp://:502", "tcp://10.0.0.7:0", "tcp://10.0.0.7:99999"])
+@table("name", ["tcp://", "tcp://:502", "tcp://10.0.0.7:0", "tcp://10.0.0.7:99999"])
 def test_a_name_without_a_place_is_a_sentence(name: str) -> None:
     with pytest.raises(NoSuchPort, match=r"it needs a host, such as tcp://10\.0\.0\.7|Port out of range"):
         Bus(name)

@@ -1,0 +1,50 @@
+"""Tables whose rows need nothing of their own: a test walks them all, and tells of every row that fails.
+
+A row costs what its check costs. As a test of its own (`pytest.mark.parametrize`) it costs some milliseconds
+more in each process that runs tests. What needs a fixture anew, or may be skipped, stays a test of its own.
+"""
+
+from __future__ import annotations
+
+import functools
+import inspect
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any
+
+import pytest
+
+Test = Callable[..., None]
+FAILURES = (Exception, pytest.fail.Exception, pytest.skip.Exception)  # a row that is skipped proves nothing
+
+
+def table(
+    names: str | Sequence[str], rows: Iterable[Any], ids: Iterable[object] | None = None
+) -> Callable[[Test], Test]:
+    """Have a test called with each row, under these names; one that fails is told by its id, or as it is."""
+    columns = [name.strip() for name in names.split(",")] if isinstance(names, str) else list(names)
+    several = not isinstance(names, str) or len(columns) > 1
+    values = [tuple(row) if several else (row,) for row in rows]
+    told = values if ids is None else list(ids)
+    assert values, "a table without rows proves nothing"
+    assert len(told) == len(values), "each row has an id"
+    assert all(len(row) == len(columns) for row in values), f"each row has {columns}"
+
+    def decorate(test: Test) -> Test:
+        @functools.wraps(test)
+        def walked(**others: Any) -> None:
+            failed: list[BaseException] = []
+            for row, name in zip(values, told, strict=True):
+                try:
+                    test(**dict(zip(columns, row, strict=True)), **others)
+                except FAILURES as failure:
+                    failure.add_note(f"in the row {name!r}")
+                    failed.append(failure)
+            if failed:
+                raise BaseExceptionGroup(f"{len(failed)} of {len(values)} rows failed", failed)
+
+        signature = inspect.signature(test)
+        others = [one for name, one in signature.parameters.items() if name not in columns]
+        walked.__signature__ = signature.replace(parameters=others)  # type: ignore[attr-defined]
+        return walked
+
+    return decorate
