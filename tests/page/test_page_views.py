@@ -148,7 +148,7 @@ DOTS = """async values => {
 
 
 def test_a_value_between_gaps_is_drawn(opened: Opener) -> None:
-    """Of a register that is read each second, three values of a plot with ten points a second."""
+    """Three values of a register that is read each second, in a plot with ten points a second."""
     page = opened()
     nothing = [None] * 9
     assert page.evaluate(DOTS, [None, *nothing, None, *nothing, None]) == 0
