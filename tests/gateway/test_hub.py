@@ -186,6 +186,18 @@ def test_a_plant_that_is_taken_over_keeps_what_is_known(hub: Hub) -> None:
     assert hub.state("pump-1") == "runs"
 
 
+def test_a_late_row_of_the_drive_that_had_a_name_is_no_value_of_the_one_that_has_it(tmp_path: Path) -> None:
+    now = [0]
+    hub = Hub(written(tmp_path, "", "pump-1", "pump-2"), lambda: (now[0], 0))
+    now[0] = 20 * PERIOD
+    hub.adopt(written(tmp_path, "", "pump-2", "pump-1"))  # each at the other's address
+    hub.take(all_of(19, FORWARD, 25))
+    assert hub.newest("pump-1", "output_frequency") is None
+    hub.take(all_of(21, STANDBY))
+    hub.take(rows((19, STATUS, FORWARD)))
+    assert hub.state("pump-1") == "stands"
+
+
 SHOWN = st.sampled_from(
     [
         Shown("runs", None),

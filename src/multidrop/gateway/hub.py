@@ -49,8 +49,9 @@ class Shown(NamedTuple):
 class _Watched:
     """One drive of the plant."""
 
-    def __init__(self, polled: PolledDrive, cycle_ns: int) -> None:
+    def __init__(self, polled: PolledDrive, cycle_ns: int, since_ns: int) -> None:
         self.polled = polled
+        self.since_ns = since_ns  # it has been asked for no longer
         self.names = tuple(poll.register.name for poll in polled.polls)
         self.cycle_ns = cycle_ns  # of its line, as planned
         self.reader = StateReader(polled.drive)
@@ -62,7 +63,7 @@ class _Watched:
         if register not in self.cells:
             every = next((poll.every for poll in self.polled.polls if poll.register.name == register), None)
             least_ns = self.cycle_ns if every is None else max(self.cycle_ns, round(every * 1e9))
-            self.cells[register] = RegisterRows(least_ns)
+            self.cells[register] = RegisterRows(least_ns, self.since_ns)
         return self.cells[register]
 
 
@@ -89,10 +90,12 @@ class Hub:
     def adopt(self, plant: Plant, planned: Mapping[str, Any] | None = None) -> None:
         """Go on with another plant; what is known of drives that stay as they are is kept.
 
+        Rows that were asked for before and come later count for these alone: a name may be another's now.
         `planned` is `plant.metadata()["planned"]`, for callers that have it: it takes seconds for hundreds
         of lines.
         """
         before = self._watched
+        since_ns = self._clock()[0] if before else 0
         self.plant = plant
         self._cells = {}
         self._watched = {}
@@ -103,7 +106,7 @@ class Hub:
                 known = before.get(polled.drive.name)
                 stays = known is not None and known.polled == polled
                 self._watched[polled.drive.name] = (
-                    known if known is not None and stays else _Watched(polled, cycle_ns)
+                    known if known is not None and stays else _Watched(polled, cycle_ns, since_ns)
                 )
 
     def take(self, batch: Batch) -> None:
@@ -129,6 +132,8 @@ class Hub:
                 cell = cells[key] = self._cell(columns.drives[drive], columns.registers[register])
                 if cell is None:
                     continue
+            if monotonic_ns < cell.since_ns:
+                continue
             row = (time, monotonic_ns, value, status)
             if status == 0:
                 if cell.good is not None and cell.newest is cell.good:

@@ -14,9 +14,10 @@ KeptRow = tuple[int, int, float, int]  # time, monotonic, value (of a miss witho
 class RegisterRows:
     """One register of one drive."""
 
-    __slots__ = ("good", "interval_ns", "least_ns", "newest")
+    __slots__ = ("good", "interval_ns", "least_ns", "newest", "since_ns")
 
-    def __init__(self, least_ns: int) -> None:
+    def __init__(self, least_ns: int, since_ns: int = 0) -> None:
+        self.since_ns = since_ns  # rows of before are another drive's, which had the name
         self.newest: KeptRow | None = None
         self.good: KeptRow | None = None
         self.least_ns = least_ns  # of its intervals, as planned
