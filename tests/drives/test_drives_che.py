@@ -215,6 +215,7 @@ def test_a_negative_setpoint_cannot_be_written_at_all() -> None:
             {"status": CHEStatus.FAULT, "fault": CHEFault.OL1_MOTOR_OVERLOAD},
             State(Condition.FAULT, fault="OL1_MOTOR_OVERLOAD"),
         ),
+        ({"status": CHEStatus.FAULT, "fault": CHEFault.NONE}, State(Condition.FAULT)),  # read before
         ({"status": CHEStatus.FAULT, "fault": 99}, State(Condition.FAULT, fault="99")),
         ({"status": 9}, State(Condition.UNKNOWN, note="1001H = 9 is not explained")),
     ],

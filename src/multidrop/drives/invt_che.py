@@ -328,7 +328,7 @@ class InvtCHE(Drive):
         status = yield from read(self.status)
         if status == CHEStatus.FAULT:
             fault = yield from read(self.fault)
-            return State(Condition.FAULT, fault=self.fault.format(fault))
+            return State(Condition.FAULT, fault=self.fault.format(fault) if fault else None)
         return STATES.get(status, State(Condition.UNKNOWN, note=f"1001H = {int(status)} is not explained"))
 
 

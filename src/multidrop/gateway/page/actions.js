@@ -64,8 +64,8 @@ function note(drive, what, done, told) {
 }
 
 // Return what makes the body at its confirmation, with the frame that was seen then; to be called as it is
-// asked for. What comes behind the dialog is seen by nobody: after a stop of the drive, or with another plant,
-// whose drives may have each other's names, it fails.
+// asked for. What comes behind the dialog is seen by nobody: after a stop of the drive, or with another
+// plant, whose drives may have each other's names, it fails.
 function seen(drive) {
   const stopped = stops(drive),
     { revision } = store.plant;

@@ -42,8 +42,9 @@ addEventListener(
   true,
 );
 
-// Show the dialog and return what was chosen, as `show` does. A question whether to stop is asked at once, and
-// what else there is to ask or tell comes after its answer: it takes no stop from under the hand that gives it.
+// Show the dialog and return what was chosen, as `show` does. A question whether to stop is asked at once,
+// and what else there is to ask or tell comes after its answer: it takes no stop from under the hand that
+// gives it.
 async function open(title, contents, buttons, { cancel = "Cancel", kind } = {}) {
   if (kind === STOP) return (stopAsked = show(title, contents, buttons, cancel));
   while (stopAsked) await stopAsked;

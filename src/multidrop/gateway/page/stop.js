@@ -104,8 +104,8 @@ find("#stopall").disabled = false;
 find("#notice").hidden = true;
 find("#notice").classList.remove("loading", "bad");
 
-// Return "one" or "all" for the keys that ask for a stop, S and Shift S, else null. Where a layout has no such
-// letter it is that key; with caps lock on, S is "all" with Shift or without.
+// Return "one" or "all" for the keys that ask for a stop, S and Shift S, else null. Where a layout has no
+// such letter it is that key; with caps lock on, S is "all" with Shift or without.
 export function stopKey({ key, code, shiftKey }) {
   const isStop = /^[a-z]$/i.test(key) ? key.toLowerCase() === "s" : code === "KeyS";
   return !isStop ? null : shiftKey || key === "S" ? "all" : "one";
