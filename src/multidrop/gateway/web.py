@@ -272,10 +272,8 @@ class _Pages:
         """
         gateway, caller = self._gateway, caller_of(request)
         body = await body_of(request)
-        secret, is_shut = (
-            text_in(body, "token"),
-            gateway.tokens.is_shut(caller.address, gateway.guard_clock()),
-        )
+        secret = text_in(body, "token")
+        is_shut = gateway.tokens.is_shut(caller.address, gateway.guard_clock())
         if is_shut and body.get("to") != "stop":
             raise Denied(429, "too many wrong tokens came from this address: try again in a minute")
         token = gateway.tokens.find(secret)
