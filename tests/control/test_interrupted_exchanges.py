@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
+from functools import partial
 from itertools import count
 from linecache import getline
 from types import FrameType
@@ -74,7 +75,7 @@ def test_an_interrupted_exchange_does_not_hold_the_port_up(monkeypatch: pytest.M
         for nth in count(1):
             bus = Bus(simulator.wires[0].path)
             drive = bus.attach(InvtCHE, address=1)
-            interruption = interrupted(lambda: bus.read(drive, drive.status), nth)
+            interruption = interrupted(partial(bus.read, drive, drive.status), nth)
             with monkeypatch.context() as patched:
                 patched.setattr(clock, "sleep", waits.append)
                 bus.close()

@@ -79,8 +79,7 @@ class Line:
         self.ids = ids
         self._echo = echo
         self._opened = OpenPort(port, ids, rs485, mastership)
-        # The core's port, on which exchanges are queued; None while it is closed. It is dropped before its
-        # descriptor is closed.
+        # The core's port, on which exchanges are queued; None once that is about to be closed.
         self.queue: Port | None = None
         self._tap: Tap | None = None
         self._log = LineLog(port)
@@ -222,7 +221,6 @@ class Line:
         into: Completion | None = None,
     ) -> Completion:
         """Carry an exchange out ahead of what is queued, and wait for it; LineError when the port fails.
-
         `into` is the completion to fill in, where nobody looks at it any more.
         """
         if self._opened.bridge and self.queue and self._opened.settings != exchange.settings:
