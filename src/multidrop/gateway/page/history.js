@@ -16,13 +16,11 @@ export const read = (labels, from, to, points) =>
     ])}`,
   );
 
-const present = spec => (spec.step === null ? "raw count" : unit(spec));
-
 // Return the unit of a series: a name may have been another drive's when it was recorded.
-export const unitOf = (told, spec) => told.unit ?? present(spec);
+export const unitOf = (told, spec) => told.unit ?? unit(spec);
 
 // Return true where a series is of the same unit as its register is now.
-export const isPresent = (told, spec) => unitOf(told, spec) === present(spec);
+export const isPresent = (told, spec) => unitOf(told, spec) === unit(spec);
 
 // Return a sentence about each series of which a part is not drawn, since it has another unit.
 export const leftOut = series =>
