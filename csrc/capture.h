@@ -23,6 +23,7 @@ struct md_tap {
     uint32_t room;       /* bytes, a power of two */
     uint32_t put, taken; /* each has one writer, only grows, and wraps around */
     uint64_t lost;       /* bytes without room */
+    int64_t ahead_ns;    /* UTC - CLOCK_MONOTONIC of what is put next; 0: as when it is taken */
 };
 
 /* Header and trailer of a packet. Each side has two: for any bytes, and for those that begin with ':'. */

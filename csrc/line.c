@@ -164,6 +164,8 @@ void md_line_sent(struct md_line *line, size_t len, int64_t begun_ns, int64_t no
         line->completion->sent_ns = begun_ns;
         line->rx_len = line->rx_from = 0;
     }
+    if (line->tap)
+        line->tap->ahead_ns = line->completion->utc_ahead_ns;
     md_tap_put(line->tap, MD_ASKING, begun_ns, line->tx + line->tx_at, len);
     line->quiet_ns = later(line->quiet_ns, now_ns) + md_wire_ns(exchange, (int64_t)len);
     line->tx_at = (uint16_t)(line->tx_at + len);

@@ -71,6 +71,7 @@ static void tap_received(const struct md_line *line, struct md_ending ending)
     md_line_tap(line, MD_NOISE, completion->first_ns, line->rx, at);
     md_line_tap(line, ending.result > 0 ? MD_ANSWERING : MD_FAILED, completion->first_ns, line->rx + at, len);
     md_line_tap(line, MD_NOISE, completion->last_ns, line->rx + at + len, line->rx_len - at - len);
+    line->tap->ahead_ns = 0;
 }
 
 void md_line_complete(struct md_line *line, struct md_ending ending)

@@ -8,9 +8,11 @@
 
 /* Stands in the ring before the bytes. */
 struct mark {
-    int64_t time_ns;
+    int64_t time_ns; /* of CLOCK_MONOTONIC, or UTC where `side` says so */
     uint32_t len, side;
 };
+
+enum { IS_UTC = 1 << 16 }; /* beside the side */
 
 static uint32_t get(const uint32_t *counter)
 {
@@ -50,8 +52,9 @@ void md_tap_put(struct md_tap *tap, int side, int64_t time_ns, const uint8_t *by
 {
     if (!tap || len == 0)
         return;
-    uint32_t put = tap->put;
-    struct mark mark = {.time_ns = time_ns, .len = (uint32_t)len, .side = (uint32_t)side};
+    uint32_t put = tap->put, is_utc = tap->ahead_ns ? IS_UTC : 0;
+    struct mark mark = {
+        .time_ns = time_ns + tap->ahead_ns, .len = (uint32_t)len, .side = (uint32_t)side | is_utc};
     if (tap->room - (put - get(&tap->taken)) < sizeof mark + len) {
         __atomic_fetch_add(&tap->lost, len, __ATOMIC_RELAXED);
         return;
@@ -117,11 +120,12 @@ size_t md_tap_take(struct md_tap *tap, const struct md_wrapping *wrappings, uint
         uint8_t first;
         copy_out(tap, taken, &mark, sizeof mark);
         copy_out(tap, taken + (uint32_t)sizeof mark, &first, 1);
-        size_t size = md_packet_length(wrappings, (int)mark.side, first, mark.len);
+        uint32_t side = mark.side & ~(uint32_t)IS_UTC;
+        size_t size = md_packet_length(wrappings, (int)side, first, mark.len);
         if (room - used < size)
             break;
-        const struct md_wrapping *wrapping = choose(wrappings, mark.side, first);
-        int64_t time_ns = mark.time_ns + utc_minus_monotonic_ns;
+        const struct md_wrapping *wrapping = choose(wrappings, side, first);
+        int64_t time_ns = mark.time_ns + (mark.side & IS_UTC ? 0 : utc_minus_monotonic_ns);
         uint8_t *bytes = wrap(wrapping, interface, time_ns, mark.len, out + used);
         copy_out(tap, taken + (uint32_t)sizeof mark, bytes, mark.len);
         used += size;

@@ -29,7 +29,8 @@ from multidrop.drive.text import Text
 from multidrop.errors import BusError
 from multidrop.transport.exchange import READ_ATTEMPTS, Exchanges
 from multidrop.transport.line import Line
-from multidrop.transport.statistics import LineMeter, LineStatistics
+from multidrop.transport.line_meter import LineMeter
+from multidrop.transport.statistics import LineStatistics
 
 D = TypeVar("D", bound=Drive)
 T = TypeVar("T", bound=float)

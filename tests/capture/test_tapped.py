@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import random
+import struct
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -32,6 +33,7 @@ from multidrop.polling.batch import Row
 from multidrop.recording import RecordingError
 from multidrop.sim import EncodedDrive, Simulator, Wire
 
+HOUR_NS = 3600 * 10**9
 FATES = Counter({"ok": 300, "no reply": 10, "bad checksum": 5, "bad character": 5, "reply cut short": 5})
 NEVER_ON_THE_LINE = {str(each) for each in (Status.NOT_ASKED, Status.LATE_ANSWER_DUE, Status.EXPIRED)}
 
@@ -257,6 +259,38 @@ def test_a_capture_has_what_comes_behind_a_reply_amid_much_noise() -> None:
     assert driver.completion.raw == GOOD
     packets = b"".join(tap.take(WRAPPINGS, 0, 0))
     assert (packets.count(b"\xff"), packets.count(b"\xfe")) == (950, 400)
+
+
+def times_of(packets: bytes) -> list[int]:
+    """The times of enhanced packet blocks."""
+    found = []
+    while packets:
+        _, size, _, high, low = struct.unpack_from("<5I", packets)
+        found.append(high << 32 | low)
+        packets = packets[size:]
+    return found
+
+
+def test_frames_have_the_time_of_their_exchange_though_the_clock_was_set_or_the_machine_slept() -> None:
+    driver, tap = LineDriver(), Tap()
+    peer = Peer(least_timeout=0.02, most_timeout=0.2)
+    asked = []
+    driver._line.tap = tap.c
+    for ahead_ns in (HOUR_NS, 3 * HOUR_NS):
+        driver.begin(
+            Exchange(Framing.RTU, ASK, peer, baudrate=9600, format="8N1", character=1e-3, silence=4e-3)
+        )
+        driver.found.utc_ahead_ns = ahead_ns
+        driver.wait_until_write()
+        asked.append(driver.found.sent_ns + ahead_ns)
+        driver.now += 5 * MS
+        driver.receive(GOOD)
+        assert driver.completion.raw == GOOD
+        asked.append(driver.found.first_ns + ahead_ns)
+    driver.now += 5 * MS
+    driver.receive(b"\xff")  # of no exchange
+    found = times_of(b"".join(tap.take(WRAPPINGS, 0, 5 * HOUR_NS)))
+    assert found == [*asked, driver.now + 5 * HOUR_NS]
 
 
 # ---- the flight recorder ----

@@ -22,8 +22,8 @@ from multidrop.gateway.connections import AGAIN_S, FIRST_S, MOST_OPEN, Connectio
 from multidrop.gateway.listener import BACKLOG
 from multidrop.gateway.rights import digest
 
-HEAD = b"POST /api/stop HTTP/1.1\r\nhost: localhost\r\ncontent-type: application/json\r\n"
-SLOW = [b"", b"POST /api/stop HTTP/1.1\r\nhost: loc", HEAD + b"content-length: 100\r\n\r\n{"]
+HEAD = b"POST /api/act HTTP/1.1\r\nhost: localhost\r\ncontent-type: application/json\r\n"
+SLOW = [b"", b"POST /api/act HTTP/1.1\r\nhost: loc", HEAD + b"content-length: 100\r\n\r\n{"]
 DESCRIPTORS = MOST_OPEN + 4 * BACKLOG  # fewer than the slow clients and the rest would take
 
 

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import asyncio
+import http.client
+import json
+import socket
 import threading
 from functools import partial
 from pathlib import Path
@@ -11,10 +14,10 @@ from types import SimpleNamespace
 import pytest
 from broken_part import BrokenFeed
 from gateways import Served, served, written
-from lines import until
+from lines import PATIENCE, until
 
 from multidrop import PlantError
-from multidrop.gateway import parts
+from multidrop.gateway import parts, request_fields
 from multidrop.gateway.command_threads import begin_stops
 from multidrop.gateway.parts import Part
 from multidrop.gateway.rights import Caller, Right
@@ -25,6 +28,7 @@ stop = "anyone"
 write = ["pump-1.setpoint", "pump-2.setpoint", "pump-1.control"]
 verbs = ["pump-1.start", "pump-2.start", "pump-1.set_frequency", "pump-1.jog", "pump-1.coast"]
 """
+STOP = b"POST /api/stop HTTP/1.1\r\nhost: localhost\r\ncontent-type: application/json\r\ncontent-length: "
 BROKEN = f"{MAY}[serve.history]\n[serve.mqtt]\n"
 
 
@@ -46,6 +50,11 @@ def start(gateway: Served, *drives: str) -> None:
         assert gateway.sims[drive].motor.goal  # type: ignore[attr-defined]
 
 
+def calling(gateway: Served) -> socket.socket:
+    """A connection to a gateway, to be closed."""
+    return socket.create_connection(("127.0.0.1", gateway.gateway.port), PATIENCE)
+
+
 def stands(gateway: Served, drive: str) -> bool:
     return not gateway.sims[drive].motor.goal  # type: ignore[attr-defined]
 
@@ -60,6 +69,49 @@ def test_all_drives_are_stopped_and_seen_to_stand(tmp_path: Path) -> None:
         assert stands(gateway, "pump-1")
         assert stands(gateway, "pump-2")
         gateway.await_state("pump-1", "stands")
+
+
+UNREADABLE = {
+    "late": b"100\r\n\r\n{",
+    "longer than any list of drives": b"%d\r\n\r\n%s" % (70_000, b" " * 70_000),
+    "no JSON": b"4\r\n\r\nstop",
+    "no body": b"0\r\n\r\n",
+    "no object": b"2\r\n\r\n[]",
+    "a name that is no list": b"20\r\n\r\n" + b'{"drives": "pump-1"}',
+    "no names": b"15\r\n\r\n" + b'{"drives": [1]}',
+}
+
+
+@pytest.mark.parametrize("body", UNREADABLE.values(), ids=UNREADABLE)
+def test_a_stop_whose_body_cannot_be_read_is_one_of_all_drives(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, body: bytes
+) -> None:
+    monkeypatch.setattr(request_fields, "STOP_BODY_S", 0.1)
+    with served(tmp_path, MAY) as gateway, calling(gateway) as client:
+        start(gateway, "pump-1", "pump-2")
+        client.sendall(STOP + body)
+        response = http.client.HTTPResponse(client)
+        response.begin()
+        told = json.loads(response.read())
+        assert {name: one["done"] for name, one in told.items()} == {"pump-1": True, "pump-2": True}
+        assert stands(gateway, "pump-1")
+        assert stands(gateway, "pump-2")
+
+
+def test_a_stop_whose_client_is_cut_off_within_its_body_is_sent(tmp_path: Path) -> None:
+    with served(tmp_path, MAY) as gateway:
+        start(gateway, "pump-1", "pump-2")
+        with calling(gateway) as client:
+            client.sendall(STOP + b'100\r\n\r\n{"drives": ["pump-1", "pu')
+        until(lambda: stands(gateway, "pump-1") and stands(gateway, "pump-2"))
+
+
+def test_a_stop_without_the_right_is_not_sent_whatever_its_body_is(tmp_path: Path) -> None:
+    with served(tmp_path, MAY.replace('stop = "anyone"\n', "")) as gateway, calling(gateway) as client:
+        start(gateway, "pump-1", "pump-2")
+        client.sendall(STOP + UNREADABLE["late"])
+        assert client.recv(1000).startswith(b"HTTP/1.1 401 ")
+        assert gateway.gateway.commands.stops == {}
 
 
 def test_one_drive_is_stopped_and_the_other_runs_on(tmp_path: Path) -> None:

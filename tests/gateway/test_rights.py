@@ -145,11 +145,10 @@ def test_methods_and_bodies(open_gateway: Served) -> None:
     assert post("/api/plant").status == 405
     assert open_gateway.request("PUT", "/api/stop").status == 405
     assert open_gateway.request("OPTIONS", "/api/stop").status == 405
-    assert post("/api/stop", b"no json").json == {"error": "the body is not JSON"}
-    assert post("/api/stop", b"[" * 50_000).status == 400
-    assert post("/api/stop", b"[]").json == {"error": "the body is not a JSON object"}
-    assert post("/api/stop", {"drives": "pump-1"}).status == 400
-    assert post("/api/stop", b" " * 70_000).status == 413
+    assert post("/api/act", b"no json").json == {"error": "the body is not JSON"}
+    assert post("/api/act", b"[" * 50_000).status == 400
+    assert post("/api/act", b"[]").json == {"error": "the body is not a JSON object"}
+    assert post("/api/act", b" " * 70_000).status == 413
     assert get("/api/nothing").json == {"error": "there is nothing here"}
     assert get("/api/drive/pump-9").status == 404
     assert get("/api/frame?after=x").status == 400

@@ -49,6 +49,7 @@ class FakeGateway:
         self.is_held: threading.Event | None = None  # for which answers to stops wait
         self.token: str | None = None  # POST wants it where it is set
         self.has_history = True
+        self.recorded: dict[str, dict[str, object]] = {}  # by series, what else its history says of it
         self.fleet: dict[str, Any] = {}  # keys of /api/fleet with other values
         self.reloaded: dict[str, Any] = {
             "done": True,
@@ -268,6 +269,7 @@ def history(handler: Any, gateway: FakeGateway, asked: dict[str, list[str]]) -> 
             "time": times, "mean": mean,
             "least": [None if v is None else v - 0.2 for v in mean],
             "most": [None if v is None else v + 0.2 for v in mean],
+            **gateway.recorded.get(label, {}),
         }  # fmt: skip
     handler.tell({"step_ms": step, "series": series})
 

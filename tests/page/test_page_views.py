@@ -114,6 +114,36 @@ def test_trends_zoom_and_move_by_keyboard_and_have_markers(opened: Opener) -> No
     assert page.locator("#span").inner_text().count(":45:00") == 1
 
 
+def test_another_unit_is_another_plot_and_what_is_left_out_is_told(
+    opened: Opener, gateway: FakeGateway
+) -> None:
+    gateway.recorded = {
+        "pump-1.output_current": {"unit": "%", "left_out": ["A", ""]},
+        "pump-2.output_current": {"unit": "A", "left_out": []},
+    }
+    page = opened("#/trends?drive=pump-2&from=1764075600000&to=1764079200000")
+    until(page, DRAWN)
+    page.get_by_label("pump-1", exact=True).check()
+    heads = page.locator("#trend-plots .plothead b")
+    wanted = ["output frequency, Hz", "output current, A", "output current, %"]
+    until_met(page, lambda: heads.all_inner_texts() == wanted)
+    note = "pump-1.output_current was recorded in A, no unit too, which is not drawn."
+    assert page.locator("#trend-note").inner_text() == note
+    said = page.locator("#trend-plots .plotbox").all()[2].get_attribute("aria-label")
+    assert said.startswith("output current. pump-1: ")
+    assert " %, last " in said
+
+
+def test_a_drive_is_not_drawn_in_a_unit_of_before(opened: Opener, gateway: FakeGateway) -> None:
+    gateway.recorded = {"pump-2.output_current": {"unit": "%", "left_out": ["A"]}}
+    page = opened("#/drives/pump-2")
+    page.locator(".panel .ranges button", has_text="1 h").click()
+    page.locator("#past-note").get_by_text("pump-2.output_current was recorded in A too").wait_for()
+    said = page.locator("#plots .plotbox")
+    until_met(page, lambda: "Hz, last" in (said.first.get_attribute("aria-label") or ""))
+    assert said.nth(1).get_attribute("aria-label") == "output current: no values"
+
+
 def test_trends_are_exported_as_they_are_shown(opened: Opener) -> None:
     page = opened("#/trends?drive=pump-2&from=1764075600000&to=1764079200000")
     until(page, DRAWN)

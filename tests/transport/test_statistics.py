@@ -255,3 +255,25 @@ def test_a_poller_counts_what_its_rows_say(toy: SimulatedDrive) -> None:
     assert 0 < found.drives["pump"].utilisation <= found.utilisation
     poller.reset_statistics()
     assert poller.statistics()["line"].exchanges == 0
+
+
+def test_drives_that_were_renamed_or_exchanged_count_from_the_reset_on(toy: SimulatedDrive) -> None:
+    """Else one has what it was asked before, and another less than nothing."""
+    others = [simulated(Toy(address, name=f"toy-{address}")) for address in (2, 3)]
+    with Simulator([Wire([toy, *others], unpaced=True)]) as simulator, Bus(simulator.wires[0].path) as bus:
+        known = [bus.attach(Toy, address=address, name=name) for address, name in ((1, "a"), (2, "b"))]
+        for drive, times in zip(known, (7, 3), strict=True):
+            for _ in range(times):
+                bus.read(drive, Toy.output_current)
+        bus.reset_statistics()
+        for drive in known:
+            bus.detach(drive)
+        again = [
+            bus.attach(Toy, address=address, name=name) for address, name in ((1, "c"), (2, "a"), (3, "b"))
+        ]
+        for drive in again:
+            bus.read(drive, Toy.output_current)
+        found = bus.statistics()
+        assert {name: drive.exchanges for name, drive in found.drives.items()} == {"c": 1, "a": 1, "b": 1}
+        assert found.exchanges == 3
+    assert bus.statistics().exchanges == 3  # closed

@@ -135,6 +135,11 @@ class Register(Generic[T]):
         return Fraction(str(self.step)) if self.step is not None else Fraction(1)
 
     @property
+    def value_unit(self) -> str:
+        """The unit of its values: of what has no stated scale they are raw counts, and not of its `unit`."""
+        return self.unit if self.values is not None or self.step is not None else "raw count"
+
+    @property
     def decimals(self) -> int:
         """Digits that step and offset need after the point."""
         parts = (Decimal(f"{float(part):.6g}") for part in (self.scale, self.coding.offset))

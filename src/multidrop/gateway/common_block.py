@@ -43,7 +43,7 @@ def common_words(polled: PolledDrive, hub: CommonSource, now_ns: int) -> list[in
         (CURRENT, "output_current", "A"),
         (SETPOINT, drive.setpoint_name, None),
     ):
-        value = _fresh_value(polled, hub, now_ns, name, unit)
+        value = _fresh_value(polled, hub, now_ns, name, unit) if _has_scale(polled, name) else None
         words[at : at + 2] = _two_words(NO_NUMBER if value is None else _hundredths(value))
     words[AGE : AGE + 2] = _two_words(_age(polled, hub, now_ns))
     return words
@@ -60,6 +60,11 @@ def _fresh_value(
             if row is not None and is_fresh(row, fresh_ns(poll.every), now_ns, hub.woke_ns()):
                 return row.value
     return None
+
+
+def _has_scale(polled: PolledDrive, name: str) -> bool:
+    """Return False where a register's values are raw counts, of which nobody knows the unit."""
+    return any(poll.register.name == name and poll.register.step is not None for poll in polled.polls)
 
 
 def _fault(polled: PolledDrive, hub: CommonSource, now_ns: int, state: str) -> int:

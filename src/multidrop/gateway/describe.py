@@ -90,7 +90,7 @@ def _register(register: Register[Any]) -> dict[str, Any]:
     words = {str(int(member)): member.name.lower() for member in members}
     return {
         "name": register.name,
-        "unit": register.unit,
+        "unit": register.value_unit,
         "digits": register.decimals,
         "kind": kind,
         "words": words,

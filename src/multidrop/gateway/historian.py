@@ -144,4 +144,6 @@ def _as_json(made: Buckets) -> dict[str, Any]:
         "mean": made.mean,
         "most": made.most,
         "missed": made.missed,
+        "unit": made.unit,
+        "left_out": made.left_out,
     }

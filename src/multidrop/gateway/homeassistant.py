@@ -115,8 +115,8 @@ def _number(name: str, register: Register[Any], topic: str) -> dict[str, Any]:
         "retain": False,
         "step": float(register.scale),
     }
-    if register.unit:
-        found["unit_of_measurement"] = register.unit
+    if register.value_unit:
+        found["unit_of_measurement"] = register.value_unit
     if register.span is not None:
         found["min"], found["max"] = register.span
     return found

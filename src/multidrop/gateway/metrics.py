@@ -58,7 +58,8 @@ def _values(hub: Hub) -> Iterator[Sample]:
             for register, known in zip(hub.polled(name), hub.known(name), strict=True):
                 if known.good is None or not known.is_fresh:
                     continue
-                labels = {"line": line.name, "drive": name, "register": register.name, "unit": register.unit}
+                labels = {"line": line.name, "drive": name, "register": register.name}
+                labels["unit"] = register.value_unit
                 yield "", labels, known.good[2]
 
 

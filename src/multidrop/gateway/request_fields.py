@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import logging
 from collections.abc import Mapping
 from typing import Any
 
@@ -14,6 +15,9 @@ from multidrop.gateway.rights import Caller
 
 MOST_BYTES = 64 * 1024  # of a body
 BODY_S = 10.0  # that it may take to come
+STOP_BODY_S = 3.0  # that a stop waits for it: a network that lost it sends it once or twice more
+
+_log = logging.getLogger("multidrop.gateway")
 
 
 def caller_of(request: Request) -> Caller:
@@ -21,11 +25,12 @@ def caller_of(request: Request) -> Caller:
     return caller
 
 
-async def body_of(request: Request) -> dict[str, Any]:
-    """Return the body's JSON object. Raises Denied for any other, and for one that is too long."""
+async def body_of(request: Request, seconds: float | None = None) -> dict[str, Any]:
+    """Return the body's JSON object. Raises Denied for any other, and for one that is too long or late."""
     data = bytearray()
+    seconds = BODY_S if seconds is None else seconds
     try:
-        async with asyncio.timeout(BODY_S):
+        async with asyncio.timeout(seconds):
             async for chunk in request.stream():
                 data += chunk
                 if len(data) > MOST_BYTES:
@@ -33,7 +38,7 @@ async def body_of(request: Request) -> dict[str, Any]:
     except ClientDisconnect:
         raise Denied(400, "the client is gone") from None
     except TimeoutError:
-        raise Denied(408, f"the body did not come within {BODY_S:g} s") from None
+        raise Denied(408, f"the body did not come within {seconds:g} s") from None
     try:
         found = json.loads(data)
     except (ValueError, RecursionError):
@@ -41,6 +46,23 @@ async def body_of(request: Request) -> dict[str, Any]:
     if not isinstance(found, dict):
         raise Denied(400, "the body is not a JSON object")
     return found
+
+
+async def drives_to_stop(request: Request) -> list[str] | None:
+    """Return the drives that a stop names; None: all.
+
+    A stop needs no body: one that is late, cut off, too long or no list of names asks for all drives. To stop
+    too many can be mended, and to stop none cannot.
+    """
+    try:
+        drives = (await body_of(request, STOP_BODY_S)).get("drives")
+    except Denied as unread:
+        _log.warning("a stop is one of all drives, because %s", unread)
+        return None
+    if drives is None or (isinstance(drives, list) and all(isinstance(one, str) for one in drives)):
+        return drives
+    _log.warning("a stop is one of all drives, because %.100r is no list of names", drives)
+    return None
 
 
 def text_in(body: Mapping[str, Any], key: str) -> str:

@@ -22,7 +22,7 @@ from multidrop.gateway.describe import describe
 from multidrop.gateway.frame_route import FrameRoute
 from multidrop.gateway.guard import COOKIE, Denied, Guard, Needed
 from multidrop.gateway.metrics import families_of
-from multidrop.gateway.request_fields import body_of, caller_of, frame_in, number_in, text_in
+from multidrop.gateway.request_fields import body_of, caller_of, drives_to_stop, frame_in, number_in, text_in
 from multidrop.gateway.rights import NEVER_THIS_WAY, NOT_ALLOWED, NOT_LISTED, Right
 from multidrop.gateway.views import figures_of, health_of, look_at, look_at_lines
 
@@ -221,12 +221,7 @@ class _Pages:
     # ---- commands ----
 
     async def stop(self, request: Request) -> Response:
-        body = await body_of(request)
-        drives = body.get("drives")
-        if drives is not None and not (
-            isinstance(drives, list) and all(isinstance(one, str) for one in drives)
-        ):
-            raise Denied(400, "drives is neither a list of names nor null, which means all")
+        drives = await drives_to_stop(request)
         told = await self._gateway.commands.stop(drives, caller_of(request))
         return JSONResponse({name: _told(one) for name, one in told.items()})
 

@@ -22,6 +22,9 @@ class Buckets:
 
     A bucket begins at `begin + number * step`, in ns. Where it has no value, `least`, `mean` and `most` are
     None: `missed` says whether it was asked in vain (above 0), or not at all (0).
+
+    All values are of one quantity, the newest of the range: `unit` says which, where that was recorded.
+    `left_out` lists the units of rows that are not in it, because the name was another register's then.
     """
 
     begin: int  # UTC in ns
@@ -31,6 +34,8 @@ class Buckets:
     least: list[float | None]
     mean: list[float | None]
     most: list[float | None]
+    unit: str | None = None
+    left_out: tuple[str, ...] = ()
 
     def __len__(self) -> int:
         return len(self.n)
@@ -138,7 +143,7 @@ class Accumulator:
         if bucket >= 0:
             self.add(bucket, n, missed, total, least, most)
 
-    def buckets(self) -> Buckets:
+    def buckets(self, unit: str | None = None, left_out: Iterable[str] = ()) -> Buckets:
         has = self._n
         return Buckets(
             self._grid.begin,
@@ -148,6 +153,8 @@ class Accumulator:
             _where(has, self._least),
             _where(has, [total / n if n else 0.0 for total, n in zip(self._sum, has, strict=True)]),
             _where(has, self._most),
+            unit,
+            tuple(left_out),
         )
 
 

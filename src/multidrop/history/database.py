@@ -106,10 +106,21 @@ def kept_metadata(database: Any, path: Path) -> dict[str, Any]:
     return metadata
 
 
+def texts_of_metadata(database: Any, paths: Iterable[Path]) -> Iterator[tuple[str, list[str]]]:
+    """Yield each text of metadata that these Parquet files have, and the files that have it."""
+    query = f"""select decode(value), list(file_name) from parquet_kv_metadata({_list(paths)})
+        where decode(key) = $key group by value"""
+    yield from database.execute(query, {"key": METADATA_KEY}).fetchall()
+
+
 def quoted(text: str) -> str:
     return "'" + text.replace("'", "''") + "'"
 
 
 def files_of(paths: Iterable[Path]) -> str:
     """Return a table of these Parquet files."""
-    return f"read_parquet([{', '.join(quoted(str(path)) for path in paths)}])"
+    return f"read_parquet({_list(paths)})"
+
+
+def _list(paths: Iterable[Path]) -> str:
+    return f"[{', '.join(quoted(str(path)) for path in paths)}]"

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 from multidrop.history.buckets import Accumulator, Buckets, Grid, grid_of
 from multidrop.history.database import MissingDuckDB
-from multidrop.history.folder import Listing, listing
+from multidrop.history.folder import HistoryFile, Listing, listing
 from multidrop.history.kept_series import Series
+from multidrop.history.quantities import Parting
 from multidrop.history.queries import (
     OF_ROWS,
     OF_TENS,
@@ -142,31 +143,45 @@ class History:
         `end` None is now. Nothing is hidden: a value that stood out for one row is in `most` or `least`.
         Times of 2 s and more become whole tens of seconds, minutes, hours or days of UTC, so that the first
         may begin before `begin` and the last end after `end`.
+
+        Where a name was another register's in a part of the range, with another unit or other names of its
+        numbers, only what is of the newest quantity is in it; `unit` and `left_out` say so.
         """
         names = _parsed(series)
         if not names:
             raise ValueError("buckets takes one series or more, such as 'pump-1.output_frequency'")
         grid = grid_of(_ns(begin), time.time_ns() if end is None else _ns(end), points)
 
-        def gathered(found: Listing) -> dict[Series, Accumulator]:
+        def gathered(found: Listing) -> dict[str, Buckets]:
             into = {name: Accumulator(grid) for name in names}
-            self._gather(found, into, grid)
-            return into
+            parting = Parting(self._sources.known(found, grid.begin, grid.end), names)
+            self._gather(found, into, grid, parting)
+            return {
+                ".".join(name): made.buckets(parting.unit_of(name), parting.left_out.get(name, ()))
+                for name, made in into.items()
+            }
 
-        return {".".join(name): made.buckets() for name, made in self._sources.again(gathered).items()}
+        return self._sources.again(gathered)
 
-    def _gather(self, found: Listing, into: dict[Series, Accumulator], grid: Grid) -> None:
-        tens = found.tens if grid.is_of_tens else []
+    def _gather(
+        self, found: Listing, into: Mapping[Series, Accumulator], grid: Grid, parting: Parting
+    ) -> None:
+        everything = tuple(into)
+        # A file of tens may be of many segments; where these differ, each is read by itself.
+        tens = [file for file in found.tens if grid.is_of_tens and parting.is_whole(file.first, file.last)]
         reckoned = {number for file in tens for number in range(file.first, file.last + 1)}
-        rows = [file for number, file in found.rows.items() if number not in reckoned]
-        for files, sums in ((tens, OF_TENS), (rows, OF_ROWS)):
+        parted: dict[tuple[str, tuple[Series, ...]], list[HistoryFile]] = {(OF_TENS, everything): tens}
+        for number, file in found.rows.items():
+            if number not in reckoned:
+                parted.setdefault((OF_ROWS, parting.series_of(number)), []).append(file)
+        for (sums, series), files in parted.items():
             files = [file for file in files if file.may_have(grid.begin, grid.end)]
-            if files:
-                gather_files(self._sources, files, sums, into, grid)
+            if files and series:
+                gather_files(self._sources, files, sums, {one: into[one] for one in series}, grid)
         for number in sorted(set(found.segments) - reckoned):
             with self._sources.segment(number, found, grid.begin, grid.end) as segment:
                 if segment:
-                    segment.gather(into, grid)
+                    segment.gather({one: into[one] for one in parting.series_of(number)}, grid)
 
     # ---- export ----
 

@@ -2,23 +2,26 @@
 
 from __future__ import annotations
 
+import json
 import os
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from tempfile import gettempdir
 from typing import Any, TypeVar
 
-from multidrop.history.database import connect
+from multidrop.history.database import connect, texts_of_metadata
 from multidrop.history.folder import HistoryFile, Listing, listing
 from multidrop.history.growing import GrowingSegment
+from multidrop.history.quantities import Known, quantities_of
 
 T = TypeVar("T")
 ALWAYS = -(2**63), 2**63 - 1  # ns
 MEMORY = "200MB"  # of DuckDB
 MOST_TRIES = 5  # for files that are replaced
 MOST_GROWING = 4  # segments of which what was learnt is kept
+FILES_AT_ONCE = 200  # of which metadata is read: a text may take 100 kB
 
 
 class Replaced(Exception):
@@ -33,6 +36,7 @@ class Sources:
         self.damage: dict[int, str] = {}  # sentences by segment
         self._growing: dict[int, GrowingSegment] = {}
         self._bounds: dict[int, tuple[int, int]] = {}  # of times in closed segments
+        self._known: dict[int, Known] = {}  # quantities in segments
         self._changing = threading.Lock()
         self._database: Any = None
 
@@ -98,6 +102,30 @@ class Sources:
             self._growing.pop(older).let_go()
         return segment
 
+    def known(self, found: Listing, begin: int, end: int) -> dict[int, Known]:
+        """Return the quantities of each segment that may have rows of this range. Raises Replaced."""
+        files = {number: file for number, file in found.rows.items() if file.may_have(begin, end)}
+        unread = [file for number, file in files.items() if number not in self._known]
+        for at in range(0, len(unread), FILES_AT_ONCE):
+            self._read_quantities(unread[at : at + FILES_AT_ONCE])
+        numbers = [*files]
+        for number in found.segments:
+            with self.segment(number, found, begin, end) as segment:
+                if segment and segment.batches(begin, end):
+                    numbers.append(number)
+                    if number not in self._known:
+                        self._known[number] = quantities_of(segment.metadata)
+        return {number: self._known[number] for number in numbers}
+
+    def _read_quantities(self, files: Sequence[HistoryFile]) -> None:
+        numbers = {str(file.path): file.first for file in files}
+        read: dict[int, Known] = {number: {} for number in numbers.values()}
+        with self.cursor() as cursor, while_there(files):
+            for text, paths in texts_of_metadata(cursor, [file.path for file in files]):
+                known = quantities_of(_parsed(text))
+                read |= {numbers[path]: known for path in paths}
+        self._known |= read
+
     def cursor(self) -> Any:
         """Return a cursor of DuckDB, to be closed. Raises ImportError."""
         with self._changing:
@@ -116,6 +144,12 @@ class Sources:
 
     def too_often(self) -> OSError:
         return OSError(f"{self.folder}: files were replaced {MOST_TRIES} times while they were read")
+
+
+def _parsed(text: str) -> object:
+    with suppress(ValueError, RecursionError):
+        return json.loads(text)
+    return None
 
 
 @contextmanager

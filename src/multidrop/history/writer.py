@@ -65,7 +65,7 @@ class HistoryWriter:
         self._compactor = Compactor(self.folder)
         self._waiting: list[GatheredRows] = []
         self._waiting_rows = 0
-        self._metadata: Metadata | None = None  # to begin a segment with
+        self._ended: list[tuple[list[GatheredRows], Metadata]] = []  # rows, and what the plant was after them
         self._changing = threading.Lock()
         self._dropped = 0
         self._trouble: str | None = None
@@ -90,9 +90,10 @@ class HistoryWriter:
             self._waiting_rows += len(batch)
 
     def begin(self, metadata: Metadata) -> None:
-        """Begin a segment with this metadata: the plant changed."""
+        """Begin a segment with this metadata: the plant changed. What was taken is in the one before."""
         with self._changing:
-            self._metadata = metadata
+            self._ended.append((self._waiting, metadata))
+            self._waiting = []
 
     def state(self) -> HistoryState:
         """Return rows written and lost so far, and what is wrong now."""
@@ -120,9 +121,13 @@ class HistoryWriter:
     def _write_waiting(self) -> None:
         with self._changing:
             waiting, self._waiting, self._waiting_rows = self._waiting, [], 0
-            metadata, self._metadata = self._metadata, None
-        if metadata is not None:
+            ended, self._ended = self._ended, []
+        for rows, metadata in ended:
+            self._write_all(rows)
             self._rotate(metadata)
+        self._write_all(waiting)
+
+    def _write_all(self, waiting: list[GatheredRows]) -> None:
         for gathered in waiting:
             self._write(gathered.batch())
 

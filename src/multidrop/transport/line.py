@@ -79,8 +79,7 @@ class Line:
         self.ids = ids
         self._echo = echo
         self._opened = OpenPort(port, ids, rs485, mastership)
-        # The core's port, on which exchanges are queued; None while it is closed. It is dropped before its
-        # descriptor is closed.
+        # The core's port, on which exchanges are queued; None once that is about to be closed.
         self.queue: Port | None = None
         self._tap: Tap | None = None
         self._log = LineLog(port)
@@ -92,7 +91,7 @@ class Line:
 
     def _make_locks(self) -> None:
         self._lock = threading.RLock()  # one thread opens or closes at a time
-        self._callers: list[None] = []  # in `carry_out`; a list grows and shrinks without a lock
+        self._callers: set[object] = set()  # in `carry_out`; a set grows and shrinks without a lock
 
     def forked(self) -> None:
         """Close it in the child at once: a descriptor left open there would keep the port busy."""
@@ -222,13 +221,13 @@ class Line:
         into: Completion | None = None,
     ) -> Completion:
         """Carry an exchange out ahead of what is queued, and wait for it; LineError when the port fails.
-
         `into` is the completion to fill in, where nobody looks at it any more.
         """
         if self._opened.bridge and self.queue and self._opened.settings != exchange.settings:
             self.require(exchange.settings)
-        self._callers.append(None)  # before the port is looked at: `drop` then waits for this thread
-        try:
+        calling = object()
+        try:  # a signal that raises between any two steps leaves none behind, for which `drop` waited
+            self._callers.add(calling)  # before the port is looked at: `drop` then waits for this thread
             core = self.queue
             if core is None:
                 raise self._closed()
@@ -237,7 +236,7 @@ class Line:
             if self.mastership is not None:
                 self.note_foreign()
         finally:
-            self._callers.pop()
+            self._callers.discard(calling)
         if self._log.shows(DEBUG):
             self._log.frames(exchange, found)
         if is_lost:
@@ -267,12 +266,13 @@ class Line:
 
     def counted_ns(self, now_ns: int) -> int:
         """Return until when its time is over and counted: now, or the beginning of what is under way."""
-        self._callers.append(None)  # as in `carry_out`
-        try:
+        calling = object()
+        try:  # as in `carry_out`
+            self._callers.add(calling)
             core = self.queue
             return now_ns if core is None else min(now_ns, core.counted_ns())
         finally:
-            self._callers.pop()
+            self._callers.discard(calling)
 
     def overruns(self) -> int | None:
         """Return how many characters came too fast since the driver was loaded; None where it is unknown."""

@@ -15,10 +15,6 @@ from operator import sub
 from typing import Any
 
 from multidrop.core import DELAY_BUCKETS, EXCEPTION_STATUS, STATUSES, Counters, Status, delay_edge
-from multidrop.transport import clock
-from multidrop.transport.exchange import Exchanges
-
-LOOKS = 3  # at counters that must be of one moment
 
 # Bytes came instead of the reply, and no good frame among them.
 _DAMAGED = (Status.BAD_CHECKSUM, Status.BAD_CHARACTER, Status.CUT_SHORT, Status.NO_START)
@@ -208,41 +204,6 @@ def line_statistics(
         for name, counters in counters_by_drive.items()
     }
     return LineStatistics(seconds, _sum(counters_by_drive.values()), overruns, counted_s, drives)
-
-
-class LineMeter:
-    """Statistics of a line since it was opened, or last reset; frozen when it is closed."""
-
-    def __init__(self, exchanges: Exchanges) -> None:
-        self._exchanges = exchanges
-        self._opened_ns = clock.now_ns()
-        self._frozen: LineStatistics | None = None
-        self._reset_at = line_statistics(0.0, {}, exchanges.line.overruns(), 0.0)
-
-    def read(self) -> LineStatistics:
-        return self._now().since(self._reset_at)
-
-    def reset(self) -> None:
-        self._reset_at = self._now()
-
-    def freeze(self, overruns: int | None) -> None:
-        """Count nothing more: the line is closed, and had lost `overruns` characters until then."""
-        self._frozen = self._frozen or self._count(overruns)
-
-    def _now(self) -> LineStatistics:
-        return self._frozen or self._count(self._exchanges.line.overruns())
-
-    def _count(self, overruns: int | None) -> LineStatistics:
-        peers = self._exchanges.peers
-        for _ in range(LOOKS):
-            counters_by_drive = {drive.name: peer.counters() for drive, peer in peers.items()}
-            now_ns = clock.now_ns()
-            counted_ns = self._exchanges.line.counted_ns(now_ns)
-            counted = sum(counters.exchanges for counters in counters_by_drive.values())
-            if counted == sum(peer.exchanges for peer in peers.values()):  # none ended meanwhile
-                break
-        seconds, counted_s = ((at_ns - self._opened_ns) / 1e9 for at_ns in (now_ns, counted_ns))
-        return line_statistics(seconds, counters_by_drive, overruns, counted_s)
 
 
 def _sum(counters_by_drive: Iterable[Counters]) -> Counters:

@@ -95,7 +95,7 @@ export function draw() {
     fill(place);
     return;
   }
-  const rows = plots().flatMap(({ plot, drives, spec, register }) =>
+  const rows = plots().flatMap(({ plot, drives, spec, register, unit }) =>
     drives.map((drive, k) => {
       const [a, b] = [at(plot, 3 + 3 * k, marks.A), at(plot, 3 + 3 * k, marks.B)],
         write = v => (v === null ? "–" : v.toFixed(spec.digits ?? 0));
@@ -106,7 +106,7 @@ export function draw() {
         make("td", {}, write(a)),
         make("td", {}, write(b)),
         make("td", {}, a === null || b === null ? "–" : write(b - a)),
-        make("td", {}, spec.unit ?? ""),
+        make("td", {}, unit),
       );
     }),
   );

@@ -2,7 +2,7 @@
 
 import * as clock from "./clock.js";
 import { colour, fill, find, make, put } from "./dom.js";
-import { exportLink, label, read } from "./history.js";
+import { exportLink, isPresent, label, leftOut, read } from "./history.js";
 import { now } from "./link.js";
 import { COLOURS, isThere, join, line, makePlot, summary, wide } from "./plots.js";
 import { isLive, store } from "./store.js";
@@ -195,6 +195,7 @@ async function fetchPast() {
   try {
     const told = await read(labels, from, to, POINTS);
     if (mine === serial) past = { series: told.series, until: to };
+    if (needsHistory()) note = leftOut(told.series).join(" ");
   } catch (error) {
     if (needsHistory()) note = error.message;
   }
@@ -230,7 +231,8 @@ export function draw() {
 // Return [times, values, most, least] of a register over the range that is shown.
 function samples(register) {
   const from = until() - range * 1000;
-  const told = past?.series?.[label(spec.name, register.name)];
+  const kept = past?.series?.[label(spec.name, register.name)],
+    told = kept && isPresent(kept, register) ? kept : null;
   if (needsHistory()) return told ? [told.time, told.mean, told.most, told.least] : [[], [], [], []];
   const [times, values] = store.drives.get(spec.name)?.pasts.get(register.name)?.since(from) ?? [[], []];
   const first = times[0] ?? Infinity,

@@ -7,11 +7,10 @@ import * as markers from "./markers.js";
 import * as picker from "./picker.js";
 import { COLOURS, join, line, makePlot, summary, wide } from "./plots.js";
 import { store } from "./store.js";
-import { unit, words } from "./values.js";
+import { words } from "./values.js";
 
-// Make the plot of one quantity of all chosen drives. `set` shows the span that was dragged over.
-export function makeTrend(place, register, told, { view, set, count }) {
-  const drives = picker.drives().filter(name => told[label(name, register)]);
+// Make the plot of one quantity of these drives. `set` shows the span that was dragged over.
+export function makeTrend(place, { register, unit, drives }, told, { view, set, count }) {
   const spec = store.drives.get(drives[0]).registers.get(register);
   const out = make("output"),
     box = make("div", { class: "plotbox", role: "img" });
@@ -22,7 +21,7 @@ export function makeTrend(place, register, told, { view, set, count }) {
       make(
         "div",
         { class: "plothead" },
-        make("b", {}, `${words(register)}${unit(spec) ? `, ${unit(spec)}` : ""}`),
+        make("b", {}, words(register) + (unit ? `, ${unit}` : "")),
         out,
       ),
       box,
@@ -45,14 +44,14 @@ export function makeTrend(place, register, told, { view, set, count }) {
         .replace(")", ", 0.22)"),
     });
     tables.push([time, most, least, mean]);
-    said.push(summary(name, mean, unit(spec), spec.digits ?? 0));
+    said.push(summary(name, mean, unit, spec.digits ?? 0));
   }
   const height = Math.max(150, Math.min(300, (innerHeight - 300) / count));
   const plot = makePlot(box, join(tables), {
     series,
     bands,
     height,
-    range: wide(spec.unit === "Hz" ? 0.5 : 1),
+    range: wide(unit === "Hz" ? 0.5 : 1),
     sync: "trends",
     cursor: { drag: { x: true, y: false, setScale: false } },
     window: () => [view.from / 1000, view.to / 1000],
@@ -72,7 +71,7 @@ export function makeTrend(place, register, told, { view, set, count }) {
     },
   });
   box.setAttribute("aria-label", `${words(register)}. ${said.join(". ")}`);
-  return { plot, drives, spec, register };
+  return { plot, drives, spec, register, unit };
 }
 
 function under(u, drives, spec) {

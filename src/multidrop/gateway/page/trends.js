@@ -2,7 +2,7 @@
 
 import * as clock from "./clock.js";
 import { fill, find, make, put } from "./dom.js";
-import { exportLink, label, read } from "./history.js";
+import { exportLink, label, leftOut, read, unitOf } from "./history.js";
 import { draw as drawLane } from "./lane.js";
 import { now } from "./link.js";
 import * as markers from "./markers.js";
@@ -159,6 +159,7 @@ async function fetchAll() {
     note = error.message;
   }
   if (mine !== serial || !isShown) return;
+  note = [note, ...leftOut(told.series)].filter(Boolean).join(" ");
   put(find("#trend-note"), note);
   find("#trend-note").hidden = note === "";
   draw();
@@ -184,11 +185,22 @@ export function draw() {
   const place = find("#trend-plots");
   fill(place);
   if (!isShown || !told || !isThere()) return;
-  const names = picker
-    .quantities()
-    .filter(register => picker.drives().some(name => told.series[label(name, register)]));
-  names.forEach(register =>
-    plots.push(makeTrend(place, register, told.series, { view, set, count: names.length })),
-  );
+  const shown = parted();
+  for (const one of shown) plots.push(makeTrend(place, one, told.series, { view, set, count: shown.length }));
   markers.draw();
+}
+
+// Return a quantity, its unit and its drives for each plot: another unit is another plot.
+function parted() {
+  const found = new Map();
+  for (const register of picker.quantities())
+    for (const name of picker.drives()) {
+      const series = told.series[label(name, register)];
+      if (!series) continue;
+      const unit = unitOf(series, store.drives.get(name).registers.get(register)),
+        key = JSON.stringify([register, unit]);
+      if (!found.has(key)) found.set(key, { register, unit, drives: [] });
+      found.get(key).drives.push(name);
+    }
+  return [...found.values()];
 }

@@ -1,0 +1,85 @@
+"""Ctrl-C at any step of an exchange: what may have been sent is told, and nothing is left behind."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from functools import partial
+from itertools import count
+from linecache import getline
+from types import FrameType
+from typing import Any
+
+import pytest
+from motors import ReceivedRequests
+
+from multidrop import Bus
+from multidrop.drives import InvtCHE
+from multidrop.sim import MotorDrive, Simulator, Wire, simulated
+from multidrop.transport import clock
+from multidrop.transport import line as of_a_port
+
+CODE = of_a_port.Line.carry_out.__code__
+
+
+def interrupted(call: Callable[[], object], nth: int) -> KeyboardInterrupt | None:
+    """Call it, and raise before the nth line of the exchanges that it makes; None where there are fewer."""
+    left, before = nth, sys.gettrace()
+
+    def trace(frame: FrameType, event: str, argument: object) -> Any:
+        nonlocal left
+        if frame.f_code is not CODE:
+            return None
+        if event == "line" and "discard" not in getline(CODE.co_filename, frame.f_lineno):  # nothing after it
+            left -= 1
+            if left == 0:
+                raise KeyboardInterrupt
+        return trace
+
+    sys.settrace(trace)
+    try:
+        call()
+    except KeyboardInterrupt as interruption:
+        return interruption
+    finally:
+        sys.settrace(before)
+    return None
+
+
+@pytest.mark.parametrize("verb", ["start", "coast", "stop"])
+def test_what_may_have_been_sent_is_told_wherever_it_is_interrupted(verb: str) -> None:
+    sim = simulated(InvtCHE(1, maximum_frequency=50))
+    assert isinstance(sim, MotorDrive)
+    received = ReceivedRequests(sim)
+    with Simulator([Wire([sim], unpaced=True)]) as simulator:
+        for nth in count(1):
+            with Bus(simulator.wires[0].path) as bus:
+                drive = bus.attach(InvtCHE, address=1, maximum_frequency=50)
+                drive.set_frequency(25.0)
+                before = len(received.writes)
+                interruption = interrupted(getattr(drive, verb), nth)
+                sent = received.writes[before:]
+            if interruption is None:
+                break
+            (told,) = interruption.__notes__
+            assert "sent" in told
+            if sent:
+                assert "nothing of the" not in told
+                assert "no stop was sent" not in told
+    assert nth > 8
+
+
+def test_an_interrupted_exchange_does_not_hold_the_port_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    waits: list[float] = []
+    with Simulator([Wire([simulated(InvtCHE(1))], unpaced=True)]) as simulator:
+        for nth in count(1):
+            bus = Bus(simulator.wires[0].path)
+            drive = bus.attach(InvtCHE, address=1)
+            interruption = interrupted(partial(bus.read, drive, drive.status), nth)
+            with monkeypatch.context() as patched:
+                patched.setattr(clock, "sleep", waits.append)
+                bus.close()
+            assert waits == []
+            if interruption is None:
+                break
+    assert nth > 8

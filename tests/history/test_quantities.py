@@ -1,0 +1,134 @@
+"""A name that is another quantity from one segment on: two units are never put together."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+from histories import DAY, NOON, SECOND, batch
+
+from multidrop import Buckets, History, HistoryWriter
+from multidrop.core.columns import Names
+from multidrop.history.compact import compact
+from multidrop.history.quantities import quantities_of
+from multidrop.polling.batch import Row
+from multidrop.recording.rows import from_rows
+from multidrop.recording.segments import SegmentWriter
+
+SERIES, OTHER = "pump-1.load", "pump-2.load"
+AMPERE, PERCENT, RAW = {"unit": "A"}, {"unit": "%"}, {"unit": "A", "step": None}
+STATES, OTHER_STATES = {"values": {"RUN": 1, "STOP": 2}}, {"values": {"STOP": 1, "RUN": 2}}
+
+
+def described(about: dict[str, Any]) -> dict[str, Any]:
+    """The metadata of a plant whose first drive has this register; the second one's stays the same."""
+    drives = {"pump-1": {"registers": {"load": about}}, "pump-2": {"registers": {"load": AMPERE}}}
+    return {"drives": drives}
+
+
+def recorded(folder: Path, *segments: dict[str, Any]) -> None:
+    """Record a segment of each quantity: 30 s of its own value, from the same second of each minute on."""
+    with SegmentWriter(folder / "rows.arrows", {}, every=1e9) as writer:
+        for number, about in enumerate(segments):
+            writer.rotate(described(about))
+            begin = NOON + number * 60 * SECOND
+            writer.write(
+                from_rows(
+                    [
+                        Row(begin + at * SECOND, at, 0, drive, "load", 10.0**number, "ok")
+                        for at in range(30)
+                        for drive in ("pump-1", "pump-2")
+                    ]
+                )
+            )
+
+
+@pytest.fixture(params=["segments", "files", "days"])
+def how(request: pytest.FixtureRequest) -> str:
+    return str(request.param)
+
+
+def kept(folder: Path, how: str, count: int) -> None:
+    """Keep the segments as they are, as files of each, or as files of each with the tens of a whole day."""
+    if how == "segments":
+        return
+    pytest.importorskip("duckdb", reason="needs duckdb")
+    if how == "days":
+        with SegmentWriter(folder / "rows.arrows", {}, every=1e9) as writer:
+            writer.write(from_rows([Row(NOON + 2 * DAY, 0, 0, "fan", "load", 1.0, "ok")]))
+        count += 1
+    compact(folder, count + 1)
+
+
+def of(
+    folder: Path, points: int, begin: int = NOON, end: int = NOON + 300 * SECOND
+) -> tuple[Buckets, Buckets]:
+    with History(folder) as history:
+        for _ in range(2):  # what was learnt of the files changes nothing
+            found = history.buckets([SERIES, OTHER], begin, end, points)
+    return found[SERIES], found[OTHER]
+
+
+@pytest.mark.parametrize("points", [300, 30])
+def test_two_units_are_no_series(tmp_path: Path, how: str, points: int) -> None:
+    recorded(tmp_path, AMPERE, PERCENT, AMPERE, PERCENT)
+    kept(tmp_path, how, 4)
+    found, other = of(tmp_path, points)
+    assert {value for value in (*found.least, *found.most) if value is not None} == {10.0, 1000.0}
+    assert (sum(found.n), found.unit, found.left_out) == (60, "%", ("A",))
+    assert (sum(other.n), other.unit, other.left_out) == (120, "A", ())
+
+
+def test_a_range_of_one_unit_has_that(tmp_path: Path, how: str) -> None:
+    recorded(tmp_path, AMPERE, PERCENT)
+    kept(tmp_path, how, 2)
+    before, _ = of(tmp_path, 40, end=NOON + 40 * SECOND)
+    after, _ = of(tmp_path, 40, begin=NOON + 50 * SECOND)
+    assert (sum(before.n), max(filter(None, before.most)), before.unit, before.left_out) == (30, 1.0, "A", ())
+    assert (sum(after.n), max(filter(None, after.most)), after.unit, after.left_out) == (30, 10.0, "%", ())
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "told"),
+    [
+        (AMPERE, {"unit": "A", "step": 0.01}, ("A", 60, ())),  # a finer step is the same quantity
+        (RAW, AMPERE, ("A", 30, ("raw count",))),
+        (STATES, OTHER_STATES, ("names", 30, ("names",))),
+        (STATES, STATES, ("names", 60, ())),
+        ({}, AMPERE, ("A", 30, ("",))),
+    ],
+)
+def test_what_is_one_quantity(
+    tmp_path: Path, first: dict[str, Any], second: dict[str, Any], told: tuple[str, int, tuple[str, ...]]
+) -> None:
+    recorded(tmp_path, first, second)
+    found, _ = of(tmp_path, 300)
+    assert (found.unit, sum(found.n), found.left_out) == told
+
+
+def test_metadata_that_says_nothing_parts_nothing() -> None:
+    for strange in (
+        None,
+        [],
+        {"drives": []},
+        {"drives": {"pump-1": None}},
+        {"drives": {"a": {"registers": 3}}},
+    ):
+        assert quantities_of(strange) == {}
+    assert quantities_of({"drives": {"a": {"registers": {"b": 3, "c": {"values": [1]}}}}}).keys() == {
+        ("a", "c")
+    }
+
+
+def test_rows_that_were_taken_before_another_plant_are_in_the_segment_before(tmp_path: Path) -> None:
+    writer = HistoryWriter(tmp_path, {"drives": {"pump-1": {"registers": {"speed": AMPERE}}}})
+    names = Names(["pump-1"])
+    for first, unit in ((0, PERCENT), (10, AMPERE), (20, AMPERE)):
+        writer.take(batch(names, 0, range(first, first + 9), NOON, SECOND))
+        writer.begin({"drives": {"pump-1": {"registers": {"speed": unit}}}})
+    writer.close()
+    with History(tmp_path) as history:
+        found = history.buckets("pump-1.speed", NOON, NOON + 30 * SECOND, 30)["pump-1.speed"]
+    assert found.n == [1] * 9 + [0] * 11 + [1] * 9 + [0]
+    assert (found.unit, found.left_out) == ("A", ("%",))
