@@ -43,7 +43,8 @@ class StopDesk:
 
         A copy of the message gets the answer of the same stop; another message is another stop. The answer
         to one that is not over soon is "under way", with what is known of it so far; the asker asks again.
-        Where we lost the line meanwhile we keep silent too: its next master may have had a copy, and stops.
+        Where we lost the line meanwhile, or let it go, we keep silent too, unless the motors stand: its next
+        master may have had a copy, and stops, or is asked next.
         """
         held = self._lines.for_stop(line)
         if held is None:
@@ -62,7 +63,8 @@ class StopDesk:
         if not task.done():
             return self._so_far(held, request)
         answer = task.result()
-        return answer if answer.is_done or self._lines.for_stop(line) is held else None
+        is_ours = self._lines.for_stop(line) is held and not held.is_leaving
+        return answer if answer.is_done or is_ours else None
 
     def _so_far(self, held: HeldLine, request: StopRequest) -> CommandAnswer:
         names = held.drives if request.drives is None else request.drives
