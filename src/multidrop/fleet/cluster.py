@@ -10,10 +10,10 @@ from multidrop.fleet.record_shapes import misshapen
 
 SILENT_NS = 2_000_000_000  # a follower answers its leader's heartbeat once a second
 _CLUSTER = {"leader": str, "replicas": list}  # left out where there is none
-_FOLLOWER = {"name": str, "current": bool, "offline": bool, "active": int}
+_REPLICA = {"name": str, "current": bool, "offline": bool, "active": int}
 
 
-class Follower(NamedTuple):
+class Replica(NamedTuple):
     """A server that follows a bucket's leader."""
 
     name: str
@@ -36,7 +36,7 @@ class Cluster(NamedTuple):
     """A bucket's leader, "" for none, and those that follow it."""
 
     leader: str = ""
-    followers: tuple[Follower, ...] = ()
+    followers: tuple[Replica, ...] = ()
 
     def home_of(self, place: int) -> str:
         """Return the server that should lead the bucket at this place: they take turns, in order of name."""
@@ -58,10 +58,10 @@ def cluster_of(info: Mapping[str, Any]) -> Cluster | None:
         return None
     told = _believed(info["cluster"], _CLUSTER, leader="", replicas=[])
     usual = {"current": False, "offline": False, "active": 0}
-    followers = (_believed(one, _FOLLOWER, **usual) for one in told["replicas"])
+    followers = (_believed(one, _REPLICA, **usual) for one in told["replicas"])
     return Cluster(
         told["leader"],
-        tuple(Follower(one["name"], one["current"], one["offline"], one["active"]) for one in followers),
+        tuple(Replica(one["name"], one["current"], one["offline"], one["active"]) for one in followers),
     )
 
 
