@@ -192,12 +192,12 @@ class Poller(RowSource):
     def remove_line(self, name: str) -> None:
         """Poll a line no more, and close its port, as `adopt` does. Raises ValueError when there is none.
 
-        While its stops are waited for other lines come and go.
+        While its stops, and what is under way, are waited for other lines come and go.
         """
         with self._changing:
             self._check_polling()
             leaving = self._lines.find(name)
-        leaving.bus.part()  # a stop may take half a minute
+        self._lines.wind_down([leaving])  # a stop may take half a minute
         with self._changing:
             if not self._closing and leaving in self._lines:
                 self._lines.let_go([leaving], GONE)

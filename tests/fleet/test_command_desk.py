@@ -265,7 +265,7 @@ def test_who_loses_the_line_at_a_stop_leaves_it_to_the_next_master(
 ) -> None:
     """A copy may have reached that one. Where we have the line again, the asker's next copy stops it."""
 
-    def lost() -> dict[str, Stopped]:
+    def lost(seconds: float | None) -> dict[str, Stopped]:
         LOSSES[loss](desk)
         return {"pump": Stopped("pump", Seen.FAILED, 0.1, "not the master")}
 

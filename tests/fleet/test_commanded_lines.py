@@ -8,6 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import pytest
 from command_desks import LINE, MAY, desks
 from peers import require_module
 
@@ -84,6 +85,42 @@ def test_a_line_that_is_let_go_answers_for_its_stops_until_it_is_closed(tmp_path
         assert path.heard == {}
         assert await made.stop() is None
         assert [name for name, _ in made.writes] == ["control"]
+
+    with desks(tmp_path) as made:
+        asyncio.run(main())
+
+
+class ClosedLines(SlowLines):
+    """Lines whose buses are closed some time before that is known."""
+
+    def __init__(self, close: Callable[[], None]) -> None:
+        super().__init__()
+        self._close = close
+        self.are_closed = asyncio.Event()
+
+    async def let_go(self, line: str) -> None:
+        await asyncio.to_thread(self._close)
+        self.are_closed.set()
+        await super().let_go(line)
+
+
+@pytest.mark.parametrize("drives", [None, ["pump"]])
+def test_a_stop_that_finds_its_line_closed_is_left_to_the_next_master(
+    tmp_path: Path, drives: list[str] | None
+) -> None:
+    """Its asker would believe a refusal, and ask nobody else."""
+
+    async def main() -> None:
+        lines = ClosedLines(made.bus(LINE).close)
+        subjects = CommandSubjects("gw-1", [HeardPath()], made.lines, made.log)  # type: ignore[list-item]
+        commanded = CommandedLines(lines, subjects)  # type: ignore[arg-type]
+        await commanded.take(LINE, {"may": MAY})
+        going = asyncio.create_task(commanded.let_go(LINE))
+        await lines.are_closed.wait()
+        assert await made.stop(drives=drives) is None
+        lines.closes.set()
+        await going
+        await settled(subjects)
 
     with desks(tmp_path) as made:
         asyncio.run(main())

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 from collections.abc import Awaitable, Callable, Mapping, Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
@@ -16,9 +17,10 @@ require_module("nats")
 
 from multidrop import read_audit  # noqa: E402
 from multidrop.fleet import fleet_commands as asker_module  # noqa: E402
+from multidrop.fleet import stop_asking  # noqa: E402
 from multidrop.fleet.buckets import Record  # noqa: E402
 from multidrop.fleet.command_words import CommandAnswer, CommandOutcome  # noqa: E402
-from multidrop.fleet.errors import FleetError, NobodyThere, NotDelivered, Unsure  # noqa: E402
+from multidrop.fleet.errors import FleetError, MayNotSend, NobodyThere, NotDelivered, Unsure  # noqa: E402
 from multidrop.fleet.fleet_commands import FleetCommands  # noqa: E402
 
 DONE, NOT_SENT, UNKNOWN = CommandOutcome.DONE, CommandOutcome.NOT_SENT, CommandOutcome.UNKNOWN
@@ -83,6 +85,7 @@ def asked(
     path: ScriptedPath,
     what: Callable[[FleetCommands], Awaitable[CommandAnswer]],
     plant: Plant | None = None,
+    nobody_s: float = 0.01,
 ) -> CommandAnswer:
     """Return what an asker was told who has this one path."""
 
@@ -95,7 +98,10 @@ def asked(
         finally:
             await asker.close()
 
-    with patch.object(asker_module, "AGAIN_S", 0.0), patch.object(asker_module, "LOST_S", 0.01):
+    with ExitStack() as stack:
+        for module, name, seconds in ((asker_module, "LOST_S", 0.01), (stop_asking, "NOBODY_S", nobody_s)):
+            stack.enter_context(patch.object(module, name, seconds))
+            stack.enter_context(patch.object(module, "AGAIN_S", 0.0))
         return asyncio.run(main())
 
 
@@ -104,6 +110,7 @@ def write(asker: FleetCommands) -> Awaitable[CommandAnswer]:
 
 
 NOBODY, LOST, CUT = NobodyThere("nobody"), Unsure("no answer"), NotDelivered("no connection")
+NO_RIGHT = MayNotSend("no right")
 ANY = FleetError("no right")  # which does not say that nobody was asked
 UNDER_WAY, TAKEN_BACK, IT_IS_DONE = answer("under way"), answer("not sent"), answer("done")
 
@@ -162,6 +169,11 @@ STOPS: dict[str, tuple[ScriptedPath, CommandOutcome, str]] = {
         NOT_SENT,
         "the stop of pump-1 was NOT sent: no gateway is master of line hall-1; use the hard-wired stop",
     ),
+    "no right": (
+        ScriptedPath(stop=[NO_RIGHT, IT_IS_DONE]),
+        NOT_SENT,
+        "the stop of pump-1 was NOT sent: no right; use the hard-wired stop",
+    ),
     "no server": (
         ScriptedPath(stop=[CUT]),
         NOT_SENT,
@@ -204,6 +216,18 @@ def test_what_is_known_of_a_stop_meanwhile_is_told_once(tmp_path: Path) -> None:
         (CommandOutcome.UNDER_WAY, "still turning"),
     ]
     assert last.outcome is DONE
+
+
+def test_that_a_line_has_no_master_yet_is_told_once_and_at_once(tmp_path: Path) -> None:
+    told: list[CommandAnswer] = []
+    path = ScriptedPath(stop=[NOBODY, NOBODY, CUT, IT_IS_DONE])
+    last = asked(tmp_path, path, lambda asker: asker.stop(["pump-1"], on_news=told.append), nobody_s=60.0)
+    assert last.outcome is DONE
+    yet = "the stop of pump-1 was NOT sent yet: {}; use the hard-wired stop"
+    assert [news.text for news in told] == [
+        yet.format("no gateway is master of line hall-1"),
+        yet.format("no connection"),
+    ]
 
 
 def test_who_hears_no_more_of_a_stop_is_told_what_was_heard_last(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import os
 import re
 import signal
@@ -12,7 +13,7 @@ from pathlib import Path
 
 import pytest
 from commands import MULTIDROP, Run
-from lines import until
+from lines import PATIENCE, until
 from peers import require_module
 from tables import table
 from terminals import on_terminal
@@ -20,7 +21,11 @@ from terminals import on_terminal
 require_module("nats")
 require_module("pyarrow")
 
+import pyarrow as pa  # noqa: E402
+import pyarrow.parquet as pq  # noqa: E402
+
 from multidrop.cli.fleet.demo import nats_nodes  # noqa: E402
+from multidrop.cli.fleet.demo.command import Stage  # noqa: E402
 from multidrop.cli.fleet.demo.judgement import (  # noqa: E402
     Answers,
     Judgement,
@@ -28,11 +33,21 @@ from multidrop.cli.fleet.demo.judgement import (  # noqa: E402
     Kill,
     StoredSource,
     judge_drive,
+    read_rows,
     silence_s,
 )
-from multidrop.cli.fleet.demo.numbered_lines import NUMBERED, NumberedDrive, plant_file  # noqa: E402
+from multidrop.cli.fleet.demo.numbered_lines import (  # noqa: E402
+    NUMBERED,
+    PORT,
+    NumberedDrive,
+    plant_file,
+)
+from multidrop.core import STATUSES, UNASKED  # noqa: E402
 from multidrop.drives import InnovertIBD  # noqa: E402
 from multidrop.plant.loader import load_plant  # noqa: E402
+from multidrop.poller import Poller  # noqa: E402
+from multidrop.polling.batch import Row  # noqa: E402
+from multidrop.sim import Simulator, Wire  # noqa: E402
 
 KILL = Kill(frozenset({"drive"}), 300, 310)
 
@@ -64,6 +79,74 @@ def test_what_became_of_the_answers(
     found: list[KeptRow], answered: int, kill: Kill | None, expected: Answers
 ) -> None:
     assert judge_drive(found, answered, kill) == expected
+
+
+def test_a_value_that_was_not_asked_for_explains_no_missing_answer(tmp_path: Path) -> None:
+    statuses = [status for status in STATUSES if status]
+    (tmp_path / "rows").mkdir()
+    columns = {
+        "time": pa.array(range(len(statuses)), pa.timestamp("ns", "UTC")),
+        "drive": ["pump"] * len(statuses),
+        "register": [NUMBERED] * len(statuses),
+        "value": [1.0 if status == "ok" else None for status in statuses],
+        "status": statuses,
+    }
+    pq.write_table(pa.table(columns), tmp_path / "rows" / "1.parquet")
+    asked = [status for status in statuses if not status.startswith(UNASKED)]
+    assert "no reply" in asked
+    assert "not asked: drive is silent" not in asked
+    assert len(read_rows(tmp_path)["pump"]) == len(asked)
+
+
+def test_late_answers_are_late_and_none_of_them_is_missing(tmp_path: Path) -> None:
+    """Answers come late by more than the time-out, twice, beside another drive whose answers do not."""
+    drives = [NumberedDrive(InnovertIBD(address=at, name=f"line-drive-{at}")) for at in (1, 2)]
+    usual = drives[0].response_delay
+    path = tmp_path / "plant.toml"
+    found: list[tuple[str, KeptRow]] = []
+    with Simulator([Wire(drives, name="line", port=PORT)]) as simulator:
+        path.write_text(plant_file({"line": simulator.wires[0].path}))
+        with Poller(load_plant(path)) as poller:
+            poller.on_batch(lambda batch: found.extend((row.drive, kept(row)) for row in batch if asked(row)))
+            for delay in (usual, 0.45, usual, 0.9, usual):
+                drives[0].response_delay = delay
+                begun = drives[0].answers
+                until(lambda: drives[0].answers >= begun + 3)  # noqa: B023
+    judged = [
+        judge_drive([row for name, row in found if name == drive.drive.name], drive.answers, None)
+        for drive in drives
+    ]
+    assert [(one.lost, one.doubled) for one in judged] == [(0, 0), (0, 0)]
+    assert judged[0].late > 0
+
+
+def asked(row: Row) -> bool:
+    return not row.status.startswith(UNASKED)
+
+
+def kept(row: Row) -> KeptRow:
+    return KeptRow(row.time, None if row.value is None else round(row.value))
+
+
+def test_the_fleet_is_calm_once_no_line_has_moved_between_two_looks() -> None:
+    async def play() -> None:
+        stage = Stage()
+
+        async def look(master: str) -> None:
+            for _ in range(10):
+                await asyncio.sleep(0)
+            stage.show({"gateways": {}, "lines": {"line-1": {"master": master}}})
+            for _ in range(10):
+                await asyncio.sleep(0)
+
+        await look("gw-1")
+        waiting = asyncio.create_task(stage.calm(0))
+        await look("gw-2")
+        assert not waiting.done()
+        await look("gw-2")
+        await asyncio.wait_for(waiting, PATIENCE)
+
+    asyncio.run(play())
 
 
 def test_a_silence_is_measured_from_the_last_kept_to_the_next() -> None:

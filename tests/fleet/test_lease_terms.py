@@ -12,7 +12,7 @@ from peers import require_module
 
 require_module("nats")
 
-from multidrop.fleet import lease_terms, names  # noqa: E402
+from multidrop.fleet import leaders, lease_terms, names  # noqa: E402
 from multidrop.fleet.errors import Unsure  # noqa: E402
 from multidrop.fleet.lease_terms import EVERY_S, FOR_S, LeaseTerms  # noqa: E402
 
@@ -32,7 +32,8 @@ class Servers:
         self.under_way = 0
         self.now = 0.0
         self.found = LeaseTerms(lambda: self.now)
-        monkeypatch.setattr(lease_terms, "ask", self.ask)
+        for module in (leaders, lease_terms):
+            monkeypatch.setattr(module, "ask", self.ask)
 
     async def ask(self, path: Any, subject: str, data: Mapping[str, Any] | None = None) -> dict[str, Any]:
         bucket = subject.rpartition("KV_")[2]

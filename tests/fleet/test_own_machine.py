@@ -13,8 +13,9 @@ from peers import require_module
 require_module("nats")
 
 from multidrop.fleet import names, own_machine  # noqa: E402
+from multidrop.fleet.cluster import cluster_of  # noqa: E402
 from multidrop.fleet.errors import Unsure  # noqa: E402
-from multidrop.fleet.leaders import home_of, owners_led_by  # noqa: E402
+from multidrop.fleet.leaders import owners_led_by  # noqa: E402
 from multidrop.fleet.own_machine import OwnMachine  # noqa: E402
 from multidrop.fleet.servers import ServerPath, paths_of  # noqa: E402
 
@@ -68,8 +69,9 @@ def test_what_could_not_be_asked_is_asked_again(monkeypatch: pytest.MonkeyPatch)
 
 
 def test_homes_are_those_to_which_leaders_are_brought() -> None:
-    cluster = {"leader": "n3", "replicas": [{"name": "n2"}, {"name": "n1"}]}
-    assert [home_of(place, cluster) for place in range(3)] == ["n1", "n2", "n3"]
+    cluster = cluster_of({"cluster": {"leader": "n3", "replicas": [{"name": "n2"}, {"name": "n1"}]}})
+    assert cluster is not None
+    assert [cluster.home_of(place) for place in range(3)] == ["n1", "n2", "n3"]
 
 
 async def led_by(server: str, path: ServerPath) -> tuple[str, ...]:

@@ -15,7 +15,7 @@ from multidrop.fleet.drive_commands import answers_of_stops, stop_drive
 Stop = Callable[[InnovertIBD], dict[str, CommandAnswer]]
 WAYS: dict[str, Stop] = {
     "the line": lambda drive: answers_of_stops(drive.bus.stop_all()),
-    "the drive": stop_drive,
+    "the drive": lambda drive: stop_drive(drive, None),
 }
 
 

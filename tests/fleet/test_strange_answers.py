@@ -12,10 +12,13 @@ from peers import require_module
 
 require_module("nats")
 
-from multidrop.fleet import samples_stream  # noqa: E402
+from multidrop.fleet import names, samples_stream  # noqa: E402
 from multidrop.fleet.buckets import Bucket, Record, ask  # noqa: E402
 from multidrop.fleet.errors import FleetError, Unsure  # noqa: E402
+from multidrop.fleet.leaders import bring_leaders_home, has_leader, owners_led_by  # noqa: E402
+from multidrop.fleet.lease_terms import LeaseTerms  # noqa: E402
 from multidrop.fleet.samples_stream import StreamError  # noqa: E402
+from multidrop.fleet.setup import check_buckets  # noqa: E402
 
 STRANGE = {
     "nothing": b"",
@@ -38,19 +41,42 @@ PARTS = {
     "data of another kind": b'{"message": {"subject": "$KV.own_0.a", "seq": 1, "data": 5, "hdrs": 5}}',
     "a sequence that is none": b'{"message": {"subject": "$KV.own_0.a", "seq": "x"}, "config": 5}',
 }
+CLUSTERS = {
+    "a text": b'{"cluster": "n1"}',
+    "a list": b'{"cluster": [1]}',
+    "null": b'{"cluster": null}',
+    "a leader that is a number": b'{"cluster": {"leader": 5}}',
+    "a leader that is a table": b'{"cluster": {"leader": {"name": "n1"}}}',
+    "replicas that are a table": b'{"cluster": {"leader": "n1", "replicas": {"name": "n2"}}}',
+    "replicas that are texts": b'{"cluster": {"leader": "n1", "replicas": ["n2", "n3"]}}',
+    "a replica without a name": b'{"cluster": {"leader": "n1", "replicas": [{"current": true}]}}',
+    "a name that is a list": b'{"cluster": {"leader": "n1", "replicas": [{"name": [1]}]}}',
+    "a text for true": b'{"cluster": {"leader": "n1", "replicas": [{"name": "n2", "current": "yes"}]}}',
+    "a text for a time": b'{"cluster": {"leader": "n1", "replicas": [{"name": "n2", "active": "1"}]}}',
+    "a list for a time": b'{"cluster": {"leader": "n1", "replicas": [{"name": "n2", "active": [1]}]}}',
+}
+TIMES = {
+    "none": b"{}",
+    "a number": b'{"ts": 5}',
+    "a text that is none": b'{"ts": "now"}',
+    "the year one": b'{"ts": "0001-01-01T00:00:00"}',
+}
 
 
 class Liar:
     """A path, or a connection, whose every request has this answer."""
 
     url = "nats://liar"
+    server_name = "liar"
     is_connected = True
     last_error = None
 
     def __init__(self, answer: bytes) -> None:
         self.answer = answer
+        self.asked: list[str] = []
 
-    async def request(self, *_: Any, **__: Any) -> Any:
+    async def request(self, subject: str, *_: Any, **__: Any) -> Any:
+        self.asked.append(subject)
         return SimpleNamespace(data=self.answer)
 
     async def request_all(self, requests: Sequence[Any]) -> list[bytes]:
@@ -91,3 +117,24 @@ def test_a_stream_of_samples_that_answers_nonsense_is_tried_again(name: str) -> 
         asyncio.run(samples_stream.last_of(client, "samples.gw.log"))
     with pytest.raises(StreamError, match="NATS answers something else than "):
         asyncio.run(samples_stream.publish(client, "samples.gw.log", b"", {}))
+
+
+@pytest.mark.parametrize("name", CLUSTERS)
+def test_a_bucket_s_servers_that_are_none_are_one_sentence_and_nothing_is_moved(name: str) -> None:
+    """A gateway looks at them in its tasks, of which none may end."""
+    path: Any = Liar(CLUSTERS[name])
+    with pytest.raises(Unsure, match="what NATS answers of a bucket's servers is none of JetStream's: "):
+        asyncio.run(owners_led_by({"n1"}, path))
+    with pytest.raises(FleetError, match="what NATS answers of a bucket's servers is none of JetStream's: "):
+        asyncio.run(check_buckets(path))
+    assert not asyncio.run(has_leader(path, names.OWNERS[0]))
+    assert asyncio.run(bring_leaders_home(path)) == 0
+    asyncio.run(LeaseTerms().keep_ahead(path))
+    assert {subject.split(".KV_")[0] for subject in path.asked} == {"$JS.API.STREAM.INFO"}
+
+
+@pytest.mark.parametrize("name", TIMES)
+def test_a_server_s_time_that_is_none_is_one_sentence(name: str) -> None:
+    path: Any = Liar(TIMES[name])
+    with pytest.raises(Unsure, match="what nats://liar answers of a bucket has no time"):
+        asyncio.run(check_buckets(path))

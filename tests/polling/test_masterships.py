@@ -12,6 +12,8 @@ import tty
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from itertools import pairwise
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 from examples import usually
@@ -19,11 +21,15 @@ from lines import HOST_LATE, PATIENCE, line, plant, polled, rows_of, until
 from toy import Toy
 
 from multidrop import Mastership, NoSuchPort, NotMaster
+from multidrop.core import RowQueue
 from multidrop.plant.loader import PlantError
 from multidrop.plant.model import PlantLine, PolledDrive
 from multidrop.poller import Poller
+from multidrop.polling import line_set
 from multidrop.polling.batch import Row
+from multidrop.polling.polled_line import PolledLine
 from multidrop.sim import SimulatedDrive, Simulator, Wire, simulated
+from multidrop.transport import clock
 
 if sys.platform != "linux":
     pytest.skip("masterships are Linux's", allow_module_level=True)
@@ -364,3 +370,58 @@ def test_many_ports_are_opened_side_by_side_and_closed_at_once(mastership: Maste
             assert len(poller.buses) == 64
             begun = time.monotonic()
         assert time.monotonic() - begun < 15
+
+
+def test_a_line_is_removed_while_another_s_request_under_way_is_waited_for(
+    mastership: Mastership, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A gateway that loses its lease has half a second for all of its lines."""
+    end, asked, is_answered = PolledLine.end, threading.Event(), threading.Event()
+
+    def waited_for(ending: PolledLine) -> bool:
+        if ending.name == "yard":
+            asked.set()
+        return end(ending) or (ending.name == "yard" and not is_answered.is_set())
+
+    monkeypatch.setattr(PolledLine, "end", waited_for)
+    monkeypatch.setattr(line_set, "ENDING_NS", 1000 * S)
+    hold(mastership)
+    with lines(0.02) as (_, both), Poller(plant(*both), mastership=mastership) as poller:
+        removing = [threading.Thread(target=poller.remove_line, args=[name]) for name in ("yard", "hall")]
+        removing[0].start()
+        assert asked.wait(PATIENCE)
+        try:
+            removing[1].start()
+            removing[1].join(PATIENCE)
+            assert list(poller.buses) == ["yard"]
+        finally:
+            is_answered.set()
+        removing[0].join(PATIENCE)
+        assert list(poller.buses) == []
+
+
+class Busy:
+    """A line with a request under way that is never answered."""
+
+    bus = SimpleNamespace(leave=lambda: None, part=lambda: None)
+
+    def leave(self) -> None:
+        """Be tended no more."""
+
+    def end(self) -> bool:
+        return True
+
+
+@pytest.mark.parametrize(("left_ns", "waited_ns"), [(0, S), (S // 5, S // 5), (-S, 0), (5 * S, S)])
+def test_a_request_under_way_is_waited_for_until_the_mastership_ends(
+    monkeypatch: pytest.MonkeyPatch, left_ns: int, waited_ns: int
+) -> None:
+    """It may have ended already, 0 here: then no timer runs. Half of a guard later the kernel kills."""
+    now = [1000 * S]
+    until_ns = now[0] + left_ns if left_ns else 0
+    monkeypatch.setattr(clock, "now_ns", lambda: now[0])
+    monkeypatch.setattr(clock, "boottime_ns", lambda: now[0])
+    monkeypatch.setattr(clock, "sleep", lambda seconds: now.__setitem__(0, now[0] + round(seconds * S)))
+    held: Any = SimpleNamespace(until_ns=until_ns)
+    line_set.LineSet(RowQueue(), None, None, held).wind_down([Busy()])  # type: ignore[list-item]
+    assert now[0] - 1000 * S == waited_ns

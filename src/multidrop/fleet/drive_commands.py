@@ -135,10 +135,10 @@ def answer_of(failure: Exception) -> CommandAnswer:
 # ---- stops ----
 
 
-def stop_drive(drive: Drive) -> dict[str, CommandAnswer]:
-    """Stop one drive; by its name, what is known of it. Never raises."""
+def stop_drive(drive: Drive, seconds: float | None) -> dict[str, CommandAnswer]:
+    """Stop one drive, for so many seconds or the usual ones; by its name, what is known. Never raises."""
     try:
-        drive.stop()
+        drive.stop(seconds=seconds)
     except DriveRefused as failure:  # each time that it was sent
         return {drive.name: CommandAnswer(CommandOutcome.FAILED, str(failure))}
     except Exception as failure:  # whatever it is: everybody must see it

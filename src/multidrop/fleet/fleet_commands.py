@@ -7,7 +7,7 @@ import difflib
 import json
 import logging
 import uuid
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Self
 
@@ -28,14 +28,13 @@ from multidrop.fleet.command_words import (
 from multidrop.fleet.errors import FleetError, NobodyThere, NotDelivered, Unsure
 from multidrop.fleet.servers import ServerPath, paths_of
 from multidrop.fleet.setup import open_all
+from multidrop.fleet.stop_asking import HARD_WIRED, News, first_answer
 from multidrop.fleet.task_end import end_tasks
 
 LOST_S = 6.0  # without any answer, after which what became of a command stays unknown
 AGAIN_S = 0.2
-HARD_WIRED = "use the hard-wired stop"
 
 _log = logging.getLogger("multidrop.fleet")
-News = Callable[[CommandAnswer], object]
 
 
 def _tell_nobody(answer: CommandAnswer) -> None:
@@ -218,36 +217,12 @@ class FleetCommands:
         what = f"the stop of {', '.join(drives) if drives else f'all drives of line {line}'}"
         record = {"id": request.id, "line": line, "what": what, "by": self.by}
         noting = asyncio.create_task(self._note_end(record, None))
-        answer = await self._first_of_stop(line, request, what)
+        answer = await first_answer(self._paths, line, request, what, on_news)
         lost = f"it is not known what became of {what}: its gateway gives no answer any more; {HARD_WIRED}"
         answer = await self._end_of(answer, names.stop_subject(line), encode(request), lost, on_news)
         await noting
         await self._note_end(record, answer)
         return answer
-
-    async def _first_of_stop(self, line: str, request: StopRequest, what: str) -> CommandAnswer:
-        """Ask on all paths at once, and return the first answer; no path waits for one that hangs.
-
-        Where each of them says that nobody was asked, that is certain.
-        """
-        subject, data = names.stop_subject(line), encode(request)
-        asking = [asyncio.create_task(path.request(subject, data)) for path in self._paths]
-        why, is_certain = "", True
-        try:
-            for asked in asyncio.as_completed(asking):
-                try:
-                    return read_answer((await asked).data)
-                except NobodyThere:
-                    why = f"no gateway is master of line {line}"
-                except NotDelivered as failure:
-                    why = why or str(failure)
-                except (FleetError, ValueError):
-                    is_certain = False
-        finally:
-            await end_tasks(*asking)
-        if is_certain:
-            return CommandAnswer(CommandOutcome.NOT_SENT, f"{what} was NOT sent: {why}; {HARD_WIRED}")
-        return CommandAnswer(CommandOutcome.UNDER_WAY, f"{what}: no gateway has answered yet; {HARD_WIRED}")
 
     # ---- the plant, and the log ----
 

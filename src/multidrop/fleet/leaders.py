@@ -2,35 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection
 from contextlib import suppress
-from typing import Any
 
 from multidrop.fleet import names
 from multidrop.fleet.buckets import ask
+from multidrop.fleet.cluster import Cluster, cluster_of
 from multidrop.fleet.errors import FleetError, Unsure
 from multidrop.fleet.servers import ServerPath
 
 
-def home_of(place: int, cluster: Mapping[str, Any]) -> str:
-    """Return the server that should lead the bucket at this place: they take turns, in order of name."""
-    servers = sorted([cluster.get("leader", ""), *(peer["name"] for peer in cluster.get("replicas", []))])
-    return str(servers[place % len(servers)])
-
-
-def is_ready(server: str, cluster: Mapping[str, Any]) -> bool:
-    """Say whether a follower could lead now."""
-    peers = {peer["name"]: peer for peer in cluster.get("replicas", [])}
-    return bool(server in peers and peers[server].get("current") and not peers[server].get("offline"))
+async def cluster_at(path: ServerPath, bucket: str) -> Cluster | None:
+    """Return the servers of a bucket, None for one server alone. Raises FleetError where none answers."""
+    return cluster_of(await ask(path, f"STREAM.INFO.KV_{bucket}"))
 
 
 async def has_leader(path: ServerPath, bucket: str) -> bool:
     """Say whether a bucket has a leader that answers: else no record of it can be written."""
     try:
-        info = await ask(path, f"STREAM.INFO.KV_{bucket}")
+        cluster = await cluster_at(path, bucket)
     except FleetError:
         return False
-    return "cluster" not in info or bool(info["cluster"].get("leader"))
+    return cluster is None or bool(cluster.leader)
 
 
 async def have_leaders(path: ServerPath) -> bool:
@@ -48,11 +41,10 @@ async def owners_led_by(servers: Collection[str], path: ServerPath) -> tuple[str
     """
     found = []
     for place, bucket in enumerate(names.OWNERS):
-        info = await ask(path, f"STREAM.INFO.KV_{bucket}")
-        cluster = info.get("cluster", {"leader": path.server_name})
-        if not cluster.get("leader"):
+        cluster = await cluster_at(path, bucket) or Cluster(path.server_name)
+        if not cluster.leader:
             raise Unsure(f"the bucket {bucket} has no leader")
-        if home_of(place, cluster) in servers:
+        if cluster.home_of(place) in servers:
             found.append(bucket)
     return tuple(found)
 
@@ -63,12 +55,11 @@ async def bring_leaders_home(path: ServerPath) -> int:
     for group in (names.LEASES, names.OWNERS):
         for place, bucket in enumerate(group):
             with suppress(FleetError):
-                info = await ask(path, f"STREAM.INFO.KV_{bucket}")
-                cluster = info.get("cluster") or {}
-                if not cluster.get("leader"):
+                cluster = await cluster_at(path, bucket)
+                if cluster is None or not cluster.leader:
                     continue
-                home = home_of(place, cluster)
-                if cluster["leader"] != home and is_ready(home, cluster):
+                home = cluster.home_of(place)
+                if home in cluster.ready:
                     wanted = {"placement": {"preferred": home}}
                     await ask(path, f"STREAM.LEADER.STEPDOWN.KV_{bucket}", wanted)
                     moved += 1

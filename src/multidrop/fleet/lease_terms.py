@@ -11,19 +11,18 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from contextlib import suppress
-from typing import Any
 
 from multidrop.fleet import names
 from multidrop.fleet.buckets import ask
+from multidrop.fleet.cluster import Cluster
 from multidrop.fleet.errors import FleetError
-from multidrop.fleet.leaders import is_ready
+from multidrop.fleet.leaders import cluster_at
 from multidrop.fleet.servers import ServerPath
 from multidrop.fleet.task_end import end_tasks
 
 EVERY_S = 3.0  # less than the shortest time between two requests for votes
-SILENT_NS = 2_000_000_000  # a follower answers its leader's heartbeat once a second
 FOR_S = 60.0  # a server that is silent for longer is not waited for
 DONE_S = 1.0  # it takes 0.03 to 0.3 s
 LOOK_S = 0.02
@@ -44,11 +43,9 @@ class LeaseTerms:
         try:
             for look in asyncio.as_completed(looks):
                 bucket, cluster = await look
-                peers = cluster.get("replicas", [])
-                ready = [peer["name"] for peer in peers if is_ready(peer["name"], cluster)]
-                found += bool(cluster.get("leader"))
-                if cluster.get("leader") and any(map(is_silent, peers)):
-                    has_silent = True
+                found += bool(cluster.leader)
+                if cluster.leader and any(follower.is_silent for follower in cluster.followers):
+                    has_silent, ready = True, cluster.ready
                     if ready and self._is_due(bucket) and not await _hand_over(path, bucket, ready[0]):
                         return
         finally:
@@ -66,16 +63,11 @@ class LeaseTerms:
         return True
 
 
-def is_silent(peer: Mapping[str, Any]) -> bool:
-    """Say whether a follower was not heard for long, or never; one that lags is heard."""
-    return not peer.get("current") and not 0 < peer.get("active", 0) < SILENT_NS
-
-
-async def _cluster(path: ServerPath, bucket: str) -> tuple[str, Mapping[str, Any]]:
+async def _cluster(path: ServerPath, bucket: str) -> tuple[str, Cluster]:
     """Return what is known of the servers of a bucket; nothing where none answers."""
     with suppress(FleetError):
-        return bucket, (await ask(path, f"STREAM.INFO.KV_{bucket}")).get("cluster") or {}
-    return bucket, {}
+        return bucket, await cluster_at(path, bucket) or Cluster()
+    return bucket, Cluster()
 
 
 async def _hand_over(path: ServerPath, bucket: str, server: str) -> bool:
@@ -85,7 +77,7 @@ async def _hand_over(path: ServerPath, bucket: str, server: str) -> bool:
         await ask(path, f"STREAM.LEADER.STEPDOWN.KV_{bucket}", wanted)
     with suppress(TimeoutError):
         async with asyncio.timeout(DONE_S):
-            while (await _cluster(path, bucket))[1].get("leader") != server:
+            while (await _cluster(path, bucket))[1].leader != server:
                 await asyncio.sleep(LOOK_S)
             return True
     return False

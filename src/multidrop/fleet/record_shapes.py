@@ -24,7 +24,8 @@ SHAPES: Mapping[str, Mapping[str, type]] = {
     names.PLANT: LINE,
 }
 SMALL, LARGE = 1 << 14, 1 << 20  # bytes of a record; a line's has the files of its families
-_KINDS = {int: "a whole number", float: "a number", str: "a text", bool: "true or false", dict: "a table"}
+_KINDS = {int: "a whole number", float: "a number", str: "a text", bool: "true or false"}
+_KINDS |= {dict: "a table", list: "a list"}
 
 
 def largest(bucket: str) -> int:

@@ -12,6 +12,7 @@ from typing import Any
 
 from multidrop.fleet import names
 from multidrop.fleet.buckets import NONE_YET, Bucket, ServerError, ask, bucket_settings
+from multidrop.fleet.cluster import Cluster, cluster_of
 from multidrop.fleet.errors import Conflict, FleetError, NobodyThere, NoRight, TooOld, Unsure
 from multidrop.fleet.leaders import bring_leaders_home
 from multidrop.fleet.lease_bucket import LeaseBucket
@@ -68,7 +69,7 @@ async def check_buckets(path: ServerPath) -> None:
             raise
         except FleetError as failure:
             raise no_quorum(path, failure) from None
-    check_clock(path, info["ts"])
+    check_clock(path, info.get("ts"))
 
 
 async def _led(path: ServerPath, bucket: str) -> dict[str, Any]:
@@ -76,16 +77,22 @@ async def _led(path: ServerPath, bucket: str) -> dict[str, Any]:
     ends = asyncio.get_running_loop().time() + LEADER_S
     while True:
         info = await ask(path, f"STREAM.INFO.KV_{bucket}")
-        if info.get("cluster", {"leader": path.server_name}).get("leader"):
+        if (cluster_of(info) or Cluster(path.server_name)).leader:
             return info
         if asyncio.get_running_loop().time() > ends:
             raise Unsure(f"the bucket {bucket} has no leader")
         await asyncio.sleep(0.1)
 
 
-def check_clock(path: ServerPath, server_time: str) -> None:
-    """Warn where this machine's clock and the server's are far apart: leases do not mind, samples do."""
-    apart = time.time() - datetime.fromisoformat(server_time).timestamp()
+def check_clock(path: ServerPath, server_time: Any) -> None:
+    """Warn where this machine's clock and the server's are far apart: leases do not mind, samples do.
+
+    Raises Unsure for what is no time.
+    """
+    try:
+        apart = time.time() - datetime.fromisoformat(server_time).timestamp()
+    except (TypeError, ValueError, OverflowError):
+        raise Unsure(f"what {path.url} answers of a bucket has no time") from None
     if abs(apart) > CLOCKS_APART_S:
         _log.warning(
             "this machine's clock is %.0f s %s that of %s: set it, for samples have its time",

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from functools import partial
 from typing import Any
 
@@ -19,13 +19,12 @@ from multidrop.fleet.command_words import CommandAnswer, CommandOutcome, StopReq
 from multidrop.fleet.drive_commands import answers_of_stops, stop_drive
 from multidrop.fleet.held_lines import HeldLine, HeldLines
 from multidrop.fleet.offers import Offers
-from multidrop.fleet.own_thread import in_own_thread
+from multidrop.fleet.own_thread import Answers, StopWork, begin_stops
 
 REMEMBERED = 1000  # stops, of which the oldest are forgotten
 CALLED = "a stop was called"
 
 _log = logging.getLogger("multidrop.fleet")
-Answers = dict[str, CommandAnswer]
 
 
 class StopDesk:
@@ -44,7 +43,8 @@ class StopDesk:
 
         A copy of the message gets the answer of the same stop; another message is another stop. The answer
         to one that is not over soon is "under way", with what is known of it so far; the asker asks again.
-        Where we lost the line meanwhile we keep silent too: its next master may have had a copy, and stops.
+        Where we lost the line meanwhile, or let it go, we keep silent too, unless the motors stand: its next
+        master may have had a copy, and stops, or is asked next.
         """
         held = self._lines.for_stop(line)
         if held is None:
@@ -63,7 +63,8 @@ class StopDesk:
         if not task.done():
             return self._so_far(held, request)
         answer = task.result()
-        return answer if answer.is_done or self._lines.for_stop(line) is held else None
+        is_ours = self._lines.for_stop(line) is held and not held.is_leaving
+        return answer if answer.is_done or is_ours else None
 
     def _so_far(self, held: HeldLine, request: StopRequest) -> CommandAnswer:
         names = held.drives if request.drives is None else request.drives
@@ -76,13 +77,12 @@ class StopDesk:
         return CommandAnswer(CommandOutcome.UNDER_WAY, text, self.gateway, drives=drives)
 
     async def _stop(self, held: HeldLine, request: StopRequest) -> CommandAnswer:
-        """Begin the stops of all drives side by side, each in a thread of its own."""
+        """Begin the stops of all drives side by side."""
         self._offers.void(held.name, request.drives, CALLED)
         drives = held.drives
         names = list(drives) if request.drives is None else list(dict.fromkeys(request.drives))
-        waited = [
-            in_own_thread(partial(_stopped_by, request.by, work)) for work in _works(held.bus, drives, names)
-        ]
+        works = _works(held.bus, drives, names)
+        waited = begin_stops([partial(_stopped_by, request.by, work) for work in works])
         _log.warning("stop of %s, asked for by %s", ", ".join(names), request.by)
         record = {"id": request.id, "line": held.name, "what": "stop", "drives": names, "by": request.by}
         self._note({"step": "begun", **record, "gateway": self.gateway})
@@ -109,21 +109,21 @@ class StopDesk:
             _log.warning("a stop is not in the log of commands: %s", failure)
 
 
-def _works(bus: Bus, drives: Mapping[str, Any], names: list[str]) -> list[Callable[[], Answers]]:
+def _works(bus: Bus, drives: Mapping[str, Any], names: list[str]) -> list[StopWork]:
     """Return what stops them: the line as a whole where all of its drives are meant."""
     if drives and drives.keys() <= set(names):
         return [partial(_stop_line, bus)]
     return [partial(stop_drive, drives[name]) for name in names if name in drives]
 
 
-def _stopped_by(by: str, work: Callable[[], Answers]) -> Answers:
+def _stopped_by(by: str, work: StopWork, seconds: float | None) -> Answers:
     with written_by(by, WAY):
-        return work()
+        return work(seconds)
 
 
-def _stop_line(bus: Bus) -> Answers:
+def _stop_line(bus: Bus, seconds: float | None) -> Answers:
     try:
-        return answers_of_stops(bus.stop_all())
+        return answers_of_stops(bus.stop_all(seconds=seconds))
     except Exception as failure:  # whatever it is: everybody must see it
         text = f"it is not known whether the stop was sent: {type(failure).__name__}: {failure}"
         return {drive.name: CommandAnswer(CommandOutcome.UNKNOWN, text) for drive in bus.drives}

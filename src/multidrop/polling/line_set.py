@@ -166,20 +166,29 @@ class LineSet:
             self._free.append(line.number)
 
     def end(self, lines: Iterable[PolledLine], why: str) -> None:
-        """End what is under way on these lines and close their ports.
-
-        Drives whose bus had `stop_on_exit` are stopped first, and stops under way are waited for; exchanges
-        under way for ENDING_NS. What waits for the port then fails with LineError, and says `why`.
-        """
+        """End what is under way on these lines and close their ports; what waits for one is told `why`."""
         going = list(lines)
-        for line in going:
-            line.bus.leave()  # all of them at once
-        for line in going:
-            line.leave()
-        for line in going:
-            line.bus.part()  # before the port is closed, on which it stops motors
-        given_up_ns = clock.now_ns() + ENDING_NS
-        while sum(line.end() for line in going) and clock.now_ns() < given_up_ns:
-            clock.sleep(0.001)
+        self.wind_down(going)
         for line in going:
             line.close(why)
+
+    def wind_down(self, lines: Sequence[PolledLine]) -> None:
+        """Begin nothing more on these lines, and wait for what is under way; it may take a second.
+
+        Drives whose bus had `stop_on_exit` are stopped first, and stops under way are waited for; exchanges
+        under way for ENDING_NS, and not beyond the end of the mastership: half of its guard later the kernel
+        ends a process whose ports are still open.
+        """
+        for line in lines:
+            line.bus.leave()  # all of them at once
+        for line in lines:
+            line.leave()
+        for line in lines:
+            line.bus.part()  # before the port is closed, on which it stops motors
+        given_up_ns = clock.now_ns() + self._patience_ns()
+        while sum(line.end() for line in lines) and clock.now_ns() < given_up_ns:
+            clock.sleep(0.001)
+
+    def _patience_ns(self) -> int:
+        until_ns = self._mastership.until_ns if self._mastership else 0
+        return min(ENDING_NS, max(0, until_ns - clock.boottime_ns())) if until_ns else ENDING_NS

@@ -112,7 +112,7 @@ async def _command(arguments: argparse.Namespace) -> int:
 async def _stop(arguments: argparse.Namespace) -> int:
     drives = arguments.drives
     from multidrop.fleet.errors import FleetError
-    from multidrop.fleet.fleet_commands import HARD_WIRED
+    from multidrop.fleet.stop_asking import HARD_WIRED
 
     if bool(drives) == arguments.all:
         raise ValueError("stop takes either drives or --all: `multidrop fleet stop pump-1`")

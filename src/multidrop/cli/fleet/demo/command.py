@@ -73,6 +73,15 @@ class Stage:
         except TimeoutError:
             raise OSError(f"{what} not within {PATIENCE_S:.0f} s: the demo has failed") from None
 
+    async def calm(self, seconds: float) -> None:
+        """Wait until no line has had another master for so long: what is shown may be older than it is."""
+        before: dict[str, str | None] | None = None
+        while (found := self.masters()) != before:
+            before = found
+            await asyncio.sleep(seconds)
+            self.looked.clear()
+            await self.until(self.looked.is_set, "the fleet was looked at")
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     pass
@@ -173,8 +182,8 @@ class Demo:
     async def _story(self) -> Kill:
         stage = self._stage
         await stage.until(lambda: self._are_all(GATEWAYS), "all lines had masters")
+        await stage.calm(RUN_S)
         stage.note(f"every line has a master: {stage.shares()}")
-        await asyncio.sleep(RUN_S)
         kill = self._kill()
         survivors = [name for name in GATEWAYS if name != KILLED]
         await stage.until(lambda: self._are_all(survivors), f"the lines of {KILLED} were taken over")

@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from multidrop.cli.fleet.demo.numbered_lines import NUMBERED
+from multidrop.core import UNASKED
 
-NOT_SENT = "not sent"  # statuses of requests that no drive has seen begin so
 _MESSAGE = re.compile(r"(\d+)-(\d+)\.arrows")
 
 
@@ -85,7 +85,7 @@ def silence_s(rows: Iterable[KeptRow], kill: Kill) -> float:
 
 
 def read_rows(parquet: Path) -> dict[str, list[KeptRow]]:
-    """Return the rows of a hub's files by drive, but for those of requests that were not sent."""
+    """Return the rows of a hub's files by drive, but for those of values that no drive was asked for."""
     import pyarrow.parquet as pq
 
     found: dict[str, list[KeptRow]] = {}
@@ -95,7 +95,7 @@ def read_rows(parquet: Path) -> dict[str, list[KeptRow]]:
         times = table.column("time").cast("int64").to_pylist()
         others = (table.column(name).to_pylist() for name in columns[1:])
         for at, drive, register, value, status in zip(times, *others, strict=True):
-            if register == NUMBERED and not status.startswith(NOT_SENT):
+            if register == NUMBERED and not status.startswith(UNASKED):
                 found.setdefault(drive, []).append(KeptRow(at, None if value is None else round(value)))
     return found
 

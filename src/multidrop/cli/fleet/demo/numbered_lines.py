@@ -1,5 +1,9 @@
 """Simulated lines whose drives number their answers, so that each can be found again in the hub's files.
 
+They speak Modbus TCP, whose replies name their requests. So each request that left has one row, with its own
+answer's number or none, however late it came. On other lines a value may be the late answer to the request
+before, and a request that only proves whose a reply is has no row.
+
 Run as a module it simulates until it is terminated, and then prints how many answers each drive gave.
 """
 
@@ -16,6 +20,7 @@ from multidrop.sim.memory import MemoryCell
 NUMBERED = "motor_speed"  # has no scale: its value is the very count
 DRIVES = 2  # of each line
 EVERY = "100 ms"
+PORT = "tcp://127.0.0.1:0"
 
 
 class NumberedDrive(SimulatedDrive):
@@ -60,7 +65,7 @@ def simulate(number: int) -> None:
     def announce(simulator: Simulator) -> None:
         print_text(json.dumps({wire.name: wire.path for wire in simulator.wires}), flush=True)
 
-    serve([Wire(found, name=line, port="socket://127.0.0.1:0") for line, found in drives.items()], announce)
+    serve([Wire(found, name=line, port=PORT) for line, found in drives.items()], announce)
     counts = {sim.drive.name: sim.answers for found in drives.values() for sim in found}
     print_text(json.dumps(counts), flush=True)
 
