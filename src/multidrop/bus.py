@@ -325,6 +325,11 @@ class Bus:
         check_drive(drive)
         self._performer.check_identity(drive)
 
+    def knows_identity(self, drive: Drive) -> bool:
+        """Return True where `check_identity` would read nothing: the drive was of its family on this port."""
+        check_drive(drive)
+        return self._writer.identity_check.is_known(drive)
+
     def watchdog(self, drive: Drive) -> str:
         """Say what the motor does when this client dies, as far as the drive can tell."""
         check_drive(drive)

@@ -27,7 +27,8 @@ from multidrop.transport import clock
 from multidrop.transport.statistics import LineStatistics
 
 LOOK_NS = 50_000_000  # between looks at the lines, while one of them or a reader of `fileno` needs them
-REST_NS = 500_000_000  # the same, where neither does
+BUSY_NS = 100_000_000  # the same, where they only have to be kept busy: a third of what is queued ahead
+REST_NS = 500_000_000  # the same, where nothing is to be done
 
 
 class Poller(RowSource):
@@ -126,7 +127,8 @@ class Poller(RowSource):
             if now >= look_ns:
                 restless = [line for line in self._lines if not line.is_steady(now)]
                 called = list(dict.fromkeys([*restless, *called]))
-                look_ns = now + (LOOK_NS if restless or self._is_watched else REST_NS)
+                needs_looks = self._is_watched or not all(line.is_well(now) for line in restless)
+                look_ns = now + (LOOK_NS if needs_looks else BUSY_NS if restless else REST_NS)
             for line in called:
                 line.tend(clock.now_ns())
             if self._is_watched and self._row_queue.chunks:

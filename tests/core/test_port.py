@@ -1,15 +1,21 @@
-"""Serial settings on a descriptor. A pty takes any baud rate, and stays 8 bits without parity."""
+"""Serial settings on a descriptor, and the thread that drives all ports.
+
+A pty takes any baud rate, and stays 8 bits without parity.
+"""
 
 from __future__ import annotations
 
 import errno
 import os
 import termios
+import threading
 from collections.abc import Iterator
+from types import SimpleNamespace
 
 import pytest
 
 from multidrop.core import REFUSALS, get_settings, set_settings
+from multidrop.core import port as port_module
 
 
 @pytest.fixture
@@ -102,3 +108,26 @@ def test_what_has_no_settings_says_so() -> None:
     with pytest.raises(OSError, match="no serial settings") as failed:
         set_settings(writer, 9600, "8N1")
     assert failed.value.errno == errno.EBADF
+
+
+def test_ports_that_are_opened_beside_each_other_have_one_thread(monkeypatch: pytest.MonkeyPatch) -> None:
+    """While it is started for one of them the others wait: the core would run lines on several threads."""
+    started: list[str] = []
+    is_second = threading.Event()
+
+    def start() -> str:
+        started.append(f"engine {len(started)}")
+        if len(started) > 1:
+            is_second.set()
+        is_second.wait(0.5)  # where nothing keeps the others from starting it, one does so at once
+        return started[0]
+
+    monkeypatch.setattr(port_module, "lib", SimpleNamespace(md_engine_start=start))
+    engine, found = port_module._Engine(), list[str]()
+    threads = [threading.Thread(target=lambda: found.append(engine.c)) for _ in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert started == ["engine 0"]
+    assert found == ["engine 0"] * 4

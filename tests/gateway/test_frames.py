@@ -5,15 +5,20 @@ from __future__ import annotations
 import asyncio
 import gzip
 import json
+from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 from clocks import Clock
+from gateways import written
 from hypothesis import given
 from hypothesis import strategies as st
 
 from multidrop.gateway import frames as module
 from multidrop.gateway.frames import REMEMBERED, WHOLE, Encoded, Frames, changes
+from multidrop.gateway.gateway import Gateway
+from multidrop.gateway.settings import ServeSettings
 
 
 @pytest.fixture
@@ -227,3 +232,25 @@ def test_a_viewer_waits_and_is_let_go(frames: Frames, monkeypatch: pytest.Monkey
         assert await frames.after(first.n) is None
 
     asyncio.run(watch())
+
+
+def test_a_frame_is_made_of_what_was_just_looked_at(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The drives are gone through once in 0.2 s, for alarms and for the frame: of rows from just before."""
+    gateway = Gateway(written(tmp_path), ServeSettings(port=0))
+    gateway.listener.close()
+    done: list[str] = []
+    monkeypatch.setattr(gateway, "_look_for_events", lambda: done.append("alarms"))
+    monkeypatch.setattr(gateway.frames, "note_news", lambda: done.append("frame"))
+    monkeypatch.setattr(gateway.hub, "take", lambda batch: None)
+    for now, batches, expected in (
+        (10.0, ["rows"], ["alarms", "frame"]),
+        (10.1, ["rows"], []),
+        (10.21, [], ["alarms", "frame"]),
+        (10.31, [], []),
+        (10.42, [], ["alarms"]),
+    ):
+        monkeypatch.setattr(gateway, "clock", lambda now=now: now)
+        poller: Any = SimpleNamespace(take=lambda batches=batches: batches.pop() if batches else None)
+        gateway.hand_out(poller)
+        assert done == expected, now
+        done.clear()

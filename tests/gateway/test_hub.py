@@ -46,9 +46,14 @@ def all_of(at: int, status: int, frequency: int = 0, fault: int = 0) -> Batch:
     return rows((at, STATUS, status), (at, FREQUENCY, frequency), (at, CURRENT, 0), (at, FAULT, fault))
 
 
+def is_fresh(hub: Hub) -> bool:
+    """Return True where the frequency of the first pump is that of now, though a miss came after it."""
+    return next(fresh for name, _, _, fresh in hub.known("pump-1") if name == "output_frequency")
+
+
 def test_nothing_is_known_before_it_was_asked(hub: Hub) -> None:
     assert hub.newest("pump-1", "status") is None
-    assert {known.good for known in hub.known("pump-1")} == {None}
+    assert {good for _, _, good, _ in hub.known("pump-1")} == {None}
     assert hub.state("pump-1") == "unknown"
     assert hub.seen_at("pump-1") is None
     assert hub.newest("pump-9", "status") is None
@@ -58,10 +63,10 @@ def test_nothing_is_known_before_it_was_asked(hub: Hub) -> None:
 def test_a_miss_is_newest_and_the_value_before_it_is_the_last_good_one(hub: Hub) -> None:
     hub.take(rows((10, FREQUENCY, 25), (11, FREQUENCY, Status.NO_REPLY)))
     sent, missed = 10 * PERIOD, 11 * PERIOD
-    good = next(known.good for known in hub.known("pump-1") if known.register == "output_frequency")
+    good = next(good for name, _, good, _ in hub.known("pump-1") if name == "output_frequency")
     assert good == (UTC_0 + sent, sent, 25.0, 0)
     assert hub.newest("pump-1", "output_frequency") == Newest(UTC_0 + missed, missed, None, "no reply")
-    assert hub.is_fresh("pump-1", "output_frequency")
+    assert is_fresh(hub)
 
 
 @pytest.mark.parametrize(
@@ -118,9 +123,9 @@ def test_a_line_is_lost_where_all_its_newest_rows_say_so(hub: Hub) -> None:
 def test_values_grow_old_where_no_row_comes(hub: Hub) -> None:
     hub.take(all_of(10, FORWARD, 25))
     hub.pass_time(10 * PERIOD + SECOND)
-    assert hub.is_fresh("pump-1", "output_frequency")
+    assert is_fresh(hub)
     hub.pass_time(10 * PERIOD + SECOND + 1)
-    assert not hub.is_fresh("pump-1", "output_frequency")
+    assert not is_fresh(hub)
     assert hub.state("pump-1") == "unknown"
 
 
@@ -131,21 +136,21 @@ def test_what_was_read_before_the_machine_slept_is_not_fresh(tmp_path: Path) -> 
     hub.take(all_of(10, FORWARD, 25))
     assert hub.state("pump-1") == "runs"
     clock[:] = [11 * PERIOD + 1, 8 * 3600 * SECOND]  # no row, and no look at the time, came in between
-    assert not hub.is_fresh("pump-1", "output_frequency")
+    assert not is_fresh(hub)
     assert hub.seen("pump-1") == Shown("unknown", NOT_ASKED)
-    assert not any(known.is_fresh for known in hub.known("pump-1"))
+    assert not any(fresh for *_, fresh in hub.known("pump-1"))
     hub.take(all_of(11, FORWARD, 25))  # just before it slept, and not taken until now
-    assert not hub.is_fresh("pump-1", "output_frequency")
+    assert not is_fresh(hub)
     clock[0] = 12 * PERIOD
     hub.take(all_of(12, FORWARD, 25))
-    assert hub.is_fresh("pump-1", "output_frequency")
+    assert is_fresh(hub)
     assert hub.state("pump-1") == "runs"
 
 
 def test_a_machine_that_slept_before_it_began_is_awake(tmp_path: Path) -> None:
     hub = Hub(written(tmp_path), lambda: (20 * PERIOD, 8 * 3600 * SECOND))
     hub.take(all_of(19, FORWARD, 25))
-    assert hub.is_fresh("pump-1", "output_frequency")
+    assert is_fresh(hub)
     assert hub.woke_ns() == 0
 
 
@@ -154,13 +159,13 @@ def test_two_clocks_that_are_not_read_at_once_are_no_sleep(tmp_path: Path) -> No
     hub = Hub(written(tmp_path), lambda: (20 * PERIOD, slept[0]))
     hub.take(all_of(19, FORWARD, 25))
     for slept[0] in (-SECOND, 0, -PERIOD, LEAST_SLEEP_NS):
-        assert hub.is_fresh("pump-1", "output_frequency")
+        assert is_fresh(hub)
 
 
 def test_a_value_that_is_overdue_is_not_fresh(hub: Hub) -> None:
     hub.take(all_of(10, FORWARD, 25))
     hub.take(rows((10 + 11, STATUS, STANDBY), drive="pump-2"))  # time passes elsewhere
-    assert not hub.is_fresh("pump-1", "output_frequency")
+    assert not is_fresh(hub)
     assert hub.seen("pump-1") == Shown("unknown", NOT_ASKED)
 
 
@@ -170,9 +175,9 @@ def test_what_is_read_seldom_is_fresh_for_longer(tmp_path: Path) -> None:
     hub = Hub(load_plant(path))
     hub.take(all_of(10, FORWARD, 25))
     hub.take(rows((10 + 290, STATUS, STANDBY), drive="pump-2"))
-    assert hub.is_fresh("pump-1", "output_frequency")
+    assert is_fresh(hub)
     hub.take(rows((10 + 301, STATUS, STANDBY), drive="pump-2"))
-    assert not hub.is_fresh("pump-1", "output_frequency")
+    assert not is_fresh(hub)
 
 
 def test_rows_of_a_drive_that_is_gone_are_dropped(hub: Hub) -> None:

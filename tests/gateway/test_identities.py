@@ -39,7 +39,11 @@ class Asked:
 
     def __init__(self, failures: dict[str, Exception]) -> None:
         self.names: list[str] = []
+        self.known: set[str] = set()
         self._failures = failures
+
+    def knows_identity(self, drive: Any) -> bool:
+        return drive.name in self.known
 
     def check_identity(self, drive: Any) -> None:
         self.names.append(drive.name)
@@ -71,12 +75,21 @@ def ask_all(bus: Asked, is_there: Callable[[str], bool], *names: str) -> list[st
 @pytest.fixture(autouse=True)
 def _at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "PAUSE_S", 0.0)
+    monkeypatch.setattr(module, "ROUND_S", 0.0)
 
 
 def test_who_does_not_answer_is_not_asked() -> None:
     bus = Asked({})
     assert ask_all(bus, lambda name: name != "silent", "pump-1", "silent", "pump-2") == []
     assert bus.names == ["pump-1", "pump-2"] * 2
+
+
+def test_who_is_known_is_not_asked() -> None:
+    """Nor is a thread woken for him: most of the time all are known."""
+    bus = Asked({})
+    bus.known.add("pump-1")
+    assert ask_all(bus, lambda name: True, "pump-1", "pump-2") == []
+    assert bus.names == ["pump-2"] * 2
 
 
 def test_another_drive_is_told_of_once_and_no_failure_ends_it(caplog: pytest.LogCaptureFixture) -> None:

@@ -10,7 +10,7 @@ from lines import line, plant, polled
 
 from multidrop import Drive, setting
 from multidrop.drives import MODELS, DelixiModbus, InvtCHE
-from multidrop.gateway.common_block import CURRENT, FREQUENCY, NO_NUMBER, SETPOINT, common_words
+from multidrop.gateway.common_block import CURRENT, FREQUENCY, NO_NUMBER, SETPOINT, CommonBlock
 from multidrop.gateway.describe import describe
 from multidrop.gateway.homeassistant import discovery
 from multidrop.gateway.hub import Hub, Newest
@@ -29,7 +29,7 @@ class FullHub(Hub):
 
     def known(self, drive: str) -> Iterator[Known]:
         for register in self.polled(drive):
-            yield Known(register.name, (1, 1, 25.0, 0), (1, 1, 25.0, 0), True)
+            yield register.name, (1, 1, 25.0, 0), (1, 1, 25.0, 0), True
 
 
 class Fan(Drive):
@@ -63,7 +63,7 @@ def test_the_common_block_has_no_number_for_a_raw_count() -> None:
     names = ("output_frequency", "output_current")
     drives = [polled(drive, [drive.registers[name] for name in names]) for drive in (delixi, che)]
     hub = FullHub(plant(line("/dev/null", *drives)))
-    (fan, pump) = (common_words(each, hub, 1) for each in drives)
+    (fan, pump) = (CommonBlock(each).words(hub, 1) for each in drives)
     assert [number(fan, at) for at in (FREQUENCY, CURRENT, SETPOINT)] == [2500, NO_NUMBER, NO_NUMBER]
     assert [number(pump, at) for at in (FREQUENCY, CURRENT, SETPOINT)] == [2500, 2500, NO_NUMBER]
 

@@ -8,6 +8,7 @@ from lines import polled, rows_of
 from toy import Toy
 
 from multidrop.drives import InvtCHE
+from multidrop.polling.polled_line import PolledLine
 from multidrop.sim import Faults, simulated
 
 DRIVES = 31
@@ -28,6 +29,32 @@ def test_a_slot_that_is_not_asked_has_its_row_when_it_has_come() -> None:
             assert all(row.monotonic_ns <= clocked.now for row in rows)
     assert all(row.monotonic_ns <= clocked.now for row in rows_of(clocked.poller))
     assert clocked.poller.summary()["lines"]["line"]["misses"]["not asked: drive is silent"] > 400
+
+
+@pytest.mark.parametrize(("is_silent", "looks"), [(False, 20), (True, 40)])
+def test_a_line_is_looked_at_more_often_while_a_drive_of_it_is_silent(
+    monkeypatch: pytest.MonkeyPatch, is_silent: bool, looks: int
+) -> None:
+    """All that a line with a period needs while its drives answer is that it is kept busy."""
+    looked: list[int] = []
+    tend = PolledLine.tend
+
+    def noted(line: PolledLine, now_ns: int) -> None:
+        looked.append(now_ns)
+        tend(line, now_ns)
+
+    monkeypatch.setattr(PolledLine, "tend", noted)
+    drives = [Toy(1, name="pump-1"), Toy(2, name="pump-2")]
+    sims = [simulated(drive) for drive in drives]
+    sims[1].deaf_until = float("inf") if is_silent else 0.0
+    with ClockedLines(
+        ClockedWire(sims, Faults()), [polled(drive, [Toy.fault], 0.1) for drive in drives]
+    ) as clocked:
+        clocked.run(5)
+        looked.clear()
+        rows = clocked.run(2)
+        assert len([row for row in rows if row.value is not None]) == (20 if is_silent else 40)
+        assert abs(len(looked) - looks) <= 3  # it is called when a drive answers again, or no more
 
 
 @pytest.mark.long

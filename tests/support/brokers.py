@@ -22,7 +22,8 @@ from peers import require_module, require_program
 
 from multidrop import InvtCHE, Plant, PlantLine, Polled, PolledDrive
 from multidrop.gateway.commands import Told
-from multidrop.gateway.hub import Newest
+from multidrop.gateway.hub import Shown
+from multidrop.gateway.kept_rows import Known
 from multidrop.gateway.parts import Inside
 from multidrop.gateway.rights import Caller, May
 
@@ -207,12 +208,11 @@ class SaidHub:
     def polled(self, drive: str) -> tuple[Any, ...]:
         return (PUMP.output_frequency, PUMP.status)
 
-    def newest(self, drive: str, register: str) -> Newest | None:
-        value = self.values.get((drive, register))
-        return Newest(7_000_000, 7_000_000, value, "ok" if value is not None else "no reply")
-
-    def is_fresh(self, drive: str, register: str) -> bool:
-        return self.values.get((drive, register)) is not None
+    def known(self, drive: str) -> Iterator[Known]:
+        for register in self.polled(drive):
+            value = self.values.get((drive, register.name))
+            row = None if value is None else (7_000_000, 7_000_000, value, 0)
+            yield register.name, row, row, row is not None
 
     def seen_at(self, drive: str) -> int | None:
         return 7_000_000
@@ -222,6 +222,9 @@ class SaidHub:
 
     def fault(self, drive: str) -> str | None:
         return self.faults.get(drive)
+
+    def seen(self, drive: str) -> Shown:
+        return Shown(self.state(drive), self.fault(drive))
 
 
 class NotedCommands:

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import threading
 from collections import deque
 from collections.abc import Sequence
 from enum import IntEnum, StrEnum
-from functools import cache
 from typing import Any
 from weakref import finalize
 
@@ -89,19 +89,27 @@ class _Engine:
     """The core's thread, started when the first port is opened; there is one in a process."""
 
     def __init__(self) -> None:
-        self.c = lib.md_engine_start()
-        if self.c == ffi.NULL:
-            raise OSError(ffi.errno, "the core's thread cannot be started")
+        self.forked()
         register_at_fork(self)
 
     def forked(self) -> None:
         """Start another one, in the child, with the next port that is opened."""
-        _engine.cache_clear()
+        self._starting = threading.Lock()  # ports are opened beside each other
+        self._c: Any = None
+
+    @property
+    def c(self) -> Any:
+        """The core's own (struct md_engine). Raises OSError where its thread cannot be started."""
+        with self._starting:
+            if self._c is None:
+                started = lib.md_engine_start()
+                if started == ffi.NULL:
+                    raise OSError(ffi.errno, "the core's thread cannot be started")
+                self._c = started
+            return self._c
 
 
-@cache
-def _engine() -> _Engine:
-    return _Engine()
+_engine = _Engine()
 
 
 def _let_go(port: Any, mastership: Mastership | None) -> None:
@@ -128,7 +136,7 @@ class Port:
         transactions: Transactions = Transactions.NONE,
         mastership: Mastership | None = None,
     ) -> None:
-        self.c = lib.md_port_open(_engine().c, fd, must_take, transactions, room)
+        self.c = lib.md_port_open(_engine.c, fd, must_take, transactions, room)
         if self.c == ffi.NULL:
             raise OSError(ffi.errno, "the port cannot be waited for")
         self.room = room

@@ -27,6 +27,11 @@ else:  # on macOS and Windows the other one runs on, too
     boottime_ns = monotonic_ns
 
 
-def slept_ns() -> int:
-    """Return for how long the machine slept so far: never too much, where a pause comes in between."""
-    return boottime_ns() - monotonic_ns()
+def now_and_slept_ns() -> tuple[int, int]:
+    """Return the present time, and for how long the machine slept so far.
+
+    Read in this order, that is never too much where a pause comes in between.
+    """
+    booted_ns = boottime_ns()
+    now_ns = monotonic_ns()
+    return now_ns, booted_ns - now_ns

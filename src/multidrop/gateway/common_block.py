@@ -6,9 +6,9 @@ known has a count of its own, so that it never reads as 0.
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import Any, Protocol
 
-from multidrop import PolledDrive
+from multidrop import PolledDrive, Register
 from multidrop.gateway.drive_words import NewestRow, fresh_ns, is_fresh
 
 COMMON_LENGTH = 16  # words of the block
@@ -31,60 +31,65 @@ class CommonSource(Protocol):
     def state(self, drive: str) -> str: ...
 
 
-def common_words(polled: PolledDrive, hub: CommonSource, now_ns: int) -> list[int]:
-    """Return the words of the block of one drive."""
-    drive = polled.drive
-    state = hub.state(drive.name)
-    words = [0] * COMMON_LENGTH
-    words[STATE] = STATES.get(state, 0)
-    words[FAULT] = _fault(polled, hub, now_ns, state)
-    for at, name, unit in (
-        (FREQUENCY, "output_frequency", "Hz"),
-        (CURRENT, "output_current", "A"),
-        (SETPOINT, drive.setpoint_name, None),
-    ):
-        value = _fresh_value(polled, hub, now_ns, name, unit) if _has_scale(polled, name) else None
-        words[at : at + 2] = _two_words(NO_NUMBER if value is None else _hundredths(value))
-    words[AGE : AGE + 2] = _two_words(_age(polled, hub, now_ns))
-    return words
+class CommonBlock:
+    """The block of one drive; its words are made of rows when they are asked for."""
+
+    def __init__(self, polled: PolledDrive) -> None:
+        self._name = polled.drive.name
+        self._fresh_ns = {
+            (poll.register.name, unit): fresh_ns(poll.every)
+            for poll in polled.polls
+            for unit in _units(poll.register)
+        }
+        self._numbers = (
+            (FREQUENCY, "output_frequency", "Hz"),
+            (CURRENT, "output_current", "A"),
+            (SETPOINT, polled.drive.setpoint_name, None),
+        )
+
+    def words(self, hub: CommonSource, now_ns: int) -> list[int]:
+        """Return the words of this moment."""
+        state, woke_ns = hub.state(self._name), hub.woke_ns()
+        words = [0] * COMMON_LENGTH
+        words[STATE] = STATES.get(state, 0)
+        words[FAULT] = self._fault(hub, now_ns, woke_ns, state)
+        for at, name, unit in self._numbers:
+            value = self._fresh_value(hub, now_ns, woke_ns, name, unit)
+            words[at : at + 2] = _two_words(NO_NUMBER if value is None else _hundredths(value))
+        words[AGE : AGE + 2] = _two_words(self._age(hub, now_ns, woke_ns))
+        return words
+
+    def _fresh_value(
+        self, hub: CommonSource, now_ns: int, woke_ns: int, name: str, unit: str | None
+    ) -> float | None:
+        """Return the fresh value of a polled register, in this unit or its own; None where there is none."""
+        longest_ns = self._fresh_ns.get((name, unit))
+        row = hub.newest(self._name, name) if longest_ns else None
+        return row.value if row and longest_ns and is_fresh(row, longest_ns, now_ns, woke_ns) else None
+
+    def _fault(self, hub: CommonSource, now_ns: int, woke_ns: int, state: str) -> int:
+        """Return the drive's own number of the fault that it shows."""
+        if state != "fault":
+            return NO_FAULT if state in ("stands", "runs") else FAULT_UNKNOWN
+        value = self._fresh_value(hub, now_ns, woke_ns, "fault", "")
+        if value is None or value != int(value) or not 0 < value < FAULT_WITHOUT_NUMBER:
+            return FAULT_WITHOUT_NUMBER
+        return int(value)
+
+    def _age(self, hub: CommonSource, now_ns: int, woke_ns: int) -> int:
+        """Return the ms since the newest value of the drive was asked for."""
+        newest = hub.answered_ns(self._name)
+        if newest is None:
+            return NEVER
+        if newest < woke_ns:  # nothing here counts the time for which the machine slept
+            return LONGEST_AGE
+        return min(max(now_ns - newest, 0) // 1_000_000, LONGEST_AGE)
 
 
-def _fresh_value(
-    polled: PolledDrive, hub: CommonSource, now_ns: int, name: str, unit: str | None
-) -> float | None:
-    """Return the fresh value of a polled register, in this unit or its own; None where there is none."""
-    for poll in polled.polls:
-        register = poll.register
-        if register.name == name and (unit is None or register.unit == unit):
-            row = hub.newest(polled.drive.name, name)
-            if row is not None and is_fresh(row, fresh_ns(poll.every), now_ns, hub.woke_ns()):
-                return row.value
-    return None
-
-
-def _has_scale(polled: PolledDrive, name: str) -> bool:
-    """Return False where a register's values are raw counts, of which nobody knows the unit."""
-    return any(poll.register.name == name and poll.register.step is not None for poll in polled.polls)
-
-
-def _fault(polled: PolledDrive, hub: CommonSource, now_ns: int, state: str) -> int:
-    """Return the drive's own number of the fault that it shows."""
-    if state != "fault":
-        return NO_FAULT if state in ("stands", "runs") else FAULT_UNKNOWN
-    value = _fresh_value(polled, hub, now_ns, "fault", "")
-    if value is None or value != int(value) or not 0 < value < FAULT_WITHOUT_NUMBER:
-        return FAULT_WITHOUT_NUMBER
-    return int(value)
-
-
-def _age(polled: PolledDrive, hub: CommonSource, now_ns: int) -> int:
-    """Return the ms since the newest value of the drive was asked for."""
-    newest = hub.answered_ns(polled.drive.name)
-    if newest is None:
-        return NEVER
-    if newest < hub.woke_ns():  # nothing here counts the time for which the machine slept
-        return LONGEST_AGE
-    return min(max(now_ns - newest, 0) // 1_000_000, LONGEST_AGE)
+def _units(register: Register[Any]) -> tuple[str | None, ...]:
+    """Return how its unit may be asked for; None, for whichever it is, gives no raw counts."""
+    is_raw = register.values is None and register.step is None
+    return (register.value_unit,) if is_raw else (register.value_unit, None)
 
 
 def _hundredths(value: float) -> int:

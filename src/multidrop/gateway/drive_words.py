@@ -112,21 +112,28 @@ def _neighbours(raw: float, number_format: NumberFormat) -> Iterable[float]:
 class _Place:
     """A register at its addresses, and the words of its latest value."""
 
-    __slots__ = ("_data", "_value", "fresh_ns", "register")
+    __slots__ = ("_data", "_fresh_ns", "_register", "_value", "name")
 
     def __init__(self, register: Register[Any], every: float | None) -> None:
-        self.register = register
-        self.fresh_ns = fresh_ns(every)
+        self.name = register.name
+        self._register = register
+        self._fresh_ns = fresh_ns(every)
         self._value: float | None = None
         self._data: bytes | None = None
 
-    def word(self, value: float, at: int) -> int | None:
-        """Return the word (coil: bit) that many addresses after its first; None where it is in doubt."""
-        if value != self._value:
-            self._value, self._data = value, exact_data(self.register, value)
+    def word(self, row: NewestRow | None, at: int, now_ns: int, since_ns: int) -> int | Lack:
+        """Return the word (coil: bit) that many addresses after its first, of its newest row; or the reason.
+
+        A row that is no value, too old, or from before `since_ns` gives none.
+        """
+        if row is None or not is_fresh(row, self._fresh_ns, now_ns, since_ns):
+            return Lack.STALE
+        value = row.value
+        if value is not None and value != self._value:
+            self._value, self._data = value, exact_data(self._register, value)
         data = self._data
         if data is None:
-            return None
+            return Lack.UNPOLLED
         return data[0] if len(data) == 1 else data[2 * at] << 8 | data[2 * at + 1]
 
 
@@ -155,23 +162,21 @@ class DriveWords:
     ) -> list[int] | Lack:
         """Return the words or bits at these addresses, each of a fresh row; else why that cannot be.
 
-        `newest` gives a register's newest row by its name; rows before `since_ns` do not count.
+        `newest` gives a register's newest row by its name, the same one throughout; rows before `since_ns` do
+        not count.
         """
-        fresh: dict[_Place, NewestRow | None] = {}
         words: list[int] = []
         lacks: list[Lack] = []
         for address in addresses:
             found = self._at.get((function, address))
             if found is None:
                 return Lack.UNPOLLED
-            for place, _ in found:
-                if place not in fresh:
-                    row = newest(place.register.name)
-                    fresh[place] = row if is_fresh(row, place.fresh_ns, now_ns, since_ns) else None
             if len(found) == 1:
-                word = _word_of(fresh[found[0][0]], *found[0])
+                place, at = found[0]
+                word = place.word(newest(place.name), at, now_ns, since_ns)
             else:
-                word = _newest_word([(fresh[place], place, at) for place, at in found])
+                rows = [(newest(place.name), place, at) for place, at in found]
+                word = _newest_word(rows, now_ns, since_ns)
             if isinstance(word, Lack):
                 lacks.append(word)
             else:
@@ -181,21 +186,13 @@ class DriveWords:
         return words
 
 
-def _word_of(row: NewestRow | None, place: _Place, at: int) -> int | Lack:
-    """Return the word of a row; the reason where it has none."""
-    if row is None or row.value is None:
-        return Lack.STALE
-    word = place.word(row.value, at)
-    return Lack.UNPOLLED if word is None else word
-
-
-def _newest_word(found: list[tuple[NewestRow | None, _Place, int]]) -> int | Lack:
+def _newest_word(found: list[tuple[NewestRow | None, _Place, int]], now_ns: int, since_ns: int) -> int | Lack:
     """Return the word that the newest row gives; several registers may lie at one address."""
     lack = Lack.STALE
-    rows = [(row, place, at) for row, place, at in found if row is not None and row.value is not None]
-    for row, place, at in sorted(rows, key=lambda one: -one[0].monotonic_ns):
-        word = _word_of(row, place, at)
+    for row, place, at in sorted(found, key=lambda one: -one[0].monotonic_ns if one[0] else 0):
+        word = place.word(row, at, now_ns, since_ns)
         if not isinstance(word, Lack):
             return word
-        lack = Lack.UNPOLLED
+        if word is Lack.UNPOLLED:
+            lack = word
     return lack

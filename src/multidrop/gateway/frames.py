@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 from multidrop.gateway.events import Events
 from multidrop.gateway.hub import FAULT, SILENT, Hub
-from multidrop.gateway.kept_rows import Known
+from multidrop.gateway.kept_rows import KeptRow
 from multidrop.gateway.lately import Lately
 
 LEAST_S = 0.2  # between two frames, on the whole: the page draws no faster
@@ -66,10 +66,16 @@ def frame_of(
 
 
 def _drive(hub: Hub, name: str, time_ns: int) -> dict[str, Any]:
+    """Return what a frame says of a drive; of a value that is known now that and the place of its time."""
     state, words = hub.seen(name)
     seen = hub.seen_at(name)
     places = Places()
-    values = {known[0]: _value(hub, known, places, time_ns) for known in hub.known(name)}
+    values: dict[str, tuple[Any, ...]] = {}
+    for register, newest, good, is_fresh in hub.known(name):
+        if is_fresh and good is not None and newest is good:
+            values[register] = _finite(good[2]), places[good[0]]
+        else:
+            values[register] = _unknown(hub, newest, good, places, time_ns)
     return {
         "state": state,
         "fault": words if state == FAULT else None,
@@ -88,16 +94,12 @@ class Places(dict[int, int]):
         return place
 
 
-def _value(hub: Hub, known: Known, places: Places, time_ns: int) -> tuple[Any, ...]:
-    """Return value, place of its time, status; of what is not known now null, and the last value and time.
-
-    The status of a good value is left out.
-    """
-    _, newest, good, is_fresh = known
+def _unknown(
+    hub: Hub, newest: KeptRow | None, good: KeptRow | None, places: Places, time_ns: int
+) -> tuple[Any, ...]:
+    """Return null, place of its time, status of what is not known now, and the last value and its time."""
     if newest is None:
         return None, places[time_ns], "not asked yet"
-    if newest is good and is_fresh:
-        return _finite(good[2]), places[good[0]]
     last = () if good is None else (_finite(good[2]), places[good[0]])
     if newest[3]:
         return None, places[newest[0]], hub.status(newest[3]), *last
@@ -196,14 +198,15 @@ class Frames:
             raise OverflowError(f"{MOST_VIEWERS} viewers wait already")
         if self._is_closed:
             return None
-        turn: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+        loop = asyncio.get_running_loop()
+        turn: asyncio.Future[None] = loop.create_future()
         self._waiting.add(turn)
         self._build_when_due()
+        timer = loop.call_later(WAIT_S, _let_go, turn)  # wait_for would take more turns of the loop
         try:
-            await asyncio.wait_for(turn, WAIT_S)
-        except TimeoutError:
-            return None
+            await turn
         finally:
+            timer.cancel()
             self._waiting.discard(turn)
         return self._since(n)
 
@@ -237,5 +240,9 @@ class Frames:
     def _wake(self) -> None:
         waiting, self._waiting = self._waiting, set()
         for turn in waiting:
-            if not turn.done():
-                turn.set_result(None)
+            _let_go(turn)
+
+
+def _let_go(turn: asyncio.Future[None]) -> None:
+    if not turn.done():
+        turn.set_result(None)

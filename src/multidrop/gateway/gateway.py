@@ -17,7 +17,7 @@ import uvicorn
 
 import multidrop
 from multidrop import Bus, Ledger, LineError, Plant, Poller
-from multidrop.gateway.clock import boottime_ns, monotonic_ns, slept_ns
+from multidrop.gateway.clock import boottime_ns, monotonic_ns, now_and_slept_ns
 from multidrop.gateway.commands import Commands
 from multidrop.gateway.connections import Connections, Watched
 from multidrop.gateway.events import Events
@@ -37,7 +37,7 @@ from multidrop.gateway.views import troubles_of
 from multidrop.gateway.web import make_app
 
 TAKE_S = 0.1  # between looks for new rows: half of the time between two frames
-EVENTS_S = 0.2  # between looks for faults and silence
+LOOK_S = 0.2  # between looks for faults and silence; frames are made then, of what was just seen
 TICK_S = 1.0  # between readings of the statistics
 LOG_S = 60.0  # between log lines of a part that goes on failing
 MOST_ASKED = 16  # requests past a register table at the same time
@@ -69,6 +69,7 @@ class Gateway:
         self._logged: dict[str, float] = {}
         self.begun = self.clock()
         self._looked = 0.0
+        self._has_news = False  # for a frame
         self.ledger = ledger or Ledger()
         self.poller: Poller | None = None
         self._end = asyncio.Event()
@@ -78,7 +79,7 @@ class Gateway:
         self.port: int = self.listener.getsockname()[1]
         self.own_names = OwnNames(settings.names, settings.host, self.port)
         self.tokens = Tokens(settings.tokens)
-        self.hub = Hub(plant, lambda: (monotonic_ns(), slept_ns()))
+        self.hub = Hub(plant, now_and_slept_ns)
         self.events = Events()
         self.lately = Lately(plant)
         self.notifier = Notifier()
@@ -174,18 +175,18 @@ class Gateway:
 
     def hand_out(self, poller: Poller) -> None:
         """Give each batch to the hub and to all parts; where one fails, the others get it all the same."""
-        is_new = False
         self.hub.pass_time(monotonic_ns())
         while batch := poller.take():
-            is_new = True
+            self._has_news = True
             self.guarded("hub", self.hub.take, batch)
             for name, feed in self.feeds.items():
                 self.guarded(name, feed.take, batch)
-        if is_new:
-            self.guarded("frames", self.frames.note_news)
-        if self.clock() - self._looked >= EVENTS_S:
+        if self.clock() - self._looked >= LOOK_S:
             self._looked = self.clock()
             self.guarded("events", self._look_for_events)
+            if self._has_news:
+                self._has_news = False
+                self.guarded("frames", self.frames.note_news)
 
     def _look_for_events(self) -> None:
         for name in self.hub.drives:
@@ -217,7 +218,7 @@ class Gateway:
             if self.poller is not None:
                 self.guarded("statistics", self._read_statistics)
             self.guarded("connections", self.connections.sweep)
-            self.guarded("frames", self.frames.note_news)  # its time is how a page knows that we live
+            self._has_news = True  # a frame's time is how a page knows that we live
             if notifier.watchdog_s:
                 notifier.tell("WATCHDOG=1")
             await asyncio.sleep(every)

@@ -56,7 +56,8 @@ class _Watched:
         self.cycle_ns = cycle_ns  # of its line, as planned
         self.reader = StateReader(polled.drive)
         self.cells: dict[str, RegisterRows] = {}
-        self.seen: tuple[int, int, Shown] | None = None  # at which batch and time
+        self.seen = Shown(UNKNOWN, None)
+        self.seen_at = -1, -1  # batch and time
 
     def cell(self, register: str) -> RegisterRows:
         """Return the cell of a register, which is new where it was not known."""
@@ -176,11 +177,6 @@ class Hub:
         time, monotonic_ns, value, status = cell.newest
         return Newest(time, monotonic_ns, None if status else value, self._statuses[status])
 
-    def is_fresh(self, drive: str, register: str) -> bool:
-        """Return True while the newest value is young: a single miss after it makes it no older."""
-        cell = self._known(drive, register)
-        return cell is not None and cell.is_fresh(self.now_ns, self.woke_ns())
-
     def polled(self, drive: str) -> tuple[Register[Any], ...]:
         """Return the registers of a drive that are polled, in the plant file's order."""
         watched = self._watched.get(drive)
@@ -196,13 +192,13 @@ class Hub:
         watched = self._watched.get(drive)
         if watched is None:
             return
-        woke_ns = self.woke_ns()
+        woke_ns, now_ns, cells = self.woke_ns(), self.now_ns, watched.cells
         for name in watched.names:
-            cell = watched.cells.get(name)
+            cell = cells.get(name)
             if cell is None:
-                yield Known(name, None, None, False)
+                yield name, None, None, False
             else:
-                yield Known(name, cell.newest, cell.good, cell.is_fresh(self.now_ns, woke_ns))
+                yield name, cell.newest, cell.good, cell.is_fresh(now_ns, woke_ns)
 
     def status(self, code: int) -> str:
         """Return the words of a row's status."""
@@ -219,10 +215,6 @@ class Hub:
         watched = self._watched.get(drive)
         cells = watched.cells.values() if watched else ()
         return max([cell.good[0] for cell in cells if cell.good], default=None)
-
-    def _known(self, drive: str, register: str) -> RegisterRows | None:
-        watched = self._watched.get(drive)
-        return watched.cells.get(register) if watched else None
 
     # ---- what they say of the drive ----
 
@@ -241,9 +233,10 @@ class Hub:
         if watched is None:
             return Shown(UNKNOWN, None)
         self.woke_ns()  # which is another time, if it slept
-        if watched.seen is None or watched.seen[:2] != (self.taken, self.now_ns):
-            watched.seen = (self.taken, self.now_ns, self._look(watched))
-        return watched.seen[2]
+        now = self.taken, self.now_ns
+        if watched.seen_at != now:
+            watched.seen, watched.seen_at = self._look(watched), now
+        return watched.seen
 
     def _look(self, watched: _Watched) -> Shown:
         fresh = FreshValues(watched.cells, self.now_ns, self._woke_ns)

@@ -8,13 +8,14 @@ from collections.abc import Callable
 
 from multidrop import Bus, BusError, Drive, Plant, Refused
 
-PAUSE_S = 0.2  # between two drives: the polling keeps the line
+PAUSE_S = 0.2  # between two drives that are asked: the polling keeps the line
+ROUND_S = 2.0  # between two looks for drives that are not known
 
 _log = logging.getLogger("multidrop.gateway")
 
 
 class Identities:
-    """Asks the drives of the present plant one by one; a bus asks each only once while its port is open.
+    """Asks the drives of the present plant one by one, each once while its port is open.
 
     `fail` is called while any other exception is handled.
     """
@@ -38,12 +39,19 @@ class Identities:
             drives = [(line.name, polled.drive) for line in self._plant().lines for polled in line.drives]
             for line, drive in drives:
                 try:
-                    if self._is_there(drive.name):
+                    if self._is_there(drive.name) and not self._knows(line, drive):
                         await asyncio.to_thread(self._ask, line, drive)
+                        await asyncio.sleep(PAUSE_S)
                 except Exception:  # whatever it is, polling and stops go on
                     self._fail()
-                await asyncio.sleep(PAUSE_S)
-            await asyncio.sleep(PAUSE_S)
+            await asyncio.sleep(ROUND_S)
+
+    def _knows(self, line: str, drive: Drive) -> bool:
+        """Return True where a drive need not be asked, or is no longer there."""
+        try:
+            return self._bus(line).knows_identity(drive)
+        except ValueError:
+            return True
 
     def _ask(self, line: str, drive: Drive) -> None:
         try:

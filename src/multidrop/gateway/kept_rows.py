@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from typing import NamedTuple
+from typing import Any
 
 STALE_NS = 1_000_000_000  # a value is never stale before that,
 STALE_PERIODS = 3  # nor before so many of its periods have passed
 
 KeptRow = tuple[int, int, float, int]  # time, monotonic, value (of a miss without meaning), status
+Known = tuple[str, KeptRow | None, KeptRow | None, bool]  # register, newest row, newest good one, is it fresh
 
 
 class RegisterRows:
@@ -45,9 +46,15 @@ class FreshValues(Mapping[str, float]):
         self._woke_ns = woke_ns
 
     def __getitem__(self, register: str) -> float:
-        cell = self._cells[register]
-        if cell.good is None or not cell.is_fresh(self._now_ns, self._woke_ns):
+        found: float | None = self.get(register)
+        if found is None:
             raise KeyError(register)
+        return found
+
+    def get(self, register: str, default: Any = None) -> Any:
+        cell = self._cells.get(register)
+        if cell is None or cell.good is None or not cell.is_fresh(self._now_ns, self._woke_ns):
+            return default
         return cell.good[2]
 
     def __iter__(self) -> Iterator[str]:
@@ -55,12 +62,3 @@ class FreshValues(Mapping[str, float]):
 
     def __len__(self) -> int:
         return sum(1 for _ in self)
-
-
-class Known(NamedTuple):
-    """All that is known of one polled register, its rows as the hub keeps them."""
-
-    register: str
-    newest: KeptRow | None
-    good: KeptRow | None
-    is_fresh: bool

@@ -55,12 +55,12 @@ def _values(hub: Hub) -> Iterator[Sample]:
     for line in hub.plant.lines:
         for polled in line.drives:
             name = polled.drive.name
-            for register, known in zip(hub.polled(name), hub.known(name), strict=True):
-                if known.good is None or not known.is_fresh:
+            for register, (_, _, good, is_fresh) in zip(hub.polled(name), hub.known(name), strict=True):
+                if good is None or not is_fresh:
                     continue
                 labels = {"line": line.name, "drive": name, "register": register.name}
                 labels["unit"] = register.value_unit
-                yield "", labels, known.good[2]
+                yield "", labels, good[2]
 
 
 def _states(hub: Hub) -> Iterator[Sample]:

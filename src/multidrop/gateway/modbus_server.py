@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 from multidrop import Batch, BusError, Carrier, Plant, Register
 from multidrop.gateway.clock import monotonic_ns
 from multidrop.gateway.commands import Told
-from multidrop.gateway.common_block import STOP, CommonSource, common_words
+from multidrop.gateway.common_block import STOP, CommonSource
 from multidrop.gateway.drive_words import Lack
 from multidrop.gateway.listener import listen
 from multidrop.gateway.mbap import SWEEP_S, Answer, MbapRequest, ModbusClient, ModbusPort
@@ -190,7 +190,7 @@ class ModbusServer:
         common = self.settings.common_addresses
         if addresses[-1] not in common or addresses.start not in common:
             raise Declined(ModbusCode.ILLEGAL_ADDRESS)
-        words = common_words(unit.polled, self._hub, monotonic_ns())
+        words = unit.common.words(self._hub, monotonic_ns())
         return words[addresses.start - common.start : addresses.stop - common.start]
 
     def _pass(

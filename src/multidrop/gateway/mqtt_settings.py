@@ -95,9 +95,7 @@ def shown(register: Register[Any], value: float) -> float | str:
 
 def fresh_values(hub: Hub, drive: str) -> dict[str, float | str | None]:
     """Return the values of a drive's polled registers; None for one that is not fresh."""
-    found: dict[str, float | str | None] = {}
-    for register in hub.polled(drive):
-        newest = hub.newest(drive, register.name) if hub.is_fresh(drive, register.name) else None
-        value = newest.value if newest else None
-        found[register.name] = None if value is None else shown(register, value)
-    return found
+    return {
+        name: shown(register, good[2]) if is_fresh and good is not None and newest is good else None
+        for register, (name, newest, good, is_fresh) in zip(hub.polled(drive), hub.known(drive), strict=True)
+    }

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from typing import NamedTuple
 
-MOST_UNDER_WAY = 20  # messages that were sent, and not acknowledged
+MOST_UNDER_WAY = 64  # messages that were sent, and not acknowledged: two lines' drives go at once
 MOST_WAITING = 4096  # topics; more than any plant has
 
 

@@ -9,6 +9,7 @@ from dataclasses import replace
 from typing import Any, NamedTuple, Protocol
 
 from multidrop import Carrier, Plant, Polled, PolledDrive, Register
+from multidrop.gateway.common_block import CommonBlock
 from multidrop.gateway.drive_words import DriveWords, reading_function
 
 MAIN = ""  # the TCP port of all lines that have none of their own
@@ -33,6 +34,7 @@ class Unit:
         self.polled = polled
         self.drive = polled.drive
         self.words = DriveWords(polled)
+        self.common = CommonBlock(polled)
         self.stops = frozenset(_stop_writes(polled.drive))
         self._readable: dict[int, set[int]] = {code: set() for code in range(5)}  # 0: by none
         self._gaps: list[tuple[int, range]] = []

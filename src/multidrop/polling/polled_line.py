@@ -152,6 +152,13 @@ class PolledLine:
         """Return True while nothing is to be done for the line unless the core calls."""
         return self._queue.is_repeating and now_ns - self._learnt_ns < RELEARN_NS
 
+    def is_well(self, now_ns: int) -> bool:
+        """Return True while its port is there and all of its drives answer: it only has to be kept busy."""
+        if self._queue.port is None or self._queue.port is not self.bus.line.queue:
+            return False
+        is_asked = not self._schedule.unasked and not self._schedule.back_off.may_sleep(now_ns)
+        return is_asked and self.bus.line.may_send
+
     def tend(self, now_ns: int) -> None:
         """Note the results of what was queued, and queue what comes next."""
         if self._is_left:  # its lock may be held until the port is closed

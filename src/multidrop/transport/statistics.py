@@ -11,7 +11,6 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import accumulate
-from operator import sub
 from typing import Any
 
 from multidrop.core import DELAY_BUCKETS, EXCEPTION_STATUS, STATUSES, Counters, Status, delay_edge
@@ -226,11 +225,16 @@ def _total(column: Sequence[Any]) -> Any:
 def _difference(now: Counters, earlier: Counters) -> Counters:
     if earlier == _NOTHING:
         return now
-    found = Counters._make(map(sub, now, earlier))
+    found = Counters._make(map(_minus, now, earlier))
     longest = now.longest_ns
     if longest == earlier.longest_ns:  # that one may have been before the span
         longest = min(longest, delay_edge(max(found.delays, default=-1) + 1))
     return found._replace(longest_ns=longest, timeout_ns=now.timeout_ns)
+
+
+def _minus(now: Any, earlier: Any) -> Any:
+    """Return the difference of numbers, or of counts by their keys: mostly nothing was counted earlier."""
+    return now - earlier if earlier else now
 
 
 def _quantiles(counters: Counters, parts: Iterable[float]) -> list[float]:
