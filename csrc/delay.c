@@ -6,9 +6,27 @@
 /* Err on the early side: an early look costs one wake-up, a late one delays the next request. A look that
  * was learnt to come just when replies are whole saved one sleep of three, and lost the line a 300th:
  * sleeps end late. */
-int64_t md_look_ns(const struct md_drive *drive, int64_t character_ns)
+static int64_t early_look_ns(const struct md_exchange *exchange)
 {
-    return later(0, drive->delay_ns - drive->deviation_ns - character_ns / 2);
+    const struct md_drive *drive = exchange->drive;
+    return later(0, drive->delay_ns - drive->deviation_ns - exchange->character_ns / 2);
+}
+
+/* A client that waits for values is back late by more than a steady drive's delays vary, and each wake-up
+ * costs it dearly: caches are cold. So of its looks but one in SURE may come when the reply must be whole.
+ * From that one is learnt whether replies come sooner. */
+enum { SURE = 8 };
+
+static int is_sure(const struct md_exchange *exchange)
+{
+    const struct md_drive *drive = exchange->drive;
+    return exchange->values && drive->sure_looks && 2 * drive->deviation_ns <= exchange->character_ns;
+}
+
+int64_t md_look_ns(const struct md_exchange *exchange)
+{
+    const struct md_drive *drive = exchange->drive;
+    return is_sure(exchange) ? drive->delay_ns + 2 * drive->deviation_ns : early_look_ns(exchange);
 }
 
 /* ---- how long to wait ---- */
@@ -90,11 +108,18 @@ static void be_patient(struct md_drive *drive, int64_t patience_ns)
     learn(&drive->patience_ns, patience_ns > usual_timeout_ns(drive) ? patience_ns : 0);
 }
 
-int64_t md_learn_delay(struct md_drive *drive, int64_t delay_ns, int is_whole, int64_t character_ns)
+int64_t md_learn_delay(const struct md_exchange *exchange, int64_t delay_ns, int is_whole)
 {
-    if (is_whole) /* it may have been so for long */
-        delay_ns = sooner(delay_ns, md_look_ns(drive, character_ns));
-    smooth(drive, delay_ns);
+    struct md_drive *drive = exchange->drive;
+    if (is_whole && is_sure(exchange)) {
+        drive->sure_looks--;
+        delay_ns = sooner(delay_ns, drive->delay_ns);
+    } else {
+        drive->sure_looks = is_whole ? 0 : SURE - 1;
+        if (is_whole) /* it may have been so for long */
+            delay_ns = sooner(delay_ns, early_look_ns(exchange));
+        smooth(drive, delay_ns);
+    }
     if (drive->patience_ns > 2 * delay_ns)
         be_patient(drive, drive->patience_ns - drive->patience_ns / 8);
     return delay_ns;

@@ -89,11 +89,11 @@ int md_reason(int framing, const struct md_message *request, const uint8_t *byte
 /* ---- delay.c: what is learnt of a drive from the delays of its replies ---- */
 
 /* Return the time after a request, beside its reply's own, before which it is not worth looking for that. */
-int64_t md_look_ns(const struct md_drive *drive, int64_t character_ns);
+int64_t md_look_ns(const struct md_exchange *exchange);
 int64_t md_timeout_ns(const struct md_exchange *exchange);
 /* Learn from a reply's delay (the longest possible, where the reply was whole when first looked at);
  * return what to take for its delay. */
-int64_t md_learn_delay(struct md_drive *drive, int64_t delay_ns, int is_whole, int64_t character_ns);
+int64_t md_learn_delay(const struct md_exchange *exchange, int64_t delay_ns, int is_whole);
 /* Learn from a late reply, so long after its request or after the last of several: wait longer from now
  * on. */
 void md_learn_lateness(struct md_drive *drive, int64_t delay_ns, int is_exact);

@@ -153,6 +153,7 @@ struct md_drive {
     int64_t interval_ns;            /* from the end of an exchange to its next request, at least */
     int64_t ready_ns;               /* no request leaves for it before then */
     uint32_t failures;              /* in a row */
+    uint32_t sure_looks;            /* so many replies are whole at the first look, if it stays steady */
     uint32_t owed_count, unanswered_count, proof_count;
     const struct md_exchange *const *proofs; /* reads whose replies differ from others' */
     struct md_drive *next_late;     /* the next one on this line with late replies due */

@@ -27,7 +27,7 @@ void md_reply_await(struct md_line *line, int reply_len)
     line->ready_ns = 0;
     line->begun_by_ns = line->give_up_ns;
     if (line->burst > 0 && drive->delay_ns) /* what comes at once is there when the port is ready */
-        line->ready_ns = line->quiet_ns + md_look_ns(drive, exchange->character_ns) + reply_ns;
+        line->ready_ns = line->quiet_ns + md_look_ns(exchange) + reply_ns;
     if (line->burst > 0 && drive->failures == 0) {
         int64_t begun_ns = timeout_ns + (line->burst + 2) * exchange->character_ns;
         line->begun_by_ns = sooner(line->quiet_ns + begun_ns, line->begun_by_ns);
@@ -84,7 +84,7 @@ static void measure(struct md_line *line, int reply_len)
     /* Characters that follow each other tell better when the first came than a late look at them. */
     completion->first_ns = sooner(completion->first_ns, later(begun_ns + exchange->character_ns, left_ns));
     int is_whole = line->waited && line->looks == 1;
-    int64_t delay_ns = md_learn_delay(drive, later(begun_ns - left_ns, 0), is_whole, exchange->character_ns);
+    int64_t delay_ns = md_learn_delay(exchange, later(begun_ns - left_ns, 0), is_whole);
     int64_t ideal_ns = line->silence_ns + request_ns + delay_ns + reply_ns;
     /* A port that is faster than its settings, such as a network's, needs no more than it took. */
     int64_t ended_ns = line->transactions ? completion->last_ns : later(completion->last_ns, left_ns);

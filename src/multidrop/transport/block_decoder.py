@@ -41,9 +41,6 @@ class BlockDecoder:
 
     def decode(self, reply: Completion) -> dict[str, Any]:
         """Return the values by the registers' names; None where the drive gave none."""
-        if self.is_plain and reply.count == self.count:
-            # with cold caches `strict` would take microseconds, and there are as many of both
-            return dict(zip(self.names, reply.numbers.tolist()))  # noqa: B905
         found: dict[str, Any] = dict(zip(self.names, reply.values_of(self.layout), strict=True))
         for name, decode in self._named:
             if found[name] is not None:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 from multidrop.core import Completion, Exchange, Framing, Peer, TransactionIds
 from multidrop.drive.family import Drive
 from multidrop.drive.own import check_drive
@@ -85,14 +83,16 @@ class Peers:
             raise _not_attached(drive)
         return peer
 
-    def carry_out(self, drive: Drive, made: Exchange, **details: Any) -> Completion:
+    def carry_out(
+        self, drive: Drive, made: Exchange, *, expires_ns: int = 0, into: Completion | None = None
+    ) -> Completion:
         """Have the line carry it out; NotAttached where the drive has left since the exchange was made."""
         asking = object()
         try:  # a signal that raises between any two steps leaves none behind, for which `add` waited for ever
             self._asked[asking] = made.peer  # before the look: what takes the drive's place waits for it
             if self.present.get(drive) is not made.peer:
                 raise _not_attached(drive)
-            return self._line.carry_out(made, **details)
+            return self._line.carry_out(made, expires_ns=expires_ns, into=into)
         finally:
             self._asked.pop(asking, None)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import Any
 
 from multidrop import core
 from multidrop.core import Completion, Exchange, Message, Peer
@@ -67,19 +67,22 @@ class PreparedRead:
         return make_read(drive, self.block, peer, values=values, insists=True, timeout=timeout)
 
 
-class ReadPlan(NamedTuple):
+class ReadPlan:
     """Reads of a set of registers, the last one first, and the registers' names as they were asked for.
 
     `is_one`: there is but one read, which has the names in that order.
     """
 
-    registers: tuple[Register[Any], ...]
-    reads: tuple[PreparedRead, ...]
-    names: tuple[str, ...]
-    is_one: bool
+    __slots__ = ("is_one", "names", "reads", "registers")
+
+    def __init__(self, registers: tuple[Register[Any], ...], reads: tuple[PreparedRead, ...]) -> None:
+        self.registers = registers
+        self.reads = reads
+        self.names = tuple(register.name for register in registers)
+        self.is_one = len(reads) == 1 and reads[0].names == self.names
 
 
-NOTHING = ReadPlan((), (), (), False)
+NOTHING = ReadPlan((), ())
 
 
 class PreparedReads:
@@ -96,10 +99,7 @@ class PreparedReads:
         def of(registers: tuple[Register[Any], ...]) -> ReadPlan:
             for register in registers:
                 check_own(drive, register)
-            reads = tuple(prepare(block) for block in reversed(blocks(drive, registers)))
-            names = tuple(register.name for register in registers)
-            is_one = len(reads) == 1 and reads[0].names == names
-            return ReadPlan(registers, reads, names, is_one)
+            return ReadPlan(registers, tuple(map(prepare, reversed(blocks(drive, registers)))))
 
         self.of = of
         self.newest = NOTHING  # the plan that was used last: found again without a look at each register
