@@ -19,7 +19,7 @@ from patient import await_turns, be_patient
 
 from multidrop.cli import main
 
-# Compiled tests are kept in any case, in folders that git ignores: six workers would compile each of them,
+# Compiled tests are kept in any case, in folders that git ignores: all workers would compile each of them,
 # and each program that a test starts all that it imports.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 sys.dont_write_bytecode = False
@@ -41,8 +41,8 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 
 @pytest.hookimpl(optionalhook=True)  # of xdist
 def pytest_xdist_auto_num_workers() -> int:
-    """Three for each processor: many tests wait for a line; 12 at most, for each collects all."""
-    return min(3 * len(os.sched_getaffinity(0)), 12)
+    """Two for each processor: many tests wait for a line; 12 at most, for each collects all."""
+    return min(2 * len(os.sched_getaffinity(0)), 12)
 
 
 @pytest.hookimpl(optionalhook=True)  # of xdist

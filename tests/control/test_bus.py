@@ -623,9 +623,13 @@ def read_until_closed(bus: Bus, rig: Rig) -> None:
 
 @patient
 def test_a_bus_that_is_closed_while_others_use_it() -> None:
-    """Whoever comes too late gets an error, and nothing worse happens."""
-    with unpaced(simulated(Rig(1))) as sim:
-        for _ in range(20):
+    """Whoever comes too late gets an error, and nothing worse happens.
+
+    Each bus has a line of its own: a reply that is lost with a port is owed to whoever opens that port again,
+    and this would be waited for as patiently.
+    """
+    for _ in range(20):
+        with unpaced(simulated(Rig(1))) as sim:
             bus = Bus(path(sim))
             ours = bus.attach(Rig, 1)
 

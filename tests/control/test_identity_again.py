@@ -72,6 +72,7 @@ def test_a_drive_that_was_silent_is_looked_at_once_before_the_next_write(
 
 
 @every_family
+@pytest.mark.usefixtures("_patient")
 @pytest.mark.parametrize("pause", ["idle", "asleep", "read since"])
 def test_a_drive_of_which_nothing_was_heard_for_ten_seconds_is_looked_at_once(
     model: str, pause: str, monkeypatch: pytest.MonkeyPatch

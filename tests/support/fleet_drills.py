@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import json
 import os
 import random
 import signal
@@ -16,6 +15,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from fleet_status import fleet_status
 from kills import kill_all
 from namespaces import Namespace
 from nats_clusters import Cluster, Node, cluster
@@ -67,8 +67,7 @@ class FleetDrill:
         )
 
     def status(self) -> dict[str, Any]:
-        found: dict[str, Any] = json.loads(self.run("status", "--json").stdout)
-        return found
+        return fleet_status(self._environment)
 
     def start(self, *names: str) -> None:
         for name in names:

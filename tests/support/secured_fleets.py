@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import subprocess
 import sys
 import time
@@ -11,6 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from fleet_status import fleet_status
 from kills import kill_all
 from secured_clusters import GATEWAYS, SecuredCluster, secured_cluster
 from serial_hall import SerialHall
@@ -65,8 +65,7 @@ class SecuredFleet:
         return (self._folder / f"{kept}.log").read_text()
 
     def status(self, user: str = "viewer") -> dict[str, Any]:
-        found: dict[str, Any] = json.loads(multidrop(self.servers, user, "fleet", "status", "--json").stdout)
-        return found
+        return fleet_status(self.servers.environment(user))
 
     def wait_for_polling(self) -> None:
         until(lambda: self.hall.are_polled(0.5), "all lines are polled")

@@ -1,0 +1,22 @@
+"""The state of a fleet as `multidrop fleet status` says it, for tests that wait until it says something."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping
+from contextlib import redirect_stdout
+from io import StringIO
+from typing import Any
+from unittest.mock import patch
+
+from multidrop.cli import main
+
+
+def fleet_status(environment: Mapping[str, str]) -> dict[str, Any]:
+    """Return the state of a fleet; in this process, for tests ask for it again and again."""
+    with patch.dict(os.environ, environment), redirect_stdout(StringIO()) as out:
+        status = main(["fleet", "status", "--json"])
+    assert status == 0
+    found: dict[str, Any] = json.loads(out.getvalue())
+    return found
