@@ -77,7 +77,7 @@ UNREADABLE = {
     "no JSON": b"4\r\n\r\nstop",
     "no body": b"0\r\n\r\n",
     "no object": b"2\r\n\r\n[]",
-    "a name that is no list": b"20\r\n\r\n" + b'{"drives": "pump-1"}',
+    "a number": b"13\r\n\r\n" + b'{"drives": 1}',
     "no names": b"15\r\n\r\n" + b'{"drives": [1]}',
 }
 
@@ -96,6 +96,14 @@ def test_a_stop_whose_body_cannot_be_read_is_one_of_all_drives(
         assert {name: one["done"] for name, one in told.items()} == {"pump-1": True, "pump-2": True}
         assert stands(gateway, "pump-1")
         assert stands(gateway, "pump-2")
+
+
+def test_a_drive_to_stop_may_be_named_without_a_list(tmp_path: Path) -> None:
+    with served(tmp_path, MAY) as gateway:
+        start(gateway, "pump-1", "pump-2")
+        assert [*gateway.request("POST", "/api/stop", {"drives": "pump-1"}).json] == ["pump-1"]
+        assert stands(gateway, "pump-1")
+        assert not stands(gateway, "pump-2")
 
 
 def test_a_stop_whose_client_is_cut_off_within_its_body_is_sent(tmp_path: Path) -> None:

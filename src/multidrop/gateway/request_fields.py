@@ -59,6 +59,8 @@ async def drives_to_stop(request: Request) -> list[str] | None:
     except Denied as unread:
         _log.warning("a stop is one of all drives, because %s", unread)
         return None
+    if isinstance(drives, str):
+        return [drives]
     if drives is None or (isinstance(drives, list) and all(isinstance(one, str) for one in drives)):
         return drives
     _log.warning("a stop is one of all drives, because %.100r is no list of names", drives)
