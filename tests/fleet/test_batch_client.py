@@ -96,6 +96,7 @@ def _rested(path: ServerPath) -> None:
     """Let a path have all there is to spare, as after some time at rest."""
     for _ in range(round(direct_gets.MOST_SPARE / direct_gets.EARNED)):
         path.spare.note(is_late=False)
+        path.spare.learn(0.01)
 
 
 @table(

@@ -65,6 +65,7 @@ def full() -> Spare:
     spare = Spare()
     for _ in range(round(MOST_SPARE / EARNED)):
         spare.note(is_late=False)
+        spare.learn(0.01)
     return spare
 
 
@@ -213,3 +214,32 @@ def test_a_path_without_a_question_to_spare_comes_to_an_end() -> None:
 
     run_controlled(main())
     assert asked(ways) == [[0.0], []]
+
+
+def test_who_saw_answers_take_long_waits_longer_before_asking_again() -> None:
+    """Each of many gateways that begin at a time reads all of the plant beside small records."""
+    way, others, spare = LateWay(0.2), [SlowWay("b"), SlowWay("c")], full()
+
+    async def main() -> None:
+        for _ in range(10):
+            await first_answer([way, *others], REQUEST, spare)
+
+    run_controlled(main())
+    assert asked(others) == [[0.1], [0.1]]  # of the first read alone
+
+
+def test_what_is_lost_is_asked_again_soon_once_answers_are_quick_again() -> None:
+    ways, spare = [LateWay(0.3) for _ in range(3)], full()
+    questions(10, ways, spare)
+    for way in ways:
+        way.delay = 0.01
+    questions(100, ways, spare)
+    ways[0].delay = NEVER
+
+    async def main() -> float:
+        loop = asyncio.get_running_loop()
+        begun = loop.time()
+        await first_answer(ways, REQUEST, spare)
+        return loop.time() - begun
+
+    assert run_controlled(main()) == pytest.approx(0.11)
