@@ -68,8 +68,5 @@ def _by_status(array: Any) -> Counter[Status]:
 
 def _by_place(array: Any, kind: Literal["I", "Q"]) -> Counter[int]:
     """Return the numbers that are not 0, by their index."""
-    data = bytes(ffi.buffer(array))
-    if data.count(0) == len(data):  # as almost always, of what goes wrong
-        return Counter()
-    numbers = memoryview(data).cast(kind)
+    numbers = memoryview(ffi.buffer(array)).cast(kind)
     return Counter({index: number for index, number in enumerate(numbers) if number})
