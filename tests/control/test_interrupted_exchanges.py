@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable
 from functools import partial
 from itertools import count
 from linecache import getline
 from types import FrameType
-from typing import Any
 
 import pytest
+from interruptions import interrupted_at
 from motors import ReceivedRequests
 
 from multidrop import Bus
@@ -22,27 +21,18 @@ from multidrop.transport import line as of_a_port
 CODE = of_a_port.Line.carry_out.__code__
 
 
+def counts(frame: FrameType) -> bool:
+    """Say whether a signal comes before this line: not before the last one, after which nothing is left."""
+    return frame.f_code is CODE and "discard" not in getline(CODE.co_filename, frame.f_lineno)
+
+
 def interrupted(call: Callable[[], object], nth: int) -> KeyboardInterrupt | None:
     """Call it, and raise before the nth line of the exchanges that it makes; None where there are fewer."""
-    left, before = nth, sys.gettrace()
-
-    def trace(frame: FrameType, event: str, argument: object) -> Any:
-        nonlocal left
-        if frame.f_code is not CODE:
-            return None
-        if event == "line" and "discard" not in getline(CODE.co_filename, frame.f_lineno):  # nothing after it
-            left -= 1
-            if left == 0:
-                raise KeyboardInterrupt
-        return trace
-
-    sys.settrace(trace)
     try:
-        call()
+        with interrupted_at(nth, counts):
+            call()
     except KeyboardInterrupt as interruption:
         return interruption
-    finally:
-        sys.settrace(before)
     return None
 
 

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import sys
 from contextlib import AbstractContextManager
 from itertools import count
 from types import FrameType
-from typing import Any
 
 import pytest
+from interruptions import interrupted_at
 from simulated_bus import one
 
 from multidrop.control import latches as of_a_bus
@@ -20,26 +19,16 @@ CODE = {of_a_bus.__file__, of_a_drive.__file__}
 
 def raises_while_it_begins(stopping: AbstractContextManager[None], nth: int) -> bool:
     """Raise before the nth line of a stop's beginning, as a signal may; False where it has fewer lines."""
-    left, has_begun, before = nth, False, sys.gettrace()
+    has_begun = False
 
-    def trace(frame: FrameType, event: str, argument: object) -> Any:
-        nonlocal left
-        if frame.f_code.co_filename not in CODE:
-            return None
-        if event == "line" and not has_begun:
-            left -= 1
-            if left == 0:
-                raise KeyboardInterrupt
-        return trace
+    def counts(frame: FrameType) -> bool:
+        return not has_begun and frame.f_code.co_filename in CODE
 
-    sys.settrace(trace)
     try:
-        with stopping:
+        with interrupted_at(nth, counts), stopping:
             has_begun = True
     except KeyboardInterrupt:
         return True
-    finally:
-        sys.settrace(before)
     return False
 
 
