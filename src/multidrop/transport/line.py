@@ -221,6 +221,7 @@ class Line:
         into: Completion | None = None,
     ) -> Completion:
         """Carry an exchange out ahead of what is queued, and wait for it; LineError when the port fails.
+
         `into` is the completion to fill in, where nobody looks at it any more.
         """
         if self._opened.bridge and self.queue and self._opened.settings != exchange.settings:
@@ -269,8 +270,7 @@ class Line:
         calling = object()
         try:  # as in `carry_out`
             self._callers.add(calling)
-            core = self.queue
-            return now_ns if core is None else min(now_ns, core.counted_ns())
+            return now_ns if (core := self.queue) is None else min(now_ns, core.counted_ns())
         finally:
             self._callers.discard(calling)
 
