@@ -371,7 +371,8 @@ class Bus:
     def stop_on_exit(self) -> None:
         """From now on, stop all drives when the `with` block is left or the process ends.
 
-        Also on SIGINT and SIGTERM, at once, together with the drives of all other buses that asked for it.
+        Also on SIGINT and SIGTERM, at once, together with the drives of all other buses that asked for it;
+        and on SIGHUP, of a terminal that is closed, unless the program handles or ignores that one.
         The signal is held until that is done, and then does what it did before; three within a second cut
         it short, with a message on standard error. From the signal on nothing that moves a motor is sent.
         Without this call leaving sends nothing: the motors go on as they are. Call it from the main thread.

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import argparse
 import io
 import json
 import os
+import select
 import signal
 import subprocess
 import sys
@@ -18,10 +20,12 @@ from lines import Faulty, patient, until
 from motors import ReceivedRequests
 from toy import Status, Toy
 
+from multidrop.cli.support.confirm import confirm
 from multidrop.control import eeprom_ledger as ledger
 from multidrop.core import Message
 from multidrop.drives.innovert_ibd import InnovertIBD
 from multidrop.drives.invt_che import InvtCHE
+from multidrop.errors import Refused
 from multidrop.sim import MotorDrive, simulated
 from multidrop.sim.drive import Reason, Refusal, SimulatedDrive
 from multidrop.sim.memory import MemoryCell
@@ -267,6 +271,25 @@ def test_a_person_at_a_terminal_is_asked(
     assert err.startswith(f"Start the motor of toy@1 on {port}? [y/N] ")
     assert (status == 0) == bool(writes)
     assert len(toy.counters.writes) == writes
+
+
+def test_what_was_typed_before_the_question_does_not_answer_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The second "y" of an impatient person belongs to the question before."""
+    terminal, program = os.openpty()
+
+    class Screen(io.StringIO):
+        def write(self, text: str) -> int:
+            if "[y/N]" in text:
+                os.write(terminal, b"n\n")
+            return super().write(text)
+
+    os.write(terminal, b"y\n")
+    with os.fdopen(program) as keyboard, os.fdopen(terminal, "rb"):
+        assert select.select([keyboard], [], [], 10)[0]  # it is there
+        monkeypatch.setattr("sys.stdin", keyboard)
+        monkeypatch.setattr("sys.stderr", Screen())
+        with pytest.raises(Refused, match="nothing was sent"):
+            confirm("Start the motor of pump?", argparse.Namespace(yes=False))
 
 
 def test_every_write_is_noted_in_the_audit_log(run: Run, port: str, tmp_path: Path) -> None:

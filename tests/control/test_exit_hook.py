@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import signal
 import subprocess
 import sys
@@ -118,6 +119,56 @@ def test_the_third_signal_within_a_second_cuts_it_short_and_says_so(
     act.go_on.set()
     until(lambda: not threading_names() & {"multidrop exit"})
     assert len(caught) == 1
+
+
+def test_a_third_signal_cuts_it_short_though_nobody_can_be_told(
+    caught: list[int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Standard error may be closed, or a terminal that is gone."""
+
+    def write(fd: int, data: bytes) -> int:
+        raise OSError(errno.EIO, "Input/output error")
+
+    hook, act = ExitHook(), Act()
+    made = hook.add(act.begin, act.work)
+    monkeypatch.setattr("multidrop.control.exit_hook.os.write", write)
+    for _ in range(3):
+        signal.raise_signal(signal.SIGINT)
+    assert caught == [signal.SIGINT]
+    hook.finish(made)
+    act.go_on.set()
+    until(lambda: not threading_names() & {"multidrop exit"})
+
+
+def test_hang_ups_cut_nothing_short(caught: list[int]) -> None:
+    """The kernel and the shell may each send one, and more where several terminals go."""
+    before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    try:
+        hook, act = ExitHook(), Act()
+        made = hook.add(act.begin, act.work)
+        hook._before[signal.SIGHUP] = lambda number, frame: caught.append(number)  # not this process's end
+        for _ in range(4):
+            signal.raise_signal(signal.SIGHUP)
+        assert act.is_begun
+        assert caught == []
+        act.go_on.set()
+        hook.finish(made)
+        until(lambda: caught == [signal.SIGHUP])
+    finally:
+        signal.signal(signal.SIGHUP, before)
+
+
+@pytest.mark.parametrize("has", [signal.SIG_IGN, lambda number, frame: None], ids=["nohup", "its own"])
+def test_a_hang_up_that_does_not_end_the_program_is_left_alone(caught: list[int], has: Any) -> None:
+    before = signal.signal(signal.SIGHUP, has)
+    try:
+        hook = ExitHook()
+        hook.take_signals()
+        assert signal.getsignal(signal.SIGHUP) == has
+        hook.finish(hook.add(lambda: None, lambda: None))
+        assert signal.getsignal(signal.SIGHUP) == has
+    finally:
+        signal.signal(signal.SIGHUP, before)
 
 
 def threading_names() -> set[str]:

@@ -15,6 +15,7 @@ from tables import table
 from toy import Status, Toy
 
 from multidrop.bus import Bus
+from multidrop.control import eeprom_ledger
 from multidrop.control.eeprom_ledger import Ledger, LedgerCell, default_path
 from multidrop.drive import Drive
 from multidrop.drive.declare import setting
@@ -163,6 +164,25 @@ def test_what_cannot_wear_is_not_counted(tmp_path: Path, monkeypatch: pytest.Mon
 # ---- simulated drives ----
 
 with_names = pytest.mark.skipif(sys.platform != "linux", reason="this system has no names for it")
+
+
+def test_a_user_without_a_home_may_stop_and_not_wear_an_eeprom(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A container's user often has neither HOME nor an entry among the system's users."""
+
+    def home() -> Path:
+        raise RuntimeError("Could not determine home directory.")
+
+    monkeypatch.delenv("XDG_STATE_HOME", raising=False)
+    monkeypatch.setattr(Path, "home", home)
+    monkeypatch.setattr(eeprom_ledger, "NO_HOME", Path("/dev/null"), raising=False)  # root could make it
+    toy = simulated(Toy(1))
+    toy["status"] = Status(0)
+    line = SimulatedBus(monkeypatch, toy)
+    drive = line.attach(Toy(1))
+    drive.stop()
+    with pytest.raises(OSError, match=r"EEPROM writes /dev/null/multidrop/wear\.sqlite cannot be kept"):
+        line.bus.write(drive, drive.acceleration_time, 12.0)
+    assert toy.counters.eeprom_writes == {}
 
 
 @with_names

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import threading
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -732,6 +733,31 @@ def test_a_staggered_start_stops_what_it_started_at_the_first_failure(
         start_staggered(drives, 2.0)
     assert [each[:17] for each in starts(line, "invt-che")] == ["01 06 10 00 00 01"]
     assert all_stopped(line, sims)
+
+
+def test_all_that_was_started_is_stopped_though_the_system_gives_no_thread(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """And none waits for another that is silent."""
+
+    class NoThread(threading.Thread):
+        def start(self) -> None:
+            raise RuntimeError("can't start new thread")
+
+    sims: list[Any] = [simulated(InvtCHE(address, maximum_frequency=50)) for address in (1, 2, 3)]
+    line = SimulatedBus(monkeypatch, *sims)
+    drives = [line.attach(sim.drive) for sim in sims]
+    for drive in drives:
+        drive.set_frequency(20)
+    line.loses = lambda request: request.address == 1 and bool(starts(line, "invt-che")[1:])
+    sims[2].trip(4)
+    monkeypatch.setattr(threading, "Thread", NoThread)
+    with pytest.raises(Refused, match="OC1"):
+        start_staggered(drives, 2.0)
+    sent = [frame[:17] for frame in line.written]
+    assert not any(sim.motor.goal for sim in sims)
+    begun = sent.index("01 06 10 00 00 05")
+    assert sent.index("02 06 10 00 00 05") < begun + 4
 
 
 def test_a_ramp_goes_no_faster_than_the_drive(monkeypatch: pytest.MonkeyPatch) -> None:

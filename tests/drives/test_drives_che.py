@@ -35,6 +35,7 @@ from multidrop.drives.invt_che import (
 
 FORWARD = "01 06 10 00 00 01 4C CA"
 STOP = "01 06 10 00 00 05 4D 09"
+STOP_JOG = checksums.rtu("01 06 10 00 00 08").hex(" ").upper()
 COAST = "01 06 10 00 00 06 0D 08"
 RESET = "01 06 10 00 00 07 CC C8"
 HALF = "01 06 20 00 13 88 8F 5C"
@@ -120,30 +121,79 @@ def test_start() -> None:
 def test_start_without_a_direction_does_not_turn_a_running_motor_round() -> None:
     wire = Wire(InvtCHE(1), {"status": CHEStatus.REVERSE, "setpoint": 40.0})
     wire.drive.start()
-    wire.drive.jog()
-    assert [each[:17] for each in wire.sent] == ["01 06 10 00 00 02", "01 06 10 00 00 04"]
+    assert [each[:17] for each in wire.sent] == ["01 06 10 00 00 02"]
+
+
+@table(
+    ("status", "sentence"),
+    [
+        (CHEStatus.FORWARD, r"turns, and may go on through a jog: call stop\(\) first"),
+        (CHEStatus.REVERSE, r"turns, and may go on through a jog: call stop\(\) first"),
+        (5, "has 0005H at 1001H, which is not explained"),
+    ],
+)
+@pytest.mark.parametrize("direction", [None, *Direction])
+def test_a_motor_that_may_turn_is_not_jogged(status: int, sentence: str, direction: Direction | None) -> None:
+    wire = Wire(InvtCHE(1), {**STANDBY, "status": status})
+    with pytest.raises(Refused, match=sentence):
+        wire.drive.jog(direction)
+    assert wire.sent == []
+
+
+@pytest.mark.parametrize("direction", [None, *Direction])
+def test_a_state_that_is_not_explained_is_not_started_from(direction: Direction | None) -> None:
+    """The manual has 1 to 4 at 1001H: 5 may be anything, and the motor may turn the other way."""
+    wire = Wire(InvtCHE(1), {**STANDBY, "status": 5})
+    with pytest.raises(Refused, match="has 0005H at 1001H, which is not explained"):
+        wire.drive.start(direction)
+    assert wire.sent == []
 
 
 def test_stop_waits_for_standby() -> None:
     wire = Wire(InvtCHE(1), {"status": [CHEStatus.FORWARD, CHEStatus.FORWARD, CHEStatus.STANDBY]})
     wire.drive.stop()
-    assert wire.sent == [STOP]
+    assert wire.sent == [STOP, STOP_JOG]
     assert wire.reads == ["status"] * 3
 
 
-def test_a_jog_that_does_not_stop_is_stopped_as_one() -> None:
+def test_a_jog_that_goes_on_through_the_stop_is_stopped_at_once() -> None:
+    """Whoever began it: not when `stop_time` is over, nor only where more time than that is given."""
+    wire = Wire(
+        InvtCHE(1),
+        {"status": CHEStatus.FORWARD},
+        turns={STOP_JOG: {"status": CHEStatus.STANDBY}},
+    )
+    wire.drive.stop()
+    assert wire.sent == [STOP, STOP_JOG]
+    assert wire.seconds < 1
     wire = Wire(InvtCHE(1, stop_time=20), {"status": CHEStatus.FORWARD})
     with pytest.raises(Unconfirmed, match="20 s"):
         wire.drive.stop()
-    assert wire.sent[0] == STOP
-    assert [each[:17] for each in wire.sent[1:]] == ["01 06 10 00 00 08"]
+    assert wire.sent == [STOP, STOP_JOG]
+
+
+def test_a_jog_is_stopped_also_where_the_stop_is_refused() -> None:
+    refusal = DriveRefused("drive", 0x12, "")
+    turns = {STOP_JOG: {"status": CHEStatus.STANDBY}}
+    wire = Wire(InvtCHE(1), {"status": CHEStatus.FORWARD}, {STOP: [refusal] * 3}, turns)
+    wire.drive.stop()
+    assert wire.sent == [STOP] * 3 + [STOP_JOG]
+
+
+def test_a_run_whose_drive_has_no_jog_to_stop_is_watched() -> None:
+    refusal = DriveRefused("drive", 0x12, "")
+    says = {"status": [CHEStatus.FORWARD] * 4 + [CHEStatus.STANDBY]}
+    wire = Wire(InvtCHE(1), says, {STOP_JOG: [refusal] * 3})
+    wire.drive.stop()
+    assert wire.sent == [STOP] + [STOP_JOG] * 3
 
 
 def test_a_stop_may_be_refused_by_a_drive_that_stands() -> None:
     refusal = DriveRefused("drive", 1, "")
     wire = Wire(InvtCHE(1), {"status": CHEStatus.FAULT}, {STOP: [refusal] * 3})
     wire.drive.stop()
-    wire = Wire(InvtCHE(1), {"status": CHEStatus.FORWARD}, {STOP: [refusal] * 3})
+    loses = {STOP: [refusal] * 3, STOP_JOG: [refusal] * 3}
+    wire = Wire(InvtCHE(1), {"status": CHEStatus.FORWARD}, loses)
     with pytest.raises(DriveRefused):
         wire.drive.stop()
 

@@ -95,9 +95,16 @@ def test_commands(framing: Framing) -> None:
 
 
 def test_jog_has_its_direction_too() -> None:
-    jog = frame(DelixiModbus(1), DelixiModbus.control, DelixiModbusControl.JOG_FORWARD)
-    wire = Wire(DelixiModbus(1), STANDING, turns={jog: TURNING})
+    jogs = [
+        frame(DelixiModbus(1), DelixiModbus.control, word)
+        for word in (DelixiModbusControl.JOG_FORWARD, DelixiModbusControl.JOG_REVERSE)
+    ]
+    wire = Wire(DelixiModbus(1), STANDING, turns=dict.fromkeys(jogs, TURNING))
     wire.drive.jog()
+    for direction in Direction:
+        with pytest.raises(Refused, match=r"turns, and may go on through a jog: call stop\(\) first"):
+            wire.drive.jog(direction)
+    wire.say(STANDING)
     wire.drive.jog(Direction.REVERSE)
     assert [each[:17] for each in wire.sent] == ["01 06 20 00 00 13", "01 06 20 00 00 23"]
 

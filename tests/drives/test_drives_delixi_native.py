@@ -105,6 +105,24 @@ def test_start_without_a_known_setpoint_is_refused() -> None:
     assert wire.sent == []
 
 
+@table(
+    ("status", "sentence"),
+    [
+        (DelixiNativeStatus.UNDERVOLTAGE, r"a fault, UNDERVOLTAGE: .*reset_fault\(\)"),
+        (DelixiNativeStatus.FAULT, r"a fault, FAULT: .*reset_fault\(\)"),
+        (9, "says 0009H to K = 03, which is not explained"),
+    ],
+)
+def test_no_motor_is_started_that_could_run_later(status: int, sentence: str) -> None:
+    """P05.31 is 0 all the same: a run command without mains may wait for them."""
+    wire = Wire(DelixiNative(1), {**STANDING, "status": status})
+    wire.drive.set_frequency(50)
+    for direction in (None, *Direction):
+        with pytest.raises(Refused, match=sentence):
+            wire.drive.start(direction)
+    assert wire.sent == [FIFTY]
+
+
 def test_the_stored_setpoint() -> None:
     drive = DelixiNative(1)
     assert frame(drive, DelixiNative.stored_frequency, 50) == FIFTY_STORED

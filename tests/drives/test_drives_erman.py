@@ -153,6 +153,14 @@ def test_stop_ends_in_an_emergency_stop_and_then_in_an_error() -> None:
     assert 30 <= wire.seconds <= 31  # twice the deceleration time and 5 s
 
 
+def test_a_drive_that_refuses_its_stop_is_stopped_by_the_emergency_stop() -> None:
+    refusal = DriveRefused("drive", 3, "")
+    for refused, begun in ((STOP_ON, [STOP_ON] * 3), (START_OFF, [STOP_ON, *[START_OFF] * 3])):
+        wire = Wire(ErmanERG220(1), STOPPED, {refused: [refusal] * 3})
+        wire.drive.stop()
+        assert wire.sent == [*begun, EMERGENCY_ON, START_OFF]
+
+
 def test_stop_is_sent_again_when_its_answer_is_lost() -> None:
     lost = Unconfirmed("drive", "stop", "no reply")
     wire = Wire(ErmanERG220(1), STOPPED, {STOP_ON: [lost, DriveRefused("drive", 3, "")]})

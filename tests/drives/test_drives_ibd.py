@@ -102,10 +102,25 @@ def test_printed_commands(framing: Framing) -> None:
 
 
 def test_reset_and_zero() -> None:
-    wire = Wire(InnovertIBD(1))
+    wire = Wire(InnovertIBD(1), STANDING)
     wire.drive.reset_fault()
     wire.drive.set_frequency(0)
-    assert wire.sent == [RESET, ZERO]
+    assert wire.sent == [STOP[Framing.RTU], RESET, ZERO]
+
+
+def test_no_run_command_outlasts_the_fault() -> None:
+    """In table 3 the word of the reset has no action in bits 1 and 0: a run of before may still be there."""
+    stop = STOP[Framing.RTU]
+    lost = [Unconfirmed("drive", "stop", "no reply")] * 3
+    wire = Wire(InnovertIBD(1), STANDING, {stop: lost})
+    with pytest.raises(Unconfirmed):
+        wire.drive.reset_fault()
+    assert wire.sent == [stop] * 3
+    for turning in ({"motor_speed": 120.0}, {"output_current": 0.4}):
+        wire = Wire(InnovertIBD(1), {**STANDING, **turning})
+        with pytest.raises(Refused, match="turns: it has no fault to reset"):
+            wire.drive.reset_fault()
+        assert wire.sent == []
 
 
 @pytest.mark.parametrize("direction", Direction)

@@ -23,6 +23,8 @@ STANDING = {
     "held_frequency": 0.0,
     "fault_record_1": 0.0,
     "maximum_frequency": 80.0,
+    "inputs": Inputs(0),
+    "always_on_function": 0.0,
 }
 AT_30_HZ = {**STANDING, "frequency": 30.0}
 
@@ -397,6 +399,35 @@ def test_reset_is_sent_once_and_followed_by_a_stop() -> None:
         wire.drive.reset_fault()
     with pytest.raises(Refused, match="runs"):
         Wire(YD1000(1), {"output_frequency": 5.0}).drive.reset_fault()
+
+
+FUNCTIONS = {f"input_{at}_function": factory for at, factory in enumerate((2.0, 3.0, 10.0, 6.0, 7.0), 1)}
+
+
+@table(
+    ("says", "terminal"),
+    [
+        ({"inputs": Inputs.F}, "terminal F"),
+        ({"inputs": Inputs.R}, "terminal R"),
+        ({"inputs": Inputs.S2, "input_5_function": 2.0}, "terminal S2"),
+        ({"always_on_function": 3.0}, "F110"),
+    ],
+)
+def test_a_reset_that_a_terminal_could_make_a_start_is_not_sent(
+    says: dict[str, object], terminal: str
+) -> None:
+    """Bit 15 goes with a power-on (section 8.1), and may with the restart: then the terminals command."""
+    wire = Wire(YD1000(1), {**STANDING, **FUNCTIONS, **says})
+    with pytest.raises(Refused, match=f"^{terminal}.* says run, and may start its motor"):
+        wire.drive.reset_fault()
+    assert wire.sent == []
+
+
+@pytest.mark.parametrize("closed", [Inputs.RST | Inputs.S1, Inputs(0)])
+def test_other_terminals_keep_no_reset_back(closed: Inputs) -> None:
+    wire = Wire(YD1000(1), {**STANDING, **FUNCTIONS, "inputs": closed})
+    wire.drive.reset_fault()
+    assert wire.sent == [frame(YD1000(1), YD1000.control, YD1000Control(0xE000)), STOP]
 
 
 def test_the_setpoint() -> None:

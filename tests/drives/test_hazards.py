@@ -123,7 +123,7 @@ HAZARDS = [
         che,
         stop,
         naive="01 06 10 00 80 00",
-        sends=("01 06 10 00 00 05",),
+        sends=("01 06 10 00 00 05", "01 06 10 00 00 08"),
         turning=True,
     ),
     Hazard(

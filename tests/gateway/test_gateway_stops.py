@@ -78,6 +78,7 @@ UNREADABLE = {
     "no body": b"0\r\n\r\n",
     "no object": b"2\r\n\r\n[]",
     "a number": b"13\r\n\r\n" + b'{"drives": 1}',
+    "an empty list": b"14\r\n\r\n" + b'{"drives": []}',
     "no names": b"15\r\n\r\n" + b'{"drives": [1]}',
 }
 

@@ -337,7 +337,7 @@ def test_clients_that_may_stop_may_do_nothing_else() -> None:
 # ---- stops ----
 
 
-@pytest.mark.parametrize("value", [v for v in range(20) if v not in (5, 6)])
+@pytest.mark.parametrize("value", [v for v in range(20) if v not in (5, 6, 8)])
 def test_of_a_control_register_only_a_stop_is_taken(gateway: Gateway, value: int) -> None:
     assert code(gateway, 1, 6, CHE_CONTROL, value) == 3
     assert (gateway.commands.written, gateway.commands.stopped) == ([], [])
@@ -348,17 +348,19 @@ def test_every_way_to_say_stop_goes_to_commands(gateway: Gateway) -> None:
         assert client.ask(1, 6, CHE_CONTROL, 5).data == bytes.fromhex("10 00 00 05")
         assert client.ask(1, 16, CHE_CONTROL, 1, data=bytes.fromhex("02 00 05")).code is None
         assert client.ask(1, 6, CHE_CONTROL, 6).code is None  # coast
+        assert client.ask(1, 6, CHE_CONTROL, 8).code is None  # jog stop
         assert client.ask(3, 6, IBD_CONTROL, IBD_STOP).code is None
         assert client.ask(3, 6, IBD_CONTROL, 0).code == 3  # "no command" stops nothing
-        assert client.ask(4, 6, BLOCK + 10, 1).code is None  # Delixi's own protocol, all the same
-    assert [drives for drives, _ in gateway.commands.stopped] == [["mill"]] * 3 + [["pump"], ["belt"]]
+        for yes in (1, 2, 0xFF00, 0xFFFF):  # as masters say it
+            assert client.ask(4, 6, BLOCK + 10, yes).code is None  # Delixi's own protocol, all the same
+    stopped = [drives for drives, _ in gateway.commands.stopped]
+    assert stopped == [["mill"]] * 4 + [["pump"]] + [["belt"]] * 4
 
 
 @pytest.mark.parametrize(
     ("function", "words", "data", "expected"),
     [
         (6, (BLOCK + 10, 0), b"", 3),
-        (6, (BLOCK + 10, 2), b"", 3),
         (6, (BLOCK, 1), b"", 2),
         (16, (BLOCK + 10, 2), b"\4\0\1\0\1", 3),
         (16, (BLOCK + 9, 2), b"\4\0\1\0\1", 2),

@@ -124,7 +124,9 @@ class Stop:
         Stop("invt-che", "control", 6),  # coast
         Stop("innovert-ibd", "control", 1),
         Stop("delixi-modbus", "control", 1),
+        Stop("invt-che", "control", 8),  # jog stop
         Stop("yd1000", "control", 0xC000),
+        Stop("yd1000", "control", 0x8000),  # section 8.1, where FNOD says the frequency
         Stop("optidrive-e3", "control", 0),
         Stop("delta-ms300", "control", 1),
     ],

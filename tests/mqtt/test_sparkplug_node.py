@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -160,6 +161,27 @@ def test_commands_of_a_host(broker: Broker, host: Host, node: tuple[Any, Running
     while len(known.commands.noted) < 2 and time.monotonic() < ends:
         time.sleep(0.01)
     assert known.commands.noted == [("write", "pump-1", "setpoint", 25.0), ("stop", ["pump-1"])]
+
+
+@pytest.mark.parametrize("damage", [b"\x0b", b"\x12\x04\x0a\x02\xff\xfe", b"\x12\x7f"])
+@pytest.mark.parametrize(
+    ("name", "noted"), [(b"Device Control/Stop", [("stop", ["pump-1"])]), (b"setpoint", [])]
+)
+def test_a_stop_is_sent_whatever_is_wrong_with_the_rest_of_its_payload(
+    tmp_path: Path, damage: bytes, name: bytes, noted: list[object]
+) -> None:
+    """A group, a name that is no UTF-8, and a metric that was cut off, behind a boolean metric."""
+    known = inside(tmp_path)
+    node = SparkplugNode(MqttSettings(sparkplug="works", node="line", commands=True), known, lambda: 7)
+    metric = b"\x0a" + bytes([len(name)]) + name + b"\x70\x01"
+
+    async def receive() -> None:
+        payload = b"\x12" + bytes([len(metric)]) + metric + damage
+        node.received(ROOT.format("DCMD") + "/pump-1", payload, is_retained=False)
+        await asyncio.gather(*asyncio.all_tasks() - {asyncio.current_task()})
+
+    asyncio.run(receive())
+    assert known.commands.noted == noted
 
 
 def test_another_plant_is_a_death_of_what_left_and_a_birth_of_the_rest(

@@ -302,11 +302,13 @@ def test_a_delta_that_follows_another_setpoint_is_not_started(shown: float, sent
 
 
 def test_an_invt_that_goes_on_jogging_is_stopped_as_one() -> None:
+    """At once, and not when all the time that a stop may take is over."""
     found = wire("invt-goodrive", GD_RUNS)
     found.drive.option["stop_time"] = 5.0
     with pytest.raises(Unconfirmed, match="5 s"):
         found.drive.stop()
     assert sent(found) == [DELTA + "00 05", DELTA + "00 08"]
+    assert found.seconds < 5.5
 
 
 def test_an_invt_that_was_jogged_is_stopped_before_a_start() -> None:

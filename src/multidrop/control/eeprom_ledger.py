@@ -20,6 +20,7 @@ YEAR = 365 * 86400.0  # s
 CYCLES = 10_000  # that an EEPROM bears (Toshiba's figure for a relative of the YD1000)
 YEARS = 10
 BUDGET = CYCLES // YEARS  # writes of one register in a year
+NO_HOME = Path("/nonexistent")  # as the user "nobody" has it
 LATEST = 6e10  # UTC in s: a time beyond it, or as far before 0, is damage
 LEAST_INTERVAL = 60.0  # s between two writes of a register that is known to be in EEPROM
 
@@ -49,9 +50,15 @@ class Wear:
 
 
 def default_path() -> Path:
-    """Return the path for state that survives restarts (XDG base directory specification)."""
-    state = os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state"
-    return Path(state) / "multidrop" / "wear.sqlite"
+    """Return the path for state that survives restarts (XDG base directory specification).
+
+    A user without a home, as in a container, has none that can be kept: a stop needs none.
+    """
+    try:
+        state = Path(os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state")
+    except RuntimeError:
+        state = NO_HOME
+    return state / "multidrop" / "wear.sqlite"
 
 
 class Ledger:

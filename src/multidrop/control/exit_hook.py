@@ -1,4 +1,4 @@
-"""ExitHook: does what buses asked for before this process ends, in any way but SIGKILL.
+"""ExitHook: does what buses asked for before this process ends, by itself or by SIGINT, SIGTERM or SIGHUP.
 
 There is one in a process. A signal only begins the last acts, which run in threads of their own, side by
 side: a handler that waited for them could wait for a lock of the very thread that it interrupts.
@@ -25,6 +25,16 @@ _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 IMPATIENT = 3  # signals within a second, after which nothing is waited for
 HANDLING_S = 0.05  # the longest that a signal waits to be handled
 CUT_SHORT = b"multidrop: the stops were cut short by a third signal: motors may still be turning\n"
+
+
+def _ending() -> tuple[signal.Signals, ...]:
+    """Return the signals that are taken.
+
+    SIGHUP, of a terminal that was closed, is one unless the program has a use for it, or nohup ignores it.
+    """
+    if sys.platform != "win32" and signal.getsignal(signal.SIGHUP) == signal.SIG_DFL:
+        return (*_SIGNALS, signal.SIGHUP)
+    return _SIGNALS
 
 
 def _send(number: int, ident: int) -> None:
@@ -81,7 +91,7 @@ class LastAct:
 
 
 class ExitHook:
-    """Begins all last acts at exit, or on SIGINT or SIGTERM, and holds the signal until they are over.
+    """Begins all last acts at exit, or on one of these signals, and holds the signal until they are over.
 
     Then the signal has the effect that it had before; at once where IMPATIENT of them come within a second.
     """
@@ -115,9 +125,9 @@ class ExitHook:
         return act
 
     def take_signals(self) -> None:
-        """Take SIGINT and SIGTERM. Raises ValueError outside the main thread, the only one that may."""
+        """Take these signals. Raises ValueError outside the main thread, the only one that may."""
         if not self._before:
-            for number in _SIGNALS:
+            for number in _ending():
                 self._before[number] = signal.signal(number, self._on_signal)
 
     def finish(self, act: LastAct) -> None:
@@ -138,7 +148,8 @@ class ExitHook:
     def _on_signal(self, number: int, frame: FrameType | None) -> None:
         """Begin the last acts. Take no lock here: the main thread may hold it."""
         now = time.monotonic()
-        self._came = [*(at for at in self._came if now - at < 1.0), now]
+        if number in _SIGNALS:  # a terminal that goes may send several, and nobody is impatient
+            self._came = [*(at for at in self._came if now - at < 1.0), now]
         if self._held is None:
             self._held, self._has_passed = number, False
         acts = [*self._acts]
@@ -147,7 +158,8 @@ class ExitHook:
         if all(act.is_over for act in acts):
             self._pass_on(number)
         elif len(self._came) >= IMPATIENT:
-            os.write(2, CUT_SHORT)
+            with suppress(OSError):  # nobody may be there to read it
+                os.write(2, CUT_SHORT)
             for act in acts:
                 act.is_cut_short = True
             self._pass_on(number)

@@ -33,15 +33,25 @@ def start_staggered(drives: Sequence[Drive], gap: float, direction: Direction | 
 
 
 def _stop(drives: Sequence[Drive]) -> None:
-    """Stop them all at once: they may be on several buses, and one may be silent."""
+    """Stop them all at once: they may be on several buses, and one may be silent.
 
-    def stop(drive: Drive) -> None:
+    Where the system gives no more threads, each of the others is sent its stop before any is waited for.
+    """
+
+    def stop(drive: Drive, seconds: float | None = None) -> None:
         with suppress(BusError, ValueError):
-            drive.stop()
+            drive.stop(seconds=seconds)
 
-    threads = [threading.Thread(target=copy_context().run, args=[stop, drive]) for drive in drives]
-    for thread in threads:
-        thread.start()
+    threads: list[threading.Thread] = []
+    with suppress(RuntimeError):
+        for drive in drives:
+            thread = threading.Thread(target=copy_context().run, args=[stop, drive])
+            thread.start()
+            threads.append(thread)
+    left = drives[len(threads) :]
+    for seconds in (0.0, None):
+        for drive in left:
+            stop(drive, seconds)
     for thread in threads:
         thread.join()
 

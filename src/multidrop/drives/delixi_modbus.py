@@ -49,7 +49,8 @@ class DelixiModbus(DelixiParameters, table=HOLDING):
     - Whether a run command without a direction keeps the old one is not stated: both are always
       sent together. `start` without a direction goes forward from rest; while the motor turns it is
       refused, because the direction cannot be read. The toggle of the direction is never sent.
-    - Whether a start ends a jog is not stated: one that was jogged is to be stopped before a start.
+    - Whether a start ends a jog, and a jog a run, is not stated: one that was jogged is to be stopped before
+      a start, and one that turns before a jog.
     - There is no fault reset, and reserved bits are not tried.
     - There is no state word: an output frequency of 0 may be a stop, or a run at a setpoint of 0.
     - "3800" bit/s is 4800; the fault "0C-xx" is OC-2, and 04 is OU.
@@ -124,8 +125,10 @@ class DelixiModbus(DelixiParameters, table=HOLDING):
 
     @verb
     def jog(self, direction: Direction | None = None) -> Script[None]:
-        """Turn slowly until stopped; without a direction forward, and only from rest."""
+        """Turn slowly from rest until stopped; without a direction forward."""
         forward = yield from self._forward(direction)
+        if not (yield from self._stands()):
+            raise self._stop_first("turns, and may go on through a jog:")
         self._jogged = True
         yield from write(
             self.control, DelixiModbusControl.JOG_FORWARD if forward else DelixiModbusControl.JOG_REVERSE

@@ -60,6 +60,8 @@ class DelixiNative(DelixiParameters, table=PARAMETER):
       other code that is not 0 is a fault.
     - "K = FOH" is F0H, "3800" bit/s is 4800, and "<80m" is 80 ms.
     - What P00.01 must be for K = 04 to be used is not stated.
+    - K = 03 may say fault or undervoltage while P05.31 is 0, and what becomes of a run command then is not
+      stated (it may wait for the mains): `start` is refused, as in any state that is not explained.
     - The sum cannot see swapped bytes: a reply is compared field by field.
     - A drive does not take another master's K = F0 to FF, and none is sent.
 
@@ -118,8 +120,13 @@ class DelixiNative(DelixiParameters, table=PARAMETER):
     def start(self, direction: Direction | None = None) -> Script[None]:
         """Start at the setpoint in force; without a direction, in the one it turns in, or forward."""
         yield from self._may_start()
+        status = yield from read(self.status)
+        if status in (DelixiNativeStatus.FAULT, DelixiNativeStatus.UNDERVOLTAGE):
+            raise self._reset_first(status.name)
+        if status not in CONDITIONS:
+            raise Refused(f"{self.name} says {int(status):04X}H to K = 03, which is not explained")
         yield from self._setpoint_in_force()
-        if direction is None and (yield from read(self.status)) == DelixiNativeStatus.REVERSE:
+        if direction is None and status == DelixiNativeStatus.REVERSE:
             direction = Direction.REVERSE
         word = DelixiNativeControl.REVERSE if direction is Direction.REVERSE else DelixiNativeControl.FORWARD
         yield from write(self.control, word)

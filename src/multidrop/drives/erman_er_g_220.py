@@ -242,9 +242,13 @@ class ErmanERG220(Drive):
 
     @verb
     def stop(self) -> Script[None]:
-        """Stop along the ramp; when the motor still runs after it, emergency stop."""
-        yield from insist(self.stop_coil, Coil.ON)
-        yield from insist(self.start_coil, Coil.OFF)
+        """Stop along the ramp; when the motor still runs after it, or refuses that, emergency stop."""
+        try:
+            yield from insist(self.stop_coil, Coil.ON)
+            yield from insist(self.start_coil, Coil.OFF)
+        except DriveRefused:
+            yield from self.emergency_stop.script()
+            return
         limit = (yield from read(self.deceleration_time)) + STOP_MARGIN
         try:
             yield from self._stopped(self._stands, limit)

@@ -105,6 +105,8 @@ class InnovertIBD(Drive):
       whatever direction is in force. The toggle of the direction is never sent.
     - A jog is left by a stop and a new start (table 3), and whether a motor that turns does so in a jog
       cannot be read: `start` and `jog` are refused while it turns, and want a stop first.
+    - A reset has "no action" in bits 1 and 0, which may leave a run of before the fault in force: a stop is
+      sent before it, and without that no reset.
     - There is no state word. The state is unknown unless the outputs are programmed as in the
       example (Prd.23 = 1, Prd.24 = 7, Prd.25 = 8, Prd.28 = 3), which `state` and `stop` look up.
       Otherwise `stop` goes by current and speed.
@@ -300,7 +302,10 @@ class InnovertIBD(Drive):
 
     @verb
     def reset_fault(self) -> Script[None]:
-        """Reset a fault; never starts the motor."""
+        """Reset a fault after a stop was commanded; never starts the motor. Sent once."""
+        if not (yield from self._stands()):
+            raise Refused(f"{self.name} turns: it has no fault to reset")
+        yield from insist(self.control, IBDControl.STOP)
         yield from write(self.control, IBDControl.RESET_FAULT)
 
     @verb

@@ -5,7 +5,7 @@ from __future__ import annotations
 from enum import IntEnum
 from typing import Any, Unpack
 
-from multidrop.drive import Advice, Drive, DriveRefused, NotDone, Refused, Unconfirmed
+from multidrop.drive import Advice, Drive, DriveRefused, NotDone, Refused
 from multidrop.drive.declare import Details, command, declaration, reading, setting
 from multidrop.drive.number_format import NumberFormat
 from multidrop.drive.options import Option
@@ -138,8 +138,10 @@ class InvtCHE(Drive):
     - Newer INVT families have the control word at 2000H: see `identify`.
     - GD200L and GD300L print the DC bus voltage with and without a decimal: its scale is left open.
     - The example that writes 5000 to 0008H does not say what that is, and is not to be repeated.
-    - STOP may not end a jog: when the drive has not stopped after it, STOP_JOG follows. Nor may a
-      start: one that was jogged is to be stopped before a start.
+    - STOP may not end a jog: where the motor still turns after it, STOP_JOG follows at once. Nor may a
+      start: one that was jogged is to be stopped before a start. Whether a run ends in a jog is not
+      stated either: `jog` is refused while the motor turns.
+    - A state word other than 1 to 4 is not explained: `start` and `jog` are refused then.
     - Exception 03 is a malformed frame; a value out of range is 12H.
 
     The drive may also speak ASCII (CHE100 manual); the chapter has RTU only. P0.01 = 2 takes
@@ -259,8 +261,10 @@ class InvtCHE(Drive):
 
     @verb
     def jog(self, direction: Direction | None = None) -> Script[None]:
-        """Turn slowly until stopped; without a direction, in the one it turns in, or forward."""
+        """Turn slowly from rest until stopped; without a direction, forward."""
         forward = yield from self._forward(direction)
+        if not (yield from self._stands()):
+            raise self._stop_first("turns, and may go on through a jog:")
         self._jogged = True
         yield from write(self.control, CHEControl.JOG_FORWARD if forward else CHEControl.JOG_REVERSE)
         yield from self._started()
@@ -270,24 +274,26 @@ class InvtCHE(Drive):
         if status == CHEStatus.FAULT:
             fault = self.fault.format((yield from read(self.fault)))
             raise self._reset_first(fault)
+        if status not in STATES:
+            raise Refused(f"{self.name} has {int(status):04X}H at 1001H, which is not explained")
         if direction is None:
             return status != CHEStatus.REVERSE
         return direction is Direction.FORWARD
 
     @verb
     def stop(self) -> Script[None]:
-        """Stop along the ramp; a jog that goes on after it is stopped on its own."""
-        limit = self.option.get("stop_time", STOP_TIME)
-        try:
-            yield from insist(self.control, CHEControl.STOP)
-        except DriveRefused:  # as it may in a fault, in which it stands already
-            if not (yield from self._stands()):
-                raise
-        try:
-            yield from self._stopped(self._stands, limit)
-        except Unconfirmed:
-            yield from insist(self.control, CHEControl.STOP_JOG)
-            yield from self._stopped(self._stands, limit)
+        """Stop along the ramp, and a jog too where the motor turns after it: that it jogs cannot be read."""
+        refusals: list[DriveRefused] = []
+        for word in (CHEControl.STOP, CHEControl.STOP_JOG):
+            try:
+                yield from insist(self.control, word)
+            except DriveRefused as refusal:  # as it may in a fault, or where there is no jog to stop
+                refusals.append(refusal)
+            if (yield from self._stands()):
+                return
+        if len(refusals) > 1:
+            raise refusals[0]
+        yield from self._stopped(self._stands, self.option.get("stop_time", STOP_TIME))
 
     @verb
     def coast(self) -> Script[None]:

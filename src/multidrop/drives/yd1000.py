@@ -25,6 +25,7 @@ PANEL = "it is effective from the panel only"
 LINE = "it changes the drive's end of the line; set it on the panel"
 COMMAND = "it belongs to the command over the motor; set it on the panel"
 NO_SCALE = "its scale is not stated"
+RUN_FUNCTIONS = (2, 3)  # of an input: those that F and R have from the factory
 AT_ONCE = "Takes effect at once."
 AFTER_RESET = "Takes effect after a reset or at the next power-on."
 
@@ -162,8 +163,10 @@ class YD1000(Drive):
       that speed.
     - How bit 7, the direct-current brake, goes with run and stop is not stated: it is never set.
     - Bit 13 (reset) and 12 (emergency stop) are held for a moment only: relatives restart again and
-      again while they are set. A reset keeps bit 15 and the run bit off, so that no terminal starts the
-      motor; its reply may be cut off, and 3 s later the stop is written again.
+      again while they are set. A reset has bit 15 and not the run bit; its reply may be cut off, and 3 s
+      later the stop is written again. A restart may take bit 15 back, as power-on does (section 8.1), so
+      that the terminals command the motor until then: a reset is refused while one of them says run. The
+      table of functions is missing: 2 and 3 are taken for run, which the terminals F and R have.
     - Jog is written without the run bit, which would turn the motor at the setpoint if jog is not obeyed.
     - 1200H and 1201H are called present values, but are frozen in a trip: only 1100H is live. A motor
       has stopped when it is 0 twice. A trip shows as a 1200H that is not 0 while 1100H is; a trip at
@@ -494,12 +497,27 @@ class YD1000(Drive):
         """
         if (yield from read(self.output_frequency)) > 0:
             raise Refused(f"{self.name} runs: it has no fault to reset")
+        yield from self._no_terminal_runs()
         with suppress(Unconfirmed):  # the restart cuts the reply off
             yield from write(self.control, STOP | YD1000Control.RESET)
         yield from wait(RESET_TIME)
         yield from insist(self.control, STOP)
         self._record = yield from read(self.fault_record_1)
         self.commanded = None
+
+    def _no_terminal_runs(self) -> Script[None]:
+        """Raise Refused where a terminal could start the motor: bit 15 does not outlast the restart."""
+        closed = yield from read(self.inputs)
+        functions = {"F110, which is always on,": self.always_on_function}
+        for number, terminal in enumerate(Inputs, 1):  # F111 is the function of F, and so on
+            if closed & terminal:
+                functions[f"terminal {terminal.name}"] = self.registers[f"input_{number}_function"]
+        for what, function in functions.items():
+            if (yield from read(function)) in RUN_FUNCTIONS:
+                raise Refused(
+                    f"{what} of {self.name} says run, and may start its motor once a reset has restarted the "
+                    "drive: take that back first"
+                )
 
     @verb
     def set_frequency(self, hz: float) -> Script[None]:

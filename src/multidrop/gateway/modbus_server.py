@@ -235,7 +235,7 @@ class ModbusServer:
         if carrier is Carrier.WORD and address in common:
             if address != common.start + STOP:
                 raise Declined(ModbusCode.ILLEGAL_ADDRESS)
-            if (count, data) != (1, b"\0\1"):
+            if count != 1 or data == b"\0\0":
                 raise Declined(ModbusCode.ILLEGAL_VALUE)
             return self._stop(unit, request, client)
         register = unit.writable(carrier, address)

@@ -51,8 +51,8 @@ async def body_of(request: Request, seconds: float | None = None) -> dict[str, A
 async def drives_to_stop(request: Request) -> list[str] | None:
     """Return the drives that a stop names; None: all.
 
-    A stop needs no body: one that is late, cut off, too long or no list of names asks for all drives. To stop
-    too many can be mended, and to stop none cannot.
+    A stop needs no body: one that is late, cut off, too long, or no list of names, or one of none, asks for
+    all drives. To stop too many can be mended, and to stop none cannot.
     """
     try:
         drives = (await body_of(request, STOP_BODY_S)).get("drives")
@@ -61,7 +61,9 @@ async def drives_to_stop(request: Request) -> list[str] | None:
         return None
     if isinstance(drives, str):
         return [drives]
-    if drives is None or (isinstance(drives, list) and all(isinstance(one, str) for one in drives)):
+    if drives is None:
+        return None
+    if isinstance(drives, list) and drives and all(isinstance(one, str) for one in drives):
         return drives
     _log.warning("a stop is one of all drives, because %.100r is no list of names", drives)
     return None

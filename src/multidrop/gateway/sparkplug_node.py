@@ -75,6 +75,8 @@ class SparkplugNode:
             sent_ms, metrics = read_command(payload)
         except ValueError as mistake:
             _log.warning("a command on %s is no Sparkplug payload: %s", topic, mistake)
+            if levels[2] == "DCMD" and STOP.encode() in payload:  # whatever is wrong with the rest
+                self._orders.stop([levels[-1]])
             return
         if levels[2] == "NCMD":
             if any(given.name == REBIRTH and given.value for given in metrics):

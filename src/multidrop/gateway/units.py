@@ -80,7 +80,11 @@ class Unit:
 
 
 def _stop_writes(drive: Any) -> Iterator[StopWrite]:
-    """Yield the first write of each verb that stops the motor, as the family's own scripts have it."""
+    """Yield the first write of each verb that stops the motor, as the family's own scripts have it.
+
+    With it all others that the family calls harmless there, such as YD1000's 8000H; but for 0, which may be
+    no command at all.
+    """
     for name in _STOPS:
         try:
             script = getattr(drive, name).script()
@@ -88,7 +92,8 @@ def _stop_writes(drive: Any) -> Iterator[StopWrite]:
             script.close()
             register, value = getattr(step, "register", None), getattr(step, "value", None)
             if isinstance(register, Register) and value is not None:
-                yield StopWrite(register.name, register.encode(value))
+                counts = {register.encode(value), *filter(None, register.harmless or ())}
+                yield from (StopWrite(register.name, raw) for raw in counts)
         except Exception:  # a family without this verb, or one whose script needs a bus
             continue
 

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import suppress
 from enum import IntEnum
 from typing import ClassVar
 
-from multidrop.drive import Unconfirmed
+from multidrop.drive import DriveRefused
 from multidrop.drive.register import Access
 from multidrop.drive.script import Script, insist, write
 from multidrop.drive.state import Condition, Direction
@@ -49,8 +50,8 @@ class Invt(Profile):
 
     - Other makes have copied the words with 5 and 6 the other way round (both stop), and some with 5 for
       reverse: compare the manual's list with `InvtControl`, word by word, before a family is declared.
-    - A stop may not end a jog, nor may a start: when the drive has not stopped, STOP_JOG follows; one that
-      was jogged is to be stopped before a start.
+    - A stop may not end a jog, nor may a start: where the motor still turns after it, STOP_JOG follows at
+      once; one that was jogged is to be stopped before a start.
     """
 
     stop_word: ClassVar[int] = InvtControl.STOP
@@ -110,11 +111,10 @@ class Invt(Profile):
         yield from self._started()
 
     def _watch_stop(self) -> Script[None]:
-        try:
-            yield from super()._watch_stop()
-        except Unconfirmed:
-            yield from insist(self.control, self._word(InvtControl.STOP_JOG))
-            yield from super()._watch_stop()
+        if self._turns((yield from self._status())):
+            with suppress(DriveRefused):  # there may be no jog to stop
+                yield from insist(self.control, self._word(InvtControl.STOP_JOG))
+        yield from super()._watch_stop()
 
     def _take_reset_back(self) -> Script[None]:
         """Do nothing: a word is carried out when it comes, and is not held."""

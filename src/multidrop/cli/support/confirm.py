@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+from contextlib import suppress
 
 from multidrop.errors import Refused
 from multidrop.printable import printable
@@ -15,6 +16,7 @@ def confirm(question: str, arguments: argparse.Namespace) -> None:
         return
     if not sys.stdin.isatty():
         raise Refused(f"{question} There is no terminal to ask on: add --yes if it is meant")
+    _drop_what_was_typed_before()
     print(f"{printable(question)} [y/N] ", end="", file=sys.stderr, flush=True)
     answer = ""
     try:
@@ -27,3 +29,13 @@ def confirm(question: str, arguments: argparse.Namespace) -> None:
             print(file=sys.stderr)
     if answer.strip().lower() not in ("y", "yes"):
         raise Refused("nothing was sent")
+
+
+def _drop_what_was_typed_before() -> None:
+    """Drop what the terminal holds: a "y" from before the question does not answer it."""
+    if sys.platform == "win32":
+        return
+    import termios
+
+    with suppress(OSError, termios.error):  # a stream that is no device
+        termios.tcflush(sys.stdin.fileno(), termios.TCIFLUSH)
