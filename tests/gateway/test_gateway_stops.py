@@ -107,6 +107,17 @@ def test_a_drive_to_stop_may_be_named_without_a_list(tmp_path: Path) -> None:
         assert not stands(gateway, "pump-2")
 
 
+@pytest.mark.parametrize("verb", ["stop", "coast"])
+@pytest.mark.parametrize("options", [None, [], "now", {"direction": "forward"}])
+def test_no_options_keep_a_stop_by_a_verb_back(tmp_path: Path, verb: str, options: object) -> None:
+    """Programs write null where they have none."""
+    with served(tmp_path, MAY) as gateway:
+        start(gateway, "pump-1")
+        body = {"drive": "pump-1", "verb": verb, "options": options}
+        assert gateway.post("/api/act", body).json["done"] is True
+        assert stands(gateway, "pump-1")
+
+
 def test_a_stop_whose_client_is_cut_off_within_its_body_is_sent(tmp_path: Path) -> None:
     with served(tmp_path, MAY) as gateway:
         start(gateway, "pump-1", "pump-2")

@@ -206,7 +206,18 @@ def test_a_stop_is_always_carried_out(broker: Broker, listener: Listener, start:
 
 
 @pytest.mark.parametrize("verb", ["coast", "emergency_stop", "stop"])
-@pytest.mark.parametrize("more", [{"time": 1}, {"time": 10**15}, {"time": "now"}, {"drive": "pump-1"}, {}])
+@pytest.mark.parametrize(
+    "more",
+    [
+        {"time": 1},
+        {"time": 10**15},
+        {"time": "now"},
+        {"drive": "pump-1"},
+        {},
+        {"options": None},
+        {"options": [1]},
+    ],
+)
 def test_a_stop_by_a_verb_is_carried_out_whenever_it_was_sent(
     broker: Broker, listener: Listener, start: Start, verb: str, more: dict[str, Any]
 ) -> None:

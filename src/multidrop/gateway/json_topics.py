@@ -83,7 +83,8 @@ class JsonTopics:
         try:
             given = _read(payload)
             if what[0] == "act" and str(given.get("verb")) in STOPPING:
-                self._orders.stop_by(drive, given["verb"], _options(drive, given))
+                _check_drive(drive, given)
+                self._orders.stop_by(drive, given["verb"], {})  # it takes none: no wrong ones keep it back
             elif is_retained:  # it comes at every connection
                 kept = "the broker had kept it; publish it without retain"
                 self._orders.refuse(drive, "/".join(what), kept)
@@ -183,12 +184,16 @@ def _read_act(drive: str, given: Mapping[str, Any]) -> tuple[str, dict[str, obje
 
 
 def _options(drive: str, given: Mapping[str, Any]) -> dict[str, object]:
+    _check_drive(drive, given)
     options = given.get("options", {})
-    if given.get("drive", drive) != drive:
-        raise ValueError(f"it names drive {given['drive']!r}, and its topic {drive!r}")
     if not isinstance(options, dict):
         raise ValueError("options is no table")
     return options
+
+
+def _check_drive(drive: str, given: Mapping[str, Any]) -> None:
+    if given.get("drive", drive) != drive:
+        raise ValueError(f"it names drive {given['drive']!r}, and its topic {drive!r}")
 
 
 def _time(given: Mapping[str, Any]) -> int:

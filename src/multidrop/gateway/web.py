@@ -24,6 +24,7 @@ from multidrop.gateway.guard import COOKIE, Denied, Guard, Needed
 from multidrop.gateway.metrics import families_of
 from multidrop.gateway.request_fields import body_of, caller_of, drives_to_stop, frame_in, number_in, text_in
 from multidrop.gateway.rights import NEVER_THIS_WAY, NOT_ALLOWED, NOT_LISTED, Right
+from multidrop.gateway.verb_rules import STOPPING
 from multidrop.gateway.views import figures_of, health_of, look_at, look_at_lines
 
 if TYPE_CHECKING:
@@ -237,10 +238,10 @@ class _Pages:
 
     async def act(self, request: Request) -> Response:
         body = await body_of(request)
-        options = body.get("options", {})
+        drive, verb = text_in(body, "drive"), text_in(body, "verb")
+        options = {} if verb in STOPPING else body.get("options", {})  # no wrong ones keep a stop back
         if not isinstance(options, dict):
             raise Denied(400, "options is no JSON object")
-        drive, verb = text_in(body, "drive"), text_in(body, "verb")
         caller = caller_of(request)
         admit = self._admission(drive, (verb, repr(options), caller), body)
         return _answer(await self._gateway.commands.act(drive, verb, options, caller, admit))
