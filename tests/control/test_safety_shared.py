@@ -157,7 +157,7 @@ def _patient(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 patient = pytest.mark.usefixtures("_patient")
-START, STOP, RESET, JOG = (f"01 06 10 00 00 {command:02X}" for command in (1, 5, 7, 3))
+START, STOP, RESET, JOG, STOP_JOG = (f"01 06 10 00 00 {command:02X}" for command in (1, 5, 7, 3, 8))
 SAYS: dict[str, bytes] = {
     "nothing": b"",
     "noise": bytes.fromhex("00 F8 FF 01 06 10 00 00"),
@@ -211,7 +211,7 @@ def test_what_another_client_says_confirms_no_stop(says: str) -> None:
     with shared_line("invt-che", seed=3) as (drive, pair, received):
         running(drive, received[0])
         pair.says = SAYS[says]
-        pair.holds = lambda said: said == rtu(STOP)
+        pair.holds = lambda said: said in (rtu(STOP), rtu(STOP_JOG))
         with pytest.raises((Unconfirmed, FAILURES.get(says, Unconfirmed))):
             drive.stop(seconds=1)
         assert pair.sent.count(rtu(STOP)) >= 2
