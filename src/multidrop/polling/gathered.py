@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from array import array
+from collections.abc import Sequence
 from typing import Any
 
 from multidrop.core import Columns
@@ -30,6 +32,14 @@ class GatheredRows(Columns):
         self._rows += len(columns)
         return True
 
+    def add_at(self, batch: Batch, places: Sequence[int]) -> None:
+        """Copy the rows at these places of a batch with the same names."""
+        columns, _, _ = batch.parts()
+        for name, gathered in self._gathered.items():
+            column = columns.array(name)
+            gathered += array(COLUMNS[name], [column[at] for at in places]).tobytes()
+        self._rows += len(places)
+
     def array(self, name: str) -> memoryview[Any]:
         if name != "valid":
             return memoryview(bytes(self._gathered[name])).cast(COLUMNS[name])
@@ -42,6 +52,14 @@ class GatheredRows(Columns):
     def batch(self) -> Batch:
         """Return all rows so far; none may be added afterwards."""
         return Batch(self, self._drives, self._registers)
+
+
+def rows_at(batch: Batch, places: Sequence[int]) -> Batch:
+    """Return a copy of the rows at these places."""
+    _, drives, registers = batch.parts()
+    found = GatheredRows(drives, registers)
+    found.add_at(batch, places)
+    return found.batch()
 
 
 def gather(gathered: list[GatheredRows], batch: Batch) -> None:
