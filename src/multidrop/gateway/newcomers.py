@@ -6,8 +6,6 @@ from collections.abc import Callable, Mapping
 from typing import Protocol
 
 from multidrop import Batch, Plant, PolledDrive
-from multidrop.polling.changes import is_same_drive
-from multidrop.polling.gathered import rows_at
 
 MOST_WAITING = 250_000  # rows: 12 MB; what comes beyond waits in the core
 
@@ -49,9 +47,9 @@ class Newcomers:
         new = [at for at, is_kept in enumerate(is_new) if is_kept]
         if not new:
             return batch
-        self._waiting.append(rows_at(batch, new))
+        self._waiting.append(batch.at(new))
         self._rows += len(new)
-        return rows_at(batch, [at for at, is_kept in enumerate(is_new) if not is_kept])
+        return batch.at([at for at, is_kept in enumerate(is_new) if not is_kept])
 
     def release(self, feed: Callable[[Batch], object]) -> None:
         """Give out what waits: the plant that came is in effect."""
@@ -76,4 +74,7 @@ def _drives(plant: Plant) -> dict[str, PolledDrive]:
 
 
 def _is_as_before(known: PolledDrive | None, polled: PolledDrive) -> bool:
-    return known is not None and is_same_drive(known.drive, polled.drive) and known.polls == polled.polls
+    """Return True where the same registers are read at the same place: what they say is described alike."""
+    if known is None or type(known.drive) is not type(polled.drive):
+        return False
+    return known.drive.address == polled.drive.address and known.polls == polled.polls

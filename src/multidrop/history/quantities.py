@@ -102,7 +102,8 @@ class Parting:
         """Return the columns of the series that are of another quantity in this segment."""
         known = self._known.get(number, {})
         return {
-            series: column for (series, quantity), column in self._columns.items()
+            series: column
+            for (series, quantity), column in self._columns.items()
             if known.get(series) == quantity
         }
 

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from array import array
-from collections.abc import Sequence
 from typing import Any
 
 from multidrop.core import Columns
 from multidrop.core.columns import COLUMNS, Names
-from multidrop.polling.batch import Batch
+from multidrop.polling.batch import Batch, bitmap_of
 
 
 class GatheredRows(Columns):
@@ -32,34 +30,17 @@ class GatheredRows(Columns):
         self._rows += len(columns)
         return True
 
-    def add_at(self, batch: Batch, places: Sequence[int]) -> None:
-        """Copy the rows at these places of a batch with the same names."""
-        columns, _, _ = batch.parts()
-        for name, gathered in self._gathered.items():
-            column = columns.array(name)
-            gathered += array(COLUMNS[name], [column[at] for at in places]).tobytes()
-        self._rows += len(places)
-
     def array(self, name: str) -> memoryview[Any]:
         if name != "valid":
             return memoryview(bytes(self._gathered[name])).cast(COLUMNS[name])
         size, codes = (self._rows + 7) // 8, self._gathered["status"]
         if codes.count(0) == len(codes):
             return memoryview(b"\xff" * size)
-        bits = "".join("0" if code else "1" for code in reversed(self.array("status")))
-        return memoryview(int(bits, 2).to_bytes(size, "little"))
+        return bitmap_of(self.array("status"))
 
     def batch(self) -> Batch:
         """Return all rows so far; none may be added afterwards."""
         return Batch(self, self._drives, self._registers)
-
-
-def rows_at(batch: Batch, places: Sequence[int]) -> Batch:
-    """Return a copy of the rows at these places."""
-    _, drives, registers = batch.parts()
-    found = GatheredRows(drives, registers)
-    found.add_at(batch, places)
-    return found.batch()
 
 
 def gather(gathered: list[GatheredRows], batch: Batch) -> None:
