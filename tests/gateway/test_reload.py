@@ -352,7 +352,7 @@ def test_rows_amid_a_reload_are_described_as_what_they_were_read_as(
 ) -> None:
     """The drive is of another family already, and polled, while another line takes its time."""
     (tmp_path / "other.toml").write_text(OTHER)
-    with two_lines(tmp_path, "[serve.history]\n" + MAY) as (gateway, rows):
+    with two_lines(tmp_path, "[serve.history]\n" + MAY) as (gateway, _):
         path, poller, hub = gateway.gateway.plant.path, gateway.gateway.poller, gateway.gateway.hub
         assert poller is not None
         path.write_text(path.read_text().replace(POLL, '["dc_bus_voltage"]'))

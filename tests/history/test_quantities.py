@@ -139,8 +139,8 @@ def test_rows_that_were_taken_before_another_plant_are_in_the_segment_before(tmp
 def columns_of(recording: Iterable[Rows]) -> dict[str, set[float | None]]:
     """The values of each column."""
     found: dict[str, set[float | None]] = {}
-    for batch in recording:
-        for row in batch:
+    for rows in recording:
+        for row in rows:
             found.setdefault(f"{row.drive}.{row.register}", set()).add(row.value)
     return found
 

@@ -1,4 +1,4 @@
-"""Newcomers: rows amid a reload that are described by the plant that comes, and wait until it is in effect."""
+"""Newcomers: rows amid a reload that the plant which comes describes, and that wait until it is in effect."""
 
 from __future__ import annotations
 
