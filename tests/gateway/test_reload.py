@@ -357,7 +357,7 @@ def test_rows_amid_a_reload_are_described_as_what_they_were_read_as(
         assert poller is not None
         path.write_text(path.read_text().replace(POLL, '["dc_bus_voltage"]'))
         assert reload(gateway)["done"]
-        until(lambda: hub.newest("fan-1", "dc_bus_voltage"))
+        until(lambda: (newest := hub.newest("fan-1", "dc_bus_voltage")) and newest.value is not None)
         opening, go_on = threading.Event(), threading.Event()
         open_bus = Bus.__init__
 
@@ -394,7 +394,7 @@ def test_rows_amid_a_reload_are_described_as_what_they_were_read_as(
             for row in batch
             if row.drive == "fan-1" and row.register == "dc_bus_voltage" and row.value is not None
         }
-    raw = next(value for _, step, value in found if step is None)
+    raw = next((value for _, step, value in found if step is None), 0.0)
     assert found == {("V", None, raw), ("A", 0.5, raw / 2)}
 
 
