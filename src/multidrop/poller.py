@@ -142,6 +142,11 @@ class Poller(RowSource):
         lines = tuple(replace(line.declared, drives=line.polled) for line in self._lines)
         return Plant(lines, self._path)
 
+    @property
+    def polled_since(self) -> dict[str, int]:
+        """By name, since which `monotonic_ns` rows are of the drive that `plant` describes."""
+        return {name: since_ns for line in self._lines for name, since_ns in line.since_ns.items()}
+
     def adopt(self, plant: Plant) -> dict[str, LineError]:
         """Poll another plant from now on; return the lines whose port is not there, by name, and why.
 
@@ -161,8 +166,7 @@ class Poller(RowSource):
         stopped before they leave, for nobody would later. One whose address is another family's now is not:
         the old family's stop may mean something else there.
 
-        Names in batches keep their codes. Returns when all is done; other lines are polled meanwhile. Any
-        thread may call this, one at a time.
+        Names in batches keep their codes. Returns when all is done; other lines are polled meanwhile.
         """
         if not isinstance(plant, Plant):
             raise TypeError(f"adopt takes a Plant, such as load_plant('plant.toml') gives, not {plant!r}")

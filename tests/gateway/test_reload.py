@@ -13,13 +13,15 @@ from typing import Any
 
 import pytest
 from broken_part import BrokenFeed
-from gateways import Answer, Served, plant_text, running, served, tokens
+from gateways import POLL, Answer, Served, plant_text, running, served, tokens
 from lines import HOST_LATE, PATIENCE, until
 
+import multidrop
 from multidrop import Batch, Bus, InvtCHE, LineError, Plant, load_plant
 from multidrop.gateway.gateway import Gateway
 from multidrop.gateway.rights import Right
 from multidrop.gateway.settings import ServeSettings, read_settings
+from multidrop.recording.segments import segments_of
 from multidrop.sim import Simulator, Wire, simulated
 
 MAY = '[serve.may]\nstop = "anyone"\nwrite = ["pump-1.setpoint"]\nverbs = ["pump-1.start"]\n'
@@ -331,6 +333,69 @@ def test_a_stop_waits_for_no_port_that_a_reload_opens(
             reloading.join(PATIENCE)
             stopping.join(PATIENCE)
         assert told[0]["done"]
+
+
+OTHER = """
+[family]
+title = "Another"
+manual = "made for this test"
+baudrates = [38400]
+formats = ["8N1"]
+counts_from = 0
+[reading]
+dc_bus_voltage = { at = 0x3002, unit = "A", step = 0.5, place = "1" }
+"""  # of a register that INVT CHE has as a raw count
+
+
+def test_rows_amid_a_reload_are_described_as_what_they_were_read_as(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The drive is of another family already, and polled, while another line takes its time."""
+    (tmp_path / "other.toml").write_text(OTHER)
+    with two_lines(tmp_path, "[serve.history]\n" + MAY) as (gateway, _):
+        path, poller, hub = gateway.gateway.plant.path, gateway.gateway.poller, gateway.gateway.hub
+        assert poller is not None
+        path.write_text(path.read_text().replace(POLL, '["dc_bus_voltage"]'))
+        assert reload(gateway)["done"]
+        until(lambda: (newest := hub.newest("fan-1", "dc_bus_voltage")) and newest.value is not None)
+        opening, go_on = threading.Event(), threading.Event()
+        open_bus = Bus.__init__
+
+        def slow(bus: Bus, *arguments: Any, **details: Any) -> None:
+            opening.set()
+            assert go_on.wait(PATIENCE)
+            open_bus(bus, *arguments, **details)
+
+        monkeypatch.setattr(Bus, "__init__", slow)
+        text = path.read_text().replace('name = "hall"', 'name = "hall"\necho = "off"')  # opened anew
+        before, _, roof = text.rpartition('model = "invt-che"')
+        path.write_text(f'{before}model = "other.toml"\nformat = "8N1"{roof}')
+        told: list[Any] = []
+        reloading = threading.Thread(target=lambda: told.append(reload(gateway)))
+        reloading.start()
+        try:
+            assert opening.wait(PATIENCE), told
+            exchanges, taken = poller.statistics()["roof"].exchanges, hub.taken
+            until(lambda: poller.statistics()["roof"].exchanges > exchanges + 5)
+            until(lambda: hub.taken > taken + 3)
+        finally:
+            go_on.set()
+            reloading.join(PATIENCE)
+        assert told[0]["done"]
+        taken = hub.taken
+        until(lambda: hub.taken > taken + 3)
+    found = set()
+    for _, segment in segments_of(tmp_path / "history" / "rows.arrows"):
+        recording = multidrop.read(segment)
+        about = recording.metadata["drives"]["fan-1"]["registers"].get("dc_bus_voltage")
+        found |= {
+            (about["unit"], about["step"], row.value)
+            for batch in recording
+            for row in batch
+            if row.drive == "fan-1" and row.register == "dc_bus_voltage" and row.value is not None
+        }
+    raw = next((value for _, step, value in found if step is None), 0.0)
+    assert found == {("V", None, raw), ("A", 0.5, raw / 2)}
 
 
 def test_a_stop_that_is_under_way_goes_on(tmp_path: Path) -> None:

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 import pytest
 from histories import DAY, NOON, SECOND, batch
 
+import multidrop
 from multidrop import Buckets, History, HistoryWriter
 from multidrop.core.columns import Names
 from multidrop.history.compact import compact
 from multidrop.history.quantities import quantities_of
-from multidrop.polling.batch import Row
+from multidrop.polling.batch import Row, Rows
 from multidrop.recording.rows import from_rows
 from multidrop.recording.segments import SegmentWriter
 
@@ -132,3 +134,64 @@ def test_rows_that_were_taken_before_another_plant_are_in_the_segment_before(tmp
         found = history.buckets("pump-1.speed", NOON, NOON + 30 * SECOND, 30)["pump-1.speed"]
     assert found.n == [1] * 9 + [0] * 11 + [1] * 9 + [0]
     assert (found.unit, found.left_out) == ("A", ("%",))
+
+
+def columns_of(recording: Iterable[Rows]) -> dict[str, set[float | None]]:
+    """The values of each column."""
+    found: dict[str, set[float | None]] = {}
+    for rows in recording:
+        for row in rows:
+            found.setdefault(f"{row.drive}.{row.register}", set()).add(row.value)
+    return found
+
+
+PARTED = {SERIES: {10.0, 1000.0}, f"{SERIES} [A]": {1.0, 100.0}, OTHER: {1.0, 10.0, 100.0, 1000.0}}
+
+
+def test_two_units_are_no_column(tmp_path: Path, how: str) -> None:
+    """Rows of another quantity are in a column that says so, wherever they are read or written to."""
+    (tmp_path / "h").mkdir()
+    recorded(tmp_path / "h", AMPERE, PERCENT, AMPERE, PERCENT)
+    kept(tmp_path / "h", how, 4)
+    with History(tmp_path / "h") as history:
+        rows = history.read([SERIES, OTHER], end=NOON + 300 * SECOND)
+        assert columns_of(rows) == PARTED
+        about = rows.metadata["drives"]["pump-1"]["registers"]
+        assert (about["load"]["unit"], about["load [A]"]["unit"]) == ("%", "A")
+        assert columns_of(history.read(SERIES, NOON, NOON + 40 * SECOND)) == {SERIES: {1.0}}
+        old = history.read(None, NOON, NOON + 40 * SECOND)
+        assert (columns_of(old), old.metadata["drives"]["pump-1"]["registers"]["load"]["unit"]) == (
+            {SERIES: {1.0}, OTHER: {1.0}},
+            "A",
+        )
+        for kind in ("csv", "arrows", "parquet"):
+            path = tmp_path / f"out.{kind}"
+            if kind == "parquet":
+                pytest.importorskip("duckdb", reason="needs duckdb")
+            history.export(path, [SERIES, OTHER], end=NOON + 300 * SECOND)
+            found = multidrop.read(path)
+            assert columns_of(found) == PARTED
+            if kind != "csv":
+                assert found.metadata["drives"]["pump-1"]["registers"]["load [A]"]["unit"] == "A"
+
+
+def test_columns_stay_what_they_are_while_the_history_grows(tmp_path: Path) -> None:
+    recorded(tmp_path, AMPERE)
+    with History(tmp_path) as history:
+        rows = history.read(SERIES)
+        assert columns_of(rows) == {SERIES: {1.0}}
+        with SegmentWriter(tmp_path / "rows.arrows", described(PERCENT), every=1e9) as writer:
+            writer.write(from_rows([Row(NOON + DAY, DAY, 0, "pump-1", "load", 50.0, "ok")]))
+        assert columns_of(rows) == {SERIES: {1.0}, f"{SERIES} [%]": {50.0}}
+        assert columns_of(history.read(SERIES)) == {SERIES: {50.0}, f"{SERIES} [A]": {1.0}}
+
+
+def test_two_tables_of_names_are_two_columns(tmp_path: Path) -> None:
+    recorded(tmp_path, STATES, OTHER_STATES, AMPERE)
+    with History(tmp_path) as history:
+        rows = history.read(SERIES)
+        registers = rows.metadata["drives"]["pump-1"]["registers"]
+        found = columns_of(rows)
+    assert found == {SERIES: {100.0}, f"{SERIES} [names]": {10.0}, f"{SERIES} [names 2]": {1.0}}
+    assert registers["load [names]"]["values"] == OTHER_STATES["values"]
+    assert registers["load [names 2]"]["values"] == STATES["values"]

@@ -465,16 +465,45 @@ def test_what_is_no_plant() -> None:
 # ---- batches ----
 
 
+def test_rows_under_a_name_are_told_apart_by_their_time() -> None:
+    """Drives of two addresses, and of two lines, exchange their names; each has a value of its own."""
+    wires = {"port of hall": toys(), "port of yard": wire(*(Toy(address) for address in (5, 6)))}
+
+    def named(*names: str) -> Plant:
+        addresses = (1, 2, 5)
+        drives = [toy(name, address, None) for name, address in zip(names, addresses, strict=True)]
+        return plant(hall(*drives[:2]), yard(drives[2], toy("stays", 6, None)))
+
+    with ClockedLines.of_lines(wires, named("a", "b", "c")) as made:
+        rows = made.run(1)
+        begun_ns = made.poller.polled_since
+        adopting = made.beside(lambda: made.poller.adopt(named("b", "c", "a")))
+        rows += made.run(2)
+        adopting.join(60)
+        since_ns = made.poller.polled_since
+    assert since_ns["stays"] == begun_ns["stays"]
+    before = {"a": 1, "b": 2, "c": 5, "stays": 6}
+    after = {"a": 5, "b": 1, "c": 2, "stays": 6}
+    told = {
+        (row.drive, row.value == proof(Toy(drives[row.drive]), CURRENT))
+        for row in rows
+        for drives in [after if row.monotonic_ns >= since_ns[row.drive] else before]
+        if row.register == "output_current" and row.value is not None
+    }
+    assert told == {(name, True) for name in before}
+
+
 def test_a_name_s_code_stays_the_same() -> None:
     with clocked(hall(*pumps())) as made:
         made.run(1)
         meant: dict[int, str] = {}
         for others in (*OTHERS, (yard(toy("pump-2", 3)),)):
-            made.poller.adopt(plant(hall(pumps()[0]), *others))
+            adopting = made.beside(lambda o=others: made.poller.adopt(plant(hall(pumps()[0]), *o)))
             with made._turn:
                 made._limit += S
                 made._turn.notify_all()
                 assert made._turn.wait_for(lambda: made._failure or made._rests, 60)
+            adopting.join(60)
             while batch := made.poller.take():
                 columns = batch.columns()
                 for code in set(columns.drive):
@@ -505,8 +534,10 @@ def test_memory_is_bounded_over_many_adoptions() -> None:
         def adopt_some(number: int) -> None:
             swapped = toy(f"pump-{2 + number % 2}", 2 + number % 2, None if number % 3 else 0.1)
             others = OTHERS[number % len(OTHERS)]
-            made.poller.adopt(plant(hall(toy("pump-1", 1, 0.1 + number / 1000), swapped), *others))
-            made.run(0.05)
+            wanted = plant(hall(toy("pump-1", 1, 0.1 + number / 1000), swapped), *others)
+            adopting = made.beside(lambda: made.poller.adopt(wanted))
+            while adopting.is_alive():
+                made.run(0.05)
 
         for number in range(30):
             adopt_some(number)

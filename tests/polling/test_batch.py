@@ -30,6 +30,14 @@ def test_empty_batch() -> None:
     assert pa.record_batch(batch).num_rows == 0
 
 
+@pytest.mark.parametrize("places", [[], [0], [4, 1], [0, 1, 2, 3, 4], [2, 2] * 9])
+def test_some_of_its_rows(places: list[int]) -> None:
+    wanted = [EXAMPLE[place] for place in places]
+    found = example().at(places)
+    assert list(found) == wanted
+    assert rows_of(pa.record_batch(found)) == wanted
+
+
 def test_pyarrow_takes_it() -> None:
     found = pa.record_batch(example())
     found.validate(full=True)

@@ -16,7 +16,7 @@ from typing import Any
 import uvicorn
 
 import multidrop
-from multidrop import Bus, Ledger, LineError, Plant, Poller
+from multidrop import Batch, Bus, Ledger, LineError, Plant, Poller
 from multidrop.gateway.clock import boottime_ns, monotonic_ns, now_and_slept_ns
 from multidrop.gateway.commands import Commands
 from multidrop.gateway.connections import Connections, Watched
@@ -27,6 +27,7 @@ from multidrop.gateway.identities import Identities
 from multidrop.gateway.lately import Lately
 from multidrop.gateway.listener import BACKLOG, listen
 from multidrop.gateway.live_parts import END_S, LiveParts
+from multidrop.gateway.newcomers import Newcomers
 from multidrop.gateway.reload import Read, Reload
 from multidrop.gateway.rights import OwnNames, Tokens
 from multidrop.gateway.sd_notify import Notifier
@@ -80,6 +81,7 @@ class Gateway:
         self.own_names = OwnNames(settings.names, settings.host, self.port)
         self.tokens = Tokens(settings.tokens)
         self.hub = Hub(plant, now_and_slept_ns)
+        self.newcomers = Newcomers()
         self.events = Events()
         self.lately = Lately(plant)
         self.notifier = Notifier()
@@ -174,19 +176,23 @@ class Gateway:
             await asyncio.sleep(TAKE_S)
 
     def hand_out(self, poller: Poller) -> None:
-        """Give each batch to the hub and to all parts; where one fails, the others get it all the same."""
+        """Give each batch to the hub and to all parts; amid a reload, what is of the plant of before."""
         self.hub.pass_time(monotonic_ns())
-        while batch := poller.take():
+        while self.newcomers.has_room and (batch := poller.take()):
             self._has_news = True
-            self.guarded("hub", self.hub.take, batch)
-            for name, feed in self.feeds.items():
-                self.guarded(name, feed.take, batch)
+            self.feed(batch if self.is_settled else self.newcomers.keep(batch, self.plant, poller))
         if self.clock() - self._looked >= LOOK_S:
             self._looked = self.clock()
             self.guarded("events", self._look_for_events)
             if self._has_news:
                 self._has_news = False
                 self.guarded("frames", self.frames.note_news)
+
+    def feed(self, batch: Batch) -> None:
+        """Give a batch to the hub and to all parts; where one fails, the others get it all the same."""
+        self.guarded("hub", self.hub.take, batch)
+        for name, feed in self.feeds.items():
+            self.guarded(name, feed.take, batch)
 
     def _look_for_events(self) -> None:
         for name in self.hub.drives:
@@ -266,8 +272,7 @@ class Gateway:
         """Return words, or bits, that a drive has at any addresses; see `Bus.ask`."""
         line, known = self.plant.find_drive(drive)
         bus = self.bus(line.name)
-        loop = asyncio.get_running_loop()
-        data = await loop.run_in_executor(
+        data = await asyncio.get_running_loop().run_in_executor(
             self._threads, lambda: bus.ask(known, function, start, count, expiry=expiry_s)
         )
         if function in (1, 2):

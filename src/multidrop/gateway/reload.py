@@ -102,6 +102,7 @@ class Reload:
             raise
         finally:
             self.is_settled = True
+            gateway.newcomers.release(gateway.feed)
         gateway.note_unopened(unopened)
         self.mistakes, self.restart = (), tuple(_after_restart(self._begun_with, plant.serve))
         for sentence in self.restart:
@@ -112,7 +113,7 @@ class Reload:
     def _take_up(self, poller: Poller, settings: ServeSettings, planned: Mapping[str, Any] | None) -> None:
         """Go on with the plant that is polled now, and with those of its settings that need no restart."""
         gateway, plant = self._gateway, poller.plant
-        gateway.hand_out(poller)  # rows of those that left
+        gateway.hand_out(poller)  # the rest of what is of the plant before
         there = {polled.drive.name for line in plant.lines for polled in line.drives}
         for name in set(gateway.hub.drives) - there:
             gateway.forget(name)
@@ -127,6 +128,7 @@ class Reload:
         for name, feed in gateway.feeds.items():
             if hasattr(feed, "adopt"):
                 gateway.guarded(name, feed.adopt, plant)
+        gateway.newcomers.release(gateway.feed)
         gateway.guarded("frames", gateway.frames.note_news)
 
     def _take_up_rights(self, settings: ServeSettings) -> None:

@@ -5,9 +5,9 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
+from multidrop.history.asked import Moment, ns_of, parsed_series
 from multidrop.history.buckets import Accumulator, Buckets, Grid, grid_of
 from multidrop.history.database import MissingDuckDB
 from multidrop.history.folder import HistoryFile, Listing, listing
@@ -22,15 +22,12 @@ from multidrop.history.queries import (
     write_parquet,
 )
 from multidrop.history.sources import ALWAYS, MOST_TRIES, Replaced, Sources
-from multidrop.polling.batch import Rows
+from multidrop.polling.batch import Row, Rows
 from multidrop.recording import open_writer
 from multidrop.recording.append_file import new_file
 from multidrop.recording.csv import HEADER, lines_of
 from multidrop.recording.format import Metadata, RecordingReader
 from multidrop.recording.rows import from_rows
-
-Moment = int | datetime
-_EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 
 
 class History:
@@ -91,22 +88,30 @@ class History:
     ) -> HistoryRows:
         """Return all rows, or those of these series, from `begin` to before `end`; None is no limit.
 
-        They come in the order of recording. What it returns is a recording like `multidrop.read` gives:
-        `to_pandas()`, `to_polars()`, `wide()`, batches of rows, Arrow.
+        They come in the order of recording. Where a name was another register's in a part of the range, with
+        another unit or other names of its numbers, those rows are in a column of their own, such as
+        "motor_load [A]", and `metadata` describes both. What it returns is a recording like
+        `multidrop.read` gives: `to_pandas()`, `to_polars()`, `wide()`, batches of rows, Arrow.
         """
-        first = ALWAYS[0] if begin is None else _ns(begin)
-        return HistoryRows(self, _parsed(series), first, ALWAYS[1] if end is None else _ns(end))
+        first = ALWAYS[0] if begin is None else ns_of(begin)
+        return HistoryRows(self, parsed_series(series), first, ALWAYS[1] if end is None else ns_of(end))
 
-    def rows_of(self, series: Sequence[Series] | None, begin: int, end: int) -> Iterator[Rows]:
+    def parting_of(self, series: Sequence[Series] | None, begin: int, end: int) -> Parting:
+        """Return the quantities of these series, or of all, in the segments of this range."""
+        return self._sources.again(lambda found: Parting(self._sources.known(found, begin, end), series))
+
+    def rows_of(
+        self, series: Sequence[Series] | None, begin: int, end: int, parting: Parting
+    ) -> Iterator[Rows]:
         """Yield the rows of `read` for parsed series and times in ns."""
-        found = self._sources.listing()
+        found = self._sources.again(lambda found: self._learnt(found, begin, end, parting))
         given = 0  # all numbers up to this one
         for number in sorted({*found.segments, *found.rows}):
             if number <= given:
                 continue
             for _ in range(MOST_TRIES):
                 try:
-                    yield from self._rows_of_segment(number, found, series, begin, end)
+                    yield from self._rows_of_segment(number, found, series, begin, end, parting)
                     break
                 except Replaced:  # before the first of its rows: now they are elsewhere
                     found = self._sources.listing()
@@ -120,18 +125,29 @@ class History:
         if any(file.first < number <= file.last for file in found.rows.values()):
             raise OSError(f"{self.folder}: files were merged while they were read: read them again")
 
+    def _learnt(self, found: Listing, begin: int, end: int, parting: Parting) -> Listing:
+        """Let the parting learn of all segments there are; return them."""
+        parting.learn(self._sources.known(found, begin, end))
+        return found
+
     def _rows_of_segment(
-        self, number: int, found: Listing, series: Sequence[Series] | None, begin: int, end: int
+        self,
+        number: int,
+        found: Listing,
+        series: Sequence[Series] | None,
+        begin: int,
+        end: int,
+        parting: Parting,
     ) -> Iterator[Rows]:
-        file = found.rows.get(number)
+        file, renamed = found.rows.get(number), parting.renamed(number)
         if file and file.may_have(begin, end):
-            yield from rows_of_file(self._sources, file, series, begin, end)
+            yield from rows_of_file(self._sources, file, series, begin, end, renamed)
         elif number in found.segments:
             wanted = None if series is None else frozenset(series)
             with self._sources.segment(number, found, begin, end) as segment:
                 for batch in segment.batches(begin, end) if segment else ():
                     if segment and (rows := segment.rows_of(batch, wanted, begin, end)):
-                        yield from_rows(rows)
+                        yield from_rows(_renamed(rows, renamed))
 
     # ---- buckets ----
 
@@ -147,10 +163,10 @@ class History:
         Where a name was another register's in a part of the range, with another unit or other names of its
         numbers, only what is of the newest quantity is in it; `unit` and `left_out` say so.
         """
-        names = _parsed(series)
+        names = parsed_series(series)
         if not names:
             raise ValueError("buckets takes one series or more, such as 'pump-1.output_frequency'")
-        grid = grid_of(_ns(begin), time.time_ns() if end is None else _ns(end), points)
+        grid = grid_of(ns_of(begin), time.time_ns() if end is None else ns_of(end), points)
 
         def gathered(found: Listing) -> dict[str, Buckets]:
             into = {name: Accumulator(grid) for name in names}
@@ -229,9 +245,13 @@ class History:
             batches = (
                 batch
                 for number in sorted(found.segments)
-                for batch in self._rows_of_segment(number, found, rows.series, rows.begin, rows.end)
+                for batch in self._rows_of_segment(
+                    number, found, rows.series, rows.begin, rows.end, rows.parting
+                )
             )
-            of = rows.series, (rows.begin, rows.end), rows.metadata
+            self._learnt(found, rows.begin, rows.end, rows.parting)
+            renamed = {file.first: rows.parting.renamed(file.first) for file in files}
+            of = rows.series, (rows.begin, rows.end), rows.metadata, renamed
             return write_parquet(self._sources, target, batches, files, *of)
 
         self._sources.cursor().close()  # without DuckDB there is no file yet
@@ -252,31 +272,15 @@ class HistoryRows(RecordingReader):
         super().__init__(history.folder)
         self._history = history
         self.series, self.begin, self.end = series, begin, end
-        self.metadata = history.metadata()
+        self.parting = history.parting_of(series, begin, end)
+        self.metadata = self.parting.described(history.metadata())
 
     def __iter__(self) -> Iterator[Rows]:
-        return self._history.rows_of(self.series, self.begin, self.end)
+        return self._history.rows_of(self.series, self.begin, self.end, self.parting)
 
 
-def _parsed(series: str | Iterable[str] | None) -> list[Series] | None:
-    if series is None:
-        return None
-    found = []
-    for name in [series] if isinstance(series, str) else series:
-        drive, point, register = name.rpartition(".")
-        if not (drive and point and register):
-            raise ValueError(
-                f"{name!r} is no series: write a drive and a register, such as 'pump-1.motor_speed'"
-            )
-        found.append((drive, register))
-    return list(dict.fromkeys(found))
-
-
-def _ns(moment: Moment) -> int:
-    if isinstance(moment, datetime):
-        if moment.tzinfo is None:
-            raise ValueError(f"{moment} has no time zone: write datetime(..., tzinfo=UTC)")
-        return (moment - _EPOCH) // timedelta(microseconds=1) * 1000
-    if isinstance(moment, bool) or not isinstance(moment, int):
-        raise TypeError(f"a moment is UTC in ns or a datetime with a time zone, not {moment!r}")
-    return moment
+def _renamed(rows: list[Row], columns: Mapping[Series, str]) -> list[Row]:
+    """Return rows with the columns of their quantities for the names of registers."""
+    if not columns:
+        return rows
+    return [row._replace(register=columns.get((row.drive, row.register), row.register)) for row in rows]

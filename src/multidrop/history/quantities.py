@@ -46,17 +46,46 @@ def _quantity(about: Mapping[str, Any]) -> Quantity:
     return Quantity(str(about.get("unit") or ""))
 
 
-class Parting:
-    """The series of a question by the quantity that each has in the newest segment, and those left out."""
+def description_of(quantity: Quantity) -> dict[str, Any]:
+    """Return what metadata say of a register with this quantity."""
+    if quantity.unit == RAW:
+        return {"unit": "", "step": None}
+    if quantity.unit == NAMED:
+        return {"unit": "", "values": {name: _number(text) for name, text in quantity.names}}
+    return {"unit": quantity.unit}
 
-    def __init__(self, known: Mapping[int, Known], series: Iterable[Series]) -> None:
-        self._known = known
-        self._series = list(series)
+
+def _number(text: object) -> object:
+    try:
+        return int(str(text))
+    except ValueError:
+        return text
+
+
+class Parting:
+    """Series by the quantity that each has in the newest segment, and those that are left out of buckets.
+
+    Where rows are read, values of another quantity are in a column of their own, such as "load [A]". Without
+    `series` it is of all that segments describe.
+    """
+
+    def __init__(self, known: Mapping[int, Known], series: Iterable[Series] | None = None) -> None:
+        self._known: dict[int, Known] = {}
+        self._series = None if series is None else list(series)
         self.newest: dict[Series, Quantity] = {}
         self.left_out: dict[Series, list[str]] = {}
-        for number in sorted(known, reverse=True):
-            for one in self._series:
-                self._note(one, known[number].get(one))
+        self._columns: dict[tuple[Series, Quantity], str] = {}
+        self.learn(known)
+
+    def learn(self, known: Mapping[int, Known]) -> None:
+        """Learn of more segments; what a column holds stays the same."""
+        before: Known | None = None
+        for number in sorted(known.keys() - self._known.keys(), reverse=True):
+            self._known[number] = found = known[number]
+            if found != before:
+                for one in found if self._series is None else self._series:
+                    self._note(one, found.get(one))
+            before = found
 
     def _note(self, series: Series, quantity: Quantity | None) -> None:
         if quantity is None or self.newest.setdefault(series, quantity) == quantity:
@@ -64,6 +93,33 @@ class Parting:
         others = self.left_out.setdefault(series, [])
         if quantity.unit not in others:
             others.append(quantity.unit)
+        if (series, quantity) not in self._columns:
+            alike = sum(one == series and other.unit == quantity.unit for one, other in self._columns)
+            words = (quantity.unit or "no unit") + (f" {alike + 1}" if alike else "")
+            self._columns[series, quantity] = f"{series[1]} [{words}]"
+
+    def renamed(self, number: int) -> dict[Series, str]:
+        """Return the columns of the series that are of another quantity in this segment."""
+        known = self._known.get(number, {})
+        return {
+            series: column
+            for (series, quantity), column in self._columns.items()
+            if known.get(series) == quantity
+        }
+
+    def described(self, metadata: Mapping[str, Any]) -> dict[str, Any]:
+        """Return the metadata with a description of each column as it is in these segments."""
+        columns = {series: (series[1], quantity) for series, quantity in self.newest.items()}
+        drives = {name: dict(_table(about)) for name, about in _table(metadata.get("drives")).items()}
+        said = quantities_of(metadata)
+        for (drive, _), (column, quantity) in [
+            *columns.items(),
+            *((series, (column, quantity)) for (series, quantity), column in self._columns.items()),
+        ]:
+            if said.get((drive, column)) != quantity:
+                about = drives.setdefault(drive, {})
+                about["registers"] = {**_table(about.get("registers")), column: description_of(quantity)}
+        return {**metadata, "drives": drives} if drives else dict(metadata)
 
     def unit_of(self, series: Series) -> str | None:
         """Return the unit of its values; None where no segment says it."""
@@ -71,7 +127,7 @@ class Parting:
 
     def series_of(self, number: int) -> tuple[Series, ...]:
         """Return the series whose values in this segment are of the newest quantity."""
-        return tuple(one for one in self._series if self._is_newest(one, number))
+        return tuple(one for one in self._series or () if self._is_newest(one, number))
 
     def is_whole(self, first: int, last: int) -> bool:
         """Return True where the values of all series are of their newest quantity in these segments."""

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from multidrop.history.buckets import Accumulator, Grid
-from multidrop.history.database import copy_out, files_of, insert, kept_metadata, rows_of
+from multidrop.history.database import copy_out, files_of, insert, kept_metadata, quoted, rows_of
 from multidrop.history.folder import HistoryFile
 from multidrop.history.kept_series import Series
 from multidrop.history.sources import Sources, while_there
@@ -16,8 +16,7 @@ from multidrop.recording.format import Metadata
 
 COLUMNS = "time, monotonic_ns, uncertainty_ns, drive, register, value, status"
 _IN_RANGE = "epoch_ns(time) >= $begin and epoch_ns(time) < $end"
-_ROWS = f"select {COLUMNS} from {{}} where {_IN_RANGE}{{}} order by monotonic_ns"
-_EXPORT = f"select {COLUMNS} from recorded union all by name select {COLUMNS} from {{}} where {_IN_RANGE}{{}}"
+_ROWS = f"select {COLUMNS} from (select * {{}} from {{}} where {_IN_RANGE}{{}})"
 _BUCKETS = f"""
 select drive, register, (epoch_ns(time) - $begin) // $step, {{sums}}
 from {{files}} where {_IN_RANGE}{{condition}} group by all
@@ -27,13 +26,21 @@ OF_TENS = "sum(n)::bigint, sum(missed)::bigint, sum(mean * n), min(least), max(m
 
 
 def rows_of_file(
-    sources: Sources, file: HistoryFile, series: Sequence[Series] | None, begin: int, end: int
+    sources: Sources,
+    file: HistoryFile,
+    series: Sequence[Series] | None,
+    begin: int,
+    end: int,
+    renamed: Mapping[Series, str],
 ) -> Iterator[Rows]:
-    """Yield the rows of these series, or of all, in the order of their requests. Raises Replaced, at once."""
+    """Yield the rows of these series, or of all, in the order of their requests. Raises Replaced, at once.
+
+    A series that is renamed has this name in place of its register's.
+    """
     condition, values = _condition(series)
     with sources.cursor() as cursor, while_there([file]):
         # It is sorted, so all of it was read before the first rows come: none are given out twice.
-        query = _ROWS.format(files_of([file.path]), condition)
+        query = _ROWS.format(_columns(renamed), files_of([file.path]), condition) + " order by monotonic_ns"
         yield from rows_of(cursor, query, {"begin": begin, "end": end, **values})
 
 
@@ -64,16 +71,33 @@ def write_parquet(
     series: Sequence[Series] | None,
     range_ns: tuple[int, int],
     metadata: Metadata,
+    renamed: Mapping[int, Mapping[Series, str]],
 ) -> int:
-    """Write these batches and the files' rows of these series and times; return how many. Raises Replaced."""
+    """Write these batches and the files' rows of these series and times; return how many. Raises Replaced.
+
+    `renamed` has the names of series by the first segment of a file, as `rows_of_file` takes them.
+    """
     condition, values = _condition(series)
     values |= dict(zip(("begin", "end"), range_ns, strict=True))
     with sources.cursor() as cursor, while_there(files):
         insert(cursor, batches)
         query = f"select {COLUMNS} from recorded"
-        if files:
-            query = _EXPORT.format(files_of(file.path for file in files), condition)
+        alike: dict[str, list[HistoryFile]] = {}
+        for file in files:
+            alike.setdefault(_columns(renamed[file.first]), []).append(file)
+        for columns, some in alike.items():
+            found = _ROWS.format(columns, files_of(file.path for file in some), condition)
+            query += f" union all by name {found}"
         return copy_out(cursor, query, target, metadata, values if files else {})
+
+
+def _columns(renamed: Mapping[Series, str]) -> str:
+    """Return what follows `select *` so that series have these names."""
+    whens = " ".join(
+        f"when drive = {quoted(drive)} and register = {quoted(register)} then {quoted(name)}"
+        for (drive, register), name in renamed.items()
+    )
+    return f"replace (case {whens} else register end as register)" if whens else ""
 
 
 def _condition(series: Sequence[Series] | None) -> tuple[str, dict[str, Any]]:

@@ -6,6 +6,7 @@ change, and ports are opened. A line that stays is not touched where nothing of 
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass, replace
 
 from multidrop.bus import Bus
@@ -29,8 +30,8 @@ class Staying:
     wanted: PlantLine
     drives: DriveChanges
 
-    def part_with(self) -> None:
-        """Let the drives go that are not wanted any more.
+    def part_with(self, names: Collection[str]) -> None:
+        """Let the drives go that are not wanted any more; none is asked yet whose name is among these.
 
         Those whose address nobody takes are stopped first, where the bus has `stop_on_exit`. At an address
         that is declared as another drive now, the old family's stop may mean something else. All stops of
@@ -42,12 +43,18 @@ class Staying:
         for drive in leaving:
             self.line.remove(drive)
             self.line.forget(drive)
+        for drive in leaving:
+            if drive.name in names:
+                self.line.await_gone(drive.address)
 
     @property
-    def is_free(self) -> bool:
-        """True unless one of the drives that join is still on another line."""
-        joining = [polled.drive for polled in self.drives.joining]
-        return all(drive.bus is None or not drive.bus.is_open for drive in joining)
+    def leaving(self) -> set[str]:
+        """The names of the drives that leave."""
+        return {polled.drive.name for polled in self.drives.leaving}
+
+    def is_free(self, present: Collection[str]) -> bool:
+        """Return True unless a drive that joins, or one of its name, is still present on another line."""
+        return not any(polled.drive.name in present for polled in self.drives.joining)
 
     def take_in(self) -> None:
         """Poll what is new. Raises LineError where the port cannot have a drive's settings."""
@@ -146,10 +153,12 @@ class Adoption:
         """Change the lines that stay, each in one go: an exchanged drive can be stopped whatever opens."""
         failures: dict[str, LineError] = {}
         parted: list[Staying] = []
-        for staying in self._staying:
-            staying.part_with()
+        names = {polled.drive.name for line in self._plant.lines for polled in line.drives}
+        for number, staying in enumerate(self._staying, 1):
+            staying.part_with(names)
             parted.append(staying)
-            for free in [each for each in parted if each.is_free]:
+            present = set().union(*(later.leaving for later in self._staying[number:]))
+            for free in [each for each in parted if each.is_free(present)]:
                 parted.remove(free)
                 try:
                     free.take_in()

@@ -10,12 +10,14 @@ rows with times as plain integers: that is refused. For NumPy, with NaN for ever
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Collection, Iterator
+from array import array
+from collections.abc import Collection, Iterator, Sequence
 from datetime import UTC, datetime
 from functools import cache
 from typing import Any, NamedTuple, NoReturn
 
 from multidrop.core import STATUSES, Columns, Names, spell
+from multidrop.core.columns import COLUMNS
 from multidrop.polling.table import ArrowTable, nanoarrow
 from multidrop.polling.wide import WideRows
 
@@ -131,6 +133,10 @@ class Batch(Rows):
         names = (self._drives.listed, self._registers.listed, _STATUSES.listed)
         return BatchColumns(time, sent, uncertainty, drive, register, value, status, valid, *names)
 
+    def at(self, places: Sequence[int]) -> Batch:
+        """Return a copy of the rows at these places."""
+        return Batch(PickedColumns(self._columns, places), self._drives, self._registers)
+
     def parts(self) -> tuple[Columns, Names, Names]:
         """Return the core's columns, and the names of drives and registers, for what copies them."""
         return self._columns, self._drives, self._registers
@@ -161,6 +167,28 @@ class Batch(Rows):
             (valid, column("value")),
             (None, *spell(column("status"), _STATUSES)),
         )
+
+
+class PickedColumns(Columns):
+    """Copies of some rows of other columns."""
+
+    def __init__(self, columns: Columns, places: Sequence[int]) -> None:
+        self._rows = len(places)
+        self._picked = {
+            name: array(kind, map(columns.array(name).__getitem__, places)) for name, kind in COLUMNS.items()
+        }
+
+    def __len__(self) -> int:
+        return self._rows
+
+    def array(self, name: str) -> memoryview[Any]:
+        return bitmap_of(self.array("status")) if name == "valid" else memoryview(self._picked[name])
+
+
+def bitmap_of(statuses: memoryview[Any]) -> memoryview[Any]:
+    """Return a bit for each row, the least significant first: 1 where its status is 0."""
+    bits = "".join("0" if code else "1" for code in reversed(statuses))
+    return memoryview(int(bits or "0", 2).to_bytes((len(statuses) + 7) // 8, "little"))
 
 
 @cache

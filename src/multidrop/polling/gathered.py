@@ -6,7 +6,7 @@ from typing import Any
 
 from multidrop.core import Columns
 from multidrop.core.columns import COLUMNS, Names
-from multidrop.polling.batch import Batch
+from multidrop.polling.batch import Batch, bitmap_of
 
 
 class GatheredRows(Columns):
@@ -36,8 +36,7 @@ class GatheredRows(Columns):
         size, codes = (self._rows + 7) // 8, self._gathered["status"]
         if codes.count(0) == len(codes):
             return memoryview(b"\xff" * size)
-        bits = "".join("0" if code else "1" for code in reversed(self.array("status")))
-        return memoryview(int(bits, 2).to_bytes(size, "little"))
+        return bitmap_of(self.array("status"))
 
     def batch(self) -> Batch:
         """Return all rows so far; none may be added afterwards."""

@@ -30,6 +30,7 @@ class LineDrives:
         self._refusals = refusals
         self._planned: dict[PolledDrive, PlannedJobs] = {}  # also of drives that were removed
         self._present: dict[Drive, PolledDrive] = {}  # of drives that are here
+        self._since_ns: dict[Drive, int] = {}  # of these: they are polled in this way no longer
         self._gone: dict[int, Peer] = {}  # of drives that left, by address: it may be asked yet
         self._polled: list[tuple[Drive, Peer]] = []
         self._observed: list[tuple[int, int, bool]] = []  # of each: failures, late until, has answered
@@ -38,6 +39,11 @@ class LineDrives:
     def polled(self) -> tuple[PolledDrive, ...]:
         """Drives that are here, with what is polled of each now."""
         return tuple(self._present.values())
+
+    @property
+    def since_ns(self) -> dict[str, int]:
+        """By name, the time since which each drive that is here is polled as it is now."""
+        return {drive.name: since_ns for drive, since_ns in self._since_ns.copy().items()}
 
     def polled_of(self, drive: Drive) -> PolledDrive:
         return self._present[drive]
@@ -56,6 +62,7 @@ class LineDrives:
             self._bus.detach(drive)
             raise
         self._present[drive] = polled
+        self._since_ns[drive] = clock.now_ns()
         if self._planned[polled].jobs:
             self._polled.append((drive, self._bus.peer(drive)))
         if is_started:
@@ -80,6 +87,7 @@ class LineDrives:
         self.schedule.back_off.forget(drive.address)
         self._refusals.forget(drive)
         self._present.pop(drive, None)
+        self._since_ns.pop(drive, None)
         self._polled = [(other, peer) for other, peer in self._polled if other is not drive]
         self._gone[drive.address] = self._bus.peer(drive)
 
@@ -101,6 +109,7 @@ class LineDrives:
             return False
         peer = self._bus.peer(drive)
         planned = self._maker.plan(after, peer.response_delay or drive.response_delay)
+        self._since_ns[drive] = clock.now_ns()
         if is_started:
             self._change_jobs(drive, planned.jobs, clock.now_ns())
         others = [(other, known) for other, known in self._polled if other is not drive]

@@ -81,12 +81,16 @@ class PolledLine:
         """Drives that are here, with what is polled of each now."""
         return self._drives.polled
 
+    @property
+    def since_ns(self) -> dict[str, int]:
+        return self._drives.since_ns
+
     def add(self, polled: PolledDrive) -> None:
         """Poll one more drive; one that comes back has the jobs that it had.
 
         Another that left its address is waited for until it is asked no more: what it owes then is known.
         """
-        self._await_gone(polled.drive.address)
+        self.await_gone(polled.drive.address)
         settings = polled.drive.settings  # here, as the polling must not wait for a port that is being opened
         self.bus.line.require((settings.baudrate, settings.format))
         with self._lock:
@@ -96,11 +100,12 @@ class PolledLine:
     def put_in_order(self) -> None:
         """Ask the drives in the order in which their settings are changed in the least time."""
         with self._lock:
-            drives = in_order(self.bus.drives, self.switching)
-            self._schedule.put_in_order([drive.address for drive in drives])
+            ordered = in_order(self.bus.drives, self.switching)
+            self._schedule.put_in_order([drive.address for drive in ordered])
         self._row_queue.call(self.number)
 
-    def _await_gone(self, address: int) -> None:
+    def await_gone(self, address: int) -> None:
+        """Wait until the drive that left this address is asked no more."""
         peer = self._drives.take_gone(address)
         while peer and not self._is_left and self.bus.is_asking(peer):
             clock.sleep(GONE_S)
@@ -167,11 +172,8 @@ class PolledLine:
             port = self.bus.line.queue
             if self._is_left or not self._is_started:
                 return
-            if port is None and self.bus.line.may_send:
-                self._regain(now_ns)
-                return
             if port is None:
-                self._stand_by(now_ns)
+                (self._regain if self.bus.line.may_send else self._stand_by)(now_ns)
                 return
             if port is not self._queue.port:  # a stop may have opened it again before the loss was seen here
                 self._miss(self._queue.clear(now_ns), Status.LINE_LOST)
