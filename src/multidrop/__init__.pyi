@@ -69,7 +69,7 @@ from multidrop.errors import Unconfirmed as Unconfirmed
 from multidrop.errors import Unsupported as Unsupported
 from multidrop.exposition import MetricFamily as MetricFamily
 from multidrop.exposition import expose_metrics as expose_metrics
-from multidrop.family_file.loader import FamilyError as FamilyError
+from multidrop.family_file.errors import FamilyError as FamilyError
 from multidrop.family_file.loader import load_family as load_family
 from multidrop.history.buckets import Buckets as Buckets
 from multidrop.history.history import History as History

@@ -17,7 +17,8 @@ from modbus_requests import read_requests
 from multidrop.capture import Capture, CaptureError, Decoding, Junk, Pairing
 from multidrop.core import Splitter
 from multidrop.drive.register import Access
-from multidrop.family_file.loader import FamilyError, load_family
+from multidrop.family_file.errors import FamilyError
+from multidrop.family_file.loader import load_family
 from multidrop.importers import SUFFIXES, ImportedDevice, family_text, plant_text, read_devices
 from multidrop.planning.blocks import blocks
 from multidrop.plant.loader import PlantError, load_plant

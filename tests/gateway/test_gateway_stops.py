@@ -7,6 +7,7 @@ import http.client
 import json
 import socket
 import threading
+from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
@@ -15,6 +16,7 @@ import pytest
 from broken_part import BrokenFeed
 from gateways import Served, served, written
 from lines import PATIENCE, until
+from tables import table
 
 from multidrop import PlantError
 from multidrop.gateway import parts, request_fields
@@ -83,12 +85,18 @@ UNREADABLE = {
 }
 
 
-@pytest.mark.parametrize("body", UNREADABLE.values(), ids=UNREADABLE)
+@pytest.fixture
+def gateway(tmp_path: Path) -> Iterator[Served]:
+    with served(tmp_path, MAY) as gateway:
+        yield gateway
+
+
+@table("body", UNREADABLE.values(), ids=UNREADABLE)
 def test_a_stop_whose_body_cannot_be_read_is_one_of_all_drives(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, body: bytes
+    gateway: Served, monkeypatch: pytest.MonkeyPatch, body: bytes
 ) -> None:
     monkeypatch.setattr(request_fields, "STOP_BODY_S", 0.1)
-    with served(tmp_path, MAY) as gateway, calling(gateway) as client:
+    with calling(gateway) as client:
         start(gateway, "pump-1", "pump-2")
         client.sendall(STOP + body)
         response = http.client.HTTPResponse(client)

@@ -62,7 +62,7 @@ def test_a_series_in_a_range(folder: Path, rows: list[list[Row]]) -> None:
     dice = random.Random(5)
     times = [row.time for row in flat(rows)]
     with History(folder) as history:
-        for _ in range(examples(20)):
+        for _ in range(examples(30)):
             begin, end = sorted(dice.sample(times, 2))
             names = dice.sample(SERIES, dice.randrange(1, 4))
             wanted = [
@@ -78,7 +78,7 @@ def test_buckets_are_what_plain_python_reckons(folder: Path, rows: list[list[Row
     dice = random.Random(6)
     times = [row.time for row in flat(rows)]
     with History(folder) as history:
-        for _ in range(examples(20)):
+        for _ in range(examples(30)):
             begin, end = sorted(dice.sample(times, 2))
             points = dice.choice((1, 3, 17, 40, 800))
             found = history.buckets(SERIES, begin, end, points)
@@ -161,7 +161,7 @@ def test_mistakes(tmp_path: Path) -> None:
 
 def test_a_grid_covers_its_range() -> None:
     dice = random.Random(7)
-    for _ in range(examples(4000)):
+    for _ in range(examples(6700)):
         begin = NOON + dice.randrange(DAY)
         end = begin + round(10 ** dice.uniform(0, 18))
         points = round(10 ** dice.uniform(0, 5))
@@ -250,7 +250,7 @@ def test_damage_anywhere_hides_no_other_segment(tmp_path: Path) -> None:
     path, dice = tmp_path / "rows.00000002.arrows", random.Random(9)
     whole = path.read_bytes()
     damaged = 0
-    for _ in range(examples(200)):
+    for _ in range(examples(340)):
         data = bytearray(whole)
         for _ in range(dice.choice((1, 1, 8))):
             data[dice.randrange(len(data))] ^= 1 << dice.randrange(8)

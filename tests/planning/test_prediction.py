@@ -16,6 +16,7 @@ from multidrop.drive import Drive, Framing
 from multidrop.drive.declare import reading
 from multidrop.drive.table import HOLDING
 from multidrop.drives import MODELS, YD1000, ErmanERG220, InnovertIBD, InvtCHE
+from multidrop.planning import prediction
 from multidrop.planning.blocks import Planned, planned
 from multidrop.planning.bus_time import in_order
 from multidrop.planning.prediction import LATENESS
@@ -59,6 +60,26 @@ def test_a_cycle_is_characters_delays_and_silences() -> None:
     assert [(rate.requests, len(rate.registers)) for rate in found.rates] == [(2, 4), (2, 4)]
     assert [rate.reached for rate in found.rates] == pytest.approx([1 / found.cycle] * 2)
     assert found.exchanges_per_second(drives[0]) == pytest.approx(2 / found.cycle)
+
+
+def test_lines_alike_are_scheduled_once_and_others_anew(monkeypatch: pytest.MonkeyPatch) -> None:
+    begun = 0
+
+    class CountedSchedule(prediction.Schedule[prediction.Job]):
+        def __init__(self) -> None:
+            nonlocal begun
+            begun += 1
+            super().__init__()
+
+    monkeypatch.setattr(prediction, "Schedule", CountedSchedule)
+    figures = [
+        (found.cycle, found.utilisation, [(rate.every, rate.reached) for rate in found.rates])
+        for delay, every in ((4.001e-3, 0.5), (4.001e-3, 0.5), (4.002e-3, 0.5), (4.001e-3, 0.6))
+        for found in [predict(asked(one, every), {one: delay}) for one in [Simple(1, name="one")]]
+    ]
+    assert figures[0] == figures[1]
+    assert figures[2] != figures[0] != figures[3]
+    assert begun == 3
 
 
 def test_a_shorter_silence_is_reckoned_with() -> None:

@@ -505,7 +505,7 @@ def test_damage_anywhere_ends_in_a_sentence(tmp_path: Path, suffix: str) -> None
     record(path, 2)
     whole = path.read_bytes()
     chance = random.Random(4)
-    for _ in range(examples(1500)):
+    for _ in range(examples(2500)):
         damaged = bytearray(whole)
         for _ in range(chance.choice((1, 1, 4))):
             damaged[chance.randrange(len(damaged))] = chance.choice((0, 1, 0x7F, 0xFF, chance.randrange(256)))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Sequence
-from importlib.metadata import version
 from pathlib import Path
 from typing import Self
 
@@ -34,6 +33,8 @@ class CaptureWriter:
     """
 
     def __init__(self, path: Path | str, lines: Sequence[str] = (), comment: str = "") -> None:
+        from importlib.metadata import version  # an eighth of what a command imports, and few write captures
+
         self.path = Path(path)
         self._lines: dict[str, int] = {}
         with writing(self.path):

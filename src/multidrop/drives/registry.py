@@ -14,7 +14,6 @@ from types import ModuleType
 from multidrop.drive import Drive
 from multidrop.drives import MODELS
 from multidrop.drives.model_file import load_model_file
-from multidrop.family_file.loader import load_family
 
 _SHIPPED = Path(__file__).parents[1] / "families"
 SHIPPED = tuple(sorted(path.stem for path in _SHIPPED.glob("*.toml")))  # each is read when it is asked for
@@ -22,7 +21,7 @@ SHIPPED = tuple(sorted(path.stem for path in _SHIPPED.glob("*.toml")))  # each i
 
 def shipped_family(name: str) -> type[Drive]:
     """Return the family of SHIPPED that has this name; it is called so, and not by its file."""
-    family = load_family(_SHIPPED / f"{name}.toml")
+    family = _family_of(_SHIPPED / f"{name}.toml")
     family.model = family.declared_in = name
     return family
 
@@ -38,7 +37,7 @@ def find_model(text: str, relative_to: Path | None = None) -> type[Drive]:
     if text in SHIPPED:
         return shipped_family(text)
     if text.endswith(".toml"):
-        return load_family((relative_to or Path()) / text)
+        return _family_of((relative_to or Path()) / text)
     path, colon, name = text.rpartition(":")
     if not colon and text.endswith(".py"):
         path = text
@@ -53,6 +52,12 @@ def find_model(text: str, relative_to: Path | None = None) -> type[Drive]:
 def is_users_own(family: type[Drive]) -> bool:
     """Return True for a family that is not of this package, and derives from none that is."""
     return family.model not in SHIPPED and not any(base in MODELS.values() for base in family.__mro__)
+
+
+def _family_of(path: Path) -> type[Drive]:
+    from multidrop.family_file.loader import load_family  # a tenth of what a command imports
+
+    return load_family(path)
 
 
 def _drive(module: ModuleType, path: str, name: str) -> type[Drive]:

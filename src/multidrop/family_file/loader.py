@@ -14,6 +14,7 @@ from multidrop.drive.family import TAKEN_NAMES, Drive
 from multidrop.drive.register import Access
 from multidrop.family_file.addresses import Counting
 from multidrop.family_file.csv_table import MOST_BYTES, beside, declare_rows
+from multidrop.family_file.errors import FamilyError
 from multidrop.family_file.facts import FAMILY_KEYS, facts_of
 from multidrop.family_file.options import options_of
 from multidrop.family_file.register_keys import shown
@@ -26,14 +27,6 @@ from multidrop.toml_check import TomlPlace, parse_document
 SECTIONS = ("family", "default", *(access.value for access in Access), "text", "option", *VERB_SECTIONS)
 MOST_MISTAKES = 200
 MOST_CSV_FILES = 20
-
-
-class FamilyError(ValueError):
-    """All mistakes of a family's file; `mistakes` has a sentence for each: its place, what would be right."""
-
-    def __init__(self, mistakes: tuple[str, ...]) -> None:
-        super().__init__("\n".join(mistakes))
-        self.mistakes = mistakes
 
 
 @dataclass(frozen=True)

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache, partial
-from typing import Any
+from functools import lru_cache
+from typing import Any, NamedTuple
 
 from multidrop.core import build_request, characters_on_wire, reply_length
 from multidrop.drive.family import Drive
@@ -163,24 +163,77 @@ def _jobs(
 
 
 def _run(jobs: Sequence[_PredictedJob], switching: float) -> None:
-    """Carry out one job after another in the schedule's order."""
-    schedule: Schedule[_PredictedJob] = Schedule()
+    """Note of each job what becomes of it."""
+    ends = {job.kind: job.planned.drive for job in jobs}  # drives of one kind are alike to their neighbours
+    numbers = {kind: number for number, kind in enumerate(ends)}
+    gaps = tuple(tuple(gap(before, after, switching) for after in ends.values()) for before in ends.values())
+    slots = tuple(
+        _Slots(
+            *(job.drive, numbers[job.kind], job.silence_ns, job.interval_ns, job.period_ns, job.duration_ns),
+            job.own,
+        )
+        for job in jobs
+    )
+    for job, done in zip(jobs, _carried_out(slots, gaps), strict=True):
+        job.count, job.skipped, job.first_ns, job.last_ns, job.taken = done
+
+
+class _Slots(NamedTuple):
+    """All that the schedule and the clock are told of a job."""
+
+    drive: int
+    kind: int
+    silence_ns: int
+    interval_ns: int
+    period_ns: int | None
+    duration_ns: int
+    own: float
+
+
+class _Done(NamedTuple):
+    exchanges: int
+    skipped: int
+    first_ns: int
+    last_ns: int
+    taken: float
+
+
+@lru_cache(64)  # a plant's lines are often alike, and several parts of a program ask for one plant
+def _carried_out(slots: tuple[_Slots, ...], gaps: tuple[tuple[float, ...], ...]) -> tuple[_Done, ...]:
+    """Carry out one job after another in the schedule's order, and return what becomes of each.
+
+    `gaps` are in s, by the kinds of two drives that follow each other.
+    """
+    schedule: Schedule[Job] = Schedule()
+    jobs = [
+        Job(
+            drive=one.drive,
+            kind=one.kind,
+            silence_ns=one.silence_ns,
+            interval_ns=one.interval_ns,
+            period_ns=one.period_ns,
+            duration_ns=one.duration_ns,
+        )
+        for one in slots
+    ]
     for job in jobs:
         schedule.add(job, 0)
-    gaps = cache(partial(gap, switching=switching))
-    at, before = 0, jobs[-1].planned.drive
+    of_job = {job: number for number, job in enumerate(jobs)}
+    done = [_Done(0, 0, 0, 0, 0.0)] * len(jobs)
+    at, before = 0, slots[-1].kind
     ready_ns: dict[int, int] = {}
     timed = any(job.period_ns is not None or job.interval_ns for job in jobs)
     for _ in range(max(LEAST_EXCHANGES, LEAST_ROUNDS * len(jobs)) if timed else len(jobs)):
         ((job, not_before_ns, _),) = schedule.take(at, at, FAR_NS, 1)
-        silent = gaps(before, job.planned.drive)
+        number = of_job[job]
+        own, known = slots[number].own, done[number]
+        silent = gaps[before][slots[number].kind]
         begin_ns = max(at + round(silent * 1e9), not_before_ns, ready_ns.get(job.drive, 0))
-        job.first_ns = job.first_ns if job.count else begin_ns
-        job.last_ns = begin_ns
-        job.count += 1
-        job.taken += silent + job.own
-        at, before = begin_ns + round(job.own * 1e9), job.planned.drive
+        first_ns = known.first_ns if known.exchanges else begin_ns
+        done[number] = _Done(known.exchanges + 1, 0, first_ns, begin_ns, known.taken + (silent + own))
+        at, before = begin_ns + round(own * 1e9), slots[number].kind
         ready_ns[job.drive] = at + job.interval_ns
+    return tuple(one._replace(skipped=job.skipped) for one, job in zip(done, jobs, strict=True))
 
 
 # ---- as a recording carries it ----

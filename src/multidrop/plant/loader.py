@@ -13,7 +13,7 @@ from multidrop.drive.network import speaks_tcp, url_of
 from multidrop.drive.timing import Settings
 from multidrop.drives import MODELS
 from multidrop.drives.registry import find_model
-from multidrop.family_file.loader import FamilyError
+from multidrop.family_file.errors import FamilyError
 from multidrop.plant.model import Plant, PlantLine, Polled, PolledDrive
 from multidrop.toml_check import Key, TomlPlace, duration_of, read_document
 

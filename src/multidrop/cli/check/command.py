@@ -19,7 +19,8 @@ from multidrop.cli.support.values import counted, wrapped
 from multidrop.drive.family import Drive
 from multidrop.drives import MODELS
 from multidrop.drives.registry import find_model
-from multidrop.family_file.loader import FamilyError, load_family
+from multidrop.family_file.errors import FamilyError
+from multidrop.family_file.loader import load_family
 from multidrop.family_file.step_words import declared_in_words
 from multidrop.plant.loader import PlantError, load_plant
 from multidrop.toml_check import read_document
