@@ -166,7 +166,8 @@ class Poller(RowSource):
         stopped before they leave, for nobody would later. One whose address is another family's now is not:
         the old family's stop may mean something else there.
 
-        Names in batches keep their codes. Returns when all is done; other lines are polled meanwhile.
+        Names in batches keep their codes. Returns when all is done; other lines are polled meanwhile. Any
+        thread may call this, one at a time.
         """
         if not isinstance(plant, Plant):
             raise TypeError(f"adopt takes a Plant, such as load_plant('plant.toml') gives, not {plant!r}")

@@ -10,7 +10,6 @@ import subprocess
 from collections.abc import Iterator
 
 import pytest
-from fleet_cuts import MachineDrill, cut, drilled_in_network, drilled_on_machines
 from fleet_drills import DEEDS, PATIENCE_S, FleetDrill, drilled
 from peers import require_module
 
@@ -24,7 +23,6 @@ DONE = (
     "ownership leader killed",
     "all nodes killed",
 )
-CUT = ("gateway cut off", "gateway does not hear the nodes", "node hears nobody")
 
 
 @pytest.fixture(scope="module")
@@ -61,44 +59,3 @@ def test_no_deed_makes_two_masters(drill: FleetDrill, deed: str) -> None:
     drill.settle()
     drill.judge(lambda: DEEDS[deed](drill))
     assert drill.hall.overlaps() == 0
-
-
-@pytest.fixture(scope="module")
-def cut_drill(tmp_path_factory: pytest.TempPathFactory) -> Iterator[FleetDrill]:
-    require_module("nats")
-    require_module("pyarrow")
-    with drilled_in_network(tmp_path_factory.mktemp("cuts")) as found:
-        yield found
-
-
-@pytest.mark.parametrize("name", CUT)
-def test_no_cut_makes_two_masters(cut_drill: FleetDrill, name: str) -> None:
-    cut_drill.settle()
-    cut_drill.judge(lambda: cut(cut_drill, name))
-    assert cut_drill.hall.overlaps() == 0
-
-
-@pytest.fixture(scope="module")
-def machine_drill(tmp_path_factory: pytest.TempPathFactory) -> Iterator[MachineDrill]:
-    require_module("nats")
-    require_module("pyarrow")
-    with drilled_on_machines(tmp_path_factory.mktemp("machines")) as found:
-        yield found
-
-
-def test_no_line_waits_for_an_election_where_a_gateway_dies_with_the_node_on_its_machine(
-    machine_drill: MachineDrill,
-) -> None:
-    """All its lines' records have leaders on other machines: `settle` waits for that."""
-    machine_drill.settle()
-    before = machine_drill.status()["lines"]
-    machine_drill.judge(machine_drill.kill_machine)
-    assert machine_drill.hall.overlaps() == 0
-    moved = [line for line, one in machine_drill.status()["lines"].items() if one != before[line]]
-    assert moved
-
-
-def test_no_cut_of_a_whole_machine_makes_two_masters(machine_drill: MachineDrill) -> None:
-    machine_drill.settle()
-    machine_drill.judge(machine_drill.cut_machine)
-    assert machine_drill.hall.overlaps() == 0

@@ -43,16 +43,17 @@ def test_hostile_names_are_text_and_break_no_layout(opened: Opener, size: str) -
         assert page.evaluate(AT_ITS_PLACE)[0], view
 
 
-@pytest.mark.parametrize("name", HOSTILE.values(), ids=["markup", "right-to-left", "long", "cyrillic"])
-def test_a_hostile_name_is_stopped_by_its_name(opened: Opener, hostile: FakeGateway, name: str) -> None:
+def test_a_hostile_name_is_stopped_by_its_name(opened: Opener, hostile: FakeGateway) -> None:
     page = opened()
-    page.evaluate("name => { location.hash = `#/drives/${encodeURIComponent(name)}` }", name)
-    page.locator("#panel h2", has_text=name[:3]).wait_for()
-    assert page.locator("#panel h2").text_content() == name
-    page.locator("#panel .danger").click()
-    assert page.locator("#ask-title").text_content() == f"Stop {name}?"
-    assert page.locator("#ask-title bdi").evaluate("e => getComputedStyle(e).unicodeBidi") == "isolate"
-    page.locator("#ask .danger").click()
-    page.get_by_role("heading", name="The drive is stopped").wait_for()
-    assert hostile.posts == [("/api/stop", {"drives": [name]})]
+    for name in HOSTILE.values():
+        page.evaluate("name => { location.hash = `#/drives/${encodeURIComponent(name)}` }", name)
+        page.locator("#panel h2", has_text=name[:3]).wait_for()
+        assert page.locator("#panel h2").text_content() == name
+        page.locator("#panel .danger").click()
+        assert page.locator("#ask-title").text_content() == f"Stop {name}?"
+        assert page.locator("#ask-title bdi").evaluate("e => getComputedStyle(e).unicodeBidi") == "isolate"
+        page.locator("#ask .danger").click()
+        page.get_by_role("heading", name="The drive is stopped").wait_for()
+        page.keyboard.press("Escape")
+    assert hostile.posts == [("/api/stop", {"drives": [name]}) for name in HOSTILE.values()]
     assert elements(page)[2] == 0
