@@ -141,15 +141,16 @@ def test_each_takes_its_share_and_a_dead_ones_lines_are_taken_over(fleet: Cluste
     async def main() -> None:
         async with gateways(fleet, "a", "b", "c") as running:
             await until(lambda: all(5 <= len(lines) <= 11 for lines in running.taken().values()), "shares")
-            lost = running.members["b"].polled.keys()
-            assert lost
+            dead = running.members["b"]
+            assert dead.polled
+            begun, left_s = time.monotonic(), dead.lease.left_s
             await running.die("b")
-            seconds = await until(running.all_are_polled, "takeover")
-            assert seconds > 2.0  # three on an idle machine
+            await until(running.all_are_polled, "takeover")
+            assert time.monotonic() - begun > left_s
             again = await running.join("b")
             assert not again.polled
             await until(lambda: len(again.polled) >= 5 and running.all_are_polled(), "it comes back")
-            assert again.lease.session == 2
+            assert again.lease.session >= 2  # more where the machine let it stand still
 
     asyncio.run(main())
 
