@@ -239,13 +239,31 @@ def test_a_stop_by_a_verb_that_the_broker_keeps_is_carried_out(
     assert known.commands.noted == [("act", "pump-1", "coast", {})]
 
 
-def test_a_stop_by_a_verb_that_names_another_drive_stops_none(
+@pytest.mark.parametrize("verb", ["coast", "emergency_stop", "stop"])
+@pytest.mark.parametrize(
+    "named", [FAN.name, "no-such-drive", "pump-1", 7, ["pump-1"], {}, None, "", "#", "pump-1/+"]
+)
+def test_a_stop_by_a_verb_stops_its_topic_s_drive_and_another_one_that_it_names(
+    broker: Broker, listener: Listener, start: Start, verb: str, named: object
+) -> None:
+    known, _ = start(commands=True)
+    listener.wait_for(has("multidrop/gateway", b"online"))
+    publish(broker, "multidrop/pump-1/act", json.dumps({"verb": verb, "drive": named, "time": 1}).encode())
+    assert told(listener)["done"]
+    others = [("act", FAN.name, verb, {})] if named == FAN.name else []
+    if others:
+        assert told(listener, FAN.name)["done"]
+    assert known.commands.noted == [("act", "pump-1", verb, {}), *others]
+
+
+def test_what_is_no_verb_or_starts_a_motor_under_two_names_is_refused(
     broker: Broker, listener: Listener, start: Start
 ) -> None:
     known, _ = start(commands=True)
     listener.wait_for(has("multidrop/gateway", b"online"))
-    publish(broker, "multidrop/pump-1/act", b'{"verb": "coast", "drive": "fan-1", "time": 1}')
-    assert "it names drive 'fan-1'" in told(listener)["text"]
+    order = {"verb": "start", "drive": FAN.name, "time": now_ms()}
+    publish(broker, "multidrop/pump-1/act", json.dumps(order).encode())
+    assert f"it names drive '{FAN.name}'" in told(listener)["text"]
     publish(broker, "multidrop/pump-1/act", b'{"verb": ["coast"], "drive": "pump-1", "time": 1}')
     assert not told(listener)["done"]
     assert known.commands.noted == []
