@@ -11,10 +11,10 @@ from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from functools import partial
 from logging import WARNING
-from os import get_terminal_size
 from pathlib import Path
 from typing import Any
 
+from multidrop.cli.monitor.console import open_console
 from multidrop.cli.monitor.keys import DOWN, ENTER, ESCAPE, PAGE_DOWN, PAGE_UP, UP, keys
 from multidrop.cli.monitor.side_reads import SideReader
 from multidrop.cli.support.extras import require_extra
@@ -56,7 +56,7 @@ def is_possible() -> bool:
 
 def watch(plant: Plant, *, out: Path | None = None, seconds: float | None = None) -> dict[str, Any]:
     """Poll the plant and show it until the user leaves or `seconds` are over; return the poller's summary."""
-    console = _console()
+    console = open_console()
     live = LivePlant(plant)
     with polling_session(plant, out, live.add) as session:
         with session.poller:
@@ -66,24 +66,6 @@ def watch(plant: Plant, *, out: Path | None = None, seconds: float | None = None
                 warn(sentence)
         session.hand_out()  # what came while the poller closed
     return session.poller.summary()
-
-
-def _console() -> Any:
-    """Return the terminal. Raises ValueError when it is too small."""
-    from rich.console import Console
-
-    from multidrop.cli.monitor.screen import LEAST_HEIGHT, LEAST_WIDTH
-
-    console = Console()
-    if console.is_dumb_terminal:
-        width, height = get_terminal_size()
-        console = Console(width=width, height=height - 1)  # it scrolls, and its last line stays empty
-    if console.width < LEAST_WIDTH or console.height < LEAST_HEIGHT:
-        raise ValueError(
-            f"the terminal is too small: it has {console.width} x {console.height} characters, "
-            f"and the monitor needs {LEAST_WIDTH} x {LEAST_HEIGHT}"
-        )
-    return console
 
 
 class Monitor:
