@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
 
-from multidrop import Plant
+from multidrop import Plant, drive_meant
 from multidrop.gateway.commands import Told
 from multidrop.gateway.homeassistant import discovery, discovery_topic
 from multidrop.gateway.hub import FAULT, SILENT
@@ -100,8 +100,9 @@ class JsonTopics:
 
         To stop too many can be mended, and to stop none cannot.
         """
-        named = given.get("drive", drive)
-        return [drive, named] if named != drive and named in [*_drives(self._plant)] else [drive]
+        named, there = given.get("drive"), _drives(self._plant)
+        other = drive_meant(named, there) if isinstance(named, str) else drive
+        return [drive, other] if other in there - {drive_meant(drive, there)} else [drive]
 
     def adopt(self, plant: Plant) -> None:
         """Go on with another plant: what the broker keeps of drives that left is taken back."""
