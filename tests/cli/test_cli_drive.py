@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+import errno
+import fcntl
 import io
 import json
 import os
@@ -10,16 +12,19 @@ import select
 import signal
 import subprocess
 import sys
+import termios
+import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 from commands import TOY, Run
-from lines import Faulty, patient, until
+from lines import PATIENCE, Faulty, patient, until
 from motors import ReceivedRequests
 from toy import Status, Toy
 
+import multidrop.cli
 from multidrop.cli.support.confirm import confirm
 from multidrop.control import eeprom_ledger as ledger
 from multidrop.core import Message
@@ -453,6 +458,70 @@ def test_a_stop_that_is_interrupted_is_sent_once_more(run: Run, che: Che) -> Non
     assert [write.data for write in received.writes[begun:]] == [b"\0\5"] * 2
     assert "the stop was sent" in err
     assert "multidrop: to stop it, type: multidrop stop " in err
+
+
+class ClosedTerminal:
+    """A terminal on which a command runs, and which is closed."""
+
+    def __init__(self, *words: object) -> None:
+        self._fd, terminal = os.openpty()
+
+        def take_terminal() -> None:
+            signal.signal(signal.SIGHUP, signal.SIG_DFL)  # whatever the tests were begun with
+            fcntl.ioctl(terminal, termios.TIOCSCTTY, 0)
+
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", "multidrop", *map(str, words)],
+            stdin=terminal,
+            stdout=terminal,
+            stderr=terminal,
+            start_new_session=True,
+            preexec_fn=take_terminal,
+        )
+        os.close(terminal)
+
+    def close(self) -> None:
+        os.close(self._fd)
+
+
+@patient
+@pytest.mark.parametrize("verb", ["stop", "coast"])
+def test_a_stop_goes_on_until_its_end_where_the_terminal_is_closed(run: Run, che: Che, verb: str) -> None:
+    received, words = che
+    assert run("start", *words, "--frequency", 20, "--yes")[0] == 0
+    begun = len(received.writes)
+    is_closed = threading.Event()
+
+    def loses(request: Message) -> bool:
+        if len(received.writes) > begun and not is_closed.is_set():
+            terminal.close()
+            is_closed.set()
+        return len(received.writes) < begun + 3
+
+    received.loses = loses
+    terminal = ClosedTerminal(verb, *words)
+    try:
+        assert terminal.process.wait(PATIENCE) >= 0  # no signal ended it; nobody could be told how it ended
+    finally:
+        terminal.process.kill()
+    assert is_closed.is_set()
+    assert len(received.writes) >= begun + 3
+    assert received.starts == received.starts[:1]
+    until(lambda: received.sim["status"] == 3)
+
+
+@patient
+def test_a_stop_goes_where_nobody_can_be_told_of_the_audit_log(
+    run: Run, che: Che, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Gone(io.StringIO):
+        def write(self, text: str) -> int:
+            raise OSError(errno.EIO, "Input/output error")
+
+    received, words = che
+    monkeypatch.setattr(sys, "stderr", Gone())
+    assert multidrop.cli.main(list(map(str, ("stop", *words, "--audit", tmp_path)))) == 0
+    assert [write.data for write in received.writes] == [b"\0\5"]
 
 
 def test_a_stop_takes_the_seconds_that_it_is_given(run: Run, che: Che) -> None:

@@ -170,6 +170,26 @@ def test_verbs_take_a_plant_file(run: Run, plant: Path, at: str, toy: SimulatedD
     assert toy["control"] == 0
 
 
+def test_a_stop_finds_its_drive_by_another_spelling_and_a_start_does_not(
+    run: Run, tmp_path: Path, port: str, toy: SimulatedDrive
+) -> None:
+    """A u with two dots is one character (U+00FC) or two (U+0075 U+0308), by the keyboard."""
+    plant = tmp_path / "spelt.toml"
+    text = LINE.format("hall-1", port) + DRIVE.format("L\u00fcfter", TOY, 1)
+    plant.write_text(text, encoding="utf-8")
+    fan = (plant, "Lu\u0308fter")
+    for words in (("start", *fan, "--yes"), ("write", *fan, "frequency", 20, "--yes")):
+        status, _, err = run(*words)
+        assert status == 2
+        assert "has no drive" in err
+    assert not toy.counters.writes
+    toy["control"] = Status.RUNNING
+    assert run("stop", *fan)[0] == 0
+    assert toy["control"] == 0
+    assert run("state", *fan)[1].startswith("stopped\n")
+    assert run("read", *fan, "output_current")[0] == 0
+
+
 def test_a_start_by_plant_asks_first(run: Run, plant: Path, at: str, toy: SimulatedDrive) -> None:
     status, _, err = run("start", plant, "pump-1", at)
     assert (status, err.startswith("multidrop: Start the motor of pump-1 on /dev/pts/")) == (1, True)

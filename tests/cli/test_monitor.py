@@ -7,6 +7,7 @@ import string
 import termios
 import threading
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -291,7 +292,7 @@ class Poller:
     def bus(self, line: str) -> Poller:
         return self
 
-    def stop_all(self) -> dict[str, Stopped]:
+    def stop_all(self, *, seconds: float | None = None) -> dict[str, Stopped]:
         self.asked.append("stop all")
         return {
             "drive-1": Stopped("drive-1", Seen.STOPPED, 0.1),
@@ -312,7 +313,7 @@ def a_monitor(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Any, Pol
         polled.drive.perform = lambda script, name=polled.drive.name: poller.perform(name, script)
     anyone: Any = poller
     monitor: Any = Monitor(LivePlant(plant), PollingSession(anyone, Interruption(), lambda: None), Console())
-    monitor._in_background = monitor._carry_out  # at once
+    monitor._begin = lambda what, work: False  # at once
     monitor._side_reader.read = lambda chosen: {}
     return monitor, poller
 
@@ -342,12 +343,40 @@ def test_a_stop_is_sent_where_the_system_gives_no_thread(
         raise RuntimeError("can't start new thread")
 
     monitor, poller = a_monitor(tmp_path, monkeypatch)
-    del monitor._in_background
+    del monitor._begin
     monkeypatch.setattr("threading.Thread.start", none)
     for key in "Sy":
         monitor._obey(key)
     assert poller.asked == ["stop all"]
     assert not monitor._is_stopping
+
+
+def test_all_lines_are_sent_their_stops_before_one_is_waited_for_without_threads(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[tuple[str, float | None]] = []
+
+    class LineBus:
+        def __init__(self, line: str) -> None:
+            self.line = line
+
+        def stop_all(self, *, seconds: float | None = None) -> dict[str, Stopped]:
+            asked.append((self.line, seconds))
+            if (self.line, seconds) == ("hall-2", 0.0):
+                raise OSError("the ledger cannot be kept")  # which keeps no other line's stop back
+            return {self.line: Stopped(self.line, Seen.STOPPED, 0.1)}
+
+    monitor, poller = a_monitor(tmp_path, monkeypatch)
+    (line,) = monitor._plant.plant.lines
+    lines = tuple(replace(line, name=f"hall-{number}") for number in (1, 2, 3))
+    monitor._plant.plant = replace(monitor._plant.plant, lines=lines)
+    poller.bus = LineBus  # type: ignore[method-assign, assignment]
+    for key in "Sy":
+        monitor._obey(key)
+    names = [line.name for line in lines]
+    assert asked == [(name, 0.0) for name in names] + [(name, None) for name in names]
+    assert "; ".join(f"1 of 1 drives on {name} have stopped" for name in names) == monitor._at.message
+    assert monitor._at.failures == []
 
 
 def seen(monitor: Any) -> str:
@@ -421,7 +450,7 @@ def test_a_stop_that_fails_in_any_way_is_seen(
 def test_leaving_under_a_stop_needs_a_yes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monitor, _ = a_monitor(tmp_path, monkeypatch)
     stands = threading.Event()
-    del monitor._in_background  # in a thread, as it is
+    del monitor._begin  # in a thread, as it is
     monitor._stop = lambda chosen: (str(stands.wait(PATIENCE)), [])
     for key in ("s", "y", "q", "n"):
         monitor._obey(key)

@@ -12,7 +12,7 @@ from multidrop.core import NumberFormat
 from multidrop.drive import Condition, Direction, DriveRefused, NotDone, Refused, Unconfirmed, Unsupported
 from multidrop.drive.table import COIL, HOLDING, INPUT, Kept
 from multidrop.drives.erman_er_g_220 import Coil, ErmanERG220, ErmanFault, ErmanStatus, Modes
-from multidrop.errors import NoReply
+from multidrop.errors import BadReply, NoReply
 
 START_ON = "01 05 00 00 FF 00 8C 3A"  # printed in section 7
 START_OFF = "01 05 00 00 00 00 CD CA"
@@ -151,6 +151,30 @@ def test_stop_ends_in_an_emergency_stop_and_then_in_an_error() -> None:
         wire.drive.stop()
     assert wire.sent == [STOP_ON, START_OFF, EMERGENCY_ON]
     assert 30 <= wire.seconds <= 31  # twice the deceleration time and 5 s
+
+
+@pytest.mark.parametrize(
+    "failure", [NoReply("drive"), BadReply("drive", "odd", b"\1"), DriveRefused("drive", 2, "")]
+)
+def test_stop_ends_in_an_emergency_stop_where_the_ramp_cannot_be_read(failure: Exception) -> None:
+    says = {**STOPPED, "deceleration_time": failure, "status": ErmanStatus.RUNNING}
+    stops = {EMERGENCY_ON: {"status": ErmanStatus.STOPPED}}
+    wire = Wire(ErmanERG220(1), says, turns=stops)
+    wire.drive.stop()
+    assert wire.sent == [STOP_ON, START_OFF, EMERGENCY_ON]
+    assert 30 <= wire.seconds <= 31
+    wire = Wire(ErmanERG220(1), says, turns=stops)
+    wire.drive.emergency_stop()
+    assert wire.sent == [EMERGENCY_ON, START_OFF]
+
+
+def test_start_is_written_off_though_nobody_confirms_the_stop() -> None:
+    lost = [Unconfirmed("drive", "stop", "no reply")] * 3
+    for stop in (STOP_ON, EMERGENCY_ON):
+        wire = Wire(ErmanERG220(1), STOPPED, {stop: lost})
+        with pytest.raises(Unconfirmed, match="no reply"):  # so that it is repeated as a whole
+            (wire.drive.stop if stop == STOP_ON else wire.drive.emergency_stop)()
+        assert wire.sent == [*[stop] * 3, START_OFF]
 
 
 def test_a_drive_that_refuses_its_stop_is_stopped_by_the_emergency_stop() -> None:

@@ -395,6 +395,19 @@ def test_a_stop_of_an_unknown_drive_says_so_and_stops_the_others(desk: Desks) ->
     assert {name: one.outcome for name, one in answer.drives.items()} == {"pump": DONE, "fan": REFUSED}
 
 
+def test_a_stop_finds_its_drive_by_another_spelling_and_a_command_does_not(tmp_path: Path) -> None:
+    """A u with two dots is one character (U+00FC) or two (U+0075 U+0308), by the keyboard."""
+    fan, spelt = "L\u00fcfter", "Lu\u0308fter"
+    with desks(tmp_path, {"write": [f"{spelt}.frequency"]}, name=fan) as desk:
+        told = desk.ask(drive=spelt, register="frequency", value=20.0)
+        assert isinstance(told, CommandAnswer)
+        assert told.outcome is REFUSED
+        answer = asyncio.run(desk.stop(drives=[spelt, fan]))
+        assert answer is not None
+        assert {name: one.outcome for name, one in answer.drives.items()} == {fan: DONE}
+        assert desk.writes == [("control", 0xC000)]
+
+
 @table("data", [b"", b"[]", b'{"outcome": "maybe", "text": ""}', b'{"outcome": "done"}'])
 def test_an_asker_believes_no_answer_that_is_none(data: bytes) -> None:
     with pytest.raises(ValueError, match=r"is not|is no text"):

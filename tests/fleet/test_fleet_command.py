@@ -18,6 +18,8 @@ from nats_clusters import Cluster, cluster, free_ports, old_server_program
 from peers import require_module
 from tables import table
 
+from multidrop.control import eeprom_ledger
+
 LINE = """
 [[line]]
 name = "{name}"
@@ -71,7 +73,24 @@ def _own_state(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 )
 def test_no_server(run: Run, nobody: str, words: list[str]) -> None:
     said = one_sentence(run("fleet", *words, "--nats", nobody))
-    assert f"no NATS server answers at {nobody}" in said
+    assert said.endswith(f"no NATS server answers at {nobody}: Connection refused")
+
+
+@pytest.mark.parametrize("words", [["stop", "pump-1"], ["write", "pump-1", "frequency", "20", "--yes"]])
+def test_a_user_without_a_home(
+    run: Run, nobody: str, monkeypatch: pytest.MonkeyPatch, words: list[str]
+) -> None:
+    """As in a container: a command is not noted, so not sent, and a stop goes."""
+
+    def none() -> Path:
+        raise RuntimeError("Could not determine home directory.")
+
+    monkeypatch.delenv("XDG_STATE_HOME")
+    monkeypatch.setattr(Path, "home", none)
+    monkeypatch.setattr(eeprom_ledger, "NO_HOME", Path("/dev/null"))  # root could make it
+    status, out, err = run("fleet", *words, "--nats", nobody)
+    assert (status, out) == (1, "")
+    assert f"no NATS server answers at {nobody}: Connection refused" in err
 
 
 def test_servers_without_a_fleet(run: Run, tmp_path: Path) -> None:

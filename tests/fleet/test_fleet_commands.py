@@ -331,6 +331,19 @@ def test_drives_of_one_line_are_one_stop(tmp_path: Path) -> None:
     assert path.asked == ["stop", "stop"]
 
 
+def test_a_stop_finds_its_drive_by_another_spelling_and_a_command_does_not(tmp_path: Path) -> None:
+    """A u with two dots is one character (U+00FC) or two (U+0075 U+0308), by the keyboard."""
+    fan, spelt = "L\u00fcfter", "Lu\u0308fter"
+    plant = Plant()
+    plant.records["hall-3"] = Record("hall-3", 1, {"line": {"drive": [{"name": fan}]}})
+    path = ScriptedPath(stop=[IT_IS_DONE])
+    asked(tmp_path, path, lambda asker: asker.stop([spelt]), plant)
+    assert f"the stop of {fan}" in {note["what"] for note in read_audit(tmp_path / "asked.jsonl")}
+    with pytest.raises(ValueError, match="has no drive"):
+        asked(tmp_path, path, lambda asker: asker.write(spelt, "frequency", 20.0), plant)
+    assert path.asked == ["stop"]
+
+
 @pytest.mark.parametrize("what", [write, lambda asker: asker.stop(["pump-1"])])
 def test_a_plant_that_cannot_be_read(tmp_path: Path, what: Any) -> None:
     with pytest.raises(FleetError, match="no server"):

@@ -5,6 +5,8 @@ from __future__ import annotations
 import asyncio
 import time
 from collections.abc import Awaitable, Callable
+from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -12,9 +14,10 @@ from modbus_gateway import plant_of
 from simulated_bus import one
 from tables import table
 
-from multidrop import Bus, InvtCHE, Plant
+from multidrop import Bus, InvtCHE, Ledger, Plant
 from multidrop.gateway.commands import Commands, Told
 from multidrop.gateway.rights import Caller, May, Right
+from multidrop.gateway.views import look_at
 
 CALLER = Caller("anna", "http", "10.0.0.7", Right.WRITE)
 MAY = May(write=frozenset({"mill.setpoint"}), verbs=frozenset({"mill.start"}))
@@ -104,3 +107,47 @@ def test_a_command_that_was_not_carried_out_has_no_end() -> None:
     commands = Commands(UnopenedLines(), MAY)
     asyncio.run(commands.write("fan", "setpoint", 10.0, CALLER))
     assert commands.ended_ns("fan") == 0
+
+
+@pytest.mark.parametrize("verb", ["stop", "coast"])
+def test_a_stop_finds_its_drive_by_another_spelling_and_a_start_does_not(
+    verb: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A u with two dots is one character (U+00FC) or two (U+0075 U+0308), by the keyboard."""
+    fan, spelt = "L\u00fcfter", "Lu\u0308fter"
+    line, known, _ = one(monkeypatch, InvtCHE(1, name=fan, maximum_frequency=50))
+    lines = UnopenedLines()
+    lines.plant = plant_of(("hall", known))
+    lines.bus = lambda name: known.bus  # type: ignore[method-assign, assignment, return-value]
+    may = May(write=frozenset({f"{spelt}.setpoint"}), verbs=frozenset({f"{spelt}.start", f"{fan}.coast"}))
+    commands = Commands(lines, may)
+
+    async def carry_out() -> list[Told]:
+        started = [
+            await commands.act(spelt, "start", {}, CALLER),
+            await commands.write(spelt, "setpoint", 10.0, CALLER),
+        ]
+        assert line.written == []
+        assert {told.is_done for told in started} == {False}
+        if verb == "stop":
+            stopped = await commands.stop([spelt], CALLER)
+            assert [*stopped] == [spelt]
+            return [stopped[spelt], await commands.act(spelt, verb, {}, CALLER)]
+        return [await commands.act(spelt, verb, {}, CALLER)]
+
+    for told in asyncio.run(carry_out()):
+        assert told.is_done, told.text
+    assert line.written
+    assert commands.stopped_ns(fan) is not None
+
+
+def test_a_look_finds_its_drive_by_another_spelling(tmp_path: Path) -> None:
+    gateway: Any = SimpleNamespace(
+        plant=plant_of(("hall", InvtCHE(1, name="L\u00fcfter"))),
+        ledger=Ledger(tmp_path / "wear.sqlite"),
+        side_reads=SimpleNamespace(look=lambda plant, name: {"of": name}),
+        lately=SimpleNamespace(drive=lambda line, name: None),
+    )
+    found = asyncio.run(look_at(gateway, "Lu\u0308fter"))
+    assert found["drive"] == "L\u00fcfter"
+    assert found["values"] == {"of": "L\u00fcfter"}

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import asyncio
+import struct
 import threading
 import time
 from collections.abc import Iterator
 from typing import Any
 
 import pytest
+from lines import until
 from modbus_gateway import Gateway, plant_of, request, serving
 
 from multidrop import (
@@ -31,7 +33,7 @@ from multidrop import (
     reading,
     setting,
 )
-from multidrop.drives import DelixiNative, InnovertIBD, InvtCHE
+from multidrop.drives import DelixiNative, ErmanERG220, InnovertIBD, InvtCHE
 from multidrop.gateway.commands import BUSY, Told
 from multidrop.gateway.modbus_server import MOST_STOPS
 from multidrop.gateway.modbus_settings import ModbusSettings
@@ -362,8 +364,9 @@ def test_every_way_to_say_stop_goes_to_commands(gateway: Gateway) -> None:
     [
         (6, (BLOCK + 10, 0), b"", 3),
         (6, (BLOCK, 1), b"", 2),
-        (16, (BLOCK + 10, 2), b"\4\0\1\0\1", 3),
-        (16, (BLOCK + 9, 2), b"\4\0\1\0\1", 2),
+        (16, (BLOCK + 10, 2), b"\4\0\0\0\1", 3),
+        (16, (BLOCK + 9, 2), b"\4\0\1\0\0", 2),
+        (16, (BLOCK + 11, 1), b"\2\0\1", 2),
     ],
 )
 def test_anything_else_in_the_common_block_is_no_stop(
@@ -371,6 +374,60 @@ def test_anything_else_in_the_common_block_is_no_stop(
 ) -> None:
     assert code(gateway, 1, function, *words, data=data) == expected
     assert gateway.commands.stopped == []
+
+
+MIXED = {  # addresses, and words as the manuals and the common block have them
+    "the stop first": (1, CHE_CONTROL, (5, 0)),
+    "amid others": (1, CHE_CONTROL - 1, (7, 5, 7)),
+    "a coast": (1, CHE_CONTROL, (6, 1)),
+    "with a setpoint": (3, IBD_CONTROL, (IBD_STOP, 5000)),
+    "the common block's": (4, BLOCK + 10, (1, 1)),
+    "behind the common block's state": (4, BLOCK + 9, (1, 0xFF00)),
+    "a whole block of 16": (4, BLOCK, (*[0] * 10, 1, *[0] * 5)),
+}
+
+
+@pytest.mark.parametrize("mixed", MIXED)
+@pytest.mark.parametrize("may", ["stop", "write"])
+def test_a_stop_among_other_words_is_sent_and_nothing_else(mixed: str, may: str) -> None:
+    unit, address, words = MIXED[mixed]
+    data = struct.pack(f">B{len(words)}H", 2 * len(words), *words)
+    with serving(plant(), ModbusSettings(listen="127.0.0.1:0", may=may)) as gateway:
+        for _ in range(MOST_STOPS + 1):
+            assert code(gateway, unit, 16, address, len(words), data=data) == 3
+        until(lambda: bool(gateway.commands.stopped))  # the answer does not wait for it
+        names = {1: "mill", 3: "pump", 4: "belt"}
+        assert {str(drives) for drives, _ in gateway.commands.stopped} == {f"['{names[unit]}']"}
+        assert gateway.commands.written == []
+
+
+def test_a_stop_among_other_coils_is_sent_and_nothing_else() -> None:
+    """Start off, stop on, emergency stop off: the ER-G-220's coils 0 to 2 (section 10)."""
+    drives = plant_of(("hall", ErmanERG220(1, name="mixer")))
+    with serving(drives, ModbusSettings(listen="127.0.0.1:0", may="write")) as gateway:
+        assert code(gateway, 1, 15, 0, 3, data=b"\1\1") == 3  # start alone
+        assert gateway.commands.stopped == []
+        assert code(gateway, 1, 15, 0, 3, data=b"\1\2") == 3
+        until(lambda: bool(gateway.commands.stopped))  # the answer does not wait for it
+        assert [drives for drives, _ in gateway.commands.stopped] == [["mixer"]]
+        assert gateway.commands.written == []
+
+
+@pytest.mark.parametrize(
+    ("address", "words"), [(CHE_CONTROL, (1, 5)), (CHE_CONTROL - 1, (5, 1)), (CHE_SETPOINT, (5, 5))]
+)
+def test_words_of_which_none_is_a_stop_go_nowhere(
+    gateway: Gateway, address: int, words: tuple[int, ...]
+) -> None:
+    data = struct.pack(f">B{len(words)}H", 2 * len(words), *words)
+    assert code(gateway, 1, 16, address, len(words), data=data) in (2, 3)
+    assert (gateway.commands.written, gateway.commands.stopped) == ([], [])
+
+
+def test_a_read_only_gateway_takes_no_stop_among_other_words() -> None:
+    with serving(plant(), ModbusSettings(listen="127.0.0.1:0")) as gateway:
+        assert code(gateway, 1, 16, CHE_CONTROL, 2, data=b"\4\0\5\0\0") == 1
+        assert gateway.commands.stopped == []
 
 
 def stop_slowly(gateway: Gateway, seconds: float) -> threading.Event:

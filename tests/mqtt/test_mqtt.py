@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import signal
 import time
@@ -9,6 +10,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -20,6 +22,7 @@ from peers import require_module
 from multidrop import InvtCHE, PolledDrive
 from multidrop.gateway.clock import boottime_ns
 from multidrop.gateway.homeassistant import discovery_topic
+from multidrop.gateway.json_topics import JsonTopics
 from multidrop.gateway.mqtt import MqttSettings, build
 from multidrop.gateway.outbox import MOST_UNDER_WAY
 
@@ -239,13 +242,55 @@ def test_a_stop_by_a_verb_that_the_broker_keeps_is_carried_out(
     assert known.commands.noted == [("act", "pump-1", "coast", {})]
 
 
-def test_a_stop_by_a_verb_that_names_another_drive_stops_none(
+@pytest.mark.parametrize("verb", ["coast", "emergency_stop", "stop"])
+@pytest.mark.parametrize(
+    "named", [FAN.name, "no-such-drive", "pump-1", 7, ["pump-1"], {}, None, "", "#", "pump-1/+"]
+)
+def test_a_stop_by_a_verb_stops_its_topic_s_drive_and_another_one_that_it_names(
+    broker: Broker, listener: Listener, start: Start, verb: str, named: object
+) -> None:
+    known, _ = start(commands=True)
+    listener.wait_for(has("multidrop/gateway", b"online"))
+    publish(broker, "multidrop/pump-1/act", json.dumps({"verb": verb, "drive": named, "time": 1}).encode())
+    assert told(listener)["done"]
+    others = [("act", FAN.name, verb, {})] if named == FAN.name else []
+    if others:
+        assert told(listener, FAN.name)["done"]
+    assert known.commands.noted == [("act", "pump-1", verb, {}), *others]
+
+
+@pytest.mark.parametrize(
+    ("topic", "named", "stopped"),
+    [
+        ("pump-1", "Lu\u0308fter", ["pump-1", "L\u00fcfter"]),
+        ("Lu\u0308fter", "L\u00fcfter", ["Lu\u0308fter"]),  # one drive: Commands finds it
+        ("L\u00fcfter", "Lu\u0308fter", ["L\u00fcfter"]),
+    ],
+)
+def test_a_stop_by_a_verb_may_name_its_drives_in_another_spelling(
+    tmp_path: Path, topic: str, named: str, stopped: list[str]
+) -> None:
+    known = inside(tmp_path, InvtCHE(2, name="L\u00fcfter"))
+
+    async def receive() -> None:
+        topics = JsonTopics(MqttSettings("mqtt://localhost", commands=True), known, now_ms)
+        topics.outbox = SimpleNamespace(put=lambda publication: None)
+        order = json.dumps({"verb": "coast", "drive": named}).encode()
+        topics.received(f"multidrop/{topic}/act", order, is_retained=False)
+        await asyncio.gather(*topics._orders._tasks)
+
+    asyncio.run(receive())
+    assert known.commands.noted == [("act", drive, "coast", {}) for drive in stopped]
+
+
+def test_what_is_no_verb_or_starts_a_motor_under_two_names_is_refused(
     broker: Broker, listener: Listener, start: Start
 ) -> None:
     known, _ = start(commands=True)
     listener.wait_for(has("multidrop/gateway", b"online"))
-    publish(broker, "multidrop/pump-1/act", b'{"verb": "coast", "drive": "fan-1", "time": 1}')
-    assert "it names drive 'fan-1'" in told(listener)["text"]
+    order = {"verb": "start", "drive": FAN.name, "time": now_ms()}
+    publish(broker, "multidrop/pump-1/act", json.dumps(order).encode())
+    assert f"it names drive '{FAN.name}'" in told(listener)["text"]
     publish(broker, "multidrop/pump-1/act", b'{"verb": ["coast"], "drive": "pump-1", "time": 1}')
     assert not told(listener)["done"]
     assert known.commands.noted == []

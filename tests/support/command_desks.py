@@ -114,11 +114,13 @@ def _patiently(patience_s: float) -> AbstractContextManager[Any]:
 
 
 @contextmanager
-def desks(folder: Path, may: Mapping[str, Any] = MAY, patience_s: float = PATIENCE_S) -> Iterator[Desks]:
-    sim = simulated(YD1000(address=1, name="pump"))
+def desks(
+    folder: Path, may: Mapping[str, Any] = MAY, patience_s: float = PATIENCE_S, name: str = "pump"
+) -> Iterator[Desks]:
+    sim = simulated(YD1000(address=1, name=name))
     audit = folder / "audit.jsonl"
     with Simulator([Wire([sim], unpaced=True)]) as line, Bus(line.wires[0].path, audit=audit) as bus:
-        bus.attach(YD1000(address=1, name="pump"))
+        bus.attach(YD1000(address=1, name=name))
         made = Desks(bus, sim, folder, may)
         try:
             with _patiently(patience_s):

@@ -5,12 +5,13 @@ from __future__ import annotations
 import argparse
 import json
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from typing import Any
 
 from multidrop.cli.support.arguments import add_json_argument, add_writing_arguments, duration
 from multidrop.cli.support.confirm import confirm
 from multidrop.cli.support.output import command_line, print_text, warn
+from multidrop.cli.support.signals import outliving_the_terminal
 from multidrop.cli.support.target import Target, add_target_arguments, check_words, number_of, target_of
 from multidrop.cli.support.values import as_json, nearest_value
 from multidrop.control.audit_log import AuditLog
@@ -55,6 +56,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
+    with outliving_the_terminal() if arguments.command in _STOPS else nullcontext():
+        return _run(arguments)
+
+
+def _run(arguments: argparse.Namespace) -> int:
     target, words = target_of(arguments)
     check_words(arguments, words, _FURTHER.get(arguments.command, ()))
     if words:

@@ -16,6 +16,7 @@ from multidrop.drive.table import COIL, HOLDING, INPUT
 from multidrop.drive.verbs import verb
 
 STOP_MARGIN = 5.0  # s, on top of the deceleration time
+UNKNOWN_RAMP = 30.0  # s that a stop may take where that time cannot be read; no document states a longest one
 
 
 class Coil(IntEnum):
@@ -109,8 +110,9 @@ class ErmanERG220(Drive):
       force. `start` is refused until that fault has been reset by this object's `reset_fault`, or
       declared as dealt with by the option `acknowledged_fault`.
     - Whether START and STOP are levels or pulses is not stated. `stop` writes STOP on and START off,
-      and EMERGENCY STOP when the motor still runs after the deceleration time. Both stay on until
-      `start` writes them off: taking them off at another time could let a kept START through.
+      and EMERGENCY STOP when the motor still runs after the deceleration time, or after 30 s where that
+      cannot be read. Both stay on until `start` writes them off: taking them off at another time could let
+      a kept START through. START is written off even where nobody confirms a stop: either may get through.
     - Exception 03 is used for any bad address and 04 says "on write": neither is a device failure.
     - The models -03 and -04 of the same make have another map: see `identify`.
 
@@ -244,12 +246,11 @@ class ErmanERG220(Drive):
     def stop(self) -> Script[None]:
         """Stop along the ramp; when the motor still runs after it, or refuses that, emergency stop."""
         try:
-            yield from insist(self.stop_coil, Coil.ON)
-            yield from insist(self.start_coil, Coil.OFF)
+            yield from self._hold_back(self.stop_coil)
         except DriveRefused:
             yield from self.emergency_stop.script()
             return
-        limit = (yield from read(self.deceleration_time)) + STOP_MARGIN
+        limit = yield from self._longest_ramp()
         try:
             yield from self._stopped(self._stands, limit)
         except Unconfirmed:
@@ -259,10 +260,24 @@ class ErmanERG220(Drive):
     @verb
     def emergency_stop(self) -> Script[None]:
         """Stop the motor as the drive's own emergency stop does."""
-        yield from insist(self.emergency_stop_coil, Coil.ON)
+        yield from self._hold_back(self.emergency_stop_coil)
+        yield from self._stopped(self._stands, (yield from self._longest_ramp()))
+
+    def _hold_back(self, stop: Register[Coil]) -> Script[None]:
+        """Write a stop on and START off; the second too where nobody confirms the first."""
+        try:
+            yield from insist(stop, Coil.ON)
+        except Unconfirmed:
+            yield from insist(self.start_coil, Coil.OFF, attempts=1)
+            raise
         yield from insist(self.start_coil, Coil.OFF)
-        limit = (yield from read(self.deceleration_time)) + STOP_MARGIN
-        yield from self._stopped(self._stands, limit)
+
+    def _longest_ramp(self) -> Script[float]:
+        """Return for how many s a stop may go on before the motor counts as not obeying it."""
+        try:
+            return (yield from read(self.deceleration_time)) + STOP_MARGIN
+        except BusError:  # a drive that answers to some requests alone is one that may not obey, either
+            return UNKNOWN_RAMP
 
     def _stands(self) -> Script[bool]:
         status = yield from read(self.status)

@@ -11,6 +11,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Self
 
+from multidrop import drive_meant
 from multidrop.fleet import names
 from multidrop.fleet.buckets import Bucket, Follower
 from multidrop.fleet.command_log import open_log
@@ -205,7 +206,8 @@ class FleetCommands:
         if drives is None:
             return dict.fromkeys(self._described())
         found: dict[str, list[str] | None] = {}
-        for drive in drives:
+        there = [name for line in self._described().values() for name in line]
+        for drive in [drive_meant(drive, there) for drive in drives]:
             here = found.setdefault(self._find(drive), [])
             assert here is not None
             here.append(drive)

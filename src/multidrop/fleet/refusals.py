@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import re
 from collections import Counter
 
@@ -39,7 +40,15 @@ def failure_to_connect(url: str, failure: BaseException) -> FleetError:
         if sign in text.lower():
             why = text.partition("failed: ")[2].partition(" (_ssl")[0]
             return NotAdmitted(sentence.format(url, why=why))
-    return FleetError(f"no NATS server answers at {url}: {text}")
+    return FleetError(f"no NATS server answers at {url}: {_words(text)}")
+
+
+def _words(text: str) -> str:
+    """Return an error's text without numbers; of asyncio's calls, what the system says in words."""
+    numbers = dict.fromkeys(re.findall(r"\[Errno (\d+)\] Connect call failed", text))
+    if numbers:
+        return ", ".join(os.strerror(int(number)) for number in numbers)
+    return re.sub(r"\[Errno -?\d+\] ", "", text)
 
 
 class Denials:

@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from functools import partial
 from typing import Any
 
-from multidrop import Bus, written_by
+from multidrop import Bus, drive_meant, written_by
 from multidrop.fleet.command_desk import HOLD_S, WAY
 from multidrop.fleet.command_log import CommandLog
 from multidrop.fleet.command_words import CommandAnswer, CommandOutcome, StopRequest, read_stop, worst
@@ -53,6 +53,8 @@ class StopDesk:
             request = read_stop(data)
         except ValueError as mistake:
             return CommandAnswer(CommandOutcome.REFUSED, f"no stop was sent: {mistake}", self.gateway)
+        if request.drives is not None:
+            request = request._replace(drives=tuple(drive_meant(one, held.drives) for one in request.drives))
         key = (held.number, request.id)
         if key not in self._stops:
             self._stops[key] = asyncio.create_task(self._stop(held, request))

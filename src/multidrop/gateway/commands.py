@@ -23,6 +23,7 @@ from multidrop import (
     Plant,
     Refused,
     Register,
+    drive_meant,
     verb_arguments,
     written_before,
 )
@@ -108,7 +109,13 @@ class Commands:
             return dict.fromkeys(wanted, denied(caller, Right.STOP, "stop"))
         self.called += 1
         _log.warning("stop of %s, asked for by %s", "all drives" if drives is None else drives, caller.by)
-        return await stop_as_changed(self._lines, drives, partial(self._stop, caller=caller))
+        meant = None if drives is None else {name: self._meant(name) for name in drives}
+        names = None if meant is None else [*meant.values()]
+        told = await stop_as_changed(self._lines, names, partial(self._stop, caller=caller))
+        return told if meant is None else {name: told[meant[name]] for name in meant}
+
+    def _meant(self, drive: str) -> str:
+        return drive_meant(drive, drives_of(self._lines.plant_now))
 
     async def _stop(self, plant: Plant, wanted: Iterable[str], caller: Caller) -> dict[str, Told]:
         """Stop these drives of a plant."""
@@ -169,6 +176,7 @@ class Commands:
         admit: Admit = lambda what: inf,
     ) -> Told:
         """Carry out a verb that the plant file lists, once; refused by a way that cannot ask a person."""
+        drive = self._meant(drive) if verb in STOPPING else drive
         what = f"{drive}.{verb}"
         rule = VERBS.get(verb)
         if rule is None:

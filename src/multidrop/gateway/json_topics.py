@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
 
-from multidrop import Plant
+from multidrop import Plant, drive_meant
 from multidrop.gateway.commands import Told
 from multidrop.gateway.homeassistant import discovery, discovery_topic
 from multidrop.gateway.hub import FAULT, SILENT
@@ -83,8 +83,8 @@ class JsonTopics:
         try:
             given = _read(payload)
             if what[0] == "act" and str(given.get("verb")) in STOPPING:
-                _check_drive(drive, given)
-                self._orders.stop_by(drive, given["verb"], {})  # it takes none: no wrong ones keep it back
+                for one in self._to_stop(drive, given):
+                    self._orders.stop_by(one, given["verb"], {})  # it takes none: no wrong ones keep it back
             elif is_retained:  # it comes at every connection
                 kept = "the broker had kept it; publish it without retain"
                 self._orders.refuse(drive, "/".join(what), kept)
@@ -94,6 +94,15 @@ class JsonTopics:
                 self._orders.act(drive, *_read_act(drive, given))
         except ValueError as mistake:
             self._orders.refuse(drive, "/".join(what), f"it is no {EXAMPLES[what[0]]}: {mistake}")
+
+    def _to_stop(self, drive: str, given: Mapping[str, Any]) -> list[str]:
+        """Return the topic's drive and, where there is one, another one that the stop names.
+
+        To stop too many can be mended, and to stop none cannot.
+        """
+        named, there = given.get("drive"), _drives(self._plant)
+        other = drive_meant(named, there) if isinstance(named, str) else drive
+        return [drive, other] if other in there - {drive_meant(drive, there)} else [drive]
 
     def adopt(self, plant: Plant) -> None:
         """Go on with another plant: what the broker keeps of drives that left is taken back."""
@@ -184,16 +193,12 @@ def _read_act(drive: str, given: Mapping[str, Any]) -> tuple[str, dict[str, obje
 
 
 def _options(drive: str, given: Mapping[str, Any]) -> dict[str, object]:
-    _check_drive(drive, given)
+    if given.get("drive", drive) != drive:
+        raise ValueError(f"it names drive {given['drive']!r}, and its topic {drive!r}")
     options = given.get("options", {})
     if not isinstance(options, dict):
         raise ValueError("options is no table")
     return options
-
-
-def _check_drive(drive: str, given: Mapping[str, Any]) -> None:
-    if given.get("drive", drive) != drive:
-        raise ValueError(f"it names drive {given['drive']!r}, and its topic {drive!r}")
 
 
 def _time(given: Mapping[str, Any]) -> int:

@@ -7,10 +7,11 @@ import contextlib
 import time
 from typing import TYPE_CHECKING, Any
 
-from multidrop import Ledger, Statistics
+from multidrop import Ledger, Statistics, drive_meant
 from multidrop.gateway.frames import lost_of
 from multidrop.gateway.lately import misses_of
 from multidrop.gateway.metrics import Figures
+from multidrop.gateway.stops_amid_reload import drives_of
 
 if TYPE_CHECKING:
     from multidrop.gateway.gateway import Gateway
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
 
 async def look_at(gateway: Gateway, name: str) -> dict[str, Any]:
     """Return what the page shows of one drive alone. Raises ValueError for an unknown one."""
+    name = drive_meant(name, drives_of(gateway.plant))
     line, drive = gateway.plant.find_drive(name)
     wear = await asyncio.to_thread(_wear, gateway.ledger, line.port, drive.address)  # it may wait for a lock
     found = gateway.side_reads.look(gateway.plant, name)

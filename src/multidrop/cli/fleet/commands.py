@@ -10,7 +10,7 @@ import os
 import socket
 import sys
 from collections.abc import Iterator
-from contextlib import AsyncExitStack, contextmanager, suppress
+from contextlib import AsyncExitStack, contextmanager, nullcontext, suppress
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,6 +19,7 @@ from multidrop.cli.fleet.connection import add_server_arguments, run_action, sta
 from multidrop.cli.support.confirm import confirm
 from multidrop.cli.support.nats import nats_options
 from multidrop.cli.support.output import print_text, warn
+from multidrop.cli.support.signals import outliving_the_terminal
 
 if TYPE_CHECKING:
     from multidrop.fleet.command_words import CommandAnswer
@@ -53,7 +54,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     work = _stop if arguments.command == "stop" else _command
-    return run_action(partial(work, arguments))
+    with outliving_the_terminal() if arguments.command in _STOPPING else nullcontext():
+        return run_action(partial(work, arguments))
 
 
 def _asker(arguments: argparse.Namespace) -> FleetCommands:
@@ -145,7 +147,8 @@ def _show(arguments: argparse.Namespace, answer: CommandAnswer) -> int:
 
 
 def _show_news(answer: CommandAnswer) -> None:
-    print_text(_sentence(answer), file=sys.stderr)
+    with suppress(OSError):  # nobody may be there to read it, and the stop goes on
+        print_text(_sentence(answer), file=sys.stderr)
 
 
 def _sentence(answer: CommandAnswer) -> str:

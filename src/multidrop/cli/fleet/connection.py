@@ -14,6 +14,7 @@ from multidrop.cli.support.arguments import add_json_argument
 from multidrop.cli.support.extras import require_extra
 from multidrop.cli.support.nats import add_nats_arguments, nats_options
 from multidrop.cli.support.output import logging_to, warn
+from multidrop.control.eeprom_ledger import default_path
 
 if TYPE_CHECKING:
     from multidrop.fleet.servers import ServerPath
@@ -41,9 +42,11 @@ def urls_of(arguments: argparse.Namespace) -> list[str]:
 
 
 def state_folder() -> Path:
-    """Return the folder of this user's gateways, and of the log of commands that this user asked for."""
-    state = os.environ.get("XDG_STATE_HOME")
-    return (Path(state) if state else Path.home() / ".local" / "state") / "multidrop" / "fleet"
+    """Return the folder of this user's gateways, and of the log of commands that this user asked for.
+
+    It is beside the ledger: a user without a home has one that cannot be kept, and a stop needs none.
+    """
+    return default_path().parent / "fleet"
 
 
 def require_fleet() -> None:

@@ -7,14 +7,14 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from functools import partial
 from logging import WARNING
-from os import get_terminal_size
 from pathlib import Path
 from typing import Any
 
+from multidrop.cli.monitor.console import open_console
 from multidrop.cli.monitor.keys import DOWN, ENTER, ESCAPE, PAGE_DOWN, PAGE_UP, UP, keys
 from multidrop.cli.monitor.side_reads import SideReader
 from multidrop.cli.support.extras import require_extra
@@ -56,7 +56,7 @@ def is_possible() -> bool:
 
 def watch(plant: Plant, *, out: Path | None = None, seconds: float | None = None) -> dict[str, Any]:
     """Poll the plant and show it until the user leaves or `seconds` are over; return the poller's summary."""
-    console = _console()
+    console = open_console()
     live = LivePlant(plant)
     with polling_session(plant, out, live.add) as session:
         with session.poller:
@@ -66,24 +66,6 @@ def watch(plant: Plant, *, out: Path | None = None, seconds: float | None = None
                 warn(sentence)
         session.hand_out()  # what came while the poller closed
     return session.poller.summary()
-
-
-def _console() -> Any:
-    """Return the terminal. Raises ValueError when it is too small."""
-    from rich.console import Console
-
-    from multidrop.cli.monitor.screen import LEAST_HEIGHT, LEAST_WIDTH
-
-    console = Console()
-    if console.is_dumb_terminal:
-        width, height = get_terminal_size()
-        console = Console(width=width, height=height - 1)  # it scrolls, and its last line stays empty
-    if console.width < LEAST_WIDTH or console.height < LEAST_HEIGHT:
-        raise ValueError(
-            f"the terminal is too small: it has {console.width} x {console.height} characters, "
-            f"and the monitor needs {LEAST_WIDTH} x {LEAST_HEIGHT}"
-        )
-    return console
 
 
 class Monitor:
@@ -250,21 +232,37 @@ class Monitor:
         self._on_yes = self._stop_lines
 
     def _stop_lines(self) -> None:
-        """Stop all lines at the same time: none waits for another's ramps."""
+        """Stop all lines at the same time: none waits for another's ramps.
+
+        Where the system gives no more threads, each of the others is sent its stops before any is waited for.
+        """
         self._stop_results = {}
-        for line in self._plant.plant.lines:
-            self._in_background(f"stopping all drives on {line.name}", partial(self._stop_all, line.name))
+        stops = {
+            line.name: (f"stopping all drives on {line.name}", partial(self._stop_all, line.name))
+            for line in self._plant.plant.lines
+        }
+        left = [line for line, stop in stops.items() if not self._begin(*stop)]
+        for line in left if len(left) > 1 else ():
+            with suppress(Exception):  # it is told below, where the stop is sent again
+                self._session.poller.bus(line).stop_all(seconds=0.0)
+        for line in left:
+            self._carry_out(*stops[line])
 
     def _in_background(self, what: str, work: Callable[[], tuple[str, list[str]]]) -> None:
-        """Carry out a stop in a thread: it waits until the motor stands."""
+        """Carry out a stop in a thread, or here and now where the system gives none: it is always sent."""
+        if not self._begin(what, work):
+            self._carry_out(what, work)
+
+    def _begin(self, what: str, work: Callable[[], tuple[str, list[str]]]) -> bool:
+        """Begin a stop in a thread, which waits until the motor stands; False where there is none."""
         self._at.message = what
         thread = threading.Thread(target=self._carry_out, args=(what, work), daemon=True)
         try:
             thread.start()
-        except RuntimeError:  # the system gives no thread: a stop is always sent
-            self._carry_out(what, work)
-        else:
-            self._stops = [*filter(threading.Thread.is_alive, self._stops), thread]
+        except RuntimeError:
+            return False
+        self._stops = [*filter(threading.Thread.is_alive, self._stops), thread]
+        return True
 
     def _carry_out(self, what: str, work: Callable[[], tuple[str, list[str]]]) -> None:
         """Carry out a stop; its failures stay on the screen until they are acknowledged."""

@@ -6,7 +6,7 @@ import logging
 import shlex
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from io import TextIOWrapper
 from typing import TextIO
 
@@ -34,9 +34,13 @@ def command_line(words: Sequence[str]) -> str:
 
 
 def warn(sentences: str) -> None:
-    """Print each line on stderr, after the program's name."""
-    for sentence in sentences.splitlines():
-        print(f"multidrop: {printable(sentence)}", file=sys.stderr)
+    """Print each line on stderr, after the program's name.
+
+    Where nobody can be told, as on a terminal that was closed, that keeps nothing back: it may be a stop.
+    """
+    with suppress(OSError):
+        for sentence in sentences.splitlines():
+            print(f"multidrop: {printable(sentence)}", file=sys.stderr)
 
 
 class _Handler(logging.Handler):

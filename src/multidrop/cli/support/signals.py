@@ -1,7 +1,7 @@
-"""SIGINT (Ctrl-C) and SIGTERM while a command runs.
+"""SIGINT (Ctrl-C), SIGTERM and SIGHUP while a command runs.
 
-Both interrupt a command at once, but for polling and sniffing: there the first one is noted, so that what
-is under way is finished and recorded, and the second one interrupts.
+The first two interrupt a command at once, but for polling and sniffing: there the first one is noted, so that
+what is under way is finished and recorded, and the second one interrupts. SIGHUP ends any command but a stop.
 """
 
 from __future__ import annotations
@@ -30,6 +30,16 @@ def handling(handler: Callable[[int, FrameType | None], object], *numbers: signa
 def sigterm_interrupts() -> AbstractContextManager[None]:
     """Raise KeyboardInterrupt on SIGTERM too."""
     return handling(signal.default_int_handler, signal.SIGTERM)
+
+
+@contextmanager
+def outliving_the_terminal() -> Iterator[None]:
+    """Go on though the terminal is closed (SIGHUP): a stop is repeated until its end."""
+    if sys.platform == "win32":  # which has no such signal
+        yield
+        return
+    with handling(lambda number, frame: None, signal.SIGHUP):
+        yield
 
 
 class Interruption:

@@ -13,9 +13,11 @@ from multidrop.cli.support.plants import add_port_option, is_plant, plant_of
 from multidrop.core import RS485, Echo
 from multidrop.drive.family import Drive
 from multidrop.drives.registry import find_model
+from multidrop.plant.drive_names import drive_meant
 
 _BY_HAND = ("PORT", "MODEL", "ADDRESS")
 _BY_PLANT = ("PLANT.toml", "DRIVE")
+_STOPS_AND_LOOKS = ("read", "state", "stop", "coast", "emergency-stop")
 _SETTINGS = ("baudrate", "format", "framing")  # of a drive without a plant file
 
 
@@ -108,10 +110,11 @@ def _by_plant(arguments: argparse.Namespace) -> Target:
     ]
     if given:
         raise ValueError(f"{given[0]} is a matter of the plant file: write it into {path}")
+    drives = [polled.drive.name for line in plant.lines for polled in line.drives]
     if not names:
-        drives = ", ".join(polled.drive.name for line in plant.lines for polled in line.drives)
-        raise _mistaken(arguments, f"name a drive of {path}: {drives}")
-    line, drive = plant.find_drive(names[0])
+        raise _mistaken(arguments, f"name a drive of {path}: {', '.join(drives)}")
+    name = drive_meant(names[0], drives) if arguments.command in _STOPS_AND_LOOKS else names[0]
+    line, drive = plant.find_drive(name)
     ports = [f"--port={name}={port}" for name, port in arguments.ports]
     words = (path, drive.name, *ports)
     return Target(drive, line.port, line.echo, line.rs485, words, command_line((path, drive.name)))

@@ -1,0 +1,31 @@
+"""Drive names in the normal forms of Unicode, of which keyboards and file systems give one or the other."""
+
+from __future__ import annotations
+
+import pytest
+
+from multidrop import drive_meant
+
+# One letter and its two spellings each, by the code charts: U+00FC = U+0075 U+0308; U+0439 = U+0438 U+0306.
+COMPOSED, APART = "L\u00fcfter", "Lu\u0308fter"
+SHORT, LONG = "\u0439", "\u0438\u0306"
+
+
+@pytest.mark.parametrize(
+    ("given", "names", "meant"),
+    [
+        (APART, [COMPOSED, "pump"], COMPOSED),
+        (COMPOSED, ["pump", APART], APART),
+        (LONG, [SHORT], SHORT),
+        (APART, [COMPOSED, APART], APART),  # an exact one goes first
+        ("pump", ["pump", "pump-1"], "pump"),
+        ("Pump", ["pump"], "Pump"),  # case is not spelling
+        ("\u212b", ["A\u030a", "\u00c5"], "\u212b"),  # three angstroms: two drives are meant, so neither is
+        ("Lufter", [COMPOSED], "Lufter"),
+        ("\ufb01", ["fi"], "\ufb01"),  # a ligature looks like two letters, and is not the same text
+        ("\ud800", [COMPOSED], "\ud800"),
+        ("", [], ""),
+    ],
+)
+def test_a_name_is_found_by_its_normal_form(given: str, names: list[str], meant: str) -> None:
+    assert drive_meant(given, names) == meant
