@@ -1,0 +1,124 @@
+"""Stops while the system fails: signals at any line, no memory, no descriptors, a ledger that others hold."""
+
+from __future__ import annotations
+
+from decimal import Decimal
+from errno import EMFILE
+from fractions import Fraction
+from linecache import getline
+from types import FrameType
+from typing import Any
+
+import pytest
+from interruptions import interrupted_at
+from simulated_bus import SimulatedBus, is_write
+
+from multidrop.control import stop_all
+from multidrop.control.outcome import Seen
+from multidrop.core import Completion, Exchange
+from multidrop.drives import InvtCHE
+from multidrop.errors import Unconfirmed
+from multidrop.sim import simulated
+from multidrop.transport import clock
+
+CODE = stop_all.stop_together.__code__
+NO_MEMORY, NO_DESCRIPTORS = MemoryError(), OSError(EMFILE, "Too many open files")
+
+
+def running(monkeypatch: pytest.MonkeyPatch, count: int = 1) -> tuple[SimulatedBus, list[Any], list[Any]]:
+    """Return a simulated bus, its drives, and their simulations, whose motors turn."""
+    sims: list[Any] = [simulated(InvtCHE(number, maximum_frequency=50)) for number in range(1, count + 1)]
+    line = SimulatedBus(monkeypatch, *sims)
+    drives = [line.attach(sim.drive) for sim in sims]
+    for drive in drives:
+        drive.set_frequency(20)
+        drive.start()
+    line.sleep(10)
+    return line, drives, sims
+
+
+def writes_to(line: SimulatedBus, address: int) -> int:
+    return sum(is_write(request) and request.address == address for request, _ in line.frames)
+
+
+# ---- signals ----
+
+
+def counts(frame: FrameType) -> bool:
+    """Say whether a signal comes before this line: not before the stops are known, nor once one is over."""
+    line = getline(CODE.co_filename, frame.f_lineno).strip()
+    return frame.f_code is CODE and not line.startswith(("under_way = list", "try:", "end("))
+
+
+def test_wherever_a_stop_of_all_is_interrupted_each_is_sent_once_more_and_told_of(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    for nth in range(1, 40):
+        line, drives, sims = running(monkeypatch, 2)
+        with pytest.raises(KeyboardInterrupt) as interruption, interrupted_at(nth, counts):
+            line.bus.stop_all()
+        told = "".join(interruption.value.__notes__)
+        for drive, sim in zip(drives, sims, strict=True):
+            assert f"{drive.name}: the stop was sent" in told, nth
+            sim.pass_time(line.seconds + 60)
+            assert not sim.motor.energised, nth
+        assert not line.bus.stops_under_way()
+
+
+# ---- no memory, no descriptors ----
+
+
+@pytest.mark.parametrize("fault", [NO_MEMORY, NO_DESCRIPTORS], ids=["memory", "descriptors"])
+@pytest.mark.parametrize("is_sent", [False, True])
+def test_a_stop_is_repeated_where_the_system_had_no_room_for_it(
+    monkeypatch: pytest.MonkeyPatch, fault: Exception, is_sent: bool
+) -> None:
+    line, drives, sims = running(monkeypatch, 2)
+    carry_out, left = line.carry_out, [7]
+
+    def failing(exchange: Exchange, **details: Any) -> Completion:
+        left[0] -= 1
+        if left[0] >= 0:
+            if is_sent:
+                carry_out(exchange, **details)
+            raise fault
+        return carry_out(exchange, **details)
+
+    monkeypatch.setattr(line, "carry_out", failing)
+    drives[0].stop()
+    assert not sims[0].motor.energised
+    left[0] = 7
+    found = line.bus.stop_all()
+    assert {stopped.seen for stopped in found.values()} == {Seen.STOPPED}
+    assert not sims[1].motor.energised
+
+
+def test_a_stop_for_which_there_is_never_room_ends_and_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    line, _, _ = running(monkeypatch)
+
+    def failing(exchange: Exchange, **details: Any) -> Completion:
+        raise NO_DESCRIPTORS
+
+    monkeypatch.setattr(line, "carry_out", failing)
+    begun = line.seconds
+    (stopped,) = line.bus.stop_all(seconds=5).values()
+    assert stopped.seen is Seen.FAILED
+    assert "Too many open files" in stopped.why
+    assert 5 <= line.seconds - begun < 6
+
+
+# ---- odd values ----
+
+
+@pytest.mark.parametrize("seconds", [Decimal(12), Fraction(12), 10**400], ids=["decimal", "fraction", "huge"])
+def test_a_stop_takes_any_number_as_its_time(monkeypatch: pytest.MonkeyPatch, seconds: Any) -> None:
+    line, drives, sims = running(monkeypatch)
+    deaf_until = line.seconds + 20
+    line.deafens = lambda request: clock.now_ns() < deaf_until * 1e9
+    if seconds == 12:
+        with pytest.raises(Unconfirmed, match="never confirmed"):
+            drives[0].stop(seconds=seconds)
+        assert line.seconds < deaf_until - 5
+    else:
+        drives[0].stop(seconds=seconds)
+        assert not sims[0].motor.energised
