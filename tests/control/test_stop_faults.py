@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from decimal import Decimal
 from errno import EMFILE
 from fractions import Fraction
@@ -13,15 +14,17 @@ import pytest
 from interruptions import interrupted_at
 from simulated_bus import SimulatedBus, is_write
 
-from multidrop.control import stop_all
+from multidrop.control import ramp, stop_all
 from multidrop.control.outcome import Seen
+from multidrop.control.ramp import start_staggered
 from multidrop.core import Completion, Exchange
 from multidrop.drives import InvtCHE
-from multidrop.errors import Unconfirmed
+from multidrop.errors import Refused, Unconfirmed
 from multidrop.sim import simulated
 from multidrop.transport import clock
 
 CODE = stop_all.stop_together.__code__
+STOPPING = ramp._stop.__code__
 NO_MEMORY, NO_DESCRIPTORS = MemoryError(), OSError(EMFILE, "Too many open files")
 
 
@@ -63,6 +66,58 @@ def test_wherever_a_stop_of_all_is_interrupted_each_is_sent_once_more_and_told_o
             sim.pass_time(line.seconds + 60)
             assert not sim.motor.energised, nth
         assert not line.bus.stops_under_way()
+
+
+def fails_to_start_the_last(line: SimulatedBus, drives: list[Any], sims: list[Any]) -> None:
+    """Stop all motors, and start them again, until the last one's fault ends that."""
+    line.bus.stop_all()
+    sims[-1].trip(4)
+    start_staggered(drives, 2.0)
+
+
+def test_a_failed_staggered_start_that_is_interrupted_stops_each_all_the_same(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    class OwnThread(threading.Thread):
+        """A thread that does its work at once."""
+
+        def start(self) -> None:
+            self.run()
+
+        def join(self, timeout: float | None = None) -> None:
+            """There is nothing to wait for."""
+
+    monkeypatch.setattr(threading, "Thread", OwnThread)
+
+    def counts(frame: FrameType) -> bool:
+        text = getline(STOPPING.co_filename, frame.f_lineno).strip()
+        return frame.f_code is STOPPING and not text.startswith(("def stop", "threads:", "left =", "try:"))
+
+    for nth in range(1, 12):
+        line, drives, sims = running(monkeypatch, 3)
+        with pytest.raises(KeyboardInterrupt), interrupted_at(nth, counts):
+            fails_to_start_the_last(line, drives, sims)
+        assert not any(sim.motor.goal for sim in sims), nth
+
+
+def test_a_failed_staggered_start_stops_each_though_the_stop_of_one_raises_anything(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    class NoThread(threading.Thread):
+        def start(self) -> None:
+            raise MemoryError
+
+    def raises(*_: object) -> None:
+        raise TypeError
+
+    line, drives, sims = running(monkeypatch, 3)
+    monkeypatch.setattr(threading, "Thread", NoThread)
+    line.bus.stop_all()
+    drives[0].carry_out_stop = raises
+    sims[2].trip(4)
+    with pytest.raises(Refused, match="OC1"):
+        start_staggered(drives, 2.0)
+    assert [bool(sim.motor.goal) for sim in sims] == [True, False, False]
 
 
 # ---- no memory, no descriptors ----
