@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+import sqlite3
 import threading
 from decimal import Decimal
 from errno import EMFILE
 from fractions import Fraction
 from linecache import getline
-from types import FrameType
+from pathlib import Path
+from types import FrameType, SimpleNamespace
 from typing import Any
 
 import pytest
 from interruptions import interrupted_at
+from own_fan import Fan
 from simulated_bus import SimulatedBus, is_write
 
-from multidrop.control import ramp, stop_all
+from multidrop.control import eeprom_ledger, ramp, stop_all
+from multidrop.control.eeprom_ledger import Ledger
 from multidrop.control.outcome import Seen
 from multidrop.control.ramp import start_staggered
 from multidrop.core import Completion, Exchange
@@ -177,3 +181,42 @@ def test_a_stop_takes_any_number_as_its_time(monkeypatch: pytest.MonkeyPatch, se
     else:
         drives[0].stop(seconds=seconds)
         assert not sims[0].motor.energised
+
+
+# ---- a ledger that others hold, or cannot keep ----
+
+
+def test_a_stop_waits_once_for_a_ledger_that_others_hold_however_often_it_was_sent(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    ledger = Ledger(tmp_path / "wear")
+    line = SimulatedBus(monkeypatch, simulated(Fan(1)), simulated(Fan(2)), ledger=ledger)
+    for address in (1, 2):
+        line.attach(Fan(address))
+    asked = 0
+
+    def busy(*_: object, **__: object) -> None:
+        nonlocal asked
+        asked += 1
+        raise sqlite3.OperationalError("database is locked")
+
+    line.loses = is_write
+    with monkeypatch.context() as held:
+        held.setattr(eeprom_ledger, "sqlite3", SimpleNamespace(connect=busy, Error=sqlite3.Error))
+        line.bus.stop_all()
+    assert asked == 1
+    assert "stops were not counted: " in caplog.text
+    before = len(line.written)
+    line.bus.stop_all()
+    assert asked == 1
+    assert sum(wear.writes for wear in ledger.wear(1.8e9)) == len(line.written) - before > 40
+
+
+def test_a_port_whose_name_is_no_text_keeps_no_stop_from_being_told(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    line = SimulatedBus(monkeypatch, simulated(Fan(1)), ledger=tmp_path / "wear")
+    line.identity = "/dev/tty\udcff"
+    line.attach(Fan(1)).stop()
+    assert len(line.written) == 1
+    assert "stops were not counted: " in caplog.text
