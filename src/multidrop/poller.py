@@ -119,20 +119,21 @@ class Poller(RowSource):
             self._caller.join()
 
     def _poll(self) -> None:
-        look_ns = 0  # when lines that have not called are looked at again: each look costs them all
-        while not self._closing:
-            seconds = max(0, look_ns - clock.now_ns()) / 1e9
-            called = self._lines.called(self._row_queue.await_calls(seconds))
-            now = clock.now_ns()
-            if now >= look_ns:
-                restless = [line for line in self._lines if not line.is_steady(now)]
-                called = list(dict.fromkeys([*restless, *called]))
-                needs_looks = self._is_watched or not all(line.is_well(now) for line in restless)
-                look_ns = now + (LOOK_NS if needs_looks else BUSY_NS if restless else REST_NS)
-            for line in called:
-                line.tend(clock.now_ns())
-            if self._is_watched and self._row_queue.chunks:
-                self._wakeup.set()
+        with self._lines.tended():
+            look_ns = 0  # when lines that have not called are looked at again: each look costs them all
+            while not self._closing:
+                seconds = max(0, look_ns - clock.now_ns()) / 1e9
+                called = self._lines.called(self._row_queue.await_calls(seconds))
+                now = clock.now_ns()
+                if now >= look_ns:
+                    restless = [line for line in self._lines if not line.is_steady(now)]
+                    called = list(dict.fromkeys([*restless, *called]))
+                    needs_looks = self._is_watched or not all(line.is_well(now) for line in restless)
+                    look_ns = now + (LOOK_NS if needs_looks else BUSY_NS if restless else REST_NS)
+                for line in called:
+                    line.tend(clock.now_ns())
+                if self._is_watched and self._row_queue.chunks:
+                    self._wakeup.set()
 
     # ---- lines and drives ----
 

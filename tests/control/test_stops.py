@@ -572,7 +572,7 @@ def test_an_unwritable_ledger_keeps_no_stop_back(
     assert len(writes(line)) == 1
     found = line.bus.stop_all()
     assert [each.seen for each in found.values()] == [Seen.STOPPED] * 2
-    assert "a stop was not counted" in caplog.text
+    assert "stops were not counted" in caplog.text
 
 
 def test_a_spent_budget_keeps_no_stop_back_and_it_is_counted(

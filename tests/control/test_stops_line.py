@@ -20,7 +20,7 @@ from multidrop.core import Message
 from multidrop.drive import Condition
 from multidrop.errors import BusError, LineError, NoReply, Overtaken, PortLost, Unconfirmed
 from multidrop.poller import Poller
-from multidrop.polling.polled_line import PolledLine
+from multidrop.polling.reopening import Reopening
 from multidrop.sim import MotorDrive, Simulator, Wire, simulated
 from multidrop.transport import clock
 from multidrop.transport import exchange as exchanges
@@ -228,7 +228,7 @@ def test_leaving_a_poller_whose_port_was_lost_stops_its_motors(
 ) -> None:
     """Whoever opens it again."""
     if opener == "the stop":
-        monkeypatch.setattr(PolledLine, "_reopen", lambda tended: None)
+        monkeypatch.setattr(Reopening, "_attempt", lambda reopening: None)
     pulled = Pulled(tmp_path / "port")
     drive: Any = pulled.drive
     with ExitStack() as stack:

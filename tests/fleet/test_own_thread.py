@@ -26,13 +26,14 @@ class Executors:
 
     def __init__(self, threads: int) -> None:
         self.threads = threads
+        self.failure: Exception = RuntimeError("can't start new thread")
 
     def __call__(self, *_: Any) -> Any:
         return self
 
     def submit(self, work: Any) -> Any:
         if self.threads == 0:
-            raise RuntimeError("can't start new thread")
+            raise self.failure
         self.threads -= 1
         return REAL(1).submit(work)
 
@@ -69,8 +70,9 @@ class Motors:
         return found
 
 
-def test_all_stops_are_sent_before_one_is_waited_for(executors: Executors) -> None:
-    executors.threads = 1
+@pytest.mark.parametrize("failure", [RuntimeError("can't start new thread"), MemoryError()])
+def test_all_stops_are_sent_before_one_is_waited_for(executors: Executors, failure: Exception) -> None:
+    executors.threads, executors.failure = 1, failure
     motors = Motors(a=1, b=3, c=2)
     assert asyncio.run(motors.stop_all()) == {"a": STANDS, "b": STANDS, "c": STANDS}
     without = [noted for noted in motors.noted if noted != ("a", None)]

@@ -272,7 +272,10 @@ def test_a_stop_is_sent_where_the_system_gives_no_thread(tmp_path: Path) -> None
         assert stands(gateway, "pump-1")
 
 
-def test_without_threads_all_stops_are_sent_before_one_is_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("failure", [RuntimeError("can't start new thread"), MemoryError()])
+def test_without_threads_all_stops_are_sent_before_one_is_waited_for(
+    monkeypatch: pytest.MonkeyPatch, failure: Exception
+) -> None:
     """The system gives one thread more."""
     done: list[tuple[str, float | None]] = []
     caller = Caller("anna", "page", "10.0.0.1", Right.STOP)
@@ -280,7 +283,7 @@ def test_without_threads_all_stops_are_sent_before_one_is_waited_for(monkeypatch
     class LastThread(threading.Thread):
         def start(self) -> None:
             if done:
-                raise RuntimeError("can't start new thread")
+                raise failure
             self.run()
 
     def work(seconds: float | None, line: str) -> str:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 import sqlite3
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -99,10 +99,15 @@ class Ledger:
             ledger.commit()
         return ""
 
-    def note(self, cell: LedgerCell, now: float) -> None:
-        """Count a stop, which no budget holds back. Raises OSError where the file cannot be kept."""
+    def note(self, cells: Sequence[LedgerCell], now: float) -> None:
+        """Count stops, which no budget holds back, in one transaction: a file that others hold is waited for.
+
+        Raises OSError where the file cannot be kept.
+        """
         with self._opened() as ledger:
-            ledger.execute("insert into writes values (?, ?, ?, ?, ?)", (*_key(cell), now))
+            ledger.execute("begin immediate")
+            ledger.executemany("insert into writes values (?, ?, ?, ?, ?)", [(*_key(c), now) for c in cells])
+            ledger.commit()
 
     def wear(self, now: float) -> list[Wear]:
         """Return every cell that was ever written, the most worn in the last year first."""

@@ -12,7 +12,7 @@ from multidrop.drive.register import Access, Register
 from multidrop.drive.script import Script, read, wait
 from multidrop.drive.state import Direction
 from multidrop.drive.table import Kept
-from multidrop.errors import BusError, Refused
+from multidrop.errors import Refused
 
 
 def start_staggered(drives: Sequence[Drive], gap: float, direction: Direction | None = None) -> None:
@@ -35,23 +35,30 @@ def start_staggered(drives: Sequence[Drive], gap: float, direction: Direction | 
 def _stop(drives: Sequence[Drive]) -> None:
     """Stop them all at once: they may be on several buses, and one may be silent.
 
-    Where the system gives no more threads, each of the others is sent its stop before any is waited for.
+    Where the system gives no more threads, each of the others is sent its stop before any is waited for. At
+    an interruption each that has no thread yet is sent its stop once more, unless a second one comes.
     """
 
     def stop(drive: Drive, seconds: float | None = None) -> None:
-        with suppress(BusError, ValueError):
+        with suppress(Exception):  # whatever it is: the others are stopped too
             drive.stop(seconds=seconds)
 
     threads: list[threading.Thread] = []
-    with suppress(RuntimeError):
-        for drive in drives:
-            thread = threading.Thread(target=copy_context().run, args=[stop, drive])
-            thread.start()
-            threads.append(thread)
-    left = drives[len(threads) :]
-    for seconds in (0.0, None):
+    left = list(drives)
+    try:
+        with suppress(RuntimeError, MemoryError):
+            while left:
+                thread = threading.Thread(target=copy_context().run, args=[stop, left[0]])
+                thread.start()
+                threads.append(thread)
+                del left[0]
+        for seconds in (0.0, None):
+            for drive in left:
+                stop(drive, seconds)
+    except BaseException:
         for drive in left:
-            stop(drive, seconds)
+            stop(drive, 0.0)
+        raise
     for thread in threads:
         thread.join()
 

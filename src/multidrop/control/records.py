@@ -90,9 +90,12 @@ class WriteRecords:
             with suppress(IndexError):  # another thread may be at it
                 while True:
                     self._append(*self._unlogged.popleft())
+            uncounted: list[LedgerCell] = []
             with suppress(IndexError):
                 while True:
-                    self._note(self._uncounted.popleft())
+                    uncounted.append(self._uncounted.popleft())
+            if uncounted:
+                self._note(uncounted)
         finally:
             self._writers.pop()
 
@@ -114,11 +117,11 @@ class WriteRecords:
             self.audit_trouble = getattr(failure, "strerror", None) or str(failure)
             _log.warning("the audit log cannot be written: %s", self.audit_trouble)
 
-    def _note(self, cell: LedgerCell) -> None:
+    def _note(self, cells: list[LedgerCell]) -> None:
         try:
-            self._ledger.at(cell.port).note(cell, clock.utc_ns() / 1e9)
-        except OSError as failure:
-            _log.warning("a stop was not counted: %s", failure)
+            self._ledger.at(cells[0].port).note(cells, clock.utc_ns() / 1e9)
+        except (OSError, ValueError) as failure:  # a port's name may be no text
+            _log.warning("stops were not counted: %s", failure)
 
     def _cell(self, drive: Drive, register: Register[Any]) -> LedgerCell:
         return LedgerCell(

@@ -8,7 +8,9 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from decimal import Decimal
 from functools import partial
+from math import inf
 from numbers import Real
 from typing import Any
 
@@ -51,7 +53,7 @@ class Stopper:
 
         Raises Unconfirmed when it is not seen to stand then, and says what is known.
         """
-        _check(seconds)
+        seconds = _checked(seconds)
         self._latches.latch(drive)  # raises for one that is not on this bus
         with self._under_way([drive]):
             stop = StopAttempt(drive, make, _now(), seconds)
@@ -67,7 +69,7 @@ class Stopper:
 
         `broadcast` is called before, and returns True where it has sent a stop to all of them.
         """
-        _check(seconds)
+        seconds = _checked(seconds)
         found: dict[str, Stopped] = {}
         with self._under_way(drives):
             begun = _now()
@@ -96,8 +98,8 @@ class Stopper:
             self._stops.discard(stop)
             end(stop)
 
-        self._stops.update(stops)
         try:
+            self._stops.update(stops)
             stop_together(stops, self._do, over)
         finally:
             self._stops.difference_update(stops)
@@ -146,12 +148,16 @@ def _now() -> float:
     return clock.now_ns() / 1e9
 
 
-def _check(seconds: float | None) -> None:
+def _checked(seconds: float | None) -> float | None:
+    """Return it as a float, which adds to a time: numpy's short ones do not, nor does a Decimal."""
     if seconds is None:
-        return
-    is_number = isinstance(seconds, Real) and not isinstance(seconds, bool)
-    if not is_number or not seconds >= 0:  # a NaN is not
-        raise ValueError(f"seconds = {seconds!r} is no time that a stop may take: give 0 or more, or none")
+        return None
+    if isinstance(seconds, (Real, Decimal)) and not isinstance(seconds, bool) and seconds >= 0:
+        try:
+            return float(seconds)
+        except OverflowError:
+            return inf
+    raise ValueError(f"seconds = {seconds!r} is no time that a stop may take: give 0 or more, or none")
 
 
 def stop_together(stops: Sequence[StopAttempt], do: Do, end: Callable[[StopAttempt], object]) -> None:
@@ -163,8 +169,7 @@ def stop_together(stops: Sequence[StopAttempt], do: Do, end: Callable[[StopAttem
     try:
         while under_way:
             stop = min(under_way, key=_due)  # the one that is due for longest
-            under_way.remove(stop)
-            under_way.append(stop)
+            under_way = [*(other for other in under_way if other is not stop), stop]  # never without it
             clock.sleep(max(0.0, stop.due - _now()))
             if stop.advance(do, _now):
                 under_way.remove(stop)

@@ -31,6 +31,7 @@ PAUSE_S = 0.2  # before it is repeated
 MOST_STEPS = 8  # that are sent once more after an interruption
 UNSENT = (Refused, LineError, NotMaster, ValueError)
 WORTH_REPEATING = (Unconfirmed, NotDone, NoReply, BadReply, DriveRefused, PortLost, NotMaster)
+NO_ROOM = (MemoryError, OSError)  # what the system may have again soon, such as memory and descriptors
 
 _log = logging.getLogger("multidrop.control")
 
@@ -61,7 +62,7 @@ class StopAttempt:
         self._seconds = seconds
         self._make = script
         self.times_sent = 0  # those that the drive refused too
-        self._times_in_doubt = 0  # those that an interruption may have kept back
+        self._times_in_doubt = 0  # those that an interruption, or the system, may have kept back
         self._is_confirmed = False
         self._pulses: set[tuple[str, Any]] = set()
         self._has_warned = False
@@ -119,7 +120,7 @@ class StopAttempt:
             error = failure  # outlives the except clause
             self._note(step, error)
             self._resume = lambda: script.throw(error)
-        except (KeyboardInterrupt, SystemExit):
+        except (KeyboardInterrupt, SystemExit, *NO_ROOM):
             self._times_in_doubt += isinstance(step, Write)
             raise
         else:
@@ -141,7 +142,7 @@ class StopAttempt:
         if isinstance(failure, NotMaster) and not failure.heard:
             self._tell_unsent(failure)
             return False
-        if not isinstance(failure, WORTH_REPEATING) or now >= self._begun + limit:
+        if not _is_worth_repeating(failure) or now >= self._begun + limit:
             return False
         if not self._has_warned:
             self._has_warned = True
@@ -208,3 +209,8 @@ class StopAttempt:
         times = f"{least}" if least == most else f"{least} to {most}"
         sent = f"the stop was sent {times} times" if most else "no stop was sent"
         return f"{self.drive.name}: {sent}; the motor is not seen to stand"
+
+
+def _is_worth_repeating(failure: Exception) -> bool:
+    is_the_system_s = isinstance(failure, NO_ROOM) and not isinstance(failure, BusError)
+    return is_the_system_s or isinstance(failure, WORTH_REPEATING)

@@ -40,7 +40,7 @@ def begin_stops(works: Sequence[StopWork]) -> list[asyncio.Future[Answers]]:
         for work in works:
             future = _in_thread(partial(work, None))
             begun.append(future)
-    except RuntimeError:
+    except (RuntimeError, MemoryError):
         begun.append(asyncio.ensure_future(_without_threads(works[len(begun) :])))
     return begun
 
@@ -62,7 +62,7 @@ async def _without_threads(works: Sequence[StopWork]) -> Answers:
         work = left.popleft()
         try:
             waited.append(_in_thread(partial(work, None)))
-        except RuntimeError:
+        except (RuntimeError, MemoryError):
             told = work(TURN_S)
             found |= told
             if not all(answer.is_done for answer in told.values()):

@@ -24,7 +24,7 @@ def begin_stops(works: Sequence[Callable[[float | None], R]], caller: Caller) ->
     them are sent before any motor is waited for.
     """
     begun: list[asyncio.Future[R]] = []
-    with suppress(RuntimeError):
+    with suppress(RuntimeError, MemoryError):
         for work in works:
             future = in_thread(partial(work, None), caller)
             begun.append(future)

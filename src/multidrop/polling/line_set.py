@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 from multidrop.bus import Bus
@@ -155,6 +155,15 @@ class LineSet:
             AuditLog(self._audit).close()
 
     # ---- going ----
+
+    @contextmanager
+    def tended(self) -> Iterator[None]:
+        """Have stops open lost ports by themselves once this ends, however it ends: nobody else does then."""
+        try:
+            yield
+        finally:
+            for line in self._lines:
+                line.bus.tended(False)
 
     def let_go(self, lines: Iterable[PolledLine], why: str) -> None:
         """End these lines, and have them no more."""

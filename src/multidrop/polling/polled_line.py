@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-from contextlib import suppress
 from typing import Any
 
 from multidrop.bus import Bus
@@ -11,7 +10,6 @@ from multidrop.core import Port, RowQueue, Status
 from multidrop.core.fork import register_at_fork
 from multidrop.drive.family import Drive
 from multidrop.drive.register import Register
-from multidrop.errors import LineError
 from multidrop.planning.bus_time import in_order
 from multidrop.planning.schedule import Schedule
 from multidrop.plant.model import PlantLine, PolledDrive
@@ -19,6 +17,7 @@ from multidrop.polling.jobs import JobMaker, PolledJob, RowNames
 from multidrop.polling.line_drives import LineDrives
 from multidrop.polling.port_queue import PortQueue, Slot
 from multidrop.polling.refusals import Refusals
+from multidrop.polling.reopening import Reopening
 from multidrop.polling.summary import line_summary
 from multidrop.transport import clock
 from multidrop.transport.peers import GONE_S
@@ -54,7 +53,7 @@ class PolledLine:
         self._drives = LineDrives(bus, self._schedule, self._maker, self._refusals)
         self._is_started = False
         self._learnt_ns = 0
-        self._reopening: threading.Thread | None = None
+        self._reopening = Reopening(bus)
         self._reopen_ns = 0
         self._standby_ns = 0
         self._lock = threading.Lock()  # of all above: drives come and go on any thread
@@ -233,16 +232,11 @@ class PolledLine:
 
     def _regain(self, now_ns: int) -> None:
         """Open the port again in a thread; until it is back every value that is due is missed."""
-        if now_ns < self._reopen_ns or (self._reopening and self._reopening.is_alive()):
+        if now_ns < self._reopen_ns or self._reopening.is_under_way:
             return
         self._miss(self._schedule.pass_all(now_ns), Status.LINE_LOST)
         self._reopen_ns = now_ns + REOPEN_NS
-        self._reopening = threading.Thread(target=self._reopen, name="multidrop reopening", daemon=True)
-        self._reopening.start()
-
-    def _reopen(self) -> None:
-        with suppress(LineError):
-            self.bus.line.regain()
+        self._reopening.begin()
 
     def leave(self) -> None:
         """Tend the line no more: what stops its motors opens a lost port again by itself."""
@@ -252,8 +246,7 @@ class PolledLine:
 
     def end(self) -> bool:
         """Begin nothing more, and open no port again; True while an exchange is still under way."""
-        if self._reopening:
-            self._reopening.join()
+        self._reopening.join()
         self._ended_ns = self._ended_ns or clock.now_ns()
         port = self.bus.line.queue
         if port is None:

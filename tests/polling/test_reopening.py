@@ -1,0 +1,90 @@
+"""A lost port of a polled line is opened by a stop where nobody else can: without a thread, or a poller."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from contextlib import ExitStack
+from pathlib import Path
+
+import pytest
+from lines import line, plant, polled, rows_of, until
+
+from multidrop.drives import InvtCHE
+from multidrop.errors import LineError
+from multidrop.poller import Poller
+from multidrop.polling.polled_line import PolledLine
+from multidrop.sim import MotorDrive, Simulator, Wire, simulated
+
+START = threading.Thread.start
+
+
+class Plant:
+    """A polled line whose port vanishes and comes back, with a drive whose motor turns meanwhile."""
+
+    def __init__(self, path: Path, stack: ExitStack) -> None:
+        self.path = path
+        self.drive = InvtCHE(1, name="pump", maximum_frequency=50)
+        sim = simulated(self.drive)
+        assert isinstance(sim, MotorDrive)
+        self.sim = sim
+        self.stack = stack
+        with self.there():
+            asked = polled(self.drive, [self.drive.status])
+            self.poller = stack.enter_context(Poller(plant(line(str(path), asked, name="hall"))))
+            self.drive.set_frequency(20.0)
+            self.drive.start()
+        self.port = self.poller.bus("hall").line
+
+    def there(self) -> Simulator:
+        """Return the line: its port is there while it is open."""
+        return Simulator([Wire([self.sim], port=str(self.path), unpaced=True)])
+
+    def stop(self) -> None:
+        self.drive.stop(seconds=20)
+        assert not self.sim.motor.energised
+
+
+@pytest.fixture
+def hall(tmp_path: Path) -> Iterator[Plant]:
+    with ExitStack() as stack:
+        yield Plant(tmp_path / "hall", stack)
+
+
+@pytest.mark.parametrize("failure", [RuntimeError("can't start new thread"), MemoryError()])
+def test_without_a_thread_a_stop_opens_the_port_and_polling_goes_on(
+    hall: Plant, monkeypatch: pytest.MonkeyPatch, failure: Exception
+) -> None:
+    tried = 0
+
+    def start(thread: threading.Thread) -> None:
+        nonlocal tried
+        if thread.name == "multidrop reopening":
+            tried += 1
+            raise failure
+        START(thread)
+
+    with monkeypatch.context() as without:
+        without.setattr(threading.Thread, "start", start)
+        until(lambda: tried > 1)
+        hall.stack.enter_context(hall.there())
+        hall.stop()
+    rows_of(hall.poller)
+    until(lambda: any(row.status == "ok" for row in rows_of(hall.poller)))
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
+def test_a_stop_opens_the_port_once_the_poller_has_failed(
+    hall: Plant, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    until(lambda: hall.port.is_lost)
+
+    def fail(*_: object) -> None:
+        raise MemoryError
+
+    monkeypatch.setattr(PolledLine, "tend", fail)
+    hall.poller._thread.join()
+    with pytest.raises(LineError):
+        hall.poller.bus("hall").read(hall.drive, hall.drive.status)
+    hall.stack.enter_context(hall.there())
+    hall.stop()
