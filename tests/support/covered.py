@@ -1,7 +1,7 @@
 """A table of what the tests reached, in Python and in C, and the lines that they did not.
 
-`python tests/support/covered.py JSON BUILD`: coverage.py's report, and the directory in which the core was
-built with --coverage. What is not reached is in README.md here, with the reason.
+`python tests/support/covered.py WHERE...`: coverage.py's report in JSON, or the directory in which the core
+was built with --coverage, or both. What is not reached is in tests/README.md, with the reason.
 """
 
 from __future__ import annotations
@@ -73,8 +73,10 @@ def room(name: str) -> str:
     return name if name.endswith((".c", ".h")) else name.rpartition("/")[0] + "/"
 
 
-def main(report: str, build: str) -> None:
-    reached = of_c(Path(build)) | of_python(Path(report))
+def main(*where: str) -> None:
+    reached: dict[str, Reach] = {}
+    for path in map(Path, where):
+        reached |= of_c(path) if path.is_dir() else of_python(path)
     rooms: defaultdict[str, list[Reach]] = defaultdict(list)
     for name, reach in sorted(reached.items()):
         rooms[room(name)].append(reach)
