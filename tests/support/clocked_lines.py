@@ -451,8 +451,9 @@ class ClockedLines:
                 port.hang_up()
             if port and not port.lost:
                 wake = min(wake, port.advance(received))
-            if wire.wake is not None:
-                wake = min(wake, -int(-wire.wake * S // 1))
+            arrival = wire.wake
+            if arrival is not None:
+                wake = min(wake, -int(-arrival * S // 1))
         return wake
 
     def send(self, name: str, request: bytes, baudrate: int) -> None:
