@@ -10,6 +10,7 @@ import asyncio
 import logging
 from collections import Counter
 from collections.abc import Awaitable, Callable, Sequence
+from contextlib import suppress
 from functools import partial
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -230,20 +231,24 @@ class ModbusServer:
     def _write(self, unit: Unit, request: MbapRequest, client: ModbusClient) -> Awaitable[bytes]:
         if self._role < Right.STOP:
             raise Declined(ModbusCode.ILLEGAL_FUNCTION)  # read only, and says so
-        carrier, address, count, data = WRITES[request.function](request)
-        common = self.settings.common_addresses
+        carrier, address, count, data = written = WRITES[request.function](request)
+        common, register = self.settings.common_addresses, unit.writable(carrier, address)
+        is_one = count == (register.words if register else 1)
+        if not is_one and unit.has_stop_in(written, common.start + STOP):
+            with suppress(Declined):  # enough of them are under way
+                self._begin_stop(unit, client)
+            raise Declined(ModbusCode.ILLEGAL_VALUE)  # what else it writes may start a motor
         if carrier is Carrier.WORD and address in common:
             if address != common.start + STOP:
                 raise Declined(ModbusCode.ILLEGAL_ADDRESS)
             if count != 1 or data == b"\0\0":
                 raise Declined(ModbusCode.ILLEGAL_VALUE)
             return self._stop(unit, request, client)
-        register = unit.writable(carrier, address)
         if register is None:
             raise Declined(
                 ModbusCode.ILLEGAL_ADDRESS if self._role >= Right.WRITE else ModbusCode.ILLEGAL_FUNCTION
             )
-        raw = register.coding.raw_in(data, 0) if count == register.words else None
+        raw = register.coding.raw_in(data, 0) if is_one else None
         if raw is not None and StopWrite(register.name, raw) in unit.stops:
             return self._stop(unit, request, client)
         if self._role < Right.WRITE:
@@ -265,6 +270,9 @@ class ModbusServer:
         return 0 if told.is_done else code_of(told.error)
 
     def _stop(self, unit: Unit, request: MbapRequest, client: ModbusClient) -> Awaitable[bytes]:
+        return self._later(request, self._begin_stop(unit, client), STOP_WAIT_S)
+
+    def _begin_stop(self, unit: Unit, client: ModbusClient) -> asyncio.Task[int]:
         """Begin a stop here and now, whatever else is under way, and whoever waits for its end."""
         self.answered["stop"] += 1
         name = unit.drive.name
@@ -274,7 +282,7 @@ class ModbusServer:
         task = asyncio.ensure_future(self._stop_one(unit, self._caller(client)))
         under_way.add(task)
         task.add_done_callback(under_way.discard)
-        return self._later(request, task, STOP_WAIT_S)
+        return task
 
     async def _stop_one(self, unit: Unit, caller: Caller) -> int:
         name = unit.drive.name

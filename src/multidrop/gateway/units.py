@@ -11,6 +11,7 @@ from typing import Any, NamedTuple, Protocol
 from multidrop import Carrier, Plant, Polled, PolledDrive, Register
 from multidrop.gateway.common_block import CommonBlock
 from multidrop.gateway.drive_words import DriveWords, reading_function
+from multidrop.gateway.pdu import WriteRequest
 
 MAIN = ""  # the TCP port of all lines that have none of their own
 UNITS = range(1, 248)  # 0 is a broadcast, and 248 to 255 are reserved
@@ -67,6 +68,19 @@ class Unit:
     def writable(self, carrier: Carrier, address: int) -> Register[Any] | None:
         """Return the register that begins at this address and may be written; None where there is none."""
         return self._writable.get((carrier, address))
+
+    def has_stop_in(self, written: WriteRequest, common_stop: int) -> bool:
+        """Return True where a stop is among what a request writes, or is the common block's."""
+        carrier, start, size, data = written
+        for at in range(size):
+            if carrier is Carrier.WORD and start + at == common_stop and data[2 * at : 2 * at + 2] != b"\0\0":
+                return True
+            register = self.writable(carrier, start + at)
+            if register is not None and at + register.words <= size:
+                raw = register.coding.raw_in(data, at)
+                if raw is not None and StopWrite(register.name, raw) in self.stops:
+                    return True
+        return False
 
     def holding_addresses(self) -> set[int]:
         """Return all addresses of words at which the family has something."""
