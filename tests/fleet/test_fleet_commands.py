@@ -369,6 +369,18 @@ def test_a_stop_needs_no_plant_where_its_line_is_named(tmp_path: Path) -> None:
         asked(tmp_path, path, stop, plant)
 
 
+def test_a_drive_that_the_plant_has_not_keeps_no_other_s_stop_back(tmp_path: Path) -> None:
+    path = ScriptedPath(stop=[{**IT_IS_DONE, "drives": {"pump-1": IT_IS_DONE}}])
+    told = asked(tmp_path, path, lambda asker: asker.stop(["pmp-2", "pump-1"]))
+    assert path.asked == ["stop"]
+    assert told.outcome is CommandOutcome.REFUSED
+    assert "no stop was sent: the fleet's plant has no drive 'pmp-2'; did you mean pump-2" in told.text
+    assert {name: one.outcome for name, one in told.drives.items()} == {
+        "pump-1": DONE,
+        "pmp-2": CommandOutcome.REFUSED,
+    }
+
+
 @pytest.mark.parametrize("what", ["write", "stop"])
 def test_a_drive_that_the_plant_has_not(tmp_path: Path, what: str) -> None:
     path = ScriptedPath()

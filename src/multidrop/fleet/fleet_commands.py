@@ -188,30 +188,42 @@ class FleetCommands:
 
         With `line` the plant is not looked at, and the drives are its. `on_news` is called in the loop with
         what is known of a stop that is not over within half a second, and again when something else is.
-        Raises ValueError for a drive that is not in the plant, FleetError where the plant cannot be read;
-        then no stop was sent.
+        A drive that is not in the plant is told as refused, and keeps no other's stop back. Raises ValueError
+        where none of them is, FleetError where the plant cannot be read; then no stop was sent.
         """
-        wanted = await self._lines_of(drives, line)
+        wanted, unknown = await self._lines_of(drives, line)
         answers = await asyncio.gather(*(self._stop(one, wanted[one], on_news) for one in wanted))
+        answers += unknown
         if len(answers) == 1:
             return answers[0]
         text = "\n".join(answer.text for answer in answers) or "the plant has no lines"
         found = {name: one for answer in answers for name, one in answer.drives.items()}
         return CommandAnswer(worst(answers), text, drives=found)
 
-    async def _lines_of(self, drives: Sequence[str] | None, line: str) -> dict[str, list[str] | None]:
+    async def _lines_of(
+        self, drives: Sequence[str] | None, line: str
+    ) -> tuple[dict[str, list[str] | None], list[CommandAnswer]]:
+        """Return the drives to stop by line, and an answer for each that is not in the plant."""
         if line:
-            return {line: None if drives is None else list(drives)}
+            return {line: None if drives is None else list(drives)}, []
         await self._read_plant(f"the stop was NOT sent; {HARD_WIRED}")
         if drives is None:
-            return dict.fromkeys(self._described())
+            return dict.fromkeys(self._described()), []
         found: dict[str, list[str] | None] = {}
+        unknown: list[CommandAnswer] = []
         there = [name for line in self._described().values() for name in line]
         for drive in [drive_meant(drive, there) for drive in drives]:
-            here = found.setdefault(self._find(drive), [])
-            assert here is not None
-            here.append(drive)
-        return found
+            try:
+                here = found.setdefault(self._find(drive), [])
+            except ValueError as mistake:
+                refused = CommandAnswer(CommandOutcome.REFUSED, f"no stop was sent: {mistake}")
+                unknown.append(refused._replace(drives={drive: refused}))
+            else:
+                assert here is not None
+                here.append(drive)
+        if unknown and not found:
+            raise ValueError(unknown[0].text)
+        return found, unknown
 
     async def _stop(self, line: str, drives: list[str] | None, on_news: News) -> CommandAnswer:
         """Send a stop until a gateway answers, and go on until it is over."""
