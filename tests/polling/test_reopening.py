@@ -73,6 +73,38 @@ def test_without_a_thread_a_stop_opens_the_port_and_polling_goes_on(
     until(lambda: any(row.status == "ok" for row in rows_of(hall.poller)))
 
 
+@pytest.mark.parametrize("threads", [0, 1])
+def test_lines_are_opened_though_the_system_gives_few_threads(
+    hall: Plant, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, threads: int
+) -> None:
+    """A reload that ended here would leave motors behind that nobody can stop."""
+    left = threads
+
+    def start(thread: threading.Thread) -> None:
+        nonlocal left
+        if thread.name.startswith("multidrop opening"):
+            left -= 1
+            if left < 0:
+                raise RuntimeError("can't start new thread")
+        START(thread)
+
+    names = [f"pump-{number}" for number in range(3)]
+    ports = [str(tmp_path / name) for name in names]
+    drives = [InvtCHE(1, name=name, maximum_frequency=50) for name in names]
+    hall.stack.enter_context(
+        Simulator([Wire([simulated(drive)], port=port) for drive, port in zip(drives, ports, strict=True)])
+    )
+    lines = [
+        line(port, polled(drive, [drive.status]), name=drive.name)
+        for drive, port in zip(drives, ports, strict=True)
+    ]
+    monkeypatch.setattr(threading.Thread, "start", start)
+    assert hall.poller.adopt(plant(*lines)) == {}
+    assert left < 0
+    for drive in drives:
+        drive.stop()
+
+
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
 def test_a_stop_opens_the_port_once_the_poller_has_failed(
     hall: Plant, monkeypatch: pytest.MonkeyPatch

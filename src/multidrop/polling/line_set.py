@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import difflib
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor, as_completed
-from contextlib import ExitStack, contextmanager
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import ExitStack, contextmanager, suppress
+from functools import partial
 from pathlib import Path
+from queue import SimpleQueue
 
 from multidrop.bus import Bus
 from multidrop.control.audit_log import AuditLog
@@ -100,10 +103,24 @@ class LineSet:
         if len(declared) < 2:
             yield from enumerate(map(self._opened, declared))
             return
+        left = deque(enumerate(declared))
+        done: SimpleQueue[tuple[int, Future[Bus | OSError]]] = SimpleQueue()
+
+        def work() -> None:
+            with suppress(IndexError):  # none is left
+                while True:
+                    place, line = left.popleft()
+                    done.put((place, _settled(partial(self._opened, line))))
+
         with ThreadPoolExecutor(OPENING, "multidrop opening") as pool:
-            opening = {pool.submit(self._opened, line): place for place, line in enumerate(declared)}
-            for opened in as_completed(opening):
-                yield opening[opened], opened.result()
+            try:
+                for _ in range(min(OPENING, len(declared))):
+                    pool.submit(work)
+            except RuntimeError:  # the system gives no more threads, and may have given none
+                work()
+            for _ in declared:
+                place, opened = done.get()
+                yield place, opened.result()
 
     def _opened(self, line: PlantLine) -> Bus | OSError:
         try:
@@ -201,3 +218,13 @@ class LineSet:
     def _patience_ns(self) -> int:
         until_ns = self._mastership.until_ns if self._mastership else 0
         return min(ENDING_NS, max(0, until_ns - clock.boottime_ns())) if until_ns else ENDING_NS
+
+
+def _settled(work: Callable[[], Bus | OSError]) -> Future[Bus | OSError]:
+    """Do this, and return its end, whatever it is."""
+    future: Future[Bus | OSError] = Future()
+    try:
+        future.set_result(work())
+    except BaseException as failure:
+        future.set_exception(failure)
+    return future
