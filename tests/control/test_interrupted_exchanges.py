@@ -10,6 +10,7 @@ from types import FrameType
 
 import pytest
 from interruptions import interrupted_at
+from lines import PATIENCE
 from motors import ReceivedRequests
 
 from multidrop import Bus
@@ -43,7 +44,7 @@ def test_what_may_have_been_sent_is_told_wherever_it_is_interrupted(verb: str) -
     received = ReceivedRequests(sim)
     with Simulator([Wire([sim], unpaced=True)]) as simulator:
         for nth in count(1):
-            with Bus(simulator.wires[0].path) as bus:
+            with Bus(simulator.wires[0].path, expiry=PATIENCE) as bus:
                 drive = bus.attach(InvtCHE, address=1, maximum_frequency=50)
                 drive.set_frequency(25.0)
                 before = len(received.writes)

@@ -385,8 +385,9 @@ def test_rows_amid_a_reload_are_described_as_what_they_were_read_as(
         taken = hub.taken
         until(lambda: hub.taken > taken + 3)
     found = set()
-    for _, segment in segments_of(tmp_path / "history" / "rows.arrows"):
-        recording = multidrop.read(segment)
+    segments = [path for _, path in segments_of(tmp_path / "history" / "rows.arrows")]
+    for path in [*segments, *(tmp_path / "history" / "rows").glob("*.parquet")]:
+        recording = multidrop.read(path)
         about = recording.metadata["drives"]["fan-1"]["registers"].get("dc_bus_voltage")
         found |= {
             (about["unit"], about["step"], row.value)

@@ -1,4 +1,4 @@
-"""What a history is asked for: series by name, and moments."""
+"""Series by name, and moments, that a history is asked for."""
 
 from __future__ import annotations
 
