@@ -291,6 +291,20 @@ def test_a_stop_of_a_drive_that_a_reload_exchanges_is_sent_to_the_new_one(
         assert gateway.gateway.revision == revision + 1
 
 
+def held_up(monkeypatch: pytest.MonkeyPatch) -> tuple[threading.Event, threading.Event]:
+    """Hold up each bus that is opened from now on; return the events that one is, and that it may go on."""
+    opening, go_on = threading.Event(), threading.Event()
+    open_bus = Bus.__init__
+
+    def slow(bus: Bus, *arguments: Any, **details: Any) -> None:
+        opening.set()
+        assert go_on.wait(PATIENCE)
+        open_bus(bus, *arguments, **details)
+
+    monkeypatch.setattr(Bus, "__init__", slow)
+    return opening, go_on
+
+
 @pytest.mark.parametrize("way", ["stop", "coast"])
 def test_a_stop_waits_for_no_port_that_a_reload_opens(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, way: str
@@ -304,15 +318,7 @@ def test_a_stop_waits_for_no_port_that_a_reload_opens(
         gateway.command("/api/write", {"drive": "fan-1", "register": "setpoint", "value": 2.0}, **writer)
         gateway.command("/api/act", {"drive": "fan-1", "verb": "start", "options": {}}, **writer)
         assert fan.goal
-        opening, go_on = threading.Event(), threading.Event()
-        open_bus = Bus.__init__
-
-        def slow(bus: Bus, *arguments: Any, **details: Any) -> None:
-            opening.set()
-            assert go_on.wait(PATIENCE)
-            open_bus(bus, *arguments, **details)
-
-        monkeypatch.setattr(Bus, "__init__", slow)
+        opening, go_on = held_up(monkeypatch)
         edit(gateway, 'name = "fan-1"', 'name = "fan-1"\nmaximum_frequency = 50.0')
         edit(gateway, 'name = "hall"', 'name = "hall"\necho = "off"')  # opened anew
         told: list[Any] = []
@@ -358,15 +364,7 @@ def test_rows_amid_a_reload_are_described_as_what_they_were_read_as(
         path.write_text(path.read_text().replace(POLL, '["dc_bus_voltage"]'))
         assert reload(gateway)["done"]
         until(lambda: (newest := hub.newest("fan-1", "dc_bus_voltage")) and newest.value is not None)
-        opening, go_on = threading.Event(), threading.Event()
-        open_bus = Bus.__init__
-
-        def slow(bus: Bus, *arguments: Any, **details: Any) -> None:
-            opening.set()
-            assert go_on.wait(PATIENCE)
-            open_bus(bus, *arguments, **details)
-
-        monkeypatch.setattr(Bus, "__init__", slow)
+        opening, go_on = held_up(monkeypatch)
         text = path.read_text().replace('name = "hall"', 'name = "hall"\necho = "off"')  # opened anew
         before, _, roof = text.rpartition('model = "invt-che"')
         path.write_text(f'{before}model = "other.toml"\nformat = "8N1"{roof}')
