@@ -64,6 +64,11 @@ void md_counters_answer(struct md_drive *drive, int64_t delay_ns, int64_t ideal_
     drive->delays[bucket(delay_ns)]++;
 }
 
+uint64_t md_replies(const struct md_drive *drive)
+{
+    return drive->counters.answered + drive->counters.late;
+}
+
 const uint64_t *md_usual_delays(const struct md_drive *drive)
 {
     return &drive->delays[bucket(drive->delay_ns)];

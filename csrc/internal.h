@@ -16,6 +16,7 @@
 void md_counters_end(const struct md_exchange *exchange, const struct md_completion *completion);
 /* Count its reply, which came after this delay and needed so long of the line. */
 void md_counters_answer(struct md_drive *drive, int64_t delay_ns, int64_t ideal_ns);
+uint64_t md_replies(const struct md_drive *drive);
 const uint64_t *md_usual_delays(const struct md_drive *drive); /* replies of the usual delay */
 
 /* ---- clock.c ---- */

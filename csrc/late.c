@@ -12,6 +12,9 @@
 
 #include <string.h>
 
+/* A device may be silent to registers that it lacks. A proof that was never answered is dropped after so many
+ * times in vain, if other replies came before each. */
+enum { MOST_VAIN = 2, PROVED = 0xFF };
 static const int64_t FORGET_NS = INT64_C(120000000000); /* no path holds anything up for so long */
 
 /* ---- outstanding requests of a drive ---- */
@@ -79,13 +82,14 @@ static int is_in_window(const struct md_exchange *exchange, int64_t now_ns)
     return 0;
 }
 
-static int is_proof(const struct md_exchange *exchange)
+/* Return which of the drive's proofs it is; their number: none. */
+static uint32_t place_of_proof(const struct md_exchange *exchange)
 {
     const struct md_drive *drive = exchange->drive;
-    for (uint32_t i = 0; i < drive->proof_count; i++)
-        if (drive->proofs[i] == exchange)
-            return 1;
-    return 0;
+    uint32_t at = 0;
+    while (at < drive->proof_count && drive->proofs[at] != exchange)
+        at++;
+    return at;
 }
 
 int md_late_bars(const struct md_exchange *exchange, int64_t now_ns)
@@ -96,7 +100,7 @@ int md_late_bars(const struct md_exchange *exchange, int64_t now_ns)
     if (is_in_window(exchange, now_ns))
         return 1;
     forget_settled(drive, now_ns);
-    return !is_proof(exchange) && has_mistakable(exchange, 0);
+    return place_of_proof(exchange) == drive->proof_count && has_mistakable(exchange, 0);
 }
 
 /* The last proof is kept for a drive that answers again: it is not outstanding from the time of silence,
@@ -152,6 +156,36 @@ const struct md_exchange *md_late_proof(const struct md_exchange *exchange, int6
     return is_answering ? last_proof(drive) : latest;
 }
 
+/* ---- proofs without a reply ---- */
+
+/* One alone proves nothing of its own late replies. */
+static void drop_proof(struct md_drive *drive, uint32_t at)
+{
+    drive->proof_count--;
+    for (; at < drive->proof_count; at++) {
+        drive->proofs[at] = drive->proofs[at + 1];
+        drive->vain[at] = drive->vain[at + 1];
+    }
+    if (drive->proof_count == 1)
+        drive->proof_count = 0;
+}
+
+void md_late_prove(const struct md_exchange *exchange, int result)
+{
+    struct md_drive *drive = exchange->drive;
+    uint32_t at = place_of_proof(exchange);
+    if (at == drive->proof_count || drive->vain[at] == PROVED)
+        return;
+    if (result > 0)
+        drive->vain[at] = PROVED;
+    uint64_t replies = md_replies(drive);
+    if (result != MD_NO_REPLY || replies == drive->vain_at)
+        return;
+    drive->vain_at = replies;
+    if (++drive->vain[at] == MOST_VAIN)
+        drop_proof(drive, at);
+}
+
 /* ---- what is outstanding ---- */
 
 void md_late_link(struct md_line *line, struct md_drive *drive)
@@ -200,6 +234,13 @@ void md_late_inherit(struct md_drive *drive, const struct md_drive *before)
 
 /* ---- late replies ---- */
 
+static void prove_late(struct md_drive *drive, const struct md_owed *owed)
+{
+    for (uint32_t i = 0; i < drive->proof_count; i++)
+        if (md_owed_is_same(owed, drive->proofs[i]))
+            drive->vain[i] = PROVED;
+}
+
 /* Account for the earliest request of the drive that the reply there fits: its length, MD_INCOMPLETE or
  * MD_NO_START. One that fits a single request, and not the present one, tells how late the drive is. */
 static int take_of(struct md_drive *drive, struct md_line *line, size_t at, int64_t now_ns, int64_t *since_ns)
@@ -220,6 +261,7 @@ static int take_of(struct md_drive *drive, struct md_line *line, size_t at, int6
     if (!earliest)
         return found;
     drive->counters.late++;
+    prove_late(drive, earliest);
     md_count_failures(drive, 0);
     drive->answered_ns = later(drive->answered_ns, earliest->sent_ns[0] - 1);
     if (since_ns)

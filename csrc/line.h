@@ -224,6 +224,8 @@ int md_late_bars(const struct md_exchange *exchange, int64_t now_ns);
 int md_late_is_repeated(const struct md_exchange *exchange);
 /* The exchange under way is over, and its reply may still come: for so long in any order. */
 void md_late_expect(struct md_line *line, int64_t window_ns);
+/* An exchange has ended: where it was a proof, tell that such a reply comes, or may not. */
+void md_late_prove(const struct md_exchange *exchange, int result);
 /* The drive has requests whose replies may come on this line. */
 void md_late_link(struct md_line *line, struct md_drive *drive);
 /* Account for the late reply that begins there: its length, MD_INCOMPLETE, or MD_NO_START. Where it may

@@ -40,6 +40,7 @@ static void count(const struct md_exchange *exchange, const struct md_completion
     struct md_drive *drive = exchange->drive;
     struct md_block *block = exchange->block;
     md_counters_end(exchange, completion);
+    md_late_prove(exchange, completion->result);
     if (is_failure(completion->result)) {
         md_count_failures(drive, drive->failures + 1);
         if (block)

@@ -155,7 +155,9 @@ struct md_drive {
     uint32_t failures;              /* in a row */
     uint32_t sure_looks;            /* so many replies are whole at the first look, if it stays steady */
     uint32_t owed_count, unanswered_count, proof_count;
-    const struct md_exchange *const *proofs; /* reads whose replies differ from others' */
+    uint64_t vain_at;             /* its replies, when a proof was given up */
+    uint8_t vain[MD_MOST_PROOFS]; /* how often each proof was given up; 255: it was answered once */
+    const struct md_exchange **proofs; /* reads whose replies differ from others' */
     struct md_drive *next_late;     /* the next one on this line with late replies due */
     struct md_history *history;     /* apart, for it is seldom needed: an exchange touches fewer pages */
     struct md_counters counters;

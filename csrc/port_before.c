@@ -4,11 +4,6 @@
 
 enum { MOST_PROOFS_SENT = 12 }; /* before one exchange */
 
-static uint64_t replies(const struct md_drive *drive)
-{
-    return drive->counters.answered + drive->counters.late;
-}
-
 const struct md_exchange *md_before_find(struct md_before *before, const struct md_exchange *exchange,
                                          int echo, int64_t now_ns)
 {
@@ -16,10 +11,10 @@ const struct md_exchange *md_before_find(struct md_before *before, const struct 
     if (before->then != exchange)
         *before = (struct md_before){.then = exchange, .failures = drive->failures};
     const struct md_exchange *proof = md_late_proof(exchange, now_ns);
-    int has_helped = before->proofs == 0 || replies(drive) != before->replies;
+    int has_helped = before->proofs == 0 || md_replies(drive) != before->replies;
     if (proof && has_helped && before->proofs < MOST_PROOFS_SENT) {
         before->proofs++;
-        before->replies = replies(drive);
+        before->replies = md_replies(drive);
         return proof;
     }
     if (!exchange->echo_probe || echo != MD_ECHO_UNKNOWN || before->is_probed)

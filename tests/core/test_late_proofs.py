@@ -85,6 +85,48 @@ def test_an_unanswered_proof_proves_nothing(line: LineDriver, drive: Peer, proof
     assert is_barred(line, drive, OTHER)
 
 
+def ask_in_vain(line: LineDriver, drive: Peer, proof: Exchange) -> None:
+    """The drive answers something else, and then neither READ nor the proof in time."""
+    ask(line, drive, Message(1, 4, 50, 1))
+    line.receive(build_reply(Framing.RTU, Message(1, 4, data=words(2222))))
+    assert line.completion.result > 0
+    time_out(line, drive, READ)
+    send(line, proof)
+    line.wait_until_done()
+    assert line.completion.result == Failure.NO_REPLY
+    line.now = drive.late_until_ns + MS
+
+
+def test_a_proof_that_is_never_answered_is_given_up(line: LineDriver, drive: Peer, proof: Exchange) -> None:
+    """A device may be silent to registers that it lacks."""
+    ask_in_vain(line, drive, proof)
+    assert is_barred(line, drive, OTHER)
+    ask_in_vain(line, drive, proof)
+    assert not is_barred(line, drive, OTHER)
+
+
+@pytest.mark.parametrize("is_late", [True, False])
+def test_a_proof_that_was_answered_once_is_never_given_up(
+    line: LineDriver, drive: Peer, proof: Exchange, is_late: bool
+) -> None:
+    if is_late:
+        ask_in_vain(line, drive, proof)
+    else:
+        send(line, proof)
+    line.receive(PROOF_REPLY)
+    for _ in range(3):
+        ask_in_vain(line, drive, proof)
+    assert is_barred(line, drive, OTHER)
+
+
+def test_a_silent_drive_keeps_its_proofs(line: LineDriver, drive: Peer, proof: Exchange) -> None:
+    for _ in range(3):
+        send(line, proof)
+        line.wait_until_done()
+        line.now = drive.late_until_ns + MS
+    assert is_barred(line, drive, OTHER)
+
+
 @pytest.mark.usefixtures("proof")
 def test_a_stop_waits_for_no_proof(line: LineDriver, drive: Peer) -> None:
     time_out(line, drive, WRITE)
