@@ -66,7 +66,7 @@ void md_counters_answer(struct md_drive *drive, int64_t delay_ns, int64_t ideal_
 
 uint64_t md_replies(const struct md_drive *drive)
 {
-    return drive->counters.answered + drive->counters.late;
+    return drive->counters.answered + drive->counters.late + drive->doubtful;
 }
 
 const uint64_t *md_usual_delays(const struct md_drive *drive)

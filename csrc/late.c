@@ -12,9 +12,6 @@
 
 #include <string.h>
 
-/* A device may be silent to registers that it lacks. A proof that was never answered is dropped after so many
- * times in vain, if other replies came before each. */
-enum { MOST_VAIN = 2, PROVED = 0xFF };
 static const int64_t FORGET_NS = INT64_C(120000000000); /* no path holds anything up for so long */
 
 /* ---- outstanding requests of a drive ---- */
@@ -82,25 +79,36 @@ static int is_in_window(const struct md_exchange *exchange, int64_t now_ns)
     return 0;
 }
 
-/* Return which of the drive's proofs it is; their number: none. */
-static uint32_t place_of_proof(const struct md_exchange *exchange)
+static int is_doubted(const struct md_exchange *exchange)
 {
     const struct md_drive *drive = exchange->drive;
-    uint32_t at = 0;
-    while (at < drive->proof_count && drive->proofs[at] != exchange)
-        at++;
-    return at;
+    return drive->is_doubted && drive->proof_count && !exchange->insists;
+}
+
+/* A refusal tells no value, and proves nothing. */
+int md_late_is_in_doubt(const struct md_exchange *exchange, const struct md_message *reply)
+{
+    return is_doubted(exchange) && !reply->exception &&
+           md_is_read(exchange->framing, exchange->request.function);
+}
+
+static int is_first_write(const struct md_exchange *exchange)
+{
+    return is_doubted(exchange) && exchange->drive->answered_ns == 0 &&
+           !md_is_read(exchange->framing, exchange->request.function);
 }
 
 int md_late_bars(const struct md_exchange *exchange, int64_t now_ns)
 {
     struct md_drive *drive = exchange->drive;
+    if (is_first_write(exchange))
+        return 1;
     if (drive->owed_count == 0 || exchange->insists)
         return 0;
     if (is_in_window(exchange, now_ns))
         return 1;
     forget_settled(drive, now_ns);
-    return place_of_proof(exchange) == drive->proof_count && has_mistakable(exchange, 0);
+    return !md_proof_is(exchange) && has_mistakable(exchange, 0);
 }
 
 /* The last proof is kept for a drive that answers again: it is not outstanding from the time of silence,
@@ -139,6 +147,8 @@ static int64_t sent_last_ns(struct md_drive *drive, const struct md_exchange *pr
 const struct md_exchange *md_late_proof(const struct md_exchange *exchange, int64_t now_ns)
 {
     struct md_drive *drive = exchange->drive;
+    if (is_first_write(exchange))
+        return last_proof(drive);
     if (drive->owed_count == 0 || exchange->insists || is_in_window(exchange, now_ns))
         return NULL;
     forget_settled(drive, now_ns);
@@ -154,36 +164,6 @@ const struct md_exchange *md_late_proof(const struct md_exchange *exchange, int6
             latest = proof;
     }
     return is_answering ? last_proof(drive) : latest;
-}
-
-/* ---- proofs without a reply ---- */
-
-/* One alone proves nothing of its own late replies. */
-static void drop_proof(struct md_drive *drive, uint32_t at)
-{
-    drive->proof_count--;
-    for (; at < drive->proof_count; at++) {
-        drive->proofs[at] = drive->proofs[at + 1];
-        drive->vain[at] = drive->vain[at + 1];
-    }
-    if (drive->proof_count == 1)
-        drive->proof_count = 0;
-}
-
-void md_late_prove(const struct md_exchange *exchange, int result)
-{
-    struct md_drive *drive = exchange->drive;
-    uint32_t at = place_of_proof(exchange);
-    if (at == drive->proof_count || drive->vain[at] == PROVED)
-        return;
-    if (result > 0)
-        drive->vain[at] = PROVED;
-    uint64_t replies = md_replies(drive);
-    if (result != MD_NO_REPLY || replies == drive->vain_at)
-        return;
-    drive->vain_at = replies;
-    if (++drive->vain[at] == MOST_VAIN)
-        drop_proof(drive, at);
 }
 
 /* ---- what is outstanding ---- */
@@ -221,6 +201,18 @@ void md_late_expect(struct md_line *line, int64_t window_ns)
     md_late_link(line, drive);
 }
 
+void md_late_doubt(struct md_line *line)
+{
+    struct md_drive *drive = line->exchange->drive;
+    md_late_expect(line, 0);
+    struct md_owed *owed = find_same(drive, line->exchange);
+    if (owed)
+        owed->is_doubtful = 1;
+    drive->is_doubted = 0;
+    drive->doubtful++;
+    md_count_failures(drive, 0);
+}
+
 void md_late_inherit(struct md_drive *drive, const struct md_drive *before)
 {
     int is_known = drive->owed_count > 0 && before->late_until_ns <= drive->late_until_ns;
@@ -233,13 +225,6 @@ void md_late_inherit(struct md_drive *drive, const struct md_drive *before)
 }
 
 /* ---- late replies ---- */
-
-static void prove_late(struct md_drive *drive, const struct md_owed *owed)
-{
-    for (uint32_t i = 0; i < drive->proof_count; i++)
-        if (md_owed_is_same(owed, drive->proofs[i]))
-            drive->vain[i] = PROVED;
-}
 
 /* Account for the earliest request of the drive that the reply there fits: its length, MD_INCOMPLETE or
  * MD_NO_START. One that fits a single request, and not the present one, tells how late the drive is. */
@@ -260,8 +245,11 @@ static int take_of(struct md_drive *drive, struct md_line *line, size_t at, int6
     }
     if (!earliest)
         return found;
-    drive->counters.late++;
-    prove_late(drive, earliest);
+    if (earliest->is_doubtful)
+        drive->doubtful++;
+    else
+        drive->counters.late++;
+    md_proof_came_late(drive, earliest);
     md_count_failures(drive, 0);
     drive->answered_ns = later(drive->answered_ns, earliest->sent_ns[0] - 1);
     if (since_ns)

@@ -213,19 +213,29 @@ void md_owed_drop_time(struct md_owed *owed); /* the earliest */
 int md_is_in_range(const struct md_message *reply, uint16_t least, uint16_t most);
 int md_is_read(int framing, uint8_t function);
 
+/* ---- proof.c: which of its proofs a drive answers ---- */
+
+int md_proof_is(const struct md_exchange *exchange);
+/* An exchange has ended, and may be a proof. */
+void md_proof_end(const struct md_exchange *exchange, int result);
+/* The reply to this request has come late, and that may be a proof. */
+void md_proof_came_late(struct md_drive *drive, const struct md_owed *owed);
+
 /* ---- late.c: replies that come after their time-out ---- */
 
 /* Return the proof to ask for first, so that no late reply can be taken for this exchange's; NULL: none is
  * needed, or none would help. */
 const struct md_exchange *md_late_proof(const struct md_exchange *exchange, int64_t now_ns);
+/* The reply may answer what another process asked. */
+int md_late_is_in_doubt(const struct md_exchange *exchange, const struct md_message *reply);
 /* A late reply could be taken for its own, and it may not be sent now. */
 int md_late_bars(const struct md_exchange *exchange, int64_t now_ns);
 /* A reply to the same request is outstanding: then a second copy of it is no adapter's echo. */
 int md_late_is_repeated(const struct md_exchange *exchange);
 /* The exchange under way is over, and its reply may still come: for so long in any order. */
 void md_late_expect(struct md_line *line, int64_t window_ns);
-/* An exchange has ended: where it was a proof, tell that such a reply comes, or may not. */
-void md_late_prove(const struct md_exchange *exchange, int result);
+/* The drive's first reply came: it may be another's, and the exchange's own may still come. */
+void md_late_doubt(struct md_line *line);
 /* The drive has requests whose replies may come on this line. */
 void md_late_link(struct md_line *line, struct md_drive *drive);
 /* Account for the late reply that begins there: its length, MD_INCOMPLETE, or MD_NO_START. Where it may

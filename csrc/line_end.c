@@ -40,9 +40,10 @@ static void count(const struct md_exchange *exchange, const struct md_completion
     struct md_drive *drive = exchange->drive;
     struct md_block *block = exchange->block;
     md_counters_end(exchange, completion);
-    md_late_prove(exchange, completion->result);
+    md_proof_end(exchange, completion->result);
+    int is_alive = completion->result == MD_BAD_ECHO && md_proof_is(exchange); /* its value is not as known */
     if (is_failure(completion->result)) {
-        md_count_failures(drive, drive->failures + 1);
+        md_count_failures(drive, is_alive ? 0 : drive->failures + 1);
         if (block)
             block->failures++;
     }

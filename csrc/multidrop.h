@@ -121,6 +121,7 @@ struct md_owed {
     uint16_t least, most; /* of the reply, as in md_exchange */
     uint8_t framing, address, function, data_len;
     uint8_t data[4];
+    uint8_t is_doubtful; /* a reply came that may answer another process's request */
 };
 
 /* A request of Modbus TCP whose reply may still come. */
@@ -154,6 +155,8 @@ struct md_drive {
     int64_t ready_ns;               /* no request leaves for it before then */
     uint32_t failures;              /* in a row */
     uint32_t sure_looks;            /* so many replies are whole at the first look, if it stays steady */
+    uint32_t is_doubted; /* its first reply may answer what another process asked */
+    uint32_t doubtful;   /* replies of which that was so */
     uint32_t owed_count, unanswered_count, proof_count;
     uint64_t vain_at;             /* its replies, when a proof was given up */
     uint8_t vain[MD_MOST_PROOFS]; /* how often each proof was given up; 255: it was answered once */

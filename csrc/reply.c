@@ -164,6 +164,17 @@ static struct md_ending end_in_doubt(struct md_line *line, size_t at, int used,
     return (struct md_ending){used, at, (size_t)used};
 }
 
+/* Whatever the first reply answers, it tells of the adapter. It is asked for again. */
+static struct md_ending doubt_first(struct md_line *line, size_t at, int used, int64_t now_ns)
+{
+    line->completion->skipped -= (uint32_t)used;
+    if (!line->transactions)
+        md_echo_learn(line, at);
+    md_late_doubt(line);
+    md_reply_find_late(line, at + (size_t)used, now_ns);
+    return (struct md_ending){MD_LATE_ANSWER_DUE, 0, line->rx_len};
+}
+
 /* ---- the search ---- */
 
 int md_reply_judge(struct md_line *line, size_t at, int used, const struct md_message *reply, int64_t now_ns,
@@ -171,6 +182,10 @@ int md_reply_judge(struct md_line *line, size_t at, int used, const struct md_me
 {
     const struct md_exchange *exchange = line->exchange;
     int64_t since_ns;
+    if (md_late_is_in_doubt(exchange, reply)) {
+        *ending = doubt_first(line, at, used, now_ns);
+        return 1;
+    }
     int is_late = !exchange->insists && exchange->drive->owed_count &&
                   md_late_take(line, at, now_ns, &since_ns) > 0;
     if (!is_late) {
@@ -252,6 +267,7 @@ struct md_ending md_reply_missed(struct md_line *line)
         md_late_expect(line, md_window_ns(exchange));
     if (!is_doubtful)
         md_learn_silence(exchange->drive);
-    int reason = md_reason(exchange->framing, &exchange->request, line->rx + begin, line->rx_len - begin);
+    int reason = first == MD_BAD_ECHO ? first :
+                 md_reason(exchange->framing, &exchange->request, line->rx + begin, line->rx_len - begin);
     return (struct md_ending){is_doubtful ? MD_MAYBE_ECHO : reason, 0, line->rx_len};
 }

@@ -3,7 +3,8 @@
  *   cc -std=c11 -D_DEFAULT_SOURCE -g -O1 -fsanitize=address,undefined -fno-sanitize-recover=all \
  *      -Icsrc tests/c/test_core.c csrc/checksum.c csrc/body.c csrc/frame.c csrc/reason.c csrc/tap.c \
  *      csrc/line.c csrc/line_states.c csrc/listen.c csrc/line_end.c csrc/reply.c csrc/tcp.c csrc/echo.c \
- *      csrc/owed.c csrc/late.c csrc/delay.c csrc/counters.c csrc/columns.c -lm -o test_core
+ *      csrc/owed.c csrc/proof.c csrc/late.c csrc/delay.c csrc/counters.c csrc/columns.c \
+ *      -lm -o test_core
  *   ./test_core tests/data/frames.csv
  *
  * Without -fsanitize it also runs under valgrind: --error-exitcode=99 --leak-check=full. */

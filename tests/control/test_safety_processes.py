@@ -12,6 +12,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import checksums
 import pytest
 from examples import usually
 
@@ -225,11 +226,14 @@ def test_an_echo_without_a_drive_confirms_nothing() -> None:
 
 
 def test_the_echo_is_not_the_drive_s_answer_to_a_write() -> None:
-    """The drive answers reads and has died by the time of the write: only the echo comes."""
-    device = bytes.fromhex("01 03 02 01 01 78 14")
+    """The drive answers two reads and has died by the time of the write: only the echo comes."""
+    read = {
+        bytes.fromhex("01 03 30 16 00 01 6A CE"): bytes.fromhex("01 03 02 01 01 78 14"),
+        checksums.rtu("010330000002"): checksums.rtu("01030400000000"),  # whose replies those are
+    }
 
     def hears(request: bytes) -> bytes:
-        return device if request == bytes.fromhex("01 03 30 16 00 01 6A CE") else b""
+        return read.get(request, b"")
 
     with echoing(hears) as port, Bus(port) as bus:
         pump = bus.attach(InvtCHE(1))

@@ -26,7 +26,7 @@ def build(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Callable[
 
 @pytest.mark.slow
 def test_core(build: Callable[..., None]) -> None:
-    line = ("line", "line_states", "listen", "line_end", "reply", "tcp", "echo", "owed", "late")
+    line = ("line", "line_states", "listen", "line_end", "reply", "tcp", "echo", "owed", "proof", "late")
     core = ("checksum", "body", "frame", "reason", "tap", *line, "delay", "counters", "columns")
     build("test_core", *core, arguments=["tests/data/frames.csv"])
 

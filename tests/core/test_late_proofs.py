@@ -170,3 +170,67 @@ def test_a_reply_is_found_where_the_line_babbled_before_its_request(line: LineDr
     line.take()
     line.receive(build_reply(Framing.RTU, Message(1, 4, data=words(2222))))
     assert (line.want, line.completion.reply.data) == ("done", words(2222))
+
+
+@pytest.fixture
+def first(drive: Peer) -> Exchange:
+    """The proof of a drive that another process may have asked READ, or anything of that length."""
+    found = exchange(LONGER, drive)
+    drive.prove_by([found, exchange(Message(1, 3, 0, 3), drive)])
+    drive.doubt_first_reply()
+    return found
+
+
+def is_in_doubt(line: LineDriver) -> bool:
+    return line.want == "done" and line.completion.result == Failure.LATE_ANSWER_DUE
+
+
+def test_the_first_reply_may_answer_what_another_process_asked(
+    line: LineDriver, drive: Peer, first: Exchange
+) -> None:
+    ask(line, drive, READ)
+    line.receive(reply(7777))  # of the other's register
+    assert is_in_doubt(line)
+    send(line, first)
+    line.receive(reply(1111))  # of READ
+    assert line.listens
+    line.receive(PROOF_REPLY)
+    ask(line, drive, READ)
+    line.receive(reply(1112))
+    assert (line.want, line.completion.reply.data) == ("done", words(1112))
+    assert drive.counters().late == 0  # it was always in time
+
+
+def test_a_refusal_proves_nothing(line: LineDriver, drive: Peer, first: Exchange) -> None:
+    ask(line, drive, READ)
+    line.receive(build_reply(Framing.RTU, Message(1, 3, exception=2)))
+    assert (line.want, line.completion.reply.exception) == ("done", 2)
+    ask(line, drive, OTHER)
+    line.receive(reply(7777))
+    assert is_in_doubt(line)
+
+
+@pytest.mark.usefixtures("first")
+def test_the_first_write_waits_for_a_reply_to_a_read(line: LineDriver, drive: Peer) -> None:
+    assert is_barred(line, drive, WRITE)
+    ask(line, drive, READ)
+    line.receive(reply(7777))
+    assert is_in_doubt(line)
+    ask(line, drive, WRITE)
+
+
+@pytest.mark.usefixtures("first")
+def test_a_stop_and_what_it_reads_are_taken_as_they_come(line: LineDriver, drive: Peer) -> None:
+    for request, came in ((READ, reply(1)), (WRITE, build_reply(Framing.RTU, WRITE))):
+        asked = exchange(request, drive)
+        asked.c.insists = 1
+        send(line, asked)
+        line.receive(came)
+        assert line.completion.result > 0
+
+
+def test_the_first_reply_is_taken_where_nothing_proves(line: LineDriver, drive: Peer) -> None:
+    drive.doubt_first_reply()
+    ask(line, drive, READ)
+    line.receive(reply(1111))
+    assert (line.want, line.completion.reply.data) == ("done", words(1111))

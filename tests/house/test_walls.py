@@ -238,6 +238,7 @@ PURE = (  # framing, and one line as a state machine
         "tcp",
         "echo",
         "owed",
+        "proof",
         "late",
         "delay",
         "counters",

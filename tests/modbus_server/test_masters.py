@@ -124,11 +124,14 @@ def rig(tmp_path_factory: pytest.TempPathFactory, _patient_module: None) -> Iter
 
 
 def fill(drive: SimulatedDrive, chance: random.Random) -> None:
-    """Give each word any bits: half of them few, as names and small numbers are."""
+    """Give each word any bits, half of them few, as small numbers are; but what a document knows."""
     for register in drive.drive.registers.values():
         for cell in drive.memory.of(register):
             top = 1 if register.table.carrier is Carrier.BIT else 0xFFFF
             cell.raw = min(chance.choice([chance.randint(0, top), chance.randint(1, 20)]), top)
+    for register, (least, _) in drive.drive.known_counts().items():
+        (cell,) = drive.memory.of(register)
+        cell.raw = least
 
 
 class Chunk(NamedTuple):

@@ -89,10 +89,11 @@ def test_an_adapter_that_always_echoes_is_known_for_it(name: str) -> None:
     story = Story(of_one_variant(LINES[name]))
     story.wire.faults = KINDS["echo"]
     with story.clocked:
+        begun = len(story.run(2))  # each drive's first value is asked for again
         story.run(HEALTHY)
     story.rows += rows_of(story.clocked.poller)
     story.judge()
-    assert {row.status for row in story.rows} <= {"ok", "poll ended"}
+    assert {row.status for row in story.rows[begun:]} <= {"ok", "poll ended"}
 
 
 @table("echo", [0, 1], ids=["no echo", "an echo"])

@@ -256,6 +256,9 @@ class ClockedLine:
     def counted_ns(self, now_ns: int) -> int:
         return self.queue.counted_ns(now_ns) if self.queue else now_ns
 
+    def end(self) -> bool:
+        return self.queue is not None and self.queue.end()
+
     def note_foreign(self) -> None:
         pass
 

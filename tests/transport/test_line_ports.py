@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 from leftovers import descriptors, threads
-from lines import line, plant, polled, rows_of, until
+from lines import PATIENCE, line, plant, polled, rows_of, until
 from serial import Serial
 from serial_server import SerialServer, pyserials_own, vanishing_pty
 from tables import table
@@ -343,6 +343,26 @@ def test_a_bridged_port_that_cannot_be_set_up_is_a_sentence() -> None:
     assert caught.value.port == port
     assert os.strerror(errno.EIO) in caught.value.reason
     assert "\n" not in str(caught.value)
+
+
+def test_a_port_is_not_freed_while_another_thread_ends_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    closing: list[threading.Thread] = []
+    end = Port.end
+
+    def end_slowly(port: Port) -> bool:
+        closing.append(threading.Thread(target=ours.close))
+        closing[0].start()
+        closing[0].join(0.2)  # it would be over by then
+        assert port.c is not None
+        return end(port)
+
+    monkeypatch.setattr(Port, "end", end_slowly)
+    with Simulator([wire()]) as simulator:
+        ours = Line(simulator.wires[0].path)
+        assert not ours.end()
+        closing[0].join(PATIENCE)
+        assert not closing[0].is_alive()
+        assert not ours.end()
 
 
 def test_a_closed_bus_says_so() -> None:

@@ -48,8 +48,9 @@ class Peer:
 
     @property
     def has_answered(self) -> bool:
-        """True once a good reply came; an exception counts as one."""
-        return bool(self.c.counters.answered)
+        """True once a reply came, be it an exception, late or in doubt."""
+        counters = self.c.counters
+        return bool(counters.answered or counters.late or self.c.doubtful)
 
     @property
     def failures(self) -> int:
@@ -99,6 +100,13 @@ class Peer:
         self.proofs = tuple(proofs[:MOST_PROOFS])
         self._c_proofs = ffi.new("struct md_exchange *[]", [proof.c for proof in self.proofs])
         self.c.proofs, self.c.proof_count = self._c_proofs, len(self.proofs)
+
+    def doubt_first_reply(self) -> None:
+        """Have a proof sent after its first reply, which may answer what another process asked.
+
+        Its first read is asked again then. Without proofs it goes as it comes.
+        """
+        self.c.is_doubted = True
 
     @property
     def timeout(self) -> float:

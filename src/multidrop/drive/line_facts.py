@@ -33,6 +33,8 @@ class LineFacts:
     turnaround_delay: ClassVar[float] = 0.1  # s, after a broadcast
 
     least_interval: ClassVar[float] = 0.0  # s, from the end of an exchange to the next request to the drive
+    # It answers or refuses each read of its table and is silent to none: a proof goes before its first value.
+    answers_every_read: ClassVar[bool] = False
 
     def __init__(
         self,

@@ -74,6 +74,7 @@ class DelixiParameters(Drive):
     baudrates = (9600, 1200, 2400, 4800, 19200, 38400)  # P04.28
     addresses = range(1, 32)  # P04.30
     response_timeout = 0.15
+    answers_every_read = True
     answering_time = 0.08  # the drive needs less
     remote = "P00.00 must be 2 (RS-485)"
     line_parameters = (

@@ -136,6 +136,7 @@ class ErmanERG220(Drive):
     )
     no_broadcasts = "the manual calls address 0 one, and does not say that nobody answers: none is sent"
     addresses = range(1, 32)
+    answers_every_read = True
     most_registers = {HOLDING: 88, INPUT: 17, COIL: 12}
     readable_gaps = {HOLDING: range(0x0000, 0x0059), INPUT: range(0x0000, 0x1000)}
     exceptions = {

@@ -131,6 +131,7 @@ class InnovertIBD(Drive):
     formats = dict.fromkeys(framings, ("8N1", "8E1", "8O1"))
     baudrates = (9600, 4800, 19200, 38400)
     addresses = range(1, 241)
+    answers_every_read = True
     silence = 10e-3  # before and after an RTU frame (table "message in RTU mode")
     most_registers = {HOLDING: 4}
     exceptions = {}

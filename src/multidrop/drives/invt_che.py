@@ -156,6 +156,7 @@ class InvtCHE(Drive):
     baudrates = (9600, 1200, 2400, 4800, 19200, 38400)  # PC.01
     addresses = range(1, 248)
     response_timeout = 0.4  # PC.03 delays the reply by up to 200 ms, 5 ms from the factory
+    answers_every_read = True
     most_registers = {HOLDING: 16}
     readable_gaps = {HOLDING: range(0x3000, 0x3017)}  # the reserved ones are listed as readable
     exceptions = {

@@ -248,11 +248,9 @@ class PolledLine:
         """Begin nothing more, and open no port again; True while an exchange is still under way."""
         self._reopening.join()
         self._ended_ns = self._ended_ns or clock.now_ns()
-        port = self.bus.line.queue
-        if port is None:
-            return False
-        self.switching = port.switching
-        return port.end()
+        if port := self.bus.line.queue:
+            self.switching = port.switching
+        return self.bus.line.end()
 
     def close(self, why: str) -> None:
         """Close the bus; every slot that is over by now has a row. Who uses the port later is told `why`."""

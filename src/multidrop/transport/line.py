@@ -121,10 +121,9 @@ class Line:
                 core.tap(self._tap)
             self._log.opened(self.identity)
             self.queue = core
-        except NoSuchPort:
-            raise
-        except LineError:
-            self._let_go()
+        except LineError as failure:
+            if not isinstance(failure, NoSuchPort):
+                self._let_go()
             raise
         except PORT_FAILURES as failure:
             self._let_go()
@@ -153,6 +152,11 @@ class Line:
             self._is_over = True
             self._let_go()
         flush(LOGGING_S)
+
+    def end(self) -> bool:
+        """Begin nothing more of the queue; return True while one of it is under way, False without a port."""
+        with self._lock:  # else another thread may free the port meanwhile
+            return self.queue is not None and self.queue.end()
 
     def _let_go(self) -> None:
         with self._lock:
@@ -205,10 +209,7 @@ class Line:
     def inherit(self, peer: Peer, before: Peer) -> None:
         """Let a drive take the place of another at its address, whose answers may still come."""
         with self._lock:
-            if self.queue:
-                self.queue.inherit(peer, before)
-            else:
-                peer.inherit(before)
+            self.queue.inherit(peer, before) if self.queue else peer.inherit(before)
 
     # ---- exchanges ----
 
@@ -234,8 +235,7 @@ class Line:
                 raise self._closed()
             found = core.carry_out(exchange, not_before_ns, expires_ns, into)
             is_lost = found.count < 0 and is_lost_by(found.result, core)
-            if self.mastership is not None:
-                self.note_foreign()
+            self.note_foreign()
         finally:
             self._callers.discard(calling)
         if self._log.shows(DEBUG):

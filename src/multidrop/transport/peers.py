@@ -56,6 +56,8 @@ class Peers:
         peer.prove_by(
             [make_exchange(drive, block.request, peer, NO_ROWS, answer=answer) for block, answer in found]
         )
+        if drive.answers_every_read:
+            peer.doubt_first_reply()
         return peer
 
     def close(self) -> None:
