@@ -524,6 +524,16 @@ def test_a_stop_goes_where_nobody_can_be_told_of_the_audit_log(
     assert [write.data for write in received.writes] == [b"\0\5"]
 
 
+@pytest.mark.parametrize("seconds", ["-1", "0", "nan", "inf", "ten", ""])
+@pytest.mark.parametrize("verb", ["stop", "coast"])
+def test_a_senseless_time_keeps_no_stop_back(run: Run, che: Che, verb: str, seconds: str) -> None:
+    received, words = che
+    status, _, err = run(verb, *words, "--seconds", seconds)
+    assert status == 0
+    assert len(received.writes) == 1
+    assert f"--seconds: '{seconds}' is not a number of seconds above 0: the stop is repeated for 30 s" in err
+
+
 def test_a_stop_takes_the_seconds_that_it_is_given(run: Run, che: Che) -> None:
     received, words = che
     received.loses = lambda request: True

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from decimal import Decimal
 from functools import partial
 from math import inf
@@ -16,12 +16,13 @@ from typing import Any
 
 from multidrop.control.latches import Latches
 from multidrop.control.outcome import Outcome, Stopped
-from multidrop.control.stop_attempt import Do, StopAttempt
+from multidrop.control.stop_attempt import LEAST_S, Do, StopAttempt
 from multidrop.control.writer import Writer
 from multidrop.drive.family import Drive
 from multidrop.drive.script import Read, Script, Step, Write
 from multidrop.errors import CheckAgain
 from multidrop.transport import clock
+from multidrop.transport.aside_log import log_aside
 from multidrop.transport.exchange import WRITE_TIMEOUT, Exchanges
 
 REGAIN_NS = 500_000_000  # between attempts of stops to open a port that was lost
@@ -51,9 +52,10 @@ class Stopper:
     def stop(self, drive: Drive, make: Callable[[], Script[Any]], seconds: float | None) -> None:
         """Carry out a stop, again and again until the motor stands, for as long as `seconds` s.
 
-        Raises Unconfirmed when it is not seen to stand then, and says what is known.
+        It is sent whatever `seconds` may be. Raises Unconfirmed when it is not seen to stand then, and says
+        what is known.
         """
-        seconds = _checked(seconds)
+        seconds = _limit(seconds)
         self._latches.latch(drive)  # raises for one that is not on this bus
         with self._under_way([drive]):
             stop = StopAttempt(drive, make, _now(), seconds)
@@ -69,7 +71,7 @@ class Stopper:
 
         `broadcast` is called before, and returns True where it has sent a stop to all of them.
         """
-        seconds = _checked(seconds)
+        seconds = _limit(seconds)
         found: dict[str, Stopped] = {}
         with self._under_way(drives):
             begun = _now()
@@ -148,16 +150,22 @@ def _now() -> float:
     return clock.now_ns() / 1e9
 
 
-def _checked(seconds: float | None) -> float | None:
-    """Return it as a float, which adds to a time: numpy's short ones do not, nor does a Decimal."""
+def _limit(seconds: float | None) -> float | None:
+    """Return it as a float, which adds to a time: numpy's short ones do not, nor does a Decimal.
+
+    What is no time keeps no stop back: it is logged, and the stop is repeated as without one.
+    """
     if seconds is None:
         return None
-    if isinstance(seconds, (Real, Decimal)) and not isinstance(seconds, bool) and seconds >= 0:
-        try:
-            return float(seconds)
-        except OverflowError:
-            return inf
-    raise ValueError(f"seconds = {seconds!r} is no time that a stop may take: give 0 or more, or none")
+    with suppress(Exception):  # Decimal("sNaN") does not compare, and a caller's own number may do anything
+        if isinstance(seconds, (Real, Decimal)) and not isinstance(seconds, bool) and seconds >= 0:
+            try:
+                return float(seconds)
+            except OverflowError:
+                return inf
+    sentence = "seconds = %.100r is no time for a stop: it is repeated for %g s at least, as without one"
+    log_aside(_log, logging.WARNING, sentence, seconds, LEAST_S)
+    return None
 
 
 def stop_together(stops: Sequence[StopAttempt], do: Do, end: Callable[[StopAttempt], object]) -> None:
