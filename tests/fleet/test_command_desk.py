@@ -11,6 +11,7 @@ from typing import Any
 
 import pytest
 from command_desks import LINE, PATIENCE_S, Desks, desks
+from lines import patient
 from peers import require_module
 from tables import table
 
@@ -34,6 +35,8 @@ DONE, REFUSED, NOT_SENT, UNKNOWN = (
     CommandOutcome.UNKNOWN,
 )
 SETPOINT = "frequency"
+
+pytestmark = patient  # a stop whose reply is late is sent again, and the writes are counted here
 
 
 @pytest.fixture
