@@ -16,7 +16,7 @@ from typing import Any
 
 from multidrop.control.latches import Latches
 from multidrop.control.outcome import Outcome, Stopped
-from multidrop.control.stop_attempt import LEAST_S, Do, StopAttempt
+from multidrop.control.stop_attempt import LEAST_S, NO_ROOM, PAUSE_S, Do, StopAttempt
 from multidrop.control.writer import Writer
 from multidrop.drive.family import Drive
 from multidrop.drive.script import Read, Script, Step, Write
@@ -26,6 +26,7 @@ from multidrop.transport.aside_log import log_aside
 from multidrop.transport.exchange import WRITE_TIMEOUT, Exchanges
 
 REGAIN_NS = 500_000_000  # between attempts of stops to open a port that was lost
+BEGINNINGS = 150  # of a stop for which the system has no room
 
 _log = logging.getLogger("multidrop.control")
 
@@ -55,11 +56,12 @@ class Stopper:
         It is sent whatever `seconds` may be. Raises Unconfirmed when it is not seen to stand then, and says
         what is known.
         """
-        seconds = _limit(seconds)
-        self._latches.latch(drive)  # raises for one that is not on this bus
-        with self._under_way([drive]):
-            stop = StopAttempt(drive, make, _now(), seconds)
-            self._carry_out([stop], lambda stop: None)
+
+        def attempt() -> list[StopAttempt]:
+            self._latches.latch(drive)  # raises for one that is not on this bus
+            return [StopAttempt(drive, make, _now(), _limit(seconds))]
+
+        (stop,) = self._carry_out([drive], attempt, lambda: False, lambda stop: None)
         _log.info("%s", stop.result(_now()))
         if stop.known is not None:
             raise stop.known
@@ -71,40 +73,78 @@ class Stopper:
 
         `broadcast` is called before, and returns True where it has sent a stop to all of them.
         """
-        seconds = _limit(seconds)
         found: dict[str, Stopped] = {}
-        with self._under_way(drives):
-            begun = _now()
-            stops = [
-                StopAttempt(drive, drive.stop.script, begun, seconds, partial(self._ready, drive))
+
+        def attempts() -> list[StopAttempt]:
+            begun, limit = _now(), _limit(seconds)
+            return [
+                StopAttempt(drive, drive.stop.script, begun, limit, partial(self._ready, drive))
                 for drive in drives
             ]
-            try:
-                sent = broadcast()
-            except BaseException as interruption:
-                send_once_more(stops, self._do, interruption)
-                raise
-            for stop in stops if sent else ():
-                stop.note_broadcast()
 
-            def end(stop: StopAttempt) -> None:
-                found[stop.drive.name] = stop.result(_now())
+        def end(stop: StopAttempt) -> None:
+            found[stop.drive.name] = stop.result(_now())
 
-            self._carry_out(stops, end)
+        self._carry_out(drives, attempts, broadcast, end)
         for stopped in found.values():  # not before: a logger's handler may hang
             _log.info("%s", stopped)
         return found
 
-    def _carry_out(self, stops: Sequence[StopAttempt], end: Callable[[StopAttempt], object]) -> None:
-        def over(stop: StopAttempt) -> None:
-            self._stops.discard(stop)
-            end(stop)
+    def _carry_out(
+        self,
+        drives: Sequence[Drive],
+        attempts: Callable[[], list[StopAttempt]],
+        broadcast: Callable[[], bool],
+        end: Callable[[StopAttempt], object],
+    ) -> list[StopAttempt]:
+        """Make the attempts and carry them out; call `end` with each at its end, and return them.
 
+        Where the system has no room for them yet, it may have it soon. What interrupts their making comes
+        too late for nobody: each is sent once.
+        """
+        stops: list[StopAttempt] = []
+        for left in reversed(range(BEGINNINGS)):
+            try:
+                with self._under_way(drives):
+                    stops = attempts()
+                    self._carry_out_known(stops, [*stops], broadcast, end)
+                break
+            except NO_ROOM:
+                if stops or not left:
+                    raise
+                clock.sleep(PAUSE_S)
+            except (KeyboardInterrupt, SystemExit) as interruption:
+                if not stops:
+                    send_once_more(attempts(), self._do, interruption)
+                raise
+        return stops
+
+    def _carry_out_known(
+        self,
+        stops: Sequence[StopAttempt],
+        under_way: list[StopAttempt],
+        broadcast: Callable[[], bool],
+        end: Callable[[StopAttempt], object],
+    ) -> None:
+        """Carry these out, all of which are `under_way`.
+
+        At an interruption each stop that is not over is sent once more, unless a second one comes.
+        """
         try:
             self._stops.update(stops)
-            stop_together(stops, self._do, over)
+            if broadcast():
+                for stop in stops:
+                    stop.note_broadcast()
+            stop_together(under_way, self._do, partial(self._over, end))
+        except BaseException as interruption:
+            send_once_more(under_way, self._do, interruption)
+            raise
         finally:
             self._stops.difference_update(stops)
+
+    def _over(self, end: Callable[[StopAttempt], object], stop: StopAttempt) -> None:
+        self._stops.discard(stop)
+        end(stop)
 
     @contextmanager
     def _under_way(self, drives: Sequence[Drive]) -> Iterator[None]:
@@ -168,23 +208,18 @@ def _limit(seconds: float | None) -> float | None:
     return None
 
 
-def stop_together(stops: Sequence[StopAttempt], do: Do, end: Callable[[StopAttempt], object]) -> None:
-    """Carry the stops out, a step of each in turn; call `end` with each at its end.
+def stop_together(under_way: list[StopAttempt], do: Do, end: Callable[[StopAttempt], object]) -> None:
+    """Carry the stops out, a step of each in turn.
 
-    At an interruption each stop that is not over is sent once more, unless a second one comes.
+    Each is taken from the list at its end, and `end` is called with it.
     """
-    under_way = list(stops)
-    try:
-        while under_way:
-            stop = min(under_way, key=_due)  # the one that is due for longest
-            under_way = [*(other for other in under_way if other is not stop), stop]  # never without it
-            clock.sleep(max(0.0, stop.due - _now()))
-            if stop.advance(do, _now):
-                under_way.remove(stop)
-                end(stop)
-    except BaseException as interruption:
-        send_once_more(under_way, do, interruption)
-        raise
+    while under_way:
+        stop = min(under_way, key=_due)  # the one that is due for longest
+        under_way[:] = [*(other for other in under_way if other is not stop), stop]  # never without it
+        clock.sleep(max(0.0, stop.due - _now()))
+        if stop.advance(do, _now):
+            under_way.remove(stop)
+            end(stop)
 
 
 def send_once_more(stops: Sequence[StopAttempt], do: Do, interruption: BaseException) -> None:
