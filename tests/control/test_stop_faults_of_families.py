@@ -38,7 +38,6 @@ FAILURES: dict[str, Callable[[], BaseException]] = {
 HOME = Path(multidrop.__file__).parent
 SCRIPTS = tuple(str(HOME / name) for name in ("drives", "profiles", "family_file", "drive/script.py"))
 ATTEMPT = (str(HOME / "control/stop_attempt.py"), str(HOME / "drive/family.py"))
-STEP = 37  # lines from one to the next that is tried; a prime, so that loops are met in different places
 
 
 def counts(frame: FrameType) -> bool:
@@ -85,19 +84,11 @@ def check_stops(monkeypatch: pytest.MonkeyPatch, family: str, failure: str, step
 
 
 @pytest.mark.usefixtures("_unbounded")
+@pytest.mark.parametrize("step", [37, pytest.param(5, marks=pytest.mark.long)])
 @pytest.mark.parametrize("failure", FAILURES)
 @pytest.mark.parametrize("family", FAMILIES)
-def test_a_motor_stands_though_its_stop_failed_at_some_lines(
-    monkeypatch: pytest.MonkeyPatch, family: str, failure: str
+def test_a_motor_stands_though_its_stop_failed_at_some_line(
+    monkeypatch: pytest.MonkeyPatch, family: str, failure: str, step: int
 ) -> None:
-    check_stops(monkeypatch, family, failure, STEP)
-
-
-@pytest.mark.long
-@pytest.mark.usefixtures("_unbounded")
-@pytest.mark.parametrize("failure", FAILURES)
-@pytest.mark.parametrize("family", FAMILIES)
-def test_a_motor_stands_though_its_stop_failed_at_any_line(
-    monkeypatch: pytest.MonkeyPatch, family: str, failure: str
-) -> None:
-    check_stops(monkeypatch, family, failure, 1)
+    """The steps are prime, so that loops are met in different places; 1 tries each line, in a quarter hour."""
+    check_stops(monkeypatch, family, failure, step)
