@@ -90,5 +90,5 @@ def check_stops(monkeypatch: pytest.MonkeyPatch, family: str, failure: str, step
 def test_a_motor_stands_though_its_stop_failed_at_some_line(
     monkeypatch: pytest.MonkeyPatch, family: str, failure: str, step: int
 ) -> None:
-    """The steps are prime, so that loops are met in different places; 1 tries each line, in a quarter hour."""
+    """Steps are prime, so that loops are met in different places; 1 tries each line, in a quarter hour."""
     check_stops(monkeypatch, family, failure, step)
