@@ -13,7 +13,7 @@ from typing import Any
 from multidrop import Plant, drive_meant
 from multidrop.gateway.commands import Told
 from multidrop.gateway.homeassistant import discovery, discovery_topic
-from multidrop.gateway.hub import FAULT, SILENT
+from multidrop.gateway.hub import SILENT
 from multidrop.gateway.mqtt_settings import MqttSettings, fresh_values
 from multidrop.gateway.orders import Orders
 from multidrop.gateway.outbox import Publication
@@ -147,11 +147,11 @@ class JsonTopics:
 
     def _state(self, drive: str) -> bytes:
         seen_ns = self._hub.seen_at(drive)
-        state, words = self._hub.seen(drive)
+        shown = self._hub.seen(drive)
         said = {
             "time": None if seen_ns is None else seen_ns // 1_000_000,
-            "state": state,
-            "fault": words if state == FAULT else None,
+            "state": shown.state,
+            "fault": shown.fault,
             "values": fresh_values(self._hub, drive),
         }
         return json.dumps(said, ensure_ascii=False).encode()
