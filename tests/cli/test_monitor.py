@@ -403,11 +403,11 @@ def test_a_failure_stays_until_it_is_acknowledged(tmp_path: Path, monkeypatch: p
     for key in ("x", DOWN, "S", "y", ENTER, "s", "n", ENTER):  # also on a drive's page, and after a success
         monitor._obey(key)
         assert failure in seen(monitor)
-    assert monitor.failures == monitor._at.failures
+    assert monitor.await_stops() == monitor._at.failures
     monitor._obey("a")
     assert failure not in seen(monitor)
     assert "q quit" in seen(monitor)
-    assert monitor.failures == []
+    assert monitor.await_stops() == []
 
 
 def test_all_lines_stand_in_what_a_stop_of_all_came_to(
@@ -466,11 +466,10 @@ def test_leaving_under_a_stop_needs_a_yes_and_waits_for_it(
         monitor._obey(key)
     assert monitor._has_left
     monitor._session = monitor._session._replace(hand_out=stands.set)  # what is polled meanwhile is recorded
-    monitor.await_stops()
+    assert monitor.await_stops() == []
     assert not any(thread.is_alive() for thread in monitor._stops)
     assert "a stop is under way, and is waited for" in capsys.readouterr().err
-    assert monitor.failures == []
-    monitor.await_stops()
+    assert monitor.await_stops() == []
     assert capsys.readouterr().err == ""
 
 

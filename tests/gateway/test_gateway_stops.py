@@ -116,7 +116,7 @@ def test_a_drive_to_stop_may_be_named_without_a_list(tmp_path: Path) -> None:
 
 
 def test_a_stop_of_strange_names_stops_the_drives_that_are_there_and_tells_of_each(tmp_path: Path) -> None:
-    """Of half a character, of a terminal's escape, and of one that is another's in another case."""
+    """Half a character, a terminal's escape, and another drive's name in capitals."""
     names = ["pump-1", "\ud800", "\x1b[2J\n", "PUMP-2", ""]
     with served(tmp_path, MAY) as gateway:
         start(gateway, "pump-1")

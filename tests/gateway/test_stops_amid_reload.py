@@ -17,7 +17,7 @@ Names = dict[str, Drive]
 
 @dataclass
 class End:
-    """What became of a stop, of this drive."""
+    """The end of a stop, of this drive."""
 
     drive: Drive | None
     is_done: bool = True

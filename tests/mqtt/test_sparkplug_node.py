@@ -70,7 +70,7 @@ def test_births_data_and_deaths(host: Host, node: tuple[Any, Running]) -> None:
 
 
 def test_a_fault_in_words_is_said_of_a_drive_whose_own_number_of_it_is_not_polled(tmp_path: Path) -> None:
-    """Where that is a register of the name `fault`, and a number without names."""
+    """Its register called `fault` is a number without names."""
     known = inside(tmp_path, VfdEl(2, name="mill"))
     known.hub.states["mill"], known.hub.faults["mill"] = "fault", "it shows a fault"
     node = SparkplugNode(MqttSettings(sparkplug="works", node="line"), known, lambda: 7)

@@ -65,14 +65,14 @@ def watch(plant: Plant, *, out: Path | None = None, seconds: float | None = None
     """
     console = open_console()
     live = LivePlant(plant)
-    with outliving_the_terminal() as closing, polling_session(plant, out, live.add) as session:
-        monitor = Monitor(live, session, console, closing)
+    with outliving_the_terminal() as hup, polling_session(plant, out, live.add) as session:
+        monitor = Monitor(live, session, console, hup)
         with session.poller:
             try:
                 monitor.show(seconds)
             finally:
-                monitor.await_stops()  # before the ports are closed: one may not have been sent yet
-        for sentence in monitor.failures:
+                failures = monitor.await_stops()  # before the ports are closed: one may not be sent yet
+        for sentence in failures:
             warn(sentence)
         session.hand_out()  # what came while the poller closed
     return session.poller.summary()
@@ -81,14 +81,12 @@ def watch(plant: Plant, *, out: Path | None = None, seconds: float | None = None
 class Monitor:
     """The screen of a polled plant: draws what has come, and carries out what keys ask for."""
 
-    def __init__(
-        self, plant: LivePlant, session: PollingSession, console: Any, closing: Interruption
-    ) -> None:
+    def __init__(self, plant: LivePlant, session: PollingSession, console: Any, hup: Interruption) -> None:
         from multidrop.cli.monitor.screen import BLOCKS, PLAIN_BLOCKS, Position
 
         self._console = console
         self._session = session
-        self._closing = closing  # of the terminal
+        self._hup = hup  # its terminal was closed
         self._plant = plant
         self._at = Position()
         self._on_yes: Callable[[], None] | None = None  # done when the question is answered with y
@@ -107,7 +105,7 @@ class Monitor:
             keys() as wait_for_key,
             logging_to(self._show_message, "multidrop", WARNING),
         ):
-            while not (self._session.interruption.came or self._closing.came or self._has_left):
+            while not (self._session.interruption.came or self._hup.came or self._has_left):
                 now = time.monotonic()
                 if seconds is not None and now - begun >= seconds:
                     return
@@ -127,17 +125,13 @@ class Monitor:
     def _show_message(self, text: str) -> None:
         self._at.message = text
 
-    def await_stops(self) -> None:
-        """Wait until no stop is under way, and record what is polled meanwhile."""
+    def await_stops(self) -> list[str]:
+        """Record until no stop is under way; return the failures that nobody acknowledged."""
         if self._is_stopping:
             warn(STILL_STOPPING)
         while self._is_stopping:
             self._session.hand_out()
             self._stops[-1].join(DRAW_S)
-
-    @property
-    def failures(self) -> list[str]:
-        """The failures of stops that nobody acknowledged."""
         return self._at.failures
 
     @property
