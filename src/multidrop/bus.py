@@ -346,13 +346,14 @@ class Bus:
         """
         return self._broadcaster.write(self.drives, register, value)
 
-    def stop_all(self, *, seconds: float | None = None) -> dict[str, Stopped]:
+    def stop_all(self, seconds: float | None = None) -> dict[str, Stopped]:
         """Stop every drive, ahead of all that is queued; by drive's name, what is known of it.
 
         First by broadcast, where all drives are known to be of one family that has it. Then each drive is
         sent its stop, in turns, until it is seen to stand: for `seconds` s, or without that for 30 s at
-        least, and for as long as the motor's ramp may take. Never raises for one drive: the others go on. A
-        call that would move a motor ends with Overtaken, if it came before this or comes while it lasts.
+        least, and for as long as the motor's ramp may take; what is no time is logged, and is as none. Never
+        raises for one drive: the others go on. A call that would move a motor ends with Overtaken, if it came
+        before this or comes while it lasts.
         After an interruption each drive that does not stand yet is sent its stop once more.
         """
         peers = self.peers

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import errno
-import fcntl
 import io
 import json
 import os
@@ -12,7 +11,6 @@ import select
 import signal
 import subprocess
 import sys
-import termios
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -22,6 +20,7 @@ import pytest
 from commands import TOY, Run
 from lines import PATIENCE, Faulty, patient, until
 from motors import ReceivedRequests
+from terminals import closing_terminal
 from toy import Status, Toy
 
 import multidrop.cli
@@ -31,6 +30,7 @@ from multidrop.core import Message
 from multidrop.drives.innovert_ibd import InnovertIBD
 from multidrop.drives.invt_che import InvtCHE
 from multidrop.errors import Refused
+from multidrop.recording import open_reader
 from multidrop.sim import MotorDrive, simulated
 from multidrop.sim.drive import Reason, Refusal, SimulatedDrive
 from multidrop.sim.memory import MemoryCell
@@ -460,30 +460,6 @@ def test_a_stop_that_is_interrupted_is_sent_once_more(run: Run, che: Che) -> Non
     assert "multidrop: to stop it, type: multidrop stop " in err
 
 
-class ClosedTerminal:
-    """A terminal on which a command runs, and which is closed."""
-
-    def __init__(self, *words: object) -> None:
-        self._fd, terminal = os.openpty()
-
-        def take_terminal() -> None:
-            signal.signal(signal.SIGHUP, signal.SIG_DFL)  # whatever the tests were begun with
-            fcntl.ioctl(terminal, termios.TIOCSCTTY, 0)
-
-        self.process = subprocess.Popen(
-            [sys.executable, "-m", "multidrop", *map(str, words)],
-            stdin=terminal,
-            stdout=terminal,
-            stderr=terminal,
-            start_new_session=True,
-            preexec_fn=take_terminal,
-        )
-        os.close(terminal)
-
-    def close(self) -> None:
-        os.close(self._fd)
-
-
 @patient
 @pytest.mark.parametrize("verb", ["stop", "coast"])
 def test_a_stop_goes_on_until_its_end_where_the_terminal_is_closed(run: Run, che: Che, verb: str) -> None:
@@ -499,15 +475,54 @@ def test_a_stop_goes_on_until_its_end_where_the_terminal_is_closed(run: Run, che
         return len(received.writes) < begun + 3
 
     received.loses = loses
-    terminal = ClosedTerminal(verb, *words)
-    try:
+    with closing_terminal(verb, *words) as terminal:
         assert terminal.process.wait(PATIENCE) >= 0  # no signal ended it; nobody could be told how it ended
-    finally:
-        terminal.process.kill()
     assert is_closed.is_set()
     assert len(received.writes) >= begun + 3
     assert received.starts == received.starts[:1]
     until(lambda: received.sim["status"] == 3)
+
+
+def plant_of(port: object, folder: Path) -> Path:
+    """Return a plant file with the CHE at this port."""
+    plant = folder / "hall.toml"
+    drive = '[[line.drive]]\nname = "pump"\nmodel = "invt-che"\naddress = 1\nmaximum_frequency = 50\n'
+    plant.write_text(f'[[line]]\nname = "hall"\nport = "{port}"\n{drive}')
+    return plant
+
+
+@patient
+@pytest.mark.parametrize("keys", [b"sy", b"Sy"])
+def test_a_stop_by_a_key_goes_on_until_its_end_where_the_terminal_is_closed(
+    run: Run, che: Che, tmp_path: Path, keys: bytes
+) -> None:
+    received, words = che
+    assert run("start", *words, "--frequency", 20, "--yes")[0] == 0
+    begun = len(received.writes)
+    plant, out = plant_of(words[0], tmp_path), tmp_path / "seen.csv"
+    received.loses = lambda request: request.start == 0x1000 and len(received.writes) < begun + 4
+    with closing_terminal("monitor", plant, "--out", out) as terminal:
+        terminal.wait_for(" Hz ")
+        terminal.press(keys)
+        until(lambda: len(received.writes) > begun)
+        terminal.close()
+        assert terminal.process.wait(PATIENCE) >= 0
+    assert len(received.writes) >= begun + 4
+    assert received.starts == received.starts[:1]
+    until(lambda: received.sim["status"] == 3)
+    rows = [row for batch in open_reader(out) for row in batch]
+    assert rows[-1].register in {row.register for row in rows[:-1]}  # it was closed in good order
+
+
+@patient
+def test_a_monitor_ends_where_its_terminal_is_closed(che: Che, tmp_path: Path) -> None:
+    received, words = che
+    plant = plant_of(words[0], tmp_path)
+    with closing_terminal("monitor", plant) as terminal:
+        terminal.wait_for(" Hz ")
+        terminal.close()
+        assert terminal.process.wait(PATIENCE) >= 0
+    assert received.writes == []
 
 
 @patient
@@ -522,6 +537,16 @@ def test_a_stop_goes_where_nobody_can_be_told_of_the_audit_log(
     monkeypatch.setattr(sys, "stderr", Gone())
     assert multidrop.cli.main(list(map(str, ("stop", *words, "--audit", tmp_path)))) == 0
     assert [write.data for write in received.writes] == [b"\0\5"]
+
+
+@pytest.mark.parametrize("seconds", ["-1", "0", "nan", "inf", "ten", ""])
+@pytest.mark.parametrize("verb", ["stop", "coast"])
+def test_a_senseless_time_keeps_no_stop_back(run: Run, che: Che, verb: str, seconds: str) -> None:
+    received, words = che
+    status, _, err = run(verb, *words, "--seconds", seconds)
+    assert status == 0
+    assert len(received.writes) == 1
+    assert f"--seconds: '{seconds}' is not a number of seconds above 0: the stop is repeated for 30 s" in err
 
 
 def test_a_stop_takes_the_seconds_that_it_is_given(run: Run, che: Che) -> None:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import re
 import string
+import sys
 import termios
 import threading
 from collections import Counter
@@ -19,6 +21,7 @@ from tables import table
 from terminals import Terminal, on_terminal
 
 import multidrop.cli.support.extras
+from multidrop.cli.monitor import keys as monitor_keys
 from multidrop.cli.monitor.command import PAGE, Monitor
 from multidrop.cli.monitor.keys import DOWN, ENTER, KEYS, PAGE_DOWN, PAGE_UP, UP, next_key
 from multidrop.cli.monitor.screen import (
@@ -312,7 +315,9 @@ def a_monitor(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Any, Pol
     for polled in plant.lines[0].drives:
         polled.drive.perform = lambda script, name=polled.drive.name: poller.perform(name, script)
     anyone: Any = poller
-    monitor: Any = Monitor(LivePlant(plant), PollingSession(anyone, Interruption(), lambda: None), Console())
+    monitor: Any = Monitor(
+        LivePlant(plant), PollingSession(anyone, Interruption(), lambda: None), Console(), Interruption()
+    )
     monitor._begin = lambda what, work: False  # at once
     monitor._side_reader.read = lambda chosen: {}
     return monitor, poller
@@ -398,11 +403,11 @@ def test_a_failure_stays_until_it_is_acknowledged(tmp_path: Path, monkeypatch: p
     for key in ("x", DOWN, "S", "y", ENTER, "s", "n", ENTER):  # also on a drive's page, and after a success
         monitor._obey(key)
         assert failure in seen(monitor)
-    assert list(monitor.left_open()) == monitor._at.failures
+    assert monitor.await_stops() == monitor._at.failures
     monitor._obey("a")
     assert failure not in seen(monitor)
     assert "q quit" in seen(monitor)
-    assert list(monitor.left_open()) == []
+    assert monitor.await_stops() == []
 
 
 def test_all_lines_stand_in_what_a_stop_of_all_came_to(
@@ -447,7 +452,9 @@ def test_a_stop_that_fails_in_any_way_is_seen(
     assert f"stopping drive-1 failed: {words}" in seen(monitor)
 
 
-def test_leaving_under_a_stop_needs_a_yes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_leaving_under_a_stop_needs_a_yes_and_waits_for_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     monitor, _ = a_monitor(tmp_path, monkeypatch)
     stands = threading.Event()
     del monitor._begin  # in a thread, as it is
@@ -455,14 +462,15 @@ def test_leaving_under_a_stop_needs_a_yes(tmp_path: Path, monkeypatch: pytest.Mo
     for key in ("s", "y", "q", "n"):
         monitor._obey(key)
         assert not monitor._has_left
-    assert list(monitor.left_open()) == ["a stop was under way and is not waited for: look at the motors"]
     for key in ("q", "y"):
         monitor._obey(key)
     assert monitor._has_left
-    stands.set()
-    for thread in monitor._stops:
-        thread.join()
-    assert list(monitor.left_open()) == []
+    monitor._session = monitor._session._replace(hand_out=stands.set)  # what is polled meanwhile is recorded
+    assert monitor.await_stops() == []
+    assert not any(thread.is_alive() for thread in monitor._stops)
+    assert "a stop is under way, and is waited for" in capsys.readouterr().err
+    assert monitor.await_stops() == []
+    assert capsys.readouterr().err == ""
 
 
 def test_page_keys_scroll_a_page_and_choose_in_the_overview(
@@ -488,6 +496,17 @@ def test_no_key_does_more_than_stop(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 
 
 # ---- on a terminal ----
+
+
+def test_a_terminal_that_is_gone_is_not_read_again_and_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its reads end at once, with nothing or a failure; no signal need come."""
+    fd, slave = os.openpty()
+    with open(slave) as stdin:  # noqa: PTH123 (it is no path)
+        monkeypatch.setattr(sys, "stdin", stdin)
+        with monitor_keys.keys() as wait_for_key:
+            os.close(fd)
+            with pytest.raises(OSError):  # noqa: PT011 (in the system's words)
+                wait_for_key(PATIENCE)
 
 
 def await_both(terminal: Terminal) -> None:

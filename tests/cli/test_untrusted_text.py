@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import logging
 import struct
 import subprocess
 from pathlib import Path
@@ -17,6 +18,7 @@ from tables import table
 from terminals import MULTIDROP
 
 import multidrop.cli
+from multidrop.cli.serve import _logging
 from multidrop.core import Framing, Message
 from multidrop.plant.loader import PlantError, load_plant
 from multidrop.printable import printable
@@ -34,6 +36,17 @@ def test_what_prints_stays_as_it_is() -> None:
     assert printable("pump-1 насос 泵 é '\"\\") == "pump-1 насос 泵 é '\"\\"
     assert printable("\x1b[2J") == r"\x1b[2J"
     assert all(printable(trap).isprintable() for trap in TRAPS)
+
+
+@pytest.mark.parametrize("form", ["text", "json"])
+def test_a_gateway_s_log_has_one_line_for_whoever_asks(capsys: pytest.CaptureFixture[str], form: str) -> None:
+    """A caller's address may be told by a proxy, and a drive's name by a topic of MQTT."""
+    with _logging(form, logging.INFO):
+        logging.getLogger("multidrop.gateway").warning("stop of %s, asked for by %s", TRAP, "anna")
+    (line,) = capsys.readouterr().err.removesuffix("\n").split("\n")
+    assert "asked for by anna" in line
+    assert not set(line) & {"\x1b", "\r", "\0"}
+    assert form == "json" or line.isprintable()
 
 
 @pytest.mark.parametrize("trap", TRAPS)

@@ -15,6 +15,7 @@ from simulated_bus import SimulatedBus, one
 from multidrop.control.audit_log import read_audit
 from multidrop.control.author import written_by
 from multidrop.control.ramp import start_staggered
+from multidrop.drive import Condition
 from multidrop.drives import InvtCHE
 from multidrop.drives.invt_che import CHEControl
 from multidrop.errors import BusError, Unconfirmed
@@ -117,14 +118,56 @@ def test_the_innermost_block_counts_and_ends(audited: Audited) -> None:
     assert [(by, way) for _, by, way in audited.noted()] == [("boris", None), ("anna", "web")]
 
 
-@pytest.mark.parametrize("who", ["", "  ", "a\nb", "\x1b[2J", "x" * 201])
-def test_a_name_that_would_spoil_the_log_is_refused(audited: Audited, who: str) -> None:
-    with pytest.raises(ValueError, match="is not 1 to 200 printable characters"), written_by(who):
-        audited.drive.set_frequency(20)
-    way: Any = 7
-    with pytest.raises(TypeError, match="way = 7 is no text"), written_by("anna", way):
-        audited.drive.set_frequency(20)
-    assert audited.line.written == []
+class Nameless:
+    """An object that cannot be shown."""
+
+    def __repr__(self) -> str:
+        raise ZeroDivisionError
+
+
+NAMES: list[tuple[Any, str | None]] = [  # and as it is noted of a stop
+    ("", None),
+    ("  ", None),
+    ("a\nb", r"a\nb"),
+    ("\x1b[2J", r"\x1b[2J"),
+    ("\ud800", r"\ud800"),
+    ("x" * 201, "x" * 200),
+    (7, "7"),
+    (None, "None"),
+    (Nameless(), "Nameless"),
+]
+
+
+@pytest.mark.parametrize(("who", "noted"), NAMES, ids=range(len(NAMES)))
+@pytest.mark.parametrize("is_way", [False, True])
+def test_under_a_name_that_would_spoil_the_log_a_stop_alone_is_sent(
+    audited: Audited, who: Any, noted: str | None, is_way: bool
+) -> None:
+    bus, drive = audited.bus, audited.drive
+    if is_way and who == "":
+        return  # no way
+    drive.set_frequency(30)
+    with written_by(*(("anna", who) if is_way else (who, "web"))):
+        for call in (
+            lambda: drive.set_frequency(20),
+            drive.start,
+            lambda: bus.raw(drive, 6, 0x1000, b"\0\5"),
+            lambda: bus.write(drive, drive.setpoint, 20.0),
+            lambda: start_staggered([drive], gap=1.0),
+        ):
+            before = len(audited.noted())
+            with pytest.raises((TypeError, ValueError), match=r"is no text|is not 1 to 200 printable"):
+                call()
+            assert {write for write, *_ in audited.noted()[before:]} <= {"control = STOP"}
+        before = len(audited.noted())
+        drive.stop()
+        bus.stop_all()
+        bus.broadcast(drive.control, CHEControl.STOP)
+        bus.write(drive, drive.control, CHEControl.STOP)
+        assert drive.state().condition is Condition.STOPPED
+    stops = audited.noted()[before:]
+    assert len(stops) == 4
+    assert set(stops) == {("control = STOP", *(("anna", noted) if is_way else (noted, "web")))}
 
 
 def test_a_log_from_before_is_read(audited: Audited) -> None:

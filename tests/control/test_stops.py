@@ -6,6 +6,7 @@ import logging
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
+from decimal import Decimal
 from itertools import pairwise
 from pathlib import Path
 from time import sleep
@@ -38,6 +39,7 @@ from multidrop.errors import (
     Unconfirmed,
 )
 from multidrop.sim import simulated
+from multidrop.transport.aside_log import flush
 
 every_family = pytest.mark.parametrize("model", MAKE)
 
@@ -449,12 +451,52 @@ def test_a_stop_gives_up_when_its_caller_says_so_and_tells_what_is_known(
     with pytest.raises(Unconfirmed):
         drive.stop(seconds=0)  # once, and no more
     assert len(writes(line)) == sent + 1
-    wrong: Any
-    for wrong in (-1, float("nan"), True, "5", [5]):
-        with pytest.raises(ValueError, match="no time that a stop may take"):
-            drive.stop(seconds=wrong)
-        with pytest.raises(ValueError, match="no time that a stop may take"):
-            line.bus.stop_all(seconds=wrong)
+
+
+class Unfit(int):
+    """A number of a caller's own that does not compare."""
+
+    def __ge__(self, other: object) -> bool:
+        raise ZeroDivisionError
+
+
+SENSELESS = [-1, float("nan"), float("-inf"), Decimal("sNaN"), True, "5", [5], 5j, Unfit(5)]
+
+
+@pytest.mark.parametrize("seconds", SENSELESS, ids=map(repr, SENSELESS))
+@pytest.mark.parametrize("stops", ["stop", "coast", "stop_all"])
+def test_a_stop_with_a_senseless_time_is_sent_as_one_without_and_says_so(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, stops: str, seconds: Any
+) -> None:
+    line, drive, sim = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
+    drive.set_frequency(50)
+    drive.start()
+    line.sleep(20)
+    deaf_until = line.seconds + LEAST_S - 5
+    line.deafens = lambda request: line.seconds < deaf_until
+    if stops == "stop_all":
+        assert line.bus.stop_all(seconds=seconds)[drive.name].seen is Seen.STOPPED
+    else:
+        getattr(drive, stops)(seconds=seconds)
+    assert not sim.motor.energised
+    flush(60)
+    assert "is no time for a stop: it is repeated for 30 s at least, as without one" in caplog.text
+
+
+def test_a_stop_that_is_called_wrongly_is_sent_before_it_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    line, drive, sim = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
+    stop: Any = drive.stop
+    for wrong, options in (((5,), {}), ((), {"second": 5}), ((drive, 1), {"seconds": -1})):
+        drive.set_frequency(50)
+        drive.start()
+        line.sleep(20)
+        with pytest.raises(TypeError, match="argument") as failure:
+            stop(*wrong, **options)
+        assert "stop of invt-che@1 was sent all the same" in "".join(failure.value.__notes__)
+        assert not sim.motor.energised
+    drive.start()
+    line.bus.stop_all(60)
+    assert not sim.motor.energised
 
 
 def test_stop_all_takes_seconds_too(monkeypatch: pytest.MonkeyPatch) -> None:

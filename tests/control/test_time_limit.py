@@ -140,6 +140,12 @@ def test_the_limit_is_asked_for_when_a_stop_would_end_the_call(line: SimulatedBu
 
 
 @table("limit", [0.5, True, "1", None])
-def test_what_is_no_function_is_refused(limit: Any) -> None:
-    with pytest.raises(TypeError, match=r"is no function that returns a time"), written_before(limit):
-        pass
+def test_under_what_is_no_function_a_stop_alone_is_sent(monkeypatch: pytest.MonkeyPatch, limit: Any) -> None:
+    line, drive, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
+    with written_before(limit):
+        for call in (lambda: drive.set_frequency(20), drive.start):
+            with pytest.raises(TypeError, match=r"is no function that returns a time"):
+                call()
+        assert not written(line)
+        drive.stop()
+    assert len(written(line)) == 1

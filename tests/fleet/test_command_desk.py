@@ -11,6 +11,7 @@ from typing import Any
 
 import pytest
 from command_desks import LINE, PATIENCE_S, Desks, desks
+from lines import patient
 from peers import require_module
 from tables import table
 
@@ -34,6 +35,8 @@ DONE, REFUSED, NOT_SENT, UNKNOWN = (
     CommandOutcome.UNKNOWN,
 )
 SETPOINT = "frequency"
+
+pytestmark = patient  # a stop whose reply is late is sent again, and the writes are counted here
 
 
 @pytest.fixture
@@ -381,11 +384,76 @@ def test_hostile_words_are_refused_in_one_sentence(desk: Desks, data: bytes) -> 
     assert desk.writes == []
 
 
-@pytest.mark.parametrize("drives", [[], "pump", {"pump": 1}, [7], ["pump"] * 1001, 0])
-def test_a_stop_of_no_drives_is_refused(desk: Desks, drives: Any) -> None:
-    answer = asyncio.run(desk.stop(drives=drives))
+ODD_STOPS = [  # messages that any asker may send, or a network may spoil
+    b"",
+    b"\xff\xfe",
+    b"null",
+    b"[" * 100_000,
+    b"x" * 70_000,
+    b"{}",
+    *(
+        json.dumps({"id": "a", "by": "b", "drives": ["pump"]} | odd).encode()
+        for odd in (
+            {"id": 7},
+            {"id": ""},
+            {"id": None},
+            {"id": "a" * 201},
+            {"id": "\x1b[31m"},
+            {"id": ["a"]},
+            {"by": "\x1b[31m\nnobody"},
+            {"by": "\ud800"},
+            {"by": None},
+            {"by": " "},
+            {"by": 10**400},
+            {"by": "b" * 201},
+            {"by": {}},
+            {"drives": []},
+            {"drives": "pump"},
+            {"drives": {"pump": 1}},
+            {"drives": [7]},
+            {"drives": ["pump"] * 1001},
+            {"drives": 0},
+            {"drives": ["pump", "\ud800", "\x1b[31m"]},
+            {"seconds": -1, "more": [1]},
+        )
+    ),
+]
+
+
+@pytest.mark.parametrize("data", ODD_STOPS, ids=range(len(ODD_STOPS)))
+def test_a_stop_is_sent_whatever_is_wrong_with_its_words(
+    desk: Desks, data: bytes, caplog: pytest.LogCaptureFixture, tmp_path: Path
+) -> None:
+    """It is noted in words that can be printed, and one that names no drives stops all of the line."""
+    answer = asyncio.run(desk.stop_by(data))
     assert answer is not None
-    assert answer.outcome is REFUSED
+    assert answer.drives["pump"].outcome is DONE
+    assert [name for name, _ in desk.writes] == ["control"]
+    assert all(record.getMessage().isprintable() for record in caplog.records)
+    begun, over = desk.notes
+    assert (begun["step"], over["step"]) == ("begun", "over")
+    assert begun["by"]
+    assert "".join((begun["by"], begun["id"], *begun["drives"])).isprintable()
+    [frame] = read_audit(tmp_path / "audit.jsonl")
+    assert frame["by"] == begun["by"]
+
+
+@table(
+    ("first", "then"),
+    [
+        ({"id": "\x1b"}, {"id": r"\x1b"}),
+        ({"id": "a" * 201}, {"id": "a" * 202}),
+        ({}, {}),
+        ({"id": "one", "drives": ["fan"]}, {"id": "one", "drives": ["pump"]}),
+    ],
+)
+def test_a_stop_that_is_no_copy_is_another_stop(
+    desk: Desks, first: dict[str, Any], then: dict[str, Any]
+) -> None:
+    asyncio.run(desk.stop_by(json.dumps(first).encode()))
+    before = len(desk.writes)
+    asyncio.run(desk.stop_by(json.dumps(then).encode()))
+    assert len(desk.writes) == before + 1
 
 
 def test_a_stop_of_an_unknown_drive_says_so_and_stops_the_others(desk: Desks) -> None:

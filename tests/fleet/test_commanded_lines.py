@@ -4,18 +4,21 @@ from __future__ import annotations
 
 import asyncio
 import json
+import threading
+import unittest.mock
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
-from command_desks import LINE, MAY, desks
+from command_desks import LINE, MAY, PATIENCE_S, desks
 from peers import require_module
 
 require_module("nats")
 
-from multidrop.fleet import names  # noqa: E402
+from multidrop.fleet import command_desk, names  # noqa: E402
 from multidrop.fleet.command_subjects import CommandedLines, CommandSubjects  # noqa: E402
+from multidrop.fleet.command_words import CommandAnswer, CommandOutcome  # noqa: E402
 
 
 class HeardPath:
@@ -50,11 +53,13 @@ class SlowLines:
 
     def __init__(self) -> None:
         self.closes = asyncio.Event()
+        self.is_going = False
 
     async def take(self, line: str, description: Any) -> None:
         """Nothing is to be opened."""
 
     async def let_go(self, line: str) -> None:
+        self.is_going = True
         await self.closes.wait()
 
 
@@ -87,6 +92,51 @@ def test_a_line_that_is_let_go_answers_for_its_stops_until_it_is_closed(tmp_path
         assert [name for name, _ in made.writes] == ["control"]
 
     with desks(tmp_path) as made:
+        asyncio.run(main())
+
+
+@pytest.mark.parametrize("may_wait", [True, False])
+def test_a_command_under_way_is_waited_for_where_the_lease_leaves_time(
+    tmp_path: Path, may_wait: bool
+) -> None:
+    """Its asker is told what came of it; else the line's end cuts its answer off."""
+    begun, go_on = threading.Event(), threading.Event()
+
+    async def main() -> None:
+        lines = SlowLines()
+        lines.closes.set()
+        subjects = CommandSubjects("gw-1", [HeardPath()], made.lines, made.log)  # type: ignore[list-item]
+        subjects.desk = made.desk
+        commanded = CommandedLines(lines, subjects, lambda: may_wait)  # type: ignore[arg-type]
+        await commanded.take(LINE, {"may": MAY})
+        first, second = made.offered(20.0), made.offered(30.0)
+        offer = made.desk.offers.find(first)
+        assert offer is not None
+        work = offer.prepared.work
+
+        def held_up() -> CommandAnswer:
+            begun.set()
+            assert go_on.wait(PATIENCE_S)
+            return work()
+
+        offer.prepared = offer.prepared._replace(work=held_up)
+        doing = asyncio.create_task(made.do(first))
+        await asyncio.to_thread(begun.wait, PATIENCE_S)
+        going = asyncio.create_task(commanded.let_go(LINE))
+        for _ in range(10):
+            await asyncio.sleep(0.002)
+        assert lines.is_going is not may_wait
+        assert (await made.do(second)).outcome is CommandOutcome.NOT_SENT  # nothing begins any more
+        go_on.set()
+        assert (await doing).outcome is CommandOutcome.DONE
+        await going
+        assert lines.is_going
+        assert [raw for name, raw in made.writes if name == "frequency"] == [2000]
+
+    with (
+        desks(tmp_path) as made,
+        unittest.mock.patch.object(command_desk, "AWAITED_S", PATIENCE_S),
+    ):
         asyncio.run(main())
 
 

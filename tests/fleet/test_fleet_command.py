@@ -169,11 +169,16 @@ def test_a_list_with_a_mistake(run: Run, nobody: str, tmp_path: Path, lists: str
         (["set-frequency", "pump-1", "fast"], "HZ = fast is no number; write 25"),
         (["stop"], "stop takes either drives or --all"),
         (["stop", "pump-1", "--all"], "stop takes either drives or --all"),
-        (["stop", "pump-1", "--by", "\x1b[31m"], "is not 1 to 200 printable characters"),
+        (["reset-fault", "pump-1", "--by", "\x1b[31m"], "is not 1 to 200 printable characters"),
     ],
 )
 def test_a_mistaken_call(run: Run, words: list[str], sentence: str) -> None:
     assert sentence in one_sentence(run("fleet", *words))
+
+
+def test_no_name_keeps_a_stop_back(run: Run, nobody: str) -> None:
+    _, _, said = run("fleet", "stop", "pump-1", "--by", "\x1b[31m" + "x" * 300, "--nats", nobody)
+    assert "the stop was NOT sent: no NATS server answers" in said
 
 
 @pytest.mark.parametrize("library", ["nats", "pyarrow"])

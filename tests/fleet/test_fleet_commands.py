@@ -344,6 +344,21 @@ def test_a_stop_finds_its_drive_by_another_spelling_and_a_command_does_not(tmp_p
     assert path.asked == ["stop"]
 
 
+@pytest.mark.parametrize(
+    ("by", "noted"), [("\x1b[31m", r"\x1b[31m"), ("\ud800", r"\ud800"), ("", "somebody"), (None, "somebody")]
+)
+def test_a_stop_is_sent_whatever_its_asker_calls_himself(tmp_path: Path, by: Any, noted: str) -> None:
+    path = ScriptedPath(stop=[IT_IS_DONE])
+
+    async def stopped(asker: FleetCommands) -> CommandAnswer:
+        asker.by = by
+        return await asker.stop("pump-1")  # for ["pump-1"]: a text is a list of letters too
+
+    assert asked(tmp_path, path, stopped).outcome is DONE
+    assert path.asked == ["stop"]
+    assert {note["by"] for note in read_audit(tmp_path / "asked.jsonl")} == {noted}
+
+
 @pytest.mark.parametrize("what", [write, lambda asker: asker.stop(["pump-1"])])
 def test_a_plant_that_cannot_be_read(tmp_path: Path, what: Any) -> None:
     with pytest.raises(FleetError, match="no server"):

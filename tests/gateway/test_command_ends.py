@@ -36,8 +36,8 @@ class UnopenedLines:
         return self.plant
 
     @property
-    def is_settled(self) -> bool:
-        return True  # nothing is reloaded
+    def plant_coming(self) -> None:
+        return None  # nothing is reloaded
 
 
 @table(

@@ -115,6 +115,17 @@ def test_a_drive_to_stop_may_be_named_without_a_list(tmp_path: Path) -> None:
         assert not stands(gateway, "pump-2")
 
 
+def test_a_stop_of_strange_names_stops_the_drives_that_are_there_and_tells_of_each(tmp_path: Path) -> None:
+    """Half a character, a terminal's escape, and another drive's name in capitals."""
+    names = ["pump-1", "\ud800", "\x1b[2J\n", "PUMP-2", ""]
+    with served(tmp_path, MAY) as gateway:
+        start(gateway, "pump-1")
+        told = gateway.request("POST", "/api/stop", {"drives": names}).json
+        assert stands(gateway, "pump-1")
+    assert [name for name, one in told.items() if one["done"]] == ["pump-1"]
+    assert [*told] == names
+
+
 @pytest.mark.parametrize("verb", ["stop", "coast"])
 @pytest.mark.parametrize("options", [None, [], "now", {"direction": "forward"}])
 def test_no_options_keep_a_stop_by_a_verb_back(tmp_path: Path, verb: str, options: object) -> None:

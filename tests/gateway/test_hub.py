@@ -78,13 +78,14 @@ def test_a_state_is_what_the_family_makes_of_its_registers(
 ) -> None:
     hub.take(all_of(10, status, frequency))
     assert hub.state("pump-1") == state
-    assert hub.fault("pump-1") is None
+    assert hub.seen("pump-1").fault is None
 
 
 def test_a_fault_has_the_drives_words(hub: Hub) -> None:
     hub.take(all_of(10, TRIPPED, fault=4))
     assert hub.state("pump-1") == "fault"
-    assert hub.fault("pump-1") == "OC1_OVERCURRENT_ACCELERATING"
+    assert hub.seen("pump-1").fault == "OC1_OVERCURRENT_ACCELERATING"
+    assert hub.seen("pump-1").why_silent is None
     assert hub.state("pump-2") == "unknown"
 
 
@@ -96,6 +97,8 @@ def test_one_lost_reply_is_no_silence_and_many_are(hub: Hub) -> None:
     hub.take(rows(*((21, register, Status.NO_REPLY) for register in range(4))))
     hub.take(rows(*((22, register, Status.NOT_ASKED) for register in range(4))))
     assert hub.seen("pump-1") == Shown("silent", "not asked: drive is silent")
+    assert hub.seen("pump-1").why_silent == "not asked: drive is silent"
+    assert hub.seen("pump-1").fault is None
     assert hub.seen_at("pump-1") == UTC_0 + 10 * PERIOD
     hub.take(all_of(23, STANDBY))
     assert hub.state("pump-1") == "stands"

@@ -50,8 +50,8 @@ class Lines(NamedTuple):
         return self.plant
 
     @property
-    def is_settled(self) -> bool:
-        return True  # nothing is reloaded
+    def plant_coming(self) -> None:
+        return None  # nothing is reloaded
 
     async def ask(self, drive: str, function: int, start: int, count: int, expiry: float) -> list[int]:
         line, known = self.plant.find_drive(drive)

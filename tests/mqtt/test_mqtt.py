@@ -208,6 +208,28 @@ def test_a_stop_is_always_carried_out(broker: Broker, listener: Listener, start:
     assert known.commands.noted[-3:] == [("stop", ["pump-1"]), ("stop", None), ("stop", [FAN.name])]
 
 
+@pytest.mark.parametrize(
+    ("topic", "payload", "stopped"),
+    [
+        ("pump-1/stop", b"x" * 70_000, ["pump-1"]),
+        ("stop", b"\xff" * 70_000, None),
+        ("pump-1/act", b'{"verb": "stop", "drive": "pump-1", "time": 17', ["pump-1"]),
+        ("pump-1/act", b'{"verb": "coast", "note": "' + b"x" * 70_000 + b'"}', ["pump-1"]),
+        ("pump-1/act", b'["emergency_stop", "\xff"]', ["pump-1"]),
+    ],
+    ids=range(5),
+)
+def test_no_payload_keeps_a_stop_back(
+    broker: Broker, listener: Listener, start: Start, topic: str, payload: bytes, stopped: list[str] | None
+) -> None:
+    """Neither one of any length, nor one that was cut off or is no text."""
+    known, _ = start(commands=True)
+    listener.wait_for(has("multidrop/gateway", b"online"))
+    publish(broker, f"multidrop/{topic}", payload)
+    assert told(listener)["what"] == "stop"
+    assert known.commands.noted == [("stop", stopped)]
+
+
 @pytest.mark.parametrize("verb", ["coast", "emergency_stop", "stop"])
 @pytest.mark.parametrize(
     "more",
@@ -354,6 +376,7 @@ def test_a_verb_names_its_drive_again(broker: Broker, listener: Listener, start:
         (b'{"value": 25, "time": "1"}', "time is no whole number of ms"),
         (b"\xc3\x28", "codec"),
         (b"[" * 60_000, "nested too deeply"),
+        (b'{"value": 25, "time": 1}' + b" " * 70_000, "it has 70024 bytes"),
     ],
 )
 def test_what_is_no_command_is_told(

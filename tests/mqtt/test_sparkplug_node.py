@@ -11,10 +11,12 @@ from typing import Any
 import pytest
 from brokers import FAN, Broker, Running, inside, mosquitto, without_fan
 from peers import require_module
+from profile_families import VfdEl
 from sparkplug_host import ROOT, Host, command
 
 from multidrop.gateway.mqtt import MqttSettings, build
 from multidrop.gateway.outbox import Outbox, Publication
+from multidrop.gateway.sparkplug import read_command
 from multidrop.gateway.sparkplug_node import SparkplugNode
 
 
@@ -65,6 +67,15 @@ def test_births_data_and_deaths(host: Host, node: tuple[Any, Running]) -> None:
     running.step()
     born = host.values(host.wait_for("DBIRTH", FAN.name))
     assert (born["state"], born["fault"]) == ("fault", "перегрев")
+
+
+def test_a_fault_in_words_is_said_of_a_drive_whose_own_number_of_it_is_not_polled(tmp_path: Path) -> None:
+    """Its register called `fault` is a number without names."""
+    known = inside(tmp_path, VfdEl(2, name="mill"))
+    known.hub.states["mill"], known.hub.faults["mill"] = "fault", "it shows a fault"
+    node = SparkplugNode(MqttSettings(sparkplug="works", node="line"), known, lambda: 7)
+    (birth,) = [given for given in read_command(node._device_birth("mill"))[1] if given.name == "fault"]
+    assert birth.value == "it shows a fault"
 
 
 def test_what_did_not_change_is_not_said(host: Host, node: tuple[Any, Running]) -> None:

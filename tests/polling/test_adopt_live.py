@@ -301,6 +301,49 @@ def test_no_drive_is_off_its_line_while_another_is_waited_for(
         assert not {pump_1, pump_2} & {*bus.drives}
 
 
+@pytest.mark.parametrize("is_circle", [False, True])
+def test_a_drive_is_on_its_line_until_the_next_one_may_have_its_name(
+    both: TwoLines, monkeypatch: pytest.MonkeyPatch, is_circle: bool
+) -> None:
+    """Its motor can be stopped while a stop on another line, from which that name goes, is waited for."""
+    hall, yard = both.hall(1), both.yard(1)
+    names = ("fan-1", "pump-1" if is_circle else "fan-2")
+    anew = [
+        line(each.port, quick(name, 1), name=each.name)
+        for each, name in zip((hall, yard), names, strict=True)
+    ]
+    with Poller(plant(hall, yard)) as poller:
+        (pump,), (fan,) = (poller.bus(name).drives for name in ("hall", "yard"))
+        pump.start()
+        bus = poller.bus("yard")
+        begun, go_on = _held_up(bus, monkeypatch)
+        stopping = threading.Thread(target=fan.stop)
+        stopping.start()
+        assert begun.wait(PATIENCE)
+        is_waited_for, await_stops = threading.Event(), bus._latches.await_stops
+
+        def tell_and_wait(drives: Collection[Drive] | None = None) -> None:
+            is_waited_for.set()
+            await_stops(drives)
+
+        monkeypatch.setattr(bus._latches, "await_stops", tell_and_wait)
+        adopting = threading.Thread(target=poller.adopt, args=[plant(*anew)])
+        adopting.start()
+        try:
+            assert is_waited_for.wait(PATIENCE)
+            assert poller.bus("hall").drives == [pump]
+            pump.stop()
+            assert not runs(both.pumps[1])
+        finally:
+            go_on.set()
+            stopping.join(PATIENCE)
+            adopting.join(PATIENCE)
+        found = [drive.name for name in ("hall", "yard") for drive in poller.bus(name).drives]
+        assert found == list(names)
+        for name in names:
+            until(lambda name=name: samples(poller, name) > 3)  # type: ignore[misc]
+
+
 def test_a_stop_on_a_line_that_goes_holds_no_other_line_up(
     both: TwoLines, monkeypatch: pytest.MonkeyPatch
 ) -> None:

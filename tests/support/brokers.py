@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 
 from peers import require_module, require_program
 
-from multidrop import InvtCHE, Plant, PlantLine, Polled, PolledDrive
+from multidrop import Drive, InvtCHE, Plant, PlantLine, Polled, PolledDrive
 from multidrop.gateway.commands import Told
 from multidrop.gateway.hub import Shown
 from multidrop.gateway.kept_rows import Known
@@ -220,11 +220,8 @@ class SaidHub:
     def state(self, drive: str) -> str:
         return self.states[drive]
 
-    def fault(self, drive: str) -> str | None:
-        return self.faults.get(drive)
-
     def seen(self, drive: str) -> Shown:
-        return Shown(self.state(drive), self.fault(drive))
+        return Shown(self.state(drive), self.faults.get(drive))
 
 
 class NotedCommands:
@@ -252,7 +249,7 @@ class NotedCommands:
         return Told(True, "done")
 
 
-def inside(folder: Path, fan: InvtCHE = FAN) -> Any:
+def inside(folder: Path, fan: Drive = FAN) -> Any:
     """Return what a part is given: two drives, a hub and commands of this test."""
     polls = tuple(Polled(register, 1.0) for register in (PUMP.output_frequency, PUMP.status))
     drives = tuple(PolledDrive(drive, polls) for drive in (PUMP, fan))

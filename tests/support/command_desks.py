@@ -96,7 +96,11 @@ class Desks:
         return answer
 
     async def stop(self, **what: Any) -> CommandAnswer | None:
-        data = json.dumps({"id": f"id-{next(_ids)}", "by": "anna", "drives": ["pump"], **what}).encode()
+        what = {"id": f"id-{next(_ids)}", "by": "anna", "drives": ["pump"], **what}
+        return await self.stop_by(json.dumps(what).encode())
+
+    async def stop_by(self, data: bytes) -> CommandAnswer | None:
+        """Return what becomes of a stop that is asked for by this message."""
         answer = await self.stops.stop(LINE, data)
         while answer is not None and answer.outcome is CommandOutcome.UNDER_WAY:
             answer = await self.stops.stop(LINE, data)

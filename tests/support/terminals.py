@@ -7,6 +7,7 @@ import os
 import pty
 import re
 import select
+import signal
 import struct
 import subprocess
 import termios
@@ -26,10 +27,12 @@ class Terminal:
         self.before = termios.tcgetattr(slave)
         self.slave = slave
         clean = {name: text for name, text in os.environ.items() if name not in ("COLUMNS", "LINES")}
-        self.process = subprocess.Popen(
-            words, stdin=slave, stdout=slave, stderr=slave, env=clean | {"TERM": "xterm"} | environment
-        )
+        self.process = self._begin(words, clean | {"TERM": "xterm"} | environment)
         self.written = b""
+
+    def _begin(self, words: list[str], environment: dict[str, str]) -> subprocess.Popen[bytes]:
+        slave = self.slave
+        return subprocess.Popen(words, stdin=slave, stdout=slave, stderr=slave, env=environment)
 
     def wait_for(self, text: str, seconds: float = 60) -> None:
         self.wait_for_match(re.escape(text), seconds)
@@ -48,6 +51,43 @@ class Terminal:
     def press(self, keys: bytes) -> None:
         self.written = b""
         os.write(self.fd, keys)
+
+
+class ClosingTerminal(Terminal):
+    """The terminal of a session of its own, which is hung up when it is closed."""
+
+    def _begin(self, words: list[str], environment: dict[str, str]) -> subprocess.Popen[bytes]:
+        slave = self.slave
+
+        def take_terminal() -> None:
+            signal.signal(signal.SIGHUP, signal.SIG_DFL)  # whatever the tests were begun with
+            fcntl.ioctl(slave, termios.TIOCSCTTY, 0)
+
+        process = subprocess.Popen(
+            words,
+            stdin=slave,
+            stdout=slave,
+            stderr=slave,
+            env=environment,
+            start_new_session=True,
+            preexec_fn=take_terminal,
+        )
+        os.close(slave)
+        return process
+
+    def close(self) -> None:
+        os.close(self.fd)
+
+
+@contextmanager
+def closing_terminal(*words: object, size: tuple[int, int] = (80, 24)) -> Iterator[ClosingTerminal]:
+    """Give a terminal that the test closes."""
+    terminal = ClosingTerminal([*MULTIDROP, *map(str, words)], size)
+    try:
+        yield terminal
+    finally:
+        terminal.process.kill()
+        terminal.process.wait()
 
 
 @contextmanager

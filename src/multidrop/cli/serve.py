@@ -28,6 +28,7 @@ from multidrop.drive.named_verbs import verbs_of
 from multidrop.drives import MODELS
 from multidrop.plant.loader import load_plant
 from multidrop.plant.model import Plant
+from multidrop.printable import printable
 
 if TYPE_CHECKING:
     from multidrop.gateway.reload import Read
@@ -191,10 +192,10 @@ class _JsonFormatter(logging.Formatter):
 
 
 class _TextFormatter(logging.Formatter):
-    """Time, level and message on a line; a traceback below it."""
+    """Time, level and message on a line, whoever's names are in it; a traceback below it."""
 
     def format(self, record: logging.LogRecord) -> str:
-        text = f"{_time(record)} {record.levelname.lower()} {record.getMessage()}"
+        text = f"{_time(record)} {record.levelname.lower()} {printable(record.getMessage())}"
         return f"{text}\n{self.formatException(record.exc_info)}" if record.exc_info else text
 
 

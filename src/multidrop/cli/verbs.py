@@ -15,6 +15,7 @@ from multidrop.cli.support.signals import outliving_the_terminal
 from multidrop.cli.support.target import Target, add_target_arguments, check_words, number_of, target_of
 from multidrop.cli.support.values import as_json, nearest_value
 from multidrop.control.audit_log import AuditLog
+from multidrop.control.stop_attempt import LEAST_S
 from multidrop.drive.family import Drive
 from multidrop.drive.script import Script, Write
 from multidrop.drive.state import Direction, State
@@ -47,12 +48,21 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         parser.add_argument(
             "--seconds",
             metavar="S",
-            type=duration,
+            type=_stop_time,
             help="repeat it for so long until the motor stands; for 30 s at least if not given",
         )
     if command != "state":
         add_writing_arguments(parser, asks=command in _QUESTIONS)
     add_json_argument(parser)
+
+
+def _stop_time(text: str) -> float | None:
+    """Parse a number of seconds above 0; what is none is told, and keeps no stop back."""
+    try:
+        return duration(text)
+    except argparse.ArgumentTypeError as mistake:
+        warn(f"--seconds: {mistake}: the stop is repeated for {LEAST_S:g} s at least, as without it")
+        return None
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -25,7 +25,7 @@ class AuditLog:
     def add(self, utc_ns: int, record: dict[str, Any]) -> None:
         """Append a record. Raises OSError, also when there was room for a part of it only."""
         line = json.dumps({"time": format_time(utc_ns), **record}, ensure_ascii=False)
-        whole = (b"\n" if self._is_truncated() else b"") + line.encode() + b"\n"
+        whole = (b"\n" if self._is_truncated() else b"") + line.encode(errors="backslashreplace") + b"\n"
         if self._file.write(whole) < len(whole):
             raise OSError(f"{self.path}: there was room for a part of a record only")
 

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from typing import Any, cast
 
+from multidrop.control.author import check_author
 from multidrop.control.latches import Latches
 from multidrop.control.performer import Performer
 from multidrop.control.rules import check_broadcast, is_harmless, is_stop, raw_count
@@ -58,6 +59,8 @@ class Broadcaster:
             self._performer.check_identity(drive)
         if is_harmless(register, raw):
             self._latches.rise(drives)
+        else:
+            check_author()
         try:
             self._writer.broadcast(first, register, raw)
         finally:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from decimal import Decimal
 from functools import partial
 from math import inf
@@ -16,15 +16,17 @@ from typing import Any
 
 from multidrop.control.latches import Latches
 from multidrop.control.outcome import Outcome, Stopped
-from multidrop.control.stop_attempt import Do, StopAttempt
+from multidrop.control.stop_attempt import LEAST_S, NO_ROOM, PAUSE_S, Do, StopAttempt
 from multidrop.control.writer import Writer
 from multidrop.drive.family import Drive
 from multidrop.drive.script import Read, Script, Step, Write
 from multidrop.errors import CheckAgain
 from multidrop.transport import clock
+from multidrop.transport.aside_log import log_aside
 from multidrop.transport.exchange import WRITE_TIMEOUT, Exchanges
 
 REGAIN_NS = 500_000_000  # between attempts of stops to open a port that was lost
+BEGINNINGS = 150  # of a stop for which the system has no room
 
 _log = logging.getLogger("multidrop.control")
 
@@ -51,13 +53,15 @@ class Stopper:
     def stop(self, drive: Drive, make: Callable[[], Script[Any]], seconds: float | None) -> None:
         """Carry out a stop, again and again until the motor stands, for as long as `seconds` s.
 
-        Raises Unconfirmed when it is not seen to stand then, and says what is known.
+        It is sent whatever `seconds` may be. Raises Unconfirmed when it is not seen to stand then, and says
+        what is known.
         """
-        seconds = _checked(seconds)
-        self._latches.latch(drive)  # raises for one that is not on this bus
-        with self._under_way([drive]):
-            stop = StopAttempt(drive, make, _now(), seconds)
-            self._carry_out([stop], lambda stop: None)
+
+        def attempt() -> list[StopAttempt]:
+            self._latches.latch(drive)  # raises for one that is not on this bus
+            return [StopAttempt(drive, make, _now(), _limit(seconds))]
+
+        (stop,) = self._carry_out([drive], attempt, lambda: False, lambda stop: None)
         _log.info("%s", stop.result(_now()))
         if stop.known is not None:
             raise stop.known
@@ -69,40 +73,78 @@ class Stopper:
 
         `broadcast` is called before, and returns True where it has sent a stop to all of them.
         """
-        seconds = _checked(seconds)
         found: dict[str, Stopped] = {}
-        with self._under_way(drives):
-            begun = _now()
-            stops = [
-                StopAttempt(drive, drive.stop.script, begun, seconds, partial(self._ready, drive))
+
+        def attempts() -> list[StopAttempt]:
+            begun, limit = _now(), _limit(seconds)
+            return [
+                StopAttempt(drive, drive.stop.script, begun, limit, partial(self._ready, drive))
                 for drive in drives
             ]
-            try:
-                sent = broadcast()
-            except BaseException as interruption:
-                send_once_more(stops, self._do, interruption)
-                raise
-            for stop in stops if sent else ():
-                stop.note_broadcast()
 
-            def end(stop: StopAttempt) -> None:
-                found[stop.drive.name] = stop.result(_now())
+        def end(stop: StopAttempt) -> None:
+            found[stop.drive.name] = stop.result(_now())
 
-            self._carry_out(stops, end)
+        self._carry_out(drives, attempts, broadcast, end)
         for stopped in found.values():  # not before: a logger's handler may hang
             _log.info("%s", stopped)
         return found
 
-    def _carry_out(self, stops: Sequence[StopAttempt], end: Callable[[StopAttempt], object]) -> None:
-        def over(stop: StopAttempt) -> None:
-            self._stops.discard(stop)
-            end(stop)
+    def _carry_out(
+        self,
+        drives: Sequence[Drive],
+        attempts: Callable[[], list[StopAttempt]],
+        broadcast: Callable[[], bool],
+        end: Callable[[StopAttempt], object],
+    ) -> list[StopAttempt]:
+        """Make the attempts and carry them out; call `end` with each at its end, and return them.
 
+        Where the system has no room for them yet, it may have it soon. What interrupts their making comes
+        too late for nobody: each is sent once.
+        """
+        stops: list[StopAttempt] = []
+        for left in reversed(range(BEGINNINGS)):
+            try:
+                with self._under_way(drives):
+                    stops = attempts()
+                    self._carry_out_known(stops, [*stops], broadcast, end)
+                break
+            except NO_ROOM:
+                if stops or not left:
+                    raise
+                clock.sleep(PAUSE_S)
+            except (KeyboardInterrupt, SystemExit) as interruption:
+                if not stops:
+                    send_once_more(attempts(), self._do, interruption)
+                raise
+        return stops
+
+    def _carry_out_known(
+        self,
+        stops: Sequence[StopAttempt],
+        under_way: list[StopAttempt],
+        broadcast: Callable[[], bool],
+        end: Callable[[StopAttempt], object],
+    ) -> None:
+        """Carry these out, all of which are `under_way`.
+
+        At an interruption each stop that is not over is sent once more, unless a second one comes.
+        """
         try:
             self._stops.update(stops)
-            stop_together(stops, self._do, over)
+            if broadcast():
+                for stop in stops:
+                    stop.note_broadcast()
+            stop_together(under_way, self._do, partial(self._over, end))
+        except BaseException as interruption:
+            send_once_more(under_way, self._do, interruption)
+            raise
         finally:
             self._stops.difference_update(stops)
+
+    def _over(self, end: Callable[[StopAttempt], object], stop: StopAttempt) -> None:
+        self._stops.discard(stop)
+        end(stop)
 
     @contextmanager
     def _under_way(self, drives: Sequence[Drive]) -> Iterator[None]:
@@ -148,35 +190,36 @@ def _now() -> float:
     return clock.now_ns() / 1e9
 
 
-def _checked(seconds: float | None) -> float | None:
-    """Return it as a float, which adds to a time: numpy's short ones do not, nor does a Decimal."""
+def _limit(seconds: float | None) -> float | None:
+    """Return it as a float, which adds to a time: numpy's short ones do not, nor does a Decimal.
+
+    What is no time keeps no stop back: it is logged, and the stop is repeated as without one.
+    """
     if seconds is None:
         return None
-    if isinstance(seconds, (Real, Decimal)) and not isinstance(seconds, bool) and seconds >= 0:
-        try:
-            return float(seconds)
-        except OverflowError:
-            return inf
-    raise ValueError(f"seconds = {seconds!r} is no time that a stop may take: give 0 or more, or none")
+    with suppress(Exception):  # Decimal("sNaN") does not compare, and a caller's own number may do anything
+        if isinstance(seconds, (Real, Decimal)) and not isinstance(seconds, bool) and seconds >= 0:
+            try:
+                return float(seconds)
+            except OverflowError:
+                return inf
+    sentence = "seconds = %.100r is no time for a stop: it is repeated for %g s at least, as without one"
+    log_aside(_log, logging.WARNING, sentence, seconds, LEAST_S)
+    return None
 
 
-def stop_together(stops: Sequence[StopAttempt], do: Do, end: Callable[[StopAttempt], object]) -> None:
-    """Carry the stops out, a step of each in turn; call `end` with each at its end.
+def stop_together(under_way: list[StopAttempt], do: Do, end: Callable[[StopAttempt], object]) -> None:
+    """Carry the stops out, a step of each in turn.
 
-    At an interruption each stop that is not over is sent once more, unless a second one comes.
+    Each is taken from the list at its end, and `end` is called with it.
     """
-    under_way = list(stops)
-    try:
-        while under_way:
-            stop = min(under_way, key=_due)  # the one that is due for longest
-            under_way = [*(other for other in under_way if other is not stop), stop]  # never without it
-            clock.sleep(max(0.0, stop.due - _now()))
-            if stop.advance(do, _now):
-                under_way.remove(stop)
-                end(stop)
-    except BaseException as interruption:
-        send_once_more(under_way, do, interruption)
-        raise
+    while under_way:
+        stop = min(under_way, key=_due)  # the one that is due for longest
+        under_way[:] = [*(other for other in under_way if other is not stop), stop]  # never without it
+        clock.sleep(max(0.0, stop.due - _now()))
+        if stop.advance(do, _now):
+            under_way.remove(stop)
+            end(stop)
 
 
 def send_once_more(stops: Sequence[StopAttempt], do: Do, interruption: BaseException) -> None:

@@ -37,6 +37,12 @@ def checked_expiry(expiry: float, what: str) -> float:
     return expiry
 
 
+def _called(limit: Limit) -> float:
+    if not callable(limit):
+        raise TypeError(f"limit = {limit!r} is no function that returns a time of CLOCK_MONOTONIC in ns")
+    return limit()
+
+
 @contextmanager
 def written_before(limit: Limit) -> Iterator[None]:
     """Send nothing of a call within the block whose first write would leave after the time of `limit`.
@@ -46,13 +52,12 @@ def written_before(limit: Limit) -> Iterator[None]:
     return 0 from then on, misses none. A call that is too late sends nothing and raises Expired; time for
     which the machine sleeps within the block counts. The later writes of a verb have the bus's own `expiry`,
     and are not cut off. Stops are sent at any time. The block is that of this thread and what it calls, or of
-    this task of asyncio and `asyncio.to_thread`. Raises TypeError for what is no function.
+    this task of asyncio and `asyncio.to_thread`. With what is no function each call raises TypeError, but
+    for stops.
     """
-    if not callable(limit):
-        raise TypeError(f"limit = {limit!r} is no function that returns a time of CLOCK_MONOTONIC in ns")
     outer = _limit.get()
     slept_ns = clock.boottime_ns() - clock.now_ns()  # so far; read in this order, it is never too long
-    token = _limit.set(lambda: min(outer(), limit() + slept_ns))
+    token = _limit.set(lambda: min(outer(), _called(limit) + slept_ns))
     try:
         yield
     finally:

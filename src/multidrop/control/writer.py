@@ -7,6 +7,7 @@ from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import replace
 from typing import Any
 
+from multidrop.control.author import check_author
 from multidrop.control.call import Call
 from multidrop.control.echo_check import EchoCheck
 from multidrop.control.identity import IdentityCheck
@@ -52,6 +53,7 @@ class Writer:
 
     def put(self, drive: Drive, step: Write, call: Call) -> Outcome:
         """Write once, by all rules but that for plain writes. Raises Overtaken and Expired, by its call."""
+        check_author()
         register, value = step.register, step.value
         raw = raw_count(drive, register, value)
         asked = register.decode(raw)
@@ -98,6 +100,7 @@ class Writer:
 
     def raw(self, drive: Drive, request: Message, call: Call) -> bytes:
         """Send any request once, past every rule but its call's; return the data of the reply."""
+        check_author()
         frame = build_request(drive.framing, request)
         what = f"raw request {frame.hex(' ').upper()}"
         log = self.records.log

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from inspect import signature
 from numbers import Real
 from typing import TYPE_CHECKING, Any, Concatenate, Generic, ParamSpec, TypeVar, cast, overload
 
@@ -35,8 +36,9 @@ _TAKES: Mapping[str, tuple[str, tuple[type, ...], str]] = {
 class _BoundVerb(Generic[P, R]):
     """A verb of one drive; a call carries it out.
 
-    A stop takes `seconds`: it is repeated for so long until the motor is seen to stand; without it for 30 s
-    at least, and as long as the motor's ramp may take.
+    A stop takes `seconds`: it is repeated for so long until the motor is seen to stand; without it, or with
+    what is no time, for 30 s at least, and as long as the motor's ramp may take. One that is called with
+    arguments that it does not take is carried out before it raises TypeError.
     """
 
     def __init__(self, name: str, drive: Drive, script: Callable[..., Script[R]]) -> None:
@@ -51,6 +53,8 @@ class _BoundVerb(Generic[P, R]):
     def __call__(self, *args: Any, **kwargs: Any) -> R:
         if self.name in STOPPING:
             seconds = kwargs.pop("seconds", None)
+            if args or kwargs:
+                self._check_stop(seconds, args, kwargs)
             return cast(
                 R, self.drive.carry_out_stop(self.name, lambda: self.script(*args, **kwargs), seconds)
             )
@@ -59,6 +63,15 @@ class _BoundVerb(Generic[P, R]):
             self.drive.check_confirmed(self.name)
             return cast(R, self.drive.carry_out_move(script, self.drive.begin_call(self.name)))
         return cast(R, self.drive.perform(script))
+
+    def _check_stop(self, seconds: float | None, args: tuple[Any, ...], kwargs: dict[str, Any]) -> None:
+        """Raise TypeError for arguments that the stop does not take, once it was carried out without them."""
+        try:
+            signature(self._script).bind(self.drive, *args, **kwargs)
+        except TypeError as mistake:
+            mistake.add_note(f"{self.name} of {self.drive.name} was sent all the same, without them")
+            self.drive.carry_out_stop(self.name, lambda: self._script(self.drive), seconds)
+            raise
 
     def script(self, *args: P.args, **kwargs: P.kwargs) -> Script[R]:
         """Return the steps, for another verb or a test. Raises TypeError for a wrong argument."""

@@ -31,6 +31,8 @@ from multidrop.fleet.offers import Offer, Offers
 from multidrop.fleet.own_thread import in_own_thread
 
 HOLD_S = 0.5  # for which an answer waits for the end; after that it says "under way"
+AWAITED_S = 3.0  # by a line that is let go: a write and its reading back take less on most lines
+LOOK_S = 0.01
 MOST_WRITES = 8  # under way on a line, without stops
 WAY = "fleet"  # in the audit log
 
@@ -100,6 +102,16 @@ class CommandDesk:
             await asyncio.wait_for(offer.over.wait(), HOLD_S)
         found = offer.answer or CommandAnswer(CommandOutcome.UNDER_WAY, f"{offer.prepared.text}: under way")
         return found._replace(gateway=self.gateway)
+
+    async def await_commands(self, line: str, may_wait: Callable[[], bool]) -> None:
+        """Wait until none is under way on a line that is about to be let go: none begins there any more.
+
+        For AWAITED_S at most, and only while `may_wait`.
+        """
+        loop = asyncio.get_running_loop()
+        ends = loop.time() + AWAITED_S
+        while self._under_way.get(line) and loop.time() < ends and may_wait():
+            await asyncio.sleep(LOOK_S)
 
     async def _carry_out(self, offer: Offer) -> None:
         line = offer.held.name

@@ -41,7 +41,7 @@ class CommandLog:
     def _add(self, record: Mapping[str, Any], now_ns: int) -> None:
         at = time.strftime("%Y-%m-%dT%H:%M:%S", time.gmtime(now_ns // 10**9))
         line = json.dumps({"time": f"{at}.{now_ns % 10**9 // 1000:06d}Z", **record}, ensure_ascii=False)
-        whole = (b"\n" if self._is_truncated() else b"") + line.encode() + b"\n"
+        whole = (b"\n" if self._is_truncated() else b"") + line.encode(errors="backslashreplace") + b"\n"
         if self._file.write(whole) < len(whole):
             raise OSError(f"{self.path}: there was room for a part of a record only")
         _sync(self._file.fileno())

@@ -92,11 +92,17 @@ async def _answer(message: Msg, heard: Heard) -> None:
 
 
 class CommandedLines:
-    """Lines that are open to commands as long as they are polled."""
+    """Lines that are open to commands as long as they are polled.
 
-    def __init__(self, lines: FleetLines, subjects: CommandSubjects) -> None:
+    `may_wait` says whether the lease leaves time before a line must be closed.
+    """
+
+    def __init__(
+        self, lines: FleetLines, subjects: CommandSubjects, may_wait: Callable[[], bool] = lambda: False
+    ) -> None:
         self._lines = lines
         self._subjects = subjects
+        self._may_wait = may_wait
 
     async def take(self, line: str, description: Any) -> None:
         """Open the line, poll it and take commands. Raises OSError or ValueError where that fails."""
@@ -106,10 +112,12 @@ class CommandedLines:
     async def let_go(self, line: str) -> None:
         """Take no commands any more, poll the line no more, and close it.
 
-        Its stops under way are waited for, and who asked for them is answered until then.
+        Its stops under way are waited for, and who asked for them is answered until then. So are commands,
+        for a moment: what one that was sent has done would never be known.
         """
         self._subjects.leave(line)
         try:
+            await self._subjects.desk.await_commands(line, self._may_wait)
             await self._lines.let_go(line)
         finally:
             self._subjects.shut(line)

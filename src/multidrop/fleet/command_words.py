@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 MOST_BYTES = 64 * 1024  # of a request
 MOST_CHARACTERS = 200  # of a name, an id or a value's text
-MOST_DRIVES = 1000  # of a stop
+NOBODY = "somebody"  # who gives no name
 
 
 class CommandOutcome(StrEnum):
@@ -78,7 +78,7 @@ class CommandRequest(NamedTuple):
 
 
 class StopRequest(NamedTuple):
-    """A stop of these drives of a line, or of all with None."""
+    """A stop of these drives of a line, or of all with None. An asker's `id` is new for each stop."""
 
     id: str
     by: str
@@ -127,21 +127,29 @@ def read_command(data: bytes) -> CommandRequest:
     return CommandRequest(id, by, drive, register=register, value=_value(found))
 
 
-def read_stop(data: bytes) -> StopRequest:
-    """Return the stop of a message from anybody. Raises ValueError, in one sentence."""
-    found = read_json(data)
+def read_stop(data: bytes) -> tuple[StopRequest, str]:
+    """Return the stop of a message from anybody, and why it is one of all drives where it names none.
+
+    A stop is never refused. To stop too many drives can be mended, and to stop none cannot. Whoever asks is
+    named in printable words, "" being no id.
+    """
+    try:
+        found = read_json(data)
+    except ValueError as mistake:
+        return StopRequest("", NOBODY, None), str(mistake)
+    request = StopRequest(spelt(found.get("id")), spelt(found.get("by")) or NOBODY, None)
     drives = found.get("drives")
-    if drives is not None and not _are_names(drives):
-        raise ValueError("drives is neither a list of names nor null, which means all of the line")
-    return StopRequest(_text(found, "id"), _text(found, "by"), None if drives is None else tuple(drives))
+    if isinstance(drives, str):
+        drives = [drives]
+    if isinstance(drives, list) and drives and all(isinstance(name, str) for name in drives):
+        return request._replace(drives=tuple(drives)), ""
+    return request, "" if drives is None else "drives is neither a list of names nor null"
 
 
-def _are_names(drives: object) -> bool:
-    return (
-        isinstance(drives, list)
-        and 0 < len(drives) <= MOST_DRIVES
-        and all(isinstance(name, str) for name in drives)
-    )
+def spelt(given: object) -> str:
+    r"""Return a name, whatever was given as one; what cannot be printed is spelt out: an escape is `\x1b`."""
+    text = str(given) if isinstance(given, (str, int, float)) else ""
+    return (text if text.isprintable() else repr(text)[1:-1]).strip()[:MOST_CHARACTERS]
 
 
 def _text(found: Mapping[str, Any], key: str, *, is_needed: bool = True) -> str:

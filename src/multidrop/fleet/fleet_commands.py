@@ -16,6 +16,7 @@ from multidrop.fleet import names
 from multidrop.fleet.buckets import Bucket, Follower
 from multidrop.fleet.command_log import open_log
 from multidrop.fleet.command_words import (
+    NOBODY,
     CommandAnswer,
     CommandOutcome,
     CommandRequest,
@@ -24,6 +25,7 @@ from multidrop.fleet.command_words import (
     encode,
     read_answer,
     read_offer,
+    spelt,
     worst,
 )
 from multidrop.fleet.errors import FleetError, NobodyThere, NotDelivered, Unsure
@@ -191,6 +193,7 @@ class FleetCommands:
         A drive that is not in the plant is told as refused, and keeps no other's stop back. Raises ValueError
         where none of them is, FleetError where the plant cannot be read; then no stop was sent.
         """
+        drives = [drives] if isinstance(drives, str) else drives
         wanted, unknown = await self._lines_of(drives, line)
         answers = await asyncio.gather(*(self._stop(one, wanted[one], on_news) for one in wanted))
         answers += unknown
@@ -227,9 +230,10 @@ class FleetCommands:
 
     async def _stop(self, line: str, drives: list[str] | None, on_news: News) -> CommandAnswer:
         """Send a stop until a gateway answers, and go on until it is over."""
-        request = StopRequest(uuid.uuid4().hex, self.by, None if drives is None else tuple(drives))
+        by = spelt(self.by) or NOBODY  # no name keeps a stop back
+        request = StopRequest(uuid.uuid4().hex, by, None if drives is None else tuple(drives))
         what = f"the stop of {', '.join(drives) if drives else f'all drives of line {line}'}"
-        record = {"id": request.id, "line": line, "what": what, "by": self.by}
+        record = {"id": request.id, "line": line, "what": what, "by": by}
         noting = asyncio.create_task(self._note_end(record, None))
         answer = await first_answer(self._paths, line, request, what, on_news)
         lost = f"it is not known what became of {what}: its gateway gives no answer any more; {HARD_WIRED}"

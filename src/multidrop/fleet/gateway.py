@@ -22,6 +22,7 @@ from multidrop.fleet.forwarder import Forwarder
 from multidrop.fleet.held_lines import HeldLines
 from multidrop.fleet.lease_rules import SECOND, USUAL
 from multidrop.fleet.life_lock import LifeLock
+from multidrop.fleet.line_keeper import SILENT_S
 from multidrop.fleet.member import Member
 from multidrop.fleet.moves import TOLD
 from multidrop.fleet.record_shapes import misshapen
@@ -72,7 +73,7 @@ class FleetGateway:
         )
         self.log = CommandLog(folder / "commands.jsonl")
         self.commands = CommandSubjects(name, self.paths, held, self.log)
-        commanded = CommandedLines(self.lines, self.commands)
+        commanded = CommandedLines(self.lines, self.commands, lambda: self.member.lease.left_s > SILENT_S)
         self.member = Member(name, self.paths, commanded, self.mastership, lock=self.lock)
         self.forwarder: Forwarder | None = None
         self._end = asyncio.Event()

@@ -10,12 +10,20 @@ import asyncio
 import logging
 from collections.abc import Mapping
 from functools import partial
+from hashlib import sha256
 from typing import Any
 
 from multidrop import Bus, drive_meant, written_by
 from multidrop.fleet.command_desk import HOLD_S, WAY
 from multidrop.fleet.command_log import CommandLog
-from multidrop.fleet.command_words import CommandAnswer, CommandOutcome, StopRequest, read_stop, worst
+from multidrop.fleet.command_words import (
+    CommandAnswer,
+    CommandOutcome,
+    StopRequest,
+    read_stop,
+    spelt,
+    worst,
+)
 from multidrop.fleet.drive_commands import answers_of_stops, stop_drive
 from multidrop.fleet.held_lines import HeldLine, HeldLines
 from multidrop.fleet.offers import Offers
@@ -35,27 +43,27 @@ class StopDesk:
         self._lines = lines
         self._offers = offers
         self._log = log
-        self._stops: dict[tuple[int, str], asyncio.Task[CommandAnswer]] = {}  # by line's number and id
+        self._stops: dict[tuple[int, object], asyncio.Task[CommandAnswer]] = {}  # by line and message
         self._notes: set[asyncio.Task[None]] = set()
 
     async def stop(self, line: str, data: bytes) -> CommandAnswer | None:
         """Stop drives of a line now; None where we are not its master and must keep silent.
 
-        A copy of the message gets the answer of the same stop; another message is another stop. The answer
-        to one that is not over soon is "under way", with what is known of it so far; the asker asks again.
+        Nothing in the message is a reason to send none. A copy of the message gets the answer of the same
+        stop; another message is another stop, and so is each without an id. The answer to one that is not
+        over soon is "under way", with what is known of it so far; the asker asks again.
         Where we lost the line meanwhile, or let it go, we keep silent too, unless the motors stand: its next
         master may have had a copy, and stops, or is asked next.
         """
         held = self._lines.for_stop(line)
         if held is None:
             return None
-        try:
-            request = read_stop(data)
-        except ValueError as mistake:
-            return CommandAnswer(CommandOutcome.REFUSED, f"no stop was sent: {mistake}", self.gateway)
+        request, why_all = read_stop(data)
+        if why_all:
+            _log.warning("a stop is one of all drives of line %s, because %s", line, why_all)
         if request.drives is not None:
             request = request._replace(drives=tuple(drive_meant(one, held.drives) for one in request.drives))
-        key = (held.number, request.id)
+        key = (held.number, sha256(data).digest() if request.id else object())
         if key not in self._stops:
             self._stops[key] = asyncio.create_task(self._stop(held, request))
             while len(self._stops) > REMEMBERED:
@@ -85,8 +93,9 @@ class StopDesk:
         names = list(drives) if request.drives is None else list(dict.fromkeys(request.drives))
         works = _works(held.bus, drives, names)
         waited = begin_stops([partial(_stopped_by, request.by, work) for work in works])
-        _log.warning("stop of %s, asked for by %s", ", ".join(names), request.by)
-        record = {"id": request.id, "line": held.name, "what": "stop", "drives": names, "by": request.by}
+        printed = [spelt(name) for name in names]
+        _log.warning("stop of %s, asked for by %s", ", ".join(printed), request.by)
+        record = {"id": request.id, "line": held.name, "what": "stop", "drives": printed, "by": request.by}
         self._note({"step": "begun", **record, "gateway": self.gateway})
         there = f"line {held.name} has no such drive; it has {', '.join(drives) or 'none'}"
         missing = CommandAnswer(CommandOutcome.REFUSED, f"no stop was sent: {there}")

@@ -15,7 +15,6 @@ from multidrop.gateway.outbox import Outbox, Publication
 PORTS = {"mqtt": 1883, "mqtts": 8883}
 RETRY_S = (1, 30)  # before the first attempt to connect again, and at most
 KEEP_ALIVE_S = 15
-MOST_COMMAND = 65_536  # bytes of a message that comes in
 FAREWELL_S = 1.0  # that the last messages may take
 
 _log = logging.getLogger("multidrop.gateway.mqtt")
@@ -179,9 +178,6 @@ class Broker:
             self._call(self._acknowledge)
 
     def _on_message(self, _client: Any, _data: Any, message: Any) -> None:
-        if len(message.payload) > MOST_COMMAND:
-            _log.warning("a message of %d bytes on %s is left out", len(message.payload), message.topic)
-            return
         received = self._speaker.received
 
         def take() -> None:

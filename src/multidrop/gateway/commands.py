@@ -30,7 +30,7 @@ from multidrop import (
 from multidrop.gateway.clock import boottime_ns, monotonic_ns
 from multidrop.gateway.command_threads import begin_stops, in_thread
 from multidrop.gateway.rights import NEVER_THIS_WAY, Caller, May, Right
-from multidrop.gateway.stops_amid_reload import ChangingLines, drives_of, stop_as_changed
+from multidrop.gateway.stops_amid_reload import ChangingLines, drives_of, stop_as_changed, stop_meant
 from multidrop.gateway.told import Told as Told
 from multidrop.gateway.told import denied, failed, not_listed, of_stop
 from multidrop.gateway.verb_rules import STOPPING, VERBS
@@ -109,13 +109,7 @@ class Commands:
             return dict.fromkeys(wanted, denied(caller, Right.STOP, "stop"))
         self.called += 1
         _log.warning("stop of %s, asked for by %s", "all drives" if drives is None else drives, caller.by)
-        meant = None if drives is None else {name: self._meant(name) for name in drives}
-        names = None if meant is None else [*meant.values()]
-        told = await stop_as_changed(self._lines, names, partial(self._stop, caller=caller))
-        return told if meant is None else {name: told[meant[name]] for name in meant}
-
-    def _meant(self, drive: str) -> str:
-        return drive_meant(drive, drives_of(self._lines.plant_now))
+        return await stop_meant(self._lines, drives, partial(self._stop, caller=caller))
 
     async def _stop(self, plant: Plant, wanted: Iterable[str], caller: Caller) -> dict[str, Told]:
         """Stop these drives of a plant."""
@@ -176,7 +170,7 @@ class Commands:
         admit: Admit = lambda what: inf,
     ) -> Told:
         """Carry out a verb that the plant file lists, once; refused by a way that cannot ask a person."""
-        drive = self._meant(drive) if verb in STOPPING else drive
+        drive = drive_meant(drive, drives_of(self._lines.plant_now)) if verb in STOPPING else drive
         what = f"{drive}.{verb}"
         rule = VERBS.get(verb)
         if rule is None:

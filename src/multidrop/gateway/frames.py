@@ -15,7 +15,7 @@ from math import isfinite
 from typing import Any, NamedTuple
 
 from multidrop.gateway.events import Events
-from multidrop.gateway.hub import FAULT, SILENT, Hub
+from multidrop.gateway.hub import Hub
 from multidrop.gateway.kept_rows import KeptRow
 from multidrop.gateway.lately import Lately
 
@@ -67,7 +67,7 @@ def frame_of(
 
 def _drive(hub: Hub, name: str, time_ns: int) -> dict[str, Any]:
     """Return what a frame says of a drive; of a value that is known now that and the place of its time."""
-    state, words = hub.seen(name)
+    shown = hub.seen(name)
     seen = hub.seen_at(name)
     places = Places()
     values: dict[str, tuple[Any, ...]] = {}
@@ -77,9 +77,9 @@ def _drive(hub: Hub, name: str, time_ns: int) -> dict[str, Any]:
         else:
             values[register] = _unknown(hub, newest, good, places, time_ns)
     return {
-        "state": state,
-        "fault": words if state == FAULT else None,
-        "why": words if state == SILENT else None,
+        "state": shown.state,
+        "fault": shown.fault,
+        "why": shown.why_silent,
         "seen": None if seen is None else places[seen],
         "ages_ms": [time_ns // 1_000_000 - time // 1_000_000 for time in places],
         "values": values,

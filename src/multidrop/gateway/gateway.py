@@ -180,7 +180,7 @@ class Gateway:
         self.hub.pass_time(monotonic_ns())
         while self.newcomers.has_room and (batch := poller.take()):
             self._has_news = True
-            self.feed(batch if self.is_settled else self.newcomers.keep(batch, self.plant, poller))
+            self.feed(batch if self.plant_coming is None else self.newcomers.keep(batch, self.plant, poller))
         if self.clock() - self._looked >= LOOK_S:
             self._looked = self.clock()
             self.guarded("events", self._look_for_events)
@@ -248,14 +248,14 @@ class Gateway:
         return f"STATUS=polling {len(self.plant.lines) - lost} lines" + (f"; {lost} lost" if lost else "")
 
     @property
-    def is_settled(self) -> bool:
-        """True unless drives are on their way from one plant to another."""
-        return self.reload.is_settled
-
-    @property
     def plant_now(self) -> Plant:
         """The plant as it is polled at this moment, amid a reload too."""
-        return self.plant if self.poller is None or self.is_settled else self.poller.plant
+        return self.plant if self.poller is None or self.plant_coming is None else self.poller.plant
+
+    @property
+    def plant_coming(self) -> Plant | None:
+        """The plant that drives are on their way to; None where all are there."""
+        return self.reload.coming
 
     # ---- for commands, parts and pages ----
 

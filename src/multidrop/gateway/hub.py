@@ -45,6 +45,15 @@ class Shown(NamedTuple):
     state: str
     words: str | None
 
+    @property
+    def fault(self) -> str | None:
+        """The fault that the drive shows, in its own words; None where it shows none."""
+        return self.words if self.state == FAULT else None
+
+    @property
+    def why_silent(self) -> str | None:
+        return self.words if self.state == SILENT else None
+
 
 class _Watched:
     """One drive of the plant."""
@@ -221,11 +230,6 @@ class Hub:
     def state(self, drive: str) -> str:
         """Return "runs", "stands", "fault", "silent" or "unknown"."""
         return self.seen(drive).state
-
-    def fault(self, drive: str) -> str | None:
-        """Return the fault that the drive shows, in its own words; None where it shows none."""
-        seen = self.seen(drive)
-        return seen.words if seen.state == FAULT else None
 
     def seen(self, drive: str) -> Shown:
         """Return a drive's state, with its fault or the reason why it is silent."""

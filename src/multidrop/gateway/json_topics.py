@@ -13,7 +13,7 @@ from typing import Any
 from multidrop import Plant, drive_meant
 from multidrop.gateway.commands import Told
 from multidrop.gateway.homeassistant import discovery, discovery_topic
-from multidrop.gateway.hub import FAULT, SILENT
+from multidrop.gateway.hub import SILENT
 from multidrop.gateway.mqtt_settings import MqttSettings, fresh_values
 from multidrop.gateway.orders import Orders
 from multidrop.gateway.outbox import Publication
@@ -25,6 +25,7 @@ EXAMPLES = {
     "act": '{"verb": "start", "drive": "pump-1", "time": UTC in ms}',
 }
 ONLINE, OFFLINE = b"online", b"offline"
+MOST_BYTES = 65_536  # of a write or a verb
 NOTHING = b""  # makes a broker forget what it kept of a topic
 
 
@@ -82,6 +83,13 @@ class JsonTopics:
         drive, *what = levels
         try:
             given = _read(payload)
+        except ValueError as mistake:
+            if what[0] == "act" and any(f'"{verb}"'.encode() in payload for verb in STOPPING):
+                self._orders.stop([drive])  # whatever is wrong with the rest
+            else:
+                self._refuse(drive, what, mistake)
+            return
+        try:
             if what[0] == "act" and str(given.get("verb")) in STOPPING:
                 for one in self._to_stop(drive, given):
                     self._orders.stop_by(one, given["verb"], {})  # it takes none: no wrong ones keep it back
@@ -93,7 +101,10 @@ class JsonTopics:
             else:
                 self._orders.act(drive, *_read_act(drive, given))
         except ValueError as mistake:
-            self._orders.refuse(drive, "/".join(what), f"it is no {EXAMPLES[what[0]]}: {mistake}")
+            self._refuse(drive, what, mistake)
+
+    def _refuse(self, drive: str, what: list[str], mistake: ValueError) -> None:
+        self._orders.refuse(drive, "/".join(what), f"it is no {EXAMPLES[what[0]]}: {mistake}")
 
     def _to_stop(self, drive: str, given: Mapping[str, Any]) -> list[str]:
         """Return the topic's drive and, where there is one, another one that the stop names.
@@ -136,11 +147,11 @@ class JsonTopics:
 
     def _state(self, drive: str) -> bytes:
         seen_ns = self._hub.seen_at(drive)
-        state, words = self._hub.seen(drive)
+        shown = self._hub.seen(drive)
         said = {
             "time": None if seen_ns is None else seen_ns // 1_000_000,
-            "state": state,
-            "fault": words if state == FAULT else None,
+            "state": shown.state,
+            "fault": shown.fault,
             "values": fresh_values(self._hub, drive),
         }
         return json.dumps(said, ensure_ascii=False).encode()
@@ -209,6 +220,8 @@ def _time(given: Mapping[str, Any]) -> int:
 
 
 def _read(payload: bytes) -> dict[str, Any]:
+    if len(payload) > MOST_BYTES:
+        raise ValueError(f"it has {len(payload)} bytes")
     try:
         given = json.loads(payload)
     except RecursionError:

@@ -47,7 +47,7 @@ class Reload:
         self._turn = asyncio.Lock()
         self._soon: asyncio.Task[None] | None = None
         self._is_wanted = False
-        self.is_settled = True  # the lines are those of `plant`: no drive is on its way from one to the other
+        self.coming: Plant | None = None  # while drives are on their way from one plant to this one
 
     @property
     def has_file(self) -> bool:
@@ -90,7 +90,7 @@ class Reload:
         plant, settings = await beside(self._read)
         planned = await beside(lambda: plant.metadata()["planned"])  # long work, which the loop must not do
         replaced = await gateway.parts.replace(settings.parts, plant)
-        self.is_settled = False
+        self.coming = plant
         try:
             unopened = await beside(partial(poller.adopt, plant))
             self._take_up(poller, settings, planned)
@@ -101,7 +101,7 @@ class Reload:
             await gateway.parts.take_back(replaced)
             raise
         finally:
-            self.is_settled = True
+            self.coming = None
             gateway.newcomers.release(gateway.feed)
         gateway.note_unopened(unopened)
         self.mistakes, self.restart = (), tuple(_after_restart(self._begun_with, plant.serve))

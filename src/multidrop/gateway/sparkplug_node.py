@@ -173,7 +173,8 @@ class SparkplugNode:
         return payload(now, metrics, self._next())
 
     def _values(self, drive: str) -> dict[str, Value]:
-        found: dict[str, Value] = {STATE: self._hub.state(drive), FAULT: self._hub.fault(drive)}
+        shown = self._hub.seen(drive)
+        found: dict[str, Value] = {STATE: shown.state, FAULT: shown.fault}
         found |= fresh_values(self._hub, drive)
         for name in self._writable(drive):
             found.setdefault(name, None)
@@ -190,7 +191,8 @@ class SparkplugNode:
         return next((dict(one.registers) for one in drives if one.name == drive), {})
 
     def _datatype(self, drive: str, name: str) -> DataType:
-        if name in (STATE, FAULT) and name not in self._registers(drive):
+        """Return a metric's type; of the hub's words, whose place a polled register of this name takes."""
+        if name in (STATE, FAULT) and all(name != register.name for register in self._hub.polled(drive)):
             return DataType.STRING
         named = self._registers(drive)[name].values is not None
         return DataType.STRING if named else DataType.DOUBLE

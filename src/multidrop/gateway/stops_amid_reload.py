@@ -6,7 +6,7 @@ import asyncio
 from collections.abc import Awaitable, Callable, Sequence
 from typing import Protocol, TypeVar
 
-from multidrop import Drive, Plant
+from multidrop import Drive, Plant, PlantLine, drive_meant
 
 LOOK_S = 0.02  # between looks at what a reload changes
 
@@ -27,11 +27,58 @@ class ChangingLines(Protocol):
     @property
     def plant_now(self) -> Plant: ...
     @property
-    def is_settled(self) -> bool: ...
+    def plant_coming(self) -> Plant | None:
+        """The plant that drives are on their way to; None where all are there."""
 
 
 def drives_of(plant: Plant) -> dict[str, Drive]:
     return {polled.drive.name: polled.drive for line in plant.lines for polled in line.drives}
+
+
+async def stop_meant(
+    lines: ChangingLines,
+    drives: Sequence[str] | None,
+    stop: Callable[[Plant, list[str]], Awaitable[dict[str, T]]],
+) -> dict[str, T]:
+    """Stop the drives that these names mean, in whatever spelling, and those that they are about to mean."""
+    if drives is None:
+        return await stop_as_changed(lines, None, stop)
+    plants = (lines.plant_now, lines.plant_coming or lines.plant_now)
+    names = dict.fromkeys(name for plant in plants for name in drives_of(plant))
+    meant = {name: drive_meant(name, names) for name in drives}
+    others = _also_meant(lines, [*meant.values()])
+    told = await stop_as_changed(lines, [*meant.values(), *others], stop)
+    return {name: told[meant.get(name, name)] for name in (*meant, *others)}
+
+
+def _also_meant(lines: ChangingLines, drives: Sequence[str]) -> list[str]:
+    """Return the names, so far, of drives that have one of these names in the plant that comes.
+
+    A stop may mean either. One of another family at that address is left out: its stop may mean something
+    else there.
+    """
+    if lines.plant_coming is None:
+        return []
+    coming = _by_place(lines.plant_coming)
+    wanted = {place: type(drive) for place, drive in coming.items() if drive.name in drives}
+    return [
+        drive.name
+        for place, drive in _by_place(lines.plant_now).items()
+        if wanted.get(place) is type(drive) and drive.name not in drives
+    ]
+
+
+def _by_place(plant: Plant) -> dict[tuple[str, int], Drive]:
+    return {(line.port, polled.drive.address): polled.drive for line in plant.lines for polled in line.drives}
+
+
+class _Latest:
+    """The latest stop of one drive: the drive as it was then, or None, and the lines as they were."""
+
+    def __init__(self, drive: Drive | None, lines: tuple[PlantLine, ...]) -> None:
+        self.drive = drive
+        self.lines = lines
+        self.has_failed = False
 
 
 async def stop_as_changed(
@@ -42,27 +89,50 @@ async def stop_as_changed(
     """Stop these drives, or all with None; by drive's name what became of the latest stop of each.
 
     `stop` is called with the plant as it is polled now. It is called again with the drives that a reload has
-    changed since, and with those whose stop failed while anything changed. It ends when no reload is under
-    way, and nothing of that is left.
+    changed since, though their stops before go on, and with those whose stop failed while anything changed.
+    It ends when no reload is under way, and nothing of that is left.
     """
-    stopped: dict[str, Drive | None] = {}  # by name, each drive as it was then
+    latest: dict[str, _Latest] = {}
     told: dict[str, T] = {}
-    plant = lines.plant_now
-    while True:
-        before, is_settled, plant = plant, lines.is_settled, lines.plant_now
-        there = drives_of(plant)
-        has_changed = plant.lines != before.lines
-        left = [
-            name
-            for name in dict.fromkeys(there if drives is None else drives)
-            if name not in stopped
-            or (name in there and there[name] is not stopped[name])
-            or (name in there and has_changed and not told[name].is_done)
-        ]
-        if left:
-            stopped |= {name: there.get(name) for name in left}
-            told |= await stop(plant, left)
-        elif is_settled:
-            return told
-        else:
-            await asyncio.sleep(LOOK_S)
+    under_way: set[asyncio.Task[None]] = set()
+
+    async def begin(plant: Plant, begun: dict[str, _Latest]) -> None:
+        for name, end in (await stop(plant, [*begun])).items():
+            if latest[name] is begun[name]:
+                told[name] = end
+                begun[name].has_failed = not end.is_done
+
+    try:
+        while True:
+            is_settled, plant = lines.plant_coming is None, lines.plant_now
+            there = drives_of(plant)
+            left = {
+                name: _Latest(there.get(name), plant.lines)
+                for name in dict.fromkeys(there if drives is None else drives)
+                if _is_left(latest.get(name), there.get(name), plant.lines)
+            }
+            if left:
+                latest |= left
+                under_way.add(asyncio.create_task(begin(plant, left)))
+            elif is_settled and not under_way:
+                return told
+            if under_way:
+                over, under_way = await asyncio.wait(
+                    under_way, timeout=LOOK_S, return_when=asyncio.FIRST_COMPLETED
+                )
+                for task in over:
+                    task.result()
+            else:
+                await asyncio.sleep(LOOK_S)
+    finally:
+        for task in under_way:  # the stops themselves go on
+            task.cancel()
+
+
+def _is_left(before: _Latest | None, drive: Drive | None, lines: tuple[PlantLine, ...]) -> bool:
+    """Return True where this drive is to be stopped, or stopped again."""
+    if before is None:
+        return True
+    if drive is None:
+        return False
+    return drive is not before.drive or (before.has_failed and lines != before.lines)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import json
 import logging
 from collections.abc import Mapping
 from pathlib import Path
@@ -224,7 +225,8 @@ class _Pages:
     async def stop(self, request: Request) -> Response:
         drives = await drives_to_stop(request)
         told = await self._gateway.commands.stop(drives, caller_of(request))
-        return JSONResponse({name: _told(one) for name, one in told.items()})
+        said = json.dumps({name: _told(one) for name, one in told.items()})  # a name may be no UTF-8
+        return Response(said, media_type="application/json")
 
     async def write(self, request: Request) -> Response:
         body = await body_of(request)

@@ -30,8 +30,8 @@ class Staying:
     wanted: PlantLine
     drives: DriveChanges
 
-    def part_with(self, names: Collection[str]) -> None:
-        """Let the drives go that are not wanted any more; none is asked yet whose name is among these.
+    def await_stops(self) -> None:
+        """End what moves the drives that are not wanted any more, and wait for their stops.
 
         Those whose address nobody takes are stopped first, where the bus has `stop_on_exit`. At an address
         that is declared as another drive now, the old family's stop may mean something else. All stops of
@@ -40,6 +40,10 @@ class Staying:
         taken = {polled.drive.address for polled in self.drives.joining}
         leaving = [polled.drive for polled in self.drives.leaving]
         self.line.bus.part_with(leaving, [drive for drive in leaving if drive.address not in taken])
+
+    def let_leave(self, names: Collection[str]) -> None:
+        """Let them go; none is asked yet whose name is among these."""
+        leaving = [polled.drive for polled in self.drives.leaving]
         for drive in leaving:
             self.line.remove(drive)
             self.line.forget(drive)
@@ -53,7 +57,7 @@ class Staying:
         return {polled.drive.name for polled in self.drives.leaving}
 
     def is_free(self, present: Collection[str]) -> bool:
-        """Return True unless a drive that joins, or one of its name, is still present on another line."""
+        """Return True unless a drive that joins, or one of its name, is still present on other lines."""
         return not any(polled.drive.name in present for polled in self.drives.joining)
 
     def take_in(self) -> None:
@@ -150,20 +154,31 @@ class Adoption:
         self._lines.let_go(self._going, GONE)
 
     def _change(self) -> dict[str, LineError]:
-        """Change the lines that stay, each in one go: an exchanged drive can be stopped whatever opens."""
+        """Change the lines that stay, each in one go: an exchanged drive can be stopped whatever opens.
+
+        One whose drives have names that leave on others waits for these, and its own can be stopped until
+        then. Lines that wait for each other change together, once all their stops are over.
+        """
         failures: dict[str, LineError] = {}
-        parted: list[Staying] = []
         names = {polled.drive.name for line in self._plant.lines for polled in line.drives}
-        for number, staying in enumerate(self._staying, 1):
-            staying.part_with(names)
-            parted.append(staying)
-            present = set().union(*(later.leaving for later in self._staying[number:]))
-            for free in [each for each in parted if each.is_free(present)]:
-                parted.remove(free)
+        left = self._staying
+        while left:
+            free = [
+                each
+                for each in left
+                if each.is_free(set().union(*(other.leaving for other in left if other is not each)))
+            ]
+            together = free[:1] or left
+            for staying in together:
+                staying.await_stops()
+            for staying in together:
+                staying.let_leave(names)
+            for staying in together:
                 try:
-                    free.take_in()
+                    staying.take_in()
                 except LineError as failure:
-                    failures[free.wanted.name] = failure
+                    failures[staying.wanted.name] = failure
+            left = [each for each in left if each not in together]
         return failures
 
     def _open(self, start: bool) -> dict[str, LineError]:

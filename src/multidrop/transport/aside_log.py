@@ -29,7 +29,7 @@ class _AsideLog:
             self._entries.put_nowait(entry)
         with self._starting:
             if not self.has_begun:
-                with suppress(RuntimeError):  # the interpreter is ending: nothing is logged any more
+                with suppress(RuntimeError, MemoryError):  # there is none now, or at the interpreter's end
                     threading.Thread(target=self._run, name="multidrop log", daemon=True).start()
                     self.has_begun = True
 

@@ -20,6 +20,7 @@ from multidrop.cli.support.confirm import confirm
 from multidrop.cli.support.nats import nats_options
 from multidrop.cli.support.output import print_text, warn
 from multidrop.cli.support.signals import outliving_the_terminal
+from multidrop.printable import printable
 
 if TYPE_CHECKING:
     from multidrop.fleet.command_words import CommandAnswer
@@ -59,11 +60,14 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _asker(arguments: argparse.Namespace) -> FleetCommands:
+    from multidrop.fleet.command_words import MOST_CHARACTERS
     from multidrop.fleet.fleet_commands import FleetCommands
 
     by = arguments.by or f"{_user()}@{socket.gethostname()}"
-    if not by.isprintable() or len(by) > 200:
-        raise ValueError(f"--by {by!r} is not 1 to 200 printable characters")
+    if arguments.command in _STOPPING:
+        by = printable(by)[:MOST_CHARACTERS]  # no name keeps a stop back
+    elif not by.isprintable() or len(by) > MOST_CHARACTERS:
+        raise ValueError(f"--by {by!r} is not 1 to {MOST_CHARACTERS} printable characters")
     log, urls = arguments.audit or state_folder() / "commands.jsonl", urls_of(arguments)
     return FleetCommands(urls, by=by, log=log, options=nats_options(arguments, urls))
 

@@ -23,6 +23,7 @@ from multidrop.cli.support.live_plant import LiveDrive, LivePlant
 from multidrop.cli.support.output import logging_to, warn
 from multidrop.cli.support.plants import add_plant_argument, add_port_option, plant_of
 from multidrop.cli.support.polling import PollingSession, polling_session
+from multidrop.cli.support.signals import Interruption, outliving_the_terminal
 from multidrop.cli.support.values import counted
 from multidrop.control.outcome import Seen
 from multidrop.plant.model import Plant
@@ -31,6 +32,9 @@ DRAW_S = 0.25
 SCROLL_S = 2.0  # between two pictures that scroll
 PAGE = 10  # lines
 _STOP_KEYS = ("s", "S")
+STILL_STOPPING = (
+    "a stop is under way, and is waited for; Ctrl-C again and again leaves it: look at the motors"
+)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -55,15 +59,21 @@ def is_possible() -> bool:
 
 
 def watch(plant: Plant, *, out: Path | None = None, seconds: float | None = None) -> dict[str, Any]:
-    """Poll the plant and show it until the user leaves or `seconds` are over; return the poller's summary."""
+    """Poll the plant and show it until the user leaves or `seconds` are over; return the poller's summary.
+
+    A terminal that is closed ends it too. Stops that are under way are waited for in any case.
+    """
     console = open_console()
     live = LivePlant(plant)
-    with polling_session(plant, out, live.add) as session:
+    with outliving_the_terminal() as hup, polling_session(plant, out, live.add) as session:
+        monitor = Monitor(live, session, console, hup)
         with session.poller:
-            monitor = Monitor(live, session, console)
-            monitor.show(seconds)
-            for sentence in monitor.left_open():
-                warn(sentence)
+            try:
+                monitor.show(seconds)
+            finally:
+                failures = monitor.await_stops()  # before the ports are closed: one may not be sent yet
+        for sentence in failures:
+            warn(sentence)
         session.hand_out()  # what came while the poller closed
     return session.poller.summary()
 
@@ -71,11 +81,12 @@ def watch(plant: Plant, *, out: Path | None = None, seconds: float | None = None
 class Monitor:
     """The screen of a polled plant: draws what has come, and carries out what keys ask for."""
 
-    def __init__(self, plant: LivePlant, session: PollingSession, console: Any) -> None:
+    def __init__(self, plant: LivePlant, session: PollingSession, console: Any, hup: Interruption) -> None:
         from multidrop.cli.monitor.screen import BLOCKS, PLAIN_BLOCKS, Position
 
         self._console = console
         self._session = session
+        self._hup = hup  # its terminal was closed
         self._plant = plant
         self._at = Position()
         self._on_yes: Callable[[], None] | None = None  # done when the question is answered with y
@@ -94,7 +105,7 @@ class Monitor:
             keys() as wait_for_key,
             logging_to(self._show_message, "multidrop", WARNING),
         ):
-            while not self._session.interruption.came and not self._has_left:
+            while not (self._session.interruption.came or self._hup.came or self._has_left):
                 now = time.monotonic()
                 if seconds is not None and now - begun >= seconds:
                     return
@@ -114,11 +125,14 @@ class Monitor:
     def _show_message(self, text: str) -> None:
         self._at.message = text
 
-    def left_open(self) -> Iterator[str]:
-        """Yield the failures that nobody acknowledged, and a warning if a stop is under way."""
-        yield from self._at.failures
+    def await_stops(self) -> list[str]:
+        """Record until no stop is under way; return the failures that nobody acknowledged."""
         if self._is_stopping:
-            yield "a stop was under way and is not waited for: look at the motors"
+            warn(STILL_STOPPING)
+        while self._is_stopping:
+            self._session.hand_out()
+            self._stops[-1].join(DRAW_S)
+        return self._at.failures
 
     @property
     def _is_stopping(self) -> bool:
@@ -215,7 +229,7 @@ class Monitor:
         if not self._is_stopping:
             self._has_left = True
             return
-        self._at.question = "A stop is under way. Leave all the same? y leaves, any other key does not"
+        self._at.question = "A stop is under way. Leave once it is over? y leaves, any other key does not"
         self._on_yes = self._leave_now
 
     def _leave_now(self) -> None:

@@ -7,6 +7,7 @@ import select
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from errno import EIO
 
 UP, DOWN, PAGE_UP, PAGE_DOWN, ENTER, ESCAPE = "up", "down", "page up", "page down", "enter", "escape"
 KEYS = {  # as terminals send them
@@ -32,7 +33,8 @@ LATIN = str.maketrans("йыіфнолЙЫІФНОЛ", "qssayjkQSSAYJK")
 def keys() -> Iterator[Callable[[float], str]]:
     """Give a function that waits so many seconds for a key, and returns its name or letter, or "".
 
-    Raises ValueError on Windows, whose consoles have no such mode.
+    It raises OSError once the terminal is gone. Raises ValueError on Windows, whose consoles have no such
+    mode.
     """
     if sys.platform == "win32":
         raise ValueError("the live screen needs a terminal of Linux or macOS; `multidrop poll` works here")
@@ -48,13 +50,16 @@ def keys() -> Iterator[Callable[[float], str]]:
         nonlocal pressed
         if not pressed and select.select([fd], [], [], seconds)[0]:
             pressed = os.read(fd, 64)
+            if not pressed:
+                raise OSError(EIO, "the terminal is closed")
         key, pressed = next_key(pressed)
         return key
 
     try:
         yield wait_for_key
     finally:
-        termios.tcsetattr(fd, termios.TCSADRAIN, before)
+        with suppress(termios.error):  # of a terminal that is gone
+            termios.tcsetattr(fd, termios.TCSADRAIN, before)
 
 
 def next_key(pressed: bytes) -> tuple[str, bytes]:

@@ -1,7 +1,8 @@
 """SIGINT (Ctrl-C), SIGTERM and SIGHUP while a command runs.
 
 The first two interrupt a command at once, but for polling and sniffing: there the first one is noted, so that
-what is under way is finished and recorded, and the second one interrupts. SIGHUP ends any command but a stop.
+what is under way is finished and recorded, and the second one interrupts. SIGHUP ends any command but a stop
+and a monitor, whose keys stop too.
 """
 
 from __future__ import annotations
@@ -32,16 +33,6 @@ def sigterm_interrupts() -> AbstractContextManager[None]:
     return handling(signal.default_int_handler, signal.SIGTERM)
 
 
-@contextmanager
-def outliving_the_terminal() -> Iterator[None]:
-    """Go on though the terminal is closed (SIGHUP): a stop is repeated until its end."""
-    if sys.platform == "win32":  # which has no such signal
-        yield
-        return
-    with handling(lambda number, frame: None, signal.SIGHUP):
-        yield
-
-
 class Interruption:
     """The first signal sets `came`; the second one raises KeyboardInterrupt."""
 
@@ -52,6 +43,21 @@ class Interruption:
         if self.came:
             raise KeyboardInterrupt
         self.came = True
+
+
+@contextmanager
+def outliving_the_terminal() -> Iterator[Interruption]:
+    """Go on though the terminal is closed (SIGHUP), which is noted: a stop is repeated until its end."""
+    closing = Interruption()
+
+    def note(number: int, frame: FrameType | None) -> None:
+        closing.came = True  # several may come: a shell and the system send one each
+
+    if sys.platform == "win32":  # which has no such signal
+        yield closing
+        return
+    with handling(note, signal.SIGHUP):
+        yield closing
 
 
 @contextmanager

@@ -1,0 +1,148 @@
+"""Stops amid a reload, of drives whose names are on their way from one line to another."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+
+import pytest
+from lines import PATIENCE, line, plant, polled
+
+from multidrop import YD1000, Drive, InvtCHE, Plant
+from multidrop.gateway.stops_amid_reload import stop_meant
+
+Names = dict[str, Drive]
+
+
+@dataclass
+class End:
+    """The end of a stop, of this drive."""
+
+    drive: Drive | None
+    is_done: bool = True
+
+
+@dataclass
+class Lines:
+    """The lines of a poller, which the test changes; stops are held up as it says."""
+
+    plant_now: Plant
+    plant_coming: Plant | None = None
+    held: dict[int, asyncio.Event] = field(default_factory=dict)  # by address
+    failing: set[int] = field(default_factory=set)
+    begun: list[Drive | None] = field(default_factory=list)
+
+    async def stop(self, now: Plant, names: list[str]) -> dict[str, End]:
+        """Stop these, each as long as it is held up."""
+        there = {polled.drive.name: polled.drive for line in now.lines for polled in line.drives}
+        found = {name: there.get(name) for name in names}
+        self.begun += found.values()
+        for drive in found.values():
+            if drive is not None and drive.address in self.held:
+                await self.held[drive.address].wait()
+        return {
+            name: End(drive, drive is not None and drive.address not in self.failing)
+            for name, drive in found.items()
+        }
+
+
+def plant_of(*drives: Drive) -> Plant:
+    """Return a plant with a line for each drive."""
+    return plant(
+        *(
+            line(f"/dev/tty{number}", polled(drive, []), name=f"hall-{number}")
+            for number, drive in enumerate(drives)
+        )
+    )
+
+
+async def until(met: Callable[[], object]) -> None:
+    async with asyncio.timeout(PATIENCE):
+        while not met():
+            await asyncio.sleep(0)
+
+
+def told(ends: dict[str, End]) -> Names:
+    return {name: end.drive for name, end in ends.items() if end.drive is not None}
+
+
+FAN, PUMP = InvtCHE(1, name="fan"), InvtCHE(2, name="pump")
+NEW_FAN = InvtCHE(2, name="fan")
+
+
+@pytest.mark.parametrize("names", [["fan"], None])
+def test_what_joins_is_stopped_though_the_stop_of_what_had_its_name_goes_on(names: list[str] | None) -> None:
+    """Such as of a drive that is silent: that one takes half a minute."""
+    silent = asyncio.Event()
+    lines = Lines(plant_of(PUMP, FAN), held={FAN.address: silent})
+
+    async def main() -> dict[str, End]:
+        stopping = asyncio.create_task(stop_meant(lines, names, lines.stop))
+        await until(lambda: FAN in lines.begun)
+        lines.plant_coming = lines.plant_now = plant_of(NEW_FAN)
+        await until(lambda: NEW_FAN in lines.begun)
+        assert not stopping.done()
+        lines.plant_coming = None
+        silent.set()
+        return await stopping
+
+    ends = asyncio.run(main())
+    assert ends["fan"].drive is NEW_FAN  # the old one's end, which came last, is not told of the new one
+    assert lines.begun.count(NEW_FAN) == 1
+
+
+def test_a_stop_that_fails_while_lines_change_is_sent_again() -> None:
+    silent = asyncio.Event()
+    lines = Lines(plant_of(PUMP, FAN), held={FAN.address: silent}, failing={FAN.address})
+
+    async def main() -> dict[str, End]:
+        stopping = asyncio.create_task(stop_meant(lines, ["fan"], lines.stop))
+        await until(lambda: FAN in lines.begun)
+        lines.plant_now = plant_of(PUMP, FAN, InvtCHE(3, name="mill"))
+        silent.set()
+        return await stopping
+
+    assert not asyncio.run(main())["fan"].is_done
+    assert lines.begun == [FAN, FAN]
+
+
+CASES: dict[str, tuple[Iterable[Drive], Iterable[Drive], list[str], Names]] = {
+    "its name is about to go to the other line": (
+        [PUMP, FAN],
+        [NEW_FAN, InvtCHE(1, name="mill")],
+        ["fan"],
+        {"fan": FAN, "pump": PUMP},
+    ),
+    "it is about to be there, in another spelling": (
+        [PUMP, FAN],
+        [InvtCHE(2, name="L\u00fcfter"), FAN],
+        ["Lu\u0308fter"],
+        {"pump": PUMP},
+    ),
+    "another family is about to be there": ([PUMP, FAN], [YD1000(2, name="fan")], ["fan"], {"fan": FAN}),
+    "it stays": ([PUMP, FAN], [InvtCHE(2, name="mill"), FAN], ["fan"], {"fan": FAN}),
+    "both are meant anyway": ([PUMP, FAN], [NEW_FAN], ["fan", "pump"], {"fan": FAN, "pump": PUMP}),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_a_stop_reaches_what_is_about_to_have_the_name_too(case: str) -> None:
+    """Nobody knows which of the two was meant; the one on the other line has another name so far."""
+    before, after, names, stopped = CASES[case]
+    lines = Lines(plant_of(*before), plant_of(*after))
+
+    async def main() -> dict[str, End]:
+        stopping = asyncio.create_task(stop_meant(lines, names, lines.stop))
+        await until(lambda: {*stopped.values()} <= {*lines.begun})
+        lines.plant_coming = None
+        return await stopping
+
+    assert told(asyncio.run(main())) == stopped
+    assert {*lines.begun} - {None} == {*stopped.values()}
+
+
+def test_without_a_reload_nothing_else_is_stopped() -> None:
+    lines = Lines(plant_of(PUMP, FAN))
+    assert told(asyncio.run(stop_meant(lines, ["fan", "nobody"], lines.stop))) == {"fan": FAN}
+    assert lines.begun == [FAN, None]
