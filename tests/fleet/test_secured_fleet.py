@@ -72,6 +72,7 @@ def told(servers: SecuredCluster, user: str, *words: str) -> str:
     return lines[-1]
 
 
+@pytest.mark.slow  # the longest file of its room begins at once
 @pytest.mark.long
 def test_a_route_to_a_server_that_is_silent_is_left_soon(tmp_path: Path) -> None:
     """By itself NATS takes a minute and more, and hands that server questions for so long."""
