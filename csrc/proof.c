@@ -1,5 +1,5 @@
-/* A drive's proofs, and which of them serve: a device may be silent to registers that it lacks, and a document
- * wrong about what a register holds. */
+/* A drive's proofs, and which of them serve: a device may be silent to registers that it lacks, and a
+ * document wrong about what a register holds. */
 #include "line.h"
 
 /* A proof that was never answered is dropped after so many times in vain; a silence counts if other replies
