@@ -100,7 +100,7 @@ def test_a_poll_s_values_are_heard_captured_and_decoded(
     assert set(polled) <= set(decoded)
     for name, column in polled.items():
         assert decoded[name][: len(column)] == column  # the last one may have come too late for the poll
-        assert len(decoded[name]) <= len(column) + 1
+        assert len(decoded[name]) <= len(column) + 3  # nor were the first one and a proof for the poll
     assert {exchange["line"] for exchange in sniffer.exchanges} == {"hall-1"}
 
 
