@@ -29,7 +29,7 @@ from multidrop.plant.model import PolledDrive
 from multidrop.poller import Poller
 
 SEEDS = range(int(os.environ.get("HOSTILE_SEEDS", "1")))
-FRAMES = 80  # that the far end hears
+FRAMES = 160  # that the far end hears
 STRANGER = 99  # no drive of ours has this address
 MOTOR = "yd1000"
 REGISTERS = 5  # of each drive
@@ -88,6 +88,8 @@ class Hostile:
 def responder_drive(kind: str, drive: PolledDrive) -> ResponderDrive:
     """It holds another number in each register that is polled, and no two drives share one."""
     found = ResponderDrive(KINDS[kind], drive.drive.address)
+    for register, (least, _) in drive.drive.known_counts().items():
+        found.hold(register.address, least)
     for at, poll in enumerate(drive.polls):
         found.hold(poll.register.address, value(drive.drive.address, at))
     return found

@@ -325,4 +325,5 @@ def test_a_child_stops_no_motor(end: str) -> None:
             parent.communicate()
         assert parent.returncode == 0
         start, *stops = (write.raw for write in sim.counters.writes if write.name == "control")
-        assert (start, set(stops)) == (1, {5})  # a busy machine may have the stop repeated
+        # A busy machine may have the stop repeated, or followed by that of a jog.
+        assert (start, stops[0], set(stops) - {5, 8}) == (1, 5, set())
