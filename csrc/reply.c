@@ -267,7 +267,8 @@ struct md_ending md_reply_missed(struct md_line *line)
         md_late_expect(line, md_window_ns(exchange));
     if (!is_doubtful)
         md_learn_silence(exchange->drive);
-    int reason = first == MD_BAD_ECHO ? first :
-                 md_reason(exchange->framing, &exchange->request, line->rx + begin, line->rx_len - begin);
+    int reason = md_reason(exchange->framing, &exchange->request, line->rx + begin, line->rx_len - begin);
+    if (first == MD_BAD_ECHO) /* a good frame, whose value is not as known: md_reason() knows no range */
+        reason = first;
     return (struct md_ending){is_doubtful ? MD_MAYBE_ECHO : reason, 0, line->rx_len};
 }
