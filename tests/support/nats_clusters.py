@@ -113,7 +113,9 @@ class Node:
         self.process.wait()
 
     def pause(self) -> None:
+        """Stop it, and return when all its threads stand still, of which one could answer until then."""
         os.kill(self.process.pid, signal.SIGSTOP)
+        os.waitid(os.P_PID, self.process.pid, os.WSTOPPED)
 
     def go_on(self) -> None:
         os.kill(self.process.pid, signal.SIGCONT)
