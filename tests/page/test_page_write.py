@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from typing import Any
 
 import pytest
 from conftest import Opener
@@ -137,18 +138,45 @@ def test_a_double_click_on_start_does_not_confirm_it(opened: Opener, gateway: Fa
     assert gateway.posts == [("/api/act", {"drive": "pump-1", "verb": "start", "options": {}})]
 
 
-def test_a_second_tap_on_start_does_not_confirm_it(opened: Opener, gateway: FakeGateway) -> None:
+def tap(page: Any, x: float, y: float, made_s: float) -> None:
+    """Tap there, as if it had been made at that time since the epoch and had waited for its turn since."""
+    session = page.context.new_cdp_session(page)
+    for kind, points in (("touchStart", [{"x": x, "y": y}]), ("touchEnd", [])):
+        touch = {"type": kind, "touchPoints": points, "timestamp": made_s}
+        session.send("Input.dispatchTouchEvent", touch)
+    session.detach()
+
+
+SLOW_S = 1.0
+SLOW_AT_CLICKS = f"""button => button.addEventListener('click', () => {{
+  const end = performance.now() + {SLOW_S * 1000};
+  while (performance.now() < end);
+}})"""
+
+
+@pytest.mark.parametrize(("slows", "later_s"), [(False, 0.2), (True, 0.9)], ids=["at once", "on a slow page"])
+def test_a_second_tap_on_start_does_not_confirm_it(
+    opened: Opener, gateway: FakeGateway, slows: bool, later_s: float
+) -> None:
+    """A page that is slow draws its dialog after the second tap, which waits for its turn."""
     page = opened("#/drives/pump-1", "phone", has_touch=True)
     until_still(page)
     start = page.get_by_role("button", name="start", exact=True)
     start.scroll_into_view_if_needed()
+    if slows:
+        start.evaluate(SLOW_AT_CLICKS)
     box = start.bounding_box()
     x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
     page.evaluate(CONFIRMED_AT, [x, y])
-    page.touchscreen.tap(x, y)
-    page.touchscreen.tap(x, y)
+    made_s = time.time()
+    tap(page, x, y, made_s)
+    tap(page, x, y, made_s + later_s)
     assert page.locator("#ask").evaluate("dialog => dialog.open")
     assert gateway.posts == []
+    page.wait_for_timeout(600)  # a tap of its own
+    tap(page, x, y, time.time())
+    page.locator("#outcomes li").wait_for()
+    assert gateway.posts == [("/api/act", {"drive": "pump-1", "verb": "start", "options": {}})]
 
 
 def test_a_command_names_the_frame_that_was_seen_at_its_confirmation(

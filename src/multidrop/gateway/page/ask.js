@@ -9,24 +9,43 @@ let answer = null, // settles the question that stands now
 const dialog = () => find("#ask");
 
 // The second click of a double click means what the first one pressed. Where the dialog opened or closed in
-// between it would press what nobody looked at, so it is not taken, but for a stop. Nor is a held key.
+// between it would press what nobody looked at, so it is not taken, but for a stop. Nor is a click that was
+// made before the change was drawn, as on a page that is slow: it waited for its turn. Nor is a held key.
 const TWICE_MS = 500,
   NEAR_PX = 30,
   AT_ONCE = "#stopall, .stop";
 export const DANGER = "danger",
   STOP = "danger stop"; // classes of buttons
 const STOP_PATIENCE_MS = 45000; // a drive that does not answer is sent its stop for 30 s
-let changes = 0, // how often the dialog opened or closed
+let drawn = -Infinity, // when the latest opening or closing of the dialog could be seen
+  changes = 0, // how often it opened or closed
   last = { x: 0, y: 0, time: -Infinity, changes }; // the latest click that was taken
+
+function changed() {
+  const change = ++changes;
+  drawn = Infinity;
+  requestAnimationFrame(() =>
+    requestAnimationFrame(time => {
+      if (change === changes) drawn = time;
+    }),
+  );
+}
+
+function isOfBefore({ clientX: x, clientY: y, timeStamp: time, detail }) {
+  const isNear = Math.hypot(x - last.x, y - last.y) < NEAR_PX;
+  if (changes === last.changes) return false;
+  return time < drawn || (isNear && (detail > 1 || time - Math.max(last.time, drawn) < TWICE_MS));
+}
+
+// Beside the dialog there is nothing but Stop all, which lies behind it.
+const isAtOnce = target => target === dialog() || target.closest(AT_ONCE);
 
 addEventListener(
   "click",
   event => {
     const { clientX: x, clientY: y, timeStamp: time, detail } = event;
     if (detail === 0) return; // by a key
-    const isNear = Math.hypot(x - last.x, y - last.y) < NEAR_PX,
-      isSecond = isNear && (detail > 1 || time - last.time < TWICE_MS);
-    if (isSecond && changes !== last.changes && !event.target.closest(AT_ONCE)) {
+    if (isOfBefore(event) && !isAtOnce(event.target)) {
       event.preventDefault();
       event.stopImmediatePropagation();
     } else last = { x, y, time, changes };
@@ -36,7 +55,7 @@ addEventListener(
 addEventListener(
   "keydown",
   event => {
-    last.time = -Infinity; // a click after a key is a click of its own
+    last.x = -Infinity; // a click after a key is a click of its own
     if (event.repeat && (event.key === "Enter" || event.key === " ")) event.preventDefault();
   },
   true,
@@ -56,7 +75,7 @@ async function open(title, contents, buttons, { cancel = "Cancel", kind } = {}) 
 function show(title, contents, buttons, cancel) {
   answer?.(null);
   const close = choice => {
-    changes++;
+    changed();
     answer?.(choice);
     answer = stopAsked = null;
     if (dialog().open) dialog().close();
@@ -93,7 +112,7 @@ function show(title, contents, buttons, cancel) {
     event.preventDefault();
     close(null);
   };
-  changes++;
+  changed();
   if (dialog().open) dialog().close(); // opened anew, it is read out
   dialog().showModal();
   (find("[data-first]", form) ?? first).focus();
