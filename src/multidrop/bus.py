@@ -91,7 +91,7 @@ class Bus:
         self.format = format
         self.silence = silence
         facts = _facts(port, echo, transaction, rs485)
-        self._begin(Line(port, *facts, mastership), ledger, audit, expiry)
+        self._begin(Line(port, *facts, mastership).open(), ledger, audit, expiry)
 
     @classmethod
     def awaiting(
@@ -109,7 +109,7 @@ class Bus:
         bus = cls.__new__(cls)
         bus.baudrate = bus.format = bus.silence = None
         facts = _facts(port, echo, transaction, rs485)
-        bus._begin(Line.awaited(port, *facts, mastership), ledger, audit, EXPIRY)
+        bus._begin(Line(port, *facts, mastership), ledger, audit, EXPIRY)
         return bus
 
     def _begin(

@@ -114,7 +114,7 @@ def test_what_a_name_means(name: str, identity: str) -> None:
 
 
 def test_a_port_without_a_device_is_known_by_its_name() -> None:
-    line = Line("loop://")
+    line = Line("loop://").open()
     assert line.identity == "loop://"
     line.close()
 
@@ -225,7 +225,7 @@ def test_a_simulator_in_another_process_is_known_until_it_is_killed(tmp_path: Pa
 
 def test_a_real_port_is_not_taken_for_a_simulated_one() -> None:
     with socket.create_server(("127.0.0.1", 0)) as listener:
-        line = Line(f"socket://127.0.0.1:{listener.getsockname()[1]}")
+        line = Line(f"socket://127.0.0.1:{listener.getsockname()[1]}").open()
         assert not is_simulated(line.identity)
         line.close()
     master, slave = os.openpty()

@@ -167,7 +167,7 @@ def opened(path: str) -> Line:
 
     def is_open() -> bool:
         try:
-            found.append(Line(path))
+            found.append(Line(path).open())
         except LineError:
             return False
         return True

@@ -279,27 +279,12 @@ class ClockedLine:
         self.queue = self._clocked.ports[self.port] = ClockedPort(self, transactions_of(self))
         self._clocked.opened.append(self.port)
 
+    def open(self) -> ClockedLine:
+        self.reopen()
+        return self
+
     regain = reopen  # it is lost: the poller has dropped it
     is_lost = False  # nobody stops a motor here
-
-
-class ClockedOpener:
-    """Opens clocked lines, in place of the class Line."""
-
-    def __init__(self, clocked: ClockedLines) -> None:
-        self._clocked = clocked
-
-    def __call__(
-        self, port: str, echo: object, ids: TransactionIds, rs485: object, mastership: None
-    ) -> ClockedLine:
-        line = self.awaited(port, echo, ids, rs485, mastership)
-        line.reopen()
-        return line
-
-    def awaited(
-        self, port: str, echo: object, ids: TransactionIds, rs485: object, mastership: None
-    ) -> ClockedLine:
-        return ClockedLine(self._clocked, port, ids)
 
 
 class ClockedLines:
@@ -320,6 +305,11 @@ class ClockedLines:
         clocked._begin(wires, polled)
         return clocked
 
+    def _line(
+        self, port: str, echo: object, ids: TransactionIds, rs485: object, mastership: None
+    ) -> ClockedLine:
+        return ClockedLine(self, port, ids)
+
     def _begin(self, wires: Mapping[str, ClockedWire], polled: Plant) -> None:
         self.now = self._limit = BEGIN_NS
         self.wires = dict(wires)
@@ -331,7 +321,7 @@ class ClockedLines:
         self._turn = threading.Condition()
         self._beside: set[threading.Thread] = set()
         patch = self._patch = pytest.MonkeyPatch()
-        patch.setattr(bus, "Line", ClockedOpener(self))
+        patch.setattr(bus, "Line", self._line)
         patch.setattr(former_peers, "_former", {})  # they are another clock's
         patch.setattr(clock, "now_ns", lambda: self.now)
         patch.setattr(clock, "boottime_ns", lambda: self.now)

@@ -112,6 +112,9 @@ class PathLine:
     def counted_ns(self, now_ns: int) -> int:
         return now_ns
 
+    def open(self) -> PathLine:
+        return self
+
     def close(self) -> None:
         pass
 

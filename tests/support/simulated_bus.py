@@ -67,6 +67,9 @@ class SimulatedBus:
     is_lost = is_tcp = False
     may_send = True  # it has no mastership
 
+    def open(self) -> SimulatedBus:
+        return self
+
     def close(self) -> None:
         pass
 

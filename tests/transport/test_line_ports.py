@@ -191,7 +191,7 @@ def test_what_cannot_be_opened_is_a_sentence(tmp_path: Path, port: str, reason: 
     port = port.format(tmp=tmp_path, closed=closed)
     reason = reason.format(unknown=os_words_of_an_unknown_zone())
     with pytest.raises(LineError) as caught:
-        Line(port)
+        Line(port).open()
     assert str(caught.value) == f"{port}: {reason}"
     assert (caught.value.port, caught.value.reason) == (port, reason)
     assert isinstance(caught.value, OSError)
@@ -204,23 +204,23 @@ def test_a_port_is_opened_by_one_at_a_time() -> None:
         port = sim.wires[0].path
         with Bus(port) as first:
             with pytest.raises(LineError) as caught:
-                Line(port)
+                Line(port).open()
             assert str(caught.value) == f"{port}: it is in use by another program"
             read_and_write(first)
-        Line(port).close()
+        Line(port).open().close()
 
 
 def test_nothing_is_left_of_a_port_that_was_closed_or_not_opened(tmp_path: Path) -> None:
     with Simulator([wire(), wire("socket://127.0.0.1:0")]) as sim:
-        Line(sim.wires[0].path).close()  # what the process has once is there now
+        Line(sim.wires[0].path).open().close()  # what the process has once is there now
         before = descriptors(), threads()
         for each in sim.wires:
             for _ in range(3):
-                Line(each.path).close()
+                Line(each.path).open().close()
         for _ in range(3):
-            Line("loop://").close()
+            Line("loop://").open().close()
             with pytest.raises(LineError):
-                Line("/dev/null")
+                Line("/dev/null").open()
         assert (descriptors(), threads()) == before
 
 
@@ -358,7 +358,7 @@ def test_a_port_is_not_freed_while_another_thread_ends_it(monkeypatch: pytest.Mo
 
     monkeypatch.setattr(Port, "end", end_slowly)
     with Simulator([wire()]) as simulator:
-        ours = Line(simulator.wires[0].path)
+        ours = Line(simulator.wires[0].path).open()
         assert not ours.end()
         closing[0].join(PATIENCE)
         assert not closing[0].is_alive()

@@ -94,7 +94,7 @@ def _scan(
 ) -> tuple[list[Finding], bool]:
     """Return what was found, and False where Ctrl-C cut it short: what came until then is kept."""
     found: list[Finding] = []
-    line = Line(arguments.port, rs485=rs485)
+    line = Line(arguments.port, rs485=rs485).open()
     try:
         found.extend(_shown(scan(line.carry_out, planned, families), arguments.json))
     except KeyboardInterrupt:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from logging import DEBUG
+from typing import Self
 
 from multidrop.core import (
     RS485,
@@ -35,7 +36,7 @@ UNOPENED = "it is not opened: this process is not its master, and could end the 
 
 
 class Line:
-    """An open port on which exchanges are carried out, urgent ones ahead of those that are queued.
+    """A port on which exchanges are carried out once it is open, urgent ones ahead of those that are queued.
 
     `port` is a device, any pyserial URL, or tcp://host:port for Modbus TCP, whose replies have their
     requests' transaction ids unless `ids` says otherwise. `rs485` is who switches the transceiver. Where it
@@ -49,26 +50,6 @@ class Line:
         ids: TransactionIds = TransactionIds.MATCH,
         rs485: RS485 = RS485.OFF,
         mastership: Mastership | None = None,
-    ) -> None:
-        self._prepare(port, echo, ids, rs485, mastership)
-        self._open()
-
-    @classmethod
-    def awaited(
-        cls,
-        port: str,
-        echo: Echo,
-        ids: TransactionIds,
-        rs485: RS485 = RS485.OFF,
-        mastership: Mastership | None = None,
-    ) -> Line:
-        """Return a line whose port is not there yet: `regain` opens it."""
-        line = cls.__new__(cls)
-        line._prepare(port, echo, ids, rs485, mastership)
-        return line
-
-    def _prepare(
-        self, port: str, echo: Echo, ids: TransactionIds, rs485: RS485, mastership: Mastership | None
     ) -> None:
         if mastership is not None:
             check_port(port, mastership)
@@ -108,6 +89,11 @@ class Line:
         return self._opened.identity
 
     # ---- opening and closing ----
+
+    def open(self) -> Self:
+        """Open it and return it; LineError when it is not there."""
+        self.reopen()
+        return self
 
     def _open(self) -> None:
         self._why_closed = "it is closed"
@@ -209,7 +195,10 @@ class Line:
     def inherit(self, peer: Peer, before: Peer) -> None:
         """Let a drive take the place of another at its address, whose answers may still come."""
         with self._lock:
-            self.queue.inherit(peer, before) if self.queue else peer.inherit(before)
+            if self.queue:
+                self.queue.inherit(peer, before)
+            else:
+                peer.inherit(before)
 
     # ---- exchanges ----
 

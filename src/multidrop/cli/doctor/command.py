@@ -178,7 +178,7 @@ def _remote(port: str) -> Iterator[Finding]:
 
 
 def _local(port: str, rs485: RS485) -> Iterator[Finding]:
-    line = Line(port, rs485=rs485)  # raises LineError, with the reason, when it cannot be opened
+    line = Line(port, rs485=rs485).open()  # raises LineError, with the reason, when it cannot be opened
     try:
         yield from _opened_com(port) if sys.platform == "win32" else _opened(port, rs485)
     finally:
@@ -237,7 +237,7 @@ def _echo(port: str, rs485: RS485, settings: Settings) -> Finding:
         character=settings.character,
         silence=max(settings.t3_5, LEAST_TIMEOUT),
     )
-    line = Line(port, rs485=rs485)
+    line = Line(port, rs485=rs485).open()
     try:
         found = line.carry_out(probe)
     except LineError as failure:

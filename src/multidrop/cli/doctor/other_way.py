@@ -24,7 +24,7 @@ def ask_once(port: str, request: Message, settings: Settings) -> Completion:
         character=settings.character,
         silence=0.0 if speaks_tcp(port) else settings.t3_5,
     )
-    line = Line(port)
+    line = Line(port).open()
     try:
         return line.carry_out(exchange)
     finally:
