@@ -14,10 +14,13 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import pytest
 from commands import MULTIDROP
 from lines import PATIENCE, until
 
 from multidrop import InvtCHE, Plant, load_plant
+from multidrop.gateway import frames
+from multidrop.gateway import gateway as gateway_module
 from multidrop.gateway.gateway import Gateway
 from multidrop.gateway.rights import Right, Token, new_token
 from multidrop.gateway.settings import ServeSettings, read_settings
@@ -153,7 +156,17 @@ def served(
 
 @contextmanager
 def running(gateway: Gateway) -> Iterator[None]:
-    """Run a gateway in a thread; its failure is raised at the end."""
+    """Run a gateway in a thread, with ten times as many frames as a page needs; its failure is raised at the end."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(frames, "LEAST_S", 0.02)
+        patch.setattr(gateway_module, "TAKE_S", 0.01)
+        patch.setattr(gateway_module, "LOOK_S", 0.02)
+        with _running(gateway):
+            yield
+
+
+@contextmanager
+def _running(gateway: Gateway) -> Iterator[None]:
     ready = threading.Event()
     failures: list[BaseException] = []
     loops: list[asyncio.AbstractEventLoop] = []
