@@ -18,6 +18,7 @@ from pathlib import Path
 
 import pytest
 from commands import TOY, Run
+from examples import usually
 from lines import PATIENCE, Faulty, patient, until
 from motors import ReceivedRequests
 from terminals import closing_terminal
@@ -461,7 +462,7 @@ def test_a_stop_that_is_interrupted_is_sent_once_more(run: Run, che: Che) -> Non
 
 
 @patient
-@pytest.mark.parametrize("verb", ["stop", "coast"])
+@pytest.mark.parametrize("verb", usually("stop", "coast"))
 def test_a_stop_goes_on_until_its_end_where_the_terminal_is_closed(run: Run, che: Che, verb: str) -> None:
     received, words = che
     assert run("start", *words, "--frequency", 20, "--yes")[0] == 0
@@ -492,7 +493,7 @@ def plant_of(port: object, folder: Path) -> Path:
 
 
 @patient
-@pytest.mark.parametrize("keys", [b"sy", b"Sy"])
+@pytest.mark.parametrize("keys", usually(b"sy", b"Sy"))
 def test_a_stop_by_a_key_goes_on_until_its_end_where_the_terminal_is_closed(
     run: Run, che: Che, tmp_path: Path, keys: bytes
 ) -> None:

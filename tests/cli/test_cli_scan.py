@@ -100,6 +100,7 @@ def test_nobody_there_is_a_failure(run: Run, port: str, tmp_path: Path) -> None:
     assert not out.exists()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("port", ["socket://127.0.0.1:0"], indirect=True)
 def test_a_serial_server_is_asked_at_its_own_baud_rate(run: Run, port: str) -> None:
     status, _, err = run("scan", port, "--quick")
@@ -230,6 +231,7 @@ def test_quickly_nobody_is_asked_again(run: Run, port: str, monkeypatch: pytest.
     assert all(late.patience > usual.patience for late, usual in zip(again, quickly, strict=True))
 
 
+@pytest.mark.long
 def test_on_a_terminal_progress_is_one_line(port: str) -> None:
     with on_terminal("scan", port, *PATIENTLY) as terminal:
         terminal.wait_for("address 2; ")

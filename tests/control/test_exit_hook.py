@@ -12,6 +12,7 @@ from contextlib import ExitStack, contextmanager
 from typing import Any
 
 import pytest
+from examples import usually
 from lines import PATIENCE, until
 from motors import ReceivedRequests
 
@@ -267,7 +268,7 @@ def test_a_third_signal_ends_the_process_though_a_drive_is_silent() -> None:
         assert CUT_SHORT.decode() in told
 
 
-@BOTH
+@pytest.mark.parametrize("number", usually(signal.SIGTERM, signal.SIGINT))
 def test_a_second_signal_leaves_no_motor_running(number: int) -> None:
     """It comes when the first drive has its stop, and the others have none perhaps."""
     with lines(1) as (received, ports), client("wait", ports) as process:

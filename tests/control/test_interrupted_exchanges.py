@@ -19,6 +19,7 @@ from multidrop.sim import MotorDrive, Simulator, Wire, simulated
 from multidrop.transport import clock
 from multidrop.transport import line as of_a_port
 
+BAUDRATE = 38400  # its silences are short
 CODE = of_a_port.Line.carry_out.__code__
 
 
@@ -39,13 +40,13 @@ def interrupted(call: Callable[[], object], nth: int) -> KeyboardInterrupt | Non
 
 @pytest.mark.parametrize("verb", ["start", "coast", "stop"])
 def test_what_may_have_been_sent_is_told_wherever_it_is_interrupted(verb: str) -> None:
-    sim = simulated(InvtCHE(1, maximum_frequency=50))
+    sim = simulated(InvtCHE(1, baudrate=BAUDRATE, maximum_frequency=50))
     assert isinstance(sim, MotorDrive)
     received = ReceivedRequests(sim)
     with Simulator([Wire([sim], unpaced=True)]) as simulator:
         for nth in count(1):
             with Bus(simulator.wires[0].path, expiry=PATIENCE) as bus:
-                drive = bus.attach(InvtCHE, address=1, maximum_frequency=50)
+                drive = bus.attach(InvtCHE, address=1, baudrate=BAUDRATE, maximum_frequency=50)
                 drive.set_frequency(25.0)
                 before = len(received.writes)
                 interruption = interrupted(getattr(drive, verb), nth)
@@ -62,10 +63,10 @@ def test_what_may_have_been_sent_is_told_wherever_it_is_interrupted(verb: str) -
 
 def test_an_interrupted_exchange_does_not_hold_the_port_up(monkeypatch: pytest.MonkeyPatch) -> None:
     waits: list[float] = []
-    with Simulator([Wire([simulated(InvtCHE(1))], unpaced=True)]) as simulator:
+    with Simulator([Wire([simulated(InvtCHE(1, baudrate=BAUDRATE))], unpaced=True)]) as simulator:
         for nth in count(1):
             bus = Bus(simulator.wires[0].path)
-            drive = bus.attach(InvtCHE, address=1)
+            drive = bus.attach(InvtCHE, address=1, baudrate=BAUDRATE)
             interruption = interrupted(partial(bus.read, drive, drive.status), nth)
             with monkeypatch.context() as patched:
                 patched.setattr(clock, "sleep", waits.append)

@@ -17,6 +17,7 @@ from typing import Any
 
 import pytest
 from completions import new_completion
+from examples import usually
 from lines import PATIENCE, until
 from toy import Status, Toy
 
@@ -126,14 +127,14 @@ def test_nothing_is_sent_before_it_is_master(scene: Scene, call: Callable[[Scene
     assert scene.audit.read_text() == ""  # what was not sent is no write
 
 
-@pytest.mark.parametrize("call", CALLS.values(), ids=CALLS)
-def test_nothing_is_sent_after_it_was_master(scene: Scene, call: Callable[[Scene], object]) -> None:
+@pytest.mark.parametrize("call", usually("start", *(call for call in CALLS if call != "start")))
+def test_nothing_is_sent_after_it_was_master(scene: Scene, call: str) -> None:
     scene.become_master()
     scene.bus.read(scene.drive, Toy.output_current)
     before = scene.requests
     scene.mastership.end()
     with pytest.raises(NotMaster):
-        call(scene)
+        CALLS[call](scene)
     assert scene.requests == before
 
 
@@ -339,6 +340,7 @@ def waits(far: int, bus: Bus, drive: Slow) -> float:
     return seconds
 
 
+@pytest.mark.long
 def test_the_line_is_listened_to_where_another_one_may_have_been_master(
     shared: tuple[int, Bus, Mastership],
 ) -> None:

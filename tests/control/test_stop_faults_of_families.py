@@ -10,6 +10,7 @@ from types import FrameType
 
 import pytest
 from declared_families import class_of, document_of
+from examples import in_turn
 from interruptions import failing_at
 from motors import MAKE
 from profile_families import ALL
@@ -86,8 +87,7 @@ def check_stops(monkeypatch: pytest.MonkeyPatch, family: str, failure: str, step
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # as a script ends
 @pytest.mark.usefixtures("_unbounded")
 @pytest.mark.parametrize("step", [37, pytest.param(5, marks=pytest.mark.long)])
-@pytest.mark.parametrize("failure", FAILURES)
-@pytest.mark.parametrize("family", FAMILIES)
+@pytest.mark.parametrize(("family", "failure"), in_turn(FAMILIES, [*FAILURES]))
 def test_a_motor_stands_though_its_stop_failed_at_some_line(
     monkeypatch: pytest.MonkeyPatch, family: str, failure: str, step: int
 ) -> None:

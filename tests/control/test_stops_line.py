@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from examples import usually
+from examples import in_turn, usually
 from lines import PATIENCE, LateWire, plant, polled, until
 from lines import line as declared_line
 from motors import MAKE, ReceivedRequests
@@ -77,8 +77,7 @@ def in_thread(act: Callable[[], object]) -> tuple[threading.Thread, list[BaseExc
     return thread, failures
 
 
-@pytest.mark.parametrize("ending", ["close", "detach"])
-@pytest.mark.parametrize("what", ["start", "write", "raw"])
+@pytest.mark.parametrize(("what", "ending"), in_turn(["start", "write", "raw"], ["close", "detach"]))
 def test_what_was_sent_is_unconfirmed_when_another_thread_closes(
     monkeypatch: pytest.MonkeyPatch, ending: str, what: str
 ) -> None:

@@ -11,6 +11,7 @@ from typing import Any
 
 import pytest
 from command_desks import LINE, PATIENCE_S, Desks, desks
+from examples import every_third
 from lines import patient
 from peers import require_module
 from tables import table
@@ -420,7 +421,7 @@ ODD_STOPS = [  # messages that any asker may send, or a network may spoil
 ]
 
 
-@pytest.mark.parametrize("data", ODD_STOPS, ids=range(len(ODD_STOPS)))
+@pytest.mark.parametrize("data", every_third(ODD_STOPS))
 def test_a_stop_is_sent_whatever_is_wrong_with_its_words(
     desk: Desks, data: bytes, caplog: pytest.LogCaptureFixture, tmp_path: Path
 ) -> None:

@@ -98,6 +98,7 @@ def test_a_value_that_was_not_asked_for_explains_no_missing_answer(tmp_path: Pat
     assert len(read_rows(tmp_path)["pump"]) == len(asked)
 
 
+@pytest.mark.long
 def test_late_answers_are_late_and_none_of_them_is_missing(tmp_path: Path) -> None:
     """Answers come late by more than the time-out, twice, beside another drive whose answers do not."""
     drives = [NumberedDrive(InnovertIBD(address=at, name=f"line-drive-{at}")) for at in (1, 2)]

@@ -6,9 +6,12 @@ import ast
 from collections.abc import Iterator
 from pathlib import Path
 
+import pytest
 from tables import table
 
 import multidrop
+
+pytestmark = pytest.mark.long  # a rule for who writes the package
 
 SOURCE = Path(multidrop.__file__).parent
 TEXT_MODES = frozenset("rwaxt+")

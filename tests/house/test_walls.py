@@ -11,6 +11,8 @@ from sources import PACKAGE, ROOT, files, run_time_imports, type_imports
 
 import multidrop
 
+pytestmark = pytest.mark.long  # rules for who writes the package
+
 FILES = files("src")
 OUTSIDE = {
     *("os", "time", "select", "selectors", "socket", "serial", "termios", "fcntl", "pty", "tty"),

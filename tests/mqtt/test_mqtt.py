@@ -15,6 +15,7 @@ from typing import Any
 
 import pytest
 from brokers import FAN, Broker, Listener, Published, Running, inside, mosquitto, publish, without_fan
+from examples import in_turn
 from gateways import served
 from lines import until
 from peers import require_module
@@ -27,6 +28,8 @@ from multidrop.gateway.mqtt import MqttSettings, build
 from multidrop.gateway.outbox import MOST_UNDER_WAY
 
 Start = Callable[..., tuple[Any, Running]]
+
+STOPS = ["coast", "emergency_stop", "stop"]
 
 
 @pytest.fixture
@@ -230,18 +233,20 @@ def test_no_payload_keeps_a_stop_back(
     assert known.commands.noted == [("stop", stopped)]
 
 
-@pytest.mark.parametrize("verb", ["coast", "emergency_stop", "stop"])
 @pytest.mark.parametrize(
-    "more",
-    [
-        {"time": 1},
-        {"time": 10**15},
-        {"time": "now"},
-        {"drive": "pump-1"},
-        {},
-        {"options": None},
-        {"options": [1]},
-    ],
+    ("more", "verb"),
+    in_turn(
+        [
+            {"time": 1},
+            {"time": 10**15},
+            {"time": "now"},
+            {"drive": "pump-1"},
+            {},
+            {"options": None},
+            {"options": [1]},
+        ],
+        STOPS,
+    ),
 )
 def test_a_stop_by_a_verb_is_carried_out_whenever_it_was_sent(
     broker: Broker, listener: Listener, start: Start, verb: str, more: dict[str, Any]
@@ -264,9 +269,9 @@ def test_a_stop_by_a_verb_that_the_broker_keeps_is_carried_out(
     assert known.commands.noted == [("act", "pump-1", "coast", {})]
 
 
-@pytest.mark.parametrize("verb", ["coast", "emergency_stop", "stop"])
 @pytest.mark.parametrize(
-    "named", [FAN.name, "no-such-drive", "pump-1", 7, ["pump-1"], {}, None, "", "#", "pump-1/+"]
+    ("named", "verb"),
+    in_turn([FAN.name, "no-such-drive", "pump-1", 7, ["pump-1"], {}, None, "", "#", "pump-1/+"], STOPS),
 )
 def test_a_stop_by_a_verb_stops_its_topic_s_drive_and_another_one_that_it_names(
     broker: Broker, listener: Listener, start: Start, verb: str, named: object

@@ -8,6 +8,7 @@ from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
+from examples import usually
 from lines import line, plant, polled, rows_of, until
 
 from multidrop.drives import InvtCHE
@@ -51,7 +52,7 @@ def hall(tmp_path: Path) -> Iterator[Plant]:
         yield Plant(tmp_path / "hall", stack)
 
 
-@pytest.mark.parametrize("failure", [RuntimeError("can't start new thread"), MemoryError()])
+@pytest.mark.parametrize("failure", usually(RuntimeError("can't start new thread"), MemoryError()))
 def test_without_a_thread_a_stop_opens_the_port_and_polling_goes_on(
     hall: Plant, monkeypatch: pytest.MonkeyPatch, failure: Exception
 ) -> None:

@@ -29,6 +29,14 @@ def in_turn(each: Iterable[object], cases: Sequence[object]) -> list[Any]:
     ]
 
 
+def every_third(cases: Sequence[object]) -> list[Any]:
+    """Return cases, numbered: every third is always tried, the others are marked `long`."""
+    return [
+        pytest.param(case, id=str(number), marks=pytest.mark.long if number % 3 else ())
+        for number, case in enumerate(cases)
+    ]
+
+
 def every_fourth(each: Iterable[object], cases: Sequence[object], tried: Sequence[object]) -> list[Any]:
     """Return every fourth pair, along diagonals, and those `tried`: all but these are marked `long`."""
     return [

@@ -156,7 +156,7 @@ def served(
 
 @contextmanager
 def running(gateway: Gateway) -> Iterator[None]:
-    """Run a gateway in a thread, with ten times as many frames as a page needs; its failure is raised at the end."""
+    """Run a gateway in a thread, with ten times the frames of a page; its failure is raised at the end."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(frames, "LEAST_S", 0.02)
         patch.setattr(gateway_module, "TAKE_S", 0.01)
