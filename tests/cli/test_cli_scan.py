@@ -13,6 +13,7 @@ from terminals import on_terminal
 from toy import Toy
 
 import multidrop.cli.scan
+import multidrop.scan.probe
 from multidrop.cli.scan import sentence
 from multidrop.core import RS485, Framing
 from multidrop.drive.timing import Settings
@@ -26,6 +27,12 @@ from multidrop.sim import SimulatedDrive, Simulator, Wire, simulated
 
 USUAL = Settings(9600, "8N1")
 PATIENTLY = ("--baudrates", "9600", "--formats", "8N1", "--addresses", "1-3")  # however busy the machine is
+
+
+@pytest.fixture(autouse=True)
+def _slow_answers(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A drive that answered at once is waited for, when a busy machine holds its next answer up."""
+    monkeypatch.setattr(multidrop.scan.probe, "LEAST_TIMEOUT", 0.1)
 
 
 @pytest.fixture
