@@ -100,9 +100,7 @@ export function draw(t) {
       age,
       found === null || found.value === null
         ? (found?.status ?? "not read")
-        : found.isOld
-          ? clock.when(found.ms)
-          : clock.lasting(found.age),
+        : clock.lasting(found.age),
     );
     if (age.textContent === "") put(age, UNKNOWN);
   }
