@@ -358,6 +358,19 @@ def test_drives_without_a_fault_take_no_room(tmp_path: Path) -> None:
     assert titles(["fault"]) == ["faults: none"]
 
 
+@pytest.mark.parametrize(("drives", "name"), [(30, "drive"), (12, "conveyor-of-the-bottling-hall-south")])
+def test_a_long_legend_takes_no_room_from_the_plot(tmp_path: Path, drives: int, name: str) -> None:
+    rows = [row(at, f"{name}-{n:02}", "output_frequency", n) for at in range(3) for n in range(drives)]
+    figure, _ = plot(load(record(tmp_path / "it.arrows", rows)))
+    figure.draw_without_rendering()
+    (axes,), (legend,) = figure.axes, figure.legends
+    inches = axes.get_window_extent().height / figure.dpi
+    assert inches > 1
+    shown = legend.get_window_extent()
+    assert 0 <= shown.x0
+    assert shown.x1 <= figure.bbox.width
+
+
 def test_a_value_that_never_changes_is_no_tiny_span(tmp_path: Path) -> None:
     rows = [row(at, "pump", "output_frequency", 50.0) for at in range(3)]
     (axes,) = plot(load(record(tmp_path / "it.arrows", rows)))[0].axes
@@ -679,6 +692,7 @@ def test_mistakes_are_one_sentence(
 
 @pytest.mark.parametrize("command", ["plot", "report"])
 def test_what_is_no_recording_or_has_no_rows_is_one_sentence(run: Run, tmp_path: Path, command: str) -> None:
+    assert run(command, ".")[::2] == (2, "multidrop: . is a folder: name the recording in it\n")
     text = tmp_path / "letter.arrows"
     text.write_text("Dear Sir")
     assert "is not a recording" in run(command, text)[2]

@@ -174,7 +174,7 @@ def _add_drives(
     ]
     if has_misses:
         handles.append(Line2D([], [], color=TEXT, marker="|", linestyle="", label="missed"))
-    add_legend(figure, handles, min(6, max(1, len(handles))))
+    add_legend(figure, handles)
 
 
 def _draw_curves(axes: Axes, panel: Panel, series: Sequence[Series], recording: Recording) -> None:
