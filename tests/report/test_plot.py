@@ -367,7 +367,7 @@ def test_a_long_legend_takes_no_room_from_the_plot(tmp_path: Path, drives: int, 
     inches = axes.get_window_extent().height / figure.dpi
     assert inches > 1
     shown = legend.get_window_extent()
-    assert 0 <= shown.x0
+    assert shown.x0 >= 0
     assert shown.x1 <= figure.bbox.width
 
 
