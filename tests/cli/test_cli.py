@@ -57,7 +57,7 @@ def test_the_help_says_of_each_word_what_it_is(run: Run, name: str) -> None:
     [
         ("read", "parity and stop bits; the family's default if not given"),
         ("read", "where the family has several; its first if not given"),
-        ("doctor", "where the family has several; its first if not given"),
+        ("doctor", "of the drive; the family's first if not given"),
         ("write", "append every write and its outcome to this file; to none if not given"),
         ("hub", "seconds of samples in a commit; 10 if not given"),
         (

@@ -131,6 +131,23 @@ def test_an_old_register_has_its_age_like_a_new_one(opened: Opener) -> None:
     until_met(page, lambda: bool(re.fullmatch(r"\d+ min", row.locator(".age").inner_text())))
 
 
+def test_what_was_looked_at_is_old_once_nobody_answers(opened: Opener, gateway: FakeGateway) -> None:
+    """It may be looked at once a minute, and is new for so long only while its drive answers."""
+    page = opened()
+    value = page.locator("#panel tr", has_text="run hours").locator(".value")
+    until_met(page, lambda: value.inner_text() == "4012h")
+    assert "old" not in str(value.get_attribute("class"))
+    page.evaluate("location.hash = '#/drives/labeller'")
+    page.locator("#panel h2", has_text="labeller").wait_for()
+    page.locator("#panel .value.old", has_text="4012").wait_for()
+    page.evaluate("location.hash = '#/drives/pump-1'")
+    page.locator("#panel h2", has_text="pump-1").wait_for()
+    until_met(page, lambda: value.inner_text() == "4012h")
+    assert "old" not in str(value.get_attribute("class"))
+    gateway.kill()
+    page.locator("#panel .value.old", has_text="4012").wait_for()
+
+
 def test_a_fault_that_is_cut_in_its_lane_shows_that_it_is(opened: Opener) -> None:
     page: Any = opened("#/trends?drive=pump-1")
     bar = page.locator(".lane .fault")
