@@ -52,6 +52,26 @@ def test_the_help_says_of_each_word_what_it_is(run: Run, name: str) -> None:
         assert word in words
 
 
+@table(
+    "name, told",
+    [
+        ("read", "parity and stop bits; the family's default if not given"),
+        ("read", "where the family has several; its first if not given"),
+        ("doctor", "of the drive; the family's first if not given"),
+        ("write", "append every write and its outcome to this file; to none if not given"),
+        ("hub", "seconds of samples in a commit; 10 if not given"),
+        (
+            "simulate",
+            "may be left out: then a share and the seed are 0, and the longest times and bursts are as",
+        ),
+        ("fleet serve", "spool, logs and lock; NAME in ~/.local/state/multidrop/fleet if not given"),
+        ("fleet stop", "what was asked for; else commands.jsonl in ~/.local/state/multidrop/fleet"),
+    ],
+)
+def test_the_help_says_what_holds_where_an_option_is_not_given(run: Run, name: str, told: str) -> None:
+    assert told in " ".join(run(*name.split(), "--help")[1].split())
+
+
 def test_help_imports_no_command_and_nothing_heavy() -> None:
     code = (
         "import sys; before = {*sys.modules}; from multidrop.cli import main; main(['--help']); "

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 from commands import TOY, Run
+from rich.cells import cell_len
 
 LINE = '[[line]]\nname = "{}"\nport = "/dev/there-is-no-such-port-{}"\n'
 DRIVE = '[[line.drive]]\nname = "{}"\nmodel = "{}"\naddress = {}\n'
@@ -50,6 +51,27 @@ def test_what_fits_is_status_0_and_its_rates_are_told(run: Run, fitting: Path) -
     assert lines[3].split()[:5] == ["pump-2", "1", "1", "-", "-"]
     assert lines[4].split() == ["pump-2", "1", "1", "500", "ms", "2/s", "2/s"]
     assert len(lines) == 5
+
+
+def test_long_names_fit_in_line_and_keep_both_ends(run: Run, tmp_path: Path) -> None:
+    """Two names may differ at their ends alone, and Chinese characters are two columns wide."""
+    path = tmp_path / "named.toml"
+    names = [
+        "conveyor-of-the-bottling-hall-1",
+        "conveyor-of-the-bottling-hall-2",
+        "主泵电机三号线北侧冷却水循环",
+    ]
+    path.write_text(
+        LINE.format("hall-1", 1) + "".join(DRIVE.format(n, TOY, at + 1) for at, n in enumerate(names))
+    )
+    _, out, _ = run("plan", path)
+    head, first, second, chinese = out.splitlines()[1:5]
+    assert [row.split()[0] for row in (first, second)] == [
+        "conveyor-of-...ng-hall-1",
+        "conveyor-of-...ng-hall-2",
+    ]
+    assert chinese.split()[0] == "主泵电机三号...却水循环"
+    assert {cell_len(row) for row in (first, second, chinese)} == {cell_len(head)}
 
 
 def test_json_has_the_figures(run: Run, fitting: Path) -> None:

@@ -16,6 +16,7 @@ from typing import Any
 import pytest
 from commands import Run, plant_file
 from lines import PATIENCE
+from rich.cells import cell_len
 from rich.console import Console
 from tables import table
 from terminals import Terminal, on_terminal
@@ -206,7 +207,7 @@ def test_it_fills_every_size_and_no_more(tmp_path: Path, size: tuple[int, int], 
         assert any(line.startswith(f">drive-{chosen + 1} ") for line in shown)
 
 
-@pytest.mark.parametrize("name", ["pump", "a-drive-of-a-long-name"])
+@pytest.mark.parametrize("name", ["pump", "a-drive-of-a-long-name", "主泵电机三号线北侧冷却水循环"])
 def test_the_least_width_has_the_age_and_all_keys(tmp_path: Path, name: str) -> None:
     live = LivePlant(a_plant(tmp_path, 1))
     live.drives[0].polled.drive.name = name
@@ -214,8 +215,16 @@ def test_the_least_width_has_the_age_and_all_keys(tmp_path: Path, name: str) -> 
     shown = texts(overview(live, Position(), size, NOW, BLOCKS))
     assert shown[2].split()[-1] == "AGE"
     assert shown[3].rstrip().endswith(" never")
+    assert cell_len(shown[3]) <= LEAST_WIDTH
+    assert cell_len(shown[3].rstrip()) == len(shown[2].rstrip())  # in line with its heading
     for lines in (shown, texts(page(live.drives[0], {}, Position(), size, NOW))):
         assert lines[-1].endswith("s stop   S stop all   q quit")
+
+
+def test_a_wide_overview_has_long_names_whole(tmp_path: Path) -> None:
+    live = LivePlant(a_plant(tmp_path, 1))
+    live.drives[0].polled.drive.name = name = "conveyor-of-the-bottling-hall-south-12"
+    assert texts(overview(live, Position(), (200, 50), NOW, BLOCKS))[3].split()[0] == f">{name}"
 
 
 def test_the_page_has_every_register(watched: LivePlant) -> None:

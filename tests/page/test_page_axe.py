@@ -5,10 +5,11 @@ from __future__ import annotations
 from importlib.resources import files
 from typing import Any
 
+import fake_plant
 import pytest
 from conftest import Opener, missing
 from fake_gateway import FakeGateway
-from watching import until_still
+from watching import until, until_still
 
 pytestmark = pytest.mark.long  # Chromium is started for each file
 
@@ -68,3 +69,61 @@ def test_axe_finds_nothing(opened: Opener, gateway: FakeGateway, axe: str, size:
         until_still(page)
         found[view] = violations(page)
     assert {view: some for view, some in found.items() if some} == {}
+
+
+@pytest.mark.parametrize(("size", "theme"), [("desk", "dark"), ("phone", "light")])
+def test_axe_finds_nothing_in_rare_states(
+    opened: Opener, gateway: FakeGateway, axe: str, size: str, theme: str
+) -> None:
+    """Dialogs that send, what a write became, nothing known of a drive, one drive, no daemon."""
+    gateway.token = "right"
+    page = opened("#/drives/pump-1", size=size, color_scheme=theme)
+    page.evaluate(axe)
+    found = {}
+
+    def look(state: str) -> None:
+        page.wait_for_timeout(300)
+        until_still(page)
+        found[state] = violations(page)
+
+    page.get_by_role("button", name="start", exact=True).click()
+    look("a start")
+    page.keyboard.press("Escape")
+    page.get_by_role("button", name="Change frequency setpoint").click()
+    page.get_by_label("New value").fill("30")
+    look("a write")
+    page.get_by_role("button", name="Write to pump-1").click()
+    page.get_by_label("Token").fill("wrong")
+    page.keyboard.press("Enter")
+    page.get_by_text("No such token is known.").wait_for()
+    look("a wrong token")
+    page.get_by_label("Token").fill("right")
+    page.keyboard.press("Enter")
+    page.locator("#outcomes").get_by_text("held by the drive").wait_for()
+    look("an outcome")
+    page.evaluate("location.hash = '#/trends'")
+    page.get_by_role("button", name="Marker A").click()
+    look("a marker")
+    unknown = {"state": "unknown", "fault": None, "seen": None, "ages_ms": [], "values": {}, "missed": None}
+    gateway.changes = {
+        "drives": {name: unknown for names in fake_plant.NAMES for name in names.split()},
+        "lines": {},
+        "alarms": [],
+        "troubles": ["history: the disk is full"],
+    }
+    page.goto(f"{gateway.url}?again#/drives/pump-2")  # a page that has seen no value
+    page.evaluate(axe)
+    page.get_by_text("31 of unknown state").wait_for()
+    look("nothing known")
+    first = fake_plant.plant({})["lines"][0]
+    gateway.plant_changes = {"lines": [first | {"drives": first["drives"][:1]}], "fleet": False}
+    page.reload()
+    page.evaluate(axe)
+    page.get_by_text("1 drive, no fault known").wait_for()
+    look("one drive")
+    gateway.kill()
+    until(page, "document.body.classList.contains('dead')")
+    for view in ("#/drives", "#/trends", "#/faults", "#/lines", "#/log"):
+        page.evaluate("view => { location.hash = view }", view)
+        look(f"dead {view}")
+    assert {state: some for state, some in found.items() if some} == {}

@@ -358,6 +358,38 @@ def test_drives_without_a_fault_take_no_room(tmp_path: Path) -> None:
     assert titles(["fault"]) == ["faults: none"]
 
 
+def test_no_line_and_no_state_leads_across_a_pause(tmp_path: Path) -> None:
+    """A process that stood still recorded nothing, not even a miss. A rate that changes is no pause."""
+    times = [0.0, 0.1, 0.2, 10.2, 10.3, 10.4, 30.4, 50.4, 70.4]
+    rows = [row(at, "pump", name, 1.0) for at in times for name in ("output_frequency", "status")]
+    about = {"drives": {"pump": {"registers": {"status": {"values": {"runs": 1}}}}}}
+    figure, _ = plot(load(record(tmp_path / "it.arrows", rows, about)))
+    lane, curve = (
+        next(axes for axes in figure.axes if axes.get_title(loc="left").startswith(name))
+        for name in ("status", "output_frequency")
+    )
+    (line,) = (one for one in curve.lines if len(one.get_xdata()) > 2)
+    drawn = ["-" if np.isnan(value) else "o" for value in line.get_ydata()]
+    assert "".join(drawn) == "ooo-oooooo"
+    (bars,) = lane.collections
+    spans = [path.get_extents() for path in bars.get_paths()]
+    seconds = [round(span.width * 86400, 1) for span in spans]
+    assert seconds == [0.2, 60.2]
+
+
+@pytest.mark.parametrize(("drives", "name"), [(30, "drive"), (12, "conveyor-of-the-bottling-hall-south")])
+def test_a_long_legend_takes_no_room_from_the_plot(tmp_path: Path, drives: int, name: str) -> None:
+    rows = [row(at, f"{name}-{n:02}", "output_frequency", n) for at in range(3) for n in range(drives)]
+    figure, _ = plot(load(record(tmp_path / "it.arrows", rows)))
+    figure.draw_without_rendering()
+    (axes,), (legend,) = figure.axes, figure.legends
+    inches = axes.get_window_extent().height / figure.dpi
+    assert inches > 1
+    shown = legend.get_window_extent()
+    assert shown.x0 >= 0
+    assert shown.x1 <= figure.bbox.width
+
+
 def test_a_value_that_never_changes_is_no_tiny_span(tmp_path: Path) -> None:
     rows = [row(at, "pump", "output_frequency", 50.0) for at in range(3)]
     (axes,) = plot(load(record(tmp_path / "it.arrows", rows)))[0].axes
@@ -679,6 +711,7 @@ def test_mistakes_are_one_sentence(
 
 @pytest.mark.parametrize("command", ["plot", "report"])
 def test_what_is_no_recording_or_has_no_rows_is_one_sentence(run: Run, tmp_path: Path, command: str) -> None:
+    assert run(command, ".")[::2] == (2, "multidrop: . is a folder: name the recording in it\n")
     text = tmp_path / "letter.arrows"
     text.write_text("Dear Sir")
     assert "is not a recording" in run(command, text)[2]

@@ -27,7 +27,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     sinks.add_argument("--parquet", metavar="FOLDER", type=Path, help="keep samples in Parquet files there")
     sinks.add_argument("--postgres", metavar="WHERE", help="keep them in PostgreSQL: 'host=db dbname=plant'")
     parser.add_argument(
-        "--every", metavar="S", type=duration, default=EVERY_S, help="seconds of samples in a commit (10)"
+        "--every",
+        metavar="S",
+        type=duration,
+        default=EVERY_S,
+        help="seconds of samples in a commit; 10 if not given",
     )
     parser.add_argument("--once", action="store_true", help="end when all is kept that is there now")
     add_nats_arguments(parser)

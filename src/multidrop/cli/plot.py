@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from multidrop.cli.support.files import load_recording
+from multidrop.cli.support.files import beside, load_recording
 from multidrop.cli.support.output import print_text
 
 SUFFIXES = (".png", ".html")
@@ -23,7 +23,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    out = arguments.out or arguments.recording.with_suffix(".png")
+    out = arguments.out or beside(arguments.recording, ".png")
     if out.suffix.lower() not in SUFFIXES:
         raise ValueError(f"{out}: a plot's name ends in {' or '.join(SUFFIXES)}")
     recording = load_recording(arguments.recording, out, "plot")

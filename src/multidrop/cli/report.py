@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from multidrop.cli.support.files import load_recording
+from multidrop.cli.support.files import beside, load_recording
 from multidrop.cli.support.output import print_text
 
 
@@ -19,7 +19,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    out = arguments.out or arguments.recording.with_suffix(".html")
+    out = arguments.out or beside(arguments.recording, ".html")
     if out.suffix.lower() != ".html":
         raise ValueError(f"{out}: a report's name ends in .html")
     recording = load_recording(arguments.recording, out, "report")

@@ -69,11 +69,12 @@ def _lanes(series: Series) -> Iterable[Lane]:
 
 
 def _lane(series: Series, title: str, value: Array, name_of: Callable[[float], str]) -> Lane:
-    """Cut the rows into runs of one value; a state lasts until the next row, whatever that says."""
+    """Cut the rows into runs of one value; a state lasts until the next row, or until a pause begins."""
     time = series.time
     differs = (value[1:] != value[:-1]) & ~(np.isnan(value[1:]) & np.isnan(value[:-1]))
-    begins = np.concatenate([[0], np.flatnonzero(differs) + 1])
-    ends = np.concatenate([time[begins[1:]], time[-1:]])
+    cuts = np.flatnonzero(differs | series.pauses)
+    begins = np.concatenate([[0], cuts + 1])
+    ends = np.concatenate([np.where(series.pauses[cuts], time[cuts], time[cuts + 1]), time[-1:]])
     names = {one: "" if np.isnan(one) else name_of(one) for one in np.unique(value[begins]).tolist()}
     states = [names[one] if one == one else "" for one in value[begins].tolist()]
     named = np.array([bool(state) for state in states])

@@ -18,6 +18,7 @@ from multidrop.recording import open_reader
 RAW = "raw count"  # the unit where no document states the scale
 LARGEST = 1e150  # drawable value: axes compute with differences and products
 LATEST_NS = 230 * 365 * 86400 * 10**9  # UTC: dates beyond it cannot be computed
+PAUSE_NS, PAUSE_STEPS = 2 * 10**9, 5  # longer than both: nothing was polled, as by a process that stood still
 LARGEST_COUNT = 2**53  # that a column of values can hold exactly
 Array = NDArray[Any]
 
@@ -56,6 +57,13 @@ class Series:
     def drawable(self) -> Array:
         """The values, with NaN for misses and for those that are too large for a picture."""
         return np.where(np.abs(self.value) < LARGEST, self.value, np.nan)
+
+    @cached_property
+    def pauses(self) -> Array:
+        """True for each row, but the last, after which nothing was polled: neither a value nor a miss."""
+        steps = np.diff(self.time)
+        beside = np.maximum(np.append(steps[1:], 0), np.append(0, steps[:-1]))
+        return np.asarray((steps > PAUSE_NS) & (steps / PAUSE_STEPS > beside) & (beside > 0))
 
     @cached_property
     def names(self) -> dict[int, str]:

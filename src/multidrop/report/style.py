@@ -26,6 +26,7 @@ BIN_NS = 2_000_000_000  # the width of one, between these
 SHORTEST_NS = 1_000_000_000  # time axis
 WIDTH = 11.0  # inches
 DPI = 110
+LEGEND_MARK, LEGEND_LETTER, LEGEND_ROW = 0.7, 0.09, 0.21  # inches
 
 _DATES: Any = dates  # it has no types
 
@@ -79,6 +80,11 @@ def set_title(axes: Axes, text: str) -> None:
 
 
 def add_legend(figure: Figure, handles: Sequence[Any], columns: int = 6) -> None:
+    """Add a legend above the axes, as wide as there is room, in a figure that grows by its rows."""
+    longest = max((len(handle.get_label()) for handle in handles), default=0)
+    columns = max(1, min(columns, int(WIDTH / (LEGEND_MARK + LEGEND_LETTER * longest))))
+    rows = -(-len(handles) // columns)
+    figure.set_figheight(figure.get_figheight() + LEGEND_ROW * max(0, rows - 1))
     figure.legend(handles=handles, loc="outside upper left", ncols=columns, frameon=False)
 
 

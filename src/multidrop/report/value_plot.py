@@ -174,7 +174,7 @@ def _add_drives(
     ]
     if has_misses:
         handles.append(Line2D([], [], color=TEXT, marker="|", linestyle="", label="missed"))
-    add_legend(figure, handles, min(6, max(1, len(handles))))
+    add_legend(figure, handles)
 
 
 def _draw_curves(axes: Axes, panel: Panel, series: Sequence[Series], recording: Recording) -> None:
@@ -182,7 +182,7 @@ def _draw_curves(axes: Axes, panel: Panel, series: Sequence[Series], recording: 
     note = f" ({too_large} values of 1e150 and more are not drawn)" if too_large else ""
     set_title(axes, f"{label(panel.title)}{note}")
     for one in series:
-        time, value = thinned(one.time, one.drawable)
+        time, value = with_pauses(*thinned(one.time, one.drawable), one.time[:-1][one.pauses])
         style = line_style(recording.drives.index(one.drive))
         marker = "." if len(time) < FEW_POINTS else ""
         axes.plot(days(time), value, linewidth=1.3, marker=marker, markersize=3, **style)
@@ -229,6 +229,12 @@ def _draw_faults(axes: Axes, series: Sequence[Series]) -> None:
     axes.set_yticks(range(len(series)), [label(one.drive) for one in series], fontsize=8)
     axes.set_ylim(len(series) - 0.5, -0.5)
     axes.grid(visible=True, axis="x", color=GRID, linewidth=0.6)
+
+
+def with_pauses(time: Array, value: Array, begins: Array) -> tuple[Array, Array]:
+    """Return the points with a miss at the begin of each pause, across which no line leads."""
+    at = np.searchsorted(time, begins, side="right")
+    return np.insert(time, at, begins + 1), np.insert(value, at, np.nan)
 
 
 def thinned(time: Array, value: Array) -> tuple[Array, Array]:

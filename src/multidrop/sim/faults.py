@@ -65,9 +65,10 @@ def _kind(name: str) -> Any:
 
 _EXAMPLES = {one.name: f"{one.name} = {one.metadata['example']}" for one in fields(Faults)}
 _KEYS = {name: Key(_kind(name), example) for name, example in _EXAMPLES.items()}
-HELP = "The faults' file has these lines, all of which may be left out:\n" + "".join(
-    f"  {_EXAMPLES[one.name]:<20}{one.metadata['means']}\n" for one in fields(Faults)
-)
+HELP = (
+    "The faults' file has these lines, all of which may be left out: then a share\n"
+    "and the seed are 0, and the longest times and bursts are as here.\n"
+) + "".join(f"  {_EXAMPLES[one.name]:<20}{one.metadata['means']}\n" for one in fields(Faults))
 
 
 def load_faults(path: Path | str) -> Faults:

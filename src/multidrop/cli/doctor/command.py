@@ -80,7 +80,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="8N1",
         help="data bits, parity and stop bits; the family's default if not given, or 8N1",
     )
-    parser.add_argument("--framing", metavar="rtu", help="of the drive, where the family has several")
+    parser.add_argument("--framing", metavar="rtu", help="of the drive; the family's first if not given")
     add_rs485_argument(parser)
     add_json_argument(parser)
 

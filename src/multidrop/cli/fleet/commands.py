@@ -15,7 +15,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from multidrop.cli.fleet.connection import add_server_arguments, run_action, state_folder, urls_of
+from multidrop.cli.fleet.connection import STATE, add_server_arguments, run_action, state_folder, urls_of
 from multidrop.cli.support.confirm import confirm
 from multidrop.cli.support.nats import nats_options
 from multidrop.cli.support.output import print_text, warn
@@ -48,7 +48,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         parser.add_argument("--yes", action="store_true", help="do not ask; needed where no terminal is")
     parser.add_argument("--by", metavar="NAME", help="whom the logs name; else USER@HOST")
     parser.add_argument(
-        "--audit", metavar="FILE", type=Path, help="where this machine notes what was asked for"
+        "--audit",
+        metavar="FILE",
+        type=Path,
+        help=f"where this machine notes what was asked for; else commands.jsonl in {STATE}",
     )
     add_server_arguments(parser)
 

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from multidrop.fleet.servers import ServerPath
 
 URLS = "nats://127.0.0.1:4222"
+STATE = "~/.local/state/multidrop/fleet"  # state_folder(), where XDG_STATE_HOME is not set
 
 
 def add_server_arguments(parser: argparse.ArgumentParser) -> None:

@@ -8,7 +8,7 @@ from contextlib import AsyncExitStack
 from functools import partial
 from pathlib import Path
 
-from multidrop.cli.fleet.connection import add_server_arguments, run_action, state_folder, urls_of
+from multidrop.cli.fleet.connection import STATE, add_server_arguments, run_action, state_folder, urls_of
 from multidrop.cli.support.nats import nats_options
 from multidrop.cli.support.output import print_text
 from multidrop.cli.support.signals import on_end_signals
@@ -16,7 +16,12 @@ from multidrop.cli.support.signals import on_end_signals
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("gateway", metavar="NAME", help="its name, such as gw-1; each has one of its own")
-    parser.add_argument("--folder", metavar="DIR", type=Path, help="for its spool, logs and lock")
+    parser.add_argument(
+        "--folder",
+        metavar="DIR",
+        type=Path,
+        help=f"for its spool, logs and lock; NAME in {STATE} if not given",
+    )
     parser.add_argument(
         "--keep", metavar="SIZE", default="10 GB", help="most that the spool takes; 10 GB if not given"
     )

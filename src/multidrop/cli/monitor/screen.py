@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from typing import Any
 
+from rich.cells import cell_len, set_cell_size
 from rich.text import Text
 
 from multidrop.cli.support.live_plant import CURRENT, FREQUENCY, LiveDrive, LivePlant
@@ -69,7 +70,7 @@ def page(
     head += f"{drive.settings} {drive.framing}"
     state = f" {shown.state or 'state not polled'}   {shown.fault}   {_misses(shown.so_far.misses)}"
     top = [
-        Text(head[:width].ljust(width), style="reverse"),
+        Text(set_cell_size(head, width), style="reverse"),
         Text(_cut(state, width)),
         Text(_cut(f" {_pace(shown)}", width)),
     ]
@@ -91,8 +92,8 @@ def page(
 
 def _title(plant: LivePlant, width: int, now_ns: int) -> Text:
     clock = f"{datetime.fromtimestamp(now_ns / 1e9, UTC):%H:%M:%S} UTC "
-    text = f" multidrop monitor  {printable(plant.plant.path.name)}"[: width - len(clock)]
-    return Text(text.ljust(width - len(clock)) + clock, style="reverse")
+    text = f" multidrop monitor  {printable(plant.plant.path.name)}"
+    return Text(set_cell_size(text, width - len(clock)) + clock, style="reverse")
 
 
 def _line_states(plant: LivePlant, width: int) -> list[Text]:
@@ -133,8 +134,9 @@ def _ms(seconds: float) -> str:
 def _columns(plant: LivePlant, width: int) -> dict[str, int]:
     """Return widths by heading; the rest of the line goes to the fault and the history."""
     columns = {"DRIVE": 5, "STATE": 10, "FREQUENCY": 9, "CURRENT": 9, "FAULT": 10, "AGE": 7}
-    longest = max(len(drive.name) for drive in plant.drives)
-    columns["DRIVE"] += max(0, min(longest - 5, 11, width - len(columns) - sum(columns.values())))
+    longest = max(cell_len(drive.name) for drive in plant.drives)
+    most = 11 + max(0, width - WIDE) // 3
+    columns["DRIVE"] += max(0, min(longest - 5, most, width - len(columns) - sum(columns.values())))
     if width > len(columns) + sum(columns.values()) + 6:
         columns["MISSED"] = 6
     if width >= WIDE:
@@ -154,7 +156,8 @@ def _row(columns: Mapping[str, int], cells: Mapping[str, str], mark: str) -> str
     parts = []
     for head, width in columns.items():
         text = _cut(cells.get(head, ""), width)
-        parts.append(text.rjust(width) if head in _RIGHT else text.ljust(width))
+        blank = " " * (width - cell_len(text))
+        parts.append(blank + text if head in _RIGHT else text + blank)
     return f"{mark:1}" + " ".join(parts)
 
 
@@ -175,7 +178,7 @@ def _drive(
     }
     style = "red" if drive.fault else "yellow" if drive.why_silent or (age is not None and age > OLD) else ""
     text = _row(columns, cells, ">" if chosen else "!" if drive.fault else "")
-    return Text(text[:width].ljust(width if chosen else 0), style=f"{style} reverse" if chosen else style)
+    return Text(set_cell_size(text, width), style=f"{style} reverse" if chosen else style)
 
 
 def _register(
@@ -220,7 +223,7 @@ def _alarms(at: Position, size: tuple[int, int]) -> list[Text]:
 
 def _foot(at: Position, width: int, helps: Sequence[str], note: str) -> list[Text]:
     if at.question:
-        return [Text(), Text(_cut(f" {at.question}", width).ljust(width), style="bold reverse")]
+        return [Text(), Text(set_cell_size(_cut(f" {at.question}", width), width), style="bold reverse")]
     text = f" {at.message}" if at.message else f" {note}"
     helps = ACKNOWLEDGE if at.failures else helps
     help_text = next((help_text for help_text in helps if len(help_text) < width), helps[-1])
@@ -232,8 +235,9 @@ def _first_seen(chosen: int, count: int, room: int) -> int:
 
 
 def _cut(text: str, width: int) -> str:
+    """Cut to so many columns of a terminal, of which some characters take two and some none."""
     text = printable(text)
-    return text if len(text) <= width else text[: max(0, width - 1)] + "~"
+    return text if cell_len(text) <= width else set_cell_size(text, max(0, width - 1)) + "~"
 
 
 def _age(seconds: float | None) -> str:

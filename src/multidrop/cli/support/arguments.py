@@ -9,7 +9,11 @@ def add_writing_arguments(parser: argparse.ArgumentParser, *, asks: bool = True)
     """Add --yes and --audit, for commands that may write; `asks`: this one asks before it does."""
     yes = "do not ask; needed where no terminal is" if asks else "changes nothing: this command never asks"
     parser.add_argument("--yes", action="store_true", help=yes)
-    parser.add_argument("--audit", metavar="FILE", help="append every write and its outcome to this file")
+    parser.add_argument(
+        "--audit",
+        metavar="FILE",
+        help="append every write and its outcome to this file; to none if not given",
+    )
 
 
 def add_json_argument(parser: argparse.ArgumentParser) -> None:

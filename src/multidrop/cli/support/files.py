@@ -52,6 +52,13 @@ def check_no_segments(path: Path) -> None:
         raise ValueError(f"{path} was recorded in segments: name one of them, such as {segments[-1][1]}")
 
 
+def beside(recording: Path, suffix: str) -> Path:
+    """Return a recording's path with another suffix. Raises ValueError for a path that names no file."""
+    if not recording.name:
+        raise ValueError(f"{recording} is a folder: name the recording in it")
+    return recording.with_suffix(suffix)
+
+
 def load_recording(path: Path, out: Path, command: str) -> Recording:
     """Load a recording for a command that draws it into the new file `out`."""
     require_extra("matplotlib", "plot", command)

@@ -52,8 +52,12 @@ def add_target_arguments(parser: argparse.ArgumentParser, *further: str) -> None
         "and the name of a drive in it",
     )
     parser.add_argument("--baudrate", type=int, metavar="N", help="where it is not the family's default")
-    parser.add_argument("--format", metavar="8N1", help="data bits, parity and stop bits")
-    parser.add_argument("--framing", metavar="rtu", help="where the family has several")
+    parser.add_argument(
+        "--format", metavar="8N1", help="data bits, parity and stop bits; the family's default if not given"
+    )
+    parser.add_argument(
+        "--framing", metavar="rtu", help="where the family has several; its first if not given"
+    )
     parser.add_argument(
         "--option",
         metavar="NAME=VALUE",

@@ -7,6 +7,7 @@ import textwrap
 from collections.abc import Iterable, Sequence
 from enum import Flag, IntEnum
 from typing import Any, TypeVar
+from unicodedata import combining, east_asian_width
 
 from multidrop.cli.support.output import warn
 from multidrop.drive.register import Register
@@ -14,19 +15,24 @@ from multidrop.drive.register import Register
 Row = Sequence[str]
 T = TypeVar("T", bound=float)
 WIDTH = 80  # characters of a line
-LONGEST_NAME = 24  # keeps tables within a terminal
+LONGEST_NAME = 24  # columns; keeps tables within a terminal
 
 
 def aligned(rows: Iterable[Row], alignment: str) -> list[str]:
     """Return one line per row with aligned columns; `alignment` has < or > for each column."""
     rows = list(rows)
-    widths = [max((len(text) for text in column), default=0) for column in zip(*rows, strict=True)]
-    return [
-        "  ".join(
-            f"{text:{side}{width}}" for text, side, width in zip(row, alignment, widths, strict=True)
-        ).rstrip()
-        for row in rows
-    ]
+    widths = [max(map(_columns_of, column), default=0) for column in zip(*rows, strict=True)]
+    return ["  ".join(map(_padded, row, alignment, widths)).rstrip() for row in rows]
+
+
+def _columns_of(text: str) -> int:
+    """Return how many columns of a terminal a text takes: some characters take two, and some none."""
+    return sum((not combining(mark)) + (east_asian_width(mark) in "WF") for mark in text)
+
+
+def _padded(text: str, side: str, width: int) -> str:
+    blank = " " * (width - _columns_of(text))
+    return text + blank if side == "<" else blank + text
 
 
 def wrapped(text: str, first: str = "", rest: str = "", *, breaks_words: bool = True) -> list[str]:
@@ -47,7 +53,15 @@ def counted(count: int, one: str, many: str = "") -> str:
 
 
 def shortened(name: str) -> str:
-    return name if len(name) <= LONGEST_NAME else f"{name[: LONGEST_NAME - 3]}..."
+    """Return a name without its middle where it is long: two may differ at their ends."""
+    if _columns_of(name) <= LONGEST_NAME:
+        return name
+    return f"{_first(name, 12)}...{_first(name[::-1], LONGEST_NAME - 15)[::-1]}"
+
+
+def _first(text: str, columns: int) -> str:
+    """Return as much of a text's beginning as fits."""
+    return next(text[:n] for n in range(len(text), -1, -1) if _columns_of(text[:n]) <= columns)
 
 
 def nearest_value(register: Register[T], value: T) -> T:

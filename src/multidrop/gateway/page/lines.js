@@ -6,7 +6,7 @@ import { fill, find, glyph, make, named, tableHead } from "./dom.js";
 import { misses } from "./misses.js";
 import { isLive, store } from "./store.js";
 import { now } from "./link.js";
-import { milliseconds, share, UNKNOWN } from "./values.js";
+import { count, milliseconds, share, UNKNOWN } from "./values.js";
 
 let shown = "";
 
@@ -39,11 +39,11 @@ function card(line, told) {
     make(
       "p",
       { class: "note" },
-      `${line.port}${line.speed ? ` · ${line.speed}` : ""} · ${line.drives.length} drives`,
+      `${line.port}${line.speed ? ` · ${line.speed}` : ""} · ${count(line.drives.length, "drive")}`,
     ),
     frame.lost ? make("p", { class: "bad" }, glyph("port"), ` The port is lost: ${frame.lost}`) : null,
     figures(frame),
-    misses(told?.minutes ?? []),
+    told ? misses(told.minutes) : null,
     delays(line, told?.drives ?? {}),
   );
 }

@@ -75,8 +75,10 @@ async function newer(n) {
     if (response.ok) return await response.json();
   } catch (error) {
     if (error.name === "AbortError") throw error;
-    throw new Error(error.name === "TimeoutError" ? "does not answer" : "cannot be reached");
+    throw new Error(
+      error.name === "TimeoutError" ? "The daemon does not answer." : "The daemon cannot be reached.",
+    );
   }
   const body = await response.json().catch(() => null);
-  throw new Error(body?.error ?? `answers ${response.status}`);
+  throw new Error(body?.error ?? `The daemon answers ${response.status}.`);
 }

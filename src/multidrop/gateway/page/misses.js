@@ -4,6 +4,7 @@ import * as clock from "./clock.js";
 import { colour, make, tableHead } from "./dom.js";
 import { share } from "./values.js";
 
+const HOUR = 60; // minutes
 const REASONS = ["c2", "c4", "c1", "c3", "c5", "c6"];
 
 // Draw one bar for each minute, stacked by reason, and the hour's sums as a table.
@@ -16,10 +17,12 @@ export function misses(minutes) {
   }
   const reasons = [...sums.keys()].sort((a, b) => sums.get(b) - sums.get(a)),
     total = [...sums.values()].reduce((a, b) => a + b, 0);
-  if (!minutes.length) return make("p", { class: "note" }, "No misses counted yet.");
+  if (!minutes.length) return make("p", { class: "note" }, "No whole minute is counted yet.");
   const head = make("h3", {}, `Missed in the last hour: ${total} of ${asked}`);
   if (!total) return make("section", {}, head);
   const most = Math.max(...minutes.map(m => Object.values(m.misses).reduce((a, b) => a + b, 0)));
+  const newest = minutes[minutes.length - 1].time,
+    began = Math.min(minutes[0].time, newest - (HOUR - 1) * 60000);
   return make(
     "section",
     {},
@@ -27,14 +30,15 @@ export function misses(minutes) {
     make(
       "div",
       { class: "minutes", role: "img", "aria-label": `Missed each minute, at most ${most}` },
+      Array.from({ length: HOUR - minutes.length }, () => make("div")),
       minutes.map(minute => column(minute, reasons, most)),
     ),
     make(
       "div",
       { class: "ends" },
-      make("span", {}, `${clock.minute(minutes[0].time)} ${clock.zoneName()}`),
+      make("span", {}, `${clock.minute(began)} ${clock.zoneName()}`),
       make("span", {}, `at most ${most} a minute`),
-      make("span", {}, clock.minute(minutes[minutes.length - 1].time)),
+      make("span", {}, clock.minute(newest)),
     ),
     make(
       "table",

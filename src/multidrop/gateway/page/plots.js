@@ -5,6 +5,7 @@ import { colour } from "./dom.js";
 
 export const COLOURS = ["c1", "c2", "c3", "c4", "c5", "c6"];
 export const DASHES = [[], [6, 4], [2, 3], [10, 3, 2, 3]]; // a series has a shape too, not its colour alone
+const RIGHT = 28; // px: half the text of a time that stands at the very end
 const FONT = "11px system-ui, DejaVu Sans, sans-serif";
 
 export const isThere = () => Boolean(globalThis.uPlot);
@@ -28,7 +29,7 @@ export function makePlot(
     {
       width: Math.max(120, into.clientWidth),
       height,
-      padding: [6, 12, hasTimes ? 0 : 6, 0],
+      padding: [6, RIGHT, hasTimes ? 0 : 6, 0],
       legend: { show: false },
       bands,
       hooks,

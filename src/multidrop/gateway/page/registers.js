@@ -3,7 +3,7 @@
 import { change } from "./actions.js";
 import * as clock from "./clock.js";
 import { make, put, tableHead } from "./dom.js";
-import { key, mayWrite, reading, store } from "./store.js";
+import { isLive, key, mayWrite, reading, state, store } from "./store.js";
 import { UNKNOWN, makeValue, showValue, withUnit, words } from "./values.js";
 
 const LOOK_MS = 60000; // in which the gateway looks at all registers of a drive that somebody looks at
@@ -88,8 +88,9 @@ export function known(drive, register, t) {
     row = drive === name ? others[register] : undefined;
   if (polled || !row) return polled;
   const [value, ms, status] = row,
-    age = t - ms;
-  return { value, ms, status, age, isOld: status !== "ok" || age > LOOK_MS };
+    age = t - ms,
+    isSilent = state(drive) === "silent" || !isLive(t);
+  return { value, ms, status, age, isOld: status !== "ok" || age > LOOK_MS || isSilent };
 }
 
 export function draw(t) {
@@ -100,9 +101,7 @@ export function draw(t) {
       age,
       found === null || found.value === null
         ? (found?.status ?? "not read")
-        : found.isOld
-          ? clock.when(found.ms)
-          : clock.lasting(found.age),
+        : clock.lasting(found.age),
     );
     if (age.textContent === "") put(age, UNKNOWN);
   }

@@ -6,6 +6,7 @@ import * as clock from "./clock.js";
 import { find, make } from "./dom.js";
 import { mayReload, reload } from "./reload.js";
 import { store } from "./store.js";
+import { count } from "./values.js";
 
 const THEME = "multidrop-theme";
 const THEMES = [
@@ -13,11 +14,11 @@ const THEMES = [
   ["light", "light"],
   ["dark", "dark"],
 ];
-const KEYS = [
+const keys = () => [
   ["↑ ↓", "another drive"],
   ["Enter", "open it"],
   ["/", "filter"],
-  ["1 to 5", "views"],
+  [`1 to ${document.querySelectorAll("nav a:not([hidden])").length}`, "views"],
   ["s", "stop the chosen drive (asks)"],
   ["Shift S", "stop all drives (asks)"],
   ["u", "UTC or local time"],
@@ -89,13 +90,13 @@ async function show() {
     make(
       "p",
       {},
-      `You may ${may.role ?? "look"}; ${may.write?.length ?? 0} registers may be written here. ` +
+      `You may ${may.role ?? "look"}; ${count(may.write?.length ?? 0, "register")} may be written here. ` +
         `Version ${store.plant?.version ?? "–"}.`,
     ),
     make(
       "dl",
       { class: "help" },
-      KEYS.flatMap(([key, what]) => [make("dt", {}, make("kbd", {}, key)), make("dd", {}, what)]),
+      keys().flatMap(([key, what]) => [make("dt", {}, make("kbd", {}, key)), make("dd", {}, what)]),
     ),
   ];
   const choice = await tell("Settings", contents, [

@@ -13,7 +13,7 @@ const HARD = "Use the hard stop at the machine if a motor must stand now.";
 // Ask, and stop all drives.
 export async function stopAll() {
   const { drives, lines } = find("#stopall").dataset;
-  const all = drives ? `all ${drives} drives` : "all drives";
+  const all = drives > 1 ? `all ${drives} drives` : "all drives";
   const where = lines > 1 ? `All ${lines} lines at once. ` : "";
   const isSure = await confirm(`Stop ${all}?`, [make("p", {}, where + HOW)], `Stop ${all}`, STOP);
   if (isSure) await stop(null, "all drives");

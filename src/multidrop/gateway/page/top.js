@@ -4,6 +4,7 @@ import * as clock from "./clock.js";
 import { fill, find, glyph, make, named, put, say, setClass } from "./dom.js";
 import { correction, link, now } from "./link.js";
 import { LIVE_MS, isLive, lasting, state, store } from "./store.js";
+import { count } from "./values.js";
 
 const DEAD_MS = 3000;
 const SKEW_MS = 2000; // a viewer's clock that is so wrong is told of
@@ -48,13 +49,13 @@ export function drawTop() {
 
 function drawNotice(isNow, age) {
   const parts = [];
-  if (store.isLost) parts.push(`The daemon ${lostWords()}.`);
+  if (store.isLost) parts.push(link.why.replace(/\.?$/, "."));
   else if (store.frame && age > LIVE_MS) parts.push("The daemon sends no new values.");
   if (store.frame && !isNow)
     parts.push(`What is shown is of ${clock.when(store.time)} ${clock.zoneName()}.`);
   const wrong = store.plant?.mistakes?.length ?? 0;
-  const count = wrong === 1 ? "a mistake" : `${wrong} mistakes`;
-  if (wrong) parts.push(`The plant file has ${count}; the plant before it goes on.`);
+  const mistakes = wrong === 1 ? "a mistake" : `${wrong} mistakes`;
+  if (wrong) parts.push(`The plant file has ${mistakes}; the plant before it goes on.`);
   for (const trouble of store.frame?.troubles ?? []) parts.push(`${trouble}.`);
   const off = correction();
   if (Math.abs(off) > SKEW_MS) {
@@ -69,8 +70,6 @@ function drawNotice(isNow, age) {
   setClass(notice, "bad", !isNow);
 }
 
-const lostWords = () => (link.why.endsWith(".") ? link.why.slice(0, -1) : link.why);
-
 function tellChange(isNow) {
   const words = store.frame === null && !store.isLost ? "" : isNow ? "live" : "old";
   if (words && words !== told && (told || words === "old"))
@@ -82,10 +81,15 @@ function tellChange(isNow) {
 function drawStrip(t) {
   const alarms = lasting(),
     most = innerWidth < 641 ? 2 : 5;
-  const count = find("#count");
-  put(count, String(alarms.length || ""));
-  count.hidden = alarms.length === 0;
+  const number = find("#count");
+  put(number, String(alarms.length || ""));
+  number.hidden = alarms.length === 0;
   const shown = alarms.slice(0, most);
+  setClass(
+    find("#strip"),
+    "bad",
+    alarms.some(alarm => alarm.kind === "fault"),
+  );
   const sign = JSON.stringify([shown, alarms.length, calm()]);
   if (sign !== shownStrip) buildStrip(shown, alarms.length - shown.length);
   shownStrip = sign;
@@ -97,17 +101,12 @@ function calm() {
   if (!store.frame) return "No values yet.";
   const unknown = [...store.drives.keys()].filter(name => state(name) === "unknown").length;
   const others = unknown ? `, ${unknown} of unknown state` : "";
-  return `${store.drives.size} drives, no fault known, none silent${others}.`;
+  return `${count(store.drives.size, "drive")}, no fault known, none silent${others}.`;
 }
 
 function buildStrip(alarms, more) {
   const strip = find("#strip");
   ages = [];
-  setClass(
-    strip,
-    "bad",
-    alarms.some(alarm => alarm.kind === "fault"),
-  );
   if (!alarms.length) fill(strip, make("li", {}, calm()));
   else
     fill(
@@ -118,7 +117,7 @@ function buildStrip(alarms, more) {
 }
 
 function item({ kind, drive, line, text, time }) {
-  const age = make("span");
+  const age = make("span", { class: "since" });
   ages.push([age, time]);
   const href = drive ? `#/drives/${encodeURIComponent(drive)}` : "#/lines";
   return make(

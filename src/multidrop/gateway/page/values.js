@@ -78,6 +78,9 @@ function set(element, value) {
   if (element.textContent !== value) element.textContent = value;
 }
 
+// Return a number of things: "1 drive", "31 drives".
+export const count = (n, what) => `${n} ${what}${n === 1 ? "" : "s"}`;
+
 // Return a share as per cent, or a dash for unknown; a small share is never shown as none.
 export function share(part) {
   if (part === null || part === undefined) return UNKNOWN;

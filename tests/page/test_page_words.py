@@ -1,0 +1,158 @@
+"""Words, counts and marks say what is so: of one drive, a plant that has just begun, a daemon that died."""
+
+from __future__ import annotations
+
+import re
+import time
+from typing import Any
+
+import fake_plant
+import pytest
+from conftest import SIZES, Opener
+from fake_gateway import FakeGateway
+from watching import until, until_met
+
+pytestmark = pytest.mark.long  # Chromium is started for each file
+
+MINUTE_MS = 60_000
+# A plot of a minute whose last tick stands at its very end, and how dark the canvas is at its right edge.
+EDGE = """async () => {
+  const { makePlot, line } = await import("/page/plots.js");
+  const place = document.querySelector("#lines");
+  place.hidden = false;
+  const times = [1764115200, 1764115260];
+  const { ctx } = makePlot(place, [times, [1, 2]],
+    { series: [line(0, "x")], height: 120, window: () => times });
+  await new Promise(done => setTimeout(done, 200));
+  const { width, height } = ctx.canvas;
+  return [...ctx.getImageData(width - 1, height - 24, 1, 24).data].some(value => value > 0);
+}"""
+
+
+def test_a_daemon_that_stays_away_is_told_of_in_one_sentence(opened: Opener, gateway: FakeGateway) -> None:
+    page = opened()
+    with page.expect_event("requestfailed", lambda request: request.url.endswith("/api/plant")):
+        gateway.kill()
+    told = r"The daemon cannot be reached\. What is shown is of \d\d:\d\d:\d\d UTC\."
+    page.wait_for_timeout(1000)
+    assert re.fullmatch(told, page.locator("#notice").inner_text())
+
+
+def test_figures_of_a_dead_daemon_look_old_and_nothing_is_said_of_misses(
+    opened: Opener, gateway: FakeGateway
+) -> None:
+    page = opened()
+    share = page.locator("tr.head .wire span").last
+    style = "element => getComputedStyle(element).fontStyle"
+    assert share.evaluate(style) == "normal"
+    gateway.kill()
+    until(page, "document.body.classList.contains('dead')")
+    assert share.evaluate(style) == "italic"
+    page.evaluate("location.hash = '#/lines'")
+    page.get_by_text("The daemon cannot be reached.", exact=True).wait_for()
+    assert "counted yet" not in page.locator("#lines").inner_text()
+
+
+def test_one_drive_is_one(opened: Opener, gateway: FakeGateway) -> None:
+    first = fake_plant.plant({})["lines"][0]
+    gateway.plant_changes = {"lines": [first | {"drives": first["drives"][:1]}], "fleet": False}
+    gateway.changes = {"alarms": []}
+    page = opened()
+    until_met(page, lambda: page.locator("#strip").inner_text() == "1 drive, no fault known, none silent.")
+    page.locator("#stopall").click()
+    assert page.locator("#ask-title").inner_text() == "Stop all drives?"
+    page.keyboard.press("Escape")
+    page.get_by_role("button", name="Settings").click()
+    settings = page.locator("#ask").inner_text()
+    assert "1 register may be written here." in settings
+    assert "1 to 5" in settings
+    page.keyboard.press("Escape")
+    page.evaluate("location.hash = '#/lines'")
+    page.get_by_text(re.compile("· 1 drive$")).wait_for()
+
+
+def test_a_fault_that_finds_no_room_colours_the_strip(opened: Opener, gateway: FakeGateway) -> None:
+    now = fake_plant.ms(time.time())
+    silent, fault = ({"text": "no reply", "kind": "silent"}, {"text": "undervoltage", "kind": "fault"})
+    kinds = zip(("labeller", "screw", "booster-1"), (silent, silent, fault), strict=True)
+    gateway.changes = {
+        "alarms": [
+            {"time": now - age * 1000, "drive": drive, "ended": None, **kind}
+            for age, (drive, kind) in enumerate(kinds)
+        ]
+    }
+    page = opened(size="phone")
+    page.get_by_role("link", name="and 1 more").wait_for()
+    assert page.locator("#strip.bad").count() == 1
+
+
+def test_the_hour_ends_with_its_newest_minute(opened: Opener, gateway: FakeGateway) -> None:
+    """A plant that began two minutes ago has two bars at the right, not at the left of an hour."""
+    newest = 1_764_115_200_000  # 00:00 UTC
+    minutes = [
+        {"time": newest - MINUTE_MS, "asked": 90, "misses": {"no reply": 2}},
+        {"time": newest, "asked": 90, "misses": {"no reply": 1}},
+    ]
+    page = opened()
+    told = {"hall-1": {"minutes": minutes, "drives": {}}, "hall-2": {"minutes": [], "drives": {}}}
+    page.route("**/api/lines", lambda route: route.fulfill(json=told))
+    page.evaluate("location.hash = '#/lines'")
+    hour = page.get_by_role("article", name="hall-1")
+    hour.get_by_text("Missed in the last hour: 3 of 180").wait_for()
+    bars = "bars => bars.map(bar => bar.children.length)"
+    assert hour.locator(".minutes > div").evaluate_all(bars) == [0] * 58 + [1, 1]
+    assert hour.locator(".ends span").all_inner_texts() == ["23:01 UTC", "at most 2 a minute", "00:00"]
+    begun = page.get_by_role("article", name="hall-2")
+    assert "No whole minute is counted yet." in begun.inner_text()
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_names_that_differ_at_their_ends_are_told_apart(
+    opened: Opener, gateway: FakeGateway, size: str
+) -> None:
+    names = [f"conveyor-of-the-bottling-hall-south-no-{n:02}" for n in (1, 2)]
+    gateway.renamed = dict(zip(("pump-1", "pump-2"), names, strict=True))
+    page = opened(size=size)
+    for name in names:
+        link = page.locator("td.name a", has_text=name)
+        assert link.evaluate("a => [a.scrollWidth <= a.clientWidth, a.scrollHeight <= a.clientHeight]") == [
+            True,
+            True,
+        ]
+
+
+def test_a_time_at_the_end_of_a_plot_is_whole(opened: Opener) -> None:
+    assert opened().evaluate(EDGE) is False
+
+
+def test_an_old_register_has_its_age_like_a_new_one(opened: Opener) -> None:
+    page = opened()
+    row = page.locator("#panel tr", has_text="acceleration time")
+    until_met(page, lambda: bool(re.fullmatch(r"\d+ min", row.locator(".age").inner_text())))
+
+
+def test_what_was_looked_at_is_old_once_nobody_answers(opened: Opener, gateway: FakeGateway) -> None:
+    """It may be looked at once a minute, and is new for so long only while its drive answers."""
+    page = opened()
+    value = page.locator("#panel tr", has_text="run hours").locator(".value")
+    until_met(page, lambda: value.inner_text() == "4012h")
+    assert "old" not in str(value.get_attribute("class"))
+    page.evaluate("location.hash = '#/drives/labeller'")
+    page.locator("#panel h2", has_text="labeller").wait_for()
+    page.locator("#panel .value.old", has_text="4012").wait_for()
+    page.evaluate("location.hash = '#/drives/pump-1'")
+    page.locator("#panel h2", has_text="pump-1").wait_for()
+    until_met(page, lambda: value.inner_text() == "4012h")
+    assert "old" not in str(value.get_attribute("class"))
+    gateway.kill()
+    page.locator("#panel .value.old", has_text="4012").wait_for()
+
+
+def test_a_fault_that_is_cut_in_its_lane_shows_that_it_is(opened: Opener) -> None:
+    page: Any = opened("#/trends?drive=pump-1")
+    bar = page.locator(".lane .fault")
+    bar.wait_for()
+    assert bar.evaluate("bar => [bar.scrollWidth > bar.clientWidth, getComputedStyle(bar).textOverflow]") == [
+        True,
+        "ellipsis",
+    ]
