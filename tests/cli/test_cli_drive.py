@@ -461,6 +461,7 @@ def test_a_stop_that_is_interrupted_is_sent_once_more(run: Run, che: Che) -> Non
     assert "multidrop: to stop it, type: multidrop stop " in err
 
 
+@pytest.mark.slow
 @patient
 @pytest.mark.parametrize("verb", usually("stop", "coast"))
 def test_a_stop_goes_on_until_its_end_where_the_terminal_is_closed(run: Run, che: Che, verb: str) -> None:

@@ -59,6 +59,7 @@ def test_simulate_does_not_replace_a_file_in_its_way(run: Run, tmp_path: Path) -
     assert link.read_text() == "mine"
 
 
+@pytest.mark.slow
 def test_simulate_brings_the_faults_of_its_file(tmp_path: Path) -> None:
     faults, ports = tmp_path / "faults.toml", tmp_path / "ports"
     faults.write_text("drop = 1\n")
@@ -115,6 +116,7 @@ def test_options_of_segments_that_do_not_fit(run: Run, plant: Path, words: list[
 LATE_OR_SILENT = {str(each) for each in (Status.NO_REPLY, Status.LATE_ANSWER_DUE, Status.NOT_ASKED)}
 
 
+@pytest.mark.slow
 def test_poll_records_what_its_summary_counts(run: Run, plant: Path, tmp_path: Path) -> None:
     out = tmp_path / "out.arrows"
     status, told, err = run("poll", plant, "--seconds", 1.5, "--out", out, "--json")

@@ -42,6 +42,7 @@ def port(request: pytest.FixtureRequest) -> Iterator[str]:
         yield sim.wires[0].path
 
 
+@pytest.mark.slow
 def test_it_says_what_it_finds(run: Run, port: str) -> None:
     status, out, err = run("scan", port, *PATIENTLY)
     assert status == 0
@@ -66,6 +67,7 @@ def test_json_is_one_object(run: Run, port: str) -> None:
     ]
 
 
+@pytest.mark.slow
 def test_the_plant_file_can_be_used_as_it_is(run: Run, port: str, tmp_path: Path) -> None:
     out = tmp_path / "found.toml"
     words = (

@@ -248,6 +248,7 @@ def test_on_a_pty_it_says_what_does_not_apply(run: Run, port: str) -> None:
     assert max(map(len, out.splitlines())) <= 80
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("port", ["socket://127.0.0.1:0"], indirect=True)
 def test_on_a_socket_it_says_what_does_not_apply(run: Run, port: str) -> None:
     status, out, _ = run("doctor", port)
@@ -370,6 +371,7 @@ def responder() -> Iterator[Callable[[Callable[[bytes], bytes]], Responder]]:
         one.close()
 
 
+@pytest.mark.slow
 def test_an_exception_to_the_look_for_an_echo_is_no_foreign_traffic(
     run: Run, responder: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:

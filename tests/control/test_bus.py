@@ -141,6 +141,7 @@ def test_all_readings_in_as_few_requests_as_the_family_allows(family: type[Drive
     assert there.counters.refusals == 0
 
 
+@pytest.mark.slow
 @patient
 def test_drives_of_all_families_at_their_own_baud_rate_and_format() -> None:
     drives = [
@@ -443,6 +444,7 @@ def test_a_drive_that_says_nothing_is_asked_a_few_times() -> None:
     assert rig.counters.requests == READ_ATTEMPTS
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("half_a_second")
 def test_a_damaged_reply_is_shown() -> None:
     rig = simulated(Rig(1))
@@ -457,6 +459,7 @@ def test_a_damaged_reply_is_shown() -> None:
     assert rig.counters.requests == READ_ATTEMPTS
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("half_a_second")
 def test_a_read_is_repeated_after_noise() -> None:
     fates = chain([lambda reply: b"", lambda reply: reply[:-1]], repeat(lambda reply: reply))

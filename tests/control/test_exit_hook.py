@@ -268,6 +268,7 @@ def test_a_third_signal_ends_the_process_though_a_drive_is_silent() -> None:
         assert CUT_SHORT.decode() in told
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", usually(signal.SIGTERM, signal.SIGINT))
 def test_a_second_signal_leaves_no_motor_running(number: int) -> None:
     """It comes when the first drive has its stop, and the others have none perhaps."""
@@ -280,6 +281,7 @@ def test_a_second_signal_leaves_no_motor_running(number: int) -> None:
         assert not any(each.sim.motor.energised for each in received[0])
 
 
+@pytest.mark.slow
 def test_a_signal_while_the_block_is_left_leaves_no_motor_running() -> None:
     with lines(1) as (received, ports), client("leave", ports) as process:
         until(lambda: stops(received[0]))
@@ -316,6 +318,7 @@ def seen(drive: ReceivedRequests, others: list[ReceivedRequests], found: list[bo
     return loses
 
 
+@pytest.mark.slow
 def test_a_poller_stops_the_drives_of_all_its_lines(monkeypatch: pytest.MonkeyPatch) -> None:
     from lines import line, plant, polled
 

@@ -43,6 +43,7 @@ def be_silent(bus: Bus, drive: Any, received: ReceivedRequests) -> None:
     received.requests.clear()
 
 
+@pytest.mark.slow
 def test_another_drive_in_the_place_of_a_known_one_is_not_started() -> None:
     with known("invt-che") as (bus, drive, received):
         drive.set_frequency(10)
@@ -106,6 +107,7 @@ def test_a_stop_of_a_drive_that_was_idle_asks_nothing_first(model: str) -> None:
         assert received.requests[0] == received.writes[0]
 
 
+@pytest.mark.slow
 @every_family
 def test_a_stop_of_a_drive_that_was_silent_asks_nothing_first(model: str) -> None:
     with known(model) as (bus, drive, received):

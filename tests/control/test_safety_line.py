@@ -82,6 +82,7 @@ OTHERS: dict[str, tuple[Drive, Drive]] = {  # declared, and there: of one framin
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("pair", OTHERS)
 def test_a_drive_of_another_family_is_not_written_to(pair: str) -> None:
     declared, there = OTHERS[pair]

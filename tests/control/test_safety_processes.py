@@ -225,6 +225,7 @@ def test_an_echo_without_a_drive_confirms_nothing() -> None:
             pump.stop(seconds=0.5)
 
 
+@pytest.mark.slow
 def test_the_echo_is_not_the_drive_s_answer_to_a_write() -> None:
     """The drive answers two reads and has died by the time of the write: only the echo comes."""
     read = {

@@ -151,6 +151,7 @@ def test_a_child_of_a_child_too(port: str) -> None:
         assert in_child(open_another) == 3.25
 
 
+@pytest.mark.slow
 def test_an_inherited_bus_says_that_it_is_its_parent_s(any_port: str) -> None:
     def use() -> list[str]:
         with bus:

@@ -151,6 +151,7 @@ def test_the_kernel_kills_a_stopped_process_half_a_guard_after_its_deadline() ->
         assert now_ns() >= until_ns + S // 5
 
 
+@pytest.mark.slow
 def test_a_process_that_extends_in_time_lives() -> None:
     then = (
         "for n in range(40):\n"

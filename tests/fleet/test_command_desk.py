@@ -316,6 +316,7 @@ def test_a_full_disk_keeps_a_command_back_and_no_stop(desk: Desks) -> None:
     assert stopped.outcome is DONE
 
 
+@pytest.mark.slow
 def test_many_at_once_are_bounded(desk: Desks) -> None:
     async def main() -> list[CommandAnswer]:
         tokens = [desk.offered(20.0 + number) for number in range(MOST_WRITES + 3)]
@@ -439,6 +440,7 @@ def test_a_stop_is_sent_whatever_is_wrong_with_its_words(
     assert frame["by"] == begun["by"]
 
 
+@pytest.mark.slow
 @table(
     ("first", "then"),
     [

@@ -182,6 +182,7 @@ def test_mistaken_credentials_are_one_sentence(
     assert status == 1 or not (tmp_path / "h").exists()  # a mistake of the call makes no folder
 
 
+@pytest.mark.slow
 def test_nothing_is_said_to_a_server_that_does_not_begin_with_tls(
     run: Run, servers: SecuredCluster, tmp_path: Path
 ) -> None:

@@ -31,6 +31,7 @@ async def _init(urls: list[str]) -> dict[str, object]:
             await path.close()
 
 
+@pytest.mark.slow
 def test_buckets_are_made_on_all_three_servers(nats: Cluster) -> None:
     made = asyncio.run(_init(nats.urls))
     assert made["replicas"] == 3

@@ -130,6 +130,7 @@ def test_one_drive_shows_what_is_not_polled_while_somebody_looks(
     until(lambda: not gateway.gateway.side_reads.under_way)
 
 
+@pytest.mark.slow
 def test_a_silent_drive_is_not_read_by_those_who_look(gateway: Served) -> None:
     gateway.sims["pump-2"].deaf_until = float("inf")
     gateway.await_state("pump-2", "silent")

@@ -59,6 +59,7 @@ def unanswered(gateway: Served) -> float:
     return sum(float(one.value) for one in misses if one.labels["reason"] == "no reply")
 
 
+@pytest.mark.slow
 def test_a_silent_drives_values_vanish_and_come_back(tmp_path: Path) -> None:
     with served(tmp_path) as gateway:
         until(lambda: len(values(gateway)) == 8)

@@ -57,6 +57,7 @@ def test_a_device_of_one_s_own(tmp_path: Path) -> None:
     assert "refused: roof: target = 60 is outside 5 to 30 degC" in printed
 
 
+@pytest.mark.slow
 def test_asyncio(tmp_path: Path) -> None:
     lines = run(tmp_path, "asyncio_poll.py", "1").splitlines()
     assert "tick" in lines
@@ -70,6 +71,7 @@ def test_two_lines(tmp_path: Path) -> None:
         assert name in printed
 
 
+@pytest.mark.slow
 def test_a_pump_is_stopped_when_its_program_ends(tmp_path: Path) -> None:
     printed = run(tmp_path, "pump.py", "1")
     assert "failed" not in printed

@@ -11,6 +11,7 @@ import sys
 from pathlib import Path
 
 import patient
+import pytest
 from lines import PATIENCE
 
 from multidrop.drives import MODELS
@@ -38,6 +39,7 @@ def test_setting_up_is_what_ci_does() -> None:
     assert sorted(found) == sorted(SETTING_UP)
 
 
+@pytest.mark.slow
 def test_ten_lines(tmp_path: Path) -> None:
     """They run in a fresh interpreter, without a warning, however long it takes."""
     (block,) = re.findall(r"^```python\n(.*?)^```$", README, re.DOTALL | re.MULTILINE)

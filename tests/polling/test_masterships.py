@@ -110,6 +110,7 @@ class Rows:
             self.until(drive, "ok")
 
 
+@pytest.mark.slow
 @paces
 def test_a_plant_is_polled_while_its_mastership_holds(mastership: Mastership, every: float | None) -> None:
     with lines(every) as (sims, made), Poller(plant(*made), mastership=mastership) as poller:
@@ -134,6 +135,7 @@ def test_a_plant_is_polled_while_its_mastership_holds(mastership: Mastership, ev
         assert summary["foreign_bytes"] == 0
 
 
+@pytest.mark.slow
 @paces
 def test_rows_of_a_line_without_its_master_are_few(mastership: Mastership, every: float | None) -> None:
     """Nothing runs round in circles."""
@@ -177,6 +179,7 @@ def wait_for_bytes(far: int) -> bytes:
     return os.read(far, 4096)
 
 
+@pytest.mark.slow
 @paces
 def test_a_line_is_listened_to_before_its_first_request(mastership: Mastership, every: float | None) -> None:
     hold(mastership)
@@ -290,6 +293,7 @@ def test_a_line_that_was_removed_is_closed_and_gets_no_byte(mastership: Mastersh
         assert list(poller.buses) == ["hall"]
 
 
+@pytest.mark.slow
 def test_no_port_is_opened_by_who_is_not_the_master(mastership: Mastership, far: Listener) -> None:
     """Not at first, and not where it was lost: that could cut the master's connection off."""
     yard = line(far.url, quick("fan", 1, None), name="yard")

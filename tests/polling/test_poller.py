@@ -133,6 +133,7 @@ def port(pump: SimulatedDrive) -> Iterator[str]:
 # ---- rates ----
 
 
+@pytest.mark.slow
 def test_a_rate_is_kept_on_its_grid_and_never_in_a_burst(port: str) -> None:
     periods = {"output_current": 0.02, "output_frequency": 0.05}
     polls = [polled(drive(), [Quick.registers[name]], every).polls for name, every in periods.items()]
@@ -422,6 +423,7 @@ def lost_as_by_a_stop(hall: PolledLine) -> int:
         return queued - (core.done - noted)
 
 
+@pytest.mark.slow
 def test_polling_goes_on_where_a_stop_has_opened_the_port_again(port: str) -> None:
     """Lose what was queued on the port that is gone: the poller may never have seen that it was gone.
 
@@ -490,6 +492,7 @@ def test_a_lost_port_that_takes_its_time_does_not_hold_the_others_up(
     assert polling.statuses("pump-1").keys() <= {"ok"} | HOST_LATE
 
 
+@pytest.mark.slow
 def test_a_drive_that_dies_and_comes_back(pump: SimulatedDrive) -> None:
     other = simulated(drive(2, "pump-2"))
     asked = [polled(drive(), ONE), polled(drive(), READINGS[:1], 0.05), polled(drive(2, "pump-2"), ONE)]

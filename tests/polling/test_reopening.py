@@ -52,6 +52,7 @@ def hall(tmp_path: Path) -> Iterator[Plant]:
         yield Plant(tmp_path / "hall", stack)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("failure", usually(RuntimeError("can't start new thread"), MemoryError()))
 def test_without_a_thread_a_stop_opens_the_port_and_polling_goes_on(
     hall: Plant, monkeypatch: pytest.MonkeyPatch, failure: Exception

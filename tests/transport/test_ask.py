@@ -137,6 +137,7 @@ def test_limits_of_families(monkeypatch: pytest.MonkeyPatch) -> None:
     assert bus.frames == []
 
 
+@pytest.mark.slow
 def test_a_line_that_is_polled_is_asked_between_the_polls() -> None:
     """However busy the machine is: a reply that it delays is another's neither here nor there."""
     drive = polled(Toy(1), [Toy.output_frequency, Toy.mystery])

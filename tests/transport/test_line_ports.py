@@ -239,6 +239,7 @@ def vanishing_socket() -> tuple[str, Callable[[], None]]:
     return path, hang_up
 
 
+@pytest.mark.slow
 def test_a_port_that_is_flooded_before_its_first_exchange_and_after_it() -> None:
     master, slave = os.openpty()
     with Bus(os.ttyname(slave)) as bus:

@@ -357,6 +357,7 @@ def test_a_start_into_a_cut_network_never_arrives_after_closing(far_network: Far
     assert START not in taken
 
 
+@pytest.mark.slow
 @pyserials_own
 @pytest.mark.skipif(not hasattr(socket, "TCP_USER_TIMEOUT"), reason="this system knows no such time-out")
 def test_a_start_into_a_cut_network_never_arrives_on_an_open_port(far_network: FarNetwork) -> None:

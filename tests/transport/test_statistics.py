@@ -237,6 +237,7 @@ def test_a_bus_has_statistics(toy: SimulatedDrive) -> None:
     assert bus.statistics().delays.replies == 1
 
 
+@pytest.mark.slow
 def test_a_poller_counts_what_its_rows_say(toy: SimulatedDrive) -> None:
     toys = [polled(Toy(1, name="pump"), [Toy.output_current]), polled(Toy(9, name="none"), [Toy.fault], 0.01)]
     with Simulator([Wire([toy], unpaced=True)]) as sim:

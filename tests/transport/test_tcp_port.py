@@ -268,6 +268,7 @@ def test_modbus_tcp_behind_socket_is_told() -> None:
         assert f"name the port tcp://{place}" in str(failure.value)
 
 
+@pytest.mark.slow
 def test_silence_names_the_other_way() -> None:
     with responder(None) as (place, _):
         for kind, other in (("tcp", "socket"), ("socket", "tcp")):
