@@ -315,9 +315,8 @@ def a_monitor(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Any, Pol
     for polled in plant.lines[0].drives:
         polled.drive.perform = lambda script, name=polled.drive.name: poller.perform(name, script)
     anyone: Any = poller
-    monitor: Any = Monitor(
-        LivePlant(plant), PollingSession(anyone, Interruption(), lambda: None), Console(), Interruption()
-    )
+    session = PollingSession(anyone, Interruption(), lambda: None)
+    monitor: Any = Monitor(LivePlant(plant), session, Console())
     monitor._begin = lambda what, work: False  # at once
     monitor._side_reader.read = lambda chosen: {}
     return monitor, poller

@@ -89,10 +89,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     if not words or words[0] in ("-h", "--help", "--version"):
         return _guarded(partial(_describe_itself, words))
     from multidrop.cli.support.output import logging_to, spell_out_unencodable, warn
-    from multidrop.cli.support.signals import sigterm_interrupts
+    from multidrop.cli.support.signals import end_signals_interrupt
 
     spell_out_unencodable()
-    with sigterm_interrupts(), logging_to(warn, "multidrop.drives.registry", logging.INFO):
+    with end_signals_interrupt(), logging_to(warn, "multidrop.drives.registry", logging.INFO):
         return _guarded(partial(_run, words[0], words[1:]))
 
 
