@@ -1,8 +1,8 @@
 """SIGINT (Ctrl-C), SIGTERM and SIGHUP while a command runs.
 
 The first two interrupt a command at once, but for polling and sniffing: there the first one is noted, so that
-what is under way is finished and recorded, and the second one interrupts. SIGHUP, of a terminal that is closed,
-ends a command as the first of them does, but for a stop, which goes on; nobody is impatient who sends several.
+what is under way is finished and recorded, and the second one interrupts. SIGHUP, of a terminal that is
+closed, ends a command as the first of them does, but for a stop, which goes on. Several of it mean no more.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from __future__ import annotations
 import signal
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import contextmanager
 from types import FrameType
 
 
