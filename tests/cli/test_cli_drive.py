@@ -484,6 +484,42 @@ def test_a_stop_goes_on_until_its_end_where_the_terminal_is_closed(run: Run, che
     until(lambda: received.sim["status"] == 3)
 
 
+@patient
+@pytest.mark.parametrize(
+    ("mistake", "told"),
+    [
+        (["--drvie", "x"], ["no such option: --drvie x\n"]),
+        (["--secnds=5"], ["no such option: --secnds=5"]),
+        (["pump-2"], ["stop takes one drive, and that is invt-che@1: pump-2"]),
+    ],
+)
+def test_a_mistake_beside_its_drive_keeps_no_stop_back(
+    run: Run, che: Che, mistake: list[str], told: list[str]
+) -> None:
+    received, words = che
+    assert run("start", *words, "--frequency", 20, "--yes")[0] == 0
+    begun = len(received.writes)
+    status, out, err = run("stop", *words, *mistake)
+    assert (status, len(received.writes) > begun) == (2, True)
+    assert "stop done" in out
+    assert all(text in err for text in told)
+    assert received.sim["status"] == 3
+    assert run("start", *words, "--yes", *mistake)[0] == 2  # and nothing else is sent beside one
+    assert received.starts == received.starts[:1]
+
+
+@pytest.mark.parametrize(
+    "words",
+    [["nowhere", "invt-che"], ["nowhere", "invt-che", "one"], ["nowhere", "invt-che", 1, "--baudrate"]],
+)
+def test_a_stop_of_which_nobody_can_tell_whose_it_is_says_that_it_was_not_sent(
+    run: Run, words: list[object]
+) -> None:
+    status, _, err = run("emergency-stop", *words)
+    assert status == 2
+    assert err.startswith("multidrop: the emergency-stop was NOT sent: ")
+
+
 def plant_of(port: object, folder: Path) -> Path:
     """Return a plant file with the CHE at this port."""
     plant = folder / "hall.toml"

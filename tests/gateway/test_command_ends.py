@@ -11,6 +11,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from lines import PATIENCE
 from modbus_gateway import plant_of
 from simulated_bus import one
 from tables import table
@@ -185,7 +186,8 @@ def test_a_coast_of_a_name_on_its_way_to_another_drive_stops_both(
     for drive in (FAN, PUMP):
         monkeypatch.setattr(drive, "coast", partial(coast, drive.name), raising=False)
     may = May(verbs=frozenset(f"{name}.coast" for name in listed))
-    told = asyncio.run(Commands(lines, may).act("fan", "coast", {}, CALLER))
+    coasting = asyncio.wait_for(Commands(lines, may).act("fan", "coast", {}, CALLER), PATIENCE)
+    told = asyncio.run(coasting)
     assert sorted(sent) == ["fan.coast", "pump.coast" if "pump" in listed else "pump.stop"]
     assert not told.is_done  # what became of the other one is told as well
     assert told.text.startswith("fan: coast is done; pump: ")

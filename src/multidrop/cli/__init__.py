@@ -167,12 +167,19 @@ def _run(command: str, words: list[str]) -> int:
     parser = _Parser(prog=prog, description=text[0].upper() + text[1:] + ".", allow_abbrev=False)
     parser.set_defaults(command=command)
     module.add_arguments(parser)
+    is_stop = command in getattr(module, "STOPS", ())
     try:
-        arguments = parser.parse_intermixed_args(words)  # an option may stand between positionals
+        arguments, unknown = parser.parse_known_intermixed_args(words)  # an option between positionals too
+        if unknown and not is_stop:
+            parser.error(f"unrecognized arguments: {' '.join(unknown)}")
     except SystemExit:  # --help was printed
         return DONE
+    except ValueError as mistake:
+        raise ValueError(f"the {command} was NOT sent: {mistake}") if is_stop else mistake from None
+    if unknown:
+        _fail(f"left out, for {command} knows no such option: {' '.join(unknown)}", MISTAKE)
     try:
-        return int(module.run(arguments))
+        return int(module.run(arguments)) or (MISTAKE if unknown else DONE)
     except Refused as refusal:
         from multidrop.cli.support.plants import is_plant
 

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 _DIRECTIONS = ("forward", "reverse")
 _DIRECTED = ("start", "jog")
-_STOPPING = ("stop", "coast", "emergency-stop")  # these ask nobody
+STOPS = ("stop", "coast", "emergency-stop")  # these ask nobody, and no unknown option keeps them back
 _FURTHER = {"write": ("REGISTER", "VALUE"), "set-frequency": ("HZ",)}  # arguments behind the drive
 
 
@@ -44,7 +44,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         parser.add_argument(word.lower(), metavar=word)
     if action in _DIRECTED:
         parser.add_argument("--direction", choices=_DIRECTIONS, help="as in force if not given")
-    if action not in _STOPPING:
+    if action not in STOPS:
         parser.add_argument("--yes", action="store_true", help="do not ask; needed where no terminal is")
     parser.add_argument("--by", metavar="NAME", help="whom the logs name; else USER@HOST")
     parser.add_argument(
@@ -55,7 +55,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     work = _stop if arguments.command == "stop" else _command
-    with outliving_the_terminal() if arguments.command in _STOPPING else nullcontext():
+    with outliving_the_terminal() if arguments.command in STOPS else nullcontext():
         return run_action(partial(work, arguments))
 
 
@@ -64,7 +64,7 @@ def _asker(arguments: argparse.Namespace) -> FleetCommands:
     from multidrop.fleet.fleet_commands import FleetCommands
 
     by = arguments.by or f"{_user()}@{socket.gethostname()}"
-    if arguments.command in _STOPPING:
+    if arguments.command in STOPS:
         by = printable(by)[:MOST_CHARACTERS]  # no name keeps a stop back
     elif not by.isprintable() or len(by) > MOST_CHARACTERS:
         raise ValueError(f"--by {by!r} is not 1 to {MOST_CHARACTERS} printable characters")
@@ -102,7 +102,7 @@ async def _command(arguments: argparse.Namespace) -> int:
     from multidrop.fleet.command_words import CommandAnswer
 
     what, agreed = _what(arguments), ""
-    if arguments.command not in _STOPPING and not arguments.yes:
+    if arguments.command not in STOPS and not arguments.yes:
         async with _asker(arguments) as asker:
             preview = await asker.preview(asker.request(arguments.drive, **what))
         if isinstance(preview, CommandAnswer):
@@ -121,7 +121,8 @@ async def _stop(arguments: argparse.Namespace) -> int:
     from multidrop.fleet.stop_asking import HARD_WIRED
 
     if bool(drives) == arguments.all:
-        raise ValueError("stop takes either drives or --all: `multidrop fleet stop pump-1`")
+        ways = "stop takes either drives or --all: `multidrop fleet stop pump-1`"
+        raise ValueError(f"the stop was NOT sent: {ways}")
     async with AsyncExitStack() as stack:
         try:
             asker = await stack.enter_async_context(_asker(arguments))
