@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
-from contextlib import ExitStack, asynccontextmanager
+from contextlib import ExitStack, asynccontextmanager, suppress
 from functools import partial
 from pathlib import Path
 
@@ -22,6 +22,7 @@ from multidrop.fleet import names  # noqa: E402
 from multidrop.fleet.buckets import Bucket  # noqa: E402
 from multidrop.fleet.command_subjects import CommandSubjects  # noqa: E402
 from multidrop.fleet.command_words import CommandOutcome, Offered  # noqa: E402
+from multidrop.fleet.errors import NobodyThere, Unsure  # noqa: E402
 from multidrop.fleet.fleet_commands import FleetCommands  # noqa: E402
 from multidrop.fleet.plant_store import store  # noqa: E402
 from multidrop.fleet.servers import ServerPath, paths_of  # noqa: E402
@@ -158,7 +159,14 @@ async def _moved_back(fleet: Fleet) -> None:
 
 
 async def _died(fleet: Fleet) -> None:
+    """Until all servers know that nobody hears its subject, what is asked there may be lost: unknown."""
     await fleet.one.die()
+    async with asyncio.timeout(PATIENCE_S):
+        for path in fleet.asker._paths:
+            with pytest.raises(NobodyThere):
+                while True:
+                    with suppress(Unsure):
+                        await path.request(fleet.one.subjects.desk.subject, b"{}", answer_s=0.1)
     await fleet.other.open()
 
 
