@@ -15,6 +15,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 from commands import TOY, Run
@@ -506,6 +507,29 @@ def test_a_mistake_beside_its_drive_keeps_no_stop_back(
     assert received.sim["status"] == 3
     assert run("start", *words, "--yes", *mistake)[0] == 2  # and nothing else is sent beside one
     assert received.starts == received.starts[:1]
+
+
+@patient
+def test_a_stop_whose_terminal_is_closed_before_it_begins_is_sent(
+    run: Run, che: Che, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its words are not read yet, which takes a small computer a while."""
+
+    def parse(*words: Any) -> Any:
+        signal.raise_signal(signal.SIGHUP)
+        return real(*words)
+
+    received, words = che
+    assert run("start", *words, "--frequency", 20, "--yes")[0] == 0
+    before = signal.signal(signal.SIGHUP, lambda number, frame: None)
+    real = multidrop.cli._Parser.parse_known_intermixed_args
+    monkeypatch.setattr(multidrop.cli._Parser, "parse_known_intermixed_args", parse)
+    try:
+        assert run("state", *words)[0] == 130
+        assert run("stop", *words)[0] == 0
+    finally:
+        signal.signal(signal.SIGHUP, before)
+    assert received.sim["status"] == 3
 
 
 @pytest.mark.parametrize(

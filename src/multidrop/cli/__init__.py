@@ -12,13 +12,14 @@ import logging
 import os
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from functools import partial
 from typing import Any, NoReturn
 
 from multidrop.errors import BusError, Refused, Unsupported
 
 DONE, FAILED, MISTAKE, INTERRUPTED = 0, 1, 2, 130
+STOPS = ("stop", "coast", "emergency-stop")  # neither a mistake beside their drive nor SIGHUP keeps one back
 _MISNAMED = (FileNotFoundError, IsADirectoryError, NotADirectoryError)
 
 COMMANDS = {  # name: module in this package, and help
@@ -89,10 +90,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     if not words or words[0] in ("-h", "--help", "--version"):
         return _guarded(partial(_describe_itself, words))
     from multidrop.cli.support.output import logging_to, spell_out_unencodable, warn
-    from multidrop.cli.support.signals import end_signals_interrupt
+    from multidrop.cli.support.signals import end_signals_interrupt, outliving_the_terminal
 
     spell_out_unencodable()
-    with end_signals_interrupt(), logging_to(warn, "multidrop.drives.registry", logging.INFO):
+    command = words[1] if words[0] == "fleet" and words[1:] else words[0]
+    going_on = outliving_the_terminal() if command in STOPS else nullcontext()
+    with end_signals_interrupt(), going_on, logging_to(warn, "multidrop.drives.registry", logging.INFO):
         return _guarded(partial(_run, words[0], words[1:]))
 
 
@@ -167,7 +170,7 @@ def _run(command: str, words: list[str]) -> int:
     parser = _Parser(prog=prog, description=text[0].upper() + text[1:] + ".", allow_abbrev=False)
     parser.set_defaults(command=command)
     module.add_arguments(parser)
-    is_stop = command in getattr(module, "STOPS", ())
+    is_stop = command in STOPS
     try:
         arguments, unknown = parser.parse_known_intermixed_args(words)  # an option between positionals too
         if unknown and not is_stop:

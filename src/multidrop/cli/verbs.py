@@ -5,14 +5,13 @@ from __future__ import annotations
 import argparse
 import json
 from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager
 from typing import Any
 
-from multidrop.cli import DONE, MISTAKE
+from multidrop.cli import DONE, MISTAKE, STOPS
 from multidrop.cli.support.arguments import add_json_argument, add_writing_arguments, duration
 from multidrop.cli.support.confirm import confirm
 from multidrop.cli.support.output import command_line, print_text, warn
-from multidrop.cli.support.signals import outliving_the_terminal
 from multidrop.cli.support.target import Target, add_target_arguments, check_words, number_of, target_of
 from multidrop.cli.support.values import as_json, nearest_value
 from multidrop.control.audit_log import AuditLog
@@ -24,7 +23,6 @@ from multidrop.errors import Unsupported
 
 _DIRECTED = ("start", "jog")
 _FURTHER = {"set-frequency": ("HZ",)}  # arguments of commands behind the drive
-STOPS = ("stop", "coast", "emergency-stop")  # a mistake beside their drive keeps none of them back
 _SHOWING_WATCHDOG = ("state", *_DIRECTED)  # they print what the motor does when the client dies
 _QUESTIONS = {  # asked before anything is sent; a stop needs no confirmation
     "start": "Start the motor of",
@@ -67,11 +65,6 @@ def _stop_time(text: str) -> float | None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    with outliving_the_terminal() if arguments.command in STOPS else nullcontext():
-        return _run(arguments)
-
-
-def _run(arguments: argparse.Namespace) -> int:
     target, words = _target(arguments)
     if words and arguments.command not in STOPS:
         arguments.frequency = number_of(arguments, "HZ", words[0])

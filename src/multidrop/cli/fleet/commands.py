@@ -10,16 +10,16 @@ import os
 import socket
 import sys
 from collections.abc import Iterator
-from contextlib import AsyncExitStack, contextmanager, nullcontext, suppress
+from contextlib import AsyncExitStack, contextmanager, suppress
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from multidrop.cli import STOPS
 from multidrop.cli.fleet.connection import add_server_arguments, run_action, state_folder, urls_of
 from multidrop.cli.support.confirm import confirm
 from multidrop.cli.support.nats import nats_options
 from multidrop.cli.support.output import print_text, warn
-from multidrop.cli.support.signals import outliving_the_terminal
 from multidrop.printable import printable
 
 if TYPE_CHECKING:
@@ -28,7 +28,6 @@ if TYPE_CHECKING:
 
 _DIRECTIONS = ("forward", "reverse")
 _DIRECTED = ("start", "jog")
-STOPS = ("stop", "coast", "emergency-stop")  # these ask nobody, and no unknown option keeps them back
 _FURTHER = {"write": ("REGISTER", "VALUE"), "set-frequency": ("HZ",)}  # arguments behind the drive
 
 
@@ -55,8 +54,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     work = _stop if arguments.command == "stop" else _command
-    with outliving_the_terminal() if arguments.command in STOPS else nullcontext():
-        return run_action(partial(work, arguments))
+    return run_action(partial(work, arguments))
 
 
 def _asker(arguments: argparse.Namespace) -> FleetCommands:
