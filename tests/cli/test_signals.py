@@ -114,3 +114,13 @@ def test_simulate_removes_its_links_where_its_terminal_is_closed(tmp_path: Path)
         terminal.close()
         assert terminal.process.wait(PATIENCE) == 0
     assert not link.is_symlink()
+
+
+@pytest.mark.slow
+def test_the_demo_of_serve_ends_where_its_terminal_is_closed() -> None:
+    """It has no plant file that could be read again."""
+    require_module("uvicorn")
+    with closing_terminal("serve", "--demo", "--no-browser") as terminal:
+        terminal.wait_for("Ctrl-C ends it")
+        terminal.close()
+        assert terminal.process.wait(PATIENCE) == 0
