@@ -17,7 +17,6 @@ from tables import table
 
 from multidrop.cli import COMMANDS, main
 from multidrop.cli.fleet import ACTIONS as FLEET
-from multidrop.cli.support.signals import noting_signals
 from multidrop.drive import Advice, Refused, carry_out
 from multidrop.drives import MODELS, ErmanERG220, InnovertIBD, InvtCHE
 from multidrop.drives.registry import SHIPPED
@@ -469,15 +468,6 @@ def test_a_thread_that_is_not_the_main_one_can_run_a_command(capsys: pytest.Capt
     assert found == [0]
     assert "TOY T1" in capsys.readouterr().out
     assert signal.getsignal(signal.SIGTERM) is before
-
-
-def test_a_second_signal_breaks_off_what_the_first_one_asked_to_end() -> None:
-    with noting_signals() as interruption:
-        assert not interruption.came
-        signal.raise_signal(signal.SIGINT)
-        assert interruption.came
-        with pytest.raises(KeyboardInterrupt):
-            signal.raise_signal(signal.SIGTERM)
 
 
 # ---- output that cannot be written ----

@@ -15,6 +15,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 from commands import TOY, Run
@@ -483,6 +484,65 @@ def test_a_stop_goes_on_until_its_end_where_the_terminal_is_closed(run: Run, che
     assert len(received.writes) >= begun + 3
     assert received.starts == received.starts[:1]
     until(lambda: received.sim["status"] == 3)
+
+
+@patient
+@pytest.mark.parametrize(
+    ("mistake", "told"),
+    [
+        (["--drvie", "x"], ["no such option: --drvie x\n"]),
+        (["--secnds=5"], ["no such option: --secnds=5"]),
+        (["pump-2"], ["stop takes one drive, and that is invt-che@1: pump-2"]),
+    ],
+)
+def test_a_mistake_beside_its_drive_keeps_no_stop_back(
+    run: Run, che: Che, mistake: list[str], told: list[str]
+) -> None:
+    received, words = che
+    assert run("start", *words, "--frequency", 20, "--yes")[0] == 0
+    begun = len(received.writes)
+    status, out, err = run("stop", *words, *mistake)
+    assert (status, len(received.writes) > begun) == (2, True)
+    assert "stop done" in out
+    assert all(text in err for text in told)
+    assert received.sim["status"] == 3
+    assert run("start", *words, "--yes", *mistake)[0] == 2  # and nothing else is sent beside one
+    assert received.starts == received.starts[:1]
+
+
+@patient
+def test_a_stop_whose_terminal_is_closed_before_it_begins_is_sent(
+    run: Run, che: Che, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its words are not read yet, which takes a small computer a while."""
+
+    def parse(*words: Any) -> Any:
+        signal.raise_signal(signal.SIGHUP)
+        return real(*words)
+
+    received, words = che
+    assert run("start", *words, "--frequency", 20, "--yes")[0] == 0
+    before = signal.signal(signal.SIGHUP, lambda number, frame: None)
+    real = multidrop.cli._Parser.parse_known_intermixed_args
+    monkeypatch.setattr(multidrop.cli._Parser, "parse_known_intermixed_args", parse)
+    try:
+        assert run("state", *words)[0] == 130
+        assert run("stop", *words)[0] == 0
+    finally:
+        signal.signal(signal.SIGHUP, before)
+    assert received.sim["status"] == 3
+
+
+@pytest.mark.parametrize(
+    "words",
+    [["nowhere", "invt-che"], ["nowhere", "invt-che", "one"], ["nowhere", "invt-che", 1, "--baudrate"]],
+)
+def test_a_stop_of_which_nobody_can_tell_whose_it_is_says_that_it_was_not_sent(
+    run: Run, words: list[object]
+) -> None:
+    status, _, err = run("emergency-stop", *words)
+    assert status == 2
+    assert err.startswith("multidrop: the emergency-stop was NOT sent: ")
 
 
 def plant_of(port: object, folder: Path) -> Path:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import select
 import string
 import sys
 import termios
@@ -24,7 +25,7 @@ from terminals import Terminal, on_terminal
 import multidrop.cli.support.extras
 from multidrop.cli.monitor import keys as monitor_keys
 from multidrop.cli.monitor.command import PAGE, Monitor
-from multidrop.cli.monitor.keys import DOWN, ENTER, KEYS, PAGE_DOWN, PAGE_UP, UP, next_key
+from multidrop.cli.monitor.keys import DOWN, ENTER, KEYS, PAGE_DOWN, PAGE_UP, UNKNOWN, UP, next_key
 from multidrop.cli.monitor.screen import (
     BLOCKS,
     LEAST_HEIGHT,
@@ -276,7 +277,7 @@ def test_the_page_scrolls_as_far_as_there_is_something(watched: LivePlant) -> No
 
 
 @table(
-    ("pressed", "keys"),
+    ("pressed", "told"),
     [
         (b"q", ["q"]),
         (b"\x1b[A\x1b[B\r", [UP, DOWN, ENTER]),
@@ -285,14 +286,44 @@ def test_the_page_scrolls_as_far_as_there_is_something(watched: LivePlant) -> No
         ("ыЫнй".encode(), ["s", "S", "y", "q"]),  # the same keys with a Russian layout
         ("\u0456\u043e\u0441".encode(), ["s", DOWN, "\u0441"]),  # and a Ukrainian one
         (b"\xd1s\xff", ["\ufffd", "s", "\ufffd"]),
+        (b"\x1bOSy\x1b[1;2S\x1b[[As\x1b[a\x1bOq", [UNKNOWN, "y", UNKNOWN, UNKNOWN, "s", UNKNOWN, UNKNOWN]),
     ],
 )
-def test_keys_that_come_together_are_told_apart(pressed: bytes, keys: list[str]) -> None:
+def test_keys_that_come_together_are_told_apart(pressed: bytes, told: list[str]) -> None:
     found = []
     while pressed:
         key, pressed = next_key(pressed)
         found.append(key)
-    assert found == keys
+    assert found == told
+
+
+@table(
+    ("pieces", "pressed"),
+    [
+        ([b"\x1b", b"OS", b"s"], [UNKNOWN, "s"]),  # F4
+        ([b"j\x1b[", b"5", b"~y"], [DOWN, PAGE_UP, "y"]),
+        (["\u044b".encode()[:1], "\u044b".encode()[1:]], ["s"]),  # with a Russian layout
+        ([b"\x1b", b""], ["escape"]),
+    ],
+)
+def test_a_key_whose_bytes_come_apart_is_one_key(
+    monkeypatch: pytest.MonkeyPatch, pieces: list[bytes], pressed: list[str]
+) -> None:
+    """A network sends them so: F4 is no stop of all drives, though it ends in S."""
+    terminal, end = os.openpty()
+    left = iter(pieces)
+
+    def wait(*waited: object) -> object:
+        os.write(terminal, next(left, b""))
+        return real(*waited)  # type: ignore[arg-type]
+
+    real = select.select
+    with open(end, closefd=True) as stdin:  # noqa: PTH123
+        monkeypatch.setattr(sys, "stdin", stdin)
+        with monitor_keys.keys() as wait_for_key:
+            monkeypatch.setattr(select, "select", wait)
+            assert [wait_for_key(PATIENCE) for _ in pressed] == pressed
+    os.close(terminal)
 
 
 class Poller:
@@ -324,9 +355,8 @@ def a_monitor(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Any, Pol
     for polled in plant.lines[0].drives:
         polled.drive.perform = lambda script, name=polled.drive.name: poller.perform(name, script)
     anyone: Any = poller
-    monitor: Any = Monitor(
-        LivePlant(plant), PollingSession(anyone, Interruption(), lambda: None), Console(), Interruption()
-    )
+    session = PollingSession(anyone, Interruption(), lambda: None)
+    monitor: Any = Monitor(LivePlant(plant), session, Console())
     monitor._begin = lambda what, work: False  # at once
     monitor._side_reader.read = lambda chosen: {}
     return monitor, poller

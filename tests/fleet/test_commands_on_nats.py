@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
-from contextlib import ExitStack, asynccontextmanager
+from contextlib import ExitStack, asynccontextmanager, suppress
 from functools import partial
 from pathlib import Path
 
@@ -22,6 +22,7 @@ from multidrop.fleet import names  # noqa: E402
 from multidrop.fleet.buckets import Bucket  # noqa: E402
 from multidrop.fleet.command_subjects import CommandSubjects  # noqa: E402
 from multidrop.fleet.command_words import CommandOutcome, Offered  # noqa: E402
+from multidrop.fleet.errors import NobodyThere, Unsure  # noqa: E402
 from multidrop.fleet.fleet_commands import FleetCommands  # noqa: E402
 from multidrop.fleet.plant_store import store  # noqa: E402
 from multidrop.fleet.servers import ServerPath, paths_of  # noqa: E402
@@ -157,8 +158,22 @@ async def _moved_back(fleet: Fleet) -> None:
     await fleet.one.open()
 
 
+async def _is_unheard(path: ServerPath, subject: str) -> bool:
+    with suppress(Unsure):
+        try:
+            await path.request(subject, b"{}", answer_s=0.1)
+        except NobodyThere:
+            return True
+    return False
+
+
 async def _died(fleet: Fleet) -> None:
+    """Until all servers know that nobody hears its subject, what is asked there may be lost: unknown."""
     await fleet.one.die()
+    async with asyncio.timeout(PATIENCE_S):
+        for path in fleet.asker._paths:
+            while not await _is_unheard(path, fleet.one.subjects.desk.subject):
+                pass
     await fleet.other.open()
 
 

@@ -43,12 +43,13 @@ def test_a_gateway_that_stands_still_is_killed_and_its_lines_go_on(drill: FleetD
 
 
 @pytest.mark.long
-def test_a_drained_gateway_gives_all_its_lines_away(drill: FleetDrill) -> None:
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])  # of a service; of a closed terminal
+def test_a_drained_gateway_gives_all_its_lines_away(drill: FleetDrill, number: int) -> None:
     drill.settle()
     drill.hall.reset()
     drill.wait(lambda: "gw-b has 0 lines left" in drill.run("drain", "gw-b").stdout, "gw-b has no lines")
     drill.wait(lambda: drill.hall.are_polled(0.5), "all lines are polled")
-    drill.gateways["gw-b"].send_signal(signal.SIGTERM)
+    drill.gateways["gw-b"].send_signal(number)
     assert drill.gateways["gw-b"].wait(PATIENCE_S) == 0
     assert drill.hall.overlaps() == 0
 

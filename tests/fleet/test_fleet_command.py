@@ -167,7 +167,7 @@ def test_a_list_with_a_mistake(run: Run, nobody: str, tmp_path: Path, lists: str
         (["start", "pump-1", "--all"], "unrecognized arguments: --all"),
         (["start", "pump-1", "--direction", "up"], "invalid choice: 'up'"),
         (["set-frequency", "pump-1", "fast"], "HZ = fast is no number; write 25"),
-        (["stop"], "stop takes either drives or --all"),
+        (["stop"], "the stop was NOT sent: stop takes either drives or --all"),
         (["stop", "pump-1", "--all"], "stop takes either drives or --all"),
         (["reset-fault", "pump-1", "--by", "\x1b[31m"], "is not 1 to 200 printable characters"),
     ],
@@ -179,6 +179,14 @@ def test_a_mistaken_call(run: Run, words: list[str], sentence: str) -> None:
 def test_no_name_keeps_a_stop_back(run: Run, nobody: str) -> None:
     _, _, said = run("fleet", "stop", "pump-1", "--by", "\x1b[31m" + "x" * 300, "--nats", nobody)
     assert "the stop was NOT sent: no NATS server answers" in said
+
+
+@pytest.mark.parametrize("action", ["stop", "coast"])
+def test_no_unknown_option_keeps_a_stop_back(run: Run, nobody: str, action: str) -> None:
+    status, _, said = run("fleet", action, "pump-1", "--lnie=hall", "--nats", nobody)
+    assert status != 0
+    assert said.startswith(f"multidrop: left out, for {action} knows no such option: --lnie=hall\n")
+    assert "no NATS server answers" in said
 
 
 @pytest.mark.parametrize("library", ["nats", "pyarrow"])

@@ -5,16 +5,18 @@ from __future__ import annotations
 import asyncio
 import time
 from collections.abc import Awaitable, Callable
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from lines import PATIENCE
 from modbus_gateway import plant_of
 from simulated_bus import one
 from tables import table
 
-from multidrop import Bus, InvtCHE, Ledger, Plant
+from multidrop import Bus, InvtCHE, Ledger, Plant, Seen, Stopped, Unconfirmed
 from multidrop.gateway.commands import Commands, Told
 from multidrop.gateway.rights import Caller, May, Right
 from multidrop.gateway.views import look_at
@@ -139,6 +141,57 @@ def test_a_stop_finds_its_drive_by_another_spelling_and_a_start_does_not(
         assert told.is_done, told.text
     assert line.written
     assert commands.stopped_ns(fan) is not None
+
+
+FAN, PUMP = (InvtCHE(address, name=name) for address, name in ((1, "fan"), (2, "pump")))
+HALLS = plant_of(("hall-1", FAN), ("hall-2", PUMP))
+
+
+class MovingLines(UnopenedLines):
+    """A plant whose drives are on their way to another one; the stops of a line are noted."""
+
+    plant = HALLS
+    plant_coming: Plant | None = None  # type: ignore[assignment]
+
+    def __init__(self, sent: list[str], plant_coming: Plant) -> None:
+        self.sent = sent
+        self.plant_coming = plant_coming
+
+    def bus(self, line: str) -> Bus:
+        (drive,) = (polled.drive for one in self.plant.lines if one.name == line for polled in one.drives)
+
+        def stop_all(**limit: object) -> dict[str, Stopped]:
+            self.sent.append(f"{drive.name}.stop")
+            self.plant_coming = None
+            return {drive.name: Stopped(drive.name, Seen.SENT, 1.0, "no reply")}
+
+        found: Any = SimpleNamespace(stop_all=stop_all)
+        return found  # type: ignore[no-any-return]
+
+
+@pytest.mark.parametrize("listed", [["fan"], ["fan", "pump"]])
+def test_a_coast_of_a_name_on_its_way_to_another_drive_stops_both(
+    monkeypatch: pytest.MonkeyPatch, listed: list[str]
+) -> None:
+    """Nobody knows which was meant. The other one is stopped on its ramp, unless it may be coasted too."""
+    sent: list[str] = []
+    lines = MovingLines(sent, plant_of(("hall-2", InvtCHE(2, name="fan"))))
+
+    def coast(name: str, **limit: object) -> None:
+        sent.append(f"{name}.coast")
+        if name == "pump":
+            lines.plant_coming = None
+            raise Unconfirmed("pump", "coast", "no reply")
+
+    for drive in (FAN, PUMP):
+        monkeypatch.setattr(drive, "coast", partial(coast, drive.name), raising=False)
+    may = May(verbs=frozenset(f"{name}.coast" for name in listed))
+    coasting = asyncio.wait_for(Commands(lines, may).act("fan", "coast", {}, CALLER), PATIENCE)
+    told = asyncio.run(coasting)
+    assert sorted(sent) == ["fan.coast", "pump.coast" if "pump" in listed else "pump.stop"]
+    assert not told.is_done  # what became of the other one is told as well
+    assert told.text.startswith("fan: coast is done; pump: ")
+    assert "no reply" in told.text
 
 
 def test_a_look_finds_its_drive_by_another_spelling(tmp_path: Path) -> None:

@@ -179,6 +179,40 @@ def test_a_second_tap_on_start_does_not_confirm_it(
     assert gateway.posts == [("/api/act", {"drive": "pump-1", "verb": "start", "options": {}})]
 
 
+def press(page: Any, key: str, made_s: float, text: str = "") -> None:
+    """Press a key, as if that had been at that time since the epoch."""
+    session = page.context.new_cdp_session(page)
+    code = {"Enter": 13, "Tab": 9, " ": 32}[key]
+    named = {"key": key, "code": "Space" if key == " " else key, "windowsVirtualKeyCode": code}
+    for kind in ("keyDown", "keyUp"):
+        typed = {"text": text} if text and kind == "keyDown" else {}
+        session.send("Input.dispatchKeyEvent", {"type": kind, "timestamp": made_s, **named, **typed})
+    session.detach()
+
+
+@pytest.mark.parametrize(("key", "text"), [("Enter", "\r"), (" ", " ")], ids=["Enter", "Space"])
+def test_keys_of_before_a_dialog_shows_do_not_confirm_it(
+    opened: Opener, gateway: FakeGateway, key: str, text: str
+) -> None:
+    """On a slow page Tab goes from its Cancel to its other button, before anybody has seen them."""
+    page = opened("#/drives/pump-1")
+    until_still(page)
+    start = page.get_by_role("button", name="start", exact=True)
+    start.evaluate(SLOW_AT_CLICKS)
+    start.focus()
+    made_s = time.time()
+    press(page, key, made_s, text)
+    assert page.locator("#ask").evaluate("dialog => dialog.open")
+    press(page, "Tab", made_s + 0.3)
+    press(page, key, made_s + 0.6, text)
+    assert page.locator("#ask").evaluate("dialog => dialog.open")
+    assert gateway.posts == []
+    page.wait_for_timeout(600)  # until it was drawn
+    press(page, key, time.time(), text)
+    page.locator("#outcomes li").wait_for()
+    assert gateway.posts == [("/api/act", {"drive": "pump-1", "verb": "start", "options": {}})]
+
+
 def test_a_command_names_the_frame_that_was_seen_at_its_confirmation(
     opened: Opener, gateway: FakeGateway
 ) -> None:

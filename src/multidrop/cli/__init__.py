@@ -12,13 +12,14 @@ import logging
 import os
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from functools import partial
 from typing import Any, NoReturn
 
 from multidrop.errors import BusError, Refused, Unsupported
 
 DONE, FAILED, MISTAKE, INTERRUPTED = 0, 1, 2, 130
+STOPS = ("stop", "coast", "emergency-stop")  # neither a mistake beside their drive nor SIGHUP keeps one back
 _MISNAMED = (FileNotFoundError, IsADirectoryError, NotADirectoryError)
 
 COMMANDS = {  # name: module in this package, and help
@@ -89,10 +90,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     if not words or words[0] in ("-h", "--help", "--version"):
         return _guarded(partial(_describe_itself, words))
     from multidrop.cli.support.output import logging_to, spell_out_unencodable, warn
-    from multidrop.cli.support.signals import sigterm_interrupts
+    from multidrop.cli.support.signals import end_signals_interrupt, outliving_the_terminal
 
     spell_out_unencodable()
-    with sigterm_interrupts(), logging_to(warn, "multidrop.drives.registry", logging.INFO):
+    command = words[1] if words[0] == "fleet" and words[1:] else words[0]
+    going_on = outliving_the_terminal() if command in STOPS else nullcontext()
+    with end_signals_interrupt(), going_on, logging_to(warn, "multidrop.drives.registry", logging.INFO):
         return _guarded(partial(_run, words[0], words[1:]))
 
 
@@ -167,12 +170,19 @@ def _run(command: str, words: list[str]) -> int:
     parser = _Parser(prog=prog, description=text[0].upper() + text[1:] + ".", allow_abbrev=False)
     parser.set_defaults(command=command)
     module.add_arguments(parser)
+    is_stop = command in STOPS
     try:
-        arguments = parser.parse_intermixed_args(words)  # an option may stand between positionals
+        arguments, unknown = parser.parse_known_intermixed_args(words)  # an option between positionals too
+        if unknown and not is_stop:
+            parser.error(f"unrecognized arguments: {' '.join(unknown)}")
     except SystemExit:  # --help was printed
         return DONE
+    except ValueError as mistake:
+        raise ValueError(f"the {command} was NOT sent: {mistake}") if is_stop else mistake from None
+    if unknown:
+        _fail(f"left out, for {command} knows no such option: {' '.join(unknown)}", MISTAKE)
     try:
-        return int(module.run(arguments))
+        return int(module.run(arguments)) or (MISTAKE if unknown else DONE)
     except Refused as refusal:
         from multidrop.cli.support.plants import is_plant
 

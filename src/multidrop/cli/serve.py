@@ -148,7 +148,7 @@ def _serve(
 
     async def live() -> None:
         on_end_signals(gateway.end)
-        if sys.platform != "win32":  # it has no such signal: there the page's button reloads
+        if read and sys.platform != "win32":  # it has no such signal: there the page's button reloads
             asyncio.get_running_loop().add_signal_handler(signal.SIGHUP, gateway.reload.begin)
         await gateway.run(lambda: on_ready(gateway.port))
 

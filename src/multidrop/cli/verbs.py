@@ -5,13 +5,13 @@ from __future__ import annotations
 import argparse
 import json
 from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager
 from typing import Any
 
+from multidrop.cli import DONE, MISTAKE, STOPS
 from multidrop.cli.support.arguments import add_json_argument, add_writing_arguments, duration
 from multidrop.cli.support.confirm import confirm
 from multidrop.cli.support.output import command_line, print_text, warn
-from multidrop.cli.support.signals import outliving_the_terminal
 from multidrop.cli.support.target import Target, add_target_arguments, check_words, number_of, target_of
 from multidrop.cli.support.values import as_json, nearest_value
 from multidrop.control.audit_log import AuditLog
@@ -23,7 +23,6 @@ from multidrop.errors import Unsupported
 
 _DIRECTED = ("start", "jog")
 _FURTHER = {"set-frequency": ("HZ",)}  # arguments of commands behind the drive
-_STOPS = ("stop", "coast", "emergency-stop")
 _SHOWING_WATCHDOG = ("state", *_DIRECTED)  # they print what the motor does when the client dies
 _QUESTIONS = {  # asked before anything is sent; a stop needs no confirmation
     "start": "Start the motor of",
@@ -44,7 +43,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         )
     if command == "start":
         parser.add_argument("--frequency", metavar="HZ", type=float, help="write this setpoint first")
-    if command in _STOPS:
+    if command in STOPS:
         parser.add_argument(
             "--seconds",
             metavar="S",
@@ -66,14 +65,8 @@ def _stop_time(text: str) -> float | None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    with outliving_the_terminal() if arguments.command in _STOPS else nullcontext():
-        return _run(arguments)
-
-
-def _run(arguments: argparse.Namespace) -> int:
-    target, words = target_of(arguments)
-    check_words(arguments, words, _FURTHER.get(arguments.command, ()))
-    if words:
+    target, words = _target(arguments)
+    if words and arguments.command not in STOPS:
         arguments.frequency = number_of(arguments, "HZ", words[0])
     drive = target.drive
     verb = getattr(drive, arguments.command.replace("-", "_"))
@@ -84,7 +77,7 @@ def _run(arguments: argparse.Namespace) -> int:
     if arguments.command in _QUESTIONS:
         drive.check_confirmed(arguments.command)
         confirm(f"{_QUESTIONS[arguments.command]} {drive.name} on {target.port}?", arguments)
-    limit = {"seconds": arguments.seconds} if arguments.command in _STOPS else {}
+    limit = {"seconds": arguments.seconds} if arguments.command in STOPS else {}
     with target.open_bus(_audit_file(arguments)) as bus, _annotating(arguments.command, target) as known:
         if hz is not None and arguments.command != "set-frequency":
             drive.set_frequency(hz)
@@ -102,7 +95,23 @@ def _run(arguments: argparse.Namespace) -> int:
         print_text(f"{state}\nwatchdog: {watchdog}")
     else:
         print_text(_sentence(arguments.command, drive, state, setpoint, watchdog))
-    return 0
+    return MISTAKE if words and arguments.command in STOPS else DONE
+
+
+def _target(arguments: argparse.Namespace) -> tuple[Target, list[str]]:
+    """Return the drive that is named, and the words behind it, of which a stop uses none and says so."""
+    command = arguments.command
+    if command not in STOPS:
+        target, words = target_of(arguments)
+        check_words(arguments, words, _FURTHER.get(command, ()))
+        return target, words
+    try:
+        target, words = target_of(arguments)
+    except (ValueError, TypeError) as mistake:
+        raise ValueError(f"the {command} was NOT sent: {mistake}") from mistake
+    if words:
+        warn(f"left out, for {command} takes one drive, and that is {target.drive.name}: {' '.join(words)}")
+    return target, words
 
 
 def _audit_file(arguments: argparse.Namespace) -> str | None:
@@ -111,7 +120,7 @@ def _audit_file(arguments: argparse.Namespace) -> str | None:
     A log that cannot be written holds no stop back.
     """
     audit: str | None = getattr(arguments, "audit", None)
-    if audit and arguments.command in _STOPS:
+    if audit and arguments.command in STOPS:
         try:
             AuditLog(audit).close()
         except OSError as failure:

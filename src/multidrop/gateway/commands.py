@@ -30,9 +30,9 @@ from multidrop import (
 from multidrop.gateway.clock import boottime_ns, monotonic_ns
 from multidrop.gateway.command_threads import begin_stops, in_thread
 from multidrop.gateway.rights import NEVER_THIS_WAY, Caller, May, Right
-from multidrop.gateway.stops_amid_reload import ChangingLines, drives_of, stop_as_changed, stop_meant
+from multidrop.gateway.stops_amid_reload import ChangingLines, drives_of, names_of, stop_meant
 from multidrop.gateway.told import Told as Told
-from multidrop.gateway.told import denied, failed, not_listed, of_stop
+from multidrop.gateway.told import as_one, denied, failed, not_listed, of_stop
 from multidrop.gateway.verb_rules import STOPPING, VERBS
 
 MOST_AGE_S = 5.0  # of a write or a verb that a network held up; a stop is never too old
@@ -89,10 +89,7 @@ class Commands:
         self.stops.update(drives)
         self._stopped_ns |= dict.fromkeys(drives, boottime_ns())
 
-    def _note_stop_end(self, drives: Iterable[str], future: object) -> None:
-        self._note_end(drives)
-
-    def _note_end(self, drives: Iterable[str]) -> None:
+    def _note_end(self, drives: Iterable[str], future: object = None) -> None:
         self._ended_ns |= dict.fromkeys(drives, monotonic_ns())
 
     # ---- stops ----
@@ -135,7 +132,7 @@ class Commands:
     ) -> list[asyncio.Future[dict[str, Told]]]:
         begun = begin_stops([work for work, _ in works], caller)
         for future, (_, drives) in zip(begun, works, strict=True):
-            future.add_done_callback(partial(self._note_stop_end, drives))
+            future.add_done_callback(partial(self._note_end, drives))
         return begun
 
     def _stop_line(self, line: str, names: list[str], seconds: float | None) -> dict[str, Told]:
@@ -170,7 +167,7 @@ class Commands:
         admit: Admit = lambda what: inf,
     ) -> Told:
         """Carry out a verb that the plant file lists, once; refused by a way that cannot ask a person."""
-        drive = drive_meant(drive, drives_of(self._lines.plant_now)) if verb in STOPPING else drive
+        drive = drive_meant(drive, names_of(self._lines)) if verb in STOPPING else drive
         what = f"{drive}.{verb}"
         rule = VERBS.get(verb)
         if rule is None:
@@ -183,33 +180,37 @@ class Commands:
         if rule.is_listed and what not in self.may.verbs:
             return failed(not_listed(what, "verbs"))
         if verb == "stop":
-            return (await self.stop([drive], caller))[drive]
+            return as_one(await self.stop([drive], caller))
         try:
             arguments = verb_arguments(verb, options)
         except ValueError as mistake:
             return failed(mistake)
-        work = partial(_act, verb=verb, arguments=arguments)
         if verb in STOPPING:
-            return await self._carry_out_stop(drive, caller, what, work)
+            return await self._carry_out_stop(drive, verb, arguments, caller)
+        work = partial(_act, verb=verb, arguments=arguments)
         return await self._carry_out(drive, caller, what, work, admit)
 
     async def _carry_out_stop(
-        self, drive: str, caller: Caller, what: str, work: Callable[[Drive], Told]
+        self, drive: str, verb: str, arguments: Mapping[str, Any], caller: Caller
     ) -> Told:
-        """Carry out a verb that stops the motor: neither writes under way nor other stops keep it back."""
+        """Carry out a verb that stops the motor: neither writes under way nor other stops keep it back.
+
+        Another drive that a reload makes it mean as well is stopped on its ramp, unless its verb is listed.
+        """
         self.called += 1
-        _log.warning("%s, asked for by %s", what, caller.by)
+        _log.warning("%s.%s, asked for by %s", drive, verb, caller.by)
 
         async def stop(plant: Plant, names: list[str]) -> dict[str, Told]:
-            try:
-                _, known = plant.find_drive(drive)
-            except ValueError as mistake:
-                return {drive: failed(mistake)}
-            self._note_stop([drive])
-            (future,) = self._begin_stops([(lambda _: {drive: work(known)}, [drive])], caller)
-            return await asyncio.shield(future)
+            there = drives_of(plant)
+            listed = {drive} | {name for name in names if f"{name}.{verb}" in self.may.verbs}
+            here = [name for name in names if name in there and name in listed]
+            self._note_stop(here)
+            works = [(partial(_stop_by, there[name], verb, arguments), [name]) for name in here]
+            rest = self._stop(plant, [name for name in names if name not in here], caller)
+            ends = await asyncio.gather(*self._begin_stops(works, caller), rest)
+            return {name: told for end in ends for name, told in end.items()}
 
-        return (await stop_as_changed(self._lines, [drive], stop))[drive]
+        return as_one(await stop_meant(self._lines, [drive], stop))
 
     async def _carry_out(
         self, drive: str, caller: Caller, what: str, work: Callable[[Drive], Told], admit: Admit
@@ -260,6 +261,11 @@ def _stop_one(drive: Drive, seconds: float | None) -> dict[str, Told]:
     except Exception as failure:  # whatever it is: everybody must see it
         return {drive.name: failed(failure)}
     return {drive.name: Told(True, "stopped: seen to stand")}
+
+
+def _stop_by(drive: Drive, verb: str, arguments: Mapping[str, Any], seconds: float | None) -> dict[str, Told]:
+    limit = {} if seconds is None else {"seconds": seconds}
+    return {drive.name: _act(drive, verb, {**arguments, **limit})}
 
 
 def _write(drive: Drive, register: str, value: float) -> Told:

@@ -35,6 +35,12 @@ def drives_of(plant: Plant) -> dict[str, Drive]:
     return {polled.drive.name: polled.drive for line in plant.lines for polled in line.drives}
 
 
+def names_of(lines: ChangingLines) -> dict[str, None]:
+    """Return the names of all drives that are there, and that are about to be."""
+    plants = (lines.plant_now, lines.plant_coming or lines.plant_now)
+    return dict.fromkeys(name for plant in plants for name in drives_of(plant))
+
+
 async def stop_meant(
     lines: ChangingLines,
     drives: Sequence[str] | None,
@@ -43,8 +49,7 @@ async def stop_meant(
     """Stop the drives that these names mean, in whatever spelling, and those that they are about to mean."""
     if drives is None:
         return await stop_as_changed(lines, None, stop)
-    plants = (lines.plant_now, lines.plant_coming or lines.plant_now)
-    names = dict.fromkeys(name for plant in plants for name in drives_of(plant))
+    names = names_of(lines)
     meant = {name: drive_meant(name, names) for name in drives}
     others = _also_meant(lines, [*meant.values()])
     told = await stop_as_changed(lines, [*meant.values(), *others], stop)

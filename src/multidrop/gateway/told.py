@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import NamedTuple
 
 from multidrop import BusError, Refused, Seen, Stopped
@@ -28,6 +29,17 @@ def of_stop(stopped: Stopped) -> Told:
     if stopped.seen is Seen.STOPPED:
         return Told(True, f"stopped: seen to stand after {stopped.seconds:.1f} s")
     return Told(False, f"{stopped.seen.value}: {stopped.why}", BusError(stopped.why))
+
+
+def as_one(found: Mapping[str, Told]) -> Told:
+    """Return the end of a stop that went to several drives, because it may have meant each of them."""
+    if len(found) == 1:
+        return next(iter(found.values()))
+    texts = (
+        one.text if one.text.startswith(f"{name}: ") else f"{name}: {one.text}" for name, one in found.items()
+    )
+    failures = (one.error for one in found.values() if not one.is_done)
+    return Told(all(one.is_done for one in found.values()), "; ".join(texts), next(failures, None))
 
 
 def denied(caller: Caller, role: Right, what: str) -> Told:

@@ -10,16 +10,16 @@ import os
 import socket
 import sys
 from collections.abc import Iterator
-from contextlib import AsyncExitStack, contextmanager, nullcontext, suppress
+from contextlib import AsyncExitStack, contextmanager, suppress
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from multidrop.cli import STOPS
 from multidrop.cli.fleet.connection import STATE, add_server_arguments, run_action, state_folder, urls_of
 from multidrop.cli.support.confirm import confirm
 from multidrop.cli.support.nats import nats_options
 from multidrop.cli.support.output import print_text, warn
-from multidrop.cli.support.signals import outliving_the_terminal
 from multidrop.printable import printable
 
 if TYPE_CHECKING:
@@ -28,7 +28,6 @@ if TYPE_CHECKING:
 
 _DIRECTIONS = ("forward", "reverse")
 _DIRECTED = ("start", "jog")
-_STOPPING = ("stop", "coast", "emergency-stop")  # these ask nobody
 _FURTHER = {"write": ("REGISTER", "VALUE"), "set-frequency": ("HZ",)}  # arguments behind the drive
 
 
@@ -44,7 +43,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         parser.add_argument(word.lower(), metavar=word)
     if action in _DIRECTED:
         parser.add_argument("--direction", choices=_DIRECTIONS, help="as in force if not given")
-    if action not in _STOPPING:
+    if action not in STOPS:
         parser.add_argument("--yes", action="store_true", help="do not ask; needed where no terminal is")
     parser.add_argument("--by", metavar="NAME", help="whom the logs name; else USER@HOST")
     parser.add_argument(
@@ -58,8 +57,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     work = _stop if arguments.command == "stop" else _command
-    with outliving_the_terminal() if arguments.command in _STOPPING else nullcontext():
-        return run_action(partial(work, arguments))
+    return run_action(partial(work, arguments))
 
 
 def _asker(arguments: argparse.Namespace) -> FleetCommands:
@@ -67,7 +65,7 @@ def _asker(arguments: argparse.Namespace) -> FleetCommands:
     from multidrop.fleet.fleet_commands import FleetCommands
 
     by = arguments.by or f"{_user()}@{socket.gethostname()}"
-    if arguments.command in _STOPPING:
+    if arguments.command in STOPS:
         by = printable(by)[:MOST_CHARACTERS]  # no name keeps a stop back
     elif not by.isprintable() or len(by) > MOST_CHARACTERS:
         raise ValueError(f"--by {by!r} is not 1 to {MOST_CHARACTERS} printable characters")
@@ -105,7 +103,7 @@ async def _command(arguments: argparse.Namespace) -> int:
     from multidrop.fleet.command_words import CommandAnswer
 
     what, agreed = _what(arguments), ""
-    if arguments.command not in _STOPPING and not arguments.yes:
+    if arguments.command not in STOPS and not arguments.yes:
         async with _asker(arguments) as asker:
             preview = await asker.preview(asker.request(arguments.drive, **what))
         if isinstance(preview, CommandAnswer):
@@ -124,7 +122,8 @@ async def _stop(arguments: argparse.Namespace) -> int:
     from multidrop.fleet.stop_asking import HARD_WIRED
 
     if bool(drives) == arguments.all:
-        raise ValueError("stop takes either drives or --all: `multidrop fleet stop pump-1`")
+        ways = "stop takes either drives or --all: `multidrop fleet stop pump-1`"
+        raise ValueError(f"the stop was NOT sent: {ways}")
     async with AsyncExitStack() as stack:
         try:
             asker = await stack.enter_async_context(_asker(arguments))

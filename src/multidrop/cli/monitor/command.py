@@ -23,7 +23,6 @@ from multidrop.cli.support.live_plant import LiveDrive, LivePlant
 from multidrop.cli.support.output import logging_to, warn
 from multidrop.cli.support.plants import add_plant_argument, add_port_option, plant_of
 from multidrop.cli.support.polling import PollingSession, polling_session
-from multidrop.cli.support.signals import Interruption, outliving_the_terminal
 from multidrop.cli.support.values import counted
 from multidrop.control.outcome import Seen
 from multidrop.plant.model import Plant
@@ -65,8 +64,8 @@ def watch(plant: Plant, *, out: Path | None = None, seconds: float | None = None
     """
     console = open_console()
     live = LivePlant(plant)
-    with outliving_the_terminal() as hup, polling_session(plant, out, live.add) as session:
-        monitor = Monitor(live, session, console, hup)
+    with polling_session(plant, out, live.add) as session:
+        monitor = Monitor(live, session, console)
         with session.poller:
             try:
                 monitor.show(seconds)
@@ -74,19 +73,17 @@ def watch(plant: Plant, *, out: Path | None = None, seconds: float | None = None
                 failures = monitor.await_stops()  # before the ports are closed: one may not be sent yet
         for sentence in failures:
             warn(sentence)
-        session.hand_out()  # what came while the poller closed
     return session.poller.summary()
 
 
 class Monitor:
     """The screen of a polled plant: draws what has come, and carries out what keys ask for."""
 
-    def __init__(self, plant: LivePlant, session: PollingSession, console: Any, hup: Interruption) -> None:
+    def __init__(self, plant: LivePlant, session: PollingSession, console: Any) -> None:
         from multidrop.cli.monitor.screen import BLOCKS, PLAIN_BLOCKS, Position
 
         self._console = console
         self._session = session
-        self._hup = hup  # its terminal was closed
         self._plant = plant
         self._at = Position()
         self._on_yes: Callable[[], None] | None = None  # done when the question is answered with y
@@ -105,7 +102,7 @@ class Monitor:
             keys() as wait_for_key,
             logging_to(self._show_message, "multidrop", WARNING),
         ):
-            while not (self._session.interruption.came or self._hup.came or self._has_left):
+            while not (self._session.interruption.came or self._has_left):
                 now = time.monotonic()
                 if seconds is not None and now - begun >= seconds:
                     return

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import codecs
 import os
+import re
 import select
 import sys
 from collections.abc import Callable, Iterator
@@ -22,8 +24,12 @@ KEYS = {  # as terminals send them
     b" ": PAGE_DOWN,
     b"\r": ENTER,
     b"\n": ENTER,
-    b"\x1b": ESCAPE,
 }
+UNKNOWN = "unknown"
+# A key that is no letter, as F4, which ends in S: it asks for nothing. And the beginning of one.
+_SEQUENCE = re.compile(rb"\x1b(?:\[\[?[0-?]*[ -/]*[@-Z\\-~]|O[ -~])")
+_BEGUN = re.compile(rb"\x1b(?:\[\[?[0-?]*[ -/]*|O)?")
+SPLIT_S = 0.05  # after which the rest of one has not been sent
 MOST_BYTES = 4  # of a character in UTF-8
 # Letters of the Russian and the Ukrainian layout, and those of the same keys on a Latin one.
 LATIN = str.maketrans("йыіфнолЙЫІФНОЛ", "qssayjkQSSAYJK")
@@ -46,12 +52,18 @@ def keys() -> Iterator[Callable[[float], str]]:
     tty.setcbreak(fd)
     pressed = b""  # and not returned yet
 
+    def read() -> bytes:
+        found = os.read(fd, 64)
+        if not found:
+            raise OSError(EIO, "the terminal is closed")
+        return found
+
     def wait_for_key(seconds: float) -> str:
         nonlocal pressed
         if not pressed and select.select([fd], [], [], seconds)[0]:
-            pressed = os.read(fd, 64)
-            if not pressed:
-                raise OSError(EIO, "the terminal is closed")
+            pressed = read()
+        while is_begun(pressed) and select.select([fd], [], [], SPLIT_S)[0]:
+            pressed += read()
         key, pressed = next_key(pressed)
         return key
 
@@ -64,11 +76,21 @@ def keys() -> Iterator[Callable[[float], str]]:
 
 def next_key(pressed: bytes) -> tuple[str, bytes]:
     """Split off the first key of what a terminal sent: its name or letter, and the rest."""
-    for code in sorted(KEYS, key=len, reverse=True):
-        if pressed.startswith(code):
-            return KEYS[code], pressed[len(code) :]
+    if sequence := _SEQUENCE.match(pressed):
+        return KEYS.get(sequence[0], UNKNOWN), pressed[sequence.end() :]
+    if pressed[:1] == b"\x1b":
+        return ESCAPE, pressed[1:]
     letter, rest = _first_letter(pressed)
     return KEYS.get(letter.encode(), letter), rest
+
+
+def is_begun(pressed: bytes) -> bool:
+    """Return True for the beginning of a key or of a letter whose rest may be sent yet."""
+    with suppress(UnicodeDecodeError):
+        return bool(_BEGUN.fullmatch(pressed)) or (
+            pressed != b"" and codecs.getincrementaldecoder("utf-8")().decode(pressed) == ""
+        )
+    return False
 
 
 def _first_letter(pressed: bytes) -> tuple[str, bytes]:

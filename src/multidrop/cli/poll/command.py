@@ -91,7 +91,6 @@ def follow(plant: Plant, arguments: argparse.Namespace, rotation: Rotation | Non
                 taps.collect()
                 if table:
                     table.draw_if_due(time.monotonic())
-        session.hand_out()  # what came while the poller closed
     if table:
         table.draw()
     return conclude(plant, session.poller.summary() | taps.summary(), arguments)

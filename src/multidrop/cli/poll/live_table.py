@@ -9,6 +9,7 @@ from __future__ import annotations
 import shutil
 from collections import Counter
 from collections.abc import Iterator
+from contextlib import suppress
 from typing import TextIO
 
 from multidrop.cli.support.live_plant import LiveDrive, LivePlant
@@ -49,7 +50,8 @@ class LiveTable:
         if len(lines) > height - 1:
             lines = [*lines[: height - 2], f"... and {counted(len(lines) - height + 2, 'more drive')}"]
         back = _UP_AND_CLEAR.format(self._height) if self._height else ""
-        print(back + "\n".join(lines), file=self._terminal, flush=True)
+        with suppress(OSError):  # of a terminal that is closed: the recording goes on to its end
+            print(back + "\n".join(lines), file=self._terminal, flush=True)
         self._height = len(lines)
 
     def _lines(self) -> Iterator[str]:

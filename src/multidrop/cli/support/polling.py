@@ -43,7 +43,7 @@ def polling_session(
     *consumers: Callable[[Rows], None],
     rotation: Rotation | None = None,
 ) -> Iterator[PollingSession]:
-    """Open the plant's ports, and then its recording; close both when the block is left."""
+    """Open the plant's ports, and then its recording; close both when the block is left, with all rows."""
     takers = list(consumers)
     with ExitStack() as stack:
         interruption = stack.enter_context(noting_signals())
@@ -56,4 +56,7 @@ def polling_session(
                 for take in takers:
                     take(batch)
 
-        yield PollingSession(poller, interruption, hand_out)
+        try:
+            yield PollingSession(poller, interruption, hand_out)
+        finally:
+            hand_out()  # what came while the poller closed, also after a failure

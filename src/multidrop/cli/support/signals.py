@@ -1,8 +1,8 @@
 """SIGINT (Ctrl-C), SIGTERM and SIGHUP while a command runs.
 
 The first two interrupt a command at once, but for polling and sniffing: there the first one is noted, so that
-what is under way is finished and recorded, and the second one interrupts. SIGHUP ends any command but a stop
-and a monitor, whose keys stop too.
+what is under way is finished and recorded, and the second one interrupts. SIGHUP, of a terminal that is
+closed, ends a command as the first of them does, but for a stop, which goes on. Several of it mean no more.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from __future__ import annotations
 import signal
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import contextmanager
 from types import FrameType
 
 
@@ -28,60 +28,88 @@ def handling(handler: Callable[[int, FrameType | None], object], *numbers: signa
             signal.signal(number, old)
 
 
-def sigterm_interrupts() -> AbstractContextManager[None]:
-    """Raise KeyboardInterrupt on SIGTERM too."""
-    return handling(signal.default_int_handler, signal.SIGTERM)
+def _hangup() -> tuple[signal.Signals, ...]:
+    """Return SIGHUP, of a terminal that is closed; nothing where there is none, or nohup ignores it."""
+    if sys.platform == "win32" or signal.getsignal(signal.SIGHUP) == signal.SIG_IGN:
+        return ()
+    return (signal.SIGHUP,)
+
+
+@contextmanager
+def end_signals_interrupt() -> Iterator[None]:
+    """Raise KeyboardInterrupt on SIGTERM too, and on the first SIGHUP."""
+    is_closed = False
+
+    def close(number: int, frame: FrameType | None) -> None:
+        nonlocal is_closed
+        if not is_closed:  # several may come: a shell and the system send one each
+            is_closed = True
+            raise KeyboardInterrupt
+
+    with handling(signal.default_int_handler, signal.SIGTERM), handling(close, *_hangup()):
+        yield
 
 
 class Interruption:
-    """The first signal sets `came`; the second one raises KeyboardInterrupt."""
+    """The first signal sets `came`; the second one raises KeyboardInterrupt. No SIGHUP does."""
 
     def __init__(self) -> None:
         self.came = False
+        self._is_asked = False  # by a person or a service manager, who may be impatient
 
     def note(self, number: int, frame: FrameType | None) -> None:
-        if self.came:
+        if self._is_asked:
             raise KeyboardInterrupt
+        self._is_asked = self.came = True
+
+    def note_hangup(self, number: int, frame: FrameType | None) -> None:
         self.came = True
 
 
 @contextmanager
-def outliving_the_terminal() -> Iterator[Interruption]:
-    """Go on though the terminal is closed (SIGHUP), which is noted: a stop is repeated until its end."""
-    closing = Interruption()
-
-    def note(number: int, frame: FrameType | None) -> None:
-        closing.came = True  # several may come: a shell and the system send one each
-
-    if sys.platform == "win32":  # which has no such signal
-        yield closing
-        return
-    with handling(note, signal.SIGHUP):
-        yield closing
+def outliving_the_terminal() -> Iterator[None]:
+    """Go on though the terminal is closed: a stop is repeated until its end."""
+    with handling(lambda number, frame: None, *_hangup()):
+        yield
 
 
 @contextmanager
 def noting_signals() -> Iterator[Interruption]:
-    """Note the first SIGINT or SIGTERM instead of being interrupted by it."""
+    """Note the first SIGINT or SIGTERM, and each SIGHUP, instead of being interrupted by it."""
     interruption = Interruption()
-    with handling(interruption.note, signal.SIGINT, signal.SIGTERM):
+    with (
+        handling(interruption.note, signal.SIGINT, signal.SIGTERM),
+        handling(interruption.note_hangup, *_hangup()),
+    ):
         yield interruption
 
 
 def on_end_signals(end: Callable[[], object]) -> None:
-    """Call `end` in the running asyncio loop at the first SIGINT or SIGTERM; a second one interrupts."""
+    """Call `end` in the running asyncio loop, once, at the first SIGINT, SIGTERM or SIGHUP.
+
+    A second SIGINT or SIGTERM interrupts.
+    """
     import asyncio
 
     loop = asyncio.get_running_loop()
+    has_ended = False
+
+    def end_once() -> None:
+        nonlocal has_ended
+        if not has_ended:
+            has_ended = True
+            end()
 
     def first(number: signal.Signals) -> None:
         if sys.platform != "win32":
             loop.remove_signal_handler(number)
         signal.signal(number, signal.default_int_handler)
-        end()
+        end_once()
 
     for number in (signal.SIGINT, signal.SIGTERM):
         if sys.platform == "win32":  # whose loops handle none
             signal.signal(number, lambda came, frame: loop.call_soon_threadsafe(first, signal.Signals(came)))
         else:
             loop.add_signal_handler(number, first, number)
+    for number in _hangup():
+        loop.add_signal_handler(number, end_once)

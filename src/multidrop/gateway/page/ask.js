@@ -10,7 +10,8 @@ const dialog = () => find("#ask");
 
 // The second click of a double click means what the first one pressed. Where the dialog opened or closed in
 // between it would press what nobody looked at, so it is not taken, but for a stop. Nor is a click that was
-// made before the change was drawn, as on a page that is slow: it waited for its turn. Nor is a held key.
+// made before the change was drawn, as on a page that is slow: it waited for its turn. Nor is Enter or Space
+// of then, nor a held one.
 const TWICE_MS = 500,
   NEAR_PX = 30,
   AT_ONCE = "#stopall, .stop";
@@ -38,7 +39,7 @@ function isOfBefore({ clientX: x, clientY: y, timeStamp: time, detail }) {
 }
 
 // Beside the dialog there is nothing but Stop all, which lies behind it.
-const isAtOnce = target => target === dialog() || target.closest(AT_ONCE);
+const isAtOnce = target => target === dialog() || target.closest?.(AT_ONCE);
 
 addEventListener(
   "click",
@@ -56,10 +57,19 @@ addEventListener(
   "keydown",
   event => {
     last.x = -Infinity; // a click after a key is a click of its own
-    if (event.repeat && (event.key === "Enter" || event.key === " ")) event.preventDefault();
+    if (event.repeat && isPress(event)) event.preventDefault();
   },
   true,
 );
+const isPress = ({ key }) => key === "Enter" || key === " ";
+for (const kind of ["keydown", "keyup"])
+  addEventListener(
+    kind,
+    event => {
+      if (isPress(event) && event.timeStamp < drawn && !isAtOnce(event.target)) event.preventDefault();
+    },
+    true,
+  );
 
 // Show the dialog and return what was chosen, as `show` does. A question whether to stop is asked at once,
 // and what else there is to ask or tell comes after its answer: it takes no stop from under the hand that

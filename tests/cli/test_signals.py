@@ -1,0 +1,126 @@
+"""Signals while a command runs: impatience, and a terminal that is closed."""
+
+from __future__ import annotations
+
+import asyncio
+import signal
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from commands import plant_file
+from peers import require_module
+from recordings import recorded
+from terminals import closing_terminal
+
+from multidrop.cli.support.signals import end_signals_interrupt, noting_signals, on_end_signals
+
+PATIENCE = 60.0
+
+
+@pytest.fixture
+def hangup_is_deadly() -> Iterator[None]:
+    """Whatever the tests were begun with."""
+    before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    yield
+    signal.signal(signal.SIGHUP, before)
+
+
+def hang_up() -> None:
+    """Send SIGHUP, to which each command has an answer: else this process would end here."""
+    assert callable(signal.getsignal(signal.SIGHUP))
+    signal.raise_signal(signal.SIGHUP)
+
+
+def test_a_closed_terminal_is_noted_and_no_impatience(hangup_is_deadly: None) -> None:
+    with noting_signals() as interruption:
+        for _ in range(2):  # a shell and the system send one each
+            hang_up()
+        assert interruption.came
+        signal.raise_signal(signal.SIGTERM)  # of a system that ends the session
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGTERM)
+
+
+def test_a_closed_terminal_interrupts_a_command_once(hangup_is_deadly: None) -> None:
+    with end_signals_interrupt():
+        with pytest.raises(KeyboardInterrupt):
+            hang_up()
+        hang_up()
+    assert signal.getsignal(signal.SIGHUP) is signal.SIG_DFL
+
+
+def test_nohup_goes_on_being_obeyed() -> None:
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        with end_signals_interrupt(), noting_signals() as interruption:
+            signal.raise_signal(signal.SIGHUP)
+        assert not interruption.came
+    finally:
+        signal.signal(signal.SIGHUP, before)
+
+
+def test_a_service_ends_once_when_its_terminal_is_closed(hangup_is_deadly: None) -> None:
+    ends: list[int] = []
+
+    async def service() -> None:
+        on_end_signals(lambda: ends.append(1))
+        hang_up()
+        async with asyncio.timeout(PATIENCE):
+            while not ends:
+                await asyncio.sleep(0)
+        hang_up()
+        signal.raise_signal(signal.SIGTERM)
+        async with asyncio.timeout(PATIENCE):
+            while signal.getsignal(signal.SIGTERM) is not signal.default_int_handler:
+                await asyncio.sleep(0)
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGTERM)
+
+    terminate = signal.getsignal(signal.SIGTERM)
+    try:
+        asyncio.run(service())
+    finally:
+        signal.signal(signal.SIGTERM, terminate)
+    assert ends == [1]
+
+
+def test_a_second_signal_breaks_off_what_the_first_one_asked_to_end() -> None:
+    with noting_signals() as interruption:
+        assert not interruption.came
+        signal.raise_signal(signal.SIGINT)
+        assert interruption.came
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGTERM)
+
+
+@pytest.mark.slow
+def test_poll_keeps_what_it_recorded_where_its_terminal_is_closed(plant: Path, tmp_path: Path) -> None:
+    require_module("pyarrow")
+    out = tmp_path / "out.parquet"  # which cannot be read unless it was closed
+    with closing_terminal("poll", plant, "--out", out) as terminal:
+        terminal.wait_for_match(r"pump-1 +[1-9]")
+        terminal.close()
+        assert terminal.process.wait(PATIENCE) >= 0
+    assert any(row.value is not None for row in recorded(out))
+
+
+def test_simulate_removes_its_links_where_its_terminal_is_closed(tmp_path: Path) -> None:
+    link = tmp_path / "ports" / "hall-1"
+    words = ["simulate", plant_file(tmp_path), "--ports", tmp_path / "ports"]
+    with closing_terminal(*words) as terminal:
+        terminal.wait_for("ready hall-1")
+        assert link.is_symlink()
+        terminal.close()
+        assert terminal.process.wait(PATIENCE) == 0
+    assert not link.is_symlink()
+
+
+@pytest.mark.slow
+def test_the_demo_of_serve_ends_where_its_terminal_is_closed() -> None:
+    """It has no plant file that could be read again."""
+    require_module("uvicorn")
+    with closing_terminal("serve", "--demo", "--no-browser") as terminal:
+        terminal.wait_for("Ctrl-C ends it")
+        terminal.close()
+        assert terminal.process.wait(PATIENCE) == 0
