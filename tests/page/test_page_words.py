@@ -42,15 +42,31 @@ def test_figures_of_a_dead_daemon_look_old_and_nothing_is_said_of_misses(
     opened: Opener, gateway: FakeGateway
 ) -> None:
     page = opened()
-    share = page.locator("tr.head .wire span").last
+    figures = [page.locator(where).last for where in ("tr.head .wire span", "#chips b", "#strip li")]
     style = "element => getComputedStyle(element).fontStyle"
-    assert share.evaluate(style) == "normal"
+    assert [figure.evaluate(style) for figure in figures] == ["normal"] * 3
     gateway.kill()
     until(page, "document.body.classList.contains('dead')")
-    assert share.evaluate(style) == "italic"
+    assert [figure.evaluate(style) for figure in figures] == ["italic"] * 3
     page.evaluate("location.hash = '#/lines'")
     page.get_by_text("The daemon cannot be reached.", exact=True).wait_for()
     assert "counted yet" not in page.locator("#lines").inner_text()
+
+
+def test_what_lasted_when_the_daemon_died_is_not_known_to_last_on(
+    opened: Opener, gateway: FakeGateway
+) -> None:
+    page = opened("#/faults")
+    lasted = page.locator("#faults td").get_by_text("so far").first
+    lasted.wait_for()
+    gateway.kill()
+    until(page, "document.body.classList.contains('dead')")
+    told = []
+    for _ in range(2):
+        page.wait_for_timeout(5100)  # it is drawn anew after 5 s
+        page.evaluate("import('/page/faults.js').then(m => m.show())")
+        told.append(lasted.inner_text())
+    assert told[0] == told[1]
 
 
 def test_one_drive_is_one(opened: Opener, gateway: FakeGateway) -> None:

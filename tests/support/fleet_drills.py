@@ -79,6 +79,7 @@ class FleetDrill:
                     stdout=subprocess.DEVNULL,
                     stderr=log,
                     text=True,
+                    preexec_fn=partial(signal.signal, signal.SIGHUP, signal.SIG_DFL),  # under nohup too
                 )
 
     def log(self, name: str) -> str:

@@ -4,7 +4,7 @@ import { get, query } from "./api.js";
 import * as clock from "./clock.js";
 import { fill, find, glyph, make, named, tableHead } from "./dom.js";
 import { now } from "./link.js";
-import { alarms } from "./store.js";
+import { alarms, isLive, store } from "./store.js";
 
 const WORDS = { fault: "fault", silent: "silent", port: "port lost" };
 const SPAN_MS = 30 * 86400e3;
@@ -76,7 +76,9 @@ function row(alarm) {
   const from = Math.floor(alarm.time - AROUND_MS),
     to = Math.ceil((alarm.ended ?? now()) + AROUND_MS);
   const where = alarm.drive ? `#/drives/${encodeURIComponent(alarm.drive)}` : "#/lines";
-  const lasted = `${clock.lasting((alarm.ended ?? now()) - alarm.time)}${isLasting ? " so far" : ""}`;
+  const t = now(),
+    seen = alarm.ended ?? (isLive(t) ? t : store.time), // of a dead daemon nothing lasts on
+    lasted = `${clock.lasting(seen - alarm.time)}${isLasting ? " so far" : ""}`;
   return make(
     "tr",
     { class: isLasting ? kind : "" },
