@@ -28,7 +28,7 @@ def packed(*batches: Batch, most: int = 900_000) -> list[Packed]:
 def test_the_rows_come_back() -> None:
     (message,) = packed(example())
     assert message.rows == len(EXAMPLE)
-    wanted = [(*row[:2], row[2] and 1000, *row[3:]) for row in EXAMPLE]  # 7 ns, rounded up to 1 us
+    wanted = [(*row[:2], row[2] and 1000, *row[3:], None) for row in EXAMPLE]  # 7 ns, rounded up to 1 us
     assert rows_of(unpack(message.data)) == sorted(wanted, key=lambda row: (row[0], row[3:5]))
 
 
@@ -45,6 +45,7 @@ def test_pyarrow_alone_opens_it() -> None:
         "register",
         "value",
         "status",
+        "unit",
     ]
     assert set(table.column("clock_ns").to_pylist()) == {UTC_0}
     found = table.drop_columns(["time"]).to_pylist()  # pyarrow gives nanoseconds by pandas alone

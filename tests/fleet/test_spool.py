@@ -361,7 +361,7 @@ def test_a_batch_comes_back_as_it_was(spool: Spool, folder: Path) -> None:
     batch = numbered(0, 20)
     spool.append(batch)
     assert spool.sync(30.0)
-    wanted = [(*row[:2], row[2] and -(-row[2] // 1000) * 1000, *row[3:]) for row in batch]
+    wanted = [(*row[:2], row[2] and -(-row[2] // 1000) * 1000, *row[3:], None) for row in batch]
     stored = spool.following(0)
     assert stored is not None
     assert rows_of(unpack(stored.path.read_bytes())) == sorted(wanted, key=lambda row: (row[0], row[3:5]))

@@ -10,6 +10,8 @@ from typing import Any
 from multidrop import Bus, Mastership, Plant, Poller
 from multidrop.fleet.buckets import Record
 from multidrop.fleet.plant_store import line_of
+from multidrop.fleet.units import Units
+from multidrop.transport import clock
 
 THREADS = 32
 
@@ -17,9 +19,10 @@ THREADS = 32
 class FleetLines:
     """Takes lines into a poller and lets them go; both in threads, for both wait for ports."""
 
-    def __init__(self, mastership: Mastership, folder: Path) -> None:
+    def __init__(self, mastership: Mastership, folder: Path, units: Units) -> None:
         self.poller = Poller(Plant((), folder), mastership=mastership, audit=folder / "audit.jsonl")
         self._folder = folder / "lines"
+        self._units = units
         self._threads = ThreadPoolExecutor(THREADS, "multidrop line")
 
     async def take(self, line: str, description: Any) -> None:
@@ -31,7 +34,11 @@ class FleetLines:
         await loop.run_in_executor(self._threads, self._take, Record(line, 0, description))
 
     def _take(self, record: Record) -> None:
-        self.poller.add_line(line_of(record, self._folder))
+        line = line_of(record, self._folder)
+        polled = {drive.name for bus in self.poller.buses.values() for drive in bus.drives}
+        if not any(one.drive.name in polled for one in line.drives):  # else `add_line` refuses it
+            self._units.note(line, clock.now_ns())  # before the first of its rows
+        self.poller.add_line(line)
 
     async def let_go(self, line: str) -> None:
         """Poll the line no more, and close its port."""

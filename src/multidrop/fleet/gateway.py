@@ -31,6 +31,7 @@ from multidrop.fleet.servers import ServerPath, paths_of
 from multidrop.fleet.setup import check_buckets, open_all
 from multidrop.fleet.spool import Spool
 from multidrop.fleet.task_end import end_tasks
+from multidrop.fleet.units import Units
 
 SPOOL_BYTES = 10_000_000_000
 STATE = {"state": str, "lines": int, "margin_s": float, "troubles": dict, "spool": dict}
@@ -64,8 +65,9 @@ class FleetGateway:
         self.lock = LifeLock(folder / f"{name}.lock")
         self.paths = paths_of(urls, options)
         self.mastership = Mastership(guard_s=USUAL.guard / SECOND)
-        self.spool = Spool(folder / "spool", name, most=spool_bytes)
-        self.lines = FleetLines(self.mastership, folder)
+        units = Units()
+        self.spool = Spool(folder / "spool", name, most=spool_bytes, units=units)
+        self.lines = FleetLines(self.mastership, folder, units)
         held = HeldLines(
             self.lines.poller,
             may_command=lambda line: self.member.keeper.may_command(line),  # it is made below

@@ -7,13 +7,17 @@
 | `uncertainty_us` | int32, null for a miss          | the value was taken between time and this much later  |
 | `drive`          | dictionary of utf8              | the drive's name                                      |
 | `register`       | dictionary of utf8              | the register's name                                   |
-| `value`          | float64, null for a miss        | in the register's unit                                |
+| `value`          | float64, null for a miss        | in `unit`                                             |
 | `status`         | dictionary of utf8              | `ok`, or why there is no value                        |
+| `unit`           | dictionary of utf8, or null     | see below; null where nobody knows it                 |
 
 Rows are ordered by register, and for one register as they were polled: values that are alike lie side by
 side, and a time that ten registers share costs little more than one. Buffers are compressed by zstd-1;
 dictionaries hold the names of these rows alone. An uncertainty is rounded up to whole microseconds: the bound
 stays true, and its last ten bits are noise.
+
+A unit is that of the description under which the row was polled: "" for a number without one, "raw count" for
+one whose step is not known, "names" where numbers stand for names. Older messages have no such column.
 """
 
 from __future__ import annotations
@@ -25,6 +29,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from multidrop import BatchColumns
+from multidrop.fleet.units import Units
 
 MOST_BYTES = 900_000  # of a message: NATS takes 1 MiB from the factory, its headers included
 MOST_ROWS = 1 << 16
@@ -41,6 +46,7 @@ ROWS = pa.schema(  # as `unpack` gives them, and as recordings have them
         pa.field("register", NAMED, nullable=False),
         pa.field("value", pa.float64()),
         pa.field("status", NAMED, nullable=False),
+        pa.field("unit", NAMED),
     ]
 )
 _KINDS = {"time": pa.int64(), "monotonic_ns": pa.int64(), "uncertainty_ns": pa.int64()}
@@ -77,7 +83,7 @@ class RowBuffer:
         self.rows += len(columns.time)
         return True
 
-    def messages(self, most: int = MOST_BYTES) -> Iterator[Packed]:
+    def messages(self, most: int = MOST_BYTES, units: Units | None = None) -> Iterator[Packed]:
         """Yield the rows as messages of at most `most` bytes and 65536 rows."""
         column = {
             name: pa.Array.from_buffers(kind, self.rows, [None, pa.py_buffer(self._columns[name])])
@@ -93,9 +99,32 @@ class RowBuffer:
             "value": pc.if_else(is_sample, column["value"], None),
             "status": column["status"],
         }
+        columns["unit"], texts = _units(column, self._names, units or Units())
+        names = {**self._names, "unit": texts}
         rows = pa.RecordBatch.from_pydict(columns)
         for begin in range(0, self.rows, MOST_ROWS):
-            yield from _pieces(rows.slice(begin, MOST_ROWS), self._names, most)
+            yield from _pieces(rows.slice(begin, MOST_ROWS), names, most)
+
+
+def _units(
+    column: Mapping[str, Any], names: Mapping[str, Sequence[str]], units: Units
+) -> tuple[Any, list[str]]:
+    """Return the code of each row's unit, and the units."""
+    drives = pc.shift_left(column["drive"].cast(pa.uint32()), pa.scalar(16, pa.uint32()))
+    pairs = pc.bit_wise_or(drives, column["register"].cast(pa.uint32()))
+    used = pairs.unique()
+    since = [
+        units.of(names["drive"][pair >> 16], names["register"][pair & 0xFFFF]) for pair in used.to_pylist()
+    ]
+    texts = sorted({unit for known in since for _, unit in known})
+    code = {unit: pa.scalar(at, pa.uint16()) for at, unit in enumerate(texts)}
+    first = pa.array([texts.index(known[0][1]) if known else None for known in since], pa.uint16())
+    codes = first.take(pc.index_in(pairs, value_set=used))
+    for pair, known in zip(used, since, strict=True):
+        for begin_ns, unit in known[1:]:
+            is_later = pc.greater_equal(column["monotonic_ns"], begin_ns)
+            codes = pc.if_else(pc.and_(pc.equal(pairs, pair), is_later), code[unit], codes)
+    return codes, texts
 
 
 def _continues(names: tuple[str, ...], known: tuple[str, ...]) -> bool:
@@ -112,6 +141,8 @@ def unpack(data: bytes | memoryview) -> Any:
         columns["monotonic_ns"] = pc.subtract(columns["time"].cast(pa.int64()), columns.pop("clock_ns"))
         columns["uncertainty_ns"] = pc.multiply(table.column("uncertainty_us").cast(pa.int64()), 1000)
         columns["value"] = table.column("value")
+        is_told = "unit" in table.schema.names
+        columns["unit"] = table.column("unit") if is_told else pa.nulls(len(table), pa.utf8())
         return pa.table([columns[name].cast(ROWS.field(name).type) for name in ROWS.names], schema=ROWS)
     except (pa.ArrowException, KeyError, TypeError, ValueError, OSError, MemoryError) as error:
         first = (str(error) or type(error).__name__).splitlines()[0]
@@ -137,7 +168,7 @@ def _coded(rows: Any, names: Mapping[str, Sequence[str]]) -> Any:
     rows = rows.take(pc.array_sort_indices(rows.column("register")))
     columns = {name: rows.column(name) for name in rows.schema.names}
     for name, known in names.items():
-        used = columns[name].unique().sort()
+        used = columns[name].unique().drop_null().sort()
         codes = pc.index_in(columns[name], value_set=used).cast(pa.uint16())
         texts = pa.array([known[code] for code in used.to_pylist()], pa.utf8())
         columns[name] = pa.DictionaryArray.from_arrays(codes, texts)

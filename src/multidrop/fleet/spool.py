@@ -15,6 +15,7 @@ from multidrop import Batch
 from multidrop.fleet.message import Packed, RowBuffer
 from multidrop.fleet.names import checked_name
 from multidrop.fleet.spool_folder import SpoolFolder, StoredMessage
+from multidrop.fleet.units import Units
 
 ENOUGH_ROWS = 1 << 14  # for a message at once
 ENOUGH_S = 1.0  # since the first row, for a message of fewer
@@ -58,12 +59,14 @@ class Spool:
         *,
         fleet: str = "fleet",
         most: int = 10_000_000_000,
+        units: Units | None = None,
     ) -> None:
         self.gateway = checked_name("gateway", gateway)
         self._folder = SpoolFolder(Path(folder), gateway, checked_name("fleet", fleet))
         self.log = self._folder.log
         self.on_message: Callable[[], object] = lambda: None  # called on the spool's thread after each
         self._most = most
+        self._units = units or Units()
         self._stored = sum(message.size for message in self._folder.messages.values())
         self._changing = threading.Condition()
         self._waiting: deque[RowBuffer] = deque()
@@ -170,7 +173,7 @@ class Spool:
 
     def _pack(self, buffer: RowBuffer) -> None:
         try:
-            self._packed += buffer.messages()
+            self._packed += buffer.messages(units=self._units)
         except Exception:  # a mistake of ours must not end the thread
             _log.exception("%d rows could not be packed", buffer.rows)
             with self._changing:

@@ -16,7 +16,7 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any
 
-from multidrop.history.database import connect, copy_out, files_of, insert, kept_metadata
+from multidrop.history.database import connect, copy_out, files_of, insert, kept_metadata, united
 from multidrop.history.folder import STEM, HistoryFile, file_name, parquet_files, widest
 from multidrop.polling.batch import Rows
 from multidrop.recording.arrows import ArrowsReader
@@ -215,7 +215,7 @@ def _merge_rows(folder: Path, part: list[HistoryFile]) -> None:
     name = file_name(part[0].first, part[-1].last, begin * 10**9, end * 10**9)
     with connect(MEMORY, folder / ".spill") as database:
         metadata = kept_metadata(database, part[-1].path)
-        query = MERGED_ROWS.format(files_of(file.path for file in part))
+        query = MERGED_ROWS.format(united(file.path for file in part))
         _write(database, query, folder / "rows" / name, metadata)
     for file in part:
         file.path.unlink(missing_ok=True)

@@ -122,5 +122,10 @@ def files_of(paths: Iterable[Path]) -> str:
     return f"read_parquet({_list(paths)})"
 
 
+def united(paths: Iterable[Path]) -> str:
+    """Return a table of these Parquet files: a column that only some have is null in the others."""
+    return f"read_parquet({_list(paths)}, union_by_name = true)"
+
+
 def _list(paths: Iterable[Path]) -> str:
     return f"[{', '.join(quoted(str(path)) for path in paths)}]"
