@@ -20,19 +20,21 @@ from datetime import UTC as UTC_ZONE
 from datetime import datetime
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 sys.path.append(str(Path(__file__).parents[2] / "tests" / "support"))
 
 from postgres_clusters import Postgres, postgres
 
 from bench.support import tables
-from multidrop import BatchColumns
+from multidrop import BatchColumns, PlantLine
 from multidrop.fleet.hub import Commit, SampleSink
 from multidrop.fleet.message import Packed, RowBuffer, unpack
 from multidrop.fleet.parquet_sink import ParquetSink
 from multidrop.fleet.postgres_sink import PostgresSink
 from multidrop.fleet.spool_folder import SpoolFolder
+from multidrop.fleet.units import Units
 
 UTC = 1_795_253_399_123_456_789
 DRIVES = 16  # a line
@@ -48,6 +50,7 @@ REGISTERS = {  # name: a value in steps, the step, and how often it moves
     "status_word": (1, 1.0, 0.0),
     "fault": (0, 1.0, 0.0),
 }
+UNITS = ("Hz", "A", "V", "V", "degC", "rpm", "kW", "%", "", "")
 STATUSES = ("ok", "no reply")
 
 
@@ -94,10 +97,21 @@ def columns_of(rows: int, lines: int, dice: random.Random) -> BatchColumns:
     )
 
 
-def packed(columns: BatchColumns) -> list[Packed]:
+def units_of(columns: BatchColumns) -> Units:
+    polls = [
+        SimpleNamespace(register=SimpleNamespace(name=name, unit=unit, values=None, step=1))
+        for name, unit in zip(REGISTERS, UNITS, strict=True)
+    ]
+    drives = [SimpleNamespace(drive=SimpleNamespace(name=name), polls=polls) for name in columns.drives]
+    units = Units()
+    units.note(cast(PlantLine, SimpleNamespace(drives=drives)), 0)
+    return units
+
+
+def packed(columns: BatchColumns, units: Units) -> list[Packed]:
     buffer = RowBuffer()
     assert buffer.add(columns)
-    return list(buffer.messages())
+    return list(buffer.messages(units=units))
 
 
 def cpu() -> float:
@@ -117,11 +131,11 @@ def cost(act: Any, times: int) -> float:
 def messages() -> Iterator[tuple[object, ...]]:
     for rows, lines in ((3100, 2), (4096, 40), (16384, 40), (16384, 500), (65536, 40), (65536, 500)):
         columns = columns_of(rows, lines, random.Random(rows))
-        made = len(columns.time)
-        found = packed(columns)
+        made, units = len(columns.time), units_of(columns)
+        found = packed(columns, units)
         size = sum(len(one.data) for one in found)
         times = max(3, 400_000 // made)
-        packing = cost(lambda columns=columns: packed(columns), times) / made
+        packing = cost(lambda columns=columns, units=units: packed(columns, units), times) / made
         reading = cost(lambda found=found: [unpack(one.data) for one in found], times) / made
         yield made, lines, len(found), f"{size / made:.2f}", f"{packing:.0f}", f"{reading:.0f}"
 
@@ -129,13 +143,13 @@ def messages() -> Iterator[tuple[object, ...]]:
 def stores(folder: Path) -> Iterator[tuple[object, ...]]:
     """Write the same half million rows of 500 lines by each store, in two commits."""
     found = [columns_of(65536, 500, random.Random(seed)) for seed in range(8)]
-    sent = [one.data for columns in found for one in packed(columns)]
+    sent = [one.data for columns in found for one in packed(columns, units_of(columns))]
     rows = sum(len(columns.time) for columns in found)
     spool = SpoolFolder(folder / "spool", "gateway-1", "fleet")
 
     def spooled() -> int:
         for columns in found:
-            for one in packed(columns):
+            for one in packed(columns, units_of(columns)):
                 spool.add(spool.write(one.data, one.rows))
         return size_of(folder / "spool")
 

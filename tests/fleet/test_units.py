@@ -11,6 +11,7 @@ from peers import require_module
 from spooled import NOON, STEP, numbered
 
 from multidrop import Mastership
+from multidrop.fleet import units as fleet_units
 from multidrop.fleet.buckets import Record
 from multidrop.fleet.fleet_lines import FleetLines
 from multidrop.fleet.hub import Commit
@@ -18,7 +19,7 @@ from multidrop.fleet.message import RowBuffer, unpack
 from multidrop.fleet.parquet_sink import ParquetSink
 from multidrop.fleet.plant_store import line_of
 from multidrop.fleet.units import Units
-from multidrop.history import compact
+from multidrop.history import compact, quantities
 
 FAMILY = """
 [family]
@@ -118,3 +119,7 @@ def test_merged_files_keep_the_units_beside_rows_without(tmp_path: Path) -> None
     found = dict(units_in(pq.read_table(merged), "value_1"))
     assert {found[at] for at in range(0, 40, 4)} == {None}
     assert {found[at] for at in range(52, 90, 4)} == {"A"}
+
+
+def test_units_have_the_words_of_a_history() -> None:
+    assert (fleet_units.RAW, fleet_units.NAMED) == (quantities.RAW, quantities.NAMED)

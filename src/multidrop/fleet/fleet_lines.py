@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,6 @@ from multidrop import Bus, Mastership, Plant, Poller
 from multidrop.fleet.buckets import Record
 from multidrop.fleet.plant_store import line_of
 from multidrop.fleet.units import Units
-from multidrop.transport import clock
 
 THREADS = 32
 
@@ -37,7 +37,7 @@ class FleetLines:
         line = line_of(record, self._folder)
         polled = {drive.name for bus in self.poller.buses.values() for drive in bus.drives}
         if not any(one.drive.name in polled for one in line.drives):  # else `add_line` refuses it
-            self._units.note(line, clock.now_ns())  # before the first of its rows
+            self._units.note(line, time.monotonic_ns())  # before the first of its rows
         self.poller.add_line(line)
 
     async def let_go(self, line: str) -> None:

@@ -112,19 +112,24 @@ def _units(
     """Return the code of each row's unit, and the units."""
     drives = pc.shift_left(column["drive"].cast(pa.uint32()), pa.scalar(16, pa.uint32()))
     pairs = pc.bit_wise_or(drives, column["register"].cast(pa.uint32()))
-    used = pairs.unique()
-    since = [
-        units.of(names["drive"][pair >> 16], names["register"][pair & 0xFFFF]) for pair in used.to_pylist()
-    ]
-    texts = sorted({unit for known in since for _, unit in known})
-    code = {unit: pa.scalar(at, pa.uint16()) for at, unit in enumerate(texts)}
-    first = pa.array([texts.index(known[0][1]) if known else None for known in since], pa.uint16())
-    codes = first.take(pc.index_in(pairs, value_set=used))
-    for pair, known in zip(used, since, strict=True):
-        for begin_ns, unit in known[1:]:
+    found = pairs.dictionary_encode()
+    drives_named, registers_named = names["drive"], names["register"]
+    since = {
+        pair: units.of(drives_named[pair >> 16], registers_named[pair & 0xFFFF])
+        for pair in found.dictionary.to_pylist()
+    }
+    code: dict[str, int] = {}
+    for known in since.values():
+        for _, unit in known:
+            code.setdefault(unit, len(code))
+    first = pa.array([code[known[0][1]] if known else None for known in since.values()], pa.uint16())
+    codes = first.take(found.indices)
+    for pair, known in since.items():
+        for begin_ns, unit in known[1:]:  # it changed, which is rare
             is_later = pc.greater_equal(column["monotonic_ns"], begin_ns)
-            codes = pc.if_else(pc.and_(pc.equal(pairs, pair), is_later), code[unit], codes)
-    return codes, texts
+            is_its = pc.equal(pairs, pa.scalar(pair, pa.uint32()))
+            codes = pc.if_else(pc.and_(is_its, is_later), pa.scalar(code[unit], pa.uint16()), codes)
+    return codes, list(code)
 
 
 def _continues(names: tuple[str, ...], known: tuple[str, ...]) -> bool:

@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 from multidrop import PlantLine, Register
-from multidrop.history.quantities import NAMED, RAW
 
+RAW, NAMED = "raw count", "names"  # as a history calls what has no unit
 Since = tuple[tuple[int, str], ...]  # units of a register, each since a time of the monotonic clock in ns
 
 
