@@ -32,9 +32,9 @@ from multidrop import BatchColumns, PlantLine
 from multidrop.fleet.hub import Commit, SampleSink
 from multidrop.fleet.message import Packed, RowBuffer, unpack
 from multidrop.fleet.parquet_sink import ParquetSink
+from multidrop.fleet.polled_units import PolledUnits
 from multidrop.fleet.postgres_sink import PostgresSink
 from multidrop.fleet.spool_folder import SpoolFolder
-from multidrop.fleet.units import Units
 
 UTC = 1_795_253_399_123_456_789
 DRIVES = 16  # a line
@@ -97,18 +97,18 @@ def columns_of(rows: int, lines: int, dice: random.Random) -> BatchColumns:
     )
 
 
-def units_of(columns: BatchColumns) -> Units:
+def units_of(columns: BatchColumns) -> PolledUnits:
     polls = [
         SimpleNamespace(register=SimpleNamespace(name=name, unit=unit, values=None, step=1))
         for name, unit in zip(REGISTERS, UNITS, strict=True)
     ]
     drives = [SimpleNamespace(drive=SimpleNamespace(name=name), polls=polls) for name in columns.drives]
-    units = Units()
+    units = PolledUnits()
     units.note(cast(PlantLine, SimpleNamespace(drives=drives)), 0)
     return units
 
 
-def packed(columns: BatchColumns, units: Units) -> list[Packed]:
+def packed(columns: BatchColumns, units: PolledUnits) -> list[Packed]:
     buffer = RowBuffer()
     assert buffer.add(columns)
     return list(buffer.messages(units=units))

@@ -11,14 +11,14 @@ from peers import require_module
 from spooled import NOON, STEP, numbered
 
 from multidrop import Mastership
-from multidrop.fleet import units as fleet_units
+from multidrop.fleet import polled_units
 from multidrop.fleet.buckets import Record
 from multidrop.fleet.fleet_lines import FleetLines
 from multidrop.fleet.hub import Commit
 from multidrop.fleet.message import RowBuffer, unpack
 from multidrop.fleet.parquet_sink import ParquetSink
 from multidrop.fleet.plant_store import line_of
-from multidrop.fleet.units import Units
+from multidrop.fleet.polled_units import PolledUnits
 from multidrop.history import compact, quantities
 
 FAMILY = """
@@ -44,15 +44,15 @@ def record(load: str) -> Record:
     return Record("line-1", 1, {"line": line, "files": {"meter.toml": FAMILY.format(load=load)}})
 
 
-def changed(folder: Path) -> Units:
+def changed(folder: Path) -> PolledUnits:
     """Return units of a line whose first register is in volts up to exchange 20, and then in amperes."""
-    units = Units()
+    units = PolledUnits()
     units.note(line_of(record('unit = "V"'), folder), 0)
     units.note(line_of(record(AMPERES), folder), 20 * STEP)
     return units
 
 
-def tables(units: Units | None, first: int = 0) -> list[pa.Table]:
+def tables(units: PolledUnits | None, first: int = 0) -> list[pa.Table]:
     buffer = RowBuffer()
     assert buffer.add(numbered(first, 40).columns())
     return [unpack(message.data) for message in buffer.messages(units=units)]
@@ -89,7 +89,7 @@ def test_a_message_of_before_has_unknown_units(tmp_path: Path) -> None:
 
 
 def test_a_gateway_notes_the_units_of_a_line_that_it_takes(tmp_path: Path) -> None:
-    units = Units()
+    units = PolledUnits()
     lines = FleetLines(Mastership(), tmp_path, units)
     lines._take(record('unit = "V"'))
     with pytest.raises(ValueError, match="line-1"):  # it is polled, and stays as it is
@@ -122,4 +122,4 @@ def test_merged_files_keep_the_units_beside_rows_without(tmp_path: Path) -> None
 
 
 def test_units_have_the_words_of_a_history() -> None:
-    assert (fleet_units.RAW, fleet_units.NAMED) == (quantities.RAW, quantities.NAMED)
+    assert (polled_units.RAW, polled_units.NAMED) == (quantities.RAW, quantities.NAMED)

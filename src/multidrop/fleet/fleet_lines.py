@@ -11,7 +11,7 @@ from typing import Any
 from multidrop import Bus, Mastership, Plant, Poller
 from multidrop.fleet.buckets import Record
 from multidrop.fleet.plant_store import line_of
-from multidrop.fleet.units import Units
+from multidrop.fleet.polled_units import PolledUnits
 
 THREADS = 32
 
@@ -19,7 +19,7 @@ THREADS = 32
 class FleetLines:
     """Takes lines into a poller and lets them go; both in threads, for both wait for ports."""
 
-    def __init__(self, mastership: Mastership, folder: Path, units: Units) -> None:
+    def __init__(self, mastership: Mastership, folder: Path, units: PolledUnits) -> None:
         self.poller = Poller(Plant((), folder), mastership=mastership, audit=folder / "audit.jsonl")
         self._folder = folder / "lines"
         self._units = units

@@ -25,13 +25,13 @@ from multidrop.fleet.life_lock import LifeLock
 from multidrop.fleet.line_keeper import SILENT_S
 from multidrop.fleet.member import Member
 from multidrop.fleet.moves import TOLD
+from multidrop.fleet.polled_units import PolledUnits
 from multidrop.fleet.record_shapes import misshapen
 from multidrop.fleet.samples_stream import connect
 from multidrop.fleet.servers import ServerPath, paths_of
 from multidrop.fleet.setup import check_buckets, open_all
 from multidrop.fleet.spool import Spool
 from multidrop.fleet.task_end import end_tasks
-from multidrop.fleet.units import Units
 
 SPOOL_BYTES = 10_000_000_000
 STATE = {"state": str, "lines": int, "margin_s": float, "troubles": dict, "spool": dict}
@@ -65,7 +65,7 @@ class FleetGateway:
         self.lock = LifeLock(folder / f"{name}.lock")
         self.paths = paths_of(urls, options)
         self.mastership = Mastership(guard_s=USUAL.guard / SECOND)
-        units = Units()
+        units = PolledUnits()
         self.spool = Spool(folder / "spool", name, most=spool_bytes, units=units)
         self.lines = FleetLines(self.mastership, folder, units)
         held = HeldLines(

@@ -29,7 +29,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from multidrop import BatchColumns
-from multidrop.fleet.units import Units
+from multidrop.fleet.polled_units import PolledUnits
 
 MOST_BYTES = 900_000  # of a message: NATS takes 1 MiB from the factory, its headers included
 MOST_ROWS = 1 << 16
@@ -83,7 +83,7 @@ class RowBuffer:
         self.rows += len(columns.time)
         return True
 
-    def messages(self, most: int = MOST_BYTES, units: Units | None = None) -> Iterator[Packed]:
+    def messages(self, most: int = MOST_BYTES, units: PolledUnits | None = None) -> Iterator[Packed]:
         """Yield the rows as messages of at most `most` bytes and 65536 rows."""
         column = {
             name: pa.Array.from_buffers(kind, self.rows, [None, pa.py_buffer(self._columns[name])])
@@ -99,7 +99,7 @@ class RowBuffer:
             "value": pc.if_else(is_sample, column["value"], None),
             "status": column["status"],
         }
-        columns["unit"], texts = _units(column, self._names, units or Units())
+        columns["unit"], texts = _units(column, self._names, units or PolledUnits())
         names = {**self._names, "unit": texts}
         rows = pa.RecordBatch.from_pydict(columns)
         for begin in range(0, self.rows, MOST_ROWS):
@@ -107,7 +107,7 @@ class RowBuffer:
 
 
 def _units(
-    column: Mapping[str, Any], names: Mapping[str, Sequence[str]], units: Units
+    column: Mapping[str, Any], names: Mapping[str, Sequence[str]], units: PolledUnits
 ) -> tuple[Any, list[str]]:
     """Return the code of each row's unit, and the units."""
     drives = pc.shift_left(column["drive"].cast(pa.uint32()), pa.scalar(16, pa.uint32()))

@@ -14,8 +14,8 @@ from typing import NamedTuple
 from multidrop import Batch
 from multidrop.fleet.message import Packed, RowBuffer
 from multidrop.fleet.names import checked_name
+from multidrop.fleet.polled_units import PolledUnits
 from multidrop.fleet.spool_folder import SpoolFolder, StoredMessage
-from multidrop.fleet.units import Units
 
 ENOUGH_ROWS = 1 << 14  # for a message at once
 ENOUGH_S = 1.0  # since the first row, for a message of fewer
@@ -59,14 +59,14 @@ class Spool:
         *,
         fleet: str = "fleet",
         most: int = 10_000_000_000,
-        units: Units | None = None,
+        units: PolledUnits | None = None,
     ) -> None:
         self.gateway = checked_name("gateway", gateway)
         self._folder = SpoolFolder(Path(folder), gateway, checked_name("fleet", fleet))
         self.log = self._folder.log
         self.on_message: Callable[[], object] = lambda: None  # called on the spool's thread after each
         self._most = most
-        self._units = units or Units()
+        self._units = units or PolledUnits()
         self._stored = sum(message.size for message in self._folder.messages.values())
         self._changing = threading.Condition()
         self._waiting: deque[RowBuffer] = deque()

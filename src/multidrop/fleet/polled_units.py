@@ -1,4 +1,4 @@
-"""Units: what the values of a gateway's rows are, by the description that they were polled under."""
+"""Polled units: what the values of a gateway's rows are, by the description that they were polled under."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ RAW, NAMED = "raw count", "names"  # as a history calls what has no unit
 Since = tuple[tuple[int, str], ...]  # units of a register, each since a time of the monotonic clock in ns
 
 
-class Units:
+class PolledUnits:
     """The unit of each register, since when. One thread at a time notes a drive; any thread may ask."""
 
     def __init__(self) -> None:
