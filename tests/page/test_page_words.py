@@ -49,7 +49,7 @@ def test_figures_of_a_dead_daemon_look_old_and_nothing_is_said_of_misses(
     until(page, "document.body.classList.contains('dead')")
     assert [figure.evaluate(style) for figure in figures] == ["italic"] * 3
     page.evaluate("location.hash = '#/lines'")
-    page.get_by_text("The daemon cannot be reached.", exact=True).wait_for()
+    page.locator("#lines").get_by_text("The daemon cannot be reached.", exact=True).wait_for()
     assert "counted yet" not in page.locator("#lines").inner_text()
 
 
