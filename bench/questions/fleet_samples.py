@@ -143,13 +143,14 @@ def messages() -> Iterator[tuple[object, ...]]:
 def stores(folder: Path) -> Iterator[tuple[object, ...]]:
     """Write the same half million rows of 500 lines by each store, in two commits."""
     found = [columns_of(65536, 500, random.Random(seed)) for seed in range(8)]
-    sent = [one.data for columns in found for one in packed(columns, units_of(columns))]
+    units = units_of(found[0])  # all have the same drives
+    sent = [one.data for columns in found for one in packed(columns, units)]
     rows = sum(len(columns.time) for columns in found)
     spool = SpoolFolder(folder / "spool", "gateway-1", "fleet")
 
     def spooled() -> int:
         for columns in found:
-            for one in packed(columns, units_of(columns)):
+            for one in packed(columns, units):
                 spool.add(spool.write(one.data, one.rows))
         return size_of(folder / "spool")
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from pathlib import Path
 
 import pyarrow as pa
@@ -95,11 +96,13 @@ def test_a_gateway_notes_the_units_of_a_line_that_it_takes(tmp_path: Path) -> No
     with pytest.raises(ValueError, match="line-1"):  # it is polled, and stays as it is
         lines._take(record('unit = "kW"'))
     lines.poller.remove_line("line-1")
+    before_ns = time.monotonic_ns()
     lines._take(record(AMPERES))
     lines.poller.close()
-    (volts_ns, volts), (amperes_ns, amperes) = units.of("pump-1", "value_1")
-    assert (volts, amperes) == ("V", "A")
-    assert volts_ns < amperes_ns
+    table = units.table(("pump-1",), ("value_1",))
+    [change] = table.changes
+    assert (table.texts[change.code], table.texts[table.newest[0].as_py()]) == ("V", "A")
+    assert before_ns < change.until_ns <= time.monotonic_ns()
 
 
 def test_merged_files_keep_the_units_beside_rows_without(tmp_path: Path) -> None:

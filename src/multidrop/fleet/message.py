@@ -23,6 +23,7 @@ one whose step is not known, "names" where numbers stand for names. Older messag
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from itertools import takewhile
 from typing import Any, NamedTuple
 
 import pyarrow as pa
@@ -108,28 +109,18 @@ class RowBuffer:
 
 def _units(
     column: Mapping[str, Any], names: Mapping[str, Sequence[str]], units: PolledUnits
-) -> tuple[Any, list[str]]:
+) -> tuple[Any, Sequence[str]]:
     """Return the code of each row's unit, and the units."""
-    drives = pc.shift_left(column["drive"].cast(pa.uint32()), pa.scalar(16, pa.uint32()))
-    pairs = pc.bit_wise_or(drives, column["register"].cast(pa.uint32()))
-    found = pairs.dictionary_encode()
-    drives_named, registers_named = names["drive"], names["register"]
-    since = {
-        pair: units.of(drives_named[pair >> 16], registers_named[pair & 0xFFFF])
-        for pair in found.dictionary.to_pylist()
-    }
-    code: dict[str, int] = {}
-    for known in since.values():
-        for _, unit in known:
-            code.setdefault(unit, len(code))
-    first = pa.array([code[known[0][1]] if known else None for known in since.values()], pa.uint16())
-    codes = first.take(found.indices)
-    for pair, known in since.items():
-        for begin_ns, unit in known[1:]:  # it changed, which is rare
-            is_later = pc.greater_equal(column["monotonic_ns"], begin_ns)
-            is_its = pc.equal(pairs, pa.scalar(pair, pa.uint32()))
-            codes = pc.if_else(pc.and_(is_its, is_later), pa.scalar(code[unit], pa.uint16()), codes)
-    return codes, list(code)
+    table = units.table(names["drive"], names["register"])
+    registers = pa.scalar(len(names["register"]), pa.uint32())
+    series = pc.add(pc.multiply(column["drive"].cast(pa.uint32()), registers), column["register"])
+    codes = table.newest.take(series)
+    oldest_ns = pc.min(column["monotonic_ns"]).as_py()
+    for change in takewhile(lambda change: change.until_ns > oldest_ns, table.changes):
+        is_its = pc.equal(series, pa.scalar(change.series, pa.uint32()))
+        is_before = pc.less(column["monotonic_ns"], change.until_ns)
+        codes = pc.if_else(pc.and_(is_its, is_before), pa.scalar(change.code, pa.uint16()), codes)
+    return codes, table.texts
 
 
 def _continues(names: tuple[str, ...], known: tuple[str, ...]) -> bool:

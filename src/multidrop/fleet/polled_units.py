@@ -2,33 +2,77 @@
 
 from __future__ import annotations
 
-from typing import Any
+import threading
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import pyarrow as pa
 
 from multidrop import PlantLine, Register
 
 RAW, NAMED = "raw count", "names"  # as a history calls what has no unit
-Since = tuple[tuple[int, str], ...]  # units of a register, each since a time of the monotonic clock in ns
+
+
+class Change(NamedTuple):
+    """The code that a series had until a time of the monotonic clock in ns."""
+
+    until_ns: int
+    series: int
+    code: int
+
+
+class UnitTable(NamedTuple):
+    """Codes of units by series, which are numbered drive * len(registers) + register."""
+
+    newest: Any  # pa.Array; null where nobody knows it
+    changes: Sequence[Change]  # the last ones first
+    texts: Sequence[str]  # by code
 
 
 class PolledUnits:
-    """The unit of each register, since when. One thread at a time notes a drive; any thread may ask."""
+    """The unit of each register, since when. Any thread may note a line or ask."""
 
     def __init__(self) -> None:
-        self._since: dict[tuple[str, str], Since] = {}
+        self._lock = threading.Lock()
+        self._since: dict[tuple[str, str], list[tuple[int, str]]] = {}
+        self._made: tuple[Sequence[str], Sequence[str], UnitTable] | None = None
 
     def note(self, line: PlantLine, since_ns: int) -> None:
         """Note that rows of this line which are asked from now on are of these units."""
-        for polled in line.drives:
-            for poll in polled.polls:
-                series = polled.drive.name, poll.register.name
-                unit = unit_of(poll.register)
-                known = self._since.get(series, ())
-                if not known or known[-1][1] != unit:
-                    self._since[series] = (*known, (since_ns, unit))
+        with self._lock:
+            for polled in line.drives:
+                for poll in polled.polls:
+                    known = self._since.setdefault((polled.drive.name, poll.register.name), [])
+                    unit = unit_of(poll.register)
+                    if not known or known[-1][1] != unit:
+                        known.append((since_ns, unit))
+            self._made = None
 
-    def of(self, drive: str, register: str) -> Since:
-        """Return the units of a register, the oldest first; none where no line has it."""
-        return self._since.get((drive, register), ())
+    def table(self, drives: Sequence[str], registers: Sequence[str]) -> UnitTable:
+        """Return the units of these drives' registers; made anew where lines or names have changed.
+
+        Messages have nearly as many series as rows, so that a look at each series would cost more than all
+        else that is done with a row.
+        """
+        with self._lock:
+            if self._made is None or self._made[:2] != (drives, registers):
+                self._made = drives, registers, self._make(drives, registers)
+            return self._made[2]
+
+    def _make(self, drives: Sequence[str], registers: Sequence[str]) -> UnitTable:
+        drive_at = {name: at for at, name in enumerate(drives)}
+        register_at = {name: at for at, name in enumerate(registers)}
+        code: dict[str, int] = {}
+        newest: list[int | None] = [None] * (len(drives) * len(registers))
+        changes: list[Change] = []
+        for (drive, register), known in self._since.items():
+            if drive in drive_at and register in register_at:
+                series = drive_at[drive] * len(registers) + register_at[register]
+                codes = [code.setdefault(unit, len(code)) for _, unit in known]
+                newest[series] = codes[-1]
+                for (until_ns, _), before in zip(known[1:], codes[:-1], strict=True):
+                    changes.append(Change(until_ns, series, before))
+        return UnitTable(pa.array(newest, pa.uint16()), sorted(changes, reverse=True), list(code))
 
 
 def unit_of(register: Register[Any]) -> str:
