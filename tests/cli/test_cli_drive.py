@@ -511,6 +511,21 @@ def test_a_mistake_beside_its_drive_keeps_no_stop_back(
 
 
 @patient
+def test_the_value_of_an_unknown_option_names_no_drive(run: Run, che: Che) -> None:
+    received, (port, model, address, option) = che
+    status, out, err = run("stop", port, model, "--secnds", 5, address, option)
+    assert status == 2
+    assert "stop done" in out
+    assert "no such option: --secnds 5\n" in err
+    assert received.writes
+    sent = len(received.writes)
+    status, _, err = run("stop", port, model, "--now", address, option)
+    assert (status, len(received.writes)) == (2, sent)
+    assert "the stop was NOT sent: " in err
+    assert "ADDRESS" in err
+
+
+@patient
 def test_a_stop_whose_terminal_is_closed_before_it_begins_is_sent(
     run: Run, che: Che, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -170,19 +170,18 @@ def _run(command: str, words: list[str]) -> int:
     parser = _Parser(prog=prog, description=text[0].upper() + text[1:] + ".", allow_abbrev=False)
     parser.set_defaults(command=command)
     module.add_arguments(parser)
-    is_stop = command in STOPS
     try:
-        arguments, unknown = parser.parse_known_intermixed_args(words)  # an option between positionals too
-        if unknown and not is_stop:
-            parser.error(f"unrecognized arguments: {' '.join(unknown)}")
+        arguments, left_out = _parsed(parser, words, command)
     except SystemExit:  # --help was printed
         return DONE
     except ValueError as mistake:
-        raise ValueError(f"the {command} was NOT sent: {mistake}") if is_stop else mistake from None
-    if unknown:
-        _fail(f"left out, for {command} knows no such option: {' '.join(unknown)}", MISTAKE)
+        if command in STOPS:
+            raise ValueError(f"the {command} was NOT sent: {mistake}") from None
+        raise
+    if left_out:
+        _fail(f"left out, for {command} knows no such option: {' '.join(left_out)}", MISTAKE)
     try:
-        return int(module.run(arguments)) or (MISTAKE if unknown else DONE)
+        return int(module.run(arguments)) or (MISTAKE if left_out else DONE)
     except Refused as refusal:
         from multidrop.cli.support.plants import is_plant
 
@@ -195,6 +194,28 @@ class _Parser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         raise ValueError(f"{message}; see `{self.prog} --help`")
+
+
+def _parsed(
+    parser: argparse.ArgumentParser, words: list[str], command: str
+) -> tuple[argparse.Namespace, list[str]]:
+    """Return what the words say, and what a stop leaves out. Raises ValueError for a mistake.
+
+    An unknown option takes the word behind it along, which may be its value and must name no drive.
+    """
+    arguments, unknown = parser.parse_known_intermixed_args(words)  # an option between positionals too
+    if not unknown:
+        return arguments, []
+    if command not in STOPS:
+        parser.error(f"unrecognized arguments: {' '.join(unknown)}")
+    options = [word for word in unknown if word.startswith("-")]
+    kept: list[str] = []
+    left_out: list[str] = []
+    for before, word in zip(["", *words[:-1]], words, strict=True):
+        is_value = before in options and "=" not in before and not word.startswith("-")
+        (left_out if is_value or word in options else kept).append(word)
+    arguments, surplus = parser.parse_known_intermixed_args(kept)
+    return arguments, [*left_out, *surplus]
 
 
 def _fail(sentences: str, status: int) -> int:
