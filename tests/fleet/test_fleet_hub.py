@@ -353,6 +353,34 @@ def test_values_that_are_missing_in_part(empty: Postgres) -> None:
     assert found[9] == ("value_10", None, "no valid value")
 
 
+OF_AN_OLDER_HUB = """
+create schema multidrop;
+create table multidrop.register_sets (id serial primary key, names text[] unique not null);
+insert into multidrop.register_sets (names)
+    values (array(select 'value_' || n from generate_series(1, 10) n));
+"""
+
+
+@pytest.mark.parametrize("before", ["", OF_AN_OLDER_HUB])
+def test_samples_have_their_units(empty: Postgres, before: str) -> None:
+    import pyarrow as pa
+
+    empty.ask(f"{before} select 1")
+    sink = PostgresSink(empty.where)
+    sink.begin("then")
+    for number, units in enumerate((None, "V", "A"), 1):
+        table = unpack(message(5 * number, 1))
+        at = table.schema.get_field_index("unit")
+        texts = pa.array([units, *[None] * 9], pa.utf8()).dictionary_encode()
+        table = table.set_column(at, table.schema.field(at), texts)
+        sink.write(Commit("then", number, number, {}, [table], 10))
+    sink.close()
+    of_one = "select unit from multidrop.samples where register = 'value_1' order by time"
+    assert empty.ask(of_one) == [(None,), ("V",), ("A",)]
+    assert empty.ask("select count(*), count(unit) from multidrop.samples") == [(30, 2)]
+    assert empty.ask("select count(*) from multidrop.register_sets") == [(3,)]
+
+
 def test_a_second_hub_of_one_database_is_kept_out(empty: Postgres) -> None:
     one, other = PostgresSink(empty.where), PostgresSink(empty.where)
     assert one.begin("then") == other.begin("then") == KeptPlace(0, {})

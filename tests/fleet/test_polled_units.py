@@ -11,7 +11,8 @@ import pytest
 from peers import require_module
 from spooled import NOON, STEP, numbered
 
-from multidrop import Mastership
+import multidrop
+from multidrop import History, Mastership
 from multidrop.fleet import polled_units
 from multidrop.fleet.buckets import Record
 from multidrop.fleet.fleet_lines import FleetLines
@@ -71,7 +72,7 @@ def test_rows_keep_the_unit_that_they_were_polled_in(tmp_path: Path) -> None:
     """Also those that are packed after the change, in one message with rows of the other unit."""
     (table,) = tables(changed(tmp_path))
     assert units_in(table, "value_1") == [(at, "V" if at < 20 else "A") for at in range(0, 40, 4)]
-    assert units_in(table, "value_2") == [(at, "names") for at in range(0, 40, 4)]
+    assert units_in(table, "value_2") == [(at, "names of meter.toml") for at in range(0, 40, 4)]
     assert units_in(table, "value_3") == [(at, "") for at in range(0, 40, 4)]
     assert units_in(table, "value_4") == [(at, None) for at in range(0, 40, 4)]  # nobody described it
 
@@ -125,4 +126,67 @@ def test_merged_files_keep_the_units_beside_rows_without(tmp_path: Path) -> None
 
 
 def test_units_have_the_words_of_a_history() -> None:
-    assert (polled_units.RAW, polled_units.NAMED) == (quantities.RAW, quantities.NAMED)
+    plant = {"drives": {"a": {"model": "meter.toml", "registers": {"b": {"values": {"ON": 1}}}}}}
+    assert quantities.units_of(plant) == {("a", "b"): "names of meter.toml"}
+    assert polled_units.RAW == quantities.RAW
+
+
+@pytest.fixture(params=["as they came", "merged"])
+def kept(tmp_path: Path, request: pytest.FixtureRequest) -> Path:
+    """The folder of a hub: with the change amid its first file, and rows of an older gateway behind it."""
+    require_module("duckdb")
+    folder, units = tmp_path / "kept", changed(tmp_path / "lines")
+    sink = ParquetSink(folder)
+    hour = 3600 * 10**9 // STEP
+    for at, first in enumerate((0, 40, 80, hour), 1):
+        found = tables(units, first)
+        if first == 40:
+            found = [table.drop_columns(["unit"]) for table in found]
+        sink.write(Commit("made", at, at, {"a.x": at}, found, 400))
+    sink.close()
+    if request.param == "merged":
+        assert compact.main([str(folder), "--below", "0", "--merge-rows"]) == 0
+        assert len(list((folder / "rows").iterdir())) == 2
+        assert pq.read_table(*(folder / "tens").glob("00000001-*")).column("unit").null_count
+    return folder
+
+
+BEGIN, BEFORE, END = NOON, NOON + 18 * STEP, NOON + 120 * STEP
+
+
+@pytest.mark.parametrize("points", [1, 120])
+def test_plots_of_a_hubs_folder_put_no_two_units_together(kept: Path, points: int) -> None:
+    with History(kept) as history:
+        found = history.buckets([f"pump-1.value_{at}" for at in (1, 2, 3, 4)], BEGIN, END, points)
+        before = history.buckets("pump-1.value_1", BEGIN, BEFORE, points)["pump-1.value_1"]
+    told = {name[-7:]: (sum(one.n), one.unit, one.left_out) for name, one in found.items()}
+    assert told == {
+        "value_1": (25, "A", ("V",)),
+        "value_2": (30, "names of meter.toml", ()),
+        "value_3": (30, "", ()),
+        "value_4": (30, None, ()),
+    }
+    assert (sum(before.n), before.unit, before.left_out) == (5, "V", ())
+
+
+def test_rows_of_a_hubs_folder_have_a_column_for_each_unit(kept: Path, tmp_path: Path) -> None:
+    with History(kept) as history:
+        rows = history.read("pump-1.value_1", BEGIN, END)
+        about = rows.metadata["drives"]["pump-1"]["registers"]
+        assert {name: one["unit"] for name, one in about.items()} == {"value_1": "A", "value_1 [V]": "V"}
+        history.export(tmp_path / "out.parquet", "pump-1.value_1", BEGIN, END)
+        everything = history.read(None, BEGIN, END)
+        about = everything.metadata["drives"]["pump-1"]["registers"]
+        assert about["value_2"]["unit"] == "names of meter.toml"
+        for found in (rows, multidrop.read(tmp_path / "out.parquet"), everything):
+            columns: dict[str, set[int]] = {}
+            for batch in found:
+                for row in batch:
+                    if row.drive == "pump-1" and "value_1" in row.register.split(" "):
+                        columns.setdefault(row.register, set()).add((row.time - NOON) // STEP)
+            assert (max(columns["value_1 [V]"]), min(columns["value_1"])) == (16, 20)
+
+
+def test_a_file_of_a_hub_is_read_by_its_folder(kept: Path) -> None:
+    with pytest.raises(ValueError, match="a file of `multidrop hub`: read its folder by"):
+        multidrop.read(min((kept / "rows").iterdir()))

@@ -195,3 +195,19 @@ def test_two_tables_of_names_are_two_columns(tmp_path: Path) -> None:
     assert found == {SERIES: {100.0}, f"{SERIES} [names]": {10.0}, f"{SERIES} [names 2]": {1.0}}
     assert registers["load [names]"]["values"] == OTHER_STATES["values"]
     assert registers["load [names 2]"]["values"] == STATES["values"]
+
+
+def test_compacted_rows_say_their_units(tmp_path: Path) -> None:
+    duckdb = pytest.importorskip("duckdb", reason="needs duckdb")
+    recorded(tmp_path, AMPERE, RAW, STATES, {})
+    kept(tmp_path, "days", 4)
+    for files, column in (("rows", "value"), ("tens", "mean")):
+        query = f"""select {column}, min(unit), max(unit) from read_parquet($path, union_by_name = true)
+            where drive = 'pump-1' group by all order by 1"""
+        found = duckdb.execute(query, {"path": f"{tmp_path}/{files}/*.parquet"}).fetchall()
+        assert found == [
+            (1.0, "A", "A"),
+            (10.0, "raw count", "raw count"),
+            (100.0, "names", "names"),
+            (1000.0, "", ""),
+        ]

@@ -26,13 +26,20 @@ _NUMBER = Struct(">ii")
 _ARRAY = Struct(">iiiiii")
 
 
+class RegisterSet(NamedTuple):
+    """The registers that were asked at once, and what the value of each is; None where nobody knows it."""
+
+    names: tuple[str, ...]
+    units: tuple[str | None, ...]
+
+
 class ExchangeRow(NamedTuple):
     """Rows of one drive that were asked at one time."""
 
     time_ns: int
     uncertainty_ns: int | None
     drive: str
-    names: tuple[str, ...]
+    asked: RegisterSet
     values: list[float | None]
     misses: list[str] | None  # None where all is ok; else "ok" or the reason
 
@@ -42,7 +49,7 @@ class ExchangeRows(NamedTuple):
 
     exchanges: list[ExchangeRow]
     drives: frozenset[str]
-    sets: frozenset[tuple[str, ...]]
+    sets: frozenset[RegisterSet]
 
 
 def exchanges_of(table: Any) -> ExchangeRows:
@@ -56,26 +63,30 @@ def exchanges_of(table: Any) -> ExchangeRows:
         pc.sort_indices(keys, [("time", "ascending"), ("drive", "ascending")])
     ).combine_chunks()
     columns = {name: table.column(name).chunk(0) for name in table.schema.names}
-    codes = {name: _numbers(columns[name].indices, "i") for name in ("drive", "register", "status")}
+    codes = {name: _numbers(columns[name].indices, "i") for name in ("drive", "register", "status", "unit")}
     texts = {name: columns[name].dictionary.to_pylist() for name in codes}
     times = _numbers(columns["time"], "q")
     uncertainties, values = _numbers(columns["uncertainty_ns"], "q"), _numbers(columns["value"], "d")
     begins = _changes(columns["time"].cast(pa.int64()), columns["drive"].indices)
-    registers, statuses, status_texts = codes["register"], codes["status"], texts["status"]
+    registers, units = codes["register"], codes["unit"]
+    statuses, status_texts = codes["status"], texts["status"]
     ok = status_texts.index("ok") if "ok" in status_texts else -1
-    sets: dict[tuple[int, ...], tuple[str, ...]] = {}
+    sets: dict[tuple[tuple[int, ...], tuple[int | None, ...]], RegisterSet] = {}
     found = []
     for begin, end in pairwise([*begins, len(times)]):
-        asked = tuple(registers[begin:end])
-        names = sets.get(asked)
-        if names is None:
-            names = sets[asked] = tuple(texts["register"][code] for code in asked)
+        key = tuple(registers[begin:end]), tuple(units[begin:end])
+        asked = sets.get(key)
+        if asked is None:
+            asked = sets[key] = RegisterSet(
+                tuple(texts["register"][code] for code in key[0]),
+                tuple(None if code is None else texts["unit"][code] for code in key[1]),
+            )
         told = statuses[begin:end]
         misses = None if told.count(ok) == len(told) else [status_texts[code] for code in told]
         one = uncertainties[begin:end]
         uncertainty = next((known for known in one if known is not None), None) if misses else one[0]
         drive = texts["drive"][codes["drive"][begin]]
-        found.append(ExchangeRow(times[begin], uncertainty, drive, names, values[begin:end], misses))
+        found.append(ExchangeRow(times[begin], uncertainty, drive, asked, values[begin:end], misses))
     return ExchangeRows(found, frozenset(one.drive for one in found), frozenset(sets.values()))
 
 
@@ -97,14 +108,14 @@ def _changes(first: Any, second: Any) -> list[int]:
 
 
 def copied(
-    found: Iterable[ExchangeRows], drives: Mapping[str, int], sets: Mapping[tuple[str, ...], int]
+    found: Iterable[ExchangeRows], drives: Mapping[str, int], sets: Mapping[RegisterSet, int]
 ) -> Iterator[bytes]:
     """Yield pieces of a COPY of the columns that `PostgresSink` names."""
     piece = [HEAD]
     size = 0
     for one in found:
         for exchange in one.exchanges:
-            piece.append(_row(exchange, drives[exchange.drive], sets[exchange.names]))
+            piece.append(_row(exchange, drives[exchange.drive], sets[exchange.asked]))
             size += len(piece[-1])
             if size >= PIECE:
                 yield b"".join(piece)

@@ -17,7 +17,8 @@ dictionaries hold the names of these rows alone. An uncertainty is rounded up to
 stays true, and its last ten bits are noise.
 
 A unit is that of the description under which the row was polled: "" for a number without one, "raw count" for
-one whose step is not known, "names" where numbers stand for names. Older messages have no such column.
+one whose step is not known, "names of yd1000" where numbers stand for this family's names. Older messages
+have no such column.
 """
 
 from __future__ import annotations

@@ -8,9 +8,9 @@ from typing import Any, NamedTuple
 
 import pyarrow as pa
 
-from multidrop import PlantLine, Register
+from multidrop import Drive, PlantLine, Register
 
-RAW, NAMED = "raw count", "names"  # as a history calls what has no unit
+RAW = "raw count"  # as a history calls it
 
 
 class Change(NamedTuple):
@@ -43,7 +43,7 @@ class PolledUnits:
             for polled in line.drives:
                 for poll in polled.polls:
                     known = self._since.setdefault((polled.drive.name, poll.register.name), [])
-                    unit = unit_of(poll.register)
+                    unit = unit_of(polled.drive, poll.register)
                     if not known or known[-1][1] != unit:
                         known.append((since_ns, unit))
             self._made = None
@@ -75,8 +75,8 @@ class PolledUnits:
         return UnitTable(pa.array(newest, pa.uint16()), sorted(changes, reverse=True), list(code))
 
 
-def unit_of(register: Register[Any]) -> str:
-    """Return a unit as histories name it: "" is a number without one."""
+def unit_of(drive: Drive, register: Register[Any]) -> str:
+    """Return a unit; "" is a number without one, and "names of yd1000" are that family's names."""
     if register.values:
-        return NAMED
+        return f"names of {drive.model or type(drive).__name__}"
     return RAW if register.step is None else register.unit

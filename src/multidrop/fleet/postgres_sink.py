@@ -1,12 +1,12 @@
 """Samples in PostgreSQL: a row an exchange, with an array of its values.
 
-| table or view             | what it holds                                                            |
-|---------------------------|--------------------------------------------------------------------------|
-| `multidrop.samples`       | view: time, time_ns, uncertainty_us, drive, register, value, status      |
-| `multidrop.exchanges`     | a row an exchange: its values, and `misses`, null where all is ok        |
-| `multidrop.drives`        | id and name                                                              |
-| `multidrop.register_sets` | id and names, in the order of the values                                 |
-| `multidrop.hub`           | one row: the stream, the place of its last message here, the sources     |
+| table or view             | what it holds                                                             |
+|---------------------------|---------------------------------------------------------------------------|
+| `multidrop.samples`       | view: time, time_ns, uncertainty_us, drive, register, value, status, unit |
+| `multidrop.exchanges`     | a row an exchange: its values, and `misses`, null where all is ok         |
+| `multidrop.drives`        | id and name                                                               |
+| `multidrop.register_sets` | id, names and units, in the order of the values                           |
+| `multidrop.hub`           | one row: the stream, the place of its last message here, the sources      |
 
 A row for each value would take four and a half times the disk. Rows come by COPY, in the transaction that
 moves the place on from where this hub left it. Where another hub has moved it, the transaction is refused.
@@ -21,7 +21,7 @@ from typing import Any
 
 import psycopg
 
-from multidrop.fleet.exchange_rows import ExchangeRows, copied, exchanges_of
+from multidrop.fleet.exchange_rows import ExchangeRows, RegisterSet, copied, exchanges_of
 from multidrop.fleet.hub import Commit, KeptPlace, NotThisHubs, SinkError
 
 ANSWER_S = 10  # to connect
@@ -31,19 +31,26 @@ create table if not exists multidrop.hub (
     id boolean primary key default true check (id),
     stream text not null, place bigint not null, sources jsonb not null);
 create table if not exists multidrop.drives (id serial primary key, name text unique not null);
-create table if not exists multidrop.register_sets (id serial primary key, names text[] unique not null);
+create table if not exists multidrop.register_sets (
+    id serial primary key, names text[] not null, units text[]);
 create table if not exists multidrop.exchanges (
     time timestamptz not null, time_ns bigint not null, uncertainty_us integer, drive integer not null,
     registers integer not null, values float8[] not null, misses text[]);
 create index if not exists exchanges_drive_time on multidrop.exchanges (drive, time);
+alter table multidrop.register_sets add column if not exists units text[];
+alter table multidrop.register_sets drop constraint if exists register_sets_names_key;
 create or replace view multidrop.samples as
     select e.time, e.time_ns, e.uncertainty_us, d.name as drive, v.register, v.value,
-        coalesce(v.miss, 'ok') as status
+        coalesce(v.miss, 'ok') as status, v.unit
     from multidrop.exchanges e
     join multidrop.drives d on d.id = e.drive
     join multidrop.register_sets r on r.id = e.registers
-    cross join lateral unnest(r.names, e.values, e.misses) as v(register, value, miss);
+    cross join lateral unnest(r.names, e.values, e.misses, r.units) as v(register, value, miss, unit);
 """
+HAS_UNITS = (  # what was made by an older hub has none
+    "select from information_schema.columns"
+    " where table_schema = 'multidrop' and table_name = 'samples' and column_name = 'unit'"
+)
 COPY = (
     "copy multidrop.exchanges (time, time_ns, uncertainty_us, drive, registers, values, misses)"
     " from stdin (format binary)"
@@ -58,7 +65,7 @@ class PostgresSink:
         self._where = where
         self._connection: psycopg.Connection[Any] | None = None
         self._drives: dict[str, int] = {}
-        self._sets: dict[tuple[str, ...], int] = {}
+        self._sets: dict[RegisterSet, int] = {}
 
     def close(self) -> None:
         if self._connection:
@@ -80,7 +87,7 @@ class PostgresSink:
 
     def _begin(self, connection: psycopg.Connection[Any], stream: str) -> KeptPlace:
         connection.execute("select pg_advisory_xact_lock(hashtext('multidrop hub'))")  # two may begin
-        if connection.execute("select to_regclass('multidrop.samples')").fetchone() == (None,):
+        if connection.execute(HAS_UNITS).fetchone() is None:
             connection.execute(TABLES)
         first = (
             "insert into multidrop.hub (stream, place, sources) values (%s, 0, '{}') on conflict do nothing"
@@ -94,8 +101,11 @@ class PostgresSink:
                 f"at {stream}: name another database"
             )
         self._drives = dict(connection.execute("select name, id from multidrop.drives").fetchall())
-        sets = connection.execute("select names, id from multidrop.register_sets").fetchall()
-        self._sets = {tuple(names): number for names, number in sets}
+        sets = connection.execute("select names, units, id from multidrop.register_sets").fetchall()
+        self._sets = {
+            RegisterSet(tuple(names), tuple(units or [None] * len(names))): number
+            for names, units, number in sets
+        }
         return KeptPlace(found[1], found[2])
 
     def write(self, commit: Commit) -> None:
@@ -125,11 +135,11 @@ class PostgresSink:
         query = "insert into multidrop.drives (name) select unnest(%s::text[]) returning name, id"
         if drives:
             self._drives |= dict(connection.execute(query, (drives,)).fetchall())
-        for names in sorted({names for one in found for names in one.sets} - self._sets.keys()):
-            query = "insert into multidrop.register_sets (names) values (%s) returning id"
-            made = connection.execute(query, (list(names),)).fetchone()
+        for asked in sorted({asked for one in found for asked in one.sets} - self._sets.keys(), key=str):
+            query = "insert into multidrop.register_sets (names, units) values (%s, %s) returning id"
+            made = connection.execute(query, (list(asked.names), list(asked.units))).fetchone()
             assert made is not None
-            self._sets[names] = made[0]
+            self._sets[asked] = made[0]
 
 
 def _sentence(failure: psycopg.Error) -> str:

@@ -143,6 +143,12 @@ class Accumulator:
         if bucket >= 0:
             self.add(bucket, n, missed, total, least, most)
 
+    def add_all(self, other: Accumulator) -> None:
+        """Add what another one of the same grid has gathered."""
+        gathered = zip(other._n, other._missed, other._sum, other._least, other._most, strict=True)
+        for bucket, known in enumerate(gathered):
+            self.add(bucket, *known)
+
     def buckets(self, unit: str | None = None, left_out: Iterable[str] = ()) -> Buckets:
         has = self._n
         return Buckets(

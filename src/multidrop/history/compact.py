@@ -16,24 +16,27 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any
 
-from multidrop.history.database import connect, copy_out, files_of, insert, kept_metadata, united
+from multidrop.history.database import connect, copy_out, insert, insert_units, kept_metadata, with_units
 from multidrop.history.folder import STEM, HistoryFile, file_name, parquet_files, widest
+from multidrop.history.quantities import units_of
 from multidrop.polling.batch import Rows
 from multidrop.recording.arrows import ArrowsReader
 from multidrop.recording.file_lock import FileLock
 from multidrop.recording.segments import segments_of
 
 MEMORY = "100MB"  # of DuckDB; the process takes about 80 MB more
-ROWS = "select * from recorded order by drive, time"
+TOLD = """
+create temp view told as select recorded.*, unit from recorded left join units using (drive, register)
+"""
+ROWS = "select * from told order by drive, time"
 TENS = """
-select to_timestamp(epoch_ns(time) // 10000000000 * 10) as time, drive, register, count(value) as n,
+select to_timestamp(epoch_ns(time) // 10000000000 * 10) as time, drive, register, unit, count(value) as n,
     count(*) - count(value) as missed, min(value) as least, avg(value) as mean, max(value) as most,
     arg_max(value, monotonic_ns) as last
-from recorded group by all order by drive, register, time
+from {} group by all order by drive, register, time
 """
-TENS_OF_FILE = TENS.replace("from recorded", "from {}")
-MERGED = "select * from {} order by drive, register, time"
-MERGED_ROWS = "select * from {} order by drive, time"
+MERGED = "select * exclude filename from {} order by drive, register, time"
+MERGED_ROWS = "select * exclude filename from {} order by drive, time"
 MOST_MERGED = 200_000_000  # bytes of files of rows that become one
 
 
@@ -125,11 +128,13 @@ def _compact_segment(folder: Path, number: int, path: Path) -> None:
             damage.append(str(error))
         else:
             insert(database, _readable(reader, damage))
+            insert_units(database, units_of(metadata))
+            database.execute(TOLD)
             bounds = "select min(epoch_ns(time)), max(epoch_ns(time)), count(*) from recorded"
             least, most, rows = database.execute(bounds).fetchone()
             if rows:
                 name = file_name(number, number, least, most)
-                _write(database, TENS, folder / "tens" / name)
+                _write(database, TENS.format("told"), folder / "tens" / name)
                 _write(database, ROWS, folder / "rows" / name, metadata)
     for sentence in damage:
         print(sentence, file=sys.stderr)
@@ -188,7 +193,7 @@ def _merge(folder: Path, run: list[HistoryFile]) -> None:
     begin, end = min(file.begin for file in run), max(file.end for file in run)
     name = file_name(run[0].first, run[-1].last, begin * 10**9, end * 10**9)
     with connect(MEMORY, folder / ".spill") as database:
-        _write(database, MERGED.format(files_of(file.path for file in run)), folder / "tens" / name)
+        _write(database, MERGED.format(with_units(file.path for file in run)), folder / "tens" / name)
     for file in run:
         file.path.unlink(missing_ok=True)
 
@@ -215,7 +220,7 @@ def _merge_rows(folder: Path, part: list[HistoryFile]) -> None:
     name = file_name(part[0].first, part[-1].last, begin * 10**9, end * 10**9)
     with connect(MEMORY, folder / ".spill") as database:
         metadata = kept_metadata(database, part[-1].path)
-        query = MERGED_ROWS.format(united(file.path for file in part))
+        query = MERGED_ROWS.format(with_units(file.path for file in part))
         _write(database, query, folder / "rows" / name, metadata)
     for file in part:
         file.path.unlink(missing_ok=True)
@@ -227,7 +232,7 @@ def _make_tens(folder: Path, rows: list[HistoryFile]) -> None:
     for file in rows:
         if file.first in missing:
             with connect(MEMORY, folder / ".spill") as database:
-                _write(database, TENS_OF_FILE.format(files_of([file.path])), folder / "tens" / file.path.name)
+                _write(database, TENS.format(with_units([file.path])), folder / "tens" / file.path.name)
 
 
 def be_low() -> None:

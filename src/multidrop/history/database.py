@@ -7,6 +7,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+from multidrop.history.kept_series import Series
 from multidrop.polling.batch import Rows, assemble, schema
 from multidrop.recording.format import METADATA_KEY, Metadata
 from multidrop.recording.rows import RecordedRows
@@ -68,6 +69,15 @@ def _insert(database: Any, waiting: list[Rows]) -> None:
         waiting.clear()
 
 
+def insert_units(database: Any, units: Mapping[Series, str]) -> None:
+    """Create the table `units`, with the unit of each series."""
+    database.execute("create temp table units (drive varchar, register varchar, unit varchar)")
+    columns = [[*part] for part in zip(*(pair for pair in units), strict=True)] or [[], []]
+    database.execute(
+        "insert into units select unnest($1), unnest($2), unnest($3)", [*columns, [*units.values()]]
+    )
+
+
 def copy_out(
     database: Any,
     query: str,
@@ -117,14 +127,10 @@ def quoted(text: str) -> str:
     return "'" + text.replace("'", "''") + "'"
 
 
-def files_of(paths: Iterable[Path]) -> str:
-    """Return a table of these Parquet files."""
-    return f"read_parquet({_list(paths)})"
-
-
-def united(paths: Iterable[Path]) -> str:
-    """Return a table of these Parquet files: a column that only some have is null in the others."""
-    return f"read_parquet({_list(paths)}, union_by_name = true)"
+def with_units(paths: Iterable[Path]) -> str:
+    """Return a table of these Parquet files and their names; `unit` is null where a file has none."""
+    files = f"read_parquet({_list(paths)}, union_by_name = true, filename = true)"
+    return f"(select * from {files} union all by name select null::varchar as unit where false)"
 
 
 def _list(paths: Iterable[Path]) -> str:

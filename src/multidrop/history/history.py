@@ -8,20 +8,22 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 from multidrop.history.asked import Moment, ns_of, parsed_series
-from multidrop.history.buckets import Accumulator, Buckets, Grid, grid_of
+from multidrop.history.buckets import Buckets, Grid, grid_of
 from multidrop.history.database import MissingDuckDB
 from multidrop.history.folder import HistoryFile, Listing, listing
 from multidrop.history.kept_series import Series
-from multidrop.history.quantities import Parting
+from multidrop.history.quantities import OtherColumn, Parting
 from multidrop.history.queries import (
     OF_ROWS,
     OF_TENS,
     gather_files,
     metadata_of,
     rows_of_file,
+    told_by,
     write_parquet,
 )
 from multidrop.history.sources import ALWAYS, MOST_TRIES, Replaced, Sources
+from multidrop.history.told_units import UnitBuckets
 from multidrop.polling.batch import Row, Rows
 from multidrop.recording import open_writer
 from multidrop.recording.append_file import new_file
@@ -98,13 +100,15 @@ class History:
 
     def parting_of(self, series: Sequence[Series] | None, begin: int, end: int) -> Parting:
         """Return the quantities of these series, or of all, in the segments of this range."""
-        return self._sources.again(lambda found: Parting(self._sources.known(found, begin, end), series))
+        parting = Parting({}, series)
+        self._sources.again(lambda found: self._learnt(found, series, begin, end, parting))
+        return parting
 
     def rows_of(
         self, series: Sequence[Series] | None, begin: int, end: int, parting: Parting
     ) -> Iterator[Rows]:
         """Yield the rows of `read` for parsed series and times in ns."""
-        found = self._sources.again(lambda found: self._learnt(found, begin, end, parting))
+        found = self._sources.again(lambda found: self._learnt(found, series, begin, end, parting))
         given = 0  # all numbers up to this one
         for number in sorted({*found.segments, *found.rows}):
             if number <= given:
@@ -125,9 +129,15 @@ class History:
         if any(file.first < number <= file.last for file in found.rows.values()):
             raise OSError(f"{self.folder}: files were merged while they were read: read them again")
 
-    def _learnt(self, found: Listing, begin: int, end: int, parting: Parting) -> Listing:
+    def _learnt(
+        self, found: Listing, series: Sequence[Series] | None, begin: int, end: int, parting: Parting
+    ) -> Listing:
         """Let the parting learn of all segments there are; return them."""
-        parting.learn(self._sources.known(found, begin, end))
+        known = self._sources.known(found, begin, end)
+        new = parting.unknown_of(known)
+        if files := [found.rows[number] for number in new if number in found.rows and not known[number]]:
+            known |= told_by(self._sources, files, series, begin, end)
+        parting.learn(known)
         return found
 
     def _rows_of_segment(
@@ -169,7 +179,7 @@ class History:
         grid = grid_of(ns_of(begin), time.time_ns() if end is None else ns_of(end), points)
 
         def gathered(found: Listing) -> dict[str, Buckets]:
-            into = {name: Accumulator(grid) for name in names}
+            into = {name: UnitBuckets(grid) for name in names}
             parting = Parting(self._sources.known(found, grid.begin, grid.end), names)
             self._gather(found, into, grid, parting)
             return {
@@ -180,7 +190,7 @@ class History:
         return self._sources.again(gathered)
 
     def _gather(
-        self, found: Listing, into: Mapping[Series, Accumulator], grid: Grid, parting: Parting
+        self, found: Listing, into: Mapping[Series, UnitBuckets], grid: Grid, parting: Parting
     ) -> None:
         everything = tuple(into)
         # A file of tens may be of many segments; where these differ, each is read by itself.
@@ -197,7 +207,7 @@ class History:
         for number in sorted(set(found.segments) - reckoned):
             with self._sources.segment(number, found, grid.begin, grid.end) as segment:
                 if segment:
-                    segment.gather({one: into[one] for one in parting.series_of(number)}, grid)
+                    segment.gather({one: into[one].untold for one in parting.series_of(number)}, grid)
 
     # ---- export ----
 
@@ -249,7 +259,7 @@ class History:
                     number, found, rows.series, rows.begin, rows.end, rows.parting
                 )
             )
-            self._learnt(found, rows.begin, rows.end, rows.parting)
+            self._learnt(found, rows.series, rows.begin, rows.end, rows.parting)
             renamed = {file.first: rows.parting.renamed(file.first) for file in files}
             of = rows.series, (rows.begin, rows.end), rows.metadata, renamed
             return write_parquet(self._sources, target, batches, files, *of)
@@ -279,8 +289,9 @@ class HistoryRows(RecordingReader):
         return self._history.rows_of(self.series, self.begin, self.end, self.parting)
 
 
-def _renamed(rows: list[Row], columns: Mapping[Series, str]) -> list[Row]:
-    """Return rows with the columns of their quantities for the names of registers."""
+def _renamed(rows: list[Row], others: Iterable[OtherColumn]) -> list[Row]:
+    """Return a segment's rows with the columns of their quantities for the names of registers."""
+    columns = {other.series: other.column for other in others}
     if not columns:
         return rows
     return [row._replace(register=columns.get((row.drive, row.register), row.register)) for row in rows]

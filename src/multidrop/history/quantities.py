@@ -6,7 +6,7 @@ put together.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from multidrop.history.kept_series import Series
@@ -21,7 +21,7 @@ class Quantity(NamedTuple):
     names: tuple[tuple[str, object], ...] = ()
 
 
-Known = Mapping[Series, Quantity]
+Known = Mapping[Series, Sequence[Quantity]]  # of the values of a file, the oldest first
 
 
 def quantities_of(metadata: object) -> dict[Series, Quantity]:
@@ -32,6 +32,21 @@ def quantities_of(metadata: object) -> dict[Series, Quantity]:
         for register, about in _table(_table(described).get("registers")).items()
         if isinstance(about, dict)
     }
+
+
+def known_by(metadata: object) -> Known:
+    """Return what is known by the metadata of one segment."""
+    return {series: (quantity,) for series, quantity in quantities_of(metadata).items()}
+
+
+def units_of(metadata: object) -> dict[Series, str]:
+    """Return what the column `unit` of Parquet files says of each series, as in a fleet's messages."""
+    found = {}
+    drives = _table(_table(metadata).get("drives"))
+    for (drive, register), quantity in quantities_of(metadata).items():
+        model = _table(drives.get(drive)).get("model") if quantity.unit == NAMED else None
+        found[drive, register] = f"{NAMED} of {model}" if model else quantity.unit
+    return found
 
 
 def _table(found: object) -> Mapping[str, Any]:
@@ -62,6 +77,14 @@ def _number(text: object) -> object:
         return text
 
 
+class OtherColumn(NamedTuple):
+    """The column of rows that are not of a series' newest quantity: those of this unit, or all of a file."""
+
+    series: Series
+    unit: str | None  # None: all
+    column: str
+
+
 class Parting:
     """Series by the quantity that each has in the newest segment, and those that are left out of buckets.
 
@@ -84,11 +107,12 @@ class Parting:
             self._known[number] = found = known[number]
             if found != before:
                 for one in found if self._series is None else self._series:
-                    self._note(one, found.get(one))
+                    for quantity in reversed(found.get(one, ())):
+                        self._note(one, quantity)
             before = found
 
-    def _note(self, series: Series, quantity: Quantity | None) -> None:
-        if quantity is None or self.newest.setdefault(series, quantity) == quantity:
+    def _note(self, series: Series, quantity: Quantity) -> None:
+        if self.newest.setdefault(series, quantity) == quantity:
             return
         others = self.left_out.setdefault(series, [])
         if quantity.unit not in others:
@@ -98,14 +122,18 @@ class Parting:
             words = (quantity.unit or "no unit") + (f" {alike + 1}" if alike else "")
             self._columns[series, quantity] = f"{series[1]} [{words}]"
 
-    def renamed(self, number: int) -> dict[Series, str]:
-        """Return the columns of the series that are of another quantity in this segment."""
+    def unknown_of(self, numbers: Iterable[int]) -> list[int]:
+        """Return the numbers of which it has not learnt."""
+        return [number for number in numbers if number not in self._known]
+
+    def renamed(self, number: int) -> list[OtherColumn]:
+        """Return the columns for what is of another quantity in this segment."""
         known = self._known.get(number, {})
-        return {
-            series: column
+        return [
+            OtherColumn(series, None if len(known[series]) == 1 else quantity.unit, column)
             for (series, quantity), column in self._columns.items()
-            if known.get(series) == quantity
-        }
+            if quantity in known.get(series, ())
+        ]
 
     def described(self, metadata: Mapping[str, Any]) -> dict[str, Any]:
         """Return the metadata with a description of each column as it is in these segments."""
@@ -136,5 +164,5 @@ class Parting:
         )
 
     def _is_newest(self, series: Series, number: int) -> bool:
-        quantity = self._known.get(number, {}).get(series)
-        return quantity is None or quantity == self.newest[series]
+        quantities = self._known.get(number, {}).get(series, ())
+        return all(quantity == self.newest[series] for quantity in quantities)

@@ -6,11 +6,13 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from multidrop.history.buckets import Accumulator, Grid
-from multidrop.history.database import copy_out, files_of, insert, kept_metadata, quoted, rows_of
+from multidrop.history.buckets import Grid
+from multidrop.history.database import copy_out, insert, kept_metadata, quoted, rows_of, with_units
 from multidrop.history.folder import HistoryFile
 from multidrop.history.kept_series import Series
+from multidrop.history.quantities import Known, OtherColumn, Quantity
 from multidrop.history.sources import Sources, while_there
+from multidrop.history.told_units import UnitBuckets
 from multidrop.polling.batch import Rows
 from multidrop.recording.format import Metadata
 
@@ -18,8 +20,12 @@ COLUMNS = "time, monotonic_ns, uncertainty_ns, drive, register, value, status"
 _IN_RANGE = "epoch_ns(time) >= $begin and epoch_ns(time) < $end"
 _ROWS = f"select {COLUMNS} from (select * {{}} from {{}} where {_IN_RANGE}{{}})"
 _BUCKETS = f"""
-select drive, register, (epoch_ns(time) - $begin) // $step, {{sums}}
+select drive, register, unit, max(epoch_ns(time)), (epoch_ns(time) - $begin) // $step, {{sums}}
 from {{files}} where {_IN_RANGE}{{condition}} group by all
+"""
+_UNITS = f"""
+select filename, drive, register, unit
+from {{files}} where {_IN_RANGE}{{condition}} and unit is not null group by all order by max(epoch_ns(time))
 """
 OF_ROWS = "count(value), count(*) - count(value), sum(value), min(value), max(value)"
 OF_TENS = "sum(n)::bigint, sum(missed)::bigint, sum(mean * n), min(least), max(most)"
@@ -31,30 +37,41 @@ def rows_of_file(
     series: Sequence[Series] | None,
     begin: int,
     end: int,
-    renamed: Mapping[Series, str],
+    renamed: Iterable[OtherColumn],
 ) -> Iterator[Rows]:
-    """Yield the rows of these series, or of all, in the order of their requests. Raises Replaced, at once.
-
-    A series that is renamed has this name in place of its register's.
-    """
+    """Yield the rows of these series, or of all, in the order of their requests. Raises Replaced, at once."""
     condition, values = _condition(series)
     with sources.cursor() as cursor, while_there([file]):
         # It is sorted, so all of it was read before the first rows come: none are given out twice.
-        query = _ROWS.format(_columns(renamed), files_of([file.path]), condition) + " order by monotonic_ns"
+        query = _ROWS.format(_columns(renamed), with_units([file.path]), condition) + " order by monotonic_ns"
         yield from rows_of(cursor, query, {"begin": begin, "end": end, **values})
 
 
 def gather_files(
-    sources: Sources, files: Sequence[HistoryFile], sums: str, into: Mapping[Series, Accumulator], grid: Grid
+    sources: Sources, files: Sequence[HistoryFile], sums: str, into: Mapping[Series, UnitBuckets], grid: Grid
 ) -> None:
     """Add the rows, or the tens, of these files to the buckets. Raises Replaced."""
     condition, values = _condition(list(into))
     values |= {"begin": grid.begin, "end": grid.end, "step": grid.step}
-    query = _BUCKETS.format(sums=sums, files=files_of(file.path for file in files), condition=condition)
+    query = _BUCKETS.format(sums=sums, files=with_units(file.path for file in files), condition=condition)
     with sources.cursor() as cursor, while_there(files):
         found = cursor.execute(query, values).fetchall()
-    for drive, register, bucket, n, missed, *numbers in found:
-        into[drive, register].add(bucket, n, missed, *numbers)
+    for drive, register, unit, newest_ns, bucket, n, missed, *numbers in found:
+        into[drive, register].told(unit, newest_ns).add(bucket, n, missed, *numbers)
+
+
+def told_by(
+    sources: Sources, files: Sequence[HistoryFile], series: Sequence[Series] | None, begin: int, end: int
+) -> dict[int, Known]:
+    """Return what the rows of each file say that they are. Raises Replaced."""
+    condition, values = _condition(series)
+    query = _UNITS.format(files=with_units(file.path for file in files), condition=condition)
+    known: dict[str, dict[Series, list[Quantity]]] = {str(file.path): {} for file in files}
+    values |= {"begin": begin, "end": end}
+    with sources.cursor() as cursor, while_there(files):
+        for path, drive, register, unit in cursor.execute(query, values).fetchall():
+            known[path].setdefault((drive, register), []).append(Quantity(unit))
+    return {file.first: known[str(file.path)] for file in files}
 
 
 def metadata_of(sources: Sources, file: HistoryFile) -> Metadata:
@@ -71,11 +88,11 @@ def write_parquet(
     series: Sequence[Series] | None,
     range_ns: tuple[int, int],
     metadata: Metadata,
-    renamed: Mapping[int, Mapping[Series, str]],
+    renamed: Mapping[int, Iterable[OtherColumn]],
 ) -> int:
     """Write these batches and the files' rows of these series and times; return how many. Raises Replaced.
 
-    `renamed` has the names of series by the first segment of a file, as `rows_of_file` takes them.
+    `renamed` has the columns by the first segment of a file, as `rows_of_file` takes them.
     """
     condition, values = _condition(series)
     values |= dict(zip(("begin", "end"), range_ns, strict=True))
@@ -86,16 +103,17 @@ def write_parquet(
         for file in files:
             alike.setdefault(_columns(renamed[file.first]), []).append(file)
         for columns, some in alike.items():
-            found = _ROWS.format(columns, files_of(file.path for file in some), condition)
+            found = _ROWS.format(columns, with_units(file.path for file in some), condition)
             query += f" union all by name {found}"
         return copy_out(cursor, query, target, metadata, values if files else {})
 
 
-def _columns(renamed: Mapping[Series, str]) -> str:
-    """Return what follows `select *` so that series have these names."""
+def _columns(renamed: Iterable[OtherColumn]) -> str:
+    """Return what follows `select *` so that rows have these columns for their registers."""
     whens = " ".join(
-        f"when drive = {quoted(drive)} and register = {quoted(register)} then {quoted(name)}"
-        for (drive, register), name in renamed.items()
+        f"when drive = {quoted(drive)} and register = {quoted(register)}"
+        f"{'' if unit is None else f' and unit = {quoted(unit)}'} then {quoted(name)}"
+        for (drive, register), unit, name in renamed
     )
     return f"replace (case {whens} else register end as register)" if whens else ""
 

@@ -14,7 +14,7 @@ from typing import Any, TypeVar
 from multidrop.history.database import connect, texts_of_metadata
 from multidrop.history.folder import HistoryFile, Listing, listing
 from multidrop.history.growing import GrowingSegment
-from multidrop.history.quantities import Known, quantities_of
+from multidrop.history.quantities import Known, known_by
 
 T = TypeVar("T")
 ALWAYS = -(2**63), 2**63 - 1  # ns
@@ -114,7 +114,7 @@ class Sources:
                 if segment and segment.batches(begin, end):
                     numbers.append(number)
                     if number not in self._known:
-                        self._known[number] = quantities_of(segment.metadata)
+                        self._known[number] = known_by(segment.metadata)
         return {number: self._known[number] for number in numbers}
 
     def _read_quantities(self, files: Sequence[HistoryFile]) -> None:
@@ -122,7 +122,7 @@ class Sources:
         read: dict[int, Known] = {number: {} for number in numbers.values()}
         with self.cursor() as cursor, while_there(files):
             for text, paths in texts_of_metadata(cursor, [file.path for file in files]):
-                known = quantities_of(_parsed(text))
+                known = known_by(_parsed(text))
                 read |= {numbers[path]: known for path in paths}
         self._known |= read
 

@@ -99,15 +99,23 @@ class ParquetReader(RecordingReader):
         with self._open() as file:
             found = file.schema_arrow
         wanted = self._arrow.schema(schema())
-        if (found.names, found.types) != (wanted.names, wanted.types):
+        has_units = found.names == [*wanted.names, "unit"]  # as a history has them
+        self._columns = wanted.names
+        if found.types[: len(wanted)] != wanted.types or not (has_units or found.names == wanted.names):
             raise self._not_a_recording("it is a Parquet file with other columns")
         self.metadata = self._parse_metadata((found.metadata or {}).get(METADATA_KEY.encode(), b"{}"))
+        if has_units and not self.metadata.get("drives"):  # a register may have two of them
+            raise self._not_a_recording(
+                "it is a file of `multidrop hub`: read its folder by multidrop.History"
+            )
 
     def __iter__(self) -> Iterator[Rows]:
         c_array = nanoarrow().c_array
         rows = 0
         with self._open() as file:
-            batches = file.iter_batches(GROUP_ROWS)  # not by groups: a damaged one may claim any size
+            batches = file.iter_batches(
+                GROUP_ROWS, columns=self._columns
+            )  # not by groups: a damaged one may claim any size
             while (batch := self._next(batches, rows)) is not None:
                 yield RecordedRows(c_array(batch))
                 rows += len(batch)
