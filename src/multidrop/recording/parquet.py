@@ -113,9 +113,8 @@ class ParquetReader(RecordingReader):
         c_array = nanoarrow().c_array
         rows = 0
         with self._open() as file:
-            batches = file.iter_batches(
-                GROUP_ROWS, columns=self._columns
-            )  # not by groups: a damaged one may claim any size
+            # Not by groups: a damaged one may claim any size.
+            batches = file.iter_batches(GROUP_ROWS, columns=self._columns)
             while (batch := self._next(batches, rows)) is not None:
                 yield RecordedRows(c_array(batch))
                 rows += len(batch)
