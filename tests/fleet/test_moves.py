@@ -57,7 +57,7 @@ def test_a_move_that_another_saw_whole_is_taken_from_it() -> None:
 
 
 def test_a_line_that_one_gave_away_and_another_took_has_moved_once() -> None:
-    """Each of them sees its own half: a drained gateway follows no line any more, and the next one began to."""
+    """Each sees its own half: a drained gateway follows no line any more, and the next began late."""
     giver, taker, moves = noted("gw-1", ""), Moves(), Moves()
     taker.note(None, record(2, ""), is_first_look=True)
     taker.note(record(2, ""), record(3, "gw-2"), is_first_look=True)

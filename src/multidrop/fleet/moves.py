@@ -83,7 +83,7 @@ class Moves:
     def newest(self, number: int) -> list[Move]:
         """Return so many moves at most, the newest first.
 
-        Who gave a line away does not see who takes it, and that one not always whose it was: both are one move.
+        Who gives a line away does not see who takes it, and that one may not know whose it was: one move.
         """
         moves = dict(self._moves)
         for key, move in self._moves.items():
