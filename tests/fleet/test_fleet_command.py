@@ -109,7 +109,7 @@ def test_an_old_server(run: Run, tmp_path: Path) -> None:
 MISTAKES: dict[str, tuple[Callable[[Path], Path], str]] = {
     "no such file": (lambda folder: folder / "none.toml", "cannot be read: No such file"),
     "a mistake": (lambda folder: plant(folder, model="innovert"), "there is no model 'innovert'"),
-    "a name": (lambda folder: plant(folder, name="hall.1"), "the line's name 'hall.1' may have letters"),
+    "a name": (lambda folder: plant(folder, name="hall.1"), "plant.toml: the line's name 'hall.1' may have"),
     "a device": (lambda folder: plant(folder, port="/dev/ttyUSB0"), "polls socket:// and tcp:// ports"),
     "a bridged port": (lambda folder: plant(folder, port="rfc2217://h:4001"), "polls socket:// and tcp://"),
 }

@@ -10,6 +10,7 @@ import socket
 from collections.abc import AsyncIterator, Iterator
 from contextlib import asynccontextmanager, suppress
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -157,6 +158,39 @@ def test_after_any_doubt_each_message_is_there_once(running: Cluster, tmp_path: 
         spool.close()
 
     asyncio.run(live())
+
+
+class Refusing:
+    """A client to whose first messages the stream says that it has no room, as full servers do."""
+
+    def __init__(self, client: Client, times: int) -> None:
+        self._client, self.left = client, times
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._client, name)
+
+    async def request(self, subject: str, data: bytes, **details: Any) -> Any:
+        if self.left and not subject.startswith("$JS"):
+            self.left -= 1
+            return SimpleNamespace(data=b'{"error":{"err_code":10023,"description":"no room"}}')
+        return await self._client.request(subject, data, **details)
+
+
+def test_a_stream_that_refuses_is_told_of_once_until_it_takes_a_message(
+    running: Cluster, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    async def live() -> None:
+        spool = filled(tmp_path / "spool", 2)
+        async with client_of(running) as client, forwarding(spool, Refusing(client, 5)) as forwarder:
+            await until(lambda: forwarder.state().last == 2)
+            await until(lambda: forwarder.state().trouble is None)
+        spool.close()
+
+    asyncio.run(live())
+    assert [record.getMessage() for record in caplog.records] == [
+        "samples are not forwarded: the stream 'samples' refuses a message: no room",
+        "samples are forwarded again, behind message 1",
+    ]
 
 
 def test_messages_that_the_spool_dropped_are_passed_over(running: Cluster, tmp_path: Path) -> None:

@@ -56,6 +56,22 @@ def test_a_move_that_another_saw_whole_is_taken_from_it() -> None:
     assert told(moves) == [("gw-1", "gw-2")]
 
 
+def test_a_line_that_one_gave_away_and_another_took_has_moved_once() -> None:
+    """Each sees its own half: a drained gateway follows no line any more, and the next began late."""
+    giver, taker, moves = noted("gw-1", ""), Moves(), Moves()
+    taker.note(None, record(2, ""), is_first_look=True)
+    taker.note(record(2, ""), record(3, "gw-2"), is_first_look=True)
+    for one in (giver, taker, giver):
+        moves.add(move_of(move.as_json()) for move in one.newest(100))
+    assert told(moves) == [("gw-1", "gw-2"), ("", "gw-1")]
+
+
+def test_a_line_that_was_seen_to_be_taken_is_not_told_to_be_nobodys_again() -> None:
+    moves = noted("gw-1", "", "gw-2")
+    moves.add(noted("gw-1", "").newest(100))  # the one who gave it away tells that again and again
+    assert told(moves) == [("gw-1", "gw-2"), ("", "gw-1")]
+
+
 def test_what_is_told_comes_back() -> None:
     [move] = noted("gw-1", is_first_look=True).newest(1)
     assert move_of(move.as_json()) == move

@@ -142,6 +142,16 @@ def test_names_that_cannot_be_in_a_subject(name: str) -> None:
         names.checked_name("line", name)
 
 
+@pytest.mark.parametrize(
+    ("name", "better"),
+    [("hall 1", "hall-1"), ("hall.1", "hall-1"), ("зал 1", "1"), ("", "line-1"), ("*", "line-1")],
+)
+def test_a_name_that_would_do_is_said(name: str, better: str) -> None:
+    with pytest.raises(ValueError, match=f": write {better}$"):
+        names.checked_name("line", name)
+    assert names.is_name(better)
+
+
 def test_records_of_lines_are_in_all_three_buckets() -> None:
     shares = Counter(map(names.owner_bucket, LINES))
     assert set(shares) == set(names.OWNERS)

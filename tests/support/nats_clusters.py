@@ -24,6 +24,7 @@ from multidrop.fleet.server_files import PINGS
 PATIENCE_S = 60.0
 ATTEMPTS = 4
 OLDEST = (2, 12)
+MAX_FILE = "64G"  # on the disk is what is stored; a part is reserved for samples
 
 
 def free_ports(number: int) -> list[int]:
@@ -90,7 +91,7 @@ class Node:
             server_name: {name}
             listen: {self.host}:{self.port}
             http: {self.host}:{self.monitor}
-            jetstream {{ store_dir: "{folder / name}", max_mem: 64M, max_file: 256M }}
+            jetstream {{ store_dir: "{folder / name}", max_mem: 64M, max_file: {MAX_FILE} }}
         """
         if len(routes) > 1:
             others = ", ".join(f"nats://{route}" for route in routes)

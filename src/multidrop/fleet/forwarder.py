@@ -100,11 +100,11 @@ class Forwarder:
     async def _forward(self) -> None:
         """Ask where the stream is, and send what is behind that, until there is a doubt."""
         place, sequence = await self._ask()
-        self._note(None)
         while True:
             self._news.clear()
             stored = self._spool.following(sequence)
             if stored is None:
+                self._note(None)
                 with suppress(TimeoutError):
                     await asyncio.wait_for(self._news.wait(), LOOKING_S)
                 end_if_cancelled()
@@ -119,6 +119,7 @@ class Forwarder:
             place, sequence = found, stored.sequence
             self._sent += 1
             self._have(sequence)
+            self._note(None)
 
     async def _ask(self) -> tuple[int, int]:
         """Return the place and the sequence of the last message that the stream has of this log."""

@@ -95,8 +95,7 @@ class FleetGateway:
         self.forwarder = Forwarder(self.spool, client)
         forwarding = asyncio.create_task(self.forwarder.run())
         try:
-            await self.paths[0].subscribe(names.gateway_subject(self.name, "*"), self._answer)
-            await self.paths[0].check_subscription(names.gateway_subject(self.name, "*"))
+            await self.paths[0].subscribe_or_raise(names.gateway_subject(self.name, "*"), self._answer)
             await self.commands.begin()
             self.lines.poller.on_batch(self.spool.append)
             with self.lines.poller:

@@ -21,6 +21,7 @@ class Move(NamedTuple):
     at_ms: int  # UTC, by the clock of the gateway that wrote it: for people alone
     before: str | None
     after: str
+    released: int = 0  # the revision by which the master before gave it away; 0 where none was seen
 
     def as_json(self) -> dict[str, Any]:
         """Return it as a gateway tells it and `--json` prints it."""
@@ -30,6 +31,7 @@ class Move(NamedTuple):
             "at_ms": self.at_ms,
             "from": self.before,
             "to": self.after,
+            "released": self.released,
         }
 
 
@@ -42,6 +44,7 @@ def move_of(told: Any) -> Move:
         int(told["at_ms"]),
         None if before is None else str(before),
         str(told["to"]),
+        int(told.get("released", 0)),  # older versions do not tell it
     )
 
 
@@ -64,7 +67,7 @@ class Moves:
             self._given_away[move.line] = move
         elif given := self._given_away.pop(move.line, None):
             self._moves.pop((given.line, given.revision), None)
-            move = move._replace(before=given.before)
+            move = move._replace(before=given.before, released=given.revision)
         self.add([move])
 
     def add(self, moves: Iterable[Move]) -> None:
@@ -78,5 +81,13 @@ class Moves:
             self._moves = {(move.line, move.revision): move for move in self.newest(self._most)}
 
     def newest(self, number: int) -> list[Move]:
-        """Return so many moves at most, the newest first."""
-        return heapq.nlargest(number, self._moves.values(), key=lambda move: (move.at_ms, move.revision))
+        """Return so many moves at most, the newest first.
+
+        Who gives a line away does not see who takes it, and that one may not know whose it was: one move.
+        """
+        moves = dict(self._moves)
+        for key, move in self._moves.items():
+            given = moves.pop((move.line, move.released), None)
+            if given and move.before is None:
+                moves[key] = move._replace(before=given.before)
+        return heapq.nlargest(number, moves.values(), key=lambda move: (move.at_ms, move.revision))

@@ -15,8 +15,9 @@ BUCKETS = (*LEASES, *OWNERS, PLANT)
 def checked_name(kind: str, name: str) -> str:
     """Return the name. Raises ValueError for one that a subject cannot have."""
     if not isinstance(name, str) or not is_name(name):
+        suggestion = re.sub(r"[^A-Za-z0-9_-]+", "-", str(name)).strip("-") or f"{kind}-1"
         raise ValueError(
-            f"the {kind}'s name {name!r} may have letters, digits, _ and - alone: write gateway-1"
+            f"the {kind}'s name {name!r} may have letters, digits, _ and - alone: write {suggestion}"
         )
     return name
 

@@ -32,7 +32,10 @@ def read_plant(path: Path) -> tuple[Plant, dict[str, Any]]:
     plant = load_plant(path)
     document = tomllib.loads(path.read_text("utf-8"))
     for line in plant.lines:
-        names.checked_name("line", line.name)
+        try:
+            names.checked_name("line", line.name)
+        except ValueError as mistake:
+            raise ValueError(f"{path}: {mistake}") from None
         if not line.port.startswith(SOCKETS):
             raise ValueError(
                 f"{path}: line {line.name} is at {line.port}: a fleet polls socket:// and tcp:// ports, "

@@ -6,6 +6,8 @@ import logging
 import os
 import re
 from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 from multidrop.fleet.errors import FleetError, MayNotSend, NoRight, NotAdmitted
 
@@ -56,6 +58,7 @@ class Denials:
 
     def __init__(self) -> None:
         self._said: Counter[tuple[str, str]] = Counter()  # how often, by kind and subject
+        self._raised = ""  # a subscription whose denial is raised, and so not told
 
     async def note(self, failure: Exception) -> None:
         """Take what a server says of its own accord."""
@@ -66,7 +69,8 @@ class Denials:
         if (kind, subject) not in self._said:
             if len(self._said) >= MOST_DENIALS:
                 return
-            _log.warning("%s", _sentence(kind, subject))
+            if (kind, subject) != ("subscription", self._raised):
+                _log.warning("%s", _sentence(kind, subject))
         self._said[kind, subject] += 1
 
     def of_request(self, subject: str) -> int:
@@ -85,8 +89,14 @@ class Denials:
             if kind == "subscription" and denied.startswith(inbox.lower()):
                 raise NoRight(_sentence(kind, denied))
 
-    def check_subscription(self, subject: str) -> None:
-        """Raise NoRight where this may not be listened to."""
+    @contextmanager
+    def raising(self, subject: str) -> Iterator[None]:
+        """Raise NoRight at the end where this was found not to be allowed to be listened to."""
+        self._raised = subject.lower()
+        try:
+            yield
+        finally:
+            self._raised = ""
         if self._said["subscription", subject.lower()]:
             raise NoRight(_sentence("subscription", subject))
 

@@ -71,6 +71,7 @@ def _operator(_: str) -> UserRights:
             *LOOK,
             *LEADERS,
             *(f"{API}.STREAM.CREATE.{stream}" for stream in made),
+            f"{API}.STREAM.INFO.{STREAM}",
             f"$KV.{names.PLANT}.*",
             *(f"{API}.STREAM.{request}.{trial}" for request in ("CREATE", "INFO", "MSG.GET", "DELETE")),
             f"$KV.{CONTEST}.*.*",

@@ -24,7 +24,15 @@ STREAM = "samples"
 SEQUENCE, DIGEST, LOST = "Multidrop-Sequence", "Multidrop-Digest", "Multidrop-Lost"
 EXPECTED = "Nats-Expected-Last-Subject-Sequence"
 ANSWER_S = 5.0  # for an answer: a new leader takes 4 to 9 s, so that is asked again
-NO_MESSAGE, WRONG_SEQUENCE = 10037, 10071  # error codes of JetStream
+NO_MESSAGE, NO_STREAM, WRONG_SEQUENCE = 10037, 10059, 10071  # error codes of JetStream
+SENTENCES = {  # and what others of them mean
+    NO_STREAM: f"there is no stream {STREAM!r}: make it by `multidrop fleet init`",
+    **dict.fromkeys(
+        (10005, 10047),
+        "the servers of NATS have no room for so many samples: keep less by `multidrop fleet init --keep`, "
+        "or raise max_file in their jetstream blocks",
+    ),
+}
 
 
 class StreamError(OSError):
@@ -105,8 +113,12 @@ async def _ignore(_: Exception) -> None:
     """Do nothing: whoever asked has the error too, and the client would log a traceback for each."""
 
 
-async def create_stream(client: Client, *, replicas: int = 3, most_bytes: int = -1) -> None:
-    """Make the stream where there is none; the oldest messages go when it has more than `most_bytes`."""
+async def create_stream(client: Client, *, replicas: int = 3, most_bytes: int = -1) -> int:
+    """Make the stream where there is none, and return the most bytes that it keeps; -1 for no limit.
+
+    The oldest messages go when it has more than `most_bytes`. That much is reserved: a stream without a limit
+    fills the servers, and then no lease can be renewed. A stream that is there stays as it is.
+    """
     config = {
         "name": STREAM,
         "subjects": [f"{STREAM}.*.*"],
@@ -118,7 +130,11 @@ async def create_stream(client: Client, *, replicas: int = 3, most_bytes: int = 
         "allow_direct": True,
         "deny_delete": True,
     }
-    await _ask(client, f"STREAM.CREATE.{STREAM}", config)
+    found = await _ask(client, f"STREAM.INFO.{STREAM}", {}, NO_STREAM)
+    if found is None:
+        found = await _ask(client, f"STREAM.CREATE.{STREAM}", config)
+    with _as_wanted():
+        return int(found["config"].get("max_bytes", -1))
 
 
 async def about(client: Client) -> StreamAbout:
@@ -232,8 +248,8 @@ async def _ask(client: Client, subject: str, what: Mapping[str, Any], *none: int
         return found
     if error.get("err_code") in none:
         return None
-    if error.get("err_code") == 10059:
-        raise StreamError(f"there is no stream {STREAM!r}: make it by `multidrop fleet init`")
+    if sentence := SENTENCES.get(error.get("err_code")):
+        raise StreamError(sentence)
     raise StreamError(f"NATS refuses {subject}: {error.get('description')}")
 
 

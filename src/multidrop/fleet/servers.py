@@ -160,13 +160,14 @@ class ServerPath:
             for subject in standing.keys() - self._wanted.keys():
                 await standing.pop(subject).unsubscribe()
 
-    async def check_subscription(self, subject: str) -> None:
-        """Raise NoRight where these credentials do not allow to hear what was subscribed to."""
-        client = self._connected()
-        with suppress(NatsError, OSError, TimeoutError):
-            await client.flush()  # this ping may leave before what waits to be sent, the next one does not
-            await client.flush()
-        self._denials.check_subscription(subject)
+    async def subscribe_or_raise(self, subject: str, called: Callable[[Msg], Any]) -> None:
+        """Subscribe. Raises NoRight where these credentials do not allow to hear it."""
+        with self._denials.raising(subject):
+            await self.subscribe(subject, called)
+            client = self._connected()
+            with suppress(NatsError, OSError, TimeoutError):
+                await client.flush()  # this ping may leave before what waits to be sent, the next does not
+                await client.flush()
 
     async def request(
         self,

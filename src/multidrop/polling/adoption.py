@@ -6,7 +6,7 @@ change, and ports are opened. A line that stays is not touched where nothing of 
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 
 from multidrop.bus import Bus
@@ -56,9 +56,14 @@ class Staying:
         """The names of the drives that leave."""
         return {polled.drive.name for polled in self.drives.leaving}
 
-    def is_free(self, present: Collection[str]) -> bool:
-        """Return True unless a drive that joins, or one of its name, is still present on other lines."""
-        return not any(polled.drive.name in present for polled in self.drives.joining)
+    @property
+    def moves(self) -> bool:
+        """Say whether drives leave or join."""
+        return bool(self.drives.leaving or self.drives.joining)
+
+    def is_free(self, leaving: Mapping[str, Staying]) -> bool:
+        """Return True unless a drive that joins has the name of one that is to leave another line."""
+        return all(leaving.get(polled.drive.name, self) is self for polled in self.drives.joining)
 
     def take_in(self) -> None:
         """Poll what is new. Raises LineError where the port cannot have a drive's settings."""
@@ -161,14 +166,14 @@ class Adoption:
         """
         failures: dict[str, LineError] = {}
         names = {polled.drive.name for line in self._plant.lines for polled in line.drives}
-        left = self._staying
+        for staying in self._staying:
+            if not staying.moves:
+                staying.take_in()
+        left = [staying for staying in self._staying if staying.moves]
         while left:
-            free = [
-                each
-                for each in left
-                if each.is_free(set().union(*(other.leaving for other in left if other is not each)))
-            ]
-            together = free[:1] or left
+            leaving = {name: staying for staying in left for name in staying.leaving}
+            free = next((staying for staying in left if staying.is_free(leaving)), None)
+            together = [free] if free else left
             for staying in together:
                 staying.await_stops()
             for staying in together:
@@ -178,7 +183,7 @@ class Adoption:
                     staying.take_in()
                 except LineError as failure:
                     failures[staying.wanted.name] = failure
-            left = [each for each in left if each not in together]
+            left = [staying for staying in left if staying is not free] if free else []
         return failures
 
     def _open(self, start: bool) -> dict[str, LineError]:

@@ -9,12 +9,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from multidrop.cli.fleet.connection import add_server_arguments, require_fleet, run_with_paths, urls_of
+from multidrop.cli.support.fleet_tables import size
 from multidrop.cli.support.nats import nats_options
 from multidrop.cli.support.output import print_text, warn
 
 if TYPE_CHECKING:
     from multidrop.fleet.buckets import Record
     from multidrop.fleet.servers import ServerPath
+
+
+KEEP = "10 GB"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -25,19 +29,26 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=Path,
         help="the plant to be stored; the one that is stored stays if not given",
     )
+    parser.add_argument(
+        "--keep",
+        metavar="SIZE",
+        help=f"most that each server keeps of samples, where their stream is made now; {KEEP} if not given",
+    )
     add_server_arguments(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
     require_fleet()
     from multidrop.fleet.plant_store import read_plant
+    from multidrop.recording.retention import parse_size
 
+    keep = parse_size(arguments.keep or KEEP)
     records = read_plant(arguments.plant)[1] if arguments.plant else None
-    return run_with_paths(arguments, partial(_init, arguments, records))
+    return run_with_paths(arguments, partial(_init, arguments, records, keep))
 
 
 async def _init(
-    arguments: argparse.Namespace, records: dict[str, Record] | None, paths: list[ServerPath]
+    arguments: argparse.Namespace, records: dict[str, Record] | None, keep: int, paths: list[ServerPath]
 ) -> int:
     from multidrop.fleet import names
     from multidrop.fleet.buckets import Bucket
@@ -48,10 +59,20 @@ async def _init(
     made = await set_up(paths)
     urls = urls_of(arguments)
     client = await connect(urls, **nats_options(arguments, urls))
-    await create_stream(client, replicas=made["replicas"])
-    await client.close()
+    try:
+        kept = await create_stream(client, replicas=made["replicas"], most_bytes=keep)
+    finally:
+        await client.close()
+    made["samples_bytes"] = None if kept < 0 else kept
     if records is not None:
         made["lines"] = await store(Bucket(names.PLANT, lambda: paths[0]), records)
+    if kept < 0 or (arguments.keep and kept != keep):
+        word = (
+            "has no limit: when it fills the servers no line is polled"
+            if kept < 0
+            else f"keeps {size(kept)} still"
+        )
+        warn(f"the stream of samples {word}; `nats stream edit samples --max-bytes {keep}` changes that")
     if arguments.json:
         print_text(json.dumps(made, indent=2))
         return 0

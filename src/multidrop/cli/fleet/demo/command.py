@@ -30,6 +30,7 @@ KILLED = "gw-2"
 LINES = 12
 PATIENCE_S = 60.0  # for what takes seconds on a machine that is not busy
 RUN_S = 2.0  # before the kill, and after each thing that happened
+KEEP = "100 MB"  # of samples, of the 256 MB that each server has
 
 Fleet = dict[str, Any]
 
@@ -128,7 +129,7 @@ class Demo:
         note(f"three NATS servers of this machine are ready, in {self._folder}")
         plant = self._folder / "plant.toml"
         plant.write_text(plant_file(json.loads(await_line(simulator) or "{}")), "utf-8")
-        children.run_multidrop("init", "fleet", "init", str(plant), "--nats", self._urls)
+        children.run_multidrop("init", "fleet", "init", str(plant), "--keep", KEEP, "--nats", self._urls)
         note(f"`fleet init` has stored {LINES} lines of {DRIVES} simulated drives each")
         for gateway in GATEWAYS:
             self._start(gateway)

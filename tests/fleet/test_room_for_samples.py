@@ -1,0 +1,94 @@
+"""Samples never take the room of leases: a server that can store no more would end all polling."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from collections.abc import Awaitable, Callable
+from pathlib import Path
+
+import nats_clusters
+import pytest
+from commands import Run
+from nats_clusters import Cluster, cluster
+from peers import require_module
+
+require_module("nats")
+
+from nats.aio.client import Client  # noqa: E402
+
+from multidrop.fleet.samples_stream import about, connect, create_stream, publish  # noqa: E402
+
+MESSAGE = 500_000  # bytes
+PLANT = """
+[[line]]
+name = "hall-1"
+port = "socket://127.0.0.1:4001"
+[[line.drive]]
+name = "pump-1"
+model = "innovert-ibd"
+address = 1
+poll = ["output_current"]
+"""
+
+
+@pytest.fixture(autouse=True)
+def _small_servers(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(nats_clusters, "MAX_FILE", "20M")
+
+
+def with_client(servers: Cluster, work: Callable[[Client], Awaitable[object]]) -> None:
+    async def live() -> None:
+        client = await connect(servers.urls)
+        try:
+            await work(client)
+        finally:
+            await client.close()
+
+    asyncio.run(live())
+
+
+def test_a_stream_that_is_full_leaves_room_for_records(run: Run, tmp_path: Path) -> None:
+    async def fill(client: Client) -> None:
+        for _ in range(60):
+            await publish(client, "samples.gw-1.log", bytes(MESSAGE), {})
+        found = await about(client)
+        assert (found.last, 60 - found.first < 8_000_000 / MESSAGE) == (60, True)
+
+    with cluster(tmp_path / "nats", 1) as one:
+        words = ["fleet", "init", "--nats", one.urls[0], "--json", "--keep", "8 MB"]
+        status, out, _ = run(*words)
+        assert (status, json.loads(out)["samples_bytes"]) == (0, 8_000_000)
+        with_client(one, fill)
+        (tmp_path / "plant.toml").write_text(PLANT)
+        status, out, _ = run(*words, tmp_path / "plant.toml")
+        assert (status, json.loads(out)["lines"]["new"]) == (0, 1)
+
+
+@pytest.mark.parametrize("number", [1, pytest.param(3, marks=pytest.mark.long)])
+def test_servers_that_have_less_room_are_one_sentence(run: Run, tmp_path: Path, number: int) -> None:
+    with cluster(tmp_path / "nats", number) as small:
+        status, out, err = run("fleet", "init", "--nats", ",".join(small.urls))
+    assert (status, out, err.count("\n")) == (1, "", 1)
+    assert "the servers of NATS have no room for so many samples: keep less by" in err
+
+
+def test_a_stream_that_is_there_stays_and_is_told_of(run: Run, tmp_path: Path) -> None:
+    with cluster(tmp_path / "nats", 1) as one:
+        with_client(one, lambda client: create_stream(client, replicas=1))
+        _, out, err = run("fleet", "init", "--nats", one.urls[0], "--json")
+        assert json.loads(out)["samples_bytes"] is None
+        assert "the stream of samples has no limit: when it fills the servers no line is polled; `nats" in err
+    with cluster(tmp_path / "other", 1) as one:
+        with_client(one, lambda client: create_stream(client, replicas=1, most_bytes=8_000_000))
+        _, _, err = run("fleet", "init", "--nats", one.urls[0], "--keep", "9 MB")
+        assert (
+            "the stream of samples keeps 8.0 MB still; `nats stream edit samples --max-bytes 9000000`" in err
+        )
+        assert "the stream of samples" not in run("fleet", "init", "--nats", one.urls[0])[2]
+
+
+def test_a_size_that_is_none(run: Run) -> None:
+    status, out, err = run("fleet", "init", "--keep", "much")
+    assert (status, out, err.count("\n")) == (2, "", 1)
+    assert "'much' is not a size" in err
