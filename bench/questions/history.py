@@ -61,6 +61,7 @@ def made(database: Any, begin_s: int, end_s: int, every: int = 1) -> None:
     insert, update = MADE.split(";")
     database.execute(insert, {"first": begin_s * 10 // every, "end": end_s * 10 // every, "every": every})
     database.execute(update)
+    database.execute("create or replace temp view told as select *, 'Hz' as unit from recorded")
 
 
 def recorded(database: Any, folder: Path, after: int) -> None:
@@ -95,7 +96,7 @@ def make_day(folder: Path, hours: int) -> None:
             begin = (number - 1) * SEGMENT_S
             made(database, begin, begin + SEGMENT_S, 1 if begin < FULL_S else 10)
             span = MIDNIGHT + begin * SECOND, MIDNIGHT + (begin + SEGMENT_S) * SECOND
-            for kind, query in (("tens", TENS), ("rows", ROWS)):
+            for kind, query in (("tens", TENS.format("told")), ("rows", ROWS)):
                 copy_out(database, query, folder / kind / file_name(number, number, *span), {})
         made(database, hours * 3600 - SEGMENT_S // 2, hours * 3600)  # the end of the day once more, growing
         recorded(database, folder, segments)
@@ -190,7 +191,7 @@ def _merge(folder: Path, hours: int) -> None:
         made(database, 30 * 3600, 30 * 3600 + 1)
         number = hours * 3600 // SEGMENT_S + 5
         span = MIDNIGHT + 30 * 3600 * SECOND, MIDNIGHT + (30 * 3600 + 1) * SECOND
-        for kind, query in (("tens", TENS), ("rows", ROWS)):
+        for kind, query in (("tens", TENS.format("told")), ("rows", ROWS)):
             copy_out(database, query, folder / kind / file_name(number, number, *span), {})
     compact(folder, 0)
 
