@@ -127,6 +127,11 @@ def quoted(text: str) -> str:
     return "'" + text.replace("'", "''") + "'"
 
 
+def files_of(paths: Iterable[Path]) -> str:
+    """Return a table of these Parquet files."""
+    return f"read_parquet({_list(paths)})"
+
+
 def with_units(paths: Iterable[Path]) -> str:
     """Return a table of these Parquet files and their names; `unit` is null where a file has none."""
     files = f"read_parquet({_list(paths)}, union_by_name = true, filename = true)"

@@ -203,7 +203,9 @@ class History:
         for (sums, series), files in parted.items():
             files = [file for file in files if file.may_have(grid.begin, grid.end)]
             if files and series:
-                gather_files(self._sources, files, sums, {one: into[one] for one in series}, grid)
+                gather_files(
+                    self._sources, files, sums, {one: into[one] for one in series}, grid, parting.newest
+                )
         for number in sorted(set(found.segments) - reckoned):
             with self._sources.segment(number, found, grid.begin, grid.end) as segment:
                 if segment:
