@@ -30,6 +30,7 @@ def registers(data: bytes) -> list[int]:
     return list(struct.unpack(f">{len(data) // 2}H", data))
 
 
+@pytest.mark.long
 def test_wireshark_decodes_every_printed_exchange(tmp_path: Path) -> None:
     packets = tshark(write(tmp_path / "a.pcapng", RTU))
     assert len(packets) == 2 * len(RTU) > 20
@@ -77,6 +78,7 @@ def test_wireshark_shows_ascii_and_delixi_frames_as_they_are(tmp_path: Path) -> 
     assert {packet["modbus.func_code"] for packet in packets} == {""}
 
 
+@pytest.mark.long
 def test_a_line_is_an_interface_with_its_name(tmp_path: Path) -> None:
     with CaptureWriter(tmp_path / "a.pcapng") as capture:
         for number, line in enumerate(("hall-1", "Halle zwei", "hall-1")):

@@ -56,6 +56,7 @@ def captured(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Path, Pat
     return plant, path, rows
 
 
+@pytest.mark.long
 def test_wireshark_says_modbus_tcp(captured: tuple[Path, Path, list[Row]]) -> None:
     _, path, rows = captured
     fields = [word for field in FIELDS for word in ("-e", field)]

@@ -480,6 +480,7 @@ def in_a_process(words: list[str]) -> list[str]:
     return [sys.executable, "-c", f"import sys; from multidrop.cli import main; sys.exit(main({words}))"]
 
 
+@pytest.mark.long
 @table("words", PRINTING)
 def test_a_full_disk_under_the_output_is_a_sentence(words: list[str]) -> None:
     with Path("/dev/full").open("w") as full:
@@ -487,6 +488,7 @@ def test_a_full_disk_under_the_output_is_a_sentence(words: list[str]) -> None:
     assert (done.returncode, done.stderr) == (1, "multidrop: No space left on device\n")
 
 
+@pytest.mark.long
 @table("words", PRINTING)
 def test_a_reader_who_has_seen_enough_is_no_failure(words: list[str]) -> None:
     with subprocess.Popen(in_a_process(words), stdout=subprocess.PIPE, stderr=subprocess.PIPE) as command:
@@ -497,6 +499,7 @@ def test_a_reader_who_has_seen_enough_is_no_failure(words: list[str]) -> None:
     assert command.returncode == 0
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("closed", "words", "status"),
     [

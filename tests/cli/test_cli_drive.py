@@ -462,6 +462,7 @@ def test_a_stop_that_is_interrupted_is_sent_once_more(run: Run, che: Che) -> Non
     assert "multidrop: to stop it, type: multidrop stop " in err
 
 
+@pytest.mark.long
 @pytest.mark.slow
 @patient
 @pytest.mark.parametrize("verb", usually("stop", "coast"))
@@ -568,6 +569,7 @@ def plant_of(port: object, folder: Path) -> Path:
     return plant
 
 
+@pytest.mark.long
 @patient
 @pytest.mark.parametrize("keys", usually(b"sy", b"Sy"))
 def test_a_stop_by_a_key_goes_on_until_its_end_where_the_terminal_is_closed(
@@ -591,6 +593,7 @@ def test_a_stop_by_a_key_goes_on_until_its_end_where_the_terminal_is_closed(
     assert rows[-1].register in {row.register for row in rows[:-1]}  # it was closed in good order
 
 
+@pytest.mark.long
 @patient
 def test_a_monitor_ends_where_its_terminal_is_closed(che: Che, tmp_path: Path) -> None:
     received, words = che

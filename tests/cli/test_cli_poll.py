@@ -36,6 +36,7 @@ with simulator(Path(sys.argv[1]), Path(sys.argv[2])):
 """
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("number", usually(signal.SIGINT, signal.SIGTERM))
 def test_simulate_runs_until_interrupted_and_removes_its_links(tmp_path: Path, number: int) -> None:
     link = tmp_path / "ports" / "hall-1"
@@ -59,6 +60,7 @@ def test_simulate_does_not_replace_a_file_in_its_way(run: Run, tmp_path: Path) -
     assert link.read_text() == "mine"
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_simulate_brings_the_faults_of_its_file(tmp_path: Path) -> None:
     faults, ports = tmp_path / "faults.toml", tmp_path / "ports"
@@ -164,6 +166,7 @@ def test_a_recording_says_what_its_registers_are(run: Run, plant: Path, tmp_path
     }
 
 
+@pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize("number", usually(signal.SIGINT, signal.SIGTERM))
 def test_poll_ended_by_a_signal_keeps_what_it_recorded(plant: Path, tmp_path: Path, number: int) -> None:
@@ -344,6 +347,7 @@ def test_a_demo_takes_the_place_of_a_demo_only(run: Run, tmp_path: Path) -> None
     assert out.read_bytes() == mine
 
 
+@pytest.mark.long
 def test_a_demo_that_is_killed_leaves_no_simulator(tmp_path: Path) -> None:
     ports = tmp_path / "ports"
     words = [sys.executable, "-c", SIMULATING, str(plant_file(tmp_path)), str(ports)]
@@ -369,6 +373,7 @@ def test_on_a_terminal_a_demo_is_watched_until_its_time_is_over(tmp_path: Path) 
     assert "delixi-native" in {row.drive for row in recorded(out)}
 
 
+@pytest.mark.long
 def test_on_a_terminal_the_newest_values_stand_in_a_table(plant: Path) -> None:
     with on_terminal("poll", plant, "--seconds", "1", size=(120, 24)) as terminal:
         terminal.wait_for("DRIVE   SAMPLES  MISSES  NEWEST VALUES")

@@ -112,6 +112,7 @@ def test_the_listener_cannot_send(line: tuple[str, str]) -> None:
         os.write(listener.fileno(), b"\x01")
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_a_request_that_nobody_answers_is_told_while_the_line_is_silent() -> None:
     master, slave = pty.openpty()

@@ -554,6 +554,7 @@ def await_both(terminal: Terminal) -> None:
     terminal.wait_for_match(r"\d\.\d s ")
 
 
+@pytest.mark.long
 def test_it_runs_on_a_terminal_and_leaves_it_as_it_was(plant: Path) -> None:
     with on_terminal("monitor", plant) as terminal:
         await_both(terminal)
@@ -586,6 +587,7 @@ def test_each_picture_is_drawn_over_the_last_one(plant: Path) -> None:
         assert terminal.process.wait(timeout=60) == 0
 
 
+@pytest.mark.long
 def test_a_stop_is_carried_out_and_told(plant: Path) -> None:
     with on_terminal("monitor", plant) as terminal:
         await_both(terminal)
@@ -633,6 +635,7 @@ def test_where_no_port_opens_nothing_is_recorded(tmp_path: Path) -> None:
     assert not out.exists()
 
 
+@pytest.mark.long
 def test_without_colour_and_without_utf_8_it_is_complete(plant: Path) -> None:
     environment = {"NO_COLOR": "1", "PYTHONIOENCODING": "ascii"}
     with on_terminal("monitor", plant, size=(200, 50), **environment) as terminal:

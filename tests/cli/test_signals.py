@@ -94,6 +94,7 @@ def test_a_second_signal_breaks_off_what_the_first_one_asked_to_end() -> None:
             signal.raise_signal(signal.SIGTERM)
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_poll_keeps_what_it_recorded_where_its_terminal_is_closed(plant: Path, tmp_path: Path) -> None:
     require_module("pyarrow")
@@ -105,6 +106,7 @@ def test_poll_keeps_what_it_recorded_where_its_terminal_is_closed(plant: Path, t
     assert any(row.value is not None for row in recorded(out))
 
 
+@pytest.mark.long
 def test_simulate_removes_its_links_where_its_terminal_is_closed(tmp_path: Path) -> None:
     link = tmp_path / "ports" / "hall-1"
     words = ["simulate", plant_file(tmp_path), "--ports", tmp_path / "ports"]
@@ -116,6 +118,7 @@ def test_simulate_removes_its_links_where_its_terminal_is_closed(tmp_path: Path)
     assert not link.is_symlink()
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_the_demo_of_serve_ends_where_its_terminal_is_closed() -> None:
     """It has no plant file that could be read again."""

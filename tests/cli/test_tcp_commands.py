@@ -25,6 +25,7 @@ poll = ["output_current"]
 """
 
 
+@pytest.mark.long
 def test_simulate_serves_a_line_of_a_plant_over_modbus_tcp(tmp_path: Path, run: Run) -> None:
     plant = tmp_path / "plant.toml"
     plant.write_text(PLANT.format(port="tcp://10.0.0.7"))
@@ -37,6 +38,7 @@ def test_simulate_serves_a_line_of_a_plant_over_modbus_tcp(tmp_path: Path, run: 
         assert "output_current" in shown
 
 
+@pytest.mark.long
 def test_a_port_of_this_machine_is_served_as_the_plant_names_it(tmp_path: Path, run: Run) -> None:
     with socket.create_server(("127.0.0.1", 0)) as free:
         port = f"tcp://127.0.0.1:{free.getsockname()[1]}"

@@ -64,6 +64,7 @@ def test_a_plant_file_has_no_names_and_ports_that_do_not_print(tmp_path: Path, t
     assert is_harmless(str(found.value))
 
 
+@pytest.mark.long
 @table(
     "words",
     [

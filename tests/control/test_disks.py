@@ -183,6 +183,7 @@ def test_a_clock_that_is_set_back_gives_no_budget_back(tmp_path: Path) -> None:
 # ---- both, under a drive ----
 
 
+@pytest.mark.long
 def test_a_setpoint_loop_while_the_clock_is_set_back(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """10 Hz to an EEPROM for an hour of such a clock: once a minute at most, and once for the jump."""
     log = tmp_path / "audit.jsonl"

@@ -250,6 +250,7 @@ def stops(received: list[ReceivedRequests]) -> int:
     )
 
 
+@pytest.mark.long
 def test_a_third_signal_ends_the_process_though_a_drive_is_silent() -> None:
     with lines(1) as (received, ports), client("wait", ports) as process:
         for each in received[0]:
@@ -268,6 +269,7 @@ def test_a_third_signal_ends_the_process_though_a_drive_is_silent() -> None:
         assert CUT_SHORT.decode() in told
 
 
+@pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize("number", usually(signal.SIGTERM, signal.SIGINT))
 def test_a_second_signal_leaves_no_motor_running(number: int) -> None:
@@ -281,6 +283,7 @@ def test_a_second_signal_leaves_no_motor_running(number: int) -> None:
         assert not any(each.sim.motor.energised for each in received[0])
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_a_signal_while_the_block_is_left_leaves_no_motor_running() -> None:
     with lines(1) as (received, ports), client("leave", ports) as process:

@@ -101,6 +101,7 @@ def value(address: int, at: int) -> int:
     return 1000 * address + 100 * at + 7
 
 
+@pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", SEEDS)
 @pytest.mark.parametrize("frames", FRAMES)

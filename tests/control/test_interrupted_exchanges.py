@@ -38,6 +38,7 @@ def interrupted(call: Callable[[], object], nth: int) -> KeyboardInterrupt | Non
     return None
 
 
+@pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize("verb", ["start", "coast", "stop"])
 def test_what_may_have_been_sent_is_told_wherever_it_is_interrupted(verb: str) -> None:

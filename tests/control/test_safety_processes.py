@@ -58,6 +58,7 @@ def pump() -> Iterator[tuple[MotorDrive, str]]:
         yield sim, simulator.wires[0].path
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("opted", "ending"),
     [*(("stop", ending) for ending in ENDINGS), *usually(*(("leave", ending) for ending in ENDINGS))],
@@ -112,6 +113,7 @@ print(entered)
 """
 
 
+@pytest.mark.long
 def test_two_processes_share_one_budget(tmp_path: Path) -> None:
     path = tmp_path / "wear.sqlite"
     words = [sys.executable, "-c", ENTRANT, str(path)]

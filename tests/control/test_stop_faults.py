@@ -57,6 +57,7 @@ def counts(frame: FrameType) -> bool:
     return frame.f_code is CODE and not line.startswith(("under_way = list", "try:", "end("))
 
 
+@pytest.mark.long
 def test_wherever_a_stop_of_all_is_interrupted_each_is_sent_once_more_and_told_of(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -79,6 +80,7 @@ def fails_to_start_the_last(line: SimulatedBus, drives: list[Any], sims: list[An
     start_staggered(drives, 2.0)
 
 
+@pytest.mark.long
 def test_a_failed_staggered_start_that_is_interrupted_stops_each_all_the_same(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -352,6 +352,7 @@ class Stops(RuleBasedStateMachine):
         self._stack.close()
 
 
+@pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", usually(*KINDS))
 def test_nothing_moves_after_a_stop(kind: str) -> None:

@@ -24,6 +24,7 @@ def build(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Callable[
     return build
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_core(build: Callable[..., None]) -> None:
     line = ("line", "line_states", "listen", "line_end", "reply", "tcp", "echo", "owed", "proof", "late")
@@ -31,11 +32,13 @@ def test_core(build: Callable[..., None]) -> None:
     build("test_core", *core, arguments=["tests/data/frames.csv"])
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_rows(build: Callable[..., None]) -> None:
     build("test_rows", "columns", "tap", "body", "frame", "checksum", "reason")
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_the_time_of_day_is_asked_for_again_and_again(build: Callable[..., None]) -> None:
     build("test_row_queue", "row_queue", "columns", "body", "frame", "checksum", "reason")
@@ -79,6 +82,7 @@ def test_a_port_is_read_once_for_an_exchange(build: Callable[..., None]) -> None
     build("test_looks", *core)
 
 
+@pytest.mark.long
 @pytest.mark.skipif(sys.platform != "linux", reason="others have no RS-485 mode")
 def test_a_transceiver_sends_until_the_last_bit_has_left(build: Callable[..., None]) -> None:
     build("test_rs485", "port_rs485")

@@ -281,6 +281,7 @@ with Simulator([Wire([simulated(Toy(1))], unpaced=True)]) as simulator:
 """
 
 
+@pytest.mark.long
 def test_a_child_ends_no_simulator() -> None:
     words = [sys.executable, "-W", "ignore", "-c", LEFT.format(support=str(Path(toy.__file__).parent))]
     done = subprocess.run(words, capture_output=True, text=True, timeout=PATIENCE, check=False)
@@ -310,6 +311,7 @@ ENDS = {
 }
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("end", ENDS)
 def test_a_child_stops_no_motor(end: str) -> None:
     """However it ends; its parent still does, when it leaves."""

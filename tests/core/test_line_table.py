@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import pytest
 from frames import words
 from line_driver import MS, LineDriver
 from multidrop._core import ffi, lib
@@ -133,6 +134,7 @@ def test_no_walk_leaves_the_table(seed: int) -> None:
         assert now in ways[before]
 
 
+@pytest.mark.long
 def test_walks_take_every_way_in_the_table() -> None:
     seen = {pair for seed in range(10) for pair in Walk(seed).run(4000)}
     assert {(state, following) for (state, _), following in TABLE.items()} <= seen

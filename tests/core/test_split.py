@@ -189,6 +189,7 @@ def damaged(frame: bytes, chance: random.Random) -> bytes:
     return bytes(found)
 
 
+@pytest.mark.long
 @table("seed", range(5))
 def test_every_exchange_that_is_not_next_to_damage_is_seen(seed: int) -> None:
     chance = random.Random(seed)

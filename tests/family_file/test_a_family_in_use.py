@@ -105,6 +105,7 @@ def test_values_are_those_of_a_class(plant: Path) -> None:
     assert (found[0]["voltage"], found[0]["power"], found[0]["energy"]) == (230.5, -12.3, 123456)
 
 
+@pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.usefixtures("_unpainted")
 def test_a_plant_of_two_files_from_the_wire_to_the_report(

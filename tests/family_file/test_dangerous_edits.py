@@ -299,6 +299,7 @@ EDITS: dict[str, tuple[Change, str]] = {
 }
 
 
+@pytest.mark.long
 @table("name", EDITS)
 def test_a_dangerous_edit_is_refused(name: str) -> None:
     document = document_of("abb")

@@ -86,6 +86,7 @@ def damaged(draw: st.DrawFn) -> tuple[str, dict[str, Any]]:
     return name, document
 
 
+@pytest.mark.long
 @settings(max_examples=examples(500))
 @given(damaged())
 def test_damaged_documents_are_told_about(case: tuple[str, dict[str, Any]]) -> None:

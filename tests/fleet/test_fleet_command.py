@@ -207,6 +207,7 @@ def test_two_gateways_of_one_name_on_one_machine(run: Run, tmp_path: Path, nobod
     assert "another gateway of this machine runs with" in said
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_what_is_made_and_shown(run: Run, nats: Cluster, tmp_path: Path) -> None:
     servers = ("--nats", ",".join(nats.urls))

@@ -81,6 +81,7 @@ def test_what_became_of_the_answers(
     assert judge_drive(found, answered, kill) == expected
 
 
+@pytest.mark.long
 def test_a_value_that_was_not_asked_for_explains_no_missing_answer(tmp_path: Path) -> None:
     statuses = [status for status in STATUSES if status]
     (tmp_path / "rows").mkdir()

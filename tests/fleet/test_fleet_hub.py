@@ -223,6 +223,7 @@ def kept_in_files(client: Client, folder: Path, place: int) -> Any:
     return live()
 
 
+@pytest.mark.long
 def test_files_are_a_history_and_read_by_duckdb(running: Cluster, tmp_path: Path) -> None:
     duckdb = require_module("duckdb")
 
@@ -333,6 +334,7 @@ def test_rows_come_back_from_postgresql(running: Cluster, empty: Postgres) -> No
     assert empty.ask("select count(*) from multidrop.exchanges") == [(25,)]
 
 
+@pytest.mark.long
 def test_values_that_are_missing_in_part(empty: Postgres) -> None:
     sink = PostgresSink(empty.where)
     sink.begin("then")
@@ -405,6 +407,7 @@ def test_no_database(empty: Postgres) -> None:
         PostgresSink(empty.where.replace("dbname=postgres", "dbname=nope")).begin("then")
 
 
+@pytest.mark.long
 def test_rights_that_do_not_suffice(empty: Postgres) -> None:
     empty.ask("drop role if exists reader; create role reader login")
     sink = PostgresSink(empty.where.replace("user=multidrop", "user=reader"))

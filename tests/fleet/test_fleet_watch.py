@@ -65,6 +65,7 @@ def test_what_is_shown() -> None:
     assert "1970-01-01 01:02:03  line-1  from gw-1  to gw-2" in text
 
 
+@pytest.mark.long
 @table("height", range(1, 60))
 def test_each_size_has_its_picture(height: int) -> None:
     for width in (20, 80, 200):

@@ -67,6 +67,7 @@ def settled(spool: Spool, most: int) -> SpoolState:
     return spool.state()
 
 
+@pytest.mark.long
 def test_nats_is_away_for_longer_than_the_spool_can_keep(tmp_path: Path, most: int) -> None:
     """Rows that are kept, and rows that the spool counts as lost, are all that there were."""
     require_module("duckdb")
@@ -91,6 +92,7 @@ def test_nats_is_away_for_longer_than_the_spool_can_keep(tmp_path: Path, most: i
     assert exchanges_in(rows) == list(range(state.missing * EXCHANGES, MESSAGES * EXCHANGES))
 
 
+@pytest.mark.long
 def test_the_hub_is_away_and_the_spool_full_of_what_was_forwarded(tmp_path: Path, most: int) -> None:
     """The stream has it: nothing is lost where the spool removes it."""
     with cluster(tmp_path / "nats", 1) as servers:

@@ -106,6 +106,7 @@ def test_rows_of_another_poller_are_not_mixed_in() -> None:
     assert buffer.add(numbered(10, 10, more).columns())  # the same poller, which knows more drives
 
 
+@pytest.mark.long
 def test_damaged_bytes_end_in_a_sentence() -> None:
     (message,) = packed(numbered(0, 40))
     whole = unpack(message.data)

@@ -169,6 +169,7 @@ def test_plots_of_a_hubs_folder_put_no_two_units_together(kept: Path, points: in
     assert (sum(before.n), before.unit, before.left_out) == (5, "V", ())
 
 
+@pytest.mark.long
 def test_rows_of_a_hubs_folder_have_a_column_for_each_unit(kept: Path, tmp_path: Path) -> None:
     with History(kept) as history:
         rows = history.read("pump-1.value_1", BEGIN, END)

@@ -48,6 +48,7 @@ def with_client(servers: Cluster, work: Callable[[Client], Awaitable[object]]) -
     asyncio.run(live())
 
 
+@pytest.mark.long
 def test_a_stream_that_is_full_leaves_room_for_records(run: Run, tmp_path: Path) -> None:
     async def fill(client: Client) -> None:
         for _ in range(60):
@@ -73,6 +74,7 @@ def test_servers_that_have_less_room_are_one_sentence(run: Run, tmp_path: Path, 
     assert "the servers of NATS have no room for so many samples: keep less by" in err
 
 
+@pytest.mark.long
 def test_a_stream_that_is_there_stays_and_is_told_of(run: Run, tmp_path: Path) -> None:
     with cluster(tmp_path / "nats", 1) as one:
         with_client(one, lambda client: create_stream(client, replicas=1))

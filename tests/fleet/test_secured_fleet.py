@@ -181,6 +181,7 @@ def test_mistaken_credentials_are_one_sentence(
     assert status == 1 or not (tmp_path / "h").exists()  # a mistake of the call makes no folder
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_nothing_is_said_to_a_server_that_does_not_begin_with_tls(
     run: Run, servers: SecuredCluster, tmp_path: Path
@@ -203,6 +204,7 @@ def test_a_server_that_begins_with_tls_is_not_met_in_the_clear(run: Run, servers
     assert "it said nothing in time; one that begins with TLS is named with tls://" in err
 
 
+@pytest.mark.long
 def test_a_context_for_tls_believes_this_authority_alone(servers: SecuredCluster) -> None:
     context = servers.options("hub")["tls"]
     assert context.verify_mode is ssl.CERT_REQUIRED

@@ -116,6 +116,7 @@ def test_servers_that_do_not_look_at_all_writers_records_are_refused(
         asyncio.run(_init(nats.urls))
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_no_quorum_is_one_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(setup, "WAIT_S", 1.0)
@@ -191,6 +192,7 @@ def test_a_bucket_without_a_leader_is_no_quorum(fleet: Cluster, monkeypatch: pyt
         asyncio.run(_check(fleet))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("ahead_s", "words"), [(3600, "is 3600 s ahead of"), (-3600, "is 3600 s behind")])
 def test_a_clock_an_hour_away_is_told_of(
     fleet: Cluster,

@@ -172,6 +172,7 @@ def one(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cluster]:
         yield running
 
 
+@pytest.mark.long
 def test_servers_give_the_newest_records_of_many_lines(one: Cluster) -> None:
     async def main() -> None:
         path = paths_of(one.urls)[0]

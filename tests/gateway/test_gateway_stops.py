@@ -91,6 +91,7 @@ def gateway(tmp_path: Path) -> Iterator[Served]:
         yield gateway
 
 
+@pytest.mark.long
 @pytest.mark.slow
 @table("body", UNREADABLE.values(), ids=UNREADABLE)
 def test_a_stop_whose_body_cannot_be_read_is_one_of_all_drives(
@@ -310,6 +311,7 @@ def test_without_threads_all_stops_are_sent_before_one_is_waited_for(
     assert done == [("a", None), ("b", 0.0), ("c", 0.0), ("b", None), ("c", None)]
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_a_silent_drives_stop_says_so_and_holds_no_other_up(tmp_path: Path) -> None:
     with served(tmp_path, MAY) as gateway:

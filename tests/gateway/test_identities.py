@@ -20,6 +20,7 @@ from multidrop.gateway.identities import Identities
 MAY = '[serve.may]\nstop = "anyone"\n'
 
 
+@pytest.mark.long
 def test_a_first_stop_is_sent_at_once(tmp_path: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """Nothing is asked about a drive's identity between the call and its stop word."""
     asked: list[str] = []

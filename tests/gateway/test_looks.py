@@ -109,6 +109,7 @@ def test_a_fault_is_told_in_the_drives_words(gateway: Served) -> None:
     until(lambda: gateway.frame()["drives"]["pump-1"]["fault"] == "OC1_OVERCURRENT_ACCELERATING")
 
 
+@pytest.mark.long
 def test_one_drive_shows_what_is_not_polled_while_somebody_looks(
     gateway: Served, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -130,6 +131,7 @@ def test_one_drive_shows_what_is_not_polled_while_somebody_looks(
     until(lambda: not gateway.gateway.side_reads.under_way)
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_a_silent_drive_is_not_read_by_those_who_look(gateway: Served) -> None:
     gateway.sims["pump-2"].deaf_until = float("inf")
@@ -144,6 +146,7 @@ def test_a_silent_drive_is_not_read_by_those_who_look(gateway: Served) -> None:
     assert asked == []
 
 
+@pytest.mark.long
 def test_lines_show_what_each_drive_costs(gateway: Served) -> None:
     until(lambda: gateway.get("/api/lines").json["hall"]["minutes"])
     line = gateway.get("/api/lines").json["hall"]

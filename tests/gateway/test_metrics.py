@@ -34,6 +34,7 @@ def states(gateway: Served) -> dict[str, str]:
     return {one.labels["drive"]: one.labels["multidrop_drive_state"] for one in found if one.value}
 
 
+@pytest.mark.long
 def test_values_states_and_counters(tmp_path: Path) -> None:
     odd = 'fan, the \\"old\\" one'  # as TOML has it
     with served(tmp_path, "", "pump-1", odd) as gateway:
@@ -59,6 +60,7 @@ def unanswered(gateway: Served) -> float:
     return sum(float(one.value) for one in misses if one.labels["reason"] == "no reply")
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_a_silent_drives_values_vanish_and_come_back(tmp_path: Path) -> None:
     with served(tmp_path) as gateway:

@@ -353,6 +353,7 @@ dc_bus_voltage = { at = 0x3002, unit = "A", step = 0.5, place = "1" }
 """  # of a register that INVT CHE has as a raw count
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_rows_amid_a_reload_are_described_as_what_they_were_read_as(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -162,6 +162,7 @@ def test_a_part_that_takes_its_time_to_open_holds_no_stop_up(
     assert told == [IN_EFFECT]
 
 
+@pytest.mark.long
 def test_a_history_begins_changes_and_ends(gateway: Served, tmp_path: Path) -> None:
     assert gateway.get("/api/export?from=0&to=1&series=pump-1.status").status == 404
     for folder in ("first", "second"):

@@ -25,6 +25,7 @@ from multidrop.gateway.rights import Right, digest, read_tokens
 UNIT = Path(__file__).parents[2] / "packaging" / "multidrop@.service"
 
 
+@pytest.mark.long
 def test_ready_alive_and_stopping_are_told_and_the_log_is_json(tmp_path: Path) -> None:
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
         manager.bind(str(tmp_path / "notify"))
@@ -92,6 +93,7 @@ def test_the_demo_has_no_file_to_be_read_again(tmp_path: Path) -> None:
         assert (told["done"], told["text"]) == (False, "this plant has no file to be read again")
 
 
+@pytest.mark.long
 def test_sigterm_ends_it_while_viewers_wait(tmp_path: Path) -> None:
     with ExitStack() as stack:
         path = stack.enter_context(simulated_plant(tmp_path, '[serve]\nlisten = "127.0.0.1:0"\n'))
@@ -113,6 +115,7 @@ def test_sigterm_ends_it_while_viewers_wait(tmp_path: Path) -> None:
         assert "Traceback" not in errors
 
 
+@pytest.mark.long
 def test_tls(tmp_path: Path) -> None:
     certificate(tmp_path, "own")
     serve = '[serve]\nlisten = "127.0.0.1:0"\ncertificate = "own.pem"\nkey = "own.key"\ntokens = "tokens"\n'

@@ -84,6 +84,7 @@ def test_tens_are_what_plain_python_reckons(tmp_path: Path) -> None:
             assert (least, mean, most, last) == (None, None, None, None)
 
 
+@pytest.mark.long
 def test_hours_that_are_over_become_one_file_of_tens(tmp_path: Path) -> None:
     begins = [NOON + 1200 * SECOND * number for number in range(5)]
     record(tmp_path, [random_rows(number, begin, 20) for number, begin in enumerate(begins)])
@@ -96,6 +97,7 @@ def test_hours_that_are_over_become_one_file_of_tens(tmp_path: Path) -> None:
     assert len(parquet_files(tmp_path / "tens")) == 2
 
 
+@pytest.mark.long
 def test_days_that_are_over_become_one_file_of_tens(tmp_path: Path) -> None:
     rows = segments()
     record(tmp_path, rows)
@@ -178,6 +180,7 @@ def test_killed_in_the_middle(tmp_path: Path) -> None:
     assert not listing(tmp_path).segments
 
 
+@pytest.mark.long
 def test_one_process_compacts_at_a_time(tmp_path: Path) -> None:
     record(tmp_path, segments())
     lock = FileLock(tmp_path / ".compact.lock")
@@ -188,6 +191,7 @@ def test_one_process_compacts_at_a_time(tmp_path: Path) -> None:
     assert len(listing(tmp_path).segments) == 0
 
 
+@pytest.mark.long
 def test_a_damaged_segment_is_read_as_far_as_it_can_be_and_kept(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -222,6 +226,7 @@ def _readable(path: Path) -> list[Row]:
     return found
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("content", usually(b"\0" * 5000, b"", b"\xff\xff\xff\xff"))
 def test_a_segment_without_a_head(tmp_path: Path, content: bytes) -> None:
     """A machine that lost power may leave a file of nothing, or of zeros."""

@@ -73,6 +73,7 @@ def test_a_series_in_a_range(folder: Path, rows: list[list[Row]]) -> None:
             assert rows_in(history, names, begin, end) == wanted
 
 
+@pytest.mark.long
 @COMPACTED
 def test_buckets_are_what_plain_python_reckons(folder: Path, rows: list[list[Row]]) -> None:
     dice = random.Random(6)
@@ -244,6 +245,7 @@ def test_a_recording_in_segments_of_poll(tmp_path: Path) -> None:
         assert rows_in(history) == rows
 
 
+@pytest.mark.long
 def test_damage_anywhere_hides_no_other_segment(tmp_path: Path) -> None:
     rows = [random_rows(number, NOON + number * 60 * SECOND, 120) for number in range(3)]
     record(tmp_path, rows)

@@ -216,6 +216,7 @@ def test_a_mistake_of_ours_does_not_end_the_recording(
 # ---- compaction and retention ----
 
 
+@pytest.mark.long
 def test_closed_segments_are_compacted_and_what_is_too_old_goes(
     tmp_path: Path, writers: Callable[..., HistoryWriter]
 ) -> None:

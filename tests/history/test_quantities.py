@@ -148,6 +148,7 @@ def columns_of(recording: Iterable[Rows]) -> dict[str, set[float | None]]:
 PARTED = {SERIES: {10.0, 1000.0}, f"{SERIES} [A]": {1.0, 100.0}, OTHER: {1.0, 10.0, 100.0, 1000.0}}
 
 
+@pytest.mark.long
 def test_two_units_are_no_column(tmp_path: Path, how: str) -> None:
     """Rows of another quantity are in a column that says so, wherever they are read or written to."""
     (tmp_path / "h").mkdir()
@@ -197,6 +198,7 @@ def test_two_tables_of_names_are_two_columns(tmp_path: Path) -> None:
     assert registers["load [names 2]"]["values"] == STATES["values"]
 
 
+@pytest.mark.long
 def test_compacted_rows_say_their_units(tmp_path: Path) -> None:
     duckdb = pytest.importorskip("duckdb", reason="needs duckdb")
     recorded(tmp_path, AMPERE, RAW, STATES, {})

@@ -88,6 +88,7 @@ def damaged(seed: int) -> bytes:
     return b"".join(words)
 
 
+@pytest.mark.long
 @settings(
     max_examples=examples(400), deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
 )

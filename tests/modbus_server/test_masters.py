@@ -201,6 +201,7 @@ def test_all_words_are_the_drives_own(rig: Rig, master: Master) -> None:
     assert rig.server.answered["passed"] - before["passed"] > 10
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_words_from_rows_are_those_that_the_line_has(rig: Rig, master: Master) -> None:
     """Every polled register that is whole is answered without the line, and as the line itself answers."""

@@ -74,6 +74,7 @@ def test_a_flood_has_a_fifth_of_the_line_s_time_and_all_of_it(seconds: float) ->
     run_controlled(main())
 
 
+@pytest.mark.long
 def test_no_second_begins_with_more_than_its_share_and_what_was_saved() -> None:
     async def main() -> None:
         share, line = LineShare(), PacedLine(0.01)

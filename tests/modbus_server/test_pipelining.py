@@ -107,6 +107,7 @@ def all_clients(gateway: Gateway, requests: int) -> None:
     assert sum(passed) > 10  # answers came out of order too
 
 
+@pytest.mark.long
 def test_thousands_of_requests_are_answered_under_their_own_ids(gateway: Gateway) -> None:
     all_clients(gateway, 8_000)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
+import pytest
 from brokers import sparkplug_messages
 from hypothesis import given
 from hypothesis import strategies as st
@@ -39,6 +40,7 @@ def value_of(metric: Any) -> object:
     return value - 2**64 if metric.datatype == DataType.INT64 and value >= 2**63 else value
 
 
+@pytest.mark.long
 @given(st.integers(0, 2**63), st.lists(metrics, max_size=5), st.none() | st.integers(0, 255))
 def test_a_host_reads_what_was_said(time_ms: int, said: list[Metric], seq: int | None) -> None:
     received = sparkplug_messages().Payload.FromString(payload(time_ms, said, seq))

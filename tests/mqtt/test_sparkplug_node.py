@@ -89,6 +89,7 @@ def test_what_did_not_change_is_not_said(host: Host, node: tuple[Any, Running]) 
     assert host.kinds.count("DDATA") == 1
 
 
+@pytest.mark.long
 def test_sequence_numbers_begin_again_after_255(host: Host, node: tuple[Any, Running]) -> None:
     known, running = node
     host.wait_for("DBIRTH", FAN.name)

@@ -78,6 +78,7 @@ def test_requests_as_libmodbus_s_server_understands_them(libmodbus: Libmodbus) -
     assert answers > NUMBER / 3
 
 
+@pytest.mark.long
 def test_requests_and_replies_as_libmodbus_s_client_has_them(libmodbus: Libmodbus) -> None:
     replies = [frame for frame in frames(2, RTU, NUMBER, replies=True) if frame.request.function != 0x08]
     differences = []
@@ -98,6 +99,7 @@ def name(framing: Framing) -> str:
     return {RTU: PYMODBUS_RTU, ASCII: PYMODBUS_ASCII}[framing]
 
 
+@pytest.mark.long
 @framings
 def test_requests_as_pymodbus_s_server_understands_them(framing: Framing) -> None:
     pymodbus = Pymodbus(framing)
@@ -108,6 +110,7 @@ def test_requests_as_pymodbus_s_server_understands_them(framing: Framing) -> Non
     explain(differences, REQUESTS, name(framing))
 
 
+@pytest.mark.long
 @framings
 def test_replies_as_pymodbus_s_client_understands_them(framing: Framing) -> None:
     pymodbus = Pymodbus(framing)

@@ -197,6 +197,7 @@ class Scattered(Drive):
     r0, r1, r2, r3, r4, r5, r6, r7, r8, r9 = (reading(address) for address in addresses_of)
 
 
+@pytest.mark.long
 @settings(max_examples=examples(200))
 @given(
     st.sets(st.sampled_from(list(Scattered.registers.values())), min_size=1, max_size=8),

@@ -211,6 +211,7 @@ def test_the_core_s_line_takes_what_was_predicted(wanted: list[tuple[str, int, i
 PERIODS = st.sampled_from([None, 0.02, 0.1, 0.5, 2.0])
 
 
+@pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.story
 @settings(max_examples=examples(40), deadline=None)

@@ -228,6 +228,7 @@ def test_all_silent_drives_together_cost_their_share() -> None:
     assert 0.01 < asked * cost_ms / 3_600_000 <= 0.02
 
 
+@pytest.mark.long
 @pytest.mark.story
 @pytest.mark.parametrize("dead", usually(10, 1, 5))
 @pytest.mark.parametrize("period_ms", [None, 400], ids=["in turn", "at a rate"])

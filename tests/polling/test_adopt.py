@@ -90,6 +90,7 @@ OTHERS = (
 )
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("every", usually(None, 0.1, 0.08), ids=str)
 def test_an_untouched_line_loses_no_slot(every: float | None) -> None:
     """Its exchanges leave at the very nanoseconds at which they leave without any adoption."""
@@ -209,6 +210,7 @@ def test_a_line_with_a_new_name_keeps_its_port() -> None:
 # ---- lines that come and go ----
 
 
+@pytest.mark.long
 def test_lines_come_and_go() -> None:
     with clocked(hall(*pumps())) as made:
         made.run(2)
@@ -381,6 +383,7 @@ def broken() -> dict[str, tuple[Plant, str]]:
     }
 
 
+@pytest.mark.long
 @table("mistake", broken())
 def test_a_broken_plant_changes_nothing(mistake: str) -> None:
     wrong, sentence = broken()[mistake]
@@ -514,6 +517,7 @@ def test_a_name_s_code_stays_the_same() -> None:
 # ---- for ever ----
 
 
+@pytest.mark.long
 def test_memory_is_bounded_over_many_adoptions() -> None:
     with clocked(hall(*pumps()), yard(*fans())) as made:
 

@@ -72,6 +72,7 @@ EACH_ON_EACH = [
 ]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("name", "kind"), EACH_ON_EACH)
 def test_a_fault_and_its_end(name: str, kind: str) -> None:
     number = LINES[name]
@@ -84,6 +85,7 @@ def test_a_fault_and_its_end(name: str, kind: str) -> None:
     assert any(story.wire.struck[rate] for rate in RATES if getattr(KINDS[kind], rate))
 
 
+@pytest.mark.long
 @table("name", LINES)
 def test_an_adapter_that_always_echoes_is_known_for_it(name: str) -> None:
     story = Story(of_one_variant(LINES[name]))

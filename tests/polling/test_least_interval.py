@@ -58,6 +58,7 @@ def quick(address: int) -> tuple[Drive, Picky]:
     return drive, Picky(drive)
 
 
+@pytest.mark.long
 @table("every", [None, 0.01, 0.5])
 @table("others", [0, 2])
 def test_it_is_asked_no_sooner_and_all_its_registers_share_its_turns(

@@ -13,6 +13,7 @@ from multidrop.sim import EncodedDrive, Faults
 STEPS = 400
 
 
+@pytest.mark.long
 @table("seconds", [0.001, 0.003, 0.01, 0.03, 0.1])
 def test_a_line_is_never_used_for_longer_than_there_is(seconds: float) -> None:
     """An exchange that was under way at a look counts in the time after it, and so does all of its time."""

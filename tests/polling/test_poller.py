@@ -492,6 +492,7 @@ def test_a_lost_port_that_takes_its_time_does_not_hold_the_others_up(
     assert polling.statuses("pump-1").keys() <= {"ok"} | HOST_LATE
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_a_drive_that_dies_and_comes_back(pump: SimulatedDrive) -> None:
     other = simulated(drive(2, "pump-2"))

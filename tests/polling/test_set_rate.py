@@ -102,6 +102,7 @@ def test_registers_that_stay_keep_their_slots() -> None:
     assert len(rows) in (29, 30, 31)
 
 
+@pytest.mark.long
 def test_every_value_is_its_own_register_s_while_rates_change() -> None:
     """And each change leaves each register with rows: nothing is lost."""
     chance = random.Random(7)

@@ -45,6 +45,7 @@ print(json.dumps([[row.time, row.monotonic_ns] for row in rows if row.status == 
 """
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_rows_have_the_time_of_their_exchange(tmp_path: Path) -> None:
     sim = simulated(InvtCHE(1, baudrate=38400))

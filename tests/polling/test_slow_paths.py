@@ -52,6 +52,7 @@ READS = every_fourth(LINES, PATHS, [(name, (constant, 0.6)) for name in LINES])
 ASKED = [pair for pair in READS if "native" not in pair.values[0]]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("name", "slow"), STORIES)
 def test_a_slow_path_costs_time_and_no_truth(name: str, slow: tuple[Callable[[float], Delay], float]) -> None:
     path, seconds = slow
@@ -60,6 +61,7 @@ def test_a_slow_path_costs_time_and_no_truth(name: str, slow: tuple[Callable[[fl
     assert answering == {drive.name for drive in story.drives}
 
 
+@pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize(("name", "longest"), STALLS)
 def test_a_stall_costs_time_and_no_truth(name: str, longest: float) -> None:

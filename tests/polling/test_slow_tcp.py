@@ -80,6 +80,7 @@ def two_of(name: str) -> list[Drive]:
     return [FAMILIES[name](address, name=f"drive-{address}") for address in (1, 2)]
 
 
+@pytest.mark.long
 @STORIES
 @pytest.mark.parametrize(("name", "slow"), ON_PATHS)
 def test_a_slow_path_costs_time_and_no_truth(

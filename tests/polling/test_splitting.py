@@ -146,6 +146,7 @@ def test_a_device_that_is_silent_to_long_requests_is_read_in_shorter_ones(
     assert {count for _, count in sim.asked} == ({1} if longest == 1 else {6})
 
 
+@pytest.mark.long
 def test_a_dead_drive_is_never_split_and_is_read_as_a_whole_when_it_comes() -> None:
     drive = family(WIDE)(1, name="pump-1")
     sim = Picky(drive)
@@ -174,6 +175,7 @@ def test_a_drive_that_falls_silent_is_not_split() -> None:
     assert set(sim.asked) == {(0, WIDE)}
 
 
+@pytest.mark.long
 def test_a_noisy_line_splits_nothing_that_was_answered_once() -> None:
     drive = family(WIDE)(1, name="pump-1")
     sim = Picky(drive)

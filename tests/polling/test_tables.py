@@ -74,6 +74,7 @@ def test_a_library_that_is_missing_is_told_with_its_extra(
             getattr(table, method)()
 
 
+@pytest.mark.long
 def test_no_library_is_imported_before_it_is_needed() -> None:
     code = (
         "import sys, multidrop; multidrop.Poller, multidrop.read, multidrop.WideRows; "

@@ -243,6 +243,7 @@ def test_the_command_line_lists_and_checks_them(capsys: pytest.CaptureFixture[st
         assert ("nobody has tested it" in capsys.readouterr().out) is (name in SHIPPED_AS)
 
 
+@pytest.mark.long
 def test_nothing_of_them_is_read_before_one_is_asked_for() -> None:
     code = (
         "import sys, multidrop.drives.registry as registry; "

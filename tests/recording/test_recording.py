@@ -502,6 +502,7 @@ class Grown:
         return batch
 
 
+@pytest.mark.long
 def test_drives_that_come_later_have_their_names_for_every_reader(tmp_path: Path) -> None:
     """polars and nanoarrow read no deltas of dictionaries: each changed one is written anew."""
     polars = pytest.importorskip("polars", reason="needs polars")

@@ -76,6 +76,7 @@ def test_random_cuts_of_arrows_lose_only_what_is_not_whole(tmp_path: Path) -> No
         assert rows(reader) == expected[: batches * ROWS]
 
 
+@pytest.mark.long
 def test_a_cut_between_names_and_their_rows_leaves_what_all_can_read(tmp_path: Path) -> None:
     """Dictionaries go before their batch, and a cut may leave some of them, and no batch."""
     polars = pytest.importorskip("polars", reason="needs polars")
@@ -497,6 +498,7 @@ def test_damaged_metadata_of_csv_is_named(tmp_path: Path) -> None:
             open_reader(path)
 
 
+@pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize("suffix", FORMATS)
 def test_damage_anywhere_ends_in_a_sentence(tmp_path: Path, suffix: str) -> None:

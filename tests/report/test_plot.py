@@ -332,6 +332,7 @@ def test_thinning_keeps_every_extreme() -> None:
 # ---- pictures and pages ----
 
 
+@pytest.mark.long
 def test_there_is_a_panel_for_every_quantity_and_unit(look: Recording) -> None:
     figure, left = plot(look)
     titles = [axes.get_title(loc="left") for axes in figure.axes]
@@ -478,6 +479,7 @@ def test_a_number_without_a_name_is_no_sum_of_others(tmp_path: Path) -> None:
     ]
 
 
+@pytest.mark.long
 def test_a_panel_has_room_for_so_many_lanes_only(tmp_path: Path) -> None:
     bits = {f"B{bit}": 1 << bit for bit in range(16)}
     drives = [f"yd{number}" for number in range(80)]
@@ -547,6 +549,7 @@ def test_names_cannot_break_the_page(tmp_path: Path) -> None:
         assert "<b>" not in page
 
 
+@pytest.mark.long
 def test_a_recording_of_nothing_but_misses_has_a_report(tmp_path: Path) -> None:
     rows = [row(at, "pump", "output_frequency", None, "no reply") for at in range(3)]
     look = load(record(tmp_path / "it.arrows", rows))
@@ -583,6 +586,7 @@ def test_what_has_no_values_is_not_drawn(run: Run, tmp_path: Path) -> None:
     assert run("plot", path)[0] == 0
 
 
+@pytest.mark.long
 def test_a_single_row_has_a_report(tmp_path: Path) -> None:
     look = load(record(tmp_path / "it.arrows", [row(1, "pump", "output_frequency", 50.0)], pieces=1))
     assert "Report on it.arrows" in report_page(look)

@@ -132,6 +132,7 @@ def whole_scan() -> tuple[Line, list[object]]:
     return line, found(line, sweeps(FAMILIES))
 
 
+@pytest.mark.long
 @pytest.mark.story
 def test_all_eight_are_found_at_their_settings_and_nothing_else(
     whole_scan: tuple[Line, list[object]],
@@ -196,6 +197,7 @@ class Echo(Line):
         self.seen += frame
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("families", [FAMILIES, [DelixiNative]], ids=["all", "own protocol"])
 def test_an_echo_is_no_drive_and_hides_none(families: list[type]) -> None:
     there = [each for each in ALL_EIGHT if type(each) in families and each.settings.baudrate in (9600, 19200)]
@@ -204,6 +206,7 @@ def test_an_echo_is_no_drive_and_hides_none(families: list[type]) -> None:
     assert drives(found(line, plan, families)) == declared(*there)
 
 
+@pytest.mark.long
 def test_a_line_without_drives_has_none() -> None:
     quiet = Pair([simulated(InvtCHE(31))])
     for line in (Line(quiet), Echo(quiet)):
@@ -221,6 +224,7 @@ class Junk(Line):
             self.seen += b"\xf7\x00\x9c"[: 1 + len(self.sent) % 3]
 
 
+@pytest.mark.long
 def test_some_noise_is_neither_a_drive_nor_several() -> None:
     line = Junk(Pair([simulated(each) for each in ALL_EIGHT]))
     findings = found(line, sweeps(FAMILIES, addresses=range(1, 12), baudrates=[9600, 38400]))
@@ -503,6 +507,7 @@ def test_an_ibd_that_does_not_show_its_line_is_named_in_doubt() -> None:
     assert text.count("# confirmed = 1  # once its name plate says so") == 2
 
 
+@pytest.mark.long
 def test_what_has_other_bits_than_an_ibd_s_terminals_is_none() -> None:
     for bits in (0x0000, 0x0800, 0x1000, 0x9800, 0xFFFF):
         drive = Bare(InnovertIBD(3))

@@ -190,6 +190,7 @@ def test_requests_are_counted_by_function(sim: SimulatedDrive) -> None:
     assert (sim.counters.requests, sim.counters.replies) == (3, 3)
 
 
+@pytest.mark.long
 def test_writes_are_remembered_within_bounds(sim: SimulatedDrive) -> None:
     for _ in range(11_000):
         ask(sim, 6, 0x10, data=b"\x00\xc8")

@@ -31,6 +31,7 @@ def answer_to_another(drive: Drive) -> bytes:
     return said
 
 
+@pytest.mark.long
 @table("name", LINES)
 def test_its_answer_is_taken_for_no_other_register_s(name: str) -> None:
     """Every value is the register's own, from the first on."""

@@ -58,6 +58,7 @@ def split(chunks: list[bytes]) -> list[tuple[bytes, bytes]]:
     return found
 
 
+@pytest.mark.long
 @given(st.binary(max_size=200), st.lists(st.integers(0, 1000), max_size=20))
 def test_a_far_end_s_escaped_data_come_back(data: bytes, cuts: list[int]) -> None:
     near, far = socket.socketpair()

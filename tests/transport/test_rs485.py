@@ -134,6 +134,7 @@ def test_a_driver_that_refuses_is_told_of_in_a_sentence_and_nothing_is_sent(driv
         assert "write" not in [event.what for event in events]
 
 
+@pytest.mark.long
 def test_rts_that_breaks_loses_the_port_and_nothing_more_is_sent(driver: Path) -> None:
     said, events = play(driver, "rts-up", 9, RS485_CALLS=6)
     assert said[-1].endswith(f"the port was lost ({os.strerror(errno.EIO)})")
