@@ -37,6 +37,9 @@ SEGMENT_S = 600
 MIDNIGHT = 1_795_219_200 * SECOND  # 2026-11-21
 FULL_S = 3600  # of the day that have rows at 10 Hz
 DRIVES, REGISTERS = 31, 10
+UNIT = "Hz"
+DESCRIBED = {f"value_{number}": {"unit": UNIT} for number in range(REGISTERS)}
+METADATA = {"drives": {f"drive-{number}": {"registers": DESCRIBED} for number in range(DRIVES)}}
 COMPACTED = """
 import resource, subprocess, sys
 subprocess.run([sys.executable, "-m", "multidrop.history.compact", sys.argv[1], "--below", "2"], check=True)
@@ -61,12 +64,12 @@ def made(database: Any, begin_s: int, end_s: int, every: int = 1) -> None:
     insert, update = MADE.split(";")
     database.execute(insert, {"first": begin_s * 10 // every, "end": end_s * 10 // every, "every": every})
     database.execute(update)
-    database.execute("create or replace temp view told as select *, 'Hz' as unit from recorded")
+    database.execute(f"create or replace temp view told as select *, '{UNIT}' as unit from recorded")
 
 
 def recorded(database: Any, folder: Path, after: int) -> None:
     """Write what was made as a segment, in batches of 0.2 s."""
-    with SegmentWriter(folder / STEM, {}, every=1e9, after=after) as writer:
+    with SegmentWriter(folder / STEM, METADATA, every=1e9, after=after) as writer:
         for batch in rows_of(database, "from recorded order by time", {}):
             pieces: list[Any] = list(batch)
             for at in range(0, len(pieces), 620):
@@ -97,7 +100,7 @@ def make_day(folder: Path, hours: int) -> None:
             made(database, begin, begin + SEGMENT_S, 1 if begin < FULL_S else 10)
             span = MIDNIGHT + begin * SECOND, MIDNIGHT + (begin + SEGMENT_S) * SECOND
             for kind, query in (("tens", TENS.format("told")), ("rows", ROWS)):
-                copy_out(database, query, folder / kind / file_name(number, number, *span), {})
+                copy_out(database, query, folder / kind / file_name(number, number, *span), METADATA)
         made(database, hours * 3600 - SEGMENT_S // 2, hours * 3600)  # the end of the day once more, growing
         recorded(database, folder, segments)
     compact(folder, 0)  # one file of tens for each hour that is over
@@ -148,7 +151,7 @@ def taking() -> None:
     batch = Batch(rows, *names)
     found = []
     with TemporaryDirectory() as folder:
-        writer = HistoryWriter(folder, {})
+        writer = HistoryWriter(folder, METADATA)
         for _ in range(300):
             begun = time.perf_counter_ns()
             writer.take(batch)
@@ -192,7 +195,7 @@ def _merge(folder: Path, hours: int) -> None:
         number = hours * 3600 // SEGMENT_S + 5
         span = MIDNIGHT + 30 * 3600 * SECOND, MIDNIGHT + (30 * 3600 + 1) * SECOND
         for kind, query in (("tens", TENS.format("told")), ("rows", ROWS)):
-            copy_out(database, query, folder / kind / file_name(number, number, *span), {})
+            copy_out(database, query, folder / kind / file_name(number, number, *span), METADATA)
     compact(folder, 0)
 
 
