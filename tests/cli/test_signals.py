@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import os
 import signal
 from collections.abc import Iterator
 from pathlib import Path
@@ -13,6 +14,7 @@ from peers import require_module
 from recordings import recorded
 from terminals import closing_terminal
 
+from multidrop.cli.support import signals
 from multidrop.cli.support.signals import end_signals_interrupt, noting_signals, on_end_signals
 
 PATIENCE = 60.0
@@ -127,3 +129,47 @@ def test_the_demo_of_serve_ends_where_its_terminal_is_closed() -> None:
         terminal.wait_for("Ctrl-C ends it")
         terminal.close()
         assert terminal.process.wait(PATIENCE) >= 0  # no signal ended it
+
+
+@pytest.mark.slow
+def test_a_gateway_ends_with_its_terminal(tmp_path: Path) -> None:
+    require_module("uvicorn")
+    path = plant_file(tmp_path)
+    with path.open("a") as file:
+        file.write('[serve]\nlisten = "127.0.0.1:0"\n')
+    with closing_terminal("serve", path) as terminal:
+        terminal.wait_for("ready http")
+        path.write_text("no plant")
+        terminal.process.send_signal(signal.SIGHUP)
+        terminal.wait_for("reload, asked for by a signal")
+        terminal.close()
+        assert terminal.process.wait(PATIENCE) == 0
+
+
+@pytest.mark.parametrize(
+    ("before", "group", "reloads"),
+    [(signal.SIG_DFL, os.getpgrp(), 1), (signal.SIG_DFL, 1, 2), (signal.SIG_IGN, os.getpgrp(), 2)],
+    ids=["before a terminal", "in the background", "by nohup"],
+)
+def test_a_closed_terminal_ends_what_stood_on_it(
+    monkeypatch: pytest.MonkeyPatch, before: signal.Handlers, group: int, reloads: int
+) -> None:
+    came: list[str] = []
+    terminal: list[int | None] = [group]
+    monkeypatch.setattr(signals, "_foreground", lambda: terminal[-1])
+
+    async def service() -> None:
+        signals.on_reload_signal(lambda: came.append("reload"), lambda: came.append("end"))
+        for number in (1, 2):
+            hang_up()
+            async with asyncio.timeout(PATIENCE):
+                while len(came) < number:
+                    await asyncio.sleep(0)
+            terminal.append(None)
+
+    was = signal.signal(signal.SIGHUP, before)
+    try:
+        asyncio.run(service())
+    finally:
+        signal.signal(signal.SIGHUP, was)
+    assert came == ["reload"] * reloads + ["end"] * (2 - reloads)

@@ -7,7 +7,6 @@ import asyncio
 import json
 import logging
 import os
-import signal
 import sys
 import threading
 import webbrowser
@@ -23,7 +22,7 @@ from multidrop.cli.support.demo_plant import DRIVES, demo_port, plant_file, simu
 from multidrop.cli.support.extras import require_extra
 from multidrop.cli.support.output import print_text, warn
 from multidrop.cli.support.plants import add_port_option, plant_of
-from multidrop.cli.support.signals import on_end_signals
+from multidrop.cli.support.signals import on_end_signals, on_reload_signal
 from multidrop.drive.named_verbs import verbs_of
 from multidrop.drives import MODELS
 from multidrop.plant.loader import load_plant
@@ -148,8 +147,8 @@ def _serve(
 
     async def live() -> None:
         on_end_signals(gateway.end)
-        if read and sys.platform != "win32":  # it has no such signal: there the page's button reloads
-            asyncio.get_running_loop().add_signal_handler(signal.SIGHUP, gateway.reload.begin)
+        if read:
+            on_reload_signal(gateway.reload.begin, gateway.end)
         await gateway.run(lambda: on_ready(gateway.port))
 
     asyncio.run(live())

@@ -3,14 +3,17 @@
 The first two interrupt a command at once, but for polling and sniffing: there the first one is noted, so that
 what is under way is finished and recorded, and the second one interrupts. SIGHUP, of a terminal that is
 closed, ends a command as the first of them does, but for a stop, which goes on. Several of it mean no more.
+A service manager sends it too, to a gateway that is to read its plant file again.
 """
 
 from __future__ import annotations
 
+import os
 import signal
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from types import FrameType
 
 
@@ -113,3 +116,32 @@ def on_end_signals(end: Callable[[], object]) -> None:
             loop.add_signal_handler(number, first, number)
     for number in _hangup():
         loop.add_signal_handler(number, end_once)
+
+
+def on_reload_signal(reload: Callable[[], object], end: Callable[[], object]) -> None:
+    """Call `reload` in the running asyncio loop at each SIGHUP; `end`, once the terminal before it is closed.
+
+    In the background, and by nohup, a command has no use for its terminal. Windows has no such signal.
+    """
+    if sys.platform == "win32":
+        return
+    import asyncio
+
+    stands_on_terminal = bool(_hangup()) and _foreground() == os.getpgrp()
+
+    def come() -> None:
+        if stands_on_terminal and _foreground() is None:
+            end()
+        else:
+            reload()
+
+    asyncio.get_running_loop().add_signal_handler(signal.SIGHUP, come)
+
+
+def _foreground() -> int | None:
+    """Return the group of processes that has this process's terminal; None without a terminal."""
+    try:
+        with Path("/dev/tty").open("rb", buffering=0) as terminal:
+            return os.tcgetpgrp(terminal.fileno())
+    except OSError:
+        return None
