@@ -86,7 +86,7 @@ def check_stops(monkeypatch: pytest.MonkeyPatch, family: str, failure: str, step
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # as a script ends
 @pytest.mark.usefixtures("_unbounded")
-@pytest.mark.parametrize("step", [37, pytest.param(5, marks=pytest.mark.long)])
+@pytest.mark.parametrize("step", [37, pytest.param(11, marks=pytest.mark.long)])
 @pytest.mark.parametrize(("family", "failure"), in_turn(FAMILIES, [*FAILURES]))
 def test_a_motor_stands_though_its_stop_failed_at_some_line(
     monkeypatch: pytest.MonkeyPatch, family: str, failure: str, step: int
