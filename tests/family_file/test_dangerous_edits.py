@@ -29,7 +29,7 @@ from multidrop.drive.verbs import STOPPING
 from multidrop.errors import BusError, Unsupported
 
 # One edit in so many is tried.
-STEP = 1 if os.environ.get("EDITS") == "all" else 4 * PART
+STEP = 1 if os.environ.get("EDITS") == "all" else 8 * PART
 
 ADDRESS = 7
 Change = Callable[[Document], object]
