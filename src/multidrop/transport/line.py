@@ -171,6 +171,8 @@ class Line:
             try:
                 self.reopen()
             except LineError as failure:
+                self._why_closed = failure.reason
+                self._log.unopened(failure.reason)
                 raise PortLost(self.port, failure.reason) from failure
 
     # ---- what the port must do ----

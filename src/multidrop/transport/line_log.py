@@ -25,6 +25,7 @@ class LineLog:
         self._port = port
         self._foreign_here = 0  # of these on the port that is open now
         self._is_lost = False
+        self._why_unopened = ""
         self.forked()
 
     def forked(self) -> None:
@@ -35,13 +36,19 @@ class LineLog:
         """Log that the port was opened; no foreign byte has come on it yet."""
         again = " again" if self._is_lost else ""
         log_aside(_log, logging.INFO, "%s: opened%s (%s)", self._port, again, identity)
-        self._is_lost, self._foreign_here = False, 0
+        self._is_lost, self._foreign_here, self._why_unopened = False, 0, ""
 
     def lost(self, why: str) -> None:
         """Log that the port was lost, unless that is in the log already."""
         if not self._is_lost:
             self._is_lost = True
             log_aside(_log, logging.WARNING, "%s: lost (%s)", self._port, why)
+
+    def unopened(self, why: str) -> None:
+        """Log why a lost port is not opened again, unless that is the last thing in the log."""
+        if why != self._why_unopened:
+            self._why_unopened = why
+            log_aside(_log, logging.WARNING, "%s: not opened again: %s", self._port, why)
 
     def closed(self) -> None:
         log_aside(_log, logging.INFO, "%s: closed", self._port)

@@ -29,7 +29,9 @@ from multidrop.transport.opening import (
     unopened,
 )
 from multidrop.transport.overruns import overruns
+from multidrop.transport.usb_adapter import USBAdapter, adapter_of
 
+BY_PLACE = "/dev/serial/by-path/"  # names that mean whatever is plugged in there
 _NO_SETTINGS = -1
 _TRANSACTIONS = {
     TransactionIds.MATCH: Transactions.MATCHED,
@@ -58,6 +60,7 @@ class OpenPort:
         self._rs485 = rs485
         self._mastership = mastership
         self._serial: serial.SerialBase | None = None
+        self._adapter: USBAdapter | None = None  # with which it was open first
 
     def open(self) -> Port:
         """Open it for the core. Raises LineError, or one of PORT_FAILURES; then close it."""
@@ -67,11 +70,25 @@ class OpenPort:
             port.exclusive = True
             port.rts = self._rs485 is not RS485.RTS_UP  # else the transceiver sends once it is open
         port.open()
+        if isinstance(port, serial.Serial) and not self.name.startswith(BY_PLACE):
+            self._require_same_adapter(device_of(port))
         self.identity = identity_of(port, self.name)
         core = self._drive(port)
         with suppress(*PORT_FAILURES, AttributeError, NotImplementedError):
             port.set_low_latency_mode(True)  # a USB adapter else holds bytes back for 16 ms
         return core
+
+    def _require_same_adapter(self, device: str) -> None:
+        """Raise LineError where another adapter came back under this name: on its line are other motors."""
+        found = adapter_of(device)
+        if self._adapter is None:
+            self._adapter = found
+        elif found is None or not found.is_same(self._adapter):
+            raise LineError(
+                self.name,
+                f"another adapter has this name now ({found or 'none on USB'}, and not {self._adapter}); "
+                "if it is meant, begin anew; a name in /dev/serial/by-id stays with its adapter",
+            )
 
     def _drive(self, port: serial.SerialBase) -> Port:
         """Give the core a descriptor of this port."""

@@ -1,0 +1,160 @@
+"""A port's name that another USB adapter has when it comes back: its line is another, with other motors."""
+
+from __future__ import annotations
+
+from collections import Counter
+from contextlib import ExitStack
+from pathlib import Path
+
+import pytest
+from lines import line, plant, polled, rows_of, until
+from tables import table
+
+from multidrop import Poller
+from multidrop.drives import InnovertIBD
+from multidrop.errors import LineError, PortLost
+from multidrop.sim import EncodedDrive, Simulator, Wire
+from multidrop.transport import open_port, usb_adapter
+from multidrop.transport.line import Line
+from multidrop.transport.usb_adapter import USBAdapter, adapter_of
+
+USB = "devices/pci0000:00/0000:00:14.0/usb1"
+
+
+class Sysfs:
+    """A folder that tells of ttys as Linux does."""
+
+    def __init__(self, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.folder = folder
+        (folder / "class" / "tty").mkdir(parents=True)
+        monkeypatch.setattr(usb_adapter, "TTYS", folder / "class" / "tty")
+
+    def add(self, tty: str, device: str, serial: str = "", port_number: str = "") -> None:
+        found = self.folder / device
+        found.mkdir(parents=True, exist_ok=True)
+        if serial:
+            plugged_in = next(part for part in found.parents if ":" not in part.name)
+            (plugged_in / "serial").write_text(f"{serial}\n", "ascii")
+        if port_number:
+            (found / "port_number").write_text(f"{port_number}\n", "ascii")
+        (self.folder / "class" / "tty" / tty).mkdir(exist_ok=True)
+        link = self.folder / "class" / "tty" / tty / "device"
+        link.unlink(missing_ok=True)
+        link.symlink_to(found)
+
+    def plug_in(self, link: Path, place: str, serial: str = "") -> None:
+        """Have the port behind this link be an adapter's."""
+        self.add(link.resolve().name, f"{USB}/{place}/{place}:1.0/tty", serial)
+
+
+@pytest.fixture
+def sysfs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Sysfs:
+    return Sysfs(tmp_path / "sys", monkeypatch)
+
+
+def wire(link: Path) -> Wire:
+    return Wire([EncodedDrive(InnovertIBD(1))], port=str(link), unpaced=True)
+
+
+@table(
+    ("device", "serial", "port_number", "adapter"),
+    [
+        (f"{USB}/1-1/1-1:1.0/ttyUSB0", "A50285BI", "0", USBAdapter("1-1:1.0.0", "A50285BI:1.0.0")),
+        (f"{USB}/1-4/1-4.2/1-4.2:1.3/ttyUSB3", "FT6", "0", USBAdapter("1-4.2:1.3.0", "FT6:1.3.0")),
+        (
+            f"{USB}/1-1/1-1:1.0/ttyUSB1",
+            "MX",
+            "1",
+            USBAdapter("1-1:1.0.1", "MX:1.0.1"),
+        ),  # several of one interface
+        (f"{USB}/1-1/1-1:1.0/ttyUSB0", "", "0", USBAdapter("1-1:1.0.0", "")),  # as many CH340 are
+        (f"{USB}/1-3/1-3:1.0", "E66", "", USBAdapter("1-3:1.0.0", "E66:1.0.0")),  # ttyACM0
+        ("devices/pnp0/00:05", "", "", None),  # ttyS0
+    ],
+)
+def test_what_is_told_of_a_device(
+    tmp_path: Path, device: str, serial: str, port_number: str, adapter: USBAdapter | None
+) -> None:
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        sysfs = Sysfs(tmp_path / (device + port_number + serial).replace("/", "_"), monkeypatch)
+        sysfs.add("tty", device, serial, port_number)
+        assert adapter_of("/dev/tty") == adapter
+        assert adapter_of("/dev/other") is None
+
+
+@table(
+    ("before", "now", "is_same"),
+    [
+        (("1-1", "A1"), ("1-1", "A1"), True),
+        (("1-1", "A1"), ("1-2", "A1"), True),  # plugged in elsewhere
+        (("1-1", "A1"), ("1-2", "B2"), False),  # they came back in another order
+        (("1-1", "A1"), ("1-1", "B2"), False),  # somebody took another, and perhaps its line
+        (("1-1", ""), ("1-1", ""), True),
+        (("1-1", ""), ("1-2", ""), False),
+        (("1-1", "A1"), ("1-2", ""), False),
+    ],
+)
+def test_a_port_is_opened_again_with_the_same_adapter_alone(
+    tmp_path: Path, before: tuple[str, str], now: tuple[str, str], is_same: bool
+) -> None:
+    folder = tmp_path / "-".join(before + now)
+    link = folder / "ttyUSB0"
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        sysfs = Sysfs(folder / "sys", monkeypatch)
+        found = Line(str(link))
+        with Simulator([wire(link)]):
+            sysfs.plug_in(link, *before)
+            found.open()
+        with Simulator([wire(link)]):
+            sysfs.plug_in(link, *now)
+            if is_same:
+                found.reopen()
+            else:
+                with pytest.raises(LineError, match="another adapter has this name now"):
+                    found.reopen()
+            assert found.is_lost != is_same
+        found.close()
+
+
+def test_a_name_by_the_place_is_whatever_is_plugged_in_there(
+    tmp_path: Path, sysfs: Sysfs, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(open_port, "BY_PLACE", str(tmp_path))
+    link = tmp_path / "pci-0000:00:14.0-usb-0:1:1.0-port0"
+    found = Line(str(link))
+    for serial in ("A1", "B2"):
+        with Simulator([wire(link)]):
+            sysfs.plug_in(link, "1-1", serial)
+            found.reopen()
+    found.close()
+
+
+def test_another_line_is_not_polled_and_a_stop_is_not_sent_to_its_drive(
+    tmp_path: Path, sysfs: Sysfs, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Its drive would tell that it stands, while the motor that is meant goes on."""
+    link = tmp_path / "ttyUSB0"
+    pump = InnovertIBD(1, name="pump")
+    asked = line(str(link), polled(pump, [InnovertIBD.output_current]))
+    statuses: Counter[str] = Counter()
+    with ExitStack() as stack:
+        with Simulator([wire(link)]):
+            sysfs.plug_in(link, "1-1", "A1")
+            poller = stack.enter_context(Poller(plant(asked)))
+
+            def seen(status: str) -> bool:
+                statuses.update(row.status for row in rows_of(poller))
+                return statuses[status] > 0
+
+            until(lambda: seen("ok"))
+        with Simulator([another := wire(link)]):
+            sysfs.plug_in(link, "1-2", "B2")
+            until(lambda: "another adapter has this name now (B2:1.0.0, and not A1:1.0.0)" in caplog.text)
+            with pytest.raises(PortLost, match="another adapter has this name now"):
+                pump.stop(seconds=0.5)
+            assert another.drives[0].counters.requests == 0
+        statuses.clear()
+        with Simulator([wire(link)]):
+            sysfs.plug_in(link, "1-3", "A1")
+            until(lambda: seen("ok"))
+    assert caplog.text.count("not opened again: another adapter") == 1
