@@ -1,6 +1,6 @@
 """Member: the state machine of one gateway of a fleet.
 
-    OUTSIDE   no session. No line is polled. Ends with a session on two of three paths.
+    OUTSIDE   no session, or a lease that ran out. No line is polled. Ends with one on two of three paths.
     SETTLING  3 s from then on: lines of dead gateways and lines that others give away are taken, but none
               that nobody had, so that in a cold start each gateway takes its own share.
     WORKING   every line that the balance gives us is claimed, and polled from then on.
@@ -97,7 +97,7 @@ class Member:
 
     @property
     def state(self) -> MemberState:
-        if not self.lease.session:
+        if not self.lease.is_valid:
             return MemberState.OUTSIDE
         if self.is_draining:
             return MemberState.DRAINING
