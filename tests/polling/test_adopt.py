@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import sys
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise
+from types import FrameType
 
 import pytest
 from clocked_lines import ClockedLines, ClockedWire, S
@@ -21,6 +23,7 @@ from multidrop.errors import LineError, NoSuchPort
 from multidrop.plant.loader import PlantError
 from multidrop.plant.model import Plant, PlantLine, PolledDrive
 from multidrop.poller import Poller
+from multidrop.polling import adoption
 from multidrop.polling.batch import Row
 from multidrop.sim import EncodedDrive, Faults, proof
 
@@ -277,6 +280,29 @@ def test_a_plant_is_adopted_before_the_polling_too() -> None:
     assert_rate(rows, "pump-1", 10, 0.2)
     assert_rate(rows, "fan-1", 10, 0.1)
     assert statuses(rows, "pump-2") == set()
+
+
+def calls_to_add_one_to(count: int) -> int:
+    """Return the calls in the adoption of so many lines and one more."""
+    lines = [hall(toy(f"pump-{number}", 1), name=f"hall-{number}") for number in range(count)]
+    calls = 0
+
+    def note(frame: FrameType, event: str, argument: object) -> None:
+        nonlocal calls
+        calls += event == "call" and frame.f_code.co_filename == adoption.__file__
+
+    with clocked(*lines) as made:
+        sys.setprofile(note)
+        try:
+            made.poller.adopt(plant(*lines, yard(*fans())))
+        finally:
+            sys.setprofile(None)
+        assert_rate(made.run(10), "fan-1", 10, 0.1)
+    return calls
+
+
+def test_a_line_is_compared_with_each_of_the_others_once() -> None:
+    assert calls_to_add_one_to(24) < 2 * calls_to_add_one_to(12)
 
 
 def test_what_was_learnt_on_a_port_is_kept_when_it_is_opened_anew() -> None:
