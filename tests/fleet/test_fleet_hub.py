@@ -383,20 +383,31 @@ def test_samples_have_their_units(empty: Postgres, before: str) -> None:
     assert empty.ask("select count(*) from multidrop.register_sets") == [(3,)]
 
 
-def test_a_second_hub_of_one_database_is_kept_out(empty: Postgres) -> None:
+def test_a_second_hub_of_one_database_waits_for_the_end_of_the_first(empty: Postgres) -> None:
     one, other = PostgresSink(empty.where), PostgresSink(empty.where)
-    assert one.begin("then") == other.begin("then") == KeptPlace(0, {})
+    assert one.begin("then") == KeptPlace(0, {})
+    with pytest.raises(SinkError, match="another hub writes into this database; this one waits for its end"):
+        other.begin("then")
     one.write(commit_of())
-    with pytest.raises(SinkError, match="another hub writes into this database"):
-        other.write(commit_of())
-    assert empty.ask("select count(*) from multidrop.exchanges") == [(5,)]
+    assert one.begin("then") == KeptPlace(1, {"a.x": 1})  # as after a failure
+    one.close()
     assert other.begin("then") == KeptPlace(1, {"a.x": 1})
     with pytest.raises(
         NotThisHubs, match="made at then, and this one was made at now: name another database"
     ):
         other.begin("now")
-    one.close()
     other.close()
+
+
+def test_rows_behind_a_place_that_another_hub_has_moved_are_refused(empty: Postgres) -> None:
+    """Behind a pooler several may have the same lock."""
+    sink = PostgresSink(empty.where)
+    sink.begin("then")
+    empty.ask("update multidrop.hub set place = 7 returning place")
+    with pytest.raises(SinkError, match="another hub writes into this database: end one of them"):
+        sink.write(commit_of())
+    sink.close()
+    assert empty.ask("select count(*) from multidrop.exchanges") == [(0,)]
 
 
 def test_no_database(empty: Postgres) -> None:

@@ -10,6 +10,7 @@
 
 A row for each value would take four and a half times the disk. Rows come by COPY, in the transaction that
 moves the place on from where this hub left it. Where another hub has moved it, the transaction is refused.
+One hub at a time writes, and others wait for its end.
 A timestamptz has microseconds; `time_ns` is exact. The drive's monotonic clock is not kept.
 """
 
@@ -55,6 +56,11 @@ COPY = (
     "copy multidrop.exchanges (time, time_ns, uncertainty_us, drive, registers, values, misses)"
     " from stdin (format binary)"
 )
+# One hub has the database, while its connection lasts: a server that hears nothing of it ends that in 25 s.
+TAKEN = """
+set tcp_keepalives_idle = 10; set tcp_keepalives_interval = 5; set tcp_keepalives_count = 3;
+set lock_timeout = '3s'; select pg_advisory_lock(hashtext('multidrop hub that writes')); set lock_timeout = 0
+"""
 MOVE = "update multidrop.hub set place = %s, sources = %s where stream = %s and place = %s"
 
 
@@ -77,16 +83,18 @@ class PostgresSink:
         self.close()
         try:
             self._connection = psycopg.connect(
-                self._where, connect_timeout=ANSWER_S, application_name="multidrop hub"
+                self._where, connect_timeout=ANSWER_S, application_name="multidrop hub", autocommit=True
             )
+            self._connection.execute(TAKEN)
             self._drives, self._sets = {}, {}
             with self._connection.transaction():
                 return self._begin(self._connection, stream)
+        except psycopg.errors.LockNotAvailable as failure:
+            raise SinkError("another hub writes into this database; this one waits for its end") from failure
         except psycopg.Error as failure:
             raise SinkError(f"PostgreSQL: {_sentence(failure)}") from failure
 
     def _begin(self, connection: psycopg.Connection[Any], stream: str) -> KeptPlace:
-        connection.execute("select pg_advisory_xact_lock(hashtext('multidrop hub'))")  # two may begin
         if connection.execute(HAS_UNITS).fetchone() is None:
             connection.execute(TABLES)
         first = (
