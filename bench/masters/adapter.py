@@ -18,13 +18,14 @@ from multidrop._core import ffi, lib
 from bench.masters.jobs import REGISTERS, Job, expected
 from bench.players.replay import Played, Unpaced
 from multidrop.bus import Bus
-from multidrop.core import Columns, Field, Names, RowLayout
+from multidrop.core import Columns, Field, Mastership, Names, RowLayout
 from multidrop.plant.loader import load_plant
 from multidrop.poller import Poller
 from multidrop.polling.batch import Batch, Row
 from multidrop.recording import open_writer
 
 BATCH_ROWS = 1 << 14
+LEASE_NS = 3600 * 1_000_000_000
 
 
 def silence(baudrate: int) -> float:
@@ -45,13 +46,13 @@ def _plant_text(job: Job) -> str:
 
 
 @contextmanager
-def polling(job: Job) -> Iterator[Poller]:
+def polling(job: Job, mastership: Mastership | None = None) -> Iterator[Poller]:
     """All registers of all drives, as fast as the line allows."""
     with TemporaryDirectory() as directory:
         path = Path(directory) / "plant.toml"
         path.write_text(_plant_text(job))
         plant = load_plant(path)
-    with Poller(plant) as poller:
+    with Poller(plant, mastership=mastership) as poller:
         yield poller
 
 
@@ -72,7 +73,7 @@ def dropped(poller: Poller) -> int:
 
 
 @contextmanager
-def multidrop(job: Job) -> Iterator[Callable[[], tuple[int, int]]]:
+def multidrop(job: Job, mastership: Mastership | None = None) -> Iterator[Callable[[], tuple[int, int]]]:
     """Poll as a rival does: take batches of columns ten times a second, and check the last one."""
 
     def poll() -> tuple[int, int]:
@@ -85,8 +86,20 @@ def multidrop(job: Job) -> Iterator[Callable[[], tuple[int, int]]]:
     def last(batches: Iterable[Batch]) -> Iterable[Row]:
         return deque(batches, 1).pop()
 
-    with polling(job) as poller:
+    with polling(job, mastership) as poller:
         yield poll
+
+
+@contextmanager
+def leased(job: Job) -> Iterator[Callable[[], tuple[int, int]]]:
+    """Poll a line that other processes may take over: before each request the clock is looked at."""
+    mastership = Mastership()
+    mastership.extend(time.clock_gettime_ns(time.CLOCK_BOOTTIME) + LEASE_NS)
+    try:
+        with multidrop(job, mastership) as poll:
+            yield poll
+    finally:
+        mastership.end()
 
 
 @contextmanager

@@ -32,6 +32,14 @@ def multidrop(job: Job) -> Iterator[Poll]:
         yield poll
 
 
+@contextmanager
+def leased(job: Job) -> Iterator[Poll]:
+    from bench.masters import adapter
+
+    with adapter.leased(job) as poll:
+        yield poll
+
+
 # ---- masters that are called for each exchange: how to open, how to read ----
 
 
@@ -164,11 +172,13 @@ IN_PYTHON = {
     **{name: in_turn(reader) for name, reader in READERS.items()},
     "pymodbus-async": pymodbus_async,
     "bus.read_many": in_turn(reading_by_hand),
+    "multidrop, leased": leased,
 }
 MASTERS = (*IN_PYTHON, "libmodbus")
 
 INSTALL = {
     "bus.read_many": "multidrop",
+    "multidrop, leased": "multidrop",
     "pymodbus": "pymodbus==3.16.1",
     "pymodbus-async": "pymodbus==3.16.1",
     "minimalmodbus": "minimalmodbus==2.1.1",
