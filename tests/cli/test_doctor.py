@@ -143,11 +143,22 @@ def test_a_long_latency_timer_is_to_be_changed(sysfs: Path) -> None:
     [
         (latency_finding(Adapter("ttyUSB0", latency_timer=1)), "1 ms: the shortest there is", False),
         (latency_finding(Adapter("ttyS0")), "the driver has none that can be seen", False),
-        (adapter_finding(Adapter("ttyS0")), "not on USB; the system names no driver for it", False),
         (
-            adapter_finding(Adapter("ttyUSB0", "ch341", "QinHeng", "1a86:7523")),
+            adapter_finding(Adapter("ttyS0"), "/dev/ttyS0", "/dev/ttyS0"),
+            "not on USB; the system names no driver for it",
+            False,
+        ),
+        (
+            adapter_finding(
+                Adapter("ttyUSB0", "ch341", "QinHeng", "1a86:7523"), "/dev/ttyUSB0", "/dev/ttyUSB0"
+            ),
             "QinHeng (1a86:7523); its driver is ch341",
             False,
+        ),
+        (
+            adapter_finding(Adapter("ttyUSB0"), "/dev/ttyUSB0", "/dev/serial/by-id/usb-FTDI_A1-port0"),
+            "not on USB; the system names no driver for it",
+            True,
         ),
         (low_latency_finding(None), "the driver has no such flag", False),
         (

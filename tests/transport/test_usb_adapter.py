@@ -14,8 +14,9 @@ from multidrop import Poller
 from multidrop.drives import InnovertIBD
 from multidrop.errors import LineError, PortLost
 from multidrop.sim import EncodedDrive, Simulator, Wire
-from multidrop.transport import open_port, usb_adapter
+from multidrop.transport import open_port, port_identity, usb_adapter
 from multidrop.transport.line import Line
+from multidrop.transport.port_identity import lasting_name
 from multidrop.transport.usb_adapter import USBAdapter, adapter_of
 
 USB = "devices/pci0000:00/0000:00:14.0/usb1"
@@ -114,6 +115,25 @@ def test_a_port_is_opened_again_with_the_same_adapter_alone(
                     found.reopen()
             assert found.is_lost != is_same
         found.close()
+
+
+def test_a_plant_file_gets_the_name_that_lasts(
+    tmp_path: Path, sysfs: Sysfs, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    by_id, names = tmp_path / "by-id", {}
+    by_id.mkdir()
+    monkeypatch.setattr(port_identity, "BY_ID", by_id)
+    for number, serial in enumerate(("A50285BI", "")):
+        device = tmp_path / f"ttyUSB{number}"
+        device.touch()
+        names[device] = by_id / f"usb-FTDI_{serial}-if00-port0"
+        names[device].symlink_to(device)
+        sysfs.add(device.name, f"{USB}/1-{number}/1-{number}:1.0/{device.name}", serial)
+    named, nameless = names
+    assert lasting_name(str(named)) == str(names[named])
+    assert lasting_name(str(nameless)) == str(nameless)  # several adapters have that link's name in turn
+    for other in (str(names[named]), "/dev/ttyS0", "socket://127.0.0.1:4001", "COM5"):
+        assert lasting_name(other) == other
 
 
 def test_a_name_by_the_place_is_whatever_is_plugged_in_there(

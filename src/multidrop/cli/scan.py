@@ -36,6 +36,7 @@ from multidrop.scan import (
     sweeps,
 )
 from multidrop.transport.line import Line
+from multidrop.transport.port_identity import lasting_name
 
 _CLEAR_LINE = "\r\x1b[K"
 
@@ -75,7 +76,7 @@ def run(arguments: argparse.Namespace) -> int:
     drives = [finding for finding in found if isinstance(finding, Found)]
     written = None
     if arguments.out and any(drive.models for drive in drives):
-        arguments.out.write_text(plant_text(arguments.port, drives, families, rs485), "utf-8")
+        arguments.out.write_text(plant_text(lasting_name(arguments.port), drives, families, rs485), "utf-8")
         written = str(arguments.out)
     if arguments.json:
         record = {"port": arguments.port, "seconds": seconds, "finished": finished}

@@ -10,6 +10,7 @@ from pathlib import Path
 from urllib.parse import urlsplit
 
 from multidrop.drive.network import MODBUS_PORT, speaks_tcp
+from multidrop.transport.usb_adapter import adapter_of
 
 BY_ID = Path("/dev/serial/by-id")  # links that udev makes, with each adapter's serial number
 _PEER = re.compile(r"(\[[^\]]+\]|[\w.-]+):\d+")
@@ -30,6 +31,14 @@ def of_device(path: str) -> str:
     except OSError:
         links = []
     return next((str(link) for link in links if os.path.realpath(link) == device), device)
+
+
+def lasting_name(port: str) -> str:
+    """Return a device's name by the serial number of its adapter, if it has one; else the name as it is."""
+    if "://" in port or Path(port).is_symlink():
+        return port
+    adapter = adapter_of(port)
+    return of_device(port) if adapter and adapter.serial else port
 
 
 def of_connection(connection: socket.socket) -> str:

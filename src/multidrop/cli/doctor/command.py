@@ -56,6 +56,7 @@ from multidrop.plant.model import Plant
 from multidrop.transport.line import Line
 from multidrop.transport.mixed_up import other_port
 from multidrop.transport.peers import LEAST_TIMEOUT
+from multidrop.transport.port_identity import lasting_name
 from multidrop.transport.prepared import make_exchange
 
 MOST_S = 5.0  # that all rounds take, where the drive is slow or silent
@@ -211,7 +212,7 @@ def _opened(port: str, rs485: RS485) -> Iterator[Finding]:
     yield Finding("port", f"{port} is a serial port{link}")
     yield Finding("set here", SETTING_UP)
     adapter = find_adapter(device)
-    yield adapter_finding(adapter)
+    yield adapter_finding(adapter, port, lasting_name(port))
     fd = os.open(device, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
     try:
         yield low_latency_finding(low_latency(fd))

@@ -26,10 +26,12 @@ class Finding:
     is_failure: bool = False  # the named drive does not answer
 
 
-def adapter_finding(adapter: Adapter) -> Finding:
+def adapter_finding(adapter: Adapter, port: str, lasting: str) -> Finding:
+    """Say what it is; `lasting` is its name by the serial number, or the port's as it is."""
     product = f"{adapter.product or 'a USB device'} ({adapter.usb_id})" if adapter.usb_id else "not on USB"
     driver = f"its driver is {adapter.driver}" if adapter.driver else "the system names no driver for it"
-    return Finding("adapter", f"{product}; {driver}")
+    advice = f"call it {lasting} in plant files: {port} is whichever adapter came first"
+    return Finding("adapter", f"{product}; {driver}", advice if lasting != port else "")
 
 
 def latency_finding(adapter: Adapter) -> Finding:
