@@ -26,6 +26,7 @@ from multidrop.drives.yd1000 import YD1000
 from multidrop.errors import LineError
 from multidrop.scan import Crowd, Found, Noise, Progress, Sweep, Untried, plant_text, scan, sweeps
 from multidrop.sim import SimulatedDrive, Wire, simulated
+from multidrop.sim.che import SimulatedCHE
 from multidrop.sim.ibd import SimulatedIBD
 from multidrop.sim.protocol import Reason, Refusal
 
@@ -318,6 +319,22 @@ def test_a_drive_that_answers_late_is_found_all_the_same(delay: float) -> None:
     assert drives(findings) == declared(InvtCHE(3), InvtCHE(5))
     delays = {finding.address: finding.response_delay for finding in findings if isinstance(finding, Found)}
     assert delays[3] == pytest.approx(delay, abs=5e-3)
+
+
+class Hesitant(SimulatedCHE):
+    """Answers what a scan asks first at once, and all else late: a converter, or a busy computer."""
+
+    hurried = 3  # tries of a probe, after the sweep's own question
+
+    @property
+    def delay(self) -> float:
+        return super().delay if self.counters.requests <= 1 + self.hurried else 0.4
+
+
+def test_a_drive_that_answers_late_from_then_on_is_identified() -> None:
+    line = Line(Pair([Hesitant(InvtCHE(3))]))
+    plan = sweeps([InvtCHE], baudrates=[9600], formats=["8N1"])
+    assert drives(found(line, plan, FAMILIES)) == declared(InvtCHE(3))
 
 
 def test_a_slow_line_is_waited_for_longer_once_it_is_known() -> None:

@@ -15,12 +15,14 @@ from multidrop.transport.replies import good_reply
 
 MOST_TIMEOUT = 1.0  # s: for a drive of which only the address is known
 TRIES = 3
+LATE_NS = 500_000_000  # for which late replies are waited for
+SHORTEST_REPLY = 5  # bytes, of an exception; less is noise
 
 
 class Scan(Protocol):
     """The part of a scan that a probe needs."""
 
-    def ask(self, sweep: Sweep, request: Message, peer: Peer) -> Completion: ...
+    def ask(self, sweep: Sweep, request: Message, peer: Peer, not_before_ns: int = 0) -> Completion: ...
 
     def peer(self, least: float, most: float) -> Peer: ...
 
@@ -36,6 +38,8 @@ class Probe:
         self.answers = self.damaged = self.followed = 0
         self.excess = 0.0
         self._answered = False  # the last request
+        self._has_missed = False  # some request
+        self._asked_ns = 0
         for _ in range(TRIES):
             self._ask(sweep.request.to(address))
         self.response_delay = self._peer.response_delay
@@ -46,15 +50,17 @@ class Probe:
         self._answered = completion.result > 0
         self.answers += self._answered
         self.damaged += not self._answered and completion.result != Failure.NO_REPLY
+        self._has_missed |= not self._answered
+        self._asked_ns = completion.begun_ns
         return completion
 
     def found(self, families: Sequence[type[Drive]]) -> Found:
         """Identify the drive, as far as reading can."""
         # Its response delay is known by now: a short time-out shows what it does not answer.
         known = max(LEAST_TIMEOUT, 4 * self.response_delay)
-        self._peer = self._scan.peer(min(LEAST_TIMEOUT, known), known)
-        self._answered = False
-        drives, guess = identify(self._sweep, self._address, families, self._reply)
+        drives, guess = self._identify(families, LEAST_TIMEOUT, known)
+        if self._has_missed and not self._is_in_step():  # it became slower, or this computer did
+            drives, guess = self._identify(families, MOST_TIMEOUT, MOST_TIMEOUT)
         documented = max((drive.response_delay for drive in drives), default=LEAST_TIMEOUT)
         self.excess = self.response_delay - documented
         return Found(
@@ -65,6 +71,19 @@ class Probe:
             self.response_delay,
             "; ".join(filter(None, (guess, self._doubt()))),
         )
+
+    def _identify(
+        self, families: Sequence[type[Drive]], least_timeout: float, most_timeout: float
+    ) -> tuple[list[Drive], str]:
+        self._peer = self._scan.peer(least_timeout, most_timeout)
+        self._answered = self._has_missed = False
+        return identify(self._sweep, self._address, families, self._reply)
+
+    def _is_in_step(self) -> bool:
+        """Say whether no reply is late: one may have been taken for that to another question."""
+        request, peer = self._sweep.request.to(self._address), self._scan.peer(MOST_TIMEOUT, MOST_TIMEOUT)
+        found = self._scan.ask(self._sweep, request, peer, self._asked_ns + LATE_NS)
+        return found.result > 0 and found.stale < SHORTEST_REPLY
 
     def _reply(self, drive: Drive, request: Message) -> Message:
         for _ in range(TRIES):

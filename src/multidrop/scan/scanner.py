@@ -109,9 +109,9 @@ class _Scan:
                 self._crowded.add(_key(sweep, address))
                 yield Crowd(address, sweep.settings, sweep.framing)
 
-    def ask(self, sweep: Sweep, request: Message, peer: Peer) -> Completion:
+    def ask(self, sweep: Sweep, request: Message, peer: Peer, not_before_ns: int = 0) -> Completion:
         """Carry out an exchange; an echo of the request is no reply."""
-        completion = self._once(sweep, sweep.framing, request, peer)
+        completion = self._once(sweep, sweep.framing, request, peer, not_before_ns)
         if sweep.framing is not Framing.TCP and completion.raw == build_request(sweep.framing, request):
             # A reply may be a copy of its request here: an exchange in another framing shows an echo.
             other = Framing.ASCII if sweep.framing is Framing.RTU else Framing.RTU
@@ -121,7 +121,9 @@ class _Scan:
                 return completion.unanswered()
         return completion
 
-    def _once(self, sweep: Sweep, framing: Framing, request: Message, peer: Peer) -> Completion:
+    def _once(
+        self, sweep: Sweep, framing: Framing, request: Message, peer: Peer, not_before_ns: int = 0
+    ) -> Completion:
         settings = sweep.settings
         exchange = Exchange(
             framing,
@@ -132,9 +134,9 @@ class _Scan:
             character=settings.character,
             silence=sweep.silence,
         )
-        completion = self._carry_out(exchange)
+        completion = self._carry_out(exchange, not_before_ns=not_before_ns)
         if completion.result == Failure.LATE_ANSWER_DUE:
-            completion = self._carry_out(exchange, not_before_ns=peer.late_until_ns)
+            completion = self._carry_out(exchange, not_before_ns=max(not_before_ns, peer.late_until_ns))
         return completion
 
     def _sweep_peer(self, sweep: Sweep) -> Peer:
