@@ -154,6 +154,11 @@ class Bus:
         """True until it is closed."""
         return not self._is_closed
 
+    @property
+    def why_lost(self) -> str | None:
+        """Why its port does not come back: "/dev/ttyUSB0: there is no such port"; None while it is there."""
+        return self.line.why_lost
+
     def __enter__(self) -> Bus:
         return self
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
@@ -46,6 +47,20 @@ def test_the_other_lines_are_polled_and_it_comes_when_its_port_does(tmp_path: Pa
             until(lambda: 'multidrop_line_up{line="roof"} 1.0\n' in served.get("/metrics").body.decode())
             until(lambda: not gateway.hub.unopened)
             assert served.get("/health").json["status"] == "ok"
+
+
+def test_a_port_that_is_lost_later_says_why_too(tmp_path: Path) -> None:
+    port = tmp_path / "hall"
+    plant = written(tmp_path, SERVE, port=str(port))
+    gateway = Gateway(plant, read_settings(plant, {}))
+    with ExitStack() as stack:
+        with Simulator([Wire([simulated(InvtCHE(1, baudrate=38400))], unpaced=True, port=str(port))]):
+            stack.enter_context(running(gateway))
+            served = Served(gateway, {}, tokens()[0])
+            served.await_state("pump-1", "stands")
+        told = {"hall": f"{port}: there is no such port"}
+        until(lambda: served.get("/health").json["lines"] == told)
+        until(lambda: gateway.status == "STATUS=polling 0 lines; 1 lost")
 
 
 def test_no_port_at_all_is_told_and_waited_for(tmp_path: Path) -> None:

@@ -222,16 +222,16 @@ class Gateway:
         every = min(TICK_S, (notifier.watchdog_s or 4 * TICK_S) / 4)
         while True:
             if self.poller is not None:
-                self.guarded("statistics", self._read_statistics)
+                self.guarded("statistics", self._read_statistics, self.poller)
             self.guarded("connections", self.connections.sweep)
             self._has_news = True  # a frame's time is how a page knows that we live
             if notifier.watchdog_s:
                 notifier.tell("WATCHDOG=1")
             await asyncio.sleep(every)
 
-    def _read_statistics(self) -> None:
-        assert self.poller is not None
-        self.lately.tick(self.clock(), _utc_ms(), self.poller.statistics())
+    def _read_statistics(self, poller: Poller) -> None:
+        self.lately.tick(self.clock(), _utc_ms(), poller.statistics())
+        self.hub.unopened |= {line: why for line, bus in poller.buses.items() if (why := bus.why_lost)}
 
     def note_unopened(self, failures: Mapping[str, LineError]) -> None:
         """Log and keep the lines whose ports are not there, and why."""

@@ -66,6 +66,7 @@ class Line:
         self._log = LineLog(port)
         self._is_over = False
         self._why_closed = "it is closed"
+        self._why_lost: str | None = None
         self.why_closing: str | None = None  # why calls on it fail now, though `close` is yet to come
         self._make_locks()
         register_at_fork(self)
@@ -106,7 +107,7 @@ class Line:
             if self._tap:
                 core.tap(self._tap)
             self._log.opened(self.identity)
-            self.queue = core
+            self.queue, self._why_lost = core, None
         except LineError as failure:
             if not isinstance(failure, NoSuchPort):
                 self._let_go()
@@ -161,6 +162,11 @@ class Line:
         core = self.queue
         return not self._is_over and (core is None or core.lost)
 
+    @property
+    def why_lost(self) -> str | None:
+        """Why a lost port is not back, with its name; None where it is there, or was not tried yet."""
+        return f"{self.port}: {self._why_lost}" if self.is_lost and self._why_lost else None
+
     def regain(self) -> None:
         """Open it again if it is lost; PortLost when it is not there, and LineError once it was closed."""
         with self._lock:
@@ -171,7 +177,7 @@ class Line:
             try:
                 self.reopen()
             except LineError as failure:
-                self._why_closed = failure.reason
+                self._why_closed = self._why_lost = failure.reason
                 self._log.unopened(failure.reason)
                 raise PortLost(self.port, failure.reason) from failure
 
