@@ -447,6 +447,14 @@ def test_a_family_s_json_has_what_bounds_a_value(run: Run) -> None:
     assert "address 0" in json.loads(out)["no_broadcasts"]
 
 
+def test_the_list_of_families_is_at_most_80_columns_wide(run: Run) -> None:
+    _, out, _ = run("models")
+    assert max(map(len, out.splitlines())) <= 80
+    assert [name for name in MODELS if f"\n{name} " not in out] == []
+    titles = " ".join(out.split())
+    assert [family.title for family in MODELS.values() if family.title not in titles] == []
+
+
 @pytest.mark.parametrize("name", MODELS)
 def test_every_sheet_is_at_most_80_columns_wide(run: Run, name: str) -> None:
     _, out, _ = run("models", name)
