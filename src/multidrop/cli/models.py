@@ -48,7 +48,8 @@ def _family(model: str, drive: str | None) -> type[Drive]:
 def _list(families: list[type[Drive]]) -> str:
     rows = [("MODEL", "FRAMINGS", "ADDRESSES")]
     rows += [
-        (family.model, " ".join(map(str, family.framings)), range_text(family.addresses)) for family in families
+        (family.model, " ".join(map(str, family.framings)), range_text(family.addresses))
+        for family in families
     ]
     titles = ["FAMILY", *(family.title for family in families)]
     columns = [f"{row}  " for row in aligned(rows, "<<>")]
