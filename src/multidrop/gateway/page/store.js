@@ -113,12 +113,13 @@ export function reading(name, register, now) {
     ms: good.ms,
     status,
     age,
-    isOld: age > (status === "ok" ? limit(drive, register) : FAILED_LIMIT_MS) || !isLive(now),
+    isOld: age > (status === "ok" ? holdsFor(name, register) : FAILED_LIMIT_MS) || !isLive(now),
   };
 }
 
-function limit(drive, register) {
-  const period = drive.registers.get(register)?.period_s;
+// Return for how long, in ms, a value of a register holds.
+export function holdsFor(name, register) {
+  const period = store.drives.get(name)?.registers.get(register)?.period_s;
   return period ? Math.max(3000 * period, 1000) : UNPLANNED_LIMIT_MS;
 }
 
