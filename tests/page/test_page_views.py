@@ -254,6 +254,22 @@ def test_a_register_that_is_asked_seldom_has_no_gaps_between_its_answers(opened:
     assert drawn["mean"] == drawn["least"] == [20.0, 21.0, None, 22.0, *(None for _ in gap), 23.0]
 
 
+def test_numbers_of_an_axis_have_a_point_and_no_groups(opened: Opener) -> None:
+    """1,000 is one thousand to some, and one to others."""
+    page = opened(locale="de-DE")
+    told = page.evaluate("""async () => {
+        const { makePlot, line } = await import('/page/plots.js');
+        const place = document.body.appendChild(document.createElement('div'));
+        const plots = [[12000, 16000], [0.3, 0.9]].map(values =>
+            makePlot(place, [[1700000000, 1700000001], values], { series: [line(0, 'speed')], height: 150 }));
+        await new Promise(requestAnimationFrame);
+        place.remove();
+        return plots.map(plot => plot.axes[1]._values);
+    }""")
+    assert [number for number in told[0] if not number.isdigit()] == []
+    assert "0.5" in told[1]
+
+
 def test_without_history_the_page_says_so_and_goes_on(opened: Opener, gateway: FakeGateway) -> None:
     gateway.has_history = False
     page = opened("#/trends")
