@@ -29,12 +29,22 @@ export async function read(labels, from, to, points) {
 
 // A register may be asked less often than there are points: what lies between two answers is no gap.
 function withoutPauses(series, longest) {
-  let asked = -Infinity;
-  const kept = [...series.time.keys()].filter(i => {
-    const isAsked = series.mean[i] !== null || series.missed[i] > 0;
-    if (isAsked) asked = series.time[i];
-    return isAsked || series.time[i] - asked > longest;
-  });
+  const kept = [];
+  let pause = [],
+    before = -Infinity;
+  const keepLong = at => {
+    if (at - before > longest) kept.push(...pause);
+    pause = [];
+  };
+  for (const [i, at] of series.time.entries()) {
+    if (series.mean[i] === null && !series.missed[i]) pause.push(i);
+    else {
+      keepLong(at);
+      kept.push(i);
+      before = at;
+    }
+  }
+  keepLong(series.time.at(-1));
   return Object.fromEntries(COLUMNS.map(column => [column, kept.map(i => series[column][i])]));
 }
 
