@@ -8,8 +8,8 @@ export const label = (drive, register) => `${drive}.${register}`;
 
 const COLUMNS = ["time", "least", "mean", "most", "missed"];
 
-// Return {series: {label: {time, least, mean, most}}, step_ms}. A null is a gap: a value was missed, or nobody
-// asked for longer than a value holds. Raises Refused where no history is kept.
+// Return {series: {label: {time, least, mean, most}}, step_ms}. A null is a gap: a value was missed, or
+// nobody asked for longer than a value holds. Raises Refused where no history is kept.
 export async function read(labels, from, to, points) {
   const told = await get(
     `api/history?${query([
