@@ -81,7 +81,10 @@ def test_a_raw_count_stays_within_its_column(
     opened: Opener, gateway: FakeGateway, size: tuple[int, int]
 ) -> None:
     line = fake_plant.plant({})["lines"][0]
-    raw = [r | {"unit": "raw count", "digits": 3} if r["unit"] == "A" else r for r in line["drives"][0]["registers"]]
+    raw = [
+        r | {"unit": "raw count", "digits": 3} if r["unit"] == "A" else r
+        for r in line["drives"][0]["registers"]
+    ]
     gateway.plant_changes = {"lines": [line | {"drives": [d | {"registers": raw} for d in line["drives"]]}]}
     page = opened()
     page.set_viewport_size(dict(zip(("width", "height"), size, strict=True)))
