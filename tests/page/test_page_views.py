@@ -296,6 +296,9 @@ def test_faults_that_last_and_that_ended(opened: Opener) -> None:
     ]
     ended = page.locator("#fault-list section").nth(1).locator("tbody tr")
     assert re.search(r"pump-1\s+fault\s+overheating of the heatsink\s+7 min\s", ended.first.inner_text())
+    edges = "cells => cells.map(cell => cell.getBoundingClientRect().left)"
+    columns = [page.locator(".faults thead").nth(at).locator("th, td").evaluate_all(edges) for at in (0, 1)]
+    assert columns[0] == columns[1]
     ended.first.get_by_role("link", name="Trend").click()
     until(page, DRAWN)
     page.locator("#lane .fault", has_text="overheating").wait_for()

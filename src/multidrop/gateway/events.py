@@ -69,7 +69,7 @@ class Events:
         if before is not None and (text in (before.text, UNNAMED) or kind == SILENT):
             return
         if before is not None and before.text == UNNAMED:  # the same fault, which has its name now
-            self._lasting[drive, kind] = before._replace(text=text)
+            self._lasting[drive, kind] = Alarm(before.time, drive, text, None, kind)
             return
         self._end(time, drive, kind)
         self._lasting[drive, kind] = Alarm(time, drive, text, None, kind)
