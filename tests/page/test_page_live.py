@@ -216,15 +216,15 @@ def test_a_page_whose_scripts_do_not_come_says_that_it_stops_nothing(opened: Ope
 
 
 def test_no_line_is_drawn_over_what_the_page_did_not_see(opened: Opener) -> None:
-    """As where a laptop slept for an hour, in a plot of ten minutes."""
+    """A laptop slept for an hour."""
     page = opened()
     seen = page.evaluate("""() => import('/page/store.js').then(({ store, takeFrame }) => {
         const ring = store.drives.get('pump-1').pasts.get('output_frequency');
-        const told = s => takeFrame({ ...store.frame, time: String(BigInt(store.frame.time) + BigInt(s * 1e9)) });
+        const later = s => String(BigInt(store.frame.time) + BigInt(s * 1e9));
         const taken = [];
         for (const s of [1, 3600, 1]) {
             const before = ring.count;
-            told(s);
+            takeFrame({ ...store.frame, time: later(s) });
             taken.push(ring.since(-Infinity)[1].slice(before).map(value => value === null));
         }
         return taken;
