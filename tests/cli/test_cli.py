@@ -330,7 +330,8 @@ def test_a_port_that_fails_is_a_sentence_and_status_1(run: Run, port: str, sente
 def test_models_lists_the_families(run: Run) -> None:
     status, out, _ = run("models")
     assert status == 0
-    assert [line.split()[0] for line in out.splitlines()[1:-2]] == [*MODELS, *SHIPPED]
+    lines = [line for line in out.splitlines()[1:-2] if line[0] != " "]  # others go on with a title
+    assert [line.split()[0] for line in lines] == [*MODELS, *SHIPPED]
     _, out, _ = run("models", "--json")
     assert [family["model"] for family in json.loads(out)] == [*MODELS, *SHIPPED]
 
@@ -445,6 +446,14 @@ def test_a_family_s_json_has_what_bounds_a_value(run: Run) -> None:
     assert json.loads(out)["needed_silence_s"] == {"delixi": 0}
     _, out, _ = run("models", "erman-er-g-220", "--json")
     assert "address 0" in json.loads(out)["no_broadcasts"]
+
+
+def test_the_list_of_families_is_at_most_80_columns_wide(run: Run) -> None:
+    _, out, _ = run("models")
+    assert max(map(len, out.splitlines())) <= 80
+    assert [name for name in MODELS if f"\n{name} " not in out] == []
+    titles = " ".join(out.split())
+    assert [family.title for family in MODELS.values() if family.title not in titles] == []
 
 
 @pytest.mark.parametrize("name", MODELS)

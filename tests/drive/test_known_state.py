@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import math
 
+import pytest
+
 from multidrop import Condition, StateReader
 from multidrop.drive import Drive
 from multidrop.drive.declare import reading
 from multidrop.drive.script import Script, read
 from multidrop.drive.state import State
 from multidrop.drive.verbs import verb
+from multidrop.drives import MODELS
 
 RUNS, STANDS = State(Condition.RUNNING), State(Condition.STOPPED)
 
@@ -70,3 +73,30 @@ def test_a_family_that_notes_something_is_asked_each_time() -> None:
     reader = StateReader(Noting(1))
     shown = [reader.state({"speed": speed}) for speed in (25.0, 0.0, 0.0, 0.0, 25.0, 0.0, 0.0)]
     assert shown == [RUNS, RUNS, STANDS, STANDS, RUNS, RUNS, STANDS]
+
+
+# Words of the manuals. A Delixi by Modbus has no status: of a fault its code alone tells.
+@pytest.mark.parametrize(
+    ("model", "values", "condition"),
+    [
+        ("invt-che", {"status": 4.0}, Condition.FAULT),
+        ("invt-che", {"status": 3.0}, Condition.STOPPED),
+        ("delixi-native", {"status": 4.0}, Condition.FAULT),
+        ("delixi-modbus", {"output_frequency": 25.0}, None),
+    ],
+)
+def test_a_fault_is_known_by_a_status_alone(
+    model: str, values: dict[str, float], condition: Condition | None
+) -> None:
+    found = StateReader(MODELS[model](1)).state(values)
+    assert (found and found.condition) == condition
+    assert found is None or found.fault is None
+
+
+def test_a_faults_code_tells_its_name_when_it_comes() -> None:
+    reader = StateReader(MODELS["invt-che"](1))
+    assert reader.state({"status": 4.0}) == State(Condition.FAULT)
+    assert reader.state({"status": 4.0}) == State(Condition.FAULT)
+    named = reader.state({"status": 4.0, "fault": 4.0})
+    assert named == State(Condition.FAULT, fault="OC1_OVERCURRENT_ACCELERATING")
+    assert reader.state({"status": 4.0}) == State(Condition.FAULT)

@@ -89,6 +89,13 @@ def test_a_fault_has_the_drives_words(hub: Hub) -> None:
     assert hub.state("pump-2") == "unknown"
 
 
+def test_a_status_alone_shows_a_fault(hub: Hub) -> None:
+    hub.take(rows((10, STATUS, TRIPPED), (10, FREQUENCY, 0)))
+    assert hub.seen("pump-1") == Shown("fault", "it shows a fault")
+    hub.take(rows((11, FAULT, 4)))
+    assert hub.seen("pump-1").fault == "OC1_OVERCURRENT_ACCELERATING"
+
+
 def test_one_lost_reply_is_no_silence_and_many_are(hub: Hub) -> None:
     hub.take(all_of(10, FORWARD, 25))
     for at in range(11, 20):
@@ -237,6 +244,13 @@ def test_alarms_begin_and_end_once(shown: list[Shown]) -> None:
     assert [alarm.time for alarm in found] == sorted((alarm.time for alarm in found), reverse=True)
     assert all(alarm.ended is None or alarm.ended > alarm.time for alarm in found)
     assert len([alarm for alarm in found if alarm.ended is None]) == len(events.lasting)
+
+
+def test_a_fault_that_gets_its_name_goes_on() -> None:
+    events = Events()
+    for time, words in enumerate(("it shows a fault", "overcurrent", "it shows a fault"), 1):
+        events.look(time, "pump-1", Shown("fault", words))
+    assert [(one.time, one.text, one.ended) for one in events.shown()] == [(1, "overcurrent", None)]
 
 
 def test_ended_alarms_are_bounded() -> None:

@@ -231,4 +231,7 @@ def test_the_audit_log_says_who_and_by_which_way(tmp_path: Path) -> None:
         assert {(one["by"], one["way"]) for one in records[:-1]} == {("anyone", "page from 127.0.0.1")}
         oldest = records[-1]["time"]
         assert gateway.get(f"/api/audit?before={oldest}").json == {"entries": [], "more": False}
+        assert gateway.get(f"/api/audit?before={oldest[:10]}").json == {"entries": [], "more": False}
+        for wrong in ("tomorrow", "", "2026-11-22T09:30%2B03:00"):
+            assert gateway.get(f"/api/audit?before={wrong}").status == 400
         assert gateway.get("/api/audit?count=1").json == {"entries": records[:1], "more": True}

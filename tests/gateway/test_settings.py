@@ -78,7 +78,7 @@ tokens = "tokens"
 audit = "no/such/folder/audit.jsonl"
 [serve.may]
 look = "everybody"
-write = ["pump-1.output_current", "pump-9.setpoint", "setpoint"]
+write = ["pump-1.output_current", "pump-9.setpoint", "setpoint", "pump-1.setpint"]
 verbs = ["pump-1.fly"]
 [serve.mqqt]
 """
@@ -99,6 +99,8 @@ verbs = ["pump-1.fly"]
         "[serve.may]: write: pump-1.output_current is never written: it can only be read",
         "[serve.may]: write: there is no drive 'pump-9'; did you mean pump-2 or pump-1?",
         "[serve.may]: write: 'setpoint' is not right; write write = [\"pump-1.frequency_setpoint\"]",
+        "[serve.may]: write: pump-1.setpint: INVT CHE has no register 'setpint'; did you mean setpoint or "
+        "pid_setpoint?",
         "[serve.may]: verbs: pump-1 has no verb 'fly' that a list allows; it has start, jog, reset_fault, "
         "set_frequency, coast",
         f"[serve]: audit {tmp_path}/no/such/folder/audit.jsonl cannot be written: No such file or directory",

@@ -266,7 +266,7 @@ def history(handler: Any, gateway: FakeGateway, asked: dict[str, list[str]]) -> 
             if i < len(mean):
                 mean[i] = None
         series[label] = {
-            "time": times, "mean": mean,
+            "time": times, "mean": mean, "missed": [int(v is None) for v in mean],
             "least": [None if v is None else v - 0.2 for v in mean],
             "most": [None if v is None else v + 0.2 for v in mean],
             **gateway.recorded.get(label, {}),

@@ -215,6 +215,23 @@ def test_a_page_whose_scripts_do_not_come_says_that_it_stops_nothing(opened: Ope
     assert page.locator("#stopall").is_disabled()
 
 
+def test_no_line_is_drawn_over_what_the_page_did_not_see(opened: Opener) -> None:
+    """A laptop slept for an hour."""
+    page = opened()
+    seen = page.evaluate("""() => import('/page/store.js').then(({ store, takeFrame }) => {
+        const ring = store.drives.get('pump-1').pasts.get('output_frequency');
+        const later = s => String(BigInt(store.frame.time) + BigInt(s * 1e9));
+        const taken = [];
+        for (const s of [1, 3600, 1]) {
+            const before = ring.count;
+            takeFrame({ ...store.frame, time: later(s) });
+            taken.push(ring.since(-Infinity)[1].slice(before).map(value => value === null));
+        }
+        return taken;
+    })""")
+    assert seen == [[False], [True, False], [False]]
+
+
 TAKEN_ANEW = """change => import('/page/store.js').then(({ store, takePlant }) => {
   const plant = structuredClone(store.plant);
   const drive = plant.lines[0].drives.find(one => one.name === 'pump-1');

@@ -6,6 +6,7 @@ import re
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
+import fake_plant
 import pytest
 from conftest import Opener
 from fake_gateway import FakeGateway
@@ -43,6 +44,56 @@ def test_the_filter_finds_drives_by_name_state_and_family(opened: Opener) -> Non
     until_met(page, lambda: shown.locator("td.name").all_inner_texts() == names)
     page.get_by_role("button", name=re.compile("^All")).click()
     until_met(page, lambda: shown.count() == 31)
+
+
+def test_bars_of_all_drives_have_one_scale_which_is_told(opened: Opener, gateway: FakeGateway) -> None:
+    """A drive that may be set to 320 Hz has no shorter bar than another one at the same frequency."""
+    gateway.plant_changes = {"lines": [line_of_one(0, 50), line_of_one(1, 320)]}
+    rows = {"output_frequency": [41.0, 0], "frequency_setpoint": [48.0, 0]}
+    one = {"state": "runs", "fault": None, "seen": 0, "ages_ms": [0], "values": rows}
+    gateway.changes = {"drives": {"pump-1": one, "filler-1": one}}
+    page = opened()
+    head = page.locator("#table th.frequency")
+    bars = page.locator("#table .bar:visible")
+    styles = "bars => bars.map(bar => [bar.children[0].style.width, bar.children[1].style.left])"
+    until_met(page, lambda: bars.evaluate_all(styles) == [["82%", "96%"]] * 2)
+    assert head.inner_text().split() == ["full", "bar", "50", "Hz", "Frequency"]
+    fast = one | {"values": rows | {"output_frequency": [160.0, 0]}}
+    gateway.changes = {"drives": {"pump-1": one, "filler-1": fast}}
+    until_met(page, lambda: head.inner_text().split() == ["full", "bar", "200", "Hz", "Frequency"])
+    until_met(page, lambda: bars.evaluate_all(styles) == [["20.5%", "24%"], ["80%", "24%"]])
+
+
+def line_of_one(number: int, most: float) -> dict[str, Any]:
+    """Return a line with its first drive alone, whose setpoint may be so many hertz."""
+    line = fake_plant.plant({})["lines"][number]
+    drive = line["drives"][0]
+    registers = [
+        r | ({"most": most} if r["name"] == "frequency_setpoint" else {}) for r in drive["registers"]
+    ]
+    return line | {"drives": [drive | {"registers": registers}]}
+
+
+@pytest.mark.parametrize(
+    "size", [(1440, 900), (1366, 768), (1200, 800), (1181, 800), (820, 1180), (390, 844)]
+)
+def test_a_raw_count_stays_within_its_column(
+    opened: Opener, gateway: FakeGateway, size: tuple[int, int]
+) -> None:
+    line = fake_plant.plant({})["lines"][0]
+    raw = [
+        r | {"unit": "raw count", "digits": 3} if r["unit"] == "A" else r
+        for r in line["drives"][0]["registers"]
+    ]
+    gateway.plant_changes = {"lines": [line | {"drives": [d | {"registers": raw} for d in line["drives"]]}]}
+    page = opened()
+    page.set_viewport_size(dict(zip(("width", "height"), size, strict=True)))
+    cells = page.locator("#table td.current")
+    until_met(page, lambda: "raw count" in cells.first.inner_text())
+    wide = "cells => cells.map(cell => cell.scrollWidth - cell.clientWidth)"
+    assert max(cells.evaluate_all(wide)) <= 0
+    states, width = page.locator("#table td.state"), "cells => cells.map(cell => cell.clientWidth)"
+    until_met(page, lambda: min(states.evaluate_all(width)) >= 120)  # px, for "overcurrent"
 
 
 def test_what_is_wrong_has_a_shape_and_a_word_beside_its_colour(opened: Opener) -> None:
@@ -185,6 +236,43 @@ def test_a_value_between_gaps_is_drawn(opened: Opener) -> None:
     assert page.evaluate(DOTS, [20, *nothing, 21, *nothing, 20]) > 3 * 9  # pixels
 
 
+def test_a_register_that_is_asked_seldom_has_no_gaps_between_its_answers(opened: Opener) -> None:
+    """Answers come each 0.6 s; one is missed, and nobody asks for 3 s: a value holds for a second here."""
+    answers = {0: 20.0, 600: 21.0, 1200: None, 1800: 22.0, 4800: 23.0}  # at ms
+    times = list(range(0, 4801, 300))
+    mean = [answers.get(at) for at in times]
+    told = {
+        "time": times, "mean": mean, "least": mean, "most": mean,
+        "missed": [int(answers.get(at, 0.0) is None) for at in times], "unit": "Hz", "left_out": [],
+    }  # fmt: skip
+    page = opened()
+    answer = {"step_ms": 300, "series": {"pump-1.output_frequency": told}}
+    page.route("**/api/history?*", lambda route: route.fulfill(json=answer))
+    drawn = page.evaluate(
+        """() => import('/page/history.js').then(m => m.read(['pump-1.output_frequency'], 0, 4801, 17))
+           .then(told => Object.values(told.series)[0])"""
+    )
+    gap = list(range(2100, 4501, 300))
+    assert drawn["time"] == [0, 600, 1200, 1800, *gap, 4800]
+    assert drawn["mean"] == drawn["least"] == [20.0, 21.0, None, 22.0, *(None for _ in gap), 23.0]
+
+
+def test_numbers_of_an_axis_have_a_point_and_no_groups(opened: Opener) -> None:
+    """1,000 is one thousand to some, and one to others."""
+    page = opened(locale="de-DE")
+    told = page.evaluate("""async () => {
+        const { makePlot, line } = await import('/page/plots.js');
+        const place = document.body.appendChild(document.createElement('div'));
+        const plots = [[12000, 16000], [0.3, 0.9]].map(values =>
+            makePlot(place, [[1700000000, 1700000001], values], { series: [line(0, 'speed')], height: 150 }));
+        await new Promise(requestAnimationFrame);
+        place.remove();
+        return plots.map(plot => plot.axes[1]._values);
+    }""")
+    assert [number for number in told[0] if not number.isdigit()] == []
+    assert "0.5" in told[1]
+
+
 def test_without_history_the_page_says_so_and_goes_on(opened: Opener, gateway: FakeGateway) -> None:
     gateway.has_history = False
     page = opened("#/trends")
@@ -208,6 +296,9 @@ def test_faults_that_last_and_that_ended(opened: Opener) -> None:
     ]
     ended = page.locator("#fault-list section").nth(1).locator("tbody tr")
     assert re.search(r"pump-1\s+fault\s+overheating of the heatsink\s+7 min\s", ended.first.inner_text())
+    edges = "cells => cells.map(cell => cell.getBoundingClientRect().left)"
+    columns = [page.locator(".faults thead").nth(at).locator("th, td").evaluate_all(edges) for at in (0, 1)]
+    assert columns[0] == columns[1]
     ended.first.get_by_role("link", name="Trend").click()
     until(page, DRAWN)
     page.locator("#lane .fault", has_text="overheating").wait_for()

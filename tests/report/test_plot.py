@@ -454,6 +454,23 @@ def test_states_are_a_lane_for_each_drive_in_its_own_names(tmp_path: Path) -> No
     assert [text.get_text() for text in axes.get_legend().get_texts()] == ["code 7"]
 
 
+def test_no_state_has_the_colour_of_a_drive(tmp_path: Path) -> None:
+    """A panel of curves and one of states stand in one picture, under one legend of drives."""
+    from matplotlib.colors import to_hex
+
+    from multidrop.report.style import line_style
+
+    values = [*range(1, 5), *range(20, 45)]
+    rows = [row(at, "che", "status", value) for at, value in enumerate(values)]
+    rows += [row(at, "yd", "status", 2) for at in range(2)]  # REVERSE: a state's name, and a bit's
+    (axes,) = plot(states(tmp_path, rows))[0].axes
+    *of_states, of_bit = (to_hex(colour) for bars in axes.collections for colour in bars.get_facecolor())
+    of_drives = [to_hex(line_style(number)["color"]) for number in range(len(values))]
+    assert len(of_states) == len(values)
+    assert set(of_states) & set(of_drives) == set()
+    assert of_bit == of_drives[1]
+
+
 def test_bits_are_a_lane_each_and_not_a_sum(tmp_path: Path) -> None:
     rows = [row(at, "yd", "status", value) for at, value in enumerate((0, 16, 18, 2, 2 + 64, 1e308, 0.5, 0))]
     (axes,) = plot(states(tmp_path, rows))[0].axes

@@ -11,7 +11,7 @@ from typing import Any
 from multidrop.cli.support.arguments import add_json_argument
 from multidrop.cli.support.family_sheet import gain_of, needed_silence, range_text, sheet, verbs_of
 from multidrop.cli.support.output import print_text
-from multidrop.cli.support.values import aligned
+from multidrop.cli.support.values import aligned, wrapped
 from multidrop.drive.family import Drive
 from multidrop.drive.read_limits import read_limit
 from multidrop.drive.register import Register
@@ -46,18 +46,19 @@ def _family(model: str, drive: str | None) -> type[Drive]:
 
 
 def _list(families: list[type[Drive]]) -> str:
-    rows = [("MODEL", "FAMILY", "FRAMINGS", "ADDRESSES", "REGISTERS")]
+    rows = [("MODEL", "FRAMINGS", "ADDRESSES")]
     rows += [
-        (
-            family.model,
-            family.title,
-            " ".join(map(str, family.framings)),
-            range_text(family.addresses),
-            str(len(family.registers)),
-        )
+        (family.model, " ".join(map(str, family.framings)), range_text(family.addresses))
         for family in families
     ]
-    return "\n".join([*aligned(rows, "<<<<>"), "", "`multidrop models MODEL` says all of one family."])
+    titles = ["FAMILY", *(family.title for family in families)]
+    columns = [f"{row}  " for row in aligned(rows, "<<>")]
+    lines = [
+        line
+        for row, title in zip(columns, titles, strict=True)
+        for line in wrapped(title, row, " " * len(row), breaks_words=False)
+    ]
+    return "\n".join([*lines, "", "`multidrop models MODEL` says all of one family."])
 
 
 # ---- as JSON ----

@@ -9,10 +9,11 @@ from typing import Any
 from multidrop.drive.family import Drive
 from multidrop.drive.register import Register
 from multidrop.drive.script import Read
-from multidrop.drive.state import State
+from multidrop.drive.state import Condition, State
 from multidrop.errors import BusError
 
 MOST_STEPS = 20
+FAULT = "fault"  # the register of a fault's code, in every family that has one
 
 
 class StateReader:
@@ -23,26 +24,28 @@ class StateReader:
 
     def __init__(self, drive: Drive) -> None:
         self._drive = copy(drive)
-        self._shown: tuple[dict[str, float], State | None] | None = None  # by these values, the last time
+        self._shown: tuple[dict[str, float | None], State | None] | None = None  # by these values, last time
         self.has_state = type(drive).state is not Drive.state
         """True where the family's document has a state at all."""
 
     def state(self, values: Mapping[str, float]) -> State | None:
         """Return the state that these values, by register's name, show; None where they do not suffice.
 
-        A value is as in a row: in the register's unit, or the raw count where it has names. The family is
-        asked again only where one of the values that it read has changed, or where it noted something.
+        A value is as in a row: in the register's unit, or the raw count where it has names. A status that
+        shows a fault suffices, though the fault's code is not among them: the fault has no name then. The
+        family is asked again only where one of the values that it read has changed, or where it noted
+        something.
         """
         if self._shown and all(values.get(name) == value for name, value in self._shown[0].items()):
             return self._shown[1]
-        notes, read = dict(vars(self._drive)), dict[str, float]()
+        notes, read = dict(vars(self._drive)), dict[str, float | None]()
         found = self._look(values, read)
         is_all_there_was = found is not None and notes == vars(self._drive)
         self._shown = (read, found) if is_all_there_was else None
         return found
 
-    def _look(self, values: Mapping[str, float], read: dict[str, float]) -> State | None:
-        """Return the state, and put the values that it is made of into `read`."""
+    def _look(self, values: Mapping[str, float], read: dict[str, float | None]) -> State | None:
+        """Return the state, and put the values that it is made of into `read`; None for one that lacks."""
         try:
             script = self._drive.state.script()
             step = next(script)
@@ -50,12 +53,21 @@ class StateReader:
                 if not isinstance(step, Read) or not isinstance(step.register, Register):
                     return None
                 register: Register[Any] = step.register
-                if register.name not in values:
-                    return None
-                value = read[register.name] = values[register.name]
+                value = read[register.name] = values.get(register.name)
+                if value is None:
+                    if register.name != FAULT:
+                        return None
+                    value = 0.0  # no fault: the family shows one only where the status says so
                 step = script.send(value if register.values is None else register.decode(value))
         except StopIteration as end:
-            return end.value if isinstance(end.value, State) else None
+            return _known(end.value, read)
         except (BusError, ValueError, ArithmeticError):
             return None
         return None
+
+
+def _known(state: object, read: Mapping[str, float | None]) -> State | None:
+    """Return a state, without what a fault's code would have told where that was not among the values."""
+    if not isinstance(state, State) or read.get(FAULT, 0) is not None:
+        return state if isinstance(state, State) else None
+    return State(Condition.FAULT) if state.condition is Condition.FAULT else None

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import deque
 from typing import NamedTuple
 
-from multidrop.gateway.hub import FAULT, NOT_ASKED, SILENT, Shown
+from multidrop.gateway.hub import FAULT, NOT_ASKED, SILENT, UNNAMED, Shown
 
 MOST_ENDED = 1000  # that are remembered
 MOST_SHOWN = 20  # of them beside those that last
@@ -39,7 +39,7 @@ class Events:
             return
         self._end(time, drive, SILENT)
         if state == FAULT:
-            self._begin(time, drive, FAULT, words or "it shows a fault")
+            self._begin(time, drive, FAULT, words or UNNAMED)
         else:
             self._end(time, drive, FAULT)
 
@@ -66,7 +66,10 @@ class Events:
 
     def _begin(self, time: int, drive: str, kind: str, text: str) -> None:
         before = self._lasting.get((drive, kind))
-        if before is not None and (before.text == text or kind == SILENT):
+        if before is not None and (text in (before.text, UNNAMED) or kind == SILENT):
+            return
+        if before is not None and before.text == UNNAMED:  # the same fault, which has its name now
+            self._lasting[drive, kind] = Alarm(before.time, drive, text, None, kind)
             return
         self._end(time, drive, kind)
         self._lasting[drive, kind] = Alarm(time, drive, text, None, kind)

@@ -13,6 +13,7 @@ from multidrop import Batch, Condition, Plant, PolledDrive, Register, StateReade
 from multidrop.gateway.kept_rows import FreshValues, Known, RegisterRows
 
 RUNS, STANDS, FAULT, SILENT, UNKNOWN = "runs", "stands", "fault", "silent", "unknown"
+UNNAMED = "it shows a fault"  # whose code is not known
 
 NOT_ASKED = "not asked lately"  # words of an unknown state: nothing is known of it at present
 
@@ -246,7 +247,7 @@ class Hub:
         fresh = FreshValues(watched.cells, self.now_ns, self._woke_ns)
         found = watched.reader.state(fresh)
         if found is not None and found.condition is not Condition.UNKNOWN:
-            fault = found.fault or "it shows a fault"
+            fault = found.fault or UNNAMED
             return Shown(_STATES[found.condition], fault if found.condition is Condition.FAULT else None)
         if not any(True for _ in fresh):
             return self._unseen(watched)

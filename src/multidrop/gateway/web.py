@@ -17,7 +17,7 @@ from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp, Receive, Scope, Send
 
 from multidrop import Refused, expose_metrics
-from multidrop.gateway.audit import MOST_RECORDS, newest_records
+from multidrop.gateway.audit import MOST_RECORDS, newest_records, time_asked
 from multidrop.gateway.commands import Admit, Told
 from multidrop.gateway.describe import describe
 from multidrop.gateway.frame_route import FrameRoute
@@ -176,7 +176,7 @@ class _Pages:
 
     async def audit(self, request: Request) -> Response:
         query = request.query_params
-        before, count = query.get("before", ""), number_in(query.get("count", str(MOST_RECORDS)), "count")
+        before, count = time_asked(query), number_in(query.get("count", str(MOST_RECORDS)), "count")
         async with self._queries:
             found = await asyncio.to_thread(newest_records, self._gateway.settings.audit, before, count)
         return JSONResponse(found)

@@ -27,7 +27,10 @@ def check_listed(plant: Plant, key: str, entry: object) -> bool:
     except ValueError as unknown:
         raise ValueError(f"{key}: {str(unknown).replace(f'{plant.path} has', 'there is')}") from None
     if key == "write":
-        register = drive.register(rest)
+        try:
+            register = drive.register(rest)
+        except ValueError as unknown:
+            raise ValueError(f"{key}: {entry}: {unknown}") from None
         if not register.writable:
             raise ValueError(f"{key}: {entry} is never written: {register.never or 'it can only be read'}")
         return True

@@ -15,8 +15,10 @@ from matplotlib.axes import Axes
 from matplotlib.patches import Patch
 
 from multidrop.report.load import Array, Recording, Series
-from multidrop.report.style import COLOURS, TEXT, days, label, line_style, mark_times
+from multidrop.report.style import TEXT, days, label, line_style, mark_times
 
+# Tol's pale ones: no state has the colour of a drive.
+COLOURS = ("#BBCCEE", "#CCDDAA", "#EEEEBB", "#CCEEFF", "#DDDDDD", "#FFCCCC")
 HATCHES = ("", "////", "....")  # the colours once more, and again
 MOST_LANES = 64  # in one panel
 NARROWEST = 1 / 1500  # of the time axis: a shorter state is drawn so wide
@@ -102,12 +104,14 @@ def draw_lanes(axes: Axes, lanes: Sequence[Lane], recording: Recording) -> None:
     span = max(recording.end - recording.begin, 1)
     shown: set[str] = set()
     for row, lane in enumerate(lanes):
-        bit_style = {"facecolor": line_style(recording.drives.index(lane.drive))["color"]}
+        of_drive = {"facecolor": line_style(recording.drives.index(lane.drive))["color"]}
         for name in _longest_first(lane):
             begin, end = _merged(lane, name, span)
             widths = np.maximum(end - begin, span * NARROWEST)
             bars = list(zip(days(begin), widths / 86400e9, strict=True))
-            axes.broken_barh(bars, (row - 0.36, 0.72), linewidth=0, **styles.get(name, bit_style))
+            axes.broken_barh(
+                bars, (row - 0.36, 0.72), linewidth=0, **(of_drive if lane.is_bit else styles[name])
+            )
             if not lane.is_bit:
                 text = label(name).lower()
                 fitting = begin[widths > span * LETTER * (len(text) + 2)][:MOST_TEXTS]
@@ -134,7 +138,7 @@ def name_bar(axes: Axes, text: str, at: float, row: int) -> None:
 
 def _style(number: int) -> dict[str, Any]:
     hatch = HATCHES[number // len(COLOURS) % len(HATCHES)]
-    return {"facecolor": COLOURS[number % len(COLOURS)], "hatch": hatch, "edgecolor": "white"}
+    return {"facecolor": COLOURS[number % len(COLOURS)], "hatch": hatch, "edgecolor": TEXT}
 
 
 def _longest_first(lane: Lane) -> list[str]:

@@ -54,7 +54,7 @@ export async function show() {
 }
 
 function part(title, alarms) {
-  const heads = [`Since, ${clock.zoneName()}`, "Drive", "Kind", "In the drive's words", "Lasted", ""];
+  const heads = [`Since, ${clock.zoneName()}`, "Drive", "Kind", "What was said", "Lasted", ""];
   return make(
     "section",
     {},

@@ -1,13 +1,17 @@
 // What the gateway recorded: series of a span of time, and links that save them.
 
 import { get, query } from "./api.js";
+import { holdsFor } from "./store.js";
 import { unit } from "./values.js";
 
 export const label = (drive, register) => `${drive}.${register}`;
 
-// Return {series: {label: {time, least, mean, most}}, step_ms}. Raises Refused where no history is kept.
-export const read = (labels, from, to, points) =>
-  get(
+const COLUMNS = ["time", "least", "mean", "most", "missed"];
+
+// Return {series: {label: {time, least, mean, most}}, step_ms}. A null is a gap: a value was missed, or
+// nobody asked for longer than a value holds. Raises Refused where no history is kept.
+export async function read(labels, from, to, points) {
+  const told = await get(
     `api/history?${query([
       ...labels.map(name => ["series", name]),
       ["from", Math.floor(from)],
@@ -15,6 +19,34 @@ export const read = (labels, from, to, points) =>
       ["points", points],
     ])}`,
   );
+  for (const [name, series] of Object.entries(told.series)) {
+    const dot = name.lastIndexOf("."),
+      longest = holdsFor(name.slice(0, dot), name.slice(dot + 1)) + told.step_ms;
+    told.series[name] = { ...series, ...withoutPauses(series, longest) };
+  }
+  return told;
+}
+
+// A register may be asked less often than there are points: what lies between two answers is no gap.
+function withoutPauses(series, longest) {
+  const kept = [];
+  let pause = [],
+    before = -Infinity;
+  const keepLong = at => {
+    if (at - before > longest) kept.push(...pause);
+    pause = [];
+  };
+  for (const [i, at] of series.time.entries()) {
+    if (series.mean[i] === null && !series.missed[i]) pause.push(i);
+    else {
+      keepLong(at);
+      kept.push(i);
+      before = at;
+    }
+  }
+  keepLong(series.time.at(-1));
+  return Object.fromEntries(COLUMNS.map(column => [column, kept.map(i => series[column][i])]));
+}
 
 // Return the unit of a series: a name may have been another drive's when it was recorded.
 export const unitOf = (told, spec) => told.unit ?? unit(spec);

@@ -17,6 +17,9 @@ export const wide = least => (_, low, high) => {
   return [low - margin, high + margin];
 };
 
+// Return a number of an axis as numbers are written elsewhere: with a point, and not in groups.
+const plain = value => (value === null ? null : String(Number(value.toPrecision(12))));
+
 // Return a plot. `options` may have series, height, bands, range, hasTimes, cursor, hooks; times are seconds.
 export function makePlot(
   into,
@@ -44,7 +47,7 @@ export function makePlot(
           space: 76,
           values: (_, splits, _axis, _space, step) => clock.ticks(splits, step),
         },
-        { ...axis, size: 48, space: 26 },
+        { ...axis, size: 48, space: 26, values: (_, splits) => splits.map(plain) },
       ],
       series: [{}, ...series],
     },

@@ -6,7 +6,7 @@ import { driveAge, isLive, key, reading, state, store } from "./store.js";
 import { STATES, UNKNOWN, makeValue, share, showValue } from "./values.js";
 
 export const COLUMNS = 8;
-const FULL_HZ = 50; // a bar's full length where no largest setpoint is stated
+const FULL_HZ = [50, 60, 80, 100, 150, 200, 300, 400, 600, 1000, 2000, 4000]; // a full bar's length
 
 // Return a line's row and its parts.
 export function makeHead(line) {
@@ -84,33 +84,50 @@ function stateWord(is, drive, age) {
   return age === null ? "silent, never answered" : `silent for ${clock.lasting(age)}`;
 }
 
-// Draw frequency and setpoint as a bar, as far as both are hertz and of now.
-function drawBar(r, actual, set, register, setRegister) {
-  const isNew = found => Boolean(found && found.value !== null && !found.isOld);
-  const isSet = setRegister?.unit === "Hz",
-    full = (isSet && setRegister.most) || FULL_HZ;
-  const width = value => `${Math.min(100, (Math.abs(value) / full) * 100)}%`;
-  r.bars.hidden = !(register?.unit === "Hz" && isNew(actual));
-  r.set.hidden = !(isSet && isNew(set));
-  if (!r.bars.hidden) r.bar.style.width = width(actual.value);
-  if (!r.set.hidden) r.set.style.left = width(set.value);
+// Return a drive's frequency or setpoint in hertz, whatever its sign, or null where it is not that of now.
+function hertz(name, part, t) {
+  const register = key(name, part),
+    found = register && reading(name, register, t);
+  const isShown = found && found.value !== null && !found.isOld;
+  return isShown && store.drives.get(name).registers.get(register).unit === "Hz"
+    ? Math.abs(found.value)
+    : null;
 }
 
-// Draw a row anew. Return true where the state is another one.
-export function drawRow(r, t) {
+// Return the frequency of a full bar, the same for all drives, or null where there is no bar.
+export function fullBar(t) {
+  const shown = [...store.drives.keys()].flatMap(name => {
+    const actual = hertz(name, "frequency", t);
+    return actual === null ? [] : [actual, hertz(name, "setpoint", t) ?? 0];
+  });
+  if (!shown.length) return null;
+  const most = shown.reduce((a, b) => Math.max(a, b));
+  return FULL_HZ.find(hz => hz >= most) ?? most;
+}
+
+// Draw frequency and setpoint as a bar.
+function drawBar(r, t, full) {
+  const actual = hertz(r.name, "frequency", t),
+    set = hertz(r.name, "setpoint", t);
+  const length = value => `${(value / full) * 100}%`;
+  r.bars.hidden = actual === null;
+  r.set.hidden = set === null;
+  if (r.bars.hidden) return;
+  r.bar.style.width = length(actual);
+  if (!r.set.hidden) r.set.style.left = length(set);
+}
+
+// Draw a row anew; a full bar is so many hertz. Return true where the state is another one.
+export function drawRow(r, t, full) {
   const drive = store.frame?.drives[r.name],
     is = state(r.name),
     age = driveAge(r.name, t),
     own = store.drives.get(r.name);
   const changed = drawState(r, is, drive, age, t);
-  const [frequency, current, setpoint] = ["frequency", "current", "setpoint"].map(part =>
-    key(r.name, part),
-  );
-  const f = frequency && reading(r.name, frequency, t),
-    s = setpoint && reading(r.name, setpoint, t);
-  showValue(r.frequency, f, own.registers.get(frequency));
+  const [frequency, current] = ["frequency", "current"].map(part => key(r.name, part));
+  showValue(r.frequency, frequency && reading(r.name, frequency, t), own.registers.get(frequency));
   showValue(r.current, current && reading(r.name, current, t), own.registers.get(current), false);
-  drawBar(r, f, s, own.registers.get(frequency), own.registers.get(setpoint));
+  drawBar(r, t, full);
   put(r.age, age === null ? UNKNOWN : clock.lasting(age));
   const missed = drive?.missed ?? null;
   put(r.missed, missed === null ? UNKNOWN : missed === 0 ? "0" : share(missed));

@@ -6,6 +6,7 @@ import { Ring } from "./ring.js";
 const SAMPLES = 2e6; // of all registers together
 const UNPLANNED_LIMIT_MS = 5000; // how old a value may be whose period is not known
 const FAILED_LIMIT_MS = 1000; // and one whose newest request failed
+const UNSEEN_MS = 5000; // between two frames: what was then is not known
 export const LIVE_MS = 1500; // a frame comes each second at least
 
 export const store = { plant: null, frame: null, time: 0, isLost: false, drives: new Map() };
@@ -58,8 +59,10 @@ function isSame(before, registers, name) {
 // Take a frame, or what changed since the one before: keep each value that is newer than its last one.
 export function takeFrame(told) {
   const frame = told.since === undefined ? told : merged(store.frame, told);
+  const before = store.time;
   store.frame = frame;
   store.time = Number(BigInt(frame.time) / 1000000n);
+  if (before && store.time - before > UNSEEN_MS) leaveGap(before + 1);
   for (const [name, drive] of store.drives) {
     const { ages_ms = [], values = {}, seen = null } = frame.drives[name] ?? {};
     const at = place => store.time - ages_ms[place];
@@ -68,6 +71,11 @@ export function takeFrame(told) {
     for (const [register, [value, place, status = "ok", lastValue, lastPlace]] of Object.entries(values))
       keep(drive, register, [value, at(place), status, lastValue, at(lastPlace)]);
   }
+}
+
+// Nobody saw what came from this time (ms) on, as where the page slept: no line is to be drawn over it.
+function leaveGap(ms) {
+  for (const { pasts } of store.drives.values()) for (const ring of pasts.values()) ring.add(ms, NaN);
 }
 
 // Return an object with the values of `changes` in place of its own, and so on in the objects in it.
@@ -113,12 +121,13 @@ export function reading(name, register, now) {
     ms: good.ms,
     status,
     age,
-    isOld: age > (status === "ok" ? limit(drive, register) : FAILED_LIMIT_MS) || !isLive(now),
+    isOld: age > (status === "ok" ? holdsFor(name, register) : FAILED_LIMIT_MS) || !isLive(now),
   };
 }
 
-function limit(drive, register) {
-  const period = drive.registers.get(register)?.period_s;
+// Return for how long, in ms, a value of a register holds.
+export function holdsFor(name, register) {
+  const period = store.drives.get(name)?.registers.get(register)?.period_s;
   return period ? Math.max(3000 * period, 1000) : UNPLANNED_LIMIT_MS;
 }
 

@@ -2,7 +2,7 @@
 
 import { colour, fill, find, make, put, setClass, tableHead } from "./dom.js";
 import { now } from "./link.js";
-import { drawHead, drawRow, makeHead, makeRow } from "./rows.js";
+import { drawHead, drawRow, fullBar, makeHead, makeRow } from "./rows.js";
 import { spark } from "./spark.js";
 import { isLive, key, onPlant, state, store } from "./store.js";
 
@@ -23,6 +23,7 @@ const SHOWN = {
   bad: ["Fault, silent, unknown", s => s === "fault" || s === "silent" || s === "unknown"],
 };
 
+const scale = make("span", { class: "full" });
 let rows = [],
   heads = [],
   show = "all",
@@ -75,6 +76,7 @@ function build() {
       ),
     ),
   );
+  find("th.frequency", table).prepend(scale, " ");
   fill(find("#table"), table);
   fit();
   choose(chosen);
@@ -124,8 +126,10 @@ export function neighbour(step) {
 export const focusChosen = () => rows.find(r => r.name === chosen)?.link.focus();
 
 export function drawRows() {
-  const t = now();
-  const changed = rows.map(row => drawRow(row, t)).includes(true);
+  const t = now(),
+    full = fullBar(t);
+  put(scale, full === null ? "" : `full bar ${full} Hz`);
+  const changed = rows.map(row => drawRow(row, t, full)).includes(true);
   if (changed) drawFilter();
   for (const h of heads) drawHead(h);
 }
