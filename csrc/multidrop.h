@@ -209,6 +209,7 @@ struct md_exchange {
     int framing;
     int insists;          /* a stop: sent even where a late reply may pass for its own */
     uint16_t least, most; /* the reply's one register lies between these; most 0: anything */
+    uint8_t is_proof;     /* of its drive */
     uint8_t frame_len;    /* 0: the frame is built when its turn comes */
     uint8_t frame[MD_KEPT_FRAME];
     struct md_message request;

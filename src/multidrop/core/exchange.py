@@ -99,6 +99,8 @@ class Peer:
         """
         self.proofs = tuple(proofs[:MOST_PROOFS])
         self._c_proofs = ffi.new("struct md_exchange *[]", [proof.c for proof in self.proofs])
+        for proof in self.proofs:
+            proof.c.is_proof = True
         self.c.proofs, self.c.proof_count = self._c_proofs, len(self.proofs)
 
     def doubt_first_reply(self) -> None:
