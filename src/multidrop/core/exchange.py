@@ -49,8 +49,7 @@ class Peer:
     @property
     def has_answered(self) -> bool:
         """True once a reply came, be it an exception, late or in doubt."""
-        counters = self.c.counters
-        return bool(counters.answered or counters.late or self.c.doubtful)
+        return bool(self.c.counters.answered or self.c.history.late or self.c.doubtful)
 
     @property
     def failures(self) -> int:
@@ -60,7 +59,7 @@ class Peer:
     @property
     def late(self) -> int:
         """Replies that came after their time-out and were recognised."""
-        return int(self.c.counters.late)
+        return int(self.c.history.late)
 
     @property
     def late_until_ns(self) -> int:
