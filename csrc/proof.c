@@ -6,8 +6,8 @@
  * came before it. */
 enum { MOST_VAIN = 2, ANSWERED = 0xFF };
 
-/* Return which of the drive's proofs it is; their number: none, as most are. Their list is elsewhere in memory,
- * and is not looked at then. */
+/* Return which of the drive's proofs it is; their number: none, as most are. Then the list is not looked at,
+ * which is elsewhere in memory. */
 static uint32_t place_of(const struct md_exchange *exchange)
 {
     const struct md_drive *drive = exchange->drive;

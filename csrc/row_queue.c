@@ -120,7 +120,7 @@ static struct md_columns *begin_chunk(struct md_row_queue *queue)
     return chunk;
 }
 
-/* Bring the places of the rows after the next ones into the caches: unlocking waits for all that is written. */
+/* Bring the places of the rows after the next ones into the caches: unlocking waits until all is written. */
 static void look_ahead(const struct md_columns *chunk, size_t count)
 {
     enum { CACHE_LINE = 64, NUMBERS = CACHE_LINE / sizeof(int64_t) };
