@@ -25,45 +25,54 @@ static void bring_port(const struct md_port *port)
     bring(turn->completion.raw, CACHE_LINE);
 }
 
-/* Fill in the exchange under way and the one that is to follow; return how many there are. */
-static int find(const struct md_turn *turn, const struct md_exchange *exchanges[2])
+static void bring_exchange(const struct md_exchange *exchange)
 {
-    int n = 0;
-    if (turn->whose != MD_NOBODYS)
-        exchanges[n++] = turn->line.exchange;
-    if (turn->round_len)
-        exchanges[n++] = turn->round[turn->round_at];
-    return n;
+    bring(exchange, offsetof(struct md_exchange, request.data));
+}
+
+/* Return the exchange under way; NULL: there is none. */
+static const struct md_exchange *present(const struct md_port *port)
+{
+    return port->turn.whose != MD_NOBODYS ? port->turn.line.exchange : NULL;
+}
+
+/* Return where the exchange to be repeated next is named; NULL: there is none. */
+static const struct md_exchange *const *next_name(const struct md_port *port)
+{
+    const struct md_turn *turn = &port->turn;
+    return turn->round_len ? &turn->round[turn->round_at] : NULL;
 }
 
 static void bring_exchanges(const struct md_port *port)
 {
-    const struct md_turn *turn = &port->turn;
-    const struct md_exchange *exchanges[2];
-    for (int n = find(turn, exchanges); n-- > 0;)
-        bring(exchanges[n], offsetof(struct md_exchange, request.data));
+    if (present(port))
+        bring_exchange(present(port));
+    if (next_name(port))
+        bring(next_name(port), sizeof *next_name(port));
 }
 
 static void bring_drives(const struct md_port *port)
 {
-    const struct md_turn *turn = &port->turn;
-    const struct md_exchange *exchanges[2];
-    for (int n = find(turn, exchanges); n-- > 0;)
-        bring(exchanges[n]->drive, offsetof(struct md_drive, delays));
-    if (turn->whose != MD_NOBODYS && turn->line.exchange->block)
-        bring(turn->line.exchange->block, sizeof *turn->line.exchange->block);
+    const struct md_exchange *exchange = present(port);
+    if (exchange)
+        bring(exchange->drive, offsetof(struct md_drive, late_until_ns));
+    if (exchange && exchange->block)
+        bring(exchange->block, sizeof *exchange->block);
+    if (next_name(port))
+        bring_exchange(*next_name(port));
 }
 
-static void bring_history(const struct md_port *port)
+static void bring_rest(const struct md_port *port)
 {
-    const struct md_turn *turn = &port->turn;
-    if (turn->whose != MD_NOBODYS)
-        bring(md_usual_delays(turn->line.exchange->drive), 1);
+    if (present(port))
+        bring(md_usual_delays(present(port)->drive), 1);
+    if (next_name(port))
+        bring((*next_name(port))->drive, offsetof(struct md_drive, counters));
 }
 
 /* Each needs what the one behind it brought: the last one is for the port that is farthest ahead. */
 static void (*const steps[MD_STEPS_AHEAD])(const struct md_port *port) = {
-    bring_history, bring_drives, bring_exchanges, bring_port,
+    bring_rest, bring_drives, bring_exchanges, bring_port,
 };
 
 void md_look_ahead(struct md_port *const *ports, int n, int next)

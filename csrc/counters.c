@@ -28,8 +28,8 @@ int64_t md_delay_edge(int bucket)
 
 void md_counters_end(const struct md_exchange *exchange, const struct md_completion *completion)
 {
-    struct md_counters *counters = &exchange->drive->counters;
-    struct md_history *history = exchange->drive->history;
+    struct md_drive *drive = exchange->drive;
+    struct md_counters *counters = &drive->counters;
     uint64_t values = exchange->block ? (uint64_t)exchange->block->count : 1;
     if (completion->result == MD_LATE_ANSWER_DUE && completion->sent_ns)
         values = 0; /* they are read again */
@@ -39,10 +39,11 @@ void md_counters_end(const struct md_exchange *exchange, const struct md_complet
     counters->stray_bytes += completion->stale + completion->skipped;
     counters->answered += completion->result > 0;
     if (completion->result <= 0)
-        history->ended[-completion->result]++;
+        drive->history->ended[-completion->result]++;
     if (completion->result < 0) {
-        history->missed[-completion->result] += values;
+        drive->history->missed[-completion->result] += values;
     } else if (exception) {
+        struct md_history *history = drive->history;
         history->exceptions++;
         history->naks += exception == NAK;
         history->busies += exception == BUSY;
@@ -52,7 +53,7 @@ void md_counters_end(const struct md_exchange *exchange, const struct md_complet
         uint64_t lacking = block && block->may_lack ? md_count_lacking(block, &completion->reply) : 0;
         counters->values += values - lacking;
         if (lacking)
-            history->missed[MD_NO_VALUE] += lacking;
+            drive->history->missed[MD_NO_VALUE] += lacking;
     }
 }
 
@@ -66,7 +67,7 @@ void md_counters_answer(struct md_drive *drive, int64_t delay_ns, int64_t ideal_
 
 uint64_t md_replies(const struct md_drive *drive)
 {
-    return drive->counters.answered + drive->counters.late + drive->doubtful;
+    return drive->counters.answered + drive->history->late + drive->doubtful;
 }
 
 const uint64_t *md_usual_delays(const struct md_drive *drive)

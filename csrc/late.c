@@ -248,7 +248,7 @@ static int take_of(struct md_drive *drive, struct md_line *line, size_t at, int6
     if (earliest->is_doubtful)
         drive->doubtful++;
     else
-        drive->counters.late++;
+        drive->history->late++;
     md_proof_came_late(drive, earliest);
     md_count_failures(drive, 0);
     drive->answered_ns = later(drive->answered_ns, earliest->sent_ns[0] - 1);

@@ -110,7 +110,6 @@ struct md_counters {
     uint64_t stray_bytes; /* bytes that were no part of a reply */
     uint64_t ideal_ns;    /* the least time on the line that the answered exchanges needed */
     int64_t longest_ns;   /* response delay */
-    uint64_t late;        /* replies that came after their time-out */
 };
 
 /* A request whose replies may still come. */
@@ -135,6 +134,7 @@ struct md_unanswered {
 struct md_history {
     uint64_t ended[MD_STATUSES];       /* exchanges without a reply, by status; MD_OK: broadcasts */
     uint64_t missed[MD_STATUSES];      /* values, by status */
+    uint64_t late;                     /* replies that came after their time-out */
     uint64_t exceptions, naks, busies; /* exchanges that ended with an exception; with code 7; with code 6 */
     uint32_t refused[MD_EXCEPTION_CODES]; /* values, by exception code */
     uint64_t pauses;                      /* replies that came MD_PAUSE_S or more after the one before */
@@ -143,27 +143,28 @@ struct md_history {
 };
 
 /* A drive: the bounds of its time-out and its interval are given, the rest is learnt from its exchanges and
- * begins as 0.
- * A time-out runs from the request's last bit to the reply's first. */
+ * begins as 0. A time-out runs from the request's last bit to the reply's first.
+ * A request needs the first cache line, its end the second one too. */
 struct md_drive {
     int64_t least_timeout_ns, most_timeout_ns;
-    int64_t delay_ns, deviation_ns; /* the response delay, smoothed, and its mean deviation */
-    int64_t patience_ns;            /* a longer time-out, learnt from late replies */
-    int64_t late_until_ns;          /* until then a late reply may come, in any order */
-    int64_t answered_ns;            /* requests that left before then are answered, or never will be */
-    int64_t interval_ns;            /* from the end of an exchange to its next request, at least */
-    int64_t ready_ns;               /* no request leaves for it before then */
-    uint32_t failures;              /* in a row */
-    uint32_t sure_looks;            /* so many replies are whole at the first look, if it stays steady */
-    uint32_t is_doubted; /* its first reply may answer what another process asked */
-    uint32_t doubtful;   /* replies of which that was so */
-    uint32_t owed_count, unanswered_count, proof_count;
-    uint64_t vain_at;             /* its replies, when a proof was given up */
-    uint8_t vain[MD_MOST_PROOFS]; /* how often each proof was given up; 255: it was answered once */
-    const struct md_exchange **proofs; /* reads whose replies differ from others' */
-    struct md_drive *next_late;     /* the next one on this line with late replies due */
-    struct md_history *history;     /* apart, for it is seldom needed: an exchange touches fewer pages */
+    int64_t delay_ns, deviation_ns;    /* the response delay, smoothed, and its mean deviation */
+    int64_t patience_ns;               /* a longer time-out, learnt from late replies */
+    int64_t interval_ns;               /* from the end of an exchange to its next request, at least */
+    int64_t ready_ns;                  /* no request leaves for it before then */
+    uint32_t failures;                 /* in a row */
+    uint8_t owed_count, proof_count;
+    uint8_t is_doubted;                /* its first reply may answer what another process asked */
+    uint8_t sure_looks;                /* so many replies are whole at the first look, if it stays steady */
     struct md_counters counters;
+    int64_t answered_ns;               /* requests that left before then are answered, or never will be */
+    int64_t late_until_ns;             /* until then a late reply may come, in any order */
+    uint64_t vain_at;                  /* its replies, when a proof was given up */
+    uint8_t vain[MD_MOST_PROOFS];      /* how often each proof was given up; 255: it was answered once */
+    uint32_t doubtful;                 /* replies of which it was doubted that they were its own */
+    uint32_t unanswered_count;
+    const struct md_exchange **proofs; /* reads whose replies differ from others' */
+    struct md_drive *next_late;        /* the next one on this line with late replies due */
+    struct md_history *history;        /* apart, for it is seldom needed: an exchange touches fewer pages */
     uint64_t delays[MD_DELAY_BUCKETS]; /* replies by response delay: bucket n begins at md_delay_edge(n) */
 };
 
@@ -193,15 +194,17 @@ enum md_rs485_mode {
 };
 
 /* One request with all that is needed to carry it out; constant while in use. What every exchange needs comes
- * first: with many lines each cache line of it is read from memory. */
+ * first, in two cache lines: with many lines each of them is read from memory. */
 struct md_exchange {
     struct md_drive *drive;
-    struct md_block *block; /* fields of its reply; NULL: no rows */
-    int64_t character_ns;   /* one character on the wire */
-    int64_t silence_ns;     /* before the request and after its reply */
+    struct md_block *block;        /* fields of its reply; NULL: no rows */
+    const struct md_block *values; /* what the caller of md_port_carry_out() gets; NULL: nothing */
+    int64_t character_ns;          /* one character on the wire */
+    int64_t silence_ns;            /* before the request and after its reply */
     /* The least time-out, of a write; 0: as learnt. One that insists waits as long as late replies are
      * known to take, but not beyond this. */
     int64_t timeout_ns;
+    int64_t period_ns; /* between its slots in a queue; 0: it has none */
     /* Sent first while it is unknown whether the adapter echoes: its reply is never a copy of its request.
      * NULL: none. */
     const struct md_exchange *echo_probe;
@@ -209,14 +212,13 @@ struct md_exchange {
     int framing;
     int insists;          /* a stop: sent even where a late reply may pass for its own */
     uint16_t least, most; /* the reply's one register lies between these; most 0: anything */
+    uint8_t is_proof;     /* of its drive */
     uint8_t frame_len;    /* 0: the frame is built when its turn comes */
     uint8_t frame[MD_KEPT_FRAME];
     struct md_message request;
     int64_t turnaround_ns; /* after a broadcast */
-    int64_t period_ns;     /* between its slots in a queue; 0: it has none */
     const uint32_t *stops; /* of its drive: sent only while they are stops_seen; NULL: always */
     uint32_t stops_seen;
-    const struct md_block *values; /* what the caller of md_port_carry_out() gets; NULL: nothing */
 };
 
 /* The reason why an exchange has no reply; an enum md_frame_fault where something came in its place. */

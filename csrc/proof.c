@@ -6,11 +6,12 @@
  * came before it. */
 enum { MOST_VAIN = 2, ANSWERED = 0xFF };
 
-/* Return which of the drive's proofs it is; their number: none. */
+/* Return which of the drive's proofs it is; their number: none, as most are. Then the list is not looked at,
+ * which is elsewhere in memory. */
 static uint32_t place_of(const struct md_exchange *exchange)
 {
     const struct md_drive *drive = exchange->drive;
-    uint32_t at = 0;
+    uint32_t at = exchange->is_proof ? 0 : drive->proof_count;
     while (at < drive->proof_count && drive->proofs[at] != exchange)
         at++;
     return at;

@@ -108,7 +108,7 @@ static void learn_late(struct md_line *line, int64_t now_ns)
         for (uint32_t i = 0; i < drive->unanswered_count; i++) {
             if (!is_reply_to(line, &drive->history->unanswered[i]))
                 continue;
-            drive->counters.late++;
+            drive->history->late++;
             md_count_failures(drive, 0);
             md_learn_lateness(drive, now_ns - drive->history->unanswered[i].sent_ns, 1);
             forget_up_to(drive, i);

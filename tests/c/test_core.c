@@ -67,7 +67,9 @@ static void check_line(const struct frame *frame, const struct md_message *reque
     static struct md_line line;
     static struct md_completion completion;
     struct md_history history = {0};
-    struct md_drive drive = {.least_timeout_ns = 1000000, .most_timeout_ns = 1000000, .history = &history};
+    /* Its proofs are none of this exchange's: the list of them is not looked at. */
+    struct md_drive drive = {.least_timeout_ns = 1000000, .most_timeout_ns = 1000000, .history = &history,
+                             .proofs = NULL, .proof_count = MD_MOST_PROOFS};
     struct md_exchange exchange = {.framing = frame->framing, .request = *request, .character_ns = 1000,
                                    .silence_ns = 4000, .drive = &drive};
     uint8_t bytes[MD_MOST_FRAME + 8];

@@ -83,6 +83,21 @@ def test_a_struct_larger_than_a_chunk_has_room(monkeypatch: pytest.MonkeyPatch) 
     assert numbers(*map(new_drive, range(3))) == [0, 1, 2]
 
 
+def last_line(struct: str, *fields: str) -> int:
+    """Return in which cache line of the struct the last of these fields ends, from 1 on."""
+    places = dict(ffi.typeof(f"struct {struct}").fields)
+    end = max(places[field].offset + ffi.sizeof(places[field].type) for field in fields)
+    return -(-end // CACHE_LINE)
+
+
+def test_what_every_exchange_touches_is_in_few_cache_lines() -> None:
+    """Two of its drive and two of itself; one of a drive that is to be asked next."""
+    assert last_line("md_drive", "most_timeout_ns", "ready_ns", "failures", "owed_count", "is_doubted") == 1
+    assert last_line("md_drive", "counters", "answered_ns") == 2
+    assert last_line("md_exchange", "values", "period_ns", "insists", "frame") == 2
+    assert ffi.offsetof("struct md_exchange", "request", "data") <= 2 * CACHE_LINE
+
+
 def test_what_is_polled_of_a_drive_is_side_by_side() -> None:
     """Proofs, and what is read by hand, have no part in its exchanges."""
     peer = Peer(least_timeout=0.02, most_timeout=1.0)

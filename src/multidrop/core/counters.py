@@ -50,7 +50,7 @@ def read_counters(drive: Any, timeout_ns: int, unasked: Counter[Status]) -> Coun
         history.exceptions,
         history.naks,
         history.busies,
-        c.late,
+        history.late,
         c.stray_bytes,
         c.ideal_ns,
         c.longest_ns,

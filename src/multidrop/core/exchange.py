@@ -49,8 +49,7 @@ class Peer:
     @property
     def has_answered(self) -> bool:
         """True once a reply came, be it an exception, late or in doubt."""
-        counters = self.c.counters
-        return bool(counters.answered or counters.late or self.c.doubtful)
+        return bool(self.c.counters.answered or self.c.history.late or self.c.doubtful)
 
     @property
     def failures(self) -> int:
@@ -60,7 +59,7 @@ class Peer:
     @property
     def late(self) -> int:
         """Replies that came after their time-out and were recognised."""
-        return int(self.c.counters.late)
+        return int(self.c.history.late)
 
     @property
     def late_until_ns(self) -> int:
@@ -99,6 +98,8 @@ class Peer:
         """
         self.proofs = tuple(proofs[:MOST_PROOFS])
         self._c_proofs = ffi.new("struct md_exchange *[]", [proof.c for proof in self.proofs])
+        for proof in self.proofs:
+            proof.c.is_proof = True
         self.c.proofs, self.c.proof_count = self._c_proofs, len(self.proofs)
 
     def doubt_first_reply(self) -> None:
