@@ -60,13 +60,15 @@ pyserials_own = pytest.mark.filterwarnings("ignore:set(Daemon|Name)\\(\\) is dep
 
 
 def vanishing_pty() -> tuple[str, Callable[[], None]]:
-    """A pty that hangs up, as an adapter does that is pulled, when it has heard a request."""
+    """A pty that hangs up, as an adapter does that is pulled, when it has heard a request.
+
+    Its other end stays open: else another program could get its number, and be what is opened again.
+    """
     master, slave = os.openpty()
     path = os.ttyname(slave)
 
     def hang_up() -> None:
         os.read(master, 1024)
-        os.close(slave)
         os.close(master)
 
     return path, hang_up
