@@ -15,10 +15,13 @@ def new_completion(**fields: object) -> Any:
     return ffi.new("struct md_completion *", fields)
 
 
-def completion_of(found: Any) -> Completion:
-    """Return the same as md_port_carry_out() would fill in."""
-    is_good = found.result > 0 and not found.reply.exception
-    return Completion(found, 0 if is_good else -1)
+def completion_of(found: Any, values: RowLayout | None = None) -> Completion:
+    """Return the same as md_port_carry_out() would fill in for an exchange with these values."""
+    completion = Completion(found, room=values.count if values else 0)
+    if found.result > 0 and not found.reply.exception:
+        reply = ffi.addressof(found, "reply")
+        completion.count = lib.md_values(values.c, reply, completion.values) if values else 0
+    return completion
 
 
 def copied(found: Any) -> Completion:
@@ -26,12 +29,14 @@ def copied(found: Any) -> Completion:
     return completion_of(ffi.new("struct md_completion *", found[0]))
 
 
-def completed(result: int, reply: Message, raw: bytes, *, at_ns: int, skipped: int = 0) -> Completion:
+def completed(
+    result: int, reply: Message, raw: bytes, values: RowLayout | None = None, *, at_ns: int, skipped: int = 0
+) -> Completion:
     """Return the result of an exchange that took no time."""
     times = dict.fromkeys(("begun_ns", "sent_ns", "first_ns", "last_ns"), at_ns)
     found = new_completion(result=result, skipped=skipped, reply=to_c(reply)[0], raw_len=len(raw), **times)
     found.raw[0 : len(raw)] = list(raw)
-    return completion_of(found)
+    return completion_of(found, values)
 
 
 def add_rows(columns: Columns, block: RowLayout, found: Any, utc_minus_monotonic_ns: int) -> bool:

@@ -15,6 +15,7 @@ from multidrop.core import (
     Failure,
     Message,
     Peer,
+    RowLayout,
     build_reply,
     build_request,
     parse_reply,
@@ -117,11 +118,13 @@ class SimulatedBus:
             self.seconds += TIMEOUT
             return self._completion(int(Failure.NO_REPLY))
         used, message = parse_reply(exchange.framing, reply, request)
-        return self._completion(used or int(Failure.CUT_SHORT), message, reply)
+        return self._completion(used or int(Failure.CUT_SHORT), message, reply, exchange.values)
 
-    def _completion(self, result: int, reply: Message | None = None, raw: bytes = b"") -> Completion:
+    def _completion(
+        self, result: int, reply: Message | None = None, raw: bytes = b"", values: RowLayout | None = None
+    ) -> Completion:
         at = round(self.seconds * 1e9)
-        return completed(result, reply or Message(0, 0), raw, at_ns=at)
+        return completed(result, reply or Message(0, 0), raw, values, at_ns=at)
 
     def attach(self, drive: Drive) -> Any:
         return self.bus.attach(drive)

@@ -121,7 +121,7 @@ class Exchanges:
                     self._answered_on[drive] = self.line.queue
                     if read.may_be_too_long:
                         prepared.answered.add(read.block)
-                    if plan.is_one and reply.count == read.whole:
+                    if read is plan.only and reply.count == read.whole:
                         return values
                     found |= values
                     continue

@@ -70,16 +70,16 @@ class PreparedRead:
 class ReadPlan:
     """Reads of a set of registers, the last one first, and the registers' names as they were asked for.
 
-    `is_one`: there is but one read, which has the names in that order.
+    `only`: the read that has all of them, named in that order; None where no single one has.
     """
 
-    __slots__ = ("is_one", "names", "reads", "registers")
+    __slots__ = ("names", "only", "reads", "registers")
 
     def __init__(self, registers: tuple[Register[Any], ...], reads: tuple[PreparedRead, ...]) -> None:
         self.registers = registers
         self.reads = reads
         self.names = tuple(register.name for register in registers)
-        self.is_one = len(reads) == 1 and reads[0].names == self.names
+        self.only = reads[0] if len(reads) == 1 and reads[0].names == self.names else None
 
 
 NOTHING = ReadPlan((), ())
