@@ -69,13 +69,18 @@ class NoValue(BadReply):
 
 
 class DriveRefused(BusError):
-    """The drive answered with an exception: it did not do what the request asked."""
+    """The drive answered with an exception: it did not do what the request asked.
 
-    def __init__(self, drive: str, code: int, meaning: str) -> None:
-        super().__init__(f"{drive} refuses: code {code:02X}H, {meaning}")
+    `register` is the name of the one that could not be read, where it was asked for by itself.
+    """
+
+    def __init__(self, drive: str, code: int, meaning: str, register: str | None = None) -> None:
+        refuses = "refuses" if register is None else f"refuses {register}"
+        super().__init__(f"{drive} {refuses}: code {code:02X}H, {meaning}")
         self.drive = drive
         self.code = code
         self.meaning = meaning
+        self.register = register
 
 
 class Unconfirmed(BusError):

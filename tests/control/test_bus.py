@@ -537,7 +537,7 @@ def test_a_refusal_has_its_family_s_meaning(
             bus.read(drive, register)
     assert caught.value.code == code
     assert caught.value.meaning.startswith(meaning)
-    assert str(caught.value).startswith(f"{drive.name} refuses: code {code:02X}H, {meaning}")
+    assert str(caught.value).startswith(f"{drive.name} refuses {register.name}: code {code:02X}H, {meaning}")
     assert there.counters.requests == 1  # an answer, which asking again would not change
 
 

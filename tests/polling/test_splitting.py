@@ -234,8 +234,9 @@ def test_by_hand_a_refused_register_is_refused_by_itself(monkeypatch: pytest.Mon
     sim = Picky(drive, refused={3})
     bus = SimulatedBus(monkeypatch, sim)
     bus.attach(drive)
-    with pytest.raises(DriveRefused):
+    with pytest.raises(DriveRefused, match=r"^pump-1 refuses r3: ") as caught:
         bus.bus.read_many(drive, drive.registers.values())
+    assert caught.value.register == "r3"
     assert sim.asked[-1] == (3, 1)
     assert len(sim.asked) <= 11
     others = [register for register in drive.registers.values() if register.address != 3]

@@ -23,7 +23,7 @@ from multidrop.transport.prepared import (
     make_exchange,
     make_read,
 )
-from multidrop.transport.replies import check_master, good_reply, no_reply, no_value
+from multidrop.transport.replies import check_master, good_reply, no_reply, no_value, refusal_of
 
 READ_ATTEMPTS = 3
 WRITE_TIMEOUT = 1.0  # s: a write that is wrongly reported as unconfirmed costs more than the wait
@@ -130,6 +130,8 @@ class Exchanges:
                     raise
                 except (DriveRefused, NoReply, BadReply) as failure:
                     parts = self._parts(drive, prepared, read, failure)
+                    if not parts and isinstance(failure, DriveRefused) and len(read.names) == 1:
+                        raise refusal_of(drive, failure.code, read.names[0]) from None
                     if not parts:
                         raise
                 prepared.parts[read.block] = parts

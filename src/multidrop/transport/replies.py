@@ -16,7 +16,7 @@ def good_reply(drive: Drive, completion: Completion) -> Message:
     if result > 0 and not reply.exception:
         return reply
     if result > 0:
-        raise DriveRefused(drive.name, reply.exception, drive.exception(reply.exception))
+        raise refusal_of(drive, reply.exception)
     if result in (Failure.NO_REPLY, Failure.LATE_ANSWER_DUE):
         raise no_reply(drive, completion)
     advice = mixed_up(_port_of(drive), completion.raw)
@@ -36,6 +36,11 @@ def check_master(drive: Drive, completion: Completion) -> None:
     if completion.result in (Failure.NOT_MASTER, Failure.OTHER_MASTER):
         is_sent = completion.sent_ns > 0
         raise NotMaster(drive.name, _port_of(drive), heard=completion.raw, is_sent=is_sent)
+
+
+def refusal_of(drive: Drive, code: int, register: str | None = None) -> DriveRefused:
+    """Return the error of an exception, and of the register that was asked for by itself."""
+    return DriveRefused(drive.name, code, drive.exception(code), register)
 
 
 def no_value(drive: Drive, found: dict[str, Any]) -> NoValue:
