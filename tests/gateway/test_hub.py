@@ -65,7 +65,7 @@ def test_a_miss_is_newest_and_the_value_before_it_is_the_last_good_one(hub: Hub)
     sent, missed = 10 * PERIOD, 11 * PERIOD
     good = next(good for name, _, good, _ in hub.known("pump-1") if name == "output_frequency")
     assert good == (UTC_0 + sent, sent, 25.0, 0)
-    assert hub.newest("pump-1", "output_frequency") == Newest(UTC_0 + missed, missed, None, "no reply")
+    assert hub.newest("pump-1", "output_frequency") == Newest(UTC_0 + missed, missed, None, "no reply", 10**9)
     assert is_fresh(hub)
 
 
@@ -187,6 +187,21 @@ def test_what_is_read_seldom_is_fresh_for_longer(tmp_path: Path) -> None:
     hub.take(rows((10 + 290, STATUS, STANDBY), drive="pump-2"))
     assert is_fresh(hub)
     hub.take(rows((10 + 301, STATUS, STANDBY), drive="pump-2"))
+    assert not is_fresh(hub)
+
+
+def test_what_an_overfull_line_reads_holds_until_three_rounds_are_over(tmp_path: Path) -> None:
+    path = written(tmp_path, "", *(f"pump-{n}" for n in range(1, 31))).path
+    path.write_text(path.read_text().replace("baudrate = 38400", "baudrate = 1200"))
+    hub = Hub(load_plant(path))
+    cycle_s = hub.plant.metadata()["planned"]["hall"]["cycle_ms"] / 1000
+    assert cycle_s > 1  # where 0.1 s are asked for
+    hub.take(all_of(10, FORWARD, 25))
+    row = hub.newest("pump-1", "output_frequency")
+    assert row is not None
+    assert hub.holds_s("pump-1", "output_frequency") == row.holds_ns / SECOND == pytest.approx(3 * cycle_s)
+    assert is_fresh(hub)
+    hub.pass_time(10 * PERIOD + row.holds_ns + 1)
     assert not is_fresh(hub)
 
 

@@ -43,6 +43,7 @@ def test_the_description_has_what_the_plant_file_and_the_manual_say(gateway: Ser
     registers = {one["name"]: one for one in pump["registers"]}
     status, frequency, setpoint = (registers[one] for one in ("status", "output_frequency", "setpoint"))
     assert (status["kind"], status["words"]["3"], status["period_s"]) == ("words", "standby", 0.1)
+    assert status["holds_s"] >= 1
     assert (frequency["kind"], frequency["unit"], frequency["digits"]) == ("number", "Hz", 2)
     assert (setpoint["access"], setpoint["least"], setpoint["most"]) == ("setting", 0, 100)
     assert setpoint["period_s"] is None

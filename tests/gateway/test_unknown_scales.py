@@ -25,7 +25,7 @@ class FullHub(Hub):
     """A hub to which each polled register said 25 just now."""
 
     def newest(self, drive: str, register: str) -> Newest | None:
-        return Newest(1, 1, 25.0, "ok")
+        return Newest(1, 1, 25.0, "ok", 1)
 
     def known(self, drive: str) -> Iterator[Known]:
         for register in self.polled(drive):
@@ -46,7 +46,7 @@ def number(words: list[int], at: int) -> int:
 def test_the_page_has_a_unit_for_what_has_a_scale_alone(model: str) -> None:
     drive = MODELS[model](1)
     told = describe(
-        plant(line("/dev/null", polled(drive, drive.readings()))),
+        Hub(plant(line("/dev/null", polled(drive, drive.readings())))),
         May(),
         None,
         revision=1,

@@ -181,12 +181,15 @@ class Meter(Drive):
     unpolled = reading(9)
 
 
+S = 1_000_000_000
+
+
 class FakeRow(NamedTuple):
     monotonic_ns: int
     value: float | None
+    holds_ns: int = S
 
 
-S = 1_000_000_000
 NOW = 100 * S
 ROWS = {
     "speed": FakeRow(NOW - S // 2, 1450.0),
@@ -201,16 +204,14 @@ ROWS = {
 }
 
 
-def cached(every: float | None = 0.1) -> DriveWords:
-    polls = tuple(Polled(Meter.registers[name], every) for name in ROWS)
+def cached() -> DriveWords:
+    polls = tuple(Polled(Meter.registers[name], 0.1) for name in ROWS)
     return DriveWords(PolledDrive(Meter(1), polls))
 
 
-def read(
-    function: int, start: int, count: int, *, since_ns: int = 0, every: float | None = 0.1, **changed: FakeRow
-) -> list[int] | Lack:
+def read(function: int, start: int, count: int, *, since_ns: int = 0, **changed: FakeRow) -> list[int] | Lack:
     rows = {**ROWS, **changed}
-    return cached(every).read(function, range(start, start + count), rows.get, NOW, since_ns)
+    return cached().read(function, range(start, start + count), rows.get, NOW, since_ns)
 
 
 def test_a_range_is_of_words_as_the_drive_has_them() -> None:
@@ -234,9 +235,8 @@ def test_a_row_that_is_old_or_a_miss_leaves_the_range_out() -> None:
     assert read(3, 0, 4, status=FakeRow(NOW, None)) is Lack.STALE
     assert read(3, 0, 4, status=FakeRow(NOW - S, 3.0)) == [1450, 2, 1, 3]
     assert read(3, 0, 4, status=FakeRow(NOW - S - 1, 3.0)) is Lack.STALE
-    assert read(3, 3, 1, status=FakeRow(NOW - 6 * S, 3.0), every=2.0) == [3]
-    assert read(3, 3, 1, status=FakeRow(NOW - 6 * S - 1, 3.0), every=2.0) is Lack.STALE
-    assert read(3, 3, 1, status=FakeRow(NOW - S, 3.0), every=None) == [3]
+    assert read(3, 3, 1, status=FakeRow(NOW - 6 * S, 3.0, 6 * S)) == [3]
+    assert read(3, 3, 1, status=FakeRow(NOW - 6 * S - 1, 3.0, 6 * S)) is Lack.STALE
     assert cached().read(3, range(1), lambda name: None, NOW) is Lack.STALE
 
 

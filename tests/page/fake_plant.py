@@ -19,10 +19,14 @@ SILENT = {"labeller": 42}
 SPEEDS = ("38400 8N1", "9600 8N1", "38400 8N1")
 
 
+UNPOLLED: dict[str, Any] = {"period_s": None, "holds_s": None}
+
+
 def register(name: str, unit: str, digits: int, place: str, **more: Any) -> dict[str, Any]:
     return {
         "name": name, "unit": unit, "digits": digits, "kind": "number", "words": {}, "access": "reading",
-        "place": place, "period_s": 0.1, "least": None, "most": None, "step": 10.0**-digits, **more,
+        "place": place, "period_s": 0.1, "holds_s": 1.0, "least": None, "most": None, "step": 10.0**-digits,
+        **more,
     }  # fmt: skip
 
 
@@ -33,11 +37,21 @@ REGISTERS = [
     register("dc_bus_voltage", "V", 0, "section 7.2, 1002H"),
     register("output_torque", "%", 1, "section 7.2, 1005H"),
     register("output_power", "kW", 1, "section 7.2, 1006H"),
-    register("heatsink_temperature", "°C", 0, "section 7.2, 1007H", period_s=1.0),
+    register("heatsink_temperature", "°C", 0, "section 7.2, 1007H", period_s=1.0, holds_s=3.0),
     register("run_state", "", 0, "table 9-2, 3000H", kind="words", words={"1": "runs", "3": "standby"}),
     register("status_bits", "", 0, "table 9-3, 3001H", kind="bits", words={"1": "ready", "4": "at_setpoint"}),
-    register("acceleration_time", "s", 1, "P0.11", access="setting", least=0, most=3600, period_s=None),
-    register("run_hours", "h", 0, "P7.11", period_s=None),
+    register(
+        "acceleration_time",
+        "s",
+        1,
+        "P0.11",
+        access="setting",
+        least=0,
+        most=3600,
+        period_s=None,
+        holds_s=None,
+    ),
+    register("run_hours", "h", 0, "P7.11", **UNPOLLED),
 ]
 KEY = {"frequency": "output_frequency", "current": "output_current", "setpoint": "frequency_setpoint"}
 
@@ -126,7 +140,7 @@ def ms(seconds: float) -> int:
 
 
 def frame(n: int, began: float, renamed: dict[str, str], stuck: dict[str, float]) -> dict[str, Any]:
-    """Return a frame. A drive of `stuck` has not had a new value since that time (s)."""
+    """Return a frame. A drive of `stuck` has not had a new value since that time (s), and no miss."""
     now = time.time()
     drives = {}
     for number, name in enumerate(" ".join(NAMES).split()):
@@ -140,8 +154,11 @@ def frame(n: int, began: float, renamed: dict[str, str], stuck: dict[str, float]
             ages = [0, ms(now) - ms(seen)]
         else:
             seen = at
-            rows = {r: [held[r], 0] for r in polled}
-            ages = [ms(now) - ms(at)]
+            holds = {r["name"]: r["holds_s"] for r in REGISTERS}
+            rows = {
+                r: [held[r], 0] if now - at <= holds[r] else [None, 1, "overdue", held[r], 0] for r in polled
+            }
+            ages = [ms(now) - ms(at), 0]
         drives[renamed.get(name, name)] = {
             "state": state(name), "fault": FAULTS[name][0] if name in FAULTS else None, "seen": len(ages) - 1,
             "ages_ms": ages, "values": rows, "why": "no reply" if name in SILENT else None,

@@ -6,6 +6,7 @@ import re
 import time
 from typing import Any
 
+import fake_plant
 import pytest
 from conftest import Opener
 from fake_gateway import FakeGateway
@@ -89,6 +90,19 @@ def test_an_old_value_is_never_shown_as_new(opened: Opener, gateway: FakeGateway
     until_met(page, lambda: fresh.evaluate("e => getComputedStyle(e).color") != style[1])
     until_met(page, lambda: page.locator(".keys .value.old").count() == 3)
     assert cell(page, "pump-2", "frequency").locator(".bar").is_hidden()
+
+
+def test_what_a_slow_line_read_seconds_ago_is_not_old(
+    opened: Opener, gateway: FakeGateway, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The period is what was asked for; how long a value holds, the gateway knows."""
+    held = [one | {"holds_s": one["holds_s"] and 600.0} for one in fake_plant.REGISTERS]
+    monkeypatch.setattr(fake_plant, "REGISTERS", held)
+    gateway.stuck = {"pump-2": time.time() - 20}
+    page = opened("#/drives/pump-2")
+    until(page, LIVE)
+    page.locator(".keys .value:not(.old)").nth(2).wait_for()
+    assert page.locator("tr.drive", has_text="pump-2").locator(".value.old").count() == 0
 
 
 def test_what_is_not_well_beside_the_lines_is_told(opened: Opener, gateway: FakeGateway) -> None:

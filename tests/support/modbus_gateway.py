@@ -26,6 +26,7 @@ PATIENCE = 30.0  # s, for what must come
 class FakeRow(NamedTuple):
     monotonic_ns: int
     value: float | None
+    holds_ns: int = 1_000_000_000
 
 
 class FakeHub:

@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import Any, Protocol
 
 from multidrop import PolledDrive, Register
-from multidrop.gateway.drive_words import NewestRow, fresh_ns, is_fresh
+from multidrop.gateway.drive_words import NewestRow, is_fresh
 
 COMMON_LENGTH = 16  # words of the block
 STATE, FAULT, FREQUENCY, CURRENT, SETPOINT, AGE, STOP = 0, 1, 2, 4, 6, 8, 10  # words from its begin
@@ -36,11 +36,7 @@ class CommonBlock:
 
     def __init__(self, polled: PolledDrive) -> None:
         self._name = polled.drive.name
-        self._fresh_ns = {
-            (poll.register.name, unit): fresh_ns(poll.every)
-            for poll in polled.polls
-            for unit in _units(poll.register)
-        }
+        self._polled = {(poll.register.name, unit) for poll in polled.polls for unit in _units(poll.register)}
         self._numbers = (
             (FREQUENCY, "output_frequency", "Hz"),
             (CURRENT, "output_current", "A"),
@@ -63,9 +59,8 @@ class CommonBlock:
         self, hub: CommonSource, now_ns: int, woke_ns: int, name: str, unit: str | None
     ) -> float | None:
         """Return the fresh value of a polled register, in this unit or its own; None where there is none."""
-        longest_ns = self._fresh_ns.get((name, unit))
-        row = hub.newest(self._name, name) if longest_ns else None
-        return row.value if row and longest_ns and is_fresh(row, longest_ns, now_ns, woke_ns) else None
+        row = hub.newest(self._name, name) if (name, unit) in self._polled else None
+        return row.value if row and is_fresh(row, now_ns, woke_ns) else None
 
     def _fault(self, hub: CommonSource, now_ns: int, woke_ns: int, state: str) -> int:
         """Return the drive's own number of the fault that it shows."""

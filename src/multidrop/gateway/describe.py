@@ -7,7 +7,8 @@ from collections.abc import Sequence
 from enum import Flag
 from typing import Any, cast
 
-from multidrop import Drive, Plant, PlantLine, PolledDrive, Register, verbs_of
+from multidrop import Drive, PlantLine, PolledDrive, Register, verbs_of
+from multidrop.gateway.hub import Hub
 from multidrop.gateway.rights import May, Right
 
 FREQUENCIES = ("output_frequency", "motor_speed")
@@ -15,7 +16,7 @@ CURRENTS = ("output_current",)
 
 
 def describe(
-    plant: Plant,
+    hub: Hub,
     may: May,
     right: Right | None,
     *,
@@ -31,7 +32,7 @@ def describe(
     return {
         "revision": revision,
         "version": version,
-        "name": plant.path.name,
+        "name": hub.plant.path.name,
         "demo": is_demo,
         "file": has_file,  # that can be read again
         "fleet": has_fleet,  # that /api/fleet tells of
@@ -41,21 +42,21 @@ def describe(
             "write": sorted(may.write) if is_writer else [],
             "verbs": sorted(may.verbs) if is_writer else [],
         },
-        "lines": [_line(line) for line in plant.lines],
+        "lines": [_line(hub, line) for line in hub.plant.lines],
     }
 
 
-def _line(line: PlantLine) -> dict[str, Any]:
+def _line(hub: Hub, line: PlantLine) -> dict[str, Any]:
     speeds = Counter(str(polled.drive.settings) for polled in line.drives)
     return {
         "name": line.name,
         "port": line.port,
         "speed": speeds.most_common(1)[0][0] if speeds else "",
-        "drives": [_drive(polled) for polled in line.drives],
+        "drives": [_drive(hub, polled) for polled in line.drives],
     }
 
 
-def _drive(polled: PolledDrive) -> dict[str, Any]:
+def _drive(hub: Hub, polled: PolledDrive) -> dict[str, Any]:
     drive = polled.drive
     periods = {poll.register.name: poll.every or 0.0 for poll in polled.polls}
     return {
@@ -65,7 +66,8 @@ def _drive(polled: PolledDrive) -> dict[str, Any]:
         "address": drive.address,
         "key": _key_registers(drive, periods),
         "registers": [
-            _register(register) | {"period_s": periods.get(register.name)}
+            _register(register)
+            | {"period_s": periods.get(register.name), "holds_s": hub.holds_s(drive.name, register.name)}
             for register in drive.registers.values()
         ],
         "verbs": verbs_of(drive),

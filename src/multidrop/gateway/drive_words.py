@@ -18,9 +18,6 @@ from typing import Any, Protocol
 
 from multidrop import Carrier, NumberFormat, PolledDrive, Register, Table
 
-LEAST_FRESH_NS = 1_000_000_000  # for which a value is the drive's present one, whatever its period
-FRESH_PERIODS = 3
-
 _FLOATS = {NumberFormat.F32: (">f", ">I"), NumberFormat.F64: (">d", ">Q")}
 _OPEN = frozenset({NumberFormat.I8, NumberFormat.U32_EITHER})
 MOST_KNOWN = 8192  # values whose data are remembered: drives of a family share their registers
@@ -41,6 +38,8 @@ class NewestRow(Protocol):
     def monotonic_ns(self) -> int: ...
     @property
     def value(self) -> float | None: ...
+    @property
+    def holds_ns(self) -> int: ...
 
 
 class Lack(Enum):
@@ -50,16 +49,11 @@ class Lack(Enum):
     STALE = "polled, and its newest row is a miss or old"
 
 
-def fresh_ns(every: float | None) -> int:
-    """Return for how long a value is the drive's present one, by its period in s."""
-    return max(LEAST_FRESH_NS, round(FRESH_PERIODS * (every or 0.0) * 1e9))
-
-
-def is_fresh(row: NewestRow | None, fresh_ns: int, now_ns: int, since_ns: int = 0) -> bool:
+def is_fresh(row: NewestRow | None, now_ns: int, since_ns: int = 0) -> bool:
     """Return True for a row with a value that is not too old, nor from before `since_ns`."""
     if row is None or row.value is None:
         return False
-    return row.monotonic_ns >= since_ns and now_ns - row.monotonic_ns <= fresh_ns
+    return row.monotonic_ns >= since_ns and now_ns - row.monotonic_ns <= row.holds_ns
 
 
 @lru_cache(maxsize=MOST_KNOWN)
@@ -112,12 +106,11 @@ def _neighbours(raw: float, number_format: NumberFormat) -> Iterable[float]:
 class _Place:
     """A register at its addresses, and the words of its latest value."""
 
-    __slots__ = ("_data", "_fresh_ns", "_register", "_value", "name")
+    __slots__ = ("_data", "_register", "_value", "name")
 
-    def __init__(self, register: Register[Any], every: float | None) -> None:
+    def __init__(self, register: Register[Any]) -> None:
         self.name = register.name
         self._register = register
-        self._fresh_ns = fresh_ns(every)
         self._value: float | None = None
         self._data: bytes | None = None
 
@@ -126,7 +119,7 @@ class _Place:
 
         A row that is no value, too old, or from before `since_ns` gives none.
         """
-        if row is None or not is_fresh(row, self._fresh_ns, now_ns, since_ns):
+        if row is None or not is_fresh(row, now_ns, since_ns):
             return Lack.STALE
         value = row.value
         if value is not None and value != self._value:
@@ -138,7 +131,7 @@ class _Place:
 
 
 class DriveWords:
-    """The polled words of one drive, by function code and address; each register has its period."""
+    """The polled words of one drive, by function code and address."""
 
     def __init__(self, polled: PolledDrive) -> None:
         self._at: dict[tuple[int, int], list[tuple[_Place, int]]] = {}
@@ -147,7 +140,7 @@ class DriveWords:
             function = reading_function(register.table)
             if not function:
                 continue
-            place = _Place(register, poll.every)
+            place = _Place(register)
             for at in range(register.words):
                 key = function, register.address + at
                 self._at.setdefault(key, []).append((place, at))

@@ -38,6 +38,7 @@ class Newest(NamedTuple):
     monotonic_ns: int
     value: float | None  # None: this row is a miss
     status: str  # "ok", or the reason
+    holds_ns: int  # for which a value of this register is the present one
 
 
 class Shown(NamedTuple):
@@ -185,12 +186,18 @@ class Hub:
         if cell is None or cell.newest is None:
             return None
         time, monotonic_ns, value, status = cell.newest
-        return Newest(time, monotonic_ns, None if status else value, self._statuses[status])
+        good = None if status else value
+        return Newest(time, monotonic_ns, good, self._statuses[status], cell.stale_ns)
 
     def polled(self, drive: str) -> tuple[Register[Any], ...]:
         """Return the registers of a drive that are polled, in the plant file's order."""
         watched = self._watched.get(drive)
         return tuple(poll.register for poll in watched.polled.polls) if watched else ()
+
+    def holds_s(self, drive: str, register: str) -> float | None:
+        """Return for how long a value is the present one, in s; None where it is not polled."""
+        watched = self._watched[drive]
+        return watched.cell(register).stale_ns / 1e9 if register in watched.names else None
 
     @property
     def drives(self) -> Iterator[str]:

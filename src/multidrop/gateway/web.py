@@ -137,7 +137,7 @@ class _Pages:
     async def plant(self, request: Request) -> Response:
         gateway = self._gateway
         described = describe(
-            gateway.plant,
+            gateway.hub,
             gateway.settings.may,
             caller_of(request).role,
             revision=gateway.revision,

@@ -4,7 +4,7 @@
 import { Ring } from "./ring.js";
 
 const SAMPLES = 2e6; // of all registers together
-const UNPLANNED_LIMIT_MS = 5000; // how old a value may be whose period is not known
+const UNPOLLED_S = 5; // for which a value of a register holds that is no longer polled
 const FAILED_LIMIT_MS = 1000; // and one whose newest request failed
 const UNSEEN_MS = 5000; // between two frames: what was then is not known
 export const LIVE_MS = 1500; // a frame comes each second at least
@@ -106,8 +106,8 @@ function most() {
 }
 
 // Return what is known of a register now, or null where nothing ever was:
-// {value, ms, status, age (ms), isOld}. `now` is the daemon's time; a value is old when it is older than
-// three periods, than a second where the newest request failed, or when the frame itself is old.
+// {value, ms, status, age (ms), isOld}. `now` is the daemon's time; a value is old when the gateway says so,
+// a second after it where the newest request failed, or when the frame itself is old.
 export function reading(name, register, now) {
   const drive = store.drives.get(name),
     newest = drive?.newest.get(register);
@@ -121,15 +121,13 @@ export function reading(name, register, now) {
     ms: good.ms,
     status,
     age,
-    isOld: age > (status === "ok" ? holdsFor(name, register) : FAILED_LIMIT_MS) || !isLive(now),
+    isOld: (status !== "ok" && age > FAILED_LIMIT_MS) || !isLive(now),
   };
 }
 
 // Return for how long, in ms, a value of a register holds.
-export function holdsFor(name, register) {
-  const period = store.drives.get(name)?.registers.get(register)?.period_s;
-  return period ? Math.max(3000 * period, 1000) : UNPLANNED_LIMIT_MS;
-}
+export const holdsFor = (name, register) =>
+  1000 * (store.drives.get(name)?.registers.get(register)?.holds_s ?? UNPOLLED_S);
 
 export const isLive = now => store.frame !== null && !store.isLost && now - store.time < LIVE_MS;
 
