@@ -320,7 +320,10 @@ def test_the_log_shows_who_wrote_what_and_what_it_became(opened: Opener) -> None
     page = opened("#/log")
     rows = page.locator("#log-list tbody tr")
     rows.first.wait_for()
-    assert rows.count() == 3
+    assert rows.count() == 5
     for part in ("pump-1", "frequency_setpoint = 38.0", "the drive holds 38", "anna by page", "01 06 20 01"):
         assert part in rows.first.inner_text()
-    assert rows.nth(2).locator(".bad").inner_text().strip() == "unconfirmed; no reply"
+    assert rows.nth(4).locator(".bad").inner_text().strip() == "unconfirmed; no reply"
+    for repeated, drive in ((rows.nth(2), "labeller"), (rows.nth(3), "mixer-2")):
+        assert drive in repeated.inner_text()
+        assert re.search(r"\b42 times since .*\d\d:\d\d:\d\d", repeated.inner_text())

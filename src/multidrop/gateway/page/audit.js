@@ -51,8 +51,8 @@ async function fetchMore(before) {
 // Draw what is shown anew, in another time zone.
 export const redraw = () => entries.length && fill(find("#log-list"), auditRows(entries, true));
 
-// Return a table of entries; `isWhole`: with the drive and the frame too.
-export function auditRows(list, isWhole) {
+// Return a table of entries, at most so many rows; `isWhole`: with the drive and the frame too.
+export function auditRows(list, isWhole, most = Infinity) {
   const heads = [
     `Time, ${clock.zoneName()}`,
     isWhole && "Drive",
@@ -68,12 +68,35 @@ export function auditRows(list, isWhole) {
     make(
       "tbody",
       {},
-      list.map(entry => row(entry, isWhole)),
+      repeats(list)
+        .slice(0, most)
+        .map(entry => row(entry, isWhole)),
     ),
   );
 }
 
-function row({ time, drive, address, model, write, sent, outcome, held, why, by, way }, isWhole) {
+// Return the entries, of what was sent to a drive again and became the same the newest alone: a stop is
+// repeated until it is seen. `times` says how often, and `since` from when on.
+function repeats(list) {
+  const newest = new Map(),
+    kept = [];
+  for (const { time, drive, address, model, ...rest } of list) {
+    const whose = JSON.stringify([drive, address, model]),
+      what = JSON.stringify(rest),
+      last = newest.get(whose);
+    if (last?.what === what) {
+      last.times += 1;
+      last.since = time;
+      continue;
+    }
+    kept.push({ ...rest, time, drive, address, model, what, times: 1, since: time });
+    newest.set(whose, kept.at(-1));
+  }
+  return kept;
+}
+
+function row(entry, isWhole) {
+  const { time, drive, address, model, write, sent, outcome, held, why, by, way, times, since } = entry;
   const isDone = DONE.test(outcome ?? ""),
     became = [outcome ?? "unknown", held !== undefined && held !== null && `the drive holds ${held}`, why]
       .filter(Boolean)
@@ -81,7 +104,12 @@ function row({ time, drive, address, model, write, sent, outcome, held, why, by,
   return make(
     "tr",
     {},
-    make("td", { title: time }, clock.when(Date.parse(time))),
+    make(
+      "td",
+      { title: time },
+      clock.when(Date.parse(time)),
+      times > 1 ? make("p", { class: "note" }, `${times} times since ${clock.when(Date.parse(since))}`) : null,
+    ),
     isWhole ? make("td", { class: "who" }, drive ? named(drive) : `${model ?? ""} ${address ?? ""}`) : null,
     make("td", { class: "words" }, make("bdi", {}, String(write ?? "–"))),
     make("td", { class: isDone ? "words" : "words bad" }, isDone ? null : glyph("fault"), ` ${became}`),

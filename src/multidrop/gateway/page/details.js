@@ -111,6 +111,6 @@ function histogram(counts) {
 function writes({ entries }, drive) {
   const own = (entries ?? []).filter(entry => entry.drive === drive);
   return own.length
-    ? auditRows(own.slice(0, 20), false)
+    ? auditRows(own, false, 20)
     : make("p", { class: "note" }, "None among the newest 200 of the log.");
 }
