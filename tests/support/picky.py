@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Iterable
 from typing import Any
 
 from multidrop.core import Message
@@ -18,6 +18,11 @@ def family(registers: int, **declared: Any) -> type[Drive]:
     return type("Plain", (Drive,), {"__doc__": "Of this test.", **readings, **declared})
 
 
+def right(addresses: Iterable[int]) -> dict[str, float]:
+    """Return what a picky device holds at these addresses, by the registers' names."""
+    return {f"r{at}": 100 + at for at in addresses}
+
+
 class Picky(SimulatedDrive):
     """Refuses reads of some addresses; refuses or ignores those of more than so many registers."""
 
@@ -28,8 +33,8 @@ class Picky(SimulatedDrive):
         self.missing = set(refused)
         self.limit, self.silent_beyond = most, silent_beyond
         self.asked: list[tuple[int, int]] = []
-        for at in range(len(drive.registers)):
-            self[f"r{at}"] = 100 + at
+        for at, name in enumerate(drive.registers):
+            self[name] = 100 + at
 
     def answer(self, request: Message, now: float) -> Message | None:
         if request.address != self.drive.address or now < self.deaf_until:

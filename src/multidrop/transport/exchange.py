@@ -130,8 +130,8 @@ class Exchanges:
                     raise
                 except (DriveRefused, NoReply, BadReply) as failure:
                     parts = self._parts(drive, prepared, read, failure)
-                    if not parts and isinstance(failure, DriveRefused) and len(read.names) == 1:
-                        raise refusal_of(drive, failure.code, read.names[0]) from None
+                    if not parts and isinstance(failure, DriveRefused) and len(read.block.registers) == 1:
+                        raise refusal_of(drive, failure.code, read.block.registers[0].name) from None
                     if not parts:
                         raise
                 prepared.parts[read.block] = parts

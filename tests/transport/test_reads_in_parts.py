@@ -1,0 +1,114 @@
+"""Reads by hand of what a drive refuses as a whole, or is silent to: in parts, none of which is lost."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from picky import Picky, family, right
+from simulated_bus import SimulatedBus
+
+from multidrop.core import NumberFormat
+from multidrop.drive.declare import reading
+from multidrop.errors import DriveRefused, NoReply
+
+WIDE = 24
+
+
+def test_a_refusal_splits_and_is_remembered(monkeypatch: pytest.MonkeyPatch) -> None:
+    drive = family(WIDE)(1, name="pump-1")
+    sim = Picky(drive, most=8)
+    bus = SimulatedBus(monkeypatch, sim)
+    bus.attach(drive)
+    first = bus.bus.read_many(drive, drive.registers.values())
+    assert first == right(range(WIDE))
+    assert [count for _, count in sim.asked] == [24, 12, 6, 6, 12, 6, 6]
+    sim.asked.clear()
+    assert bus.bus.read_many(drive, drive.registers.values()) == first
+    assert [count for _, count in sim.asked] == [6] * 4
+    bus.queue = object()  # the port was opened again
+    sim.asked.clear()
+    assert bus.bus.read_many(drive, drive.registers.values()) == first
+    assert sim.asked[0] == (0, WIDE)
+
+
+def test_a_refused_register_is_refused_by_itself(monkeypatch: pytest.MonkeyPatch) -> None:
+    drive = family(WIDE)(1, name="pump-1")
+    sim = Picky(drive, refused={3})
+    bus = SimulatedBus(monkeypatch, sim)
+    bus.attach(drive)
+    with pytest.raises(DriveRefused, match=r"^pump-1 refuses r3: ") as caught:
+        bus.bus.read_many(drive, drive.registers.values())
+    assert caught.value.register == "r3"
+    assert sim.asked[-1] == (3, 1)
+    assert len(sim.asked) <= 11
+    others = [register for register in drive.registers.values() if register.address != 3]
+    assert bus.bus.read_many(drive, others) == right(set(range(WIDE)) - {3})
+
+
+@given(st.sets(st.integers(0, 5), max_size=2), st.integers(1, 6), st.sets(st.integers(0, 5), min_size=1))
+def test_all_comes_or_what_is_refused_is_named(refused: set[int], most: int, asked: set[int]) -> None:
+    drive = family(6)(1, name="pump-1")
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        bus = SimulatedBus(monkeypatch, Picky(drive, refused, most)).bus
+        bus.attach(drive)
+        registers = [drive.register(f"r{at}") for at in sorted(asked)]
+        for _ in range(2):  # then the parts are known
+            if not refused & asked:
+                assert bus.read_many(drive, registers) == right(asked)
+                continue
+            with pytest.raises(DriveRefused) as caught:
+                bus.read_many(drive, registers)
+            assert caught.value.register in {f"r{at}" for at in refused & asked}
+
+
+@pytest.mark.parametrize("code", [1, 5, 6])
+def test_busy_splits_nothing(code: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    drive = family(WIDE)(1, name="pump-1")
+    bus = SimulatedBus(monkeypatch, sim := Picky(drive))
+    bus.attach(drive)
+    sim.limit = 0
+    monkeypatch.setattr(sim, "_code", lambda reason: code)
+    with pytest.raises(DriveRefused):
+        bus.bus.read_many(drive, drive.registers.values())
+    assert sim.asked == [(0, WIDE)]
+
+
+def test_no_register_is_named_where_several_were_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    scaled = {"flow": reading(2, scale_register="power"), "power": reading(3, number_format=NumberFormat.I16)}
+    drive = family(2, **scaled)(1, name="pump-1")
+    bus = SimulatedBus(monkeypatch, sim := Picky(drive))
+    bus.attach(drive)
+    sim.limit = 0
+    monkeypatch.setattr(sim, "_code", lambda reason: 6)
+    with pytest.raises(DriveRefused, match=r"^pump-1 refuses: ") as caught:
+        bus.bus.read_many(drive, [drive.register("r1"), drive.register("flow")])
+    assert caught.value.register is None
+
+
+def test_silence_to_a_long_request_splits_where_a_short_one_is_answered(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    drive = family(WIDE)(1, name="pump-1")
+    bus = SimulatedBus(monkeypatch, sim := Picky(drive, silent_beyond=8))
+    bus.attach(drive)
+    assert bus.bus.read_many(drive, drive.registers.values()) == right(range(WIDE))
+    sim.asked.clear()
+    assert bus.bus.read_many(drive, drive.registers.values()) == right(range(WIDE))
+    assert [count for _, count in sim.asked] == [6] * 4
+
+
+def test_a_dead_drive_costs_one_request_more(monkeypatch: pytest.MonkeyPatch) -> None:
+    drive = family(WIDE)(1, name="pump-1")
+    bus = SimulatedBus(monkeypatch, sim := Picky(drive, silent_beyond=0))
+    bus.attach(drive)
+    with pytest.raises(NoReply):
+        bus.bus.read_many(drive, drive.registers.values())
+    assert sim.asked == [(0, WIDE)] * 3 + [(0, 1)]
+    sim.silent_beyond = 125
+    assert bus.bus.read_many(drive, drive.registers.values()) == right(range(WIDE))
+    sim.asked.clear()
+    sim.silent_beyond = 1  # noise, say: it has answered the whole
+    with pytest.raises(NoReply):
+        bus.bus.read_many(drive, drive.registers.values())
+    assert sim.asked == [(0, WIDE)] * 3
