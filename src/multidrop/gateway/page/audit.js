@@ -95,6 +95,10 @@ function repeats(list) {
   return kept;
 }
 
+const at = time => clock.when(Date.parse(time));
+
+const repeated = (times, since) => make("p", { class: "note" }, `${times} times since ${at(since)}`);
+
 function row(entry, isWhole) {
   const { time, drive, address, model, write, sent, outcome, held, why, by, way, times, since } = entry;
   const isDone = DONE.test(outcome ?? ""),
@@ -104,12 +108,7 @@ function row(entry, isWhole) {
   return make(
     "tr",
     {},
-    make(
-      "td",
-      { title: time },
-      clock.when(Date.parse(time)),
-      times > 1 ? make("p", { class: "note" }, `${times} times since ${clock.when(Date.parse(since))}`) : null,
-    ),
+    make("td", { title: time }, at(time), times > 1 ? repeated(times, since) : null),
     isWhole ? make("td", { class: "who" }, drive ? named(drive) : `${model ?? ""} ${address ?? ""}`) : null,
     make("td", { class: "words" }, make("bdi", {}, String(write ?? "–"))),
     make("td", { class: isDone ? "words" : "words bad" }, isDone ? null : glyph("fault"), ` ${became}`),
