@@ -526,6 +526,28 @@ def test_rows_under_a_name_are_told_apart_by_their_time() -> None:
     assert told == {(name, True) for name in before}
 
 
+def test_what_has_a_name_anew_is_counted_from_its_own_beginning() -> None:
+    with clocked(hall(*pumps())) as made:
+        made.run(20)
+        first = made.poller.statistics()["hall"]
+        made.poller.adopt(plant(hall(toy("pump-1", 3), toy("pump-2", 2))))
+        made.run(5)
+        second = made.poller.statistics()["hall"]
+        before, after, span = (one.drives for one in (first, second, second.since(first)))
+        assert span["pump-1"].exchanges == after["pump-1"].exchanges > 0
+        assert span["pump-2"].exchanges == after["pump-2"].exchanges - before["pump-2"].exchanges > 0
+        made.poller.adopt(plant(replace(hall(*pumps()), port="port of roof")))
+        made.run(5)
+        third = made.poller.statistics()["hall"]
+        found = third.since(second)
+        assert found.seconds == third.seconds == pytest.approx(5, abs=0.5)
+        assert found.exchanges == third.exchanges > 0
+        made.poller.reset_statistics()
+        made.run(2)
+        last = made.poller.statistics()["hall"]
+        assert last.since(third).seconds == last.seconds == pytest.approx(2, abs=0.5)
+
+
 def test_a_name_s_code_stays_the_same() -> None:
     with clocked(hall(*pumps())) as made:
         made.run(1)
