@@ -224,6 +224,7 @@ def test_what_is_made_and_shown(run: Run, nats: Cluster, tmp_path: Path) -> None
     status, out, _ = run("fleet", "status", *servers)
     assert status == 1  # a line without a master
     assert "1 line, 1 without a master" in out
+    assert run("fleet", "status", "--json", *servers)[0] == 1  # for programs too
     said = one_sentence(run("fleet", "drain", "gw-9", *servers))
     assert "no gateway called gw-9 answers; `multidrop fleet status` lists them" in said
 
