@@ -27,7 +27,7 @@ from multidrop.fleet.member import Member
 from multidrop.fleet.moves import TOLD
 from multidrop.fleet.polled_units import PolledUnits
 from multidrop.fleet.record_shapes import misshapen
-from multidrop.fleet.samples_stream import connect
+from multidrop.fleet.samples_stream import close, connect
 from multidrop.fleet.servers import ServerPath, paths_of
 from multidrop.fleet.setup import check_buckets, open_all
 from multidrop.fleet.spool import Spool
@@ -112,7 +112,7 @@ class FleetGateway:
             await self._forward_the_rest(forwarding)
         finally:
             await end_tasks(forwarding)
-            await client.close()
+            await close(client)
             await self._close()
 
     def end(self) -> None:
