@@ -14,7 +14,7 @@ import pytest
 from nats_clusters import Cluster, cluster, free_ports, old_server_program, server_program
 from tables import table
 
-from multidrop.fleet import lease_bucket, servers, setup
+from multidrop.fleet import lease_bucket, names, servers, setup
 from multidrop.fleet.batch_client import DirectMessage
 from multidrop.fleet.buckets import ask
 from multidrop.fleet.errors import FleetError, Unsure
@@ -114,6 +114,27 @@ def test_servers_that_do_not_look_at_all_writers_records_are_refused(
     monkeypatch.setattr(lease_bucket.LeaseBucket, "_all_of", lease_bucket.LeaseBucket._subject)
     with pytest.raises(FleetError, match=r"gave one revision of a key to [2-6] of 6 claimants at once"):
         asyncio.run(_init(nats.urls))
+
+
+@pytest.mark.long
+@pytest.mark.slow
+def test_a_server_that_is_down_is_waited_for_at_first_and_not_later(tmp_path: Path) -> None:
+    """What is made without it would stay on two servers, of which each one's death ends all polling."""
+    with cluster(tmp_path, 3) as three:
+        down = next(node for node in three.nodes if not node.leads_servers())
+        others = [node for node in three.nodes if node is not down]
+        down.kill()
+        with pytest.raises(FleetError, match=f"^{down.url} does not answer, and what is made now"):
+            asyncio.run(_init(three.urls))
+        down.start()
+        three.wait()
+        assert asyncio.run(_init(three.urls))["replicas"] == 3
+        down.kill()
+        ends = time.monotonic() + 60
+        while not {f"KV_{name}" for name in names.BUCKETS} <= set().union(*(one.leads() for one in others)):
+            assert time.monotonic() < ends
+            time.sleep(0.1)
+        assert asyncio.run(_init(three.urls))["replicas"] == 3  # a plant may be stored meanwhile
 
 
 @pytest.mark.long
