@@ -145,7 +145,7 @@ def test_no_quorum_is_one_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPat
         for node in three.nodes[1:]:
             node.kill()
         with pytest.raises(FleetError, match="have no quorum: more than half of them must run"):
-            asyncio.run(_init(three.urls))
+            asyncio.run(_init(three.urls[:1]))
 
 
 NO_LEADER = (
