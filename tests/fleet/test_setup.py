@@ -208,9 +208,26 @@ def test_a_bucket_without_a_leader_is_no_quorum(fleet: Cluster, monkeypatch: pyt
         return info
 
     monkeypatch.setattr(setup, "ask", without_leader)
-    monkeypatch.setattr(setup, "LEADER_S", 0.2)
+    monkeypatch.setattr(setup, "WAIT_S", 0.2)
     with pytest.raises(FleetError, match=r"have no quorum: .*the bucket lease_0 has no leader"):
         asyncio.run(_check(fleet))
+
+
+def test_a_leader_that_is_being_elected_is_waited_for(
+    fleet: Cluster, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nobody answers for a bucket whose leader has died, and most of the servers may be there."""
+    told, silent = setup.ask, ["STREAM.INFO.KV_lease_1"] * 3
+
+    async def silent_at_first(path: ServerPath, subject: str) -> dict[str, Any]:
+        if subject in silent:
+            silent.remove(subject)
+            raise Unsure("no answer")
+        return await told(path, subject)
+
+    monkeypatch.setattr(setup, "ask", silent_at_first)
+    asyncio.run(_check(fleet))
+    assert silent == []
 
 
 @pytest.mark.long

@@ -23,7 +23,6 @@ ROUNDS = 40  # 2.9.10 fails in the first few of them
 CLAIMANTS = 6
 MOST_REPLICAS = 3
 WAIT_S = 10.0  # an election takes 4 to 9 s
-LEADER_S = 2.0
 CLOCKS_APART_S = 10.0
 
 _log = logging.getLogger("multidrop.fleet")
@@ -63,10 +62,11 @@ async def open_all(paths: Sequence[ServerPath]) -> None:
 
 
 async def check_buckets(path: ServerPath) -> None:
-    """Raise FleetError where there is no fleet in these servers yet, or no quorum."""
+    """Raise FleetError where there is no fleet in these servers yet, or no quorum; an election is no lack."""
+    ends = asyncio.get_running_loop().time() + WAIT_S
     for bucket in names.BUCKETS:
         try:
-            info = await _led(path, bucket)
+            info = await _led(path, bucket, ends)
         except ServerError as failure:
             if failure.is_missing:
                 raise FleetError(
@@ -80,15 +80,18 @@ async def check_buckets(path: ServerPath) -> None:
     check_clock(path, info.get("ts"))
 
 
-async def _led(path: ServerPath, bucket: str) -> dict[str, Any]:
-    """Return the state of a bucket once it has a leader: it has none while that moves home."""
-    ends = asyncio.get_running_loop().time() + LEADER_S
+async def _led(path: ServerPath, bucket: str, ends: float) -> dict[str, Any]:
+    """Return the state of a bucket once it has a leader: it has none while that moves home, or is elected."""
     while True:
-        info = await ask(path, f"STREAM.INFO.KV_{bucket}")
-        if (cluster_of(info) or Cluster(path.server_name)).leader:
-            return info
+        try:
+            info = await ask(path, f"STREAM.INFO.KV_{bucket}")
+            if (cluster_of(info) or Cluster(path.server_name)).leader:
+                return info
+            lack = Unsure(f"the bucket {bucket} has no leader")
+        except Unsure as failure:
+            lack = failure
         if asyncio.get_running_loop().time() > ends:
-            raise Unsure(f"the bucket {bucket} has no leader")
+            raise lack
         await asyncio.sleep(0.1)
 
 
