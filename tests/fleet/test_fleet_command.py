@@ -159,6 +159,12 @@ def test_a_list_with_a_mistake(run: Run, nobody: str, tmp_path: Path, lists: str
         (["drain"], "are required: NAME; see `multidrop fleet drain --help`"),
         (["serve", "gw.1"], "the gateway's name 'gw.1' may have letters"),
         (["status", "--nats", "127.0.0.1"], "127.0.0.1 is no address of a NATS server"),
+        (["status", "--nats", ","], "',' names no NATS server; write nats://127.0.0.1:4222"),
+        (["stop", "pump-1", "--nats", ","], "the stop was NOT sent: ',' names no NATS server"),
+        (["coast", "pump-1", "--credentials", "/no/key"], "the coast was NOT sent: /no/key: No such file"),
+        (["status", "--ca", "/no/ca.pem"], "/no/ca.pem: No such file or directory"),
+        (["drain", "gw 1"], "the gateway's name 'gw 1' may have letters"),
+        (["serve", "gw-1", "--json"], "unrecognized arguments: --json"),
         (["dance"], "there is no action 'dance'; did you mean drain?"),
         (["status", "gw-1"], "unrecognized arguments: gw-1; see `multidrop fleet status --help`"),
         (["write", "pump-1", "frequency"], "are required: VALUE; see `multidrop fleet write --help`"),
@@ -224,6 +230,7 @@ def test_what_is_made_and_shown(run: Run, nats: Cluster, tmp_path: Path) -> None
     status, out, _ = run("fleet", "status", *servers)
     assert status == 1  # a line without a master
     assert "1 line, 1 without a master" in out
+    assert run("fleet", "status", "--json", *servers)[0] == 1  # for programs too
     said = one_sentence(run("fleet", "drain", "gw-9", *servers))
     assert "no gateway called gw-9 answers; `multidrop fleet status` lists them" in said
 

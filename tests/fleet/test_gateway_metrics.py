@@ -62,7 +62,7 @@ def test_what_a_gateway_says_is_scraped() -> None:
 
 def test_what_is_not_known_has_no_sample() -> None:
     spool = STATE["spool"] | {"behind": None, "lag_s": None}
-    found = samples(STATE | {"session": 0, "margin_s": -80000.0, "state": "outside", "spool": spool})
+    found = samples(STATE | {"session": 0, "margin_s": 0.0, "state": "outside", "spool": spool})
     missing = {"lease_margin_seconds", "session", "behind_messages", "behind_seconds"}
     assert missing & found.keys() == set()
     assert found["lines"] == 4

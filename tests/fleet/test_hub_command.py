@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -11,6 +12,7 @@ import pytest
 from nats_clusters import Cluster, cluster, free_ports
 from peers import require_module
 from spooled import exchanges_in, numbered
+from terminals import closing_terminal
 
 from multidrop import History
 from multidrop.cli import main
@@ -18,6 +20,8 @@ from multidrop.fleet import samples_stream
 from multidrop.fleet.forwarder import Forwarder
 from multidrop.fleet.samples_stream import connect, create_stream
 from multidrop.fleet.spool import Spool
+
+PATIENCE_S = 60.0
 
 
 @pytest.fixture(scope="module")
@@ -60,6 +64,31 @@ def test_all_that_is_there_is_kept_once(
     assert json.loads(capsys.readouterr().out) == {
         **{"place": 4, "behind": 0, "rows": 0, "alarms": 0, "missing": 0, "doubled": 0, "trouble": None}
     }
+    with History(tmp_path) as history:
+        rows = [tuple(row) for batch in history.read() for row in batch]
+    assert exchanges_in(sorted(rows)) == list(range(40))
+
+
+@pytest.mark.long
+@pytest.mark.slow
+@pytest.mark.parametrize("end", ["terminal closed", "SIGTERM"])
+def test_what_was_kept_is_there_however_the_hub_ends(
+    running: Cluster, tmp_path: Path, capsys: pytest.CaptureFixture[str], end: str
+) -> None:
+    words = ["hub", running.urls[0], "--parquet", str(tmp_path), "--every", "0.2"]
+    ends = time.monotonic() + PATIENCE_S
+    with closing_terminal(*words) as terminal:
+        while not list(tmp_path.glob("rows/*-00000004.*.parquet")):
+            assert time.monotonic() < ends
+            time.sleep(0.05)
+        if end == "SIGTERM":
+            terminal.process.terminate()
+        else:
+            terminal.close()
+        assert terminal.process.wait(PATIENCE_S) == 130
+    assert main([*words[:-2], "--once", "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert (found["place"], found["rows"], found["alarms"]) == (4, 0, 0)
     with History(tmp_path) as history:
         rows = [tuple(row) for batch in history.read() for row in batch]
     assert exchanges_in(sorted(rows)) == list(range(40))

@@ -14,7 +14,7 @@ import pytest
 from nats_clusters import Cluster, cluster, free_ports, old_server_program, server_program
 from tables import table
 
-from multidrop.fleet import lease_bucket, servers, setup
+from multidrop.fleet import lease_bucket, names, servers, setup
 from multidrop.fleet.batch_client import DirectMessage
 from multidrop.fleet.buckets import ask
 from multidrop.fleet.errors import FleetError, Unsure
@@ -118,13 +118,34 @@ def test_servers_that_do_not_look_at_all_writers_records_are_refused(
 
 @pytest.mark.long
 @pytest.mark.slow
+def test_a_server_that_is_down_is_waited_for_at_first_and_not_later(tmp_path: Path) -> None:
+    """What is made without it would stay on two servers, of which each one's death ends all polling."""
+    with cluster(tmp_path, 3) as three:
+        down = next(node for node in three.nodes if not node.leads_servers())
+        others = [node for node in three.nodes if node is not down]
+        down.kill()
+        with pytest.raises(FleetError, match=f"^{down.url} does not answer, and what is made now"):
+            asyncio.run(_init(three.urls))
+        down.start()
+        three.wait()
+        assert asyncio.run(_init(three.urls))["replicas"] == 3
+        down.kill()
+        ends = time.monotonic() + 60
+        while not {f"KV_{name}" for name in names.BUCKETS} <= set().union(*(one.leads() for one in others)):
+            assert time.monotonic() < ends
+            time.sleep(0.1)
+        assert asyncio.run(_init(three.urls))["replicas"] == 3  # a plant may be stored meanwhile
+
+
+@pytest.mark.long
+@pytest.mark.slow
 def test_no_quorum_is_one_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(setup, "WAIT_S", 1.0)
     with cluster(tmp_path, 3) as three:
         for node in three.nodes[1:]:
             node.kill()
         with pytest.raises(FleetError, match="have no quorum: more than half of them must run"):
-            asyncio.run(_init(three.urls))
+            asyncio.run(_init(three.urls[:1]))
 
 
 NO_LEADER = (
@@ -187,9 +208,26 @@ def test_a_bucket_without_a_leader_is_no_quorum(fleet: Cluster, monkeypatch: pyt
         return info
 
     monkeypatch.setattr(setup, "ask", without_leader)
-    monkeypatch.setattr(setup, "LEADER_S", 0.2)
+    monkeypatch.setattr(setup, "WAIT_S", 0.2)
     with pytest.raises(FleetError, match=r"have no quorum: .*the bucket lease_0 has no leader"):
         asyncio.run(_check(fleet))
+
+
+def test_a_leader_that_is_being_elected_is_waited_for(
+    fleet: Cluster, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nobody answers for a bucket whose leader has died, and most of the servers may be there."""
+    told, silent = setup.ask, ["STREAM.INFO.KV_lease_1"] * 3
+
+    async def silent_at_first(path: ServerPath, subject: str) -> dict[str, Any]:
+        if subject in silent:
+            silent.remove(subject)
+            raise Unsure("no answer")
+        return await told(path, subject)
+
+    monkeypatch.setattr(setup, "ask", silent_at_first)
+    asyncio.run(_check(fleet))
+    assert silent == []
 
 
 @pytest.mark.long

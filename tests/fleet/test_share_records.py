@@ -133,6 +133,21 @@ def test_moves_into_a_share_are_told_with_the_master_before() -> None:
     assert records.owned_by("b", 1) == set()
 
 
+@pytest.mark.parametrize("known", [None, OTHER])
+def test_who_did_not_follow_a_line_does_not_say_whose_it_was(known: Any) -> None:
+    """It was asked for in a cold start, or an hour ago, and was others' since then."""
+    path: Any = None
+    records = ShareRecords("a", lambda: path, USUAL, lambda: None, is_mine)
+    follower = records.owners[names.owner_bucket("line")]
+    follower.take(Record("line", 5 if known else 0, known))
+    follower.take(Record("line", 8, NOBODY))
+    follower.take(Record("line", 9, ME))
+    [move] = [move for move in records.moves.newest(9) if move.revision == 9]
+    assert (move.before, move.released) == (None, 8)
+    follower.take(Record("line", 10, NOBODY))  # we gave it away
+    assert [move.before for move in records.moves.newest(9) if move.revision == 10] == ["a"]
+
+
 def test_of_sessions_that_have_no_line_any_more_nothing_is_kept() -> None:
     path: Any = None
     records = ShareRecords("a", lambda: path, USUAL, lambda: None, is_mine)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import weakref
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -52,3 +53,12 @@ def test_figures_of_a_line_are_those_of_the_last_seconds(lately: Lately) -> None
     assert lately.line("hall")["rate"] == 10.0
     assert lately.drive_figures("pump-1")["missed"] == pytest.approx(2 / 600, abs=1e-3)
     assert lately.line("roof")["rate"] is None
+
+
+def test_another_line_of_a_name_is_not_set_against_the_one_before(lately: Lately) -> None:
+    """A reading of it may come while its plant is being adopted."""
+    lately.tick(100.0, 100_000, {"hall": replace(reading(100), count=1)})
+    lately.tick(101.0, 101_000, {"hall": replace(reading(1), count=2)})
+    assert (lately.line("hall")["rate"], lately.line("hall")["used"]) == (None, None)
+    lately.tick(106.0, 106_000, {"hall": replace(reading(6), count=2)})
+    assert lately.line("hall")["rate"] == 10.0

@@ -402,6 +402,10 @@ def broken() -> dict[str, tuple[Plant, str]]:
             plant(hall(alien)),
             'line "hall", drive "alien": this output_current is no register of alien, which is a INVT CHE',
         ),
+        "not readable": (
+            plant(yard(*fans(0.5)), hall(polled(Toy(1, name="pump-1"), (*ALL, Toy.control), 0.1), other)),
+            'line "hall", drive "pump-1": control of pump-1 cannot be read: it is a command',
+        ),
         "no rate": (
             plant(hall(toy("pump-1", 1, -1.0))),
             'line "hall", drive "pump-1": every = -1.0 is not a number of seconds',
@@ -520,6 +524,28 @@ def test_rows_under_a_name_are_told_apart_by_their_time() -> None:
         if row.register == "output_current" and row.value is not None
     }
     assert told == {(name, True) for name in before}
+
+
+def test_what_has_a_name_anew_is_counted_from_its_own_beginning() -> None:
+    with clocked(hall(*pumps())) as made:
+        made.run(20)
+        first = made.poller.statistics()["hall"]
+        made.poller.adopt(plant(hall(toy("pump-1", 3), toy("pump-2", 2))))
+        made.run(5)
+        second = made.poller.statistics()["hall"]
+        before, after, span = (one.drives for one in (first, second, second.since(first)))
+        assert span["pump-1"].exchanges == after["pump-1"].exchanges > 0
+        assert span["pump-2"].exchanges == after["pump-2"].exchanges - before["pump-2"].exchanges > 0
+        made.poller.adopt(plant(replace(hall(*pumps()), port="port of roof")))
+        made.run(5)
+        third = made.poller.statistics()["hall"]
+        found = third.since(second)
+        assert found.seconds == third.seconds == pytest.approx(5, abs=0.5)
+        assert found.exchanges == third.exchanges > 0
+        made.poller.reset_statistics()
+        made.run(2)
+        last = made.poller.statistics()["hall"]
+        assert last.since(third).seconds == last.seconds == pytest.approx(2, abs=0.5)
 
 
 def test_a_name_s_code_stays_the_same() -> None:

@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager, suppress
 from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from namespaces import Namespace
 from peers import require_program
@@ -132,11 +132,18 @@ class Node:
             return bool(answer.status == 200)
         return False
 
+    def leads_servers(self) -> bool:
+        """Say whether this one decides what streams there are."""
+        return bool(self._told("")["meta_cluster"]["leader"] == self.name)
+
+    def _told(self, about: str) -> Any:
+        url = f"http://{self.host}:{self.monitor}/jsz{about}"
+        with closing(urllib.request.urlopen(url, timeout=2)) as answer:
+            return json.load(answer)
+
     def leads(self) -> set[str]:
         """Return the streams of which this one is the leader."""
-        url = f"http://{self.host}:{self.monitor}/jsz?streams=true&accounts=true"
-        with closing(urllib.request.urlopen(url, timeout=2)) as answer:
-            found = json.load(answer)
+        found = self._told("?streams=true&accounts=true")
         streams = [one for account in found["account_details"] for one in account.get("stream_detail") or ()]
         return {one["name"] for one in streams if one.get("cluster", {}).get("leader") == self.name}
 

@@ -73,7 +73,7 @@ def _sink(arguments: argparse.Namespace) -> SampleSink:
 
 async def _read(arguments: argparse.Namespace, sink: SampleSink, options: dict[str, Any]) -> HubState:
     from multidrop.fleet.hub import SampleHub
-    from multidrop.fleet.samples_stream import connect
+    from multidrop.fleet.samples_stream import close, connect
 
     client = await connect(arguments.servers, **options)
     try:
@@ -86,7 +86,7 @@ async def _read(arguments: argparse.Namespace, sink: SampleSink, options: dict[s
             await asyncio.wait([tending])
         return hub.state()
     finally:
-        await client.close()
+        await close(client)
 
 
 async def _tend(folder: Path | None) -> None:

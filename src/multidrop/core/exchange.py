@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
+from itertools import count
 from typing import Any
 
 from multidrop._core import ffi, lib
@@ -17,6 +18,7 @@ from multidrop.core.result import Status
 
 MOST_PROOFS: int = lib.MD_MOST_PROOFS
 PAUSE_NS: int = lib.MD_PAUSE_S * 1_000_000_000
+_NUMBERS = count(1)
 
 
 class Peer:
@@ -38,6 +40,7 @@ class Peer:
                 "history": self._history,
             },
         )
+        self.number = next(_NUMBERS)  # no other peer of this process has it
         self.proofs: tuple[Exchange, ...] = ()
         self.unasked: Counter[Status] = Counter()  # values that were due and not asked for
 

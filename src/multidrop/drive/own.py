@@ -29,6 +29,12 @@ def check_own(drive: Drive, register: Register[Any]) -> None:
         raise ValueError(f"this {register.name} is no register of {drive.name}, which is a {family}")
 
 
+def check_readable(drive: Drive, register: Register[Any]) -> None:
+    """Raise ValueError for a register that is written alone."""
+    if not register.readable:
+        raise ValueError(f"{register.name} of {drive.name} cannot be read: it is a {register.access.value}")
+
+
 def check_own_text(drive: Drive, text: Text) -> None:
     """Raise ValueError for another family's text, TypeError for what is none."""
     check_drive(drive)

@@ -45,8 +45,8 @@ def connect_options(
     """Return the options of a connection to these servers.
 
     `credentials` is a user's secret key, or a .creds file; `ca` the certificate that the servers' are signed
-    by. With it, or with tls:// in a URL, nothing is said before TLS has begun. Raises OSError or ValueError
-    for a file that is none.
+    by. With it, or with tls:// in a URL, nothing is said before TLS has begun. Raises ValueError for a file
+    that is none.
     """
     options: dict[str, Any] = {}
     if ca is not None or any(url.startswith("tls://") for url in urls):
@@ -55,7 +55,10 @@ def connect_options(
 
 
 def _user(credentials: Path) -> dict[str, Any]:
-    text = credentials.read_text("utf-8", "replace").strip()
+    try:
+        text = credentials.read_text("utf-8", "replace").strip()
+    except OSError as failure:
+        raise ValueError(f"{credentials}: {failure.strerror}") from None
     if CREDS in text:
         return {"user_credentials": str(credentials)}
     if not text.startswith(SEED):
@@ -72,3 +75,5 @@ def _context(ca: Path | None) -> ssl.SSLContext:
         return ssl.create_default_context(cafile=ca)
     except ssl.SSLError:
         raise ValueError(f"{ca} has no certificate: it must be a PEM file") from None
+    except OSError as failure:
+        raise ValueError(f"{ca}: {failure.strerror}") from None

@@ -115,8 +115,8 @@ class FleetRecords:
             self._owned[former].discard(record.key)
             if not self._owned[former]:
                 del self._owned[former]  # sessions come and go for years
-        self.moves.note(before, record, is_first_look=self._is_first_look(bucket))
+        self.moves.note(before, record, is_next=self._is_next(bucket, before, record))
 
-    def _is_first_look(self, bucket: str) -> bool:
-        """Say whether a record of which none was known before may have had another one."""
-        return bucket not in self._read
+    def _is_next(self, bucket: str, before: Record | None, record: Record) -> bool:
+        """Say whether the record that was known before, or none, is the one that this record replaced."""
+        return before is not None or bucket in self._read

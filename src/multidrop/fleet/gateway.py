@@ -27,7 +27,7 @@ from multidrop.fleet.member import Member
 from multidrop.fleet.moves import TOLD
 from multidrop.fleet.polled_units import PolledUnits
 from multidrop.fleet.record_shapes import misshapen
-from multidrop.fleet.samples_stream import connect
+from multidrop.fleet.samples_stream import close, connect
 from multidrop.fleet.servers import ServerPath, paths_of
 from multidrop.fleet.setup import check_buckets, open_all
 from multidrop.fleet.spool import Spool
@@ -112,7 +112,7 @@ class FleetGateway:
             await self._forward_the_rest(forwarding)
         finally:
             await end_tasks(forwarding)
-            await client.close()
+            await close(client)
             await self._close()
 
     def end(self) -> None:
@@ -140,7 +140,9 @@ class FleetGateway:
     # ---- what others ask ----
 
     async def _answer(self, message: Msg) -> None:
-        """Answer a request about this gateway."""
+        """Answer a request about this gateway; without a session it may be about another of its name."""
+        if not self.member.lease.session:
+            return
         if message.subject == names.gateway_subject(self.name, "drain"):
             self.member.drain()
             _log.warning("%s: asked to give all lines away", self.name)
@@ -156,7 +158,7 @@ class FleetGateway:
             "gateway": self.name,
             "state": member.state.value,
             "session": member.lease.session,
-            "margin_s": round(member.lease.left_s, 3),
+            "margin_s": max(0.0, round(member.lease.left_s, 3)),
             "paths": [path.server_name for path in self.paths],
             "avoids": [*member.own_machine.avoided],
             "lines": len(member.polled),

@@ -44,8 +44,8 @@ def families_of(state: Mapping[str, Any], version: str) -> Iterator[MetricFamily
     states = [("", {label: one.value}, float(one.value == state["state"])) for one in MemberState]
     yield MetricFamily(label, "stateset", "State of the gateway.", states)
     if state["session"]:
-        margin = max(0.0, state["margin_s"])
-        yield _family("lease_margin_seconds", "gauge", "Time for which the gateway may still send.", margin)
+        margin, text = state["margin_s"], "Time for which the gateway may still send."
+        yield _family("lease_margin_seconds", "gauge", text, margin)
         yield _family("session", "gauge", "Number of the session.", state["session"])
     servers = len(set(filter(None, state["paths"])))
     yield _family("servers", "gauge", "Servers that its three connections are at.", servers)

@@ -56,16 +56,17 @@ class Moves:
         self._moves: dict[tuple[str, int], Move] = {}
         self._given_away: dict[str, Move] = {}  # by line: nobody has taken it yet
 
-    def note(self, before: Record | None, record: Record, *, is_first_look: bool) -> None:
-        """Note a line's new record; the records of a first look do not say who was master before."""
+    def note(self, before: Record | None, record: Record, *, is_next: bool) -> None:
+        """Note a line's new record; `before` says whose it was only if this one is the next."""
         if not record.value:
             return
         after, _ = owner_of(record)
-        master = None if before is None and is_first_look else owner_of(before)[0]
+        master = owner_of(before)[0] if is_next else None
         move = Move(record.key, record.revision, int(record.value.get("since", 0)), master, after)
+        given = self._given_away.pop(move.line, None)
         if after == NOBODY:
             self._given_away[move.line] = move
-        elif given := self._given_away.pop(move.line, None):
+        elif given and is_next:
             self._moves.pop((given.line, given.revision), None)
             move = move._replace(before=given.before, released=given.revision)
         self.add([move])

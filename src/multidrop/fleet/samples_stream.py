@@ -96,17 +96,22 @@ async def connect(servers: list[str], **options: Any) -> Client:
             )
     except (Error, OSError, TimeoutError) as failure:
         last = client.last_error or failure
-        with suppress(Exception):  # of a client that is half connected
-            await client.close()
+        await close(client)
         raise StreamError(str(failure_to_connect(", ".join(servers), last))) from failure
     version = client.connected_server_version
     if (version.major, version.minor) < OLDEST:
-        await client.close()
+        await close(client)
         raise StreamError(
             f"the server of NATS at {', '.join(servers)} is {version.major}.{version.minor}.{version.patch}: "
             f"a fleet needs {'.'.join(map(str, OLDEST))} or newer"
         )
     return client
+
+
+async def close(client: Client) -> None:
+    """Close a connection, also of a client that is half connected, or whose servers are gone."""
+    with suppress(Exception):
+        await client.close()
 
 
 async def _ignore(_: Exception) -> None:

@@ -23,7 +23,6 @@ ROUNDS = 40  # 2.9.10 fails in the first few of them
 CLAIMANTS = 6
 MOST_REPLICAS = 3
 WAIT_S = 10.0  # an election takes 4 to 9 s
-LEADER_S = 2.0
 CLOCKS_APART_S = 10.0
 
 _log = logging.getLogger("multidrop.fleet")
@@ -32,11 +31,19 @@ _log = logging.getLogger("multidrop.fleet")
 async def set_up(paths: Sequence[ServerPath]) -> dict[str, Any]:
     """Make what is missing, and return what there is. Raises FleetError, in one sentence.
 
-    Buckets that are there stay as they are.
+    Buckets that are there stay as they are. To make some takes each of the servers.
     """
     await open_all(paths)
-    replicas = min(MOST_REPLICAS, len({path.server_name for path in paths}))
-    await _contest(paths, replicas)
+    reached = min(MOST_REPLICAS, len({path.server_name for path in paths}))
+    replicas = await _kept_on(paths[0])
+    away = [path.urls[0] for path in paths if path.url != path.urls[0]]
+    if away and not replicas:
+        raise FleetError(
+            f"{away[0]} does not answer, and what is made now stays on the other servers for good: start it "
+            "first, or leave its address out"
+        )
+    replicas = replicas or reached
+    await _contest(paths, reached)
     for bucket in names.BUCKETS:
         await _create(paths[0], bucket_settings(bucket, replicas))
     await _wait_for_plant(paths[0])
@@ -55,10 +62,11 @@ async def open_all(paths: Sequence[ServerPath]) -> None:
 
 
 async def check_buckets(path: ServerPath) -> None:
-    """Raise FleetError where there is no fleet in these servers yet, or no quorum."""
+    """Raise FleetError where there is no fleet in these servers yet, or no quorum; an election is no lack."""
+    ends = asyncio.get_running_loop().time() + WAIT_S
     for bucket in names.BUCKETS:
         try:
-            info = await _led(path, bucket)
+            info = await _led(path, bucket, ends)
         except ServerError as failure:
             if failure.is_missing:
                 raise FleetError(
@@ -72,15 +80,18 @@ async def check_buckets(path: ServerPath) -> None:
     check_clock(path, info.get("ts"))
 
 
-async def _led(path: ServerPath, bucket: str) -> dict[str, Any]:
-    """Return the state of a bucket once it has a leader: it has none while that moves home."""
-    ends = asyncio.get_running_loop().time() + LEADER_S
+async def _led(path: ServerPath, bucket: str, ends: float) -> dict[str, Any]:
+    """Return the state of a bucket once it has a leader: it has none while that moves home, or is elected."""
     while True:
-        info = await ask(path, f"STREAM.INFO.KV_{bucket}")
-        if (cluster_of(info) or Cluster(path.server_name)).leader:
-            return info
+        try:
+            info = await ask(path, f"STREAM.INFO.KV_{bucket}")
+            if (cluster_of(info) or Cluster(path.server_name)).leader:
+                return info
+            lack = Unsure(f"the bucket {bucket} has no leader")
+        except Unsure as failure:
+            lack = failure
         if asyncio.get_running_loop().time() > ends:
-            raise Unsure(f"the bucket {bucket} has no leader")
+            raise lack
         await asyncio.sleep(0.1)
 
 
@@ -113,23 +124,39 @@ def no_quorum(path: ServerPath, failure: Exception) -> FleetError:
     )
 
 
-async def _create(path: ServerPath, settings: Mapping[str, Any]) -> None:
+async def _kept_on(path: ServerPath) -> int:
+    """Return the least number of servers that keep a bucket; 0 where one is missing."""
+    kept = []
+    for bucket in names.BUCKETS:
+        info = await _info(path, f"KV_{bucket}")
+        if info is None:
+            return 0
+        cluster = cluster_of(info)
+        kept.append(1 + len(cluster.followers) if cluster else 1)
+    return min(kept)
+
+
+async def _info(path: ServerPath, stream: str) -> dict[str, Any] | None:
+    """Return the state of a stream, None where there is none; a leader is waited for."""
     ends = asyncio.get_running_loop().time() + WAIT_S
     while True:
         try:
-            await ask(path, f"STREAM.INFO.{settings['name']}")
+            return await ask(path, f"STREAM.INFO.{stream}")
         except ServerError as failure:
-            if not failure.is_missing:
-                raise
+            if failure.is_missing:
+                return None
+            raise
         except NoRight:
             raise
         except FleetError as failure:
             if asyncio.get_running_loop().time() > ends:
                 raise no_quorum(path, failure) from None
             await asyncio.sleep(0.2)
-            continue
-        else:
-            return
+
+
+async def _create(path: ServerPath, settings: Mapping[str, Any]) -> None:
+    ends = asyncio.get_running_loop().time() + WAIT_S
+    while await _info(path, settings["name"]) is None:
         try:
             await ask(path, f"STREAM.CREATE.{settings['name']}", settings)
         except ServerError:
@@ -179,7 +206,7 @@ async def _contest(paths: Sequence[ServerPath], replicas: int) -> None:
                     f"the NATS servers around {paths[0].url} gave one revision of a key to {len(granted)} of "
                     f"{CLAIMANTS} claimants at once; no lease is safe there"
                 )
-            revision = granted[0] if granted else (await claimants[0].get(CONTEST)).revision
+            revision = granted[0] if granted else await _revision(claimants[0], paths[0])
             if unsure > 2 * ROUNDS:
                 raise no_quorum(paths[0], Unsure("a key was never granted"))
     finally:
@@ -188,6 +215,15 @@ async def _contest(paths: Sequence[ServerPath], replicas: int) -> None:
 
 def _itself(path: ServerPath) -> ServerPath:
     return path
+
+
+async def _revision(claimant: LeaseBucket, path: ServerPath) -> int:
+    try:
+        return (await claimant.get(CONTEST)).revision
+    except NoRight:
+        raise
+    except FleetError as failure:
+        raise no_quorum(path, failure) from None
 
 
 async def _claim(claimant: LeaseBucket, revision: int) -> int | None:

@@ -92,8 +92,9 @@ class ShareRecords(FleetRecords):
         self._shares[bucket.name] = ShareFollower(bucket, on_take, self._is_mine)
         return self._shares[bucket.name]
 
-    def _is_first_look(self, bucket: str) -> bool:
-        return True
+    def _is_next(self, bucket: str, before: Record | None, record: Record) -> bool:
+        """Say whether it was replaced by us, or was ours: else it may have been others' meanwhile, unseen."""
+        return self._is_mine(record) or (before is not None and self._is_mine(before))
 
     def want(self, lines: Iterable[str]) -> None:
         """Follow the masters of these lines from now on."""

@@ -11,6 +11,7 @@ from typing import Any
 
 from multidrop.core import Framing, Message
 from multidrop.drive.family import Drive
+from multidrop.drive.own import check_readable
 from multidrop.drive.read_limits import may_be_crossed, read_limit, read_span
 from multidrop.drive.register import Register
 from multidrop.drive.request import read_request
@@ -184,10 +185,7 @@ def _neighbours(drive: Drive, registers: Iterable[Register[Any]]) -> list[_Neigh
     """Return these registers by read space."""
     spaces: dict[object, list[tuple[range, Register[Any]]]] = {}
     for register in dict.fromkeys(registers):
-        if not register.readable:
-            raise ValueError(
-                f"{register.name} of {drive.name} cannot be read: it is a {register.access.value}"
-            )
+        check_readable(drive, register)
         spaces.setdefault(register.table.read_space, []).append((read_span(drive, register), register))
     return [_side_by_side(drive, wanted) for wanted in spaces.values()]
 

@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from copy import copy
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from multidrop.drive.family import Drive
 from multidrop.drive.network import speaks_tcp
-from multidrop.drive.own import check_own
+from multidrop.drive.own import check_own, check_readable
+from multidrop.drive.register import Register
 from multidrop.plant.loader import PlantError
 from multidrop.plant.model import Plant, PlantLine, PolledDrive
 from multidrop.toml_check import check_period
@@ -53,11 +54,16 @@ def check_plant(plant: Plant, *, is_free: Callable[[Drive], bool]) -> None:
                 framed = copy(drive) if drive.bus and drive.bus.is_open else drive
                 found += _mistakes(at, partial(framed.take_framing_of, line.port))
             for poll in polled.polls:
-                found += _mistakes(at, partial(check_own, drive, poll.register))
+                found += _mistakes(at, partial(_check_polled, drive, poll.register))
                 if poll.every is not None:
                     found += _mistakes(at, partial(check_period, poll.every))
     if found:
         raise PlantError(tuple(dict.fromkeys(found)))  # many registers may have the same rate
+
+
+def _check_polled(drive: Drive, register: Register[Any]) -> None:
+    check_own(drive, register)
+    check_readable(drive, register)
 
 
 def _mistakes(place: str, check: Callable[[], object]) -> list[str]:

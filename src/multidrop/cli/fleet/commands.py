@@ -9,8 +9,8 @@ import json
 import os
 import socket
 import sys
-from collections.abc import Iterator
-from contextlib import AsyncExitStack, contextmanager, suppress
+from collections.abc import AsyncIterator, Iterator
+from contextlib import AsyncExitStack, asynccontextmanager, contextmanager, suppress
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -73,6 +73,23 @@ def _asker(arguments: argparse.Namespace) -> FleetCommands:
     return FleetCommands(urls, by=by, log=log, options=nats_options(arguments, urls))
 
 
+@asynccontextmanager
+async def _asking(arguments: argparse.Namespace) -> AsyncIterator[FleetCommands]:
+    """Give who asks. Where there is none a stop's failure says that nothing was sent."""
+    from multidrop.fleet.errors import FleetError
+    from multidrop.fleet.stop_asking import HARD_WIRED
+
+    async with AsyncExitStack() as stack:
+        try:
+            asker = await stack.enter_async_context(_asker(arguments))
+        except (FleetError, ValueError) as failure:
+            if arguments.command not in STOPS:
+                raise
+            kind = FleetError if isinstance(failure, FleetError) else ValueError
+            raise kind(f"the {arguments.command} was NOT sent: {failure}; {HARD_WIRED}") from None
+        yield asker
+
+
 def _user() -> str:
     with suppress(OSError, KeyError):  # an id without a name, as in a container
         return getpass.getuser()
@@ -104,13 +121,13 @@ async def _command(arguments: argparse.Namespace) -> int:
 
     what, agreed = _what(arguments), ""
     if arguments.command not in STOPS and not arguments.yes:
-        async with _asker(arguments) as asker:
+        async with _asking(arguments) as asker:
             preview = await asker.preview(asker.request(arguments.drive, **what))
         if isinstance(preview, CommandAnswer):
             return _show(arguments, preview)
         agreed = preview.text
         confirm(f"{agreed}; gateway {preview.gateway} is to do it?", arguments)
-    async with _asker(arguments) as asker:
+    async with _asking(arguments) as asker:
         request = asker.request(arguments.drive, **what)
         with _annotating(request.words):
             return _show(arguments, await asker.carry_out(request, agreed))
@@ -118,17 +135,10 @@ async def _command(arguments: argparse.Namespace) -> int:
 
 async def _stop(arguments: argparse.Namespace) -> int:
     drives = arguments.drives
-    from multidrop.fleet.errors import FleetError
-    from multidrop.fleet.stop_asking import HARD_WIRED
-
     if bool(drives) == arguments.all:
         ways = "stop takes either drives or --all: `multidrop fleet stop pump-1`"
         raise ValueError(f"the stop was NOT sent: {ways}")
-    async with AsyncExitStack() as stack:
-        try:
-            asker = await stack.enter_async_context(_asker(arguments))
-        except FleetError as failure:
-            raise FleetError(f"the stop was NOT sent: {failure}; {HARD_WIRED}") from None
+    async with _asking(arguments) as asker:
         with _annotating(f"the stop of {', '.join(drives) or 'all drives'}"):
             answer = await asker.stop(drives or None, line=arguments.line or "", on_news=_show_news)
             return _show(arguments, answer)

@@ -24,21 +24,28 @@ STATE = "~/.local/state/multidrop/fleet"  # state_folder(), where XDG_STATE_HOME
 
 
 def add_server_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add what every action takes that speaks with the servers."""
+    """Add what every action takes that speaks with the servers, and says something of what it did."""
+    add_address_arguments(parser)
+    add_json_argument(parser)
+
+
+def add_address_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add where the servers are, and who asks."""
     parser.add_argument(
         "--nats", metavar="URLS", help=f"servers, with commas; else MULTIDROP_NATS, or {URLS}"
     )
     add_nats_arguments(parser)
-    add_json_argument(parser)
 
 
 def urls_of(arguments: argparse.Namespace) -> list[str]:
-    """Return the servers' URLs. Raises ValueError for one that is not nats:// or tls://."""
+    """Return the servers' URLs. Raises ValueError for none, and for one that is not nats:// or tls://."""
     text = arguments.nats or os.environ.get("MULTIDROP_NATS") or URLS
     found = [url.strip() for url in text.split(",") if url.strip()]
     for url in found:
         if not url.startswith(("nats://", "tls://")):
             raise ValueError(f"{url} is no address of a NATS server; write {URLS}")
+    if not found:
+        raise ValueError(f"{text!r} names no NATS server; write {URLS}")
     return found
 
 

@@ -9,7 +9,7 @@ import time
 from functools import partial
 from typing import TYPE_CHECKING
 
-from multidrop.cli.fleet.connection import add_server_arguments, run_with_paths
+from multidrop.cli.fleet.connection import add_server_arguments, require_fleet, run_with_paths
 from multidrop.cli.support.output import print_text
 from multidrop.cli.support.values import counted
 
@@ -25,6 +25,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
+    require_fleet()
+    from multidrop.fleet.names import checked_name
+
+    checked_name("gateway", arguments.gateway)
     return run_with_paths(arguments, partial(_drain, arguments))
 
 

@@ -53,7 +53,7 @@ async def _init(
     from multidrop.fleet import names
     from multidrop.fleet.buckets import Bucket
     from multidrop.fleet.plant_store import store
-    from multidrop.fleet.samples_stream import connect, create_stream
+    from multidrop.fleet.samples_stream import close, connect, create_stream
     from multidrop.fleet.setup import set_up
 
     made = await set_up(paths)
@@ -62,7 +62,7 @@ async def _init(
     try:
         kept = await create_stream(client, replicas=made["replicas"], most_bytes=keep)
     finally:
-        await client.close()
+        await close(client)
     made["samples_bytes"] = None if kept < 0 else kept
     if records is not None:
         made["lines"] = await store(Bucket(names.PLANT, lambda: paths[0]), records)

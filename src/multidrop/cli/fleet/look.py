@@ -45,11 +45,14 @@ async def _status(arguments: argparse.Namespace, paths: list[ServerPath]) -> int
     found = await _seen(paths)
     if arguments.json:
         print_text(json.dumps(found, indent=2))
-        return 0
-    print_text("\n".join([*gateway_table(found), "", count_sentence(found), *trouble_sentences(found)]))
-    if found["moves"]:
-        print_text("\n".join(["", "last moves:", *move_table(found["moves"])]))
+    else:
+        print_text("\n".join(_table(found)))
     return 1 if free_lines(found) else 0
+
+
+def _table(found: dict[str, Any]) -> list[str]:
+    table = [*gateway_table(found), "", count_sentence(found), *trouble_sentences(found)]
+    return [*table, "", "last moves:", *move_table(found["moves"])] if found["moves"] else table
 
 
 async def _lines(arguments: argparse.Namespace, paths: list[ServerPath]) -> int:

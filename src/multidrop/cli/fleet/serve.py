@@ -8,7 +8,7 @@ from contextlib import AsyncExitStack
 from functools import partial
 from pathlib import Path
 
-from multidrop.cli.fleet.connection import STATE, add_server_arguments, run_action, state_folder, urls_of
+from multidrop.cli.fleet.connection import STATE, add_address_arguments, run_action, state_folder, urls_of
 from multidrop.cli.support.nats import nats_options
 from multidrop.cli.support.output import print_text
 from multidrop.cli.support.signals import on_end_signals
@@ -26,7 +26,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--keep", metavar="SIZE", default="10 GB", help="most that the spool takes; 10 GB if not given"
     )
     parser.add_argument("--metrics", metavar="HOST:PORT", help="answer GET /metrics there")
-    add_server_arguments(parser)
+    add_address_arguments(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:

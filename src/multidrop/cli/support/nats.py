@@ -27,7 +27,7 @@ def add_nats_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def nats_options(arguments: argparse.Namespace, urls: Sequence[str]) -> dict[str, Any]:
-    """Return the options of a connection. Raises OSError or ValueError for a file that holds no key."""
+    """Return the options of a connection. Raises ValueError for a file that holds no key."""
     from multidrop.fleet.credentials import connect_options
 
     logging.getLogger("asyncio").addFilter(_is_news)

@@ -1,0 +1,94 @@
+"""One gateway of a fleet: whom it answers, and how it ends."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import subprocess
+import sys
+import time
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import pytest
+from nats_clusters import cluster
+from peers import require_module
+from serial_hall import SerialHall
+
+require_module("nats")
+require_module("pyarrow")
+
+from multidrop.fleet import names  # noqa: E402
+from multidrop.fleet.gateway import FleetGateway  # noqa: E402
+
+PATIENCE_S = 60.0
+
+
+class Asked:
+    """A request, and the answers to it."""
+
+    def __init__(self, wanted: str) -> None:
+        self.subject = names.gateway_subject("gw-1", wanted)
+        self.answers: list[dict[str, Any]] = []
+
+    async def respond(self, data: bytes) -> None:
+        self.answers.append(json.loads(data))
+
+
+def test_who_waits_for_the_session_of_another_of_its_name_answers_nothing(tmp_path: Path) -> None:
+    """The other one is asked too: `status` would show the wrong one, and `drain` believe it."""
+
+    async def main() -> None:
+        gateway = FleetGateway("gw-1", ["nats://127.0.0.1:1"], tmp_path)
+        lease = gateway.member.lease
+        for wanted in ("state", "drain"):
+            asked: Any = Asked(wanted)
+            await gateway._answer(asked)
+            assert (asked.answers, gateway.member.is_draining) == ([], False)
+        lease.session = 7
+        asked = Asked("state")
+        await gateway._answer(asked)
+        assert [answer["session"] for answer in asked.answers] == [7]
+        await gateway._close()
+
+    asyncio.run(main())
+
+
+def test_a_margin_is_never_less_than_none(tmp_path: Path) -> None:
+    async def main() -> None:
+        gateway = FleetGateway("gw-1", ["nats://127.0.0.1:1"], tmp_path)
+        assert gateway.state()["margin_s"] == 0.0
+        await gateway._close()
+
+    asyncio.run(main())
+
+
+@pytest.mark.long
+@pytest.mark.slow
+def test_it_ends_in_good_order_though_all_servers_are_gone(tmp_path: Path) -> None:
+    words = [sys.executable, "-m", "multidrop", "fleet"]
+    with cluster(tmp_path / "nats", 1) as one, closing(SerialHall(1)) as hall:
+        environment = {**os.environ, "MULTIDROP_NATS": one.urls[0], "XDG_STATE_HOME": str(tmp_path)}
+        (tmp_path / "plant.toml").write_text(hall.plant())
+        subprocess.run(
+            [*words, "init", tmp_path / "plant.toml"], env=environment, check=True, timeout=PATIENCE_S
+        )
+        log = tmp_path / "gw-1.log"
+        with log.open("w") as file:
+            gateway = subprocess.Popen([*words, "serve", "gw-1"], env=environment, stderr=file)
+        try:
+            ends = time.monotonic() + PATIENCE_S
+            while not hall.are_polled(0.5):
+                assert time.monotonic() < ends, log.read_text()
+                time.sleep(0.05)
+            one.nodes[0].kill()
+            while "no line is polled" not in log.read_text():
+                assert time.monotonic() < ends, log.read_text()
+                time.sleep(0.05)
+            gateway.terminate()
+            assert gateway.wait(PATIENCE_S) == 0, log.read_text()
+        finally:
+            gateway.kill()
+            gateway.wait()
