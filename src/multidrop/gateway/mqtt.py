@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import asyncio
-import time
 from collections.abc import Awaitable, Callable
 from typing import Any
 
 from multidrop import Batch, Plant
 from multidrop.gateway.broker import Broker, parse_broker
+from multidrop.gateway.clock import utc_ms
 from multidrop.gateway.json_topics import JsonTopics
 from multidrop.gateway.mqtt_settings import MqttSettings as MqttSettings
 from multidrop.gateway.parts import Feed, Inside
@@ -17,14 +17,10 @@ from multidrop.gateway.sparkplug_node import SparkplugNode
 
 def build(settings: MqttSettings, inside: Inside) -> Feed:
     """Return the part. Raises ImportError without paho."""
-    speakers: list[Any] = [JsonTopics(settings, inside, _utc_ms)]
+    speakers: list[Any] = [JsonTopics(settings, inside, utc_ms)]
     if settings.sparkplug:
-        speakers.append(SparkplugNode(settings, inside, _utc_ms))
+        speakers.append(SparkplugNode(settings, inside, utc_ms))
     return Mqtt(settings, inside, speakers)
-
-
-def _utc_ms() -> int:
-    return time.time_ns() // 1_000_000
 
 
 class Mqtt:
