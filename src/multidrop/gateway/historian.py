@@ -9,7 +9,18 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Protocol
 
-from multidrop import Batch, Buckets, History, HistoryState, HistoryWriter, Plant, parse_age, parse_size
+from multidrop import (
+    Batch,
+    Buckets,
+    History,
+    HistoryState,
+    HistoryWriter,
+    MetricFamily,
+    Plant,
+    parse_age,
+    parse_size,
+)
+from multidrop.gateway.metrics import counter
 
 MS_NS = 1_000_000
 PIECE = 1 << 16  # bytes of an export
@@ -97,10 +108,15 @@ class Historian:
         trouble = self.state.trouble
         return f"nothing is recorded: {trouble}" if trouble else ""
 
-    def figures(self) -> dict[str, float]:
+    def figures(self) -> list[MetricFamily]:
         """Return rows written and rows lost since the start."""
         state = self.state
-        return {"rows_total": state.rows, "dropped_total": state.dropped}
+        return [
+            counter("multidrop_history_rows", "Rows written to the history.", state.rows),
+            counter(
+                "multidrop_history_dropped", "Rows that the history could not take or write.", state.dropped
+            ),
+        ]
 
     @property
     def state(self) -> HistoryState:
