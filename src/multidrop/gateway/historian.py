@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Protocol
@@ -56,7 +58,12 @@ class Surroundings(Protocol):
 
 
 def build(settings: HistorySettings, inside: Surroundings) -> Historian:
-    """Return the historian of a gateway; a relative folder is beside its plant file."""
+    """Return the historian of a gateway; a relative folder is beside its plant file.
+
+    DuckDB is loaded here, before polling begins, and not while the first viewer waits.
+    """
+    with suppress(ImportError):
+        import_module("duckdb")
     folder = inside.folder / settings.folder
     try:
         return Historian(inside.plant, folder, settings)
