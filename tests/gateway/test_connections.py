@@ -17,8 +17,9 @@ from examples import usually
 from gateways import certificate, get, served, serving, simulated_plant
 from lines import PATIENCE
 
-from multidrop.gateway import request_fields
+from multidrop.gateway import connections, request_fields
 from multidrop.gateway.connections import AGAIN_S, FIRST_S, MOST_OPEN, Connections
+from multidrop.gateway.guard import MOST_HEAD
 from multidrop.gateway.listener import BACKLOG
 from multidrop.gateway.rights import digest
 
@@ -82,6 +83,39 @@ def test_a_slow_body_is_ended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
         client.sendall(SLOW[2])
         assert client.recv(1000).startswith(b"HTTP/1.1 408 ")
         assert gateway.get("/api/plant").status == 200
+
+
+def test_slow_headers_are_ended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(connections, "FIRST_S", 0.1)
+    with (
+        served(tmp_path) as gateway,
+        socket.create_connection(("127.0.0.1", gateway.gateway.port), PATIENCE) as client,
+    ):
+        client.sendall(SLOW[1])
+        assert client.recv(1000) == b""
+        assert gateway.get("/api/plant").status == 200
+
+
+def test_long_headers_are_refused_and_no_stop_is(tmp_path: Path) -> None:
+    with served(tmp_path, '[serve.may]\nstop = "anyone"\n') as gateway:
+        cookie = "a=" + "b" * MOST_HEAD
+        assert gateway.get("/api/plant", cookie=cookie).status == 431
+        assert gateway.get("/api/plant", cookie=cookie[: MOST_HEAD // 2]).status == 200
+        assert gateway.post("/api/stop", {}, cookie=cookie).status == 200
+
+
+def test_headers_in_pieces_are_taken_up_to_a_length(tmp_path: Path) -> None:
+    with served(tmp_path) as gateway:
+        address = "127.0.0.1", gateway.gateway.port
+        head = b"GET /api/plant HTTP/1.1\r\nhost: localhost:%d\r\ncookie: " % address[1]
+        with socket.create_connection(address, PATIENCE) as client:
+            client.sendall(head + b"b" * (MOST_HEAD // 2))
+            assert gateway.get("/page/icon.svg").status == 200  # it read that piece before
+            client.sendall(b"\r\n\r\n")
+            assert client.recv(1000).startswith(b"HTTP/1.1 200 ")
+        with socket.create_connection(address, PATIENCE) as client:
+            client.sendall(head + b"b" * MOST_HEAD)
+            assert client.recv(1000).startswith(b"HTTP/1.1 400 ")
 
 
 @pytest.fixture

@@ -18,7 +18,7 @@ from multidrop.gateway.kept_rows import Known
 from multidrop.gateway.metrics import Figures, families_of
 from multidrop.gateway.rights import May
 
-FIGURES = Figures("1", 0, 0, 0, {}, {})
+FIGURES = Figures("1", 0, 0, 0, {}, [])
 
 
 class FullHub(Hub):

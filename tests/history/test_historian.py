@@ -7,6 +7,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+from gateways import serving, simulated_plant
 from histories import NOON, SECOND, batch
 
 from multidrop import Plant, open_reader
@@ -68,3 +69,10 @@ def test_it_records_and_answers(tmp_path: Path) -> None:
 
     asyncio.run(live())
     assert [path.name for path in (tmp_path / "kept").glob("*.arrows")] == ["rows.00000001.arrows"]
+
+
+def test_duckdb_is_loaded_before_anybody_asks(tmp_path: Path) -> None:
+    pytest.importorskip("duckdb", reason="needs duckdb")
+    serve = "[serve]\nlisten = '127.0.0.1:0'\n[serve.history]\n"
+    with simulated_plant(tmp_path, serve) as path, serving(path) as (process, _):
+        assert "duckdb" in Path(f"/proc/{process.pid}/maps").read_text()

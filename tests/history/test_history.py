@@ -12,7 +12,7 @@ from examples import examples, usually
 from histories import DAY, METADATA, NOON, SECOND, check_buckets, random_rows, record, rows_in
 
 from multidrop import History, open_reader
-from multidrop.history import kept_series
+from multidrop.history import growing, kept_series
 from multidrop.history.buckets import grid_of
 from multidrop.history.compact import compact
 from multidrop.polling.batch import Row
@@ -308,6 +308,7 @@ def test_plots_of_a_segment_that_grows_are_of_all_its_rows(
 ) -> None:
     """Asked again and again for other series and ranges, among them such as begin before or far behind."""
     monkeypatch.setattr(kept_series, "MOST_KEPT", most)
+    monkeypatch.setattr(growing, "MOST_TENS", 3 if most else 0)
     dice = random.Random(most)
     rows = random_rows(5, NOON, 400) + random_rows(6, NOON + 20 * SECOND, 200)  # the clock was set back
     with SegmentWriter(tmp_path / "rows.arrows", METADATA, every=1e9) as writer, History(tmp_path) as history:
@@ -317,6 +318,17 @@ def test_plots_of_a_segment_that_grows_are_of_all_its_rows(
                 begin = NOON + dice.randrange(-5, 120) * SECOND
                 end = begin + dice.randrange(1, 100) * SECOND
                 series = dice.sample(SERIES, dice.randrange(1, 4))
-                for name, found in history.buckets(series, begin, end, points=97).items():
-                    assert not grid_of(begin, end, 97).is_of_tens
-                    check_buckets(found, rows[: at + 40], name)
+                for points in (97, 4):
+                    for name, found in history.buckets(series, begin, end, points).items():
+                        check_buckets(found, rows[: at + 40], name)
+                assert not grid_of(begin, end, 97).is_of_tens
+                assert end - begin < 8 * SECOND or grid_of(begin, end, 4).is_of_tens
+
+
+def test_no_tens_are_reckoned_of_what_nobody_asked_for(tmp_path: Path) -> None:
+    with SegmentWriter(tmp_path / "rows.arrows", METADATA, every=1e9) as writer, History(tmp_path) as history:
+        for number, name in enumerate(SERIES[:2]):
+            writer.write(from_rows(random_rows(number, NOON + number * 60 * SECOND, 200)))
+            history.buckets(name, NOON, NOON + DAY)
+            (segment,) = history._sources._growing.values()
+            assert [".".join(one) for one in segment._tens] == SERIES[: number + 1][::-1]

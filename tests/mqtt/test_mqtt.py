@@ -138,7 +138,8 @@ def test_a_broker_that_stands_still_holds_up_nothing(
             received.topic == "multidrop/pump-1" and json_of(received)["values"]["output_frequency"] == 499.0
         )
     )
-    assert running._part.figures()["dropped_total"] > 0
+    figures = {family.name: list(family.samples) for family in running._part.figures()}
+    assert figures["multidrop_mqtt_dropped"][0][2] > 0
 
 
 def test_a_broker_that_comes_back_is_told_anew(broker: Broker, listener: Listener, start: Start) -> None:
@@ -489,6 +490,21 @@ def test_metrics_say_what_was_sent(broker: Broker, tmp_path: Path) -> None:
         assert figures().keys() == {"sent_total", "dropped_total", "connected"}
         broker.kill()
         until(lambda: figures()["connected"] == 0.0)
+
+
+def test_metrics_say_in_words_what_they_count(broker: Broker, tmp_path: Path) -> None:
+    require_module("paho.mqtt.client")
+    with served(tmp_path, f'[serve.history]\n[serve.mqtt]\nbroker = "{broker.address}"\n') as gateway:
+        lines = gateway.get("/metrics").body.decode().splitlines()
+        told = dict(
+            line.removeprefix("# HELP multidrop_").split(" ", 1) for line in lines if "# HELP" in line
+        )
+        assert told["history_rows_total"] == "Rows written to the history."
+        assert told["history_dropped_total"] == "Rows that the history could not take or write."
+        assert told["mqtt_sent_total"] == "Messages handed to connections to the broker."
+        for word in ("replaced", "no connection", "not acknowledged"):
+            assert word in told["mqtt_dropped_total"]
+        assert "one more for Sparkplug" in told["mqtt_connected"]
 
 
 # ---- another plant ----

@@ -1,4 +1,4 @@
-"""Clock: the times by which the gateway judges ages, which nobody sets."""
+"""Clock: the times by which the gateway judges ages, which nobody sets, and the time of day."""
 
 from __future__ import annotations
 
@@ -35,3 +35,7 @@ def now_and_slept_ns() -> tuple[int, int]:
     booted_ns = boottime_ns()
     now_ns = monotonic_ns()
     return now_ns, booted_ns - now_ns
+
+
+def utc_ms() -> int:
+    return time.time_ns() // 1_000_000

@@ -17,11 +17,12 @@ import uvicorn
 
 import multidrop
 from multidrop import Batch, Bus, Ledger, LineError, Plant, Poller
-from multidrop.gateway.clock import boottime_ns, monotonic_ns, now_and_slept_ns
+from multidrop.gateway.clock import boottime_ns, monotonic_ns, now_and_slept_ns, utc_ms
 from multidrop.gateway.commands import Commands
 from multidrop.gateway.connections import Connections, Watched
 from multidrop.gateway.events import Events
 from multidrop.gateway.frames import Frames, frame_of, lost_of
+from multidrop.gateway.guard import MOST_HEAD
 from multidrop.gateway.hub import SILENT, Hub
 from multidrop.gateway.identities import Identities
 from multidrop.gateway.lately import Lately
@@ -89,7 +90,7 @@ class Gateway:
         self.commands = Commands(self, settings.may)
         self.seen_frames = SeenFrames(boottime_ns, self.commands.stopped_ns)
         self.frames = Frames(self._frame, self.clock, begin=secrets.randbits(48))
-        self.side_reads = SideReads(self.bus, self._is_there, self.clock, _utc_ms)
+        self.side_reads = SideReads(self.bus, self._is_there, self.clock, utc_ms)
         self.identities = Identities(
             lambda: self.plant, self.bus, self._is_there, lambda: self.note_failure("identities")
         )
@@ -156,6 +157,7 @@ class Gateway:
             Watched(make_app(self), self.connections),
             backlog=BACKLOG,
             http="h11",
+            h11_max_incomplete_event_size=MOST_HEAD,  # what is longer and does not come at once is cut off
             ws="none",
             lifespan="off",
             log_config=None,
@@ -196,13 +198,13 @@ class Gateway:
 
     def _look_for_events(self) -> None:
         for name in self.hub.drives:
-            self.events.look(_utc_ms(), name, self.hub.seen(name))
+            self.events.look(utc_ms(), name, self.hub.seen(name))
         for line in [line for line in self.hub.unopened if lost_of(self.hub, line) is None]:
             del self.hub.unopened[line]  # it came: should it go again, that has another reason
 
     def forget(self, drive: str) -> None:
         """End the alarms of a drive that is no longer there."""
-        self.events.forget(drive, _utc_ms())
+        self.events.forget(drive, utc_ms())
 
     def guarded(self, name: str, work: Callable[..., object], *arguments: object) -> None:
         try:
@@ -230,7 +232,7 @@ class Gateway:
             await asyncio.sleep(every)
 
     def _read_statistics(self, poller: Poller) -> None:
-        self.lately.tick(self.clock(), _utc_ms(), poller.statistics())
+        self.lately.tick(self.clock(), utc_ms(), poller.statistics())
         self.hub.unopened |= {line: why for line, bus in poller.buses.items() if (why := bus.why_lost)}
 
     def note_unopened(self, failures: Mapping[str, LineError]) -> None:
@@ -294,7 +296,3 @@ class _Server(uvicorn.Server):
     @contextmanager
     def capture_signals(self) -> Any:
         yield
-
-
-def _utc_ms() -> int:
-    return time.time_ns() // 1_000_000

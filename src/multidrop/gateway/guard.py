@@ -29,6 +29,7 @@ PAGE_HEADERS = HEADERS | {
     "cache-control": "no-cache",  # a page's file is asked for again, by its ETag
 }
 ANYONE = "anyone"
+MOST_HEAD = 64 * 1024  # bytes before a request's body: a browser sends the cookies of all ports of a host
 
 
 def _raw(headers: Mapping[str, str]) -> list[tuple[bytes, bytes]]:
@@ -109,6 +110,8 @@ class Guard:
             raise Denied(421, f"{name[:100]!r} is not this gateway; add it to names of [serve] if it is")
         path: str = scope["path"]
         needed = self._find(path)
+        if needed.right is not Right.STOP and _length(scope) > MOST_HEAD:
+            raise Denied(431, f"the headers are longer than {MOST_HEAD} bytes")
         if scope["method"] != needed.method and (scope["method"], needed.method) != ("HEAD", "GET"):
             raise Denied(405, f"{path[:100]!r} takes {needed.method} alone")
         self._check_site(headers, hosts[0], needed)
@@ -184,6 +187,12 @@ class Guard:
             return peer
         told = headers.get("x-forwarded-for", "").rpartition(",")[2].strip()
         return told[:64] or peer
+
+
+def _length(scope: Scope) -> int:
+    """Return the bytes of a request's path, query and headers."""
+    words = sum(len(name) + len(value) for name, value in scope["headers"])
+    return words + len(scope["raw_path"]) + len(scope["query_string"])
 
 
 def _secret(headers: Headers) -> tuple[str, str]:

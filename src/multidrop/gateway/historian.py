@@ -4,12 +4,25 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Protocol
 
-from multidrop import Batch, Buckets, History, HistoryState, HistoryWriter, Plant, parse_age, parse_size
+from multidrop import (
+    Batch,
+    Buckets,
+    History,
+    HistoryState,
+    HistoryWriter,
+    MetricFamily,
+    Plant,
+    parse_age,
+    parse_size,
+)
+from multidrop.gateway.metrics import counter
 
 MS_NS = 1_000_000
 PIECE = 1 << 16  # bytes of an export
@@ -45,7 +58,12 @@ class Surroundings(Protocol):
 
 
 def build(settings: HistorySettings, inside: Surroundings) -> Historian:
-    """Return the historian of a gateway; a relative folder is beside its plant file."""
+    """Return the historian of a gateway; a relative folder is beside its plant file.
+
+    DuckDB is loaded here, before polling begins, and not while the first viewer waits.
+    """
+    with suppress(ImportError):
+        import_module("duckdb")
     folder = inside.folder / settings.folder
     try:
         return Historian(inside.plant, folder, settings)
@@ -97,10 +115,15 @@ class Historian:
         trouble = self.state.trouble
         return f"nothing is recorded: {trouble}" if trouble else ""
 
-    def figures(self) -> dict[str, float]:
+    def figures(self) -> list[MetricFamily]:
         """Return rows written and rows lost since the start."""
         state = self.state
-        return {"rows_total": state.rows, "dropped_total": state.dropped}
+        return [
+            counter("multidrop_history_rows", "Rows written to the history.", state.rows),
+            counter(
+                "multidrop_history_dropped", "Rows that the history could not take or write.", state.dropped
+            ),
+        ]
 
     @property
     def state(self) -> HistoryState:

@@ -5,7 +5,7 @@ A drive that is silent has no values: its series vanish, and nobody takes an old
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 from multidrop import LineStatistics, MetricFamily
@@ -24,7 +24,7 @@ class Figures(NamedTuple):
     frames: int
     dropped: int  # rows
     failures: Mapping[str, int]  # of parts, by name
-    parts: Mapping[str, Mapping[str, float]]  # figures of each, by name
+    parts: Sequence[MetricFamily]  # what they say of themselves
 
 
 def families_of(
@@ -43,12 +43,12 @@ def families_of(
     )
     yield from _line_families(statistics)
     yield from _drive_families(statistics)
-    yield _count("multidrop_rows_dropped", "Rows that nobody took in time.", figures.dropped)
-    yield _count("multidrop_frames", "Frames made for viewers.", figures.frames)
+    yield counter("multidrop_rows_dropped", "Rows that nobody took in time.", figures.dropped)
+    yield counter("multidrop_frames", "Frames made for viewers.", figures.frames)
     yield MetricFamily("multidrop_viewers", "gauge", "Viewers that wait.", [("", {}, figures.viewers)])
     failures = [("_total", {"part": name}, float(n)) for name, n in figures.failures.items()]
     yield MetricFamily("multidrop_part_failures", "counter", "Failures of each part.", failures)
-    yield from _part_families(figures.parts)
+    yield from figures.parts
 
 
 def _values(hub: Hub) -> Iterator[Sample]:
@@ -114,14 +114,6 @@ def _drive_families(statistics: Mapping[str, LineStatistics]) -> Iterator[Metric
     )
 
 
-def _part_families(parts: Mapping[str, Mapping[str, float]]) -> Iterator[MetricFamily]:
-    for part, found in parts.items():
-        for name, value in found.items():
-            base, is_count = name.removesuffix("_total"), name.endswith("_total")
-            kind, suffix = ("counter", "_total") if is_count else ("gauge", "")
-            text = base.replace("_", " ").capitalize() + f" of {part}."
-            yield MetricFamily(f"multidrop_{part}_{base}", kind, text, [(suffix, {}, float(value))])
-
-
-def _count(name: str, text: str, value: float) -> MetricFamily:
+def counter(name: str, text: str, value: float) -> MetricFamily:
+    """Return a family of one count."""
     return MetricFamily(name, "counter", text, [("_total", {}, value)])

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import asyncio
-import time
 from collections.abc import Awaitable, Callable
 from typing import Any
 
-from multidrop import Batch, Plant
+from multidrop import Batch, MetricFamily, Plant
 from multidrop.gateway.broker import Broker, parse_broker
+from multidrop.gateway.clock import utc_ms
 from multidrop.gateway.json_topics import JsonTopics
+from multidrop.gateway.metrics import counter
 from multidrop.gateway.mqtt_settings import MqttSettings as MqttSettings
 from multidrop.gateway.parts import Feed, Inside
 from multidrop.gateway.sparkplug_node import SparkplugNode
@@ -17,14 +18,10 @@ from multidrop.gateway.sparkplug_node import SparkplugNode
 
 def build(settings: MqttSettings, inside: Inside) -> Feed:
     """Return the part. Raises ImportError without paho."""
-    speakers: list[Any] = [JsonTopics(settings, inside, _utc_ms)]
+    speakers: list[Any] = [JsonTopics(settings, inside, utc_ms)]
     if settings.sparkplug:
-        speakers.append(SparkplugNode(settings, inside, _utc_ms))
+        speakers.append(SparkplugNode(settings, inside, utc_ms))
     return Mqtt(settings, inside, speakers)
-
-
-def _utc_ms() -> int:
-    return time.time_ns() // 1_000_000
 
 
 class Mqtt:
@@ -74,11 +71,26 @@ class Mqtt:
         """Return why a broker is not reached; "" is well."""
         return next((broker.trouble for broker in self._brokers if not broker.is_connected), "")
 
-    def figures(self) -> dict[str, float]:
+    def figures(self) -> list[MetricFamily]:
         """Return messages sent and dropped since the start, and how many connections there are."""
         outboxes = [broker.outbox for broker in self._brokers]
-        return {
-            "sent_total": sum(outbox.sent for outbox in outboxes),
-            "dropped_total": sum(outbox.dropped for outbox in outboxes),
-            "connected": sum(broker.is_connected for broker in self._brokers),
-        }
+        connected = sum(broker.is_connected for broker in self._brokers)
+        return [
+            counter(
+                "multidrop_mqtt_sent",
+                "Messages handed to connections to the broker.",
+                sum(outbox.sent for outbox in outboxes),
+            ),
+            counter(
+                "multidrop_mqtt_dropped",
+                "Messages replaced by newer ones before they were sent, made while there was no connection, "
+                "or not acknowledged when it broke.",
+                sum(outbox.dropped for outbox in outboxes),
+            ),
+            MetricFamily(
+                "multidrop_mqtt_connected",
+                "gauge",
+                "Connections to the broker that are up: one for JSON, and one more for Sparkplug.",
+                [("", {}, connected)],
+            ),
+        ]

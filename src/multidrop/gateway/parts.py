@@ -50,7 +50,7 @@ class Feed(Protocol):
     """A part that was built.
 
     It may have `adopt(plant)`, which is told of another plant once the hub has it, `health()`, which says
-    what is not well, and `figures()` for the metrics.
+    what is not well, and `figures()`, a list of families for the metrics.
     """
 
     def take(self, batch: Batch) -> None:

@@ -7,7 +7,7 @@ import contextlib
 import time
 from typing import TYPE_CHECKING, Any
 
-from multidrop import Ledger, Statistics, drive_meant
+from multidrop import Ledger, MetricFamily, Statistics, drive_meant
 from multidrop.gateway.frames import lost_of
 from multidrop.gateway.lately import misses_of
 from multidrop.gateway.metrics import Figures
@@ -134,12 +134,12 @@ def _health_of_part(feed: object) -> str:
 
 def figures_of(gateway: Gateway) -> Figures:
     """Return what the metrics say of the gateway itself."""
-    parts = {}
-    for name, feed in gateway.feeds.items():
+    parts: list[MetricFamily] = []
+    for feed in gateway.feeds.values():
         said = getattr(feed, "figures", None)
         if said is not None:
             with contextlib.suppress(Exception):  # a part's failure hides its own figures alone
-                parts[name] = dict(said())
+                parts += said()
     dropped = gateway.poller.dropped if gateway.poller else 0
     failures = {name: gateway.failures.get(name, 0) for name in ("hub", *gateway.feeds)} | gateway.failures
     return Figures(gateway.version, gateway.frames.viewers, gateway.frames.made, dropped, failures, parts)

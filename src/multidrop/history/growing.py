@@ -1,11 +1,10 @@
-"""A segment that is not compacted yet: each batch is read once, and its tens are computed."""
+"""A segment that is not compacted yet: rows and tens of the series that are asked for."""
 
 from __future__ import annotations
 
 import threading
 from collections.abc import Iterator, Mapping, Sequence
 from functools import lru_cache
-from itertools import repeat
 from pathlib import Path
 from typing import NamedTuple
 
@@ -17,8 +16,32 @@ from multidrop.polling.batch import Row
 from multidrop.recording.arrow_decoder import RecordedColumns
 from multidrop.recording.arrows_tail import ArrowsTail, BatchPlace
 
+MOST_TENS = 4096  # series whose tens are kept: names of none may be asked for, too
+
 Ten = list[float]  # values, misses, their sum, least, most
-Tens = dict[int, Ten]  # by number since 1970
+
+
+class SeriesTens:
+    """The tens of one series, of all batches before the one numbered `past`."""
+
+    __slots__ = ("by_number", "past")
+
+    def __init__(self) -> None:
+        self.past = 0
+        self.by_number: dict[int, Ten] = {}  # numbers since 1970
+
+    def add(self, time: int, value: float | None) -> None:
+        """Add a row; None is a miss."""
+        ten = self.by_number.setdefault(time // TEN_NS, [0, 0, 0.0, float("inf"), float("-inf")])
+        if value is None:
+            ten[1] += 1
+            return
+        ten[0] += 1
+        ten[2] += value
+        if value < ten[3]:
+            ten[3] = value
+        if value > ten[4]:
+            ten[4] = value
 
 
 class IndexedBatch(NamedTuple):
@@ -41,9 +64,7 @@ class GrowingSegment:
         self._changing = threading.RLock()
         self._batches: list[IndexedBatch] = []
         self._kept = KeptSeries(self._read)
-        self._tens: dict[Series, Tens] = {}
-        self._by_code: dict[int, Tens] = {}
-        self._names: tuple[tuple[str, ...], tuple[str, ...]] = ((), ())
+        self._tens: dict[Series, SeriesTens] = {}
         self.metadata = self._tail.metadata
         self.damage: str | None = None
 
@@ -76,36 +97,9 @@ class GrowingSegment:
             try:
                 for columns, place in self._tail.new() if self.damage is None else ():
                     if len(columns.time):
-                        self._add(columns)
                         self._batches.append(IndexedBatch(place, min(columns.time), max(columns.time)))
             except ValueError as damage:
                 self.damage = str(damage)
-
-    def _add(self, columns: RecordedColumns) -> None:
-        if self._names != (columns.drives, columns.registers):
-            self._names = columns.drives, columns.registers
-            self._by_code.clear()
-        by_code = self._by_code
-        for time, drive, register, value, valid in zip(
-            columns.time, columns.drive, columns.register, columns.value, _valid(columns), strict=False
-        ):
-            code = drive << 16 | register
-            tens = by_code.get(code)
-            if tens is None:
-                series = columns.drives[drive], columns.registers[register]
-                tens = by_code[code] = self._tens.setdefault(series, {})
-            ten = tens.get(time // TEN_NS)
-            if ten is None:
-                ten = tens[time // TEN_NS] = [0, 0, 0.0, float("inf"), float("-inf")]
-            if valid:
-                ten[0] += 1
-                ten[2] += value
-                if value < ten[3]:
-                    ten[3] = value
-                if value > ten[4]:
-                    ten[4] = value
-            else:
-                ten[1] += 1
 
     def batches(self, begin: int, end: int) -> list[IndexedBatch]:
         """Return the batches that may have rows from `begin` to before `end`, in ns."""
@@ -146,16 +140,24 @@ class GrowingSegment:
             yield SeriesRow(name, columns.time[at], columns.value[at] if _is_valid(columns, at) else None)
 
     def _gather_tens(self, found: Mapping[Series, Accumulator], grid: Grid) -> None:
+        if len(self._tens) > MOST_TENS:
+            self._tens.clear()
+        self._tens = {one: SeriesTens() for one in found} | self._tens
+        self._tend_tens()
         for series, into in found.items():
-            for number, (n, missed, *sums) in self._tens.get(series, {}).items():
+            for number, (n, missed, *sums) in self._tens[series].by_number.items():
                 if grid.begin <= number * TEN_NS < grid.end:
                     into.add((number * TEN_NS - grid.begin) // grid.step, int(n), int(missed), *sums)
 
-
-def _valid(columns: RecordedColumns) -> Iterator[bool]:
-    if columns.valid is None:
-        return repeat(True)
-    return (bool(byte >> bit & 1) for byte in columns.valid for bit in range(8))
+    def _tend_tens(self) -> None:
+        """Read each batch once more for those series that lack it."""
+        end = len(self._batches)
+        for number in range(min((tens.past for tens in self._tens.values()), default=end), end):
+            behind = frozenset(series for series, tens in self._tens.items() if tens.past <= number)
+            for row in self._read(number, behind):
+                self._tens[row.series].add(row.time, row.value)
+        for tens in self._tens.values():
+            tens.past = end
 
 
 def _is_valid(columns: RecordedColumns, at: int) -> bool:
