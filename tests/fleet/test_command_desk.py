@@ -424,9 +424,15 @@ ODD_STOPS = [  # messages that any asker may send, or a network may spoil
 
 @pytest.mark.parametrize("data", every_third(ODD_STOPS))
 def test_a_stop_is_sent_whatever_is_wrong_with_its_words(
-    desk: Desks, data: bytes, caplog: pytest.LogCaptureFixture, tmp_path: Path
+    desk: Desks,
+    data: bytes,
+    caplog: pytest.LogCaptureFixture,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """It is noted in words that can be printed, and one that names no drives stops all of the line."""
+    # Who asks again for a stop without an id asks for another one.
+    monkeypatch.setattr("multidrop.fleet.stop_desk.HOLD_S", PATIENCE_S)
     answer = asyncio.run(desk.stop_by(data))
     assert answer is not None
     assert answer.drives["pump"].outcome is DONE

@@ -112,7 +112,7 @@ def test_a_request_that_is_not_waited_for_any_longer_says_so(
     tmp_path: Path, gateways: list[Gateway], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("multidrop.polling.line_set.ENDING_NS", 0)
-    with simulated_line(tmp_path, delay=0.1) as (drives, line):
+    with simulated_line(tmp_path, delay=1.0) as (drives, line):
         hand_over(gateways[0], drives, line)
         hand_over(gateways[1], drives, line)
         judged = judge(drives, gateways)
