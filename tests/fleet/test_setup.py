@@ -119,7 +119,7 @@ def test_servers_that_do_not_look_at_all_writers_records_are_refused(
 @pytest.mark.long
 @pytest.mark.slow
 def test_a_server_that_is_down_is_waited_for_at_first_and_not_later(tmp_path: Path) -> None:
-    """What is made without it would stay on two servers, of which each one's death ends all polling."""
+    """Buckets made without it would stay on two servers, of which each one's death ends all polling."""
     with cluster(tmp_path, 3) as three:
         down = next(node for node in three.nodes if not node.leads_servers())
         others = [node for node in three.nodes if node is not down]
