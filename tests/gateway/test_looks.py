@@ -157,6 +157,29 @@ def test_lines_show_what_each_drive_costs(gateway: Served) -> None:
     assert line["drives"]["pump-1"]["asked"] > 0
 
 
+@pytest.mark.long
+def test_a_silent_drives_misses_are_a_share_of_its_values(gateway: Served) -> None:
+    """They were set against its requests, of which each brings several values, and a silent drive has few."""
+    lately = gateway.gateway.lately
+
+    def came() -> int:
+        statistics = lately.drive("hall", "pump-2")
+        return statistics.samples if statistics else 0
+
+    def missed() -> int:
+        found: int = gateway.get("/api/lines").json["hall"]["drives"]["pump-2"]["missed"]
+        return found
+
+    until(lambda: came() > 40)
+    before = came()
+    gateway.sims["pump-2"].deaf_until = float("inf")
+    until(lambda: missed() > 40)
+    line = gateway.get("/api/lines").json["hall"]["drives"]["pump-2"]
+    assert line["asked"] >= line["missed"] + before
+    drive = gateway.get("/api/drive/pump-2").json
+    assert drive["asked"] >= sum(drive["misses"].values()) + before
+
+
 def test_reads_past_the_table(gateway: Served) -> None:
     """Words as they lie in the drive, for masters that get in through the gateway."""
     gateway.sims["pump-1"]["output_current"] = 12.3

@@ -9,7 +9,7 @@ import fake_plant
 import pytest
 from conftest import Opener, missing
 from fake_gateway import FakeGateway
-from watching import until, until_still
+from watching import press_enter, until, until_still
 
 pytestmark = pytest.mark.long  # Chromium is started for each file
 
@@ -94,11 +94,11 @@ def test_axe_finds_nothing_in_rare_states(
     look("a write")
     page.get_by_role("button", name="Write to pump-1").click()
     page.get_by_label("Token").fill("wrong")
-    page.keyboard.press("Enter")
+    press_enter(page)
     page.get_by_text("No such token is known.").wait_for()
     look("a wrong token")
     page.get_by_label("Token").fill("right")
-    page.keyboard.press("Enter")
+    press_enter(page)
     page.locator("#outcomes").get_by_text("held by the drive").wait_for()
     look("an outcome")
     page.evaluate("location.hash = '#/trends'")

@@ -9,7 +9,7 @@ import pytest
 from conftest import Opener
 from fake_gateway import FakeGateway
 from gateways import served
-from watching import LIVE, until
+from watching import LIVE, press_enter, until
 
 from multidrop.gateway.rights import Right
 
@@ -39,18 +39,18 @@ def test_the_keyboard_alone_reads_it_again_and_all_mistakes_are_told(
     gateway.reloaded = {"done": False, "text": text, "mistakes": mistakes, "restart": []}
     page = opened()
     page.locator("#more").focus()
-    page.keyboard.press("Enter")
+    press_enter(page)
     tab_to(page, READ_AGAIN)
-    page.keyboard.press("Enter")
+    press_enter(page)
     told(page, "Read bottling plant.toml again?")
-    page.keyboard.press("Enter")  # Cancel has the focus
+    press_enter(page)  # Cancel has the focus
     assert gateway.posts == []
     page.locator("#more").focus()
-    page.keyboard.press("Enter")
+    press_enter(page)
     tab_to(page, READ_AGAIN)
-    page.keyboard.press("Enter")
+    press_enter(page)
     tab_to(page, "Read bottling plant.toml")
-    page.keyboard.press("Enter")
+    press_enter(page)
     told(page, "The file has 30 mistakes")
     assert page.locator("#ask .outcome li").all_inner_texts() == mistakes
     tab_to(page, "".join(mistakes))

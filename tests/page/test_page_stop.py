@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from conftest import SIZES, Opener
 from fake_gateway import FakeGateway
-from watching import AT_ITS_PLACE, LIVE, VIEWS, until, until_met
+from watching import AT_ITS_PLACE, LIVE, VIEWS, press_enter, until, until_met
 
 from multidrop.control.stop_attempt import LEAST_S
 
@@ -61,7 +61,7 @@ def test_one_drive_is_stopped_by_keyboard_alone(opened: Opener, gateway: FakeGat
     page.keyboard.press("ArrowDown")
     page.keyboard.press("s")
     assert title(page).inner_text() == "Stop pump-2?"
-    page.keyboard.press("Enter")  # Cancel has the focus
+    press_enter(page)  # Cancel has the focus
     assert gateway.posts == []
     page.keyboard.press("s")
     page.keyboard.press("Tab")
@@ -75,7 +75,7 @@ def test_one_drive_is_stopped_by_keyboard_alone(opened: Opener, gateway: FakeGat
 def test_all_drives_are_stopped_by_keyboard_alone(opened: Opener, gateway: FakeGateway) -> None:
     page = opened("#/log")
     page.keyboard.press("Shift+S")
-    page.keyboard.press("Enter")
+    press_enter(page)
     assert gateway.posts == []
     page.keyboard.press("Shift+S")
     page.keyboard.press("Tab")
@@ -197,7 +197,7 @@ def test_a_stop_without_the_right_asks_for_a_token_and_goes_on(opened: Opener, g
     page.locator("#stopall").click()
     page.get_by_role("button", name="Stop all 31 drives").click()
     page.get_by_label("Token").fill("wrong")
-    page.keyboard.press("Enter")
+    press_enter(page)
     page.get_by_text("No such token is known.").wait_for()
     page.get_by_label("Token").fill("right")
     page.get_by_role("button", name="Sign in and send it").click()

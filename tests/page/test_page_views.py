@@ -117,7 +117,7 @@ def test_a_drive_shows_all_registers_with_unit_and_place(opened: Opener) -> None
     assert rows.nth(7).locator(".value").inner_text() == "runs (1)"
     assert rows.nth(8).locator(".value").inner_text() == "ready, at setpoint"
     page.get_by_text("half within 4.1 ms, 99 % within 6.1 ms").wait_for()
-    assert "Missed 4 of 5120 requests" in page.locator("#delays").inner_text()
+    assert "Missed 4 of 5120 values" in page.locator("#delays").inner_text()
     looked_at = rows.nth(10).locator(".value")  # just now
     until_met(page, lambda: looked_at.get_attribute("class") == "value")
     assert rows.nth(9).locator(".value").get_attribute("class") == "value old"  # read an hour ago

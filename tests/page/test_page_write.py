@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from conftest import Opener
 from fake_gateway import FakeGateway
-from watching import until, until_met, until_still
+from watching import press_enter, until, until_met, until_still
 
 pytestmark = pytest.mark.long  # Chromium is started for each file
 
@@ -52,7 +52,7 @@ def test_what_a_write_became_is_said_in_the_gateways_words(opened: Opener, gatew
     page = opened("#/drives/pump-1")
     page.get_by_role("button", name="Change frequency setpoint").click()
     page.get_by_label("New value, Hz").fill("31.5")
-    page.keyboard.press("Enter")
+    press_enter(page)
     assert "bad" in page.locator("#outcomes li").get_attribute("class")
     assert "the drive took 30.0 Hz instead" in page.locator("#outcomes").inner_text()
 
@@ -88,7 +88,7 @@ def test_a_start_warns_and_enter_alone_sends_nothing(opened: Opener, gateway: Fa
     page.get_by_role("button", name="start").click()
     assert page.locator("#ask-title").inner_text() == "start: pump-1?"
     assert "The motor will turn." in page.locator("#ask").inner_text()
-    page.keyboard.press("Enter")
+    press_enter(page)
     assert gateway.posts == []
     page.get_by_role("button", name="start").click()
     page.get_by_role("button", name="start pump-1").click()

@@ -53,6 +53,12 @@ def until_still(page: Any) -> None:
     )
 
 
+def press_enter(page: Any) -> None:
+    """Press Enter once a dialog that opened or closed is drawn: before, the page takes no such key."""
+    page.evaluate("new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done)))")
+    page.keyboard.press("Enter")
+
+
 def told(page: Any) -> str:
     """Return what the head says, for who reads of a failure."""
     return str(

@@ -123,7 +123,7 @@ class Lately:
         """Return the figures since the newest minute began; none where it has just begun."""
         begin_ms, before = self._minutes[-1] if self._minutes else (0, {})
         minute = self._since(before, line)
-        return [{"time": begin_ms, "asked": _asked(minute), "misses": misses_of(minute)}] if minute else []
+        return [{"time": begin_ms, "asked": asked_of(minute), "misses": misses_of(minute)}] if minute else []
 
 
 def _counts_on(before: PlantLine, line: PlantLine) -> bool:
@@ -148,12 +148,13 @@ def misses_of(statistics: Statistics) -> dict[str, int]:
     return {why: n for why, n in statistics.misses.items() if n > 0}
 
 
-def _asked(statistics: Statistics) -> int:
+def asked_of(statistics: Statistics) -> int:
+    """Return the number of values that came or were missed."""
     return statistics.samples + sum(statistics.misses.values())
 
 
 def _of_minute(statistics: Statistics) -> dict[str, Any]:
-    asked = _asked(statistics)
+    asked = asked_of(statistics)
     delays = statistics.delays
     return {
         "missed": round(1 - statistics.samples / asked, 4) if asked else None,

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from multidrop import Ledger, MetricFamily, Statistics, drive_meant
 from multidrop.gateway.frames import lost_of
-from multidrop.gateway.lately import misses_of
+from multidrop.gateway.lately import asked_of, misses_of
 from multidrop.gateway.metrics import Figures
 from multidrop.gateway.stops_amid_reload import drives_of
 
@@ -28,7 +28,7 @@ async def look_at(gateway: Gateway, name: str) -> dict[str, Any]:
         "drive": name,
         "delays": _delays(statistics),
         "misses": misses_of(statistics) if statistics else {},
-        "asked": statistics.exchanges if statistics else 0,
+        "asked": asked_of(statistics) if statistics else 0,
         "timeout_ms": round(statistics.timeout * 1e3, 1) if statistics else None,
         "values": found,
         "ledger": wear,
@@ -150,6 +150,6 @@ def _drive_figures(statistics: Statistics | None) -> dict[str, Any] | None:
         return None
     return {
         **_usual_delays(statistics),
-        "asked": statistics.exchanges,
+        "asked": asked_of(statistics),
         "missed": sum(statistics.misses.values()),
     }

@@ -54,7 +54,7 @@ function delays({ delays, misses, asked, ledger }) {
     make(
       "p",
       { class: "note" },
-      asked ? `Missed ${total} of ${asked} requests, ${share(total / asked)}.` : "Nothing was asked yet.",
+      asked ? `Missed ${total} of ${asked} values, ${share(total / asked)}.` : "Nothing was asked yet.",
     ),
     total
       ? make(
