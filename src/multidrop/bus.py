@@ -117,11 +117,11 @@ class Bus:
     ) -> None:
         self.line = line
         try:
+            book = ledger if isinstance(ledger, Ledger) else Ledger(ledger)
             log = AuditLog(audit) if audit else None
-        except OSError:
+        except BaseException:
             self.line.close()
             raise
-        book = ledger if isinstance(ledger, Ledger) else Ledger(ledger)
         self._exchanges = Exchanges(self.line)
         self._records = WriteRecords(self.line, book, log)
         self._latches = Latches(self._exchanges)

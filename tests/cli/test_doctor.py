@@ -42,6 +42,7 @@ from multidrop.core import RS485, Completion, Failure, Framing, Message, build_r
 from multidrop.drive.timing import Settings
 from multidrop.drives.innovert_ibd import InnovertIBD
 from multidrop.drives.invt_che import InvtCHE
+from multidrop.drives.registry import find_model
 from multidrop.sim import Simulator, Wire, simulated
 
 USUAL = Settings(9600, "8N1")
@@ -457,3 +458,20 @@ def test_what_was_mixed_up_is_told(port: str, asked: str, spoken: str, other: st
     told = " ".join(said.split())
     assert f"the far end speaks {spoken}, and not" in told
     assert f"name the port {other}://{place} in place of {asked}://{place}" in told
+
+
+@pytest.mark.parametrize(
+    "table_of", ["setting", "command"], ids=["readable", "unreadable"]
+)
+def test_a_family_without_readings_is_measured_by_what_can_be_read(
+    run: Run, tmp_path: Path, table_of: str
+) -> None:
+    family = tmp_path / "relay.toml"
+    family.write_text(
+        '[family]\ntitle = "Relay board"\nmanual = "x"\ncounts_from = 0\n[default]\ntable = "coil"\n'
+        f'[{table_of}]\nrelay = {{ at = 0, unit = "", kept = "ram" }}\n'
+    )
+    with Simulator([Wire([simulated(find_model(str(family))(1))])]) as simulator:
+        _, out, _ = run("doctor", simulator.wires[0].path, "--model", str(family), "--address", "1")
+    assert "round trip" in out
+    assert ("nothing of it can be read" in " ".join(out.split())) == (table_of == "command")

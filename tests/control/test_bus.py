@@ -706,3 +706,13 @@ def test_a_drive_that_takes_another_s_place_knows_what_a_thread_has_asked_that()
             bus.read(pump, Single.mystery)
         taking.join(PATIENCE)
         assert bus.peer(taken[0]).late_until_ns
+
+
+@pytest.mark.parametrize("wrong", ["audit", "ledger"])
+def test_a_bus_that_cannot_be_made_leaves_its_port(wrong: str) -> None:
+    with Simulator([Wire([simulated(Toy(1))])]) as simulator:
+        port = simulator.wires[0].path
+        with pytest.raises(TypeError) as kept:
+            Bus(port, **cast("dict[str, Any]", {wrong: 5.5}))
+        assert kept.tb
+        Bus(port).close()

@@ -68,7 +68,7 @@ class LineSet:
 
     def find_drive(self, drive: Drive | str) -> tuple[PolledLine, Drive]:
         """Return a drive, by itself or by its name, and its line; ValueError where it is not polled."""
-        drives = {known.name: (line, known) for line in self._lines for known in line.bus.drives}
+        drives = {each.drive.name: (line, each.drive) for line in self._lines for each in line.polled}
         name = drive if isinstance(drive, str) else drive.name
         line, known = drives.get(name, (None, None))
         if line is None or known is None or drive not in (name, known):

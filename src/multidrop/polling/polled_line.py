@@ -147,7 +147,8 @@ class PolledLine:
             self.started_ns = clock.now_ns()
             self.bus.tended(True)
             self.bus.reset_statistics()
-            for drive in in_order(self.bus.drives, self.switching):
+            polled = [polled.drive for polled in self.polled]  # others may be attached to the bus by hand
+            for drive in in_order(polled, self.switching):
                 self._drives.begin(drive, self.started_ns)
             self._is_started = True
         self._row_queue.call(self.number)

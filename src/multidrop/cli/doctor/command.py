@@ -154,7 +154,8 @@ def _findings(port: str, rs485: RS485, drive: Drive | None, settings: Settings) 
     if not other_port(port) or (drive and not measured.is_failure):
         return
     if drive:
-        yield other_way_finding(port, _first_reading(drive).request, settings)
+        if block := _first_readable(drive):
+            yield other_way_finding(port, block.request, settings)
     elif not speaks_tcp(port):  # a line without drives says nothing in the other way
         yield other_way_finding(port, nobody, settings)
 
@@ -256,9 +257,11 @@ def _round_trip(port: str, rs485: RS485, drive: Drive | None) -> Finding:
             "name one with --model and --address, or one of a plant file; `multidrop scan` finds those "
             "that are there",
         )
+    block = _first_readable(drive)
+    if block is None:
+        return Finding("round trip", f"not measured: nothing of it can be read ({drive.name})")
     with Bus(port, rs485=rs485) as bus:
         bus.attach(drive)
-        block = _first_reading(drive)
         poll = make_exchange(drive, block.request, bus.peer(drive))
         completions = list(_repeat(bus.line, poll))
     # Time of the request and the reply's first character: unknown on a network and on a pseudo-terminal.
@@ -270,8 +273,13 @@ def _round_trip(port: str, rs485: RS485, drive: Drive | None) -> Finding:
     return round_trip_finding(drive, delays, len(completions), 0.0 if shows_bits else wire)
 
 
-def _first_reading(drive: Drive) -> Block:
-    (block,) = blocks(drive, [next(iter(drive.readings()))])
+def _first_readable(drive: Drive) -> Block | None:
+    """Return a request for the drive's first reading, or else for the first register that can be read."""
+    readable = (register for register in drive.registers.values() if register.readable)
+    register = next(iter(drive.readings()), None) or next(readable, None)
+    if register is None:
+        return None
+    (block,) = blocks(drive, [register])
     return block
 
 
