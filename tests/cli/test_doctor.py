@@ -460,9 +460,7 @@ def test_what_was_mixed_up_is_told(port: str, asked: str, spoken: str, other: st
     assert f"name the port {other}://{place} in place of {asked}://{place}" in told
 
 
-@pytest.mark.parametrize(
-    "table_of", ["setting", "command"], ids=["readable", "unreadable"]
-)
+@pytest.mark.parametrize("table_of", ["setting", "command"], ids=["readable", "unreadable"])
 def test_a_family_without_readings_is_measured_by_what_can_be_read(
     run: Run, tmp_path: Path, table_of: str
 ) -> None:
