@@ -99,8 +99,10 @@ int md_port_keep_rts(int fd)
 {
     attributes port;
     int failure = get(fd, &port);
+    if (failure)
+        return failure;
     port.c_cflag &= ~(tcflag_t)HUPCL;
-    return failure ? failure : put(fd, &port);
+    return put(fd, &port);
 }
 
 int md_port_set(int fd, const struct md_settings *settings)

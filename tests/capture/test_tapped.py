@@ -342,6 +342,19 @@ def test_the_last_minutes_and_what_follows_are_written_when_something_goes_wrong
     assert b"hall-1: pump-1: bad checksum; hall-1: pump-2: fell silent\0" in path.read_bytes()[:200]
 
 
+def test_two_that_write_into_one_directory_in_the_same_second_both_do(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for _ in range(2):
+        one_flight = Flight(tmp_path, monkeypatch)  # on a clock that begins at the same time
+        one_flight.pass_(10, "hall-1: pump-1: bad checksum")
+        one_flight.pass_(5)
+    assert sorted(path.name for path in tmp_path.iterdir()) == [
+        "flight-20231114T223012Z.pcapng",
+        "flight-20231114T223013Z.pcapng",
+    ]
+
+
 def test_a_line_in_trouble_does_not_fill_the_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     one_flight = Flight(tmp_path, monkeypatch, seconds=20, most_files=3)
     (tmp_path / "flight-plan.pcapng").touch()  # somebody's own

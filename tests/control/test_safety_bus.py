@@ -22,7 +22,7 @@ from multidrop.control.outcome import Effect, Seen
 from multidrop.control.ramp import ramp, start_staggered
 from multidrop.core import Completion, Exchange, Framing, Message, build_reply
 from multidrop.drive import Condition, Direction, Drive, Script, State, read, wait, write
-from multidrop.drive.declare import reading, setting
+from multidrop.drive.declare import command, reading, setting
 from multidrop.drive.table import COIL, Kept
 from multidrop.drive.verbs import verb
 from multidrop.drives import MODELS, YD1000, DelixiModbus, ErmanERG220, InnovertIBD, InvtCHE
@@ -797,6 +797,28 @@ def test_a_ramp_to_an_eeprom_is_refused(monkeypatch: pytest.MonkeyPatch) -> None
     line, drive, _ = one(monkeypatch, DelixiModbus(1))
     with pytest.raises(Refused, match="EEPROM"):
         ramp(drive, 20.0)
+    assert line.written == []
+
+
+class KeptToy(Toy):
+    """Its setpoint is declared a command, and yet kept in EEPROM."""
+
+    frequency = command(0x2000, "Hz", step=0.01, span=(0, 50), kept=Kept.EEPROM, moves=False)
+
+    @verb
+    def set_frequency(self, hz: float) -> Script[None]:
+        yield from self._hold(self.frequency, hz)
+
+
+def test_a_ramp_to_a_command_in_eeprom_is_refused_before_its_first_step(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    line = SimulatedBus(monkeypatch, simulated(KeptToy(1)))
+    toy = line.attach(KeptToy(1))
+    toy.set_frequency(5)
+    line.frames.clear()
+    with pytest.raises(Refused, match="which a ramp would wear out"):
+        ramp(toy, 20.0, rate=5.0)
     assert line.written == []
 
 

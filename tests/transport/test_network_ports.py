@@ -193,6 +193,24 @@ def test_a_request_that_waited_behind_another_is_never_sent() -> None:
     assert b"start" not in port.written
 
 
+def test_a_bridge_for_which_there_are_no_threads_is_a_port_that_failed(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    started: list[threading.Thread] = []
+    start = threading.Thread.start
+
+    def first_alone(thread: threading.Thread) -> None:
+        if started:
+            raise RuntimeError("can't start new thread")
+        started.append(thread)
+        start(thread)
+
+    monkeypatch.setattr(threading.Thread, "start", first_alone)
+    with pytest.raises(OSError, match="can't start new thread"):
+        Bridge(HeldUp())  # type: ignore[arg-type]
+    assert not started[0].is_alive()
+
+
 def test_what_comes_is_handed_over_in_pieces_that_the_core_reads_whole() -> None:
     port = HeldUp()
     arrived = bytes(range(256)) * 20

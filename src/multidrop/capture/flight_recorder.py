@@ -74,8 +74,9 @@ class FlightRecorder:
             self._write(now_ns())
 
     def _write(self, now: int) -> None:
-        moment = datetime.fromtimestamp((now + utc_minus_monotonic_ns()) // 10**9, UTC)
-        path = self.directory / f"flight-{moment:%Y%m%dT%H%M%SZ}.pcapng"
+        second = (now + utc_minus_monotonic_ns()) // 10**9
+        while (path := self.directory / _name(second)).exists():  # of another recorder in this directory
+            second += 1
         with CaptureWriter(path, self._lines, "; ".join(dict.fromkeys(self._anomalies))) as capture:
             for _, packets in self._packets:
                 capture.append(packets)
@@ -84,4 +85,8 @@ class FlightRecorder:
         self._next_ns = now + round(PAUSE_S * 1e9)
         files = sorted(file for file in self.directory.iterdir() if _NAME.fullmatch(file.name))
         for oldest in files[: -self._most_files]:
-            oldest.unlink()
+            oldest.unlink(missing_ok=True)  # another recorder may have removed it
+
+
+def _name(second: int) -> str:
+    return f"flight-{datetime.fromtimestamp(second, UTC):%Y%m%dT%H%M%SZ}.pcapng"

@@ -7,8 +7,9 @@ from collections.abc import Sequence
 from contextlib import suppress
 from contextvars import copy_context
 
+from multidrop.control.rules import wears
 from multidrop.drive.family import Drive
-from multidrop.drive.register import Access, Register
+from multidrop.drive.register import Register
 from multidrop.drive.script import Script, read, wait
 from multidrop.drive.state import Direction
 from multidrop.drive.table import Kept
@@ -76,7 +77,7 @@ def _ramp(drive: Drive, hz: float, rate: float | None, every: float) -> Script[N
     if not every > 0:
         raise ValueError(f"every = {every:g} s is not above 0")
     register = drive.register(drive.setpoint_name)
-    if register.kept is not Kept.RAM and register.access is Access.SETTING and register.name not in drive.ram:
+    if wears(drive, register) is not Kept.RAM:
         raise Refused(f"the setpoint of {drive.name} may be kept in EEPROM, which a ramp would wear out")
     own = yield from _own_rate(drive)
     if rate is None and own is None:

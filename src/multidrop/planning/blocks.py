@@ -119,6 +119,12 @@ def blocks(drive: Drive, registers: Iterable[Register[Any]], delay: float | None
     return tuple(each.block for each in found.planned)
 
 
+def first_block(drive: Drive) -> Block | None:
+    """Return a request for the drive's first reading, or else for the first register that can be read."""
+    readable = [*drive.readings(), *(each for each in drive.registers.values() if each.readable)]
+    return blocks(drive, readable[:1])[0] if readable else None
+
+
 def all_requests(
     drive: Drive, registers: Iterable[Register[Any]]
 ) -> Iterator[tuple[int, tuple[Register[Any], ...], int, int]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import socket
 import struct
 import sys
@@ -86,9 +87,15 @@ class Bridge:
         self._ours.settimeout(LOOK_EVERY)
         self.theirs.setblocking(False)
         self._closing = threading.Event()
-        self._threads = [threading.Thread(target=copy, daemon=True) for copy in (self._out, self._in)]
-        for thread in self._threads:
-            thread.start()
+        self._threads: list[threading.Thread] = []
+        try:
+            for copy in (self._out, self._in):
+                thread = threading.Thread(target=copy, daemon=True)
+                thread.start()
+                self._threads.append(thread)
+        except RuntimeError as failure:  # the system gives no more threads
+            self.close()
+            raise OSError(errno.ENOMEM, str(failure)) from failure
 
     def _out(self) -> None:
         with suppress(*PORT_FAILURES):

@@ -51,7 +51,7 @@ from multidrop.drive.network import speaks_tcp
 from multidrop.drive.timing import Settings
 from multidrop.drives.registry import find_model
 from multidrop.errors import LineError
-from multidrop.planning.blocks import Block, blocks
+from multidrop.planning.blocks import first_block
 from multidrop.plant.model import Plant
 from multidrop.transport.line import Line
 from multidrop.transport.mixed_up import other_port
@@ -153,9 +153,8 @@ def _findings(port: str, rs485: RS485, drive: Drive | None, settings: Settings) 
     yield measured
     if not other_port(port) or (drive and not measured.is_failure):
         return
-    if drive:
-        if block := _first_readable(drive):
-            yield other_way_finding(port, block.request, settings)
+    if drive and (block := first_block(drive)):
+        yield other_way_finding(port, block.request, settings)
     elif not speaks_tcp(port):  # a line without drives says nothing in the other way
         yield other_way_finding(port, nobody, settings)
 
@@ -257,7 +256,7 @@ def _round_trip(port: str, rs485: RS485, drive: Drive | None) -> Finding:
             "name one with --model and --address, or one of a plant file; `multidrop scan` finds those "
             "that are there",
         )
-    block = _first_readable(drive)
+    block = first_block(drive)
     if block is None:
         return Finding("round trip", f"not measured: nothing of it can be read ({drive.name})")
     with Bus(port, rs485=rs485) as bus:
@@ -271,16 +270,6 @@ def _round_trip(port: str, rs485: RS485, drive: Drive | None) -> Finding:
     seen = [(done.first_ns - done.sent_ns) / 1e9 for done in completions if done.result > 0]
     delays = sorted(max(0.0, delay - wire) if shows_bits else delay for delay in seen)
     return round_trip_finding(drive, delays, len(completions), 0.0 if shows_bits else wire)
-
-
-def _first_readable(drive: Drive) -> Block | None:
-    """Return a request for the drive's first reading, or else for the first register that can be read."""
-    readable = (register for register in drive.registers.values() if register.readable)
-    register = next(iter(drive.readings()), None) or next(readable, None)
-    if register is None:
-        return None
-    (block,) = blocks(drive, [register])
-    return block
 
 
 def _repeat(line: Line, poll: Exchange) -> Iterator[Completion]:
