@@ -108,9 +108,14 @@ function row(entry, isWhole) {
   return make(
     "tr",
     {},
-    make("td", { title: time }, at(time), times > 1 ? repeated(times, since) : null),
+    make("td", { title: time }, at(time)),
     isWhole ? make("td", { class: "who" }, drive ? named(drive) : `${model ?? ""} ${address ?? ""}`) : null,
-    make("td", { class: "words" }, make("bdi", {}, String(write ?? "–"))),
+    make(
+      "td",
+      { class: "words" },
+      make("bdi", {}, String(write ?? "–")),
+      times > 1 ? repeated(times, since) : null,
+    ),
     make("td", { class: isDone ? "words" : "words bad" }, isDone ? null : glyph("fault"), ` ${became}`),
     make("td", { class: "words" }, by ? named(by) : (way ?? "–")),
     isWhole ? make("td", { class: "frame" }, String(sent ?? "–")) : null,
