@@ -325,6 +325,17 @@ def test_plots_of_a_segment_that_grows_are_of_all_its_rows(
                 assert end - begin < 8 * SECOND or grid_of(begin, end, 4).is_of_tens
 
 
+def test_names_of_nothing_fill_no_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(kept_series, "MOST_SERIES", 3)
+    with SegmentWriter(tmp_path / "rows.arrows", METADATA, every=1e9) as writer, History(tmp_path) as history:
+        writer.write(from_rows(random_rows(1, NOON, 200)))
+        for at in range(9):
+            (found,) = history.buckets(f"nobody.register-{at}", NOON, NOON + SECOND, 97).values()
+            assert sum(found.n) == 0
+            (segment,) = history._sources._growing.values()
+            assert len(segment._kept._kept) == min(at + 1, 3)
+
+
 def test_no_tens_are_reckoned_of_what_nobody_asked_for(tmp_path: Path) -> None:
     with SegmentWriter(tmp_path / "rows.arrows", METADATA, every=1e9) as writer, History(tmp_path) as history:
         for number, name in enumerate(SERIES[:2]):

@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 Series = tuple[str, str]  # drive and register
 MOST_KEPT = 200_000  # rows of a segment: 4 MB
+MOST_SERIES = 4096  # without rows too: names of none may be asked for
 
 
 class SeriesRow(NamedTuple):
@@ -52,9 +53,12 @@ class KeptSeries:
         for rows in found.values():
             rows.past = max(rows.past, batches.stop)
         self._kept.update(found)
-        while sum(len(rows.times) for rows in self._kept.values()) > MOST_KEPT:
+        while len(self._kept) > MOST_SERIES or self._rows() > MOST_KEPT:
             del self._kept[next(iter(self._kept))]
         return found
+
+    def _rows(self) -> int:
+        return sum(len(rows.times) for rows in self._kept.values())
 
     def _found(self, series: Series, batches: range) -> SeriesRows:
         """Return the rows that are kept, if these batches follow on them; else none, to be read anew."""
