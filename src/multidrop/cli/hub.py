@@ -13,6 +13,7 @@ from multidrop.cli.support.arguments import add_json_argument, duration
 from multidrop.cli.support.extras import require_extra
 from multidrop.cli.support.nats import add_nats_arguments, nats_options
 from multidrop.cli.support.output import logging_to, print_text, warn
+from multidrop.cli.support.signals import end_signals_cancel
 from multidrop.cli.support.values import counted
 
 if TYPE_CHECKING:
@@ -47,7 +48,7 @@ def run(arguments: argparse.Namespace) -> int:
     sink = _sink(arguments)
     try:
         with logging_to(warn, "multidrop.fleet", logging.INFO):
-            state = asyncio.run(_read(arguments, sink, options))
+            state = asyncio.run(_read_until_signal(arguments, sink, options))
     finally:
         sink.close()
     if arguments.json:
@@ -69,6 +70,13 @@ def _sink(arguments: argparse.Namespace) -> SampleSink:
     from multidrop.fleet.parquet_sink import ParquetSink
 
     return ParquetSink(arguments.parquet)
+
+
+async def _read_until_signal(
+    arguments: argparse.Namespace, sink: SampleSink, options: dict[str, Any]
+) -> HubState:
+    with end_signals_cancel():
+        return await _read(arguments, sink, options)
 
 
 async def _read(arguments: argparse.Namespace, sink: SampleSink, options: dict[str, Any]) -> HubState:

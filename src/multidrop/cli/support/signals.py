@@ -118,6 +118,22 @@ def on_end_signals(end: Callable[[], object]) -> None:
         loop.add_signal_handler(number, end_once)
 
 
+@contextmanager
+def end_signals_cancel() -> Iterator[None]:
+    """Cancel the running asyncio task where it waits, at the first such signal; KeyboardInterrupt then.
+
+    An exception in the midst of a task, maybe a library's, would leave what others wait for.
+    """
+    import asyncio
+
+    if task := asyncio.current_task():
+        on_end_signals(task.cancel)
+    try:
+        yield
+    except asyncio.CancelledError:
+        raise KeyboardInterrupt from None
+
+
 def on_reload_signal(reload: Callable[[], object], end: Callable[[], object]) -> None:
     """Call `reload` in the running asyncio loop at each SIGHUP; `end`, once the terminal before it is closed.
 

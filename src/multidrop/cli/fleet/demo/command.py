@@ -23,7 +23,7 @@ from multidrop.cli.fleet.watch import drawing, follow
 from multidrop.cli.support.fleet_tables import natural
 from multidrop.cli.support.nats import CA, CREDENTIALS
 from multidrop.cli.support.output import print_text
-from multidrop.cli.support.signals import on_end_signals
+from multidrop.cli.support.signals import end_signals_cancel
 
 GATEWAYS = ("gw-1", "gw-2", "gw-3")
 KILLED = "gw-2"
@@ -154,16 +154,11 @@ class Demo:
 
     async def play(self) -> Kill:
         """Kill a gateway, start it again, and show it. Raises KeyboardInterrupt for a signal."""
-        playing = asyncio.current_task()
-        assert playing is not None
-        on_end_signals(playing.cancel)
         over = asyncio.Event()
-        with _drawn(self._stage):
+        with end_signals_cancel(), _drawn(self._stage):
             watching = asyncio.create_task(self._watch(over))
             try:
                 return await self._story()
-            except asyncio.CancelledError:
-                raise KeyboardInterrupt from None
             finally:
                 over.set()
                 await watching
