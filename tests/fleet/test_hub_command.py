@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import asyncio
 import json
+import signal
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 from nats_clusters import Cluster, cluster, free_ports
@@ -18,6 +20,7 @@ from multidrop import History
 from multidrop.cli import main
 from multidrop.fleet import samples_stream
 from multidrop.fleet.forwarder import Forwarder
+from multidrop.fleet.hub import SampleHub
 from multidrop.fleet.samples_stream import connect, create_stream
 from multidrop.fleet.spool import Spool
 
@@ -92,6 +95,36 @@ def test_what_was_kept_is_there_however_the_hub_ends(
     with History(tmp_path) as history:
         rows = [tuple(row) for batch in history.read() for row in batch]
     assert exchanges_in(sorted(rows)) == list(range(40))
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_waits_for_what_the_hub_is_doing(
+    running: Cluster, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: signal.Signals
+) -> None:
+    """Raised in the midst of it, in nats-py's own tasks too, it would leave something that is waited for."""
+    done: list[str] = []
+
+    async def read(hub: SampleHub, *, once: bool) -> None:
+        signal.raise_signal(number)
+        done.append("went on")
+        try:
+            await asyncio.sleep(PATIENCE_S)
+        finally:
+            done.append("ended")
+
+    monkeypatch.setattr(SampleHub, "run", read)
+    assert main(["hub", running.urls[0], "--parquet", str(tmp_path)]) == 130
+    assert done == ["went on", "ended"]
+
+
+def test_a_connection_whose_end_does_not_come_is_left(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Stuck:
+        async def close(self) -> None:
+            await asyncio.sleep(PATIENCE_S)
+
+    monkeypatch.setattr(samples_stream, "ANSWER_S", 0.01)
+    stuck: Any = Stuck()
+    asyncio.run(asyncio.wait_for(samples_stream.close(stuck), PATIENCE_S / 2))
 
 
 def refused(capsys: pytest.CaptureFixture[str], *words: str) -> tuple[int, str]:

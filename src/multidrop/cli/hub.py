@@ -13,6 +13,7 @@ from multidrop.cli.support.arguments import add_json_argument, duration
 from multidrop.cli.support.extras import require_extra
 from multidrop.cli.support.nats import add_nats_arguments, nats_options
 from multidrop.cli.support.output import logging_to, print_text, warn
+from multidrop.cli.support.signals import on_end_signals
 from multidrop.cli.support.values import counted
 
 if TYPE_CHECKING:
@@ -48,6 +49,8 @@ def run(arguments: argparse.Namespace) -> int:
     try:
         with logging_to(warn, "multidrop.fleet", logging.INFO):
             state = asyncio.run(_read(arguments, sink, options))
+    except asyncio.CancelledError:  # by a signal
+        raise KeyboardInterrupt from None
     finally:
         sink.close()
     if arguments.json:
@@ -75,6 +78,9 @@ async def _read(arguments: argparse.Namespace, sink: SampleSink, options: dict[s
     from multidrop.fleet.hub import SampleHub
     from multidrop.fleet.samples_stream import close, connect
 
+    reading = asyncio.current_task()
+    assert reading is not None
+    on_end_signals(reading.cancel)  # raised in the midst of nats-py, it leaves what is waited for in vain
     client = await connect(arguments.servers, **options)
     try:
         hub = SampleHub(client, sink, every=arguments.every)

@@ -111,7 +111,8 @@ async def connect(servers: list[str], **options: Any) -> Client:
 async def close(client: Client) -> None:
     """Close a connection, also of a client that is half connected, or whose servers are gone."""
     with suppress(Exception):
-        await client.close()
+        async with asyncio.timeout(ANSWER_S):
+            await client.close()
 
 
 async def _ignore(_: Exception) -> None:
