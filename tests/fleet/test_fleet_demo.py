@@ -151,6 +151,13 @@ def test_the_fleet_is_calm_once_no_line_has_moved_between_two_looks() -> None:
     asyncio.run(play())
 
 
+def test_what_the_stream_lacks_is_known_of_each_gateway() -> None:
+    stage = Stage()
+    says = [{"spool": {"behind": 0}}, {"spool": {"behind": 2}}, {"spool": {"behind": None}}, None]
+    stage.show({"gateways": {f"gw-{n}": {"says": one} for n, one in enumerate(says)}, "lines": {}})
+    assert stage.behind() == [0, 2, None, None]
+
+
 def test_a_silence_is_measured_from_the_last_kept_to_the_next() -> None:
     seconds = [row._replace(time_ns=row.time_ns * 10_000_000) for row in rows(1, 2, None, None, 5)]
     assert silence_s(seconds, Kill(frozenset(), 2_100_000_000, 2_200_000_000)) == 3.0
