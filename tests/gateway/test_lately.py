@@ -57,8 +57,8 @@ def test_figures_of_a_line_are_those_of_the_last_seconds(lately: Lately) -> None
 
 def test_another_line_of_a_name_is_not_set_against_the_one_before(lately: Lately) -> None:
     """A reading of it may come while its plant is being adopted."""
-    lately.tick(100.0, 100_000, {"hall": replace(reading(100), count=1)})
-    lately.tick(101.0, 101_000, {"hall": replace(reading(1), count=2)})
+    lately.tick(100.0, 100_000, {"hall": replace(reading(100), epoch=1)})
+    lately.tick(101.0, 101_000, {"hall": replace(reading(1), epoch=2)})
     assert (lately.line("hall")["rate"], lately.line("hall")["used"]) == (None, None)
-    lately.tick(106.0, 106_000, {"hall": replace(reading(6), count=2)})
+    lately.tick(106.0, 106_000, {"hall": replace(reading(6), epoch=2)})
     assert lately.line("hall")["rate"] == 10.0

@@ -89,7 +89,7 @@ class Lately:
         """Return the used share of a line's time and its exchanges a second, lately."""
         before = self._recent[0][1].get(name) if self._recent else None
         now = self.newest.get(name)
-        if before is None or now is None or before is now or before.count != now.count:
+        if before is None or now is None or before is now or before.epoch != now.epoch:
             return None, None
         seconds = max(now.seconds - before.seconds, 1e-9)
         used_s = (now.counters.ideal_ns - before.counters.ideal_ns) / 1e9

@@ -13,7 +13,7 @@ from multidrop.transport.exchange import Exchanges
 from multidrop.transport.statistics import LineStatistics, line_statistics
 
 LOOKS = 3  # at counters that must be of one moment
-_NUMBERS = count(1)
+_EPOCHS = count(1)
 
 
 class Count(NamedTuple):
@@ -33,7 +33,7 @@ class LineMeter:
         self._exchanges = exchanges
         self._opened_ns = clock.now_ns()
         self._frozen: Count | None = None
-        self._reset_at = _numbered(Count(line_statistics(0.0, {}, exchanges.line.overruns(), 0.0), {}))
+        self._reset_at = _begins(Count(line_statistics(0.0, {}, exchanges.line.overruns(), 0.0), {}))
 
     def read(self) -> LineStatistics:
         now, reset_at = self._now(), self._reset_at
@@ -41,11 +41,11 @@ class LineMeter:
         before = {
             name: reset_at.statistics.drives[names[peer]] for name, peer in now.peers.items() if peer in names
         }
-        earlier = replace(reset_at.statistics, drives=before, count=now.statistics.count)
-        return replace(now.statistics.since(earlier), count=reset_at.statistics.count)
+        earlier = replace(reset_at.statistics, drives=before, epoch=now.statistics.epoch)
+        return replace(now.statistics.since(earlier), epoch=reset_at.statistics.epoch)
 
     def reset(self) -> None:
-        self._reset_at = _numbered(self._now())
+        self._reset_at = _begins(self._now())
 
     def freeze(self, overruns: int | None) -> None:
         """Count nothing more: the line is closed, and had lost `overruns` characters until then."""
@@ -64,10 +64,10 @@ class LineMeter:
             if counted == sum(peer.exchanges for peer in peers.values()):  # none ended meanwhile
                 break
         seconds, counted_s = ((at_ns - self._opened_ns) / 1e9 for at_ns in (now_ns, counted_ns))
-        counts = {name: peer.number for name, peer in peers.items()}
-        return Count(line_statistics(seconds, counters_by_drive, overruns, counted_s, counts), peers)
+        epochs = {name: peer.number for name, peer in peers.items()}
+        return Count(line_statistics(seconds, counters_by_drive, overruns, counted_s, epochs), peers)
 
 
-def _numbered(reading: Count) -> Count:
-    """Return the reading from which another count goes on, with that one's number."""
-    return reading._replace(statistics=replace(reading.statistics, count=next(_NUMBERS)))
+def _begins(reading: Count) -> Count:
+    """Return a reading as the beginning of an epoch of its own."""
+    return reading._replace(statistics=replace(reading.statistics, epoch=next(_EPOCHS)))

@@ -86,9 +86,9 @@ class Statistics:
     counted_s: float | None = None
     """Time in s of the exchanges that are counted. It ends, as it begins, where an exchange under way began:
     that one counts in the time after it. None: `seconds`."""
-    count: int = field(default=0, kw_only=True)
-    """Number of the count that this is a reading of. Another line or drive of the same name has another one,
-    and so has a line whose statistics were reset."""
+    epoch: int = field(default=0, kw_only=True)
+    """Number of the beginning from which all this is counted. Another line or drive of the same name has
+    another one, and so has a line whose statistics were reset."""
 
     @property
     def exchanges(self) -> int:
@@ -183,15 +183,15 @@ class LineStatistics(Statistics):
 
         What is counted anew since then, because it is another line or drive or was reset, begins at nothing.
         """
-        if self.count != earlier.count:
+        if self.epoch != earlier.epoch:
             return self
         seconds = max(self.seconds - earlier.seconds, 1e-9)
         lost = None
         if self.overruns is not None and earlier.overruns is not None:
             lost = self.overruns - earlier.overruns
-        counts = {name: drive.count for name, drive in self.drives.items()}
+        epochs = {name: drive.epoch for name, drive in self.drives.items()}
         before = {
-            name: drive.counters for name, drive in earlier.drives.items() if counts.get(name) == drive.count
+            name: drive.counters for name, drive in earlier.drives.items() if epochs.get(name) == drive.epoch
         }
         counters_by_drive = {
             name: _difference(drive.counters, before.get(name, _NOTHING))
@@ -200,7 +200,7 @@ class LineStatistics(Statistics):
         counted_s = None
         if self.counted_s is not None and earlier.counted_s is not None:
             counted_s = max(self.counted_s - earlier.counted_s, 1e-9)
-        return line_statistics(seconds, counters_by_drive, lost, counted_s, counts)
+        return line_statistics(seconds, counters_by_drive, lost, counted_s, epochs)
 
 
 def line_statistics(
@@ -208,14 +208,14 @@ def line_statistics(
     counters_by_drive: Mapping[str, Counters],
     overruns: int | None,
     counted_s: float | None = None,
-    counts: Mapping[str, int] = _UNNUMBERED,
+    epochs: Mapping[str, int] = _UNNUMBERED,
 ) -> LineStatistics:
     """Return the statistics that drives' counters, by their names, amount to after so many seconds.
 
-    `counts` has the numbers of the drives' counts.
+    `epochs` has those of the drives, by their names.
     """
     drives = {
-        name: Statistics(seconds, counters, counted_s=counted_s, count=counts.get(name, 0))
+        name: Statistics(seconds, counters, counted_s=counted_s, epoch=epochs.get(name, 0))
         for name, counters in counters_by_drive.items()
     }
     return LineStatistics(seconds, _sum(counters_by_drive.values()), overruns, counted_s, drives)
