@@ -38,4 +38,5 @@ def now_and_slept_ns() -> tuple[int, int]:
 
 
 def utc_ms() -> int:
+    """Return the time of day, in ms since 1970."""
     return time.time_ns() // 1_000_000
