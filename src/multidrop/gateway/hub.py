@@ -187,7 +187,7 @@ class Hub:
             return None
         time, monotonic_ns, value, status = cell.newest
         good = None if status else value
-        return Newest(time, monotonic_ns, good, self._statuses[status], cell.stale_ns)
+        return Newest(time, monotonic_ns, good, self._statuses[status], cell.holds_ns)
 
     def polled(self, drive: str) -> tuple[Register[Any], ...]:
         """Return the registers of a drive that are polled, in the plant file's order."""
@@ -197,7 +197,7 @@ class Hub:
     def holds_s(self, drive: str, register: str) -> float | None:
         """Return for how long a value is the present one, in s; None where it is not polled."""
         watched = self._watched[drive]
-        return watched.cell(register).stale_ns / 1e9 if register in watched.names else None
+        return watched.cell(register).holds_ns / 1e9 if register in watched.names else None
 
     @property
     def drives(self) -> Iterator[str]:

@@ -25,8 +25,8 @@ class RegisterRows:
         self.interval_ns = 0  # between its latest two samples, with no miss between them
 
     @property
-    def stale_ns(self) -> int:
-        """The age from which its value is no longer the present one."""
+    def holds_ns(self) -> int:
+        """The time for which its value is the present one."""
         return max(STALE_NS, STALE_PERIODS * max(self.least_ns, self.interval_ns))
 
     def is_fresh(self, now_ns: int, woke_ns: int) -> bool:
@@ -34,7 +34,7 @@ class RegisterRows:
         if self.good is None or self.good[1] < woke_ns:
             return False
         age = now_ns - self.good[1]
-        return age <= STALE_NS or age <= self.stale_ns
+        return age <= STALE_NS or age <= self.holds_ns
 
 
 class FreshValues(Mapping[str, float]):
