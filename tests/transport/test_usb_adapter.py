@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections import Counter
-from contextlib import ExitStack
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import pytest
@@ -43,18 +44,20 @@ class Sysfs:
         link.unlink(missing_ok=True)
         link.symlink_to(found)
 
-    def plug_in(self, link: Path, place: str, serial: str = "") -> None:
-        """Have the port behind this link be an adapter's."""
-        self.add(link.resolve().name, f"{USB}/{place}/{place}:1.0/tty", serial)
+    @contextmanager
+    def plugged_in(self, link: Path, place: str, serial: str = "") -> Iterator[Wire]:
+        """Simulate a line behind an adapter, which is known before its port has the name, as by Linux."""
+        port = link.with_name(place)
+        with Simulator([wire := Wire([EncodedDrive(InnovertIBD(1))], port=str(port), unpaced=True)]):
+            self.add(port.resolve().name, f"{USB}/{place}/{place}:1.0/tty", serial)
+            link.symlink_to(port)
+            yield wire
+        link.unlink()
 
 
 @pytest.fixture
 def sysfs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Sysfs:
     return Sysfs(tmp_path / "sys", monkeypatch)
-
-
-def wire(link: Path) -> Wire:
-    return Wire([EncodedDrive(InnovertIBD(1))], port=str(link), unpaced=True)
 
 
 @table(
@@ -103,11 +106,9 @@ def test_a_port_is_opened_again_with_the_same_adapter_alone(
     with pytest.MonkeyPatch.context() as monkeypatch:
         sysfs = Sysfs(folder / "sys", monkeypatch)
         found = Line(str(link))
-        with Simulator([wire(link)]):
-            sysfs.plug_in(link, *before)
+        with sysfs.plugged_in(link, *before):
             found.open()
-        with Simulator([wire(link)]):
-            sysfs.plug_in(link, *now)
+        with sysfs.plugged_in(link, *now):
             if is_same:
                 found.reopen()
             else:
@@ -143,8 +144,7 @@ def test_a_name_by_the_place_is_whatever_is_plugged_in_there(
     link = tmp_path / "pci-0000:00:14.0-usb-0:1:1.0-port0"
     found = Line(str(link))
     for serial in ("A1", "B2"):
-        with Simulator([wire(link)]):
-            sysfs.plug_in(link, "1-1", serial)
+        with sysfs.plugged_in(link, "1-1", serial):
             found.reopen()
     found.close()
 
@@ -158,8 +158,7 @@ def test_another_line_is_not_polled_and_a_stop_is_not_sent_to_its_drive(
     asked = line(str(link), polled(pump, [InnovertIBD.output_current]))
     statuses: Counter[str] = Counter()
     with ExitStack() as stack:
-        with Simulator([wire(link)]):
-            sysfs.plug_in(link, "1-1", "A1")
+        with sysfs.plugged_in(link, "1-1", "A1"):
             poller = stack.enter_context(Poller(plant(asked)))
 
             def seen(status: str) -> bool:
@@ -167,14 +166,12 @@ def test_another_line_is_not_polled_and_a_stop_is_not_sent_to_its_drive(
                 return statuses[status] > 0
 
             until(lambda: seen("ok"))
-        with Simulator([another := wire(link)]):
-            sysfs.plug_in(link, "1-2", "B2")
+        with sysfs.plugged_in(link, "1-2", "B2") as another:
             until(lambda: "another adapter has this name now (B2:1.0.0, and not A1:1.0.0)" in caplog.text)
             with pytest.raises(PortLost, match="another adapter has this name now"):
                 pump.stop(seconds=0.5)
             assert another.drives[0].counters.requests == 0
         statuses.clear()
-        with Simulator([wire(link)]):
-            sysfs.plug_in(link, "1-3", "A1")
+        with sysfs.plugged_in(link, "1-3", "A1"):
             until(lambda: seen("ok"))
     assert caplog.text.count("not opened again: another adapter") == 1
