@@ -12,7 +12,7 @@ from peers import require_module
 
 require_module("nats")
 
-from multidrop.fleet import names, samples_stream  # noqa: E402
+from multidrop.fleet import names, samples_stream, setup  # noqa: E402
 from multidrop.fleet.buckets import Bucket, Record, ask  # noqa: E402
 from multidrop.fleet.errors import FleetError, Unsure  # noqa: E402
 from multidrop.fleet.leaders import bring_leaders_home, has_leader, owners_led_by  # noqa: E402
@@ -120,8 +120,11 @@ def test_a_stream_of_samples_that_answers_nonsense_is_tried_again(name: str) -> 
 
 
 @pytest.mark.parametrize("name", CLUSTERS)
-def test_a_bucket_s_servers_that_are_none_are_one_sentence_and_nothing_is_moved(name: str) -> None:
+def test_a_bucket_s_servers_that_are_none_are_one_sentence_and_nothing_is_moved(
+    name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A gateway looks at them in its tasks, of which none may end."""
+    monkeypatch.setattr(setup, "WAIT_S", 0.0)  # for the end of an election
     path: Any = Liar(CLUSTERS[name])
     with pytest.raises(Unsure, match="what NATS answers of a bucket's servers is none of JetStream's: "):
         asyncio.run(owners_led_by({"n1"}, path))
