@@ -71,14 +71,6 @@ def _import_nodes(node: ast.AST, for_types: bool) -> Iterator[tuple[ast.Import |
             yield from _import_nodes(child, for_types)
 
 
-def docstrings(path: Path) -> Iterator[tuple[int, str]]:
-    """Yield each docstring with the line on which it begins."""
-    kinds = ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef
-    for node in ast.walk(parsed(path)):
-        if isinstance(node, kinds) and node.body and (text := ast.get_docstring(node)):
-            yield node.body[0].lineno, text
-
-
 def loop_variables(path: Path) -> Iterator[tuple[int, str]]:
     """Yield each name that a loop or a comprehension binds, with its line."""
     for node in ast.walk(parsed(path)):
