@@ -143,6 +143,7 @@ def test_a_packet_that_ends_within_its_tags_holds_nothing(tmp_path: Path, tags: 
     assert [span.raw for span in found] == [READ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("content", "count"), [(READ, 33_000), (b"\xff" * 700, STREAM_ROOM // 700 + 1)])
 @pytest.mark.parametrize("format", ["pcapng", "pcap"])
 def test_a_capture_may_hold_more_than_is_heard_at_once(
@@ -200,6 +201,7 @@ def test_pieces_of_a_file_are_one_capture(
 OTHER_BLOCK = struct.pack("<II", 5, 1024) + bytes(1012) + struct.pack("<I", 1024)  # of statistics
 
 
+@pytest.mark.slow
 def test_a_capture_that_is_cut_short_while_it_is_read_is_a_sentence(tmp_path: Path) -> None:
     """In a process of its own: where the file is mapped, the end of its bytes is the end of the process."""
     path = write(tmp_path / "it.pcapng", RTU * 20)

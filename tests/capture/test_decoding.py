@@ -170,6 +170,7 @@ def test_a_request_for_more_than_a_reply_can_hold_is_rows_of_what_it_can(tmp_pat
     ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("reply", "end"), [(Message(1, 3, 0, 100, bytes(200)), (0, "ok")), (None, (None, "no reply"))]
 )

@@ -465,6 +465,7 @@ def test_a_lost_port_is_trouble_once() -> None:
 # ---- on the command line ----
 
 
+@pytest.mark.slow
 def test_a_poll_is_captured(tmp_path: Path, run: Run, mixed_plant: Path) -> None:
     capture = tmp_path / "a.pcapng"
     words = ["poll", mixed_plant, "--seconds", 1, "--capture", capture]
@@ -488,6 +489,7 @@ def test_a_poll_is_captured(tmp_path: Path, run: Run, mixed_plant: Path) -> None
     )
 
 
+@pytest.mark.slow
 def test_a_flight_is_written_when_a_drive_s_replies_are_damaged(
     tmp_path: Path, run: Run, mixed_plant: Path, wire: Faulty
 ) -> None:

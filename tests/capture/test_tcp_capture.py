@@ -73,6 +73,7 @@ def test_wireshark_says_modbus_tcp(captured: tuple[Path, Path, list[Row]]) -> No
     assert "Malformed" not in said
 
 
+@pytest.mark.slow
 def test_our_own_reader_has_the_poll_s_values(captured: tuple[Path, Path, list[Row]]) -> None:
     plant, path, polled = captured
     known = load_plant(plant)

@@ -246,6 +246,7 @@ def test_verbs_are_carried_out(run: Run, port: str, toy: SimulatedDrive) -> None
     assert toy["control"] == 0
 
 
+@pytest.mark.slow
 def test_a_drive_that_cannot_say_its_setpoint_is_started_with_one(run: Run) -> None:
     """A command does not know what another one wrote."""
     with Simulator([Wire([simulated(InnovertIBD(1))], unpaced=True)]) as simulator:
@@ -377,6 +378,7 @@ def test_state_in_words_and_as_json(run: Run, port: str) -> None:
     assert json.loads(out)["state"] == {"condition": "running", "direction": None, "fault": None, "note": ""}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("words", [(9,), (1, "--baudrate", 19200)], ids=["no drive", "wrong baud rate"])
 def test_silence_is_a_sentence_that_says_what_to_check(
     run: Run, port: str, words: tuple[object, ...]
@@ -629,6 +631,7 @@ def test_a_senseless_time_keeps_no_stop_back(run: Run, che: Che, verb: str, seco
     assert f"--seconds: '{seconds}' is not a number of seconds above 0: the stop is repeated for 30 s" in err
 
 
+@pytest.mark.slow
 def test_a_stop_takes_the_seconds_that_it_is_given(run: Run, che: Che) -> None:
     received, words = che
     received.loses = lambda request: True

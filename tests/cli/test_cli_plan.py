@@ -188,6 +188,7 @@ def test_a_file_that_is_not_there_is_status_2(run: Run, tmp_path: Path) -> None:
 # ---- after a poll ----
 
 
+@pytest.mark.slow
 def test_poll_puts_prediction_and_measurement_side_by_side(run: Run, plant: Path) -> None:
     summary = json.loads(run("poll", plant, "--seconds", 1, "--json")[1])["lines"]["hall-1"]
     found = summary["comparison"]
@@ -204,6 +205,7 @@ def test_poll_puts_prediction_and_measurement_side_by_side(run: Run, plant: Path
     assert found["measured"]["switching_ms"] == summary["switching_ms"] > 0
 
 
+@pytest.mark.slow
 def test_poll_shows_them_to_a_person(run: Run, plant: Path) -> None:
     lines = run("poll", plant, "--seconds", 1)[1].splitlines()
     heading = next(
@@ -215,12 +217,14 @@ def test_poll_shows_them_to_a_person(run: Run, plant: Path) -> None:
     assert max(map(len, lines)) <= 80
 
 
+@pytest.mark.slow
 def test_what_switching_took_is_told_where_drives_differ(run: Run, plant: Path) -> None:
     plant.write_text(plant.read_text().replace("address = 9\n", "address = 9\nbaudrate = 19200\n"))
     told = run("poll", plant, "--seconds", 1)[1]
     assert re.search(r"\n  and with the \d+\.\d\d ms that the port needed to change its settings\n", told)
 
 
+@pytest.mark.slow
 def test_where_drives_wait_to_be_due_no_cycle_is_measured(run: Run, plant: Path) -> None:
     plant.write_text(plant.read_text().replace("address = 1\n", 'address = 1\nevery = "200 ms"\n'))
     found = json.loads(run("poll", plant, "--seconds", 1, "--json")[1])["lines"]["hall-1"]["comparison"]

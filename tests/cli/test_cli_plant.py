@@ -86,6 +86,7 @@ def test_a_line_s_port_is_replaced(run: Run, plant: Path, at: str) -> None:
     assert "/dev/none-3" in run("read", *both, plant, "pump-2", "output_current")[2]
 
 
+@pytest.mark.slow
 def test_what_a_plant_says_of_a_drive_holds_for_a_command(run: Run, plant: Path, at: str) -> None:
     text = plant.read_text().replace("address = 1\n", 'address = 1\nframing = "ascii"\nbaudrate = 19200\n')
     plant.write_text(text)
@@ -265,6 +266,7 @@ def test_monitor_takes_other_ports(run: Run, plant: Path, monkeypatch: pytest.Mo
     assert shown == ["/dev/none-1", "/dev/other"]
 
 
+@pytest.mark.slow
 def test_scan_takes_a_line_of_a_plant(run: Run, plant: Path, port: str, at: str) -> None:
     few = ("--model", TOY, "--addresses", "1", "--baudrates", "9600", "--formats", "8N1", "--json")
     status, out, _ = run("scan", plant, "hall-1", at, *few)
@@ -278,6 +280,7 @@ def test_scan_takes_a_line_of_a_plant(run: Run, plant: Path, port: str, at: str)
     assert "the following arguments are required: PORT" in run("scan")[2]
 
 
+@pytest.mark.slow
 def test_doctor_measures_with_a_drive_of_a_plant(run: Run, plant: Path, port: str, at: str) -> None:
     def findings(*words: object) -> dict[str, str]:
         record = json.loads(run("doctor", plant, *words, at, "--json")[1])

@@ -180,6 +180,7 @@ def test_poll_ended_by_a_signal_keeps_what_it_recorded(plant: Path, tmp_path: Pa
     assert len(recorded(out)) == json.loads(text)["samples"] + json.loads(text)["misses"]
 
 
+@pytest.mark.slow
 def test_poll_tells_a_person_the_same(run: Run, plant: Path) -> None:
     lines = run("poll", plant, "--seconds", 1)[1].splitlines()
     assert lines[0].startswith("hall-1: ")
@@ -191,6 +192,7 @@ def test_poll_tells_a_person_the_same(run: Run, plant: Path) -> None:
     assert max(map(len, lines)) <= 80
 
 
+@pytest.mark.slow
 def test_nothing_read_at_all_is_status_1(run: Run, plant: Path) -> None:
     text = plant.read_text().replace("address = 1\n", "address = 8\n")
     plant.write_text(text)
@@ -263,6 +265,7 @@ def test_a_port_that_is_not_there_is_a_sentence(run: Run, tmp_path: Path) -> Non
     assert not out.exists()
 
 
+@pytest.mark.slow
 def test_convert_keeps_every_row(run: Run, plant: Path, tmp_path: Path) -> None:
     run("poll", plant, "--seconds", 1, "--out", tmp_path / "a.arrows")
     rows = recorded(tmp_path / "a.arrows")
@@ -330,6 +333,7 @@ def test_demo_reads_every_variant_of_every_family(tmp_path: Path) -> None:
         assert sum(map(len, Decoding(found))) > 0
 
 
+@pytest.mark.slow
 def test_a_demo_goes_on_without_a_motor_that_does_not_answer(tmp_path: Path) -> None:
     """A machine may have much else to do."""
     toy = Toy(1)

@@ -56,6 +56,7 @@ def test_it_says_what_it_finds(run: Run, port: str) -> None:
     assert " s left" in err
 
 
+@pytest.mark.slow
 def test_json_is_one_object(run: Run, port: str) -> None:
     status, out, _ = run("scan", port, *PATIENTLY, "--model", "invt-che", "--json")
     told = json.loads(out)

@@ -282,6 +282,7 @@ def test_who_switches_the_transceiver_is_said_of_a_device_only(run: Run, port: s
         assert sentence in err
 
 
+@pytest.mark.slow
 @pyserials_own
 @pytest.mark.parametrize("port", ["socket://127.0.0.1:0"], indirect=True)
 def test_on_a_port_of_pyserial_s_it_says_what_does_not_apply(run: Run, port: str) -> None:
@@ -312,6 +313,7 @@ def test_what_asks_a_driver_tells_a_port_that_is_gone_from_one_that_lacks_it() -
             ask(slave)
 
 
+@pytest.mark.slow
 def test_the_round_trip_is_measured_with_a_drive(run: Run, port: str) -> None:
     words = ("--model", "innovert-ibd", "--address", "2", "--framing", "ascii", "--json")
     status, out, _ = run("doctor", port, *words)
@@ -397,6 +399,7 @@ def test_an_exception_to_the_look_for_an_echo_is_no_foreign_traffic(
     assert "came unasked" not in told
 
 
+@pytest.mark.slow
 def test_only_what_was_sent_is_counted(run: Run, responder: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """A silent drive is not asked again while its late answer may come; that was no request."""
     end = responder(lambda request: b"")

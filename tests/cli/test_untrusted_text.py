@@ -98,6 +98,7 @@ def test_arguments_are_told_without_their_commands(run: Run, words: tuple[object
     assert is_harmless(out + err)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("_unpainted")
 def test_the_names_in_a_recording_are_told_without_their_commands(run: Run, tmp_path: Path) -> None:
     rows = [row(at, TRAP, f"{TRAP}{number}", at) for at in range(3) for number in range(4)]

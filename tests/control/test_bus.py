@@ -383,6 +383,7 @@ MISTAKES: dict[str, tuple[Callable[[Bus, Rig], Any], type[Exception], str]] = {
 }
 
 
+@pytest.mark.slow
 @table("mistake", MISTAKES)
 def test_a_mistake_is_told_before_anything_is_sent(mistake: str) -> None:
     call, kind, sentence = MISTAKES[mistake]
@@ -410,6 +411,7 @@ def half_a_second(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Rig, "response_timeout", 0.5)
 
 
+@pytest.mark.slow
 def test_a_confirmation_that_is_lost_and_cannot_be_looked_up() -> None:
     rig = simulated(Rig(1))
     with faulty(rig, losing(0x06)) as sim, Bus(path(sim)) as bus:
@@ -422,6 +424,7 @@ def test_a_confirmation_that_is_lost_and_cannot_be_looked_up() -> None:
     assert rig["target"] == 1500  # as it happens
 
 
+@pytest.mark.slow
 def test_a_confirmation_that_is_lost_and_nothing_can_be_read_back() -> None:
     rig = simulated(Rig(1))
     with faulty(rig, losing(0x03, 0x06)) as sim, Bus(path(sim)) as bus:
@@ -431,6 +434,7 @@ def test_a_confirmation_that_is_lost_and_nothing_can_be_read_back() -> None:
     assert sent(rig).get(0x06, 0) <= 1
 
 
+@pytest.mark.slow
 def test_a_drive_that_says_nothing_is_asked_a_few_times() -> None:
     rig = simulated(Rig(1))
     with faulty(rig, losing(0x03)) as sim, Bus(path(sim)) as bus:
@@ -479,6 +483,7 @@ WRONG = {  # pymodbus, libmodbus and minimalmodbus each take some of these for t
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("wrong", usually(*WRONG))
 def test_a_wrong_reply_is_never_data(wrong: str) -> None:
     with faulty(simulated(Rig(1)), lambda reply: WRONG[wrong]) as sim, Bus(path(sim)) as bus:
@@ -592,6 +597,7 @@ def test_a_broadcast_that_could_do_harm_is_refused(drives: list[Drive], value: I
 # ---- one bus for all ----
 
 
+@pytest.mark.slow
 @patient
 def test_two_threads_on_one_bus() -> None:
     drives = [EncodedDrive(Toy(address)) for address in (1, 2, 3)]
@@ -627,6 +633,7 @@ def read_until_closed(bus: Bus, rig: Rig) -> None:
         read_for_ever(bus, rig)
 
 
+@pytest.mark.slow
 @patient
 def test_a_bus_that_is_closed_while_others_use_it() -> None:
     """Whoever comes too late gets an error, and nothing worse happens.

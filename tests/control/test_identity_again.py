@@ -56,6 +56,7 @@ def test_another_drive_in_the_place_of_a_known_one_is_not_started() -> None:
         assert received.writes == []
 
 
+@pytest.mark.slow
 @every_family
 def test_a_drive_that_was_silent_is_looked_at_once_before_the_next_write(
     model: str, monkeypatch: pytest.MonkeyPatch
@@ -118,6 +119,7 @@ def test_a_stop_of_a_drive_that_was_silent_asks_nothing_first(model: str) -> Non
         assert received.requests[0] == received.writes[0]
 
 
+@pytest.mark.slow
 def test_what_polling_missed_counts_too() -> None:
     """Also while the drive was interrupted, its line was polled: nobody has to ask by hand."""
     sim = simulated(MAKE["invt-che"](1))

@@ -42,6 +42,7 @@ def write(port: str, seconds: float, ledger: Ledger | None = None) -> None:
 # ---- what a port is ----
 
 
+@pytest.mark.slow
 def test_one_write_a_minute_however_the_port_is_spelt(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -204,6 +205,7 @@ def test_a_ledger_that_is_named_counts_simulated_drives_too(tmp_path: Path) -> N
     assert len(Ledger(tmp_path / "wear").wear(0)) == 1
 
 
+@pytest.mark.slow
 @with_names
 def test_a_simulator_in_another_process_is_known_until_it_is_killed(tmp_path: Path) -> None:
     program = (

@@ -127,6 +127,7 @@ def test_nothing_is_sent_before_it_is_master(scene: Scene, call: Callable[[Scene
     assert scene.audit.read_text() == ""  # what was not sent is no write
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("call", usually("start", *(call for call in CALLS if call != "start")))
 def test_nothing_is_sent_after_it_was_master(scene: Scene, call: str) -> None:
     scene.become_master()
@@ -199,6 +200,7 @@ def test_a_stop_of_all_says_it_of_each(scene: Scene) -> None:
     assert other.bus is scene.bus
 
 
+@pytest.mark.slow
 def test_a_look_at_what_was_started_says_why_there_is_none(scene: Scene) -> None:
     scene.become_master()
     scene.drive.start()
@@ -207,6 +209,7 @@ def test_a_look_at_what_was_started_says_why_there_is_none(scene: Scene) -> None
         scene.drive.state()
 
 
+@pytest.mark.slow
 def test_commands_go_on_when_it_is_master_again(scene: Scene) -> None:
     scene.become_master()
     scene.drive.start()
@@ -233,6 +236,7 @@ def hold_back(monkeypatch: pytest.MonkeyPatch, scene: Scene, *, sent_ns: int, af
     monkeypatch.setattr(scene.bus.line, "carry_out", held_back)
 
 
+@pytest.mark.slow
 def test_a_write_of_which_a_part_has_left_is_unconfirmed(
     scene: Scene, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -244,6 +248,7 @@ def test_a_write_of_which_a_part_has_left_is_unconfirmed(
     assert "this process may not send on " in str(entry)
 
 
+@pytest.mark.slow
 def test_a_script_that_is_held_back_at_its_second_write_says_so(
     scene: Scene, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -404,6 +409,7 @@ def test_a_stop_is_sent_beside_another_master(shared: tuple[int, Bus, Mastership
     assert b"\x01\x06\x00\x14\x00\x00" in sent_on(far)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("port", ["tcp://127.0.0.1:0", "socket://127.0.0.1:0"])
 def test_a_network_s_port_is_held_back_too(port: str) -> None:
     mastership, sim = Mastership(), simulated(Brief(1))

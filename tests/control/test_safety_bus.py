@@ -503,6 +503,7 @@ def test_a_setpoint_that_is_clamped_is_told_with_what_was_taken(monkeypatch: pyt
 # ---- EEPROM ----
 
 
+@pytest.mark.slow
 def test_a_setpoint_loop_to_an_eeprom_is_stopped_with_advice(monkeypatch: pytest.MonkeyPatch) -> None:
     line, drive, sim = one(monkeypatch, DelixiModbus(1))
     drive.set_frequency(10.0)

@@ -164,6 +164,7 @@ def values(register: Register[Any]) -> st.SearchStrategy[Any]:
     return st.one_of(known, st.integers(0, 0xFFFF))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("model", MAKE)
 @settings(
     max_examples=examples(100),

@@ -43,6 +43,7 @@ def line(drive: Drive, other: Drive | None = None) -> Iterator[tuple[Any, MotorD
         yield bus.attach(drive), sim, received
 
 
+@pytest.mark.slow
 @every_family
 def test_a_start_whose_reply_is_lost_is_sent_once(model: str) -> None:
     with line(MAKE[model](1)) as (drive, sim, received):

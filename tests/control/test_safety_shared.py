@@ -189,6 +189,7 @@ MOMENTS = [("start", says) for says in SAYS] + [
 ]
 
 
+@pytest.mark.slow
 @patient
 @pytest.mark.parametrize(("verb", "says"), usually(*MOMENTS))
 def test_what_another_client_says_confirms_no_pulse(verb: str, says: str) -> None:
@@ -205,6 +206,7 @@ def test_what_another_client_says_confirms_no_pulse(verb: str, says: str) -> Non
         assert received[0].sim.motor.fault == (4 if verb == "reset_fault" else 0)
 
 
+@pytest.mark.slow
 @patient
 @pytest.mark.parametrize("says", usually(*SAYS))
 def test_what_another_client_says_confirms_no_stop(says: str) -> None:
@@ -230,6 +232,7 @@ def test_the_same_stop_of_another_client_is_one_too() -> None:
         assert not received[0].sim.motor.energised
 
 
+@pytest.mark.slow
 @patient
 @pytest.mark.parametrize("verb", ["stop", "coast"])
 def test_another_client_that_asks_the_same_is_not_our_echo_for_long(verb: str) -> None:
@@ -247,6 +250,7 @@ def test_another_client_that_asks_the_same_is_not_our_echo_for_long(verb: str) -
         assert not received[0].sim.motor.energised
 
 
+@pytest.mark.slow
 @patient
 def test_another_client_s_setpoint_is_seen_before_the_start() -> None:
     with shared_line("invt-che", seed=3) as (drive, pair, received), Bus(pair.theirs) as other:

@@ -188,6 +188,7 @@ def test_a_stop_takes_any_number_as_its_time(monkeypatch: pytest.MonkeyPatch, se
 # ---- a ledger that others hold, or cannot keep ----
 
 
+@pytest.mark.slow
 def test_a_stop_waits_once_for_a_ledger_that_others_hold_however_often_it_was_sent(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -84,6 +84,7 @@ def check_stops(monkeypatch: pytest.MonkeyPatch, family: str, failure: str, step
     assert nth > 80
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # as a script ends
 @pytest.mark.usefixtures("_unbounded")
 @pytest.mark.parametrize("step", [37, pytest.param(11, marks=pytest.mark.long)])

@@ -249,6 +249,7 @@ def test_leaving_a_poller_whose_port_was_lost_stops_its_motors(
             assert sum(waits) == 0  # it never comes back
 
 
+@pytest.mark.slow
 def test_nothing_is_sent_to_a_drive_while_its_stop_is_repeated() -> None:
     with line("invt-che") as (_, drive, received, _):
         drive.set_frequency(20)

@@ -809,6 +809,7 @@ def test_what_a_port_is_asking_is_told() -> None:
             urgent.join()
 
 
+@pytest.mark.slow
 def test_ports_come_and_go(drive: Drive) -> None:
     """Opened and closed a thousand times, under way or not, on one engine."""
 
@@ -861,6 +862,7 @@ def test_a_thousand_ports_come_and_go_at_once(descriptors: int) -> None:
     assert come_and_go() == come_and_go()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("exchanges", [10_000, pytest.param(50_000, marks=pytest.mark.long)])
 def test_memory_is_flat_over_many_exchanges(drive: Drive, exchanges: int) -> None:
     asked, row_queue = read(0), RowQueue(chunk_rows=1000, most_chunks=4)

@@ -167,6 +167,7 @@ def test_an_inherited_bus_says_that_it_is_its_parent_s(any_port: str) -> None:
         assert current(bus) == 3.25
 
 
+@pytest.mark.slow
 def test_a_child_neither_hangs_nor_harms_when_it_lets_go_of_a_bus(any_port: str) -> None:
     buses = [Bus(any_port)]
 
@@ -182,6 +183,7 @@ def test_a_child_neither_hangs_nor_harms_when_it_lets_go_of_a_bus(any_port: str)
         buses[0].close()
 
 
+@pytest.mark.slow
 def test_a_bridge_is_not_hung_up_by_a_child() -> None:
     with Bus("loop://") as bus:
         assert in_child(bus.close) is None

@@ -143,6 +143,7 @@ def test_a_guard_is_a_number() -> None:
         Mastership("1")  # type: ignore[arg-type]
 
 
+@pytest.mark.slow
 def test_the_kernel_kills_a_stopped_process_half_a_guard_after_its_deadline() -> None:
     with keeper(0.4, 0.3) as process:
         until_ns = until_of(process)

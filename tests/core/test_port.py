@@ -110,6 +110,7 @@ def test_what_has_no_settings_says_so() -> None:
     assert failed.value.errno == errno.EBADF
 
 
+@pytest.mark.slow
 def test_ports_that_are_opened_beside_each_other_have_one_thread(monkeypatch: pytest.MonkeyPatch) -> None:
     """While it is started for one of them the others wait: the core would run lines on several threads."""
     started: list[str] = []

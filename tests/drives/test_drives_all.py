@@ -299,6 +299,7 @@ def test_what_is_shown_can_be_typed(
     assert register.encode(register.parse(shown)) == register.encode(value)
 
 
+@pytest.mark.slow
 def test_drives_import_what_they_may() -> None:
     for path in Path(multidrop.drives.__file__).parent.glob("*.py"):
         for node in ast.walk(ast.parse(path.read_text())):

@@ -71,6 +71,7 @@ def test_a_file_is_the_class_that_these_tests_make(name: str) -> None:
             assert getattr(same, fact) == getattr(register, fact), (register.name, fact)
 
 
+@pytest.mark.slow
 def test_a_plant_s_motor_is_started_and_stopped(plant: Path) -> None:
     lines, sims = load_plant(plant).lines, sims_of(plant)
     wire = Wire(sims, port=ANY_PORT, unpaced=True)

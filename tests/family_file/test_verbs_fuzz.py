@@ -111,6 +111,7 @@ def ends(family: type[Drive], verb: str, answer: Any) -> float:
         return waited
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 @given(raws=st.lists(st.integers(0, 0xFFFF), min_size=1, max_size=5))
 @settings(max_examples=10)

@@ -165,6 +165,7 @@ def test_each_of_many_records_is_replaced_at_its_own_revision_or_not(one: Cluste
     _with_path(one, work)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("way")
 def test_a_request_without_an_answer_is_told_from_those_that_have_one(one: Cluster) -> None:
     async def main() -> None:

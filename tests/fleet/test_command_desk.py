@@ -225,6 +225,7 @@ def test_a_damaged_list_allows_nothing(tmp_path: Path, may: Any) -> None:
         assert answer.outcome is REFUSED
 
 
+@pytest.mark.slow
 def test_a_start_runs_the_motor_and_a_stop_stops_it(desk: Desks) -> None:
     async def main() -> list[CommandOutcome]:
         found = [(await desk.do(desk.offered(20.0))).outcome]
@@ -237,6 +238,7 @@ def test_a_start_runs_the_motor_and_a_stop_stops_it(desk: Desks) -> None:
     assert {"begun", "over"} == {note["step"] for note in desk.notes if note["what"] == "stop"}
 
 
+@pytest.mark.slow
 def test_a_stop_that_goes_on_says_what_is_known_of_it(desk: Desks) -> None:
     """Its asker is told that it was sent long before the motor stands; this one stands when that was told."""
     desk.sim["output_frequency"] = 10.0

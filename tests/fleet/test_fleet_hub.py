@@ -130,6 +130,7 @@ def test_after_any_failure_each_row_is_kept_once(running: Cluster, fates: str) -
     asyncio.run(live())
 
 
+@pytest.mark.slow
 def test_messages_of_several_answers(running: Cluster, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(hub_module, "MOST_READ", 3)
 
@@ -363,6 +364,7 @@ insert into multidrop.register_sets (names)
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("before", ["", OF_AN_OLDER_HUB])
 def test_samples_have_their_units(empty: Postgres, before: str) -> None:
     import pyarrow as pa
@@ -383,6 +385,7 @@ def test_samples_have_their_units(empty: Postgres, before: str) -> None:
     assert empty.ask("select count(*) from multidrop.register_sets") == [(3,)]
 
 
+@pytest.mark.slow
 def test_a_second_hub_of_one_database_waits_for_the_end_of_the_first(empty: Postgres) -> None:
     one, other = PostgresSink(empty.where), PostgresSink(empty.where)
     assert one.begin("then") == KeptPlace(0, {})

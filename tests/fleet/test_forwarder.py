@@ -277,6 +277,7 @@ def test_the_largest_message_comes_back(running: Cluster) -> None:
 # ---- mistakes ----
 
 
+@pytest.mark.slow
 def test_no_server(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(samples_stream, "ANSWER_S", 1.0)
     (port,) = free_ports(1)

@@ -97,6 +97,7 @@ def judge(drives: list[NumberedDrive], gateways: list[Gateway]) -> list[Answers]
     ]
 
 
+@pytest.mark.slow
 def test_a_line_goes_to_and_fro_with_a_request_under_way_each_time(
     tmp_path: Path, gateways: list[Gateway]
 ) -> None:

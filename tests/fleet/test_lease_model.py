@@ -210,6 +210,7 @@ def test_no_two_masters_in_any_interleaving_of_a_longer_lease() -> None:
 LARGE = ("deadline from the acknowledgement", "guard shorter than the timer's lateness", "needs 1, ends 2")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "mutation",
     [pytest.param(name, marks=pytest.mark.long if name in LARGE else ()) for name in MUTATIONS],

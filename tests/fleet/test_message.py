@@ -25,6 +25,7 @@ def packed(*batches: Batch, most: int = 900_000) -> list[Packed]:
     return list(buffer.messages(most))
 
 
+@pytest.mark.slow
 def test_the_rows_come_back() -> None:
     (message,) = packed(example())
     assert message.rows == len(EXAMPLE)

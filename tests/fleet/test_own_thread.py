@@ -70,6 +70,7 @@ class Motors:
         return found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("failure", [RuntimeError("can't start new thread"), MemoryError()])
 def test_all_stops_are_sent_before_one_is_waited_for(executors: Executors, failure: Exception) -> None:
     executors.threads, executors.failure = 1, failure
@@ -79,6 +80,7 @@ def test_all_stops_are_sent_before_one_is_waited_for(executors: Executors, failu
     assert without == [("b", 0.0), ("c", 0.0), ("b", TURN_S), ("c", TURN_S), ("b", TURN_S)]
 
 
+@pytest.mark.slow
 def test_the_loop_goes_on_and_a_thread_that_comes_free_is_taken(executors: Executors) -> None:
     motors = Motors(a=3, b=2)
     turns = 0
@@ -107,6 +109,7 @@ def test_a_stop_that_is_never_seen_is_told_so_in_the_end(
     assert motors.noted == [("a", 0.0)]
 
 
+@pytest.mark.slow
 def test_a_motor_is_stopped_without_a_thread(executors: Executors, tmp_path: Path) -> None:
     with desks(tmp_path) as desk:
         stopped = asyncio.run(desk.stop(drives=["pump"]))

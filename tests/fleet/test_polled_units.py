@@ -106,6 +106,7 @@ def test_a_gateway_notes_the_units_of_a_line_that_it_takes(tmp_path: Path) -> No
     assert before_ns < change.until_ns <= time.monotonic_ns()
 
 
+@pytest.mark.slow
 def test_merged_files_keep_the_units_beside_rows_without(tmp_path: Path) -> None:
     require_module("duckdb")
     sink = ParquetSink(tmp_path)
@@ -154,6 +155,7 @@ def kept(tmp_path: Path, request: pytest.FixtureRequest) -> Path:
 BEGIN, BEFORE, END = NOON, NOON + 18 * STEP, NOON + 120 * STEP
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("points", [1, 120])
 def test_plots_of_a_hubs_folder_put_no_two_units_together(kept: Path, points: int) -> None:
     with History(kept) as history:

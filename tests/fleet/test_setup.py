@@ -39,6 +39,7 @@ def test_buckets_are_made_on_all_three_servers(nats: Cluster) -> None:
     assert asyncio.run(_init(nats.urls)) == made  # a second time changes nothing
 
 
+@pytest.mark.slow
 def test_each_path_is_at_a_server_of_its_own_and_so_is_each_leader(fleet: Cluster) -> None:
     async def main() -> None:
         paths = paths_of(fleet.urls)
@@ -153,6 +154,7 @@ NO_LEADER = (
 )
 
 
+@pytest.mark.slow
 def test_servers_that_say_that_they_cannot_decide_have_no_quorum(
     nats: Cluster, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -166,6 +168,7 @@ def test_servers_that_say_that_they_cannot_decide_have_no_quorum(
         asyncio.run(_init(nats.urls))
 
 
+@pytest.mark.slow
 def test_a_plant_that_cannot_be_read_yet_is_waited_for(
     nats: Cluster, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -182,6 +185,7 @@ def test_a_plant_that_cannot_be_read_yet_is_waited_for(
     assert failures == []
 
 
+@pytest.mark.slow
 def test_a_server_without_jetstream_is_one_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(setup, "WAIT_S", 0.5)
     [port] = free_ports(1)

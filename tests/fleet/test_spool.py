@@ -60,6 +60,7 @@ def test_rows_are_in_files_when_sync_returns(spool: Spool, folder: Path) -> None
     assert state.stored == sum(file.stat().st_size for file in folder.glob("*.arrows"))
 
 
+@pytest.mark.slow
 def test_a_second_of_rows_is_a_message_without_being_asked(spool: Spool, folder: Path) -> None:
     spool.append(numbered(0, 3))
     until(lambda: spool.state().written == 30)
@@ -239,6 +240,7 @@ def test_what_was_removed_before_the_stream_was_asked_counts_when_it_answers(fol
     spool.close()
 
 
+@pytest.mark.slow
 def test_a_full_disk_is_told_and_holds_nobody_up(
     folder: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -270,6 +272,7 @@ def test_a_full_disk_is_told_and_holds_nobody_up(
     ]
 
 
+@pytest.mark.slow
 def test_a_full_disk_takes_what_was_forwarded_first(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(spool_module, "AGAIN_S", 0.01)
     filled(folder, 3)

@@ -85,6 +85,7 @@ def test_a_slow_body_is_ended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
         assert gateway.get("/api/plant").status == 200
 
 
+@pytest.mark.slow
 def test_slow_headers_are_ended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(connections, "FIRST_S", 0.1)
     with (

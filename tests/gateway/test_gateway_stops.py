@@ -61,6 +61,7 @@ def stands(gateway: Served, drive: str) -> bool:
     return not gateway.sims[drive].motor.goal  # type: ignore[attr-defined]
 
 
+@pytest.mark.slow
 def test_all_drives_are_stopped_and_seen_to_stand(tmp_path: Path) -> None:
     with served(tmp_path, MAY) as gateway:
         start(gateway, "pump-1", "pump-2")
@@ -109,6 +110,7 @@ def test_a_stop_whose_body_cannot_be_read_is_one_of_all_drives(
         assert stands(gateway, "pump-2")
 
 
+@pytest.mark.slow
 def test_a_drive_to_stop_may_be_named_without_a_list(tmp_path: Path) -> None:
     with served(tmp_path, MAY) as gateway:
         start(gateway, "pump-1", "pump-2")
@@ -117,6 +119,7 @@ def test_a_drive_to_stop_may_be_named_without_a_list(tmp_path: Path) -> None:
         assert not stands(gateway, "pump-2")
 
 
+@pytest.mark.slow
 def test_a_stop_of_strange_names_stops_the_drives_that_are_there_and_tells_of_each(tmp_path: Path) -> None:
     """Half a character, a terminal's escape, and another drive's name in capitals."""
     names = ["pump-1", "\ud800", "\x1b[2J\n", "PUMP-2", ""]
@@ -139,6 +142,7 @@ def test_no_options_keep_a_stop_by_a_verb_back(tmp_path: Path, verb: str, option
         assert stands(gateway, "pump-1")
 
 
+@pytest.mark.slow
 def test_a_stop_whose_client_is_cut_off_within_its_body_is_sent(tmp_path: Path) -> None:
     with served(tmp_path, MAY) as gateway:
         start(gateway, "pump-1", "pump-2")
@@ -165,6 +169,7 @@ def test_one_drive_is_stopped_and_the_other_runs_on(tmp_path: Path) -> None:
         assert not stands(gateway, "pump-2")
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("_broken_parts")
 def test_a_stop_works_while_all_parts_are_broken(tmp_path: Path) -> None:
     with served(tmp_path, BROKEN) as gateway:
@@ -184,6 +189,7 @@ def test_a_stop_works_while_all_parts_are_broken(tmp_path: Path) -> None:
         assert 'multidrop_part_failures_total{part="history"}' in gateway.get("/metrics").body.decode()
 
 
+@pytest.mark.slow
 def test_a_stop_works_while_the_hub_and_the_frames_are_broken(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -202,6 +208,7 @@ def test_a_stop_works_while_the_hub_and_the_frames_are_broken(
         assert [one["done"] for one in gateway.post("/api/stop").json.values()] == [True, True]
 
 
+@pytest.mark.slow
 def test_a_stop_waits_for_no_write(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Writes that hang fill all that is kept for them, and further ones are refused; stops go on."""
     held, entered = threading.Event(), []
@@ -328,6 +335,7 @@ def test_a_silent_drives_stop_says_so_and_holds_no_other_up(tmp_path: Path) -> N
         assert [one["done"] for one in found[0].values()] == [True, True]  # type: ignore[attr-defined]
 
 
+@pytest.mark.slow
 def test_verbs_and_writes_say_what_became_of_them(tmp_path: Path) -> None:
     with served(tmp_path, MAY) as gateway:
         writer = {"authorization": gateway.bearer(Right.WRITE)}

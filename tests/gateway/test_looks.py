@@ -180,6 +180,7 @@ def test_a_silent_drives_misses_are_a_share_of_its_values(gateway: Served) -> No
     assert drive["asked"] >= sum(drive["misses"].values()) + before
 
 
+@pytest.mark.slow
 def test_reads_past_the_table(gateway: Served) -> None:
     """Words as they lie in the drive, for masters that get in through the gateway."""
     gateway.sims["pump-1"]["output_current"] = 12.3

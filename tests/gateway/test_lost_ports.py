@@ -17,6 +17,7 @@ from multidrop.sim import Simulator, Wire, simulated
 SERVE = '[serve]\nlisten = "127.0.0.1:0"\n[serve.may]\nstop = "anyone"\n'
 
 
+@pytest.mark.slow
 def test_the_other_lines_are_polled_and_it_comes_when_its_port_does(tmp_path: Path) -> None:
     port = tmp_path / "late"
     sims = [simulated(InvtCHE(1, name=name, baudrate=38400)) for name in ("pump-1", "fan-1")]
@@ -49,6 +50,7 @@ def test_the_other_lines_are_polled_and_it_comes_when_its_port_does(tmp_path: Pa
             assert served.get("/health").json["status"] == "ok"
 
 
+@pytest.mark.slow
 def test_a_port_that_is_lost_later_says_why_too(tmp_path: Path) -> None:
     port = tmp_path / "hall"
     plant = written(tmp_path, SERVE, port=str(port))

@@ -85,6 +85,7 @@ def two_lines(
             yield Served(gateway, sims, secrets), rows
 
 
+@pytest.mark.slow
 def test_a_file_with_mistakes_changes_nothing(tmp_path: Path) -> None:
     with served(tmp_path) as gateway:
         revision = gateway.gateway.revision
@@ -229,6 +230,7 @@ def test_a_reload_needs_the_right_to_write_and_a_confirmation(tmp_path: Path) ->
         assert gateway.gateway.revision == revision
 
 
+@pytest.mark.slow
 def test_a_start_of_before_a_reload_does_not_go_to_what_has_its_drive_s_name_now(tmp_path: Path) -> None:
     with served(tmp_path, MAY) as gateway:
         seen = gateway.frame()["n"]
@@ -246,6 +248,7 @@ def test_a_start_of_before_a_reload_does_not_go_to_what_has_its_drive_s_name_now
         assert not any(sim.motor.goal for sim in gateway.sims.values())  # type: ignore[attr-defined]
 
 
+@pytest.mark.slow
 def test_a_stop_of_a_drive_that_a_reload_exchanges_is_sent_to_the_new_one(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -305,6 +308,7 @@ def held_up(monkeypatch: pytest.MonkeyPatch) -> tuple[threading.Event, threading
     return opening, go_on
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("way", ["stop", "coast"])
 def test_a_stop_waits_for_no_port_that_a_reload_opens(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, way: str
@@ -399,6 +403,7 @@ def test_rows_amid_a_reload_are_described_as_what_they_were_read_as(
     assert found == {("V", None, raw), ("A", 0.5, raw / 2)}
 
 
+@pytest.mark.slow
 def test_a_stop_that_is_under_way_goes_on(tmp_path: Path) -> None:
     """The reload waits for it, and exchanges the drive only then."""
     with two_lines(tmp_path) as (gateway, _):

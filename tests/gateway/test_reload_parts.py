@@ -90,6 +90,7 @@ def test_a_part_that_cannot_be_opened_changes_nothing(gateway: Served) -> None:
     assert gateway.frame()["drives"].keys() == {"pump-1", "pump-2"}
 
 
+@pytest.mark.slow
 def test_a_part_that_fails_in_another_way_changes_nothing(
     gateway: Served, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -175,6 +176,7 @@ def test_a_history_begins_changes_and_ends(gateway: Served, tmp_path: Path) -> N
     assert gateway.get("/api/export?from=0&to=1&series=pump-1.status").status == 404
 
 
+@pytest.mark.slow
 def test_mqtt_begins_changes_and_ends(gateway: Served, tmp_path: Path) -> None:
     require_module("paho.mqtt.client")
     with mosquitto(tmp_path) as broker:

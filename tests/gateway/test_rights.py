@@ -59,6 +59,7 @@ TABLE = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("serve", "address"), TABLE)
 def test_each_caller_may_what_the_table_says(tmp_path: Path, serve: str, address: str) -> None:
     with served(tmp_path, serve, behind_proxy=address is OTHER) as gateway:
@@ -218,6 +219,7 @@ def guard_clock(gateway: Served, now: list[float]) -> None:
     gateway.gateway.guard_clock = lambda: now[0]
 
 
+@pytest.mark.slow
 def test_the_audit_log_says_who_and_by_which_way(tmp_path: Path) -> None:
     with served(tmp_path, LOOPBACK_STOPS) as gateway:
         until(lambda: gateway.gateway.hub.taken > 0)

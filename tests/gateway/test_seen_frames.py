@@ -230,6 +230,7 @@ def test_a_stop_that_is_called_as_a_start_begins_ends_it(
         assert commands(gateway) == []
 
 
+@pytest.mark.slow
 def test_a_frame_of_a_gateway_that_was_started_again_is_none_of_its_own(tmp_path: Path) -> None:
     with served(tmp_path, MAY) as gateway:
         seen = gateway.frame_number()
@@ -262,6 +263,7 @@ def test_a_stop_by_any_verb_says_nothing_of_what_was_seen(tmp_path: Path) -> Non
             assert told["done"] is True
 
 
+@pytest.mark.slow
 def test_a_start_from_a_shell_as_the_documentation_has_it(tmp_path: Path) -> None:
     for program in ("curl", "jq"):
         require_program(program)

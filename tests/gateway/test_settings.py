@@ -108,6 +108,7 @@ verbs = ["pump-1.fly"]
     assert sorted(found) == sorted(expected)
 
 
+@pytest.mark.slow
 @table(
     ("keys", "is_right"),
     [

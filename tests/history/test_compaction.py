@@ -48,6 +48,7 @@ def check(folder: Path, rows: list[Row]) -> None:
         check_buckets(history.buckets(SERIES, NOON, NOON + 700 * SECOND, 50)[SERIES], rows, SERIES)
 
 
+@pytest.mark.slow
 def test_a_parquet_file_has_the_rows_of_its_segment_by_drive_and_time(tmp_path: Path) -> None:
     rows = random_rows(1, NOON, 500)
     record(tmp_path, [rows, random_rows(2, NOON + DAY, 5)])
@@ -61,6 +62,7 @@ def test_a_parquet_file_has_the_rows_of_its_segment_by_drive_and_time(tmp_path: 
     assert file.begin * SECOND <= rows[0].time <= rows[-1].time <= file.end * SECOND
 
 
+@pytest.mark.slow
 def test_tens_are_what_plain_python_reckons(tmp_path: Path) -> None:
     rows = random_rows(1, NOON, 500)
     record(tmp_path, [rows])
@@ -270,6 +272,7 @@ def test_it_asks_for_the_lowest_priority_and_needs_none(monkeypatch: pytest.Monk
     assert asked == [(0, os.SCHED_BATCH, os.sched_param(0)), (19,)]
 
 
+@pytest.mark.slow
 def test_it_leaves_the_real_time_of_its_recorder() -> None:
     """A process that may not run by SCHED_RR leaves the usual scheduling all the same."""
     lines = (

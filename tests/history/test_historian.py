@@ -35,6 +35,7 @@ def test_a_folder_that_cannot_be_is_one_sentence(tmp_path: Path) -> None:
     assert "Errno" not in str(failure.value)
 
 
+@pytest.mark.slow
 def test_it_records_and_answers(tmp_path: Path) -> None:
     async def live() -> None:
         inside = SimpleNamespace(plant=Plant((), Path("plant.toml")), folder=tmp_path)
@@ -71,6 +72,7 @@ def test_it_records_and_answers(tmp_path: Path) -> None:
     assert [path.name for path in (tmp_path / "kept").glob("*.arrows")] == ["rows.00000001.arrows"]
 
 
+@pytest.mark.slow
 def test_duckdb_is_loaded_before_anybody_asks(tmp_path: Path) -> None:
     pytest.importorskip("duckdb", reason="needs duckdb")
     serve = "[serve]\nlisten = '127.0.0.1:0'\n[serve.history]\n"

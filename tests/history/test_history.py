@@ -47,6 +47,7 @@ def flat(rows: list[list[Row]]) -> list[Row]:
     return [row for some in rows for row in some]
 
 
+@pytest.mark.slow
 @COMPACTED
 def test_all_rows_in_the_order_of_recording(folder: Path, rows: list[list[Row]]) -> None:
     with History(folder) as history:
@@ -57,6 +58,7 @@ def test_all_rows_in_the_order_of_recording(folder: Path, rows: list[list[Row]])
         assert history.damage == []
 
 
+@pytest.mark.slow
 @COMPACTED
 def test_a_series_in_a_range(folder: Path, rows: list[list[Row]]) -> None:
     dice = random.Random(5)
@@ -91,6 +93,7 @@ def test_buckets_are_what_plain_python_reckons(folder: Path, rows: list[list[Row
                 check_buckets(buckets, flat(rows), series)
 
 
+@pytest.mark.slow
 @COMPACTED
 def test_gaps_are_gaps(folder: Path) -> None:
     with History(folder) as history:
@@ -103,6 +106,7 @@ def test_gaps_are_gaps(folder: Path) -> None:
     assert set(nothing.mean) == {None}
 
 
+@pytest.mark.slow
 @COMPACTED
 def test_an_export_is_what_is_read(folder: Path, rows: list[list[Row]]) -> None:
     begin, end = NOON + 20 * SECOND, NOON + 320 * SECOND
@@ -120,6 +124,7 @@ def test_an_export_is_what_is_read(folder: Path, rows: list[list[Row]]) -> None:
     assert text == (folder / "a.csv").read_bytes()
 
 
+@pytest.mark.slow
 @COMPACTED
 def test_a_table(folder: Path, rows: list[list[Row]]) -> None:
     pytest.importorskip("pandas", reason="needs pandas")
@@ -205,6 +210,7 @@ def test_a_reader_sees_what_comes_and_each_row_once(tmp_path: Path) -> None:
                 compact(tmp_path, writer.open_number)
 
 
+@pytest.mark.slow
 def test_files_that_are_replaced_under_a_reader(tmp_path: Path) -> None:
     """Compacted between its listing and its reading: each row comes once all the same."""
     pytest.importorskip("duckdb", reason="needs duckdb")
@@ -302,6 +308,7 @@ def test_without_duckdb(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None
                 ask()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("most", [0, 150, 100_000], ids="{} rows are kept".format)
 def test_plots_of_a_segment_that_grows_are_of_all_its_rows(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, most: int

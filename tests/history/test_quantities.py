@@ -72,6 +72,7 @@ def of(
     return found[SERIES], found[OTHER]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("points", [300, 30])
 def test_two_units_are_no_series(tmp_path: Path, how: str, points: int) -> None:
     recorded(tmp_path, AMPERE, PERCENT, AMPERE, PERCENT)

@@ -49,6 +49,7 @@ def test_a_logger_to_parquet(tmp_path: Path) -> None:
     assert {row.drive for row in rows if row.status == "ok"} == {"pump", "fan"}
 
 
+@pytest.mark.slow
 def test_a_device_of_one_s_own(tmp_path: Path) -> None:
     printed = run(tmp_path, "own_device.py")
     assert "temperature  21.4 degC" in printed

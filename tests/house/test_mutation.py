@@ -77,6 +77,7 @@ def test_a_condition_of_several_lines_is_negated_as_a_whole() -> None:
     assert negated == "if (!(a || b))"
 
 
+@pytest.mark.slow
 def test_explained_mutants_can_be_made() -> None:
     files = {each["file"] for each in EXPLAINED}
     names = {mutant.name for path in files for mutant in mutants(path, (ROOT / path).read_text("utf-8"))}

@@ -229,6 +229,7 @@ def test_a_failure_on_the_line_has_its_code(gateway: Gateway, failure: Exception
     assert code(gateway, 1, 3, CHE_OUTPUT_VOLTAGE, 1) == expected
 
 
+@pytest.mark.slow
 def test_reads_that_find_the_queue_full_are_busy(gateway: Gateway) -> None:
     gateway.hub.values.clear()
     gateway.line.seconds = 0.6  # three times what may be used at once
@@ -443,6 +444,7 @@ def stop_slowly(gateway: Gateway, seconds: float) -> threading.Event:
     return ended
 
 
+@pytest.mark.slow
 def test_a_stop_that_takes_long_is_acknowledged_and_goes_on(gateway: Gateway) -> None:
     ended = stop_slowly(gateway, 1.0)
     with gateway.client() as client:

@@ -104,6 +104,7 @@ def test_a_value_that_is_not_fresh_is_null_and_a_silent_drive_is_offline(
     assert json_of(said)["values"]["output_frequency"] is None
 
 
+@pytest.mark.slow
 def test_the_broker_says_that_the_gateway_is_gone(listener: Listener, start: Start) -> None:
     _, running = start()
     listener.wait_for(has("multidrop/gateway", b"online"))
@@ -142,6 +143,7 @@ def test_a_broker_that_stands_still_holds_up_nothing(
     assert figures["multidrop_mqtt_dropped"][0][2] > 0
 
 
+@pytest.mark.slow
 def test_a_broker_that_comes_back_is_told_anew(broker: Broker, listener: Listener, start: Start) -> None:
     start()
     listener.wait_for(has("multidrop/gateway", b"online"))
@@ -201,6 +203,7 @@ def test_a_command_that_the_broker_keeps_is_not_carried_out(
     assert known.commands.noted == []
 
 
+@pytest.mark.slow
 def test_a_stop_is_always_carried_out(broker: Broker, listener: Listener, start: Start) -> None:
     publish(broker, "multidrop/pump-1/stop", b"stop", "-r")
     known, _ = start(commands=True)
@@ -477,6 +480,7 @@ def test_a_drive_that_cannot_be_a_topic_is_told(tmp_path: Path) -> None:
 # ---- figures ----
 
 
+@pytest.mark.slow
 def test_metrics_say_what_was_sent(broker: Broker, tmp_path: Path) -> None:
     require_module("paho.mqtt.client")
     with served(tmp_path, f'[serve.mqtt]\nbroker = "{broker.address}"\n') as gateway:

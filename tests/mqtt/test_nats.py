@@ -50,6 +50,7 @@ def now_ms() -> int:
     return time.time_ns() // 1_000_000
 
 
+@pytest.mark.slow
 def test_state_is_kept_and_the_broker_says_that_the_gateway_is_gone(broker: Broker, start: Start) -> None:
     listener = Listener(broker)
     try:
@@ -108,6 +109,7 @@ def test_a_command_that_the_broker_keeps_is_not_carried_out(broker: Broker, star
         listener.close()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("broker", [old_server_program], indirect=True)
 def test_a_topic_that_it_does_not_take_costs_the_others_nothing(broker: Broker, start: Start) -> None:
     """The namespace of Sparkplug has a dot, with which nats-server closes the connection before 2.10."""
@@ -129,6 +131,7 @@ def test_a_topic_that_it_does_not_take_costs_the_others_nothing(broker: Broker, 
         listener.close()
 
 
+@pytest.mark.slow
 def test_births_data_rebirth_death_and_commands_of_sparkplug(broker: Broker, start: Start) -> None:
     host = Host(broker)
     try:

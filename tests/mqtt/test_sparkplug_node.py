@@ -109,6 +109,7 @@ def test_rebirth(broker: Broker, host: Host, node: tuple[Any, Running]) -> None:
     host.wait_for("DBIRTH", FAN.name)
 
 
+@pytest.mark.slow
 def test_a_lost_connection_is_a_death_and_a_birth_of_the_next_number(
     host: Host, node: tuple[Any, Running]
 ) -> None:

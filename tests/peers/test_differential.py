@@ -120,6 +120,7 @@ def test_replies_as_pymodbus_s_client_understands_them(framing: Framing) -> None
     explain(differences, REPLIES, name(framing))
 
 
+@pytest.mark.slow
 @framings
 def test_replies_that_pymodbus_encodes_are_ours_byte_by_byte(framing: Framing) -> None:
     pymodbus = Pymodbus(framing)

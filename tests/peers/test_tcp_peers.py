@@ -105,6 +105,7 @@ def test_the_command_line_reads_and_writes_it_too(server: str, capsys: pytest.Ca
     assert ["current", "101.0", "A"] in map(str.split, shown.splitlines())
 
 
+@pytest.mark.slow
 def test_another_unit_of_pymodbus_is_silence(tmp_path: Path) -> None:
     with subprocess.Popen(pymodbus(tmp_path), stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None

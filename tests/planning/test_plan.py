@@ -264,6 +264,7 @@ FORBIDDEN = {  # addresses of which the documents do not say that they can be re
 }
 
 
+@pytest.mark.slow
 @settings(max_examples=examples(300))
 @given(st.data())
 def test_no_other_plan_of_a_family_is_cheaper(data: st.DataObject) -> None:

@@ -301,6 +301,7 @@ def calls_to_add_one_to(count: int) -> int:
     return calls
 
 
+@pytest.mark.slow
 def test_a_line_is_compared_with_each_of_the_others_once() -> None:
     assert calls_to_add_one_to(24) < 2 * calls_to_add_one_to(12)
 

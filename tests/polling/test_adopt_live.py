@@ -301,6 +301,7 @@ def test_no_drive_is_off_its_line_while_another_is_waited_for(
         assert not {pump_1, pump_2} & {*bus.drives}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("is_circle", [False, True])
 def test_a_drive_is_on_its_line_until_the_next_one_may_have_its_name(
     both: TwoLines, monkeypatch: pytest.MonkeyPatch, is_circle: bool
@@ -579,6 +580,7 @@ class Dawdling(dict[object, object]):
         assert not self._changing.is_alive()
 
 
+@pytest.mark.slow
 def test_a_summary_is_of_the_plant_before_or_after(both: TwoLines) -> None:
     with Poller(plant(both.hall())) as poller:
         (polled_line,) = poller._lines

@@ -25,6 +25,7 @@ poll = ["output_frequency"]
 """
 
 
+@pytest.mark.slow
 def test_it_is_beside_the_polled_ones(tmp_path: Path) -> None:
     path = tmp_path / "plant.toml"
     with Simulator([Wire([simulated(YD1000(1)), simulated(YD1000(9))])]) as simulator:

@@ -43,6 +43,7 @@ def test_pyarrow_takes_it() -> None:
     assert rows_of(found) == EXAMPLE
 
 
+@pytest.mark.slow
 def test_pyarrow_takes_it_as_a_stream_and_its_schema_alone() -> None:
     table = pa.table(example())
     assert table.schema.equals(SCHEMA)
@@ -64,6 +65,7 @@ def test_numbers_are_not_copied() -> None:
     assert taken.column("value")[0].as_py() == 7.5
 
 
+@pytest.mark.slow
 def test_polars_takes_it() -> None:
     polars = pytest.importorskip("polars", reason="needs polars")
     frame = polars.DataFrame(example())

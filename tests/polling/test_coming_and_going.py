@@ -91,6 +91,7 @@ def test_a_line_may_be_left_by_all_and_joined_again(port: str) -> None:
         assert poller.summary()["samples"] > before
 
 
+@pytest.mark.slow
 def test_a_silent_drive_that_leaves_takes_its_rest_along(port: str) -> None:
     with Poller(plant(line(port, pump(1), pump(3, "dead")))) as poller:
         seen = Seen(poller)
@@ -116,6 +117,7 @@ def test_what_cannot_come_or_go(port: str) -> None:
         assert list(poller.summary()["lines"]["line"]["drives"]) == ["pump-1"]
 
 
+@pytest.mark.slow
 def test_a_drive_of_which_nothing_is_polled_disturbs_nobody(port: str) -> None:
     with Poller(plant(line(port, pump(1), polled(Toy(3, name="pump-3"), [])))) as poller:
         seen = Seen(poller)
@@ -139,6 +141,7 @@ def test_nothing_is_asked_of_a_drive_that_was_detached(port: str) -> None:
         assert peer.proofs is proofs  # at one of which the core may look just now
 
 
+@pytest.mark.slow
 def test_a_drive_of_another_family_gets_no_late_answer_of_the_one_before(port: str) -> None:
     with Bus(port) as bus:
         gone = bus.attach(Toy, address=9)

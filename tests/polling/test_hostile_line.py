@@ -110,6 +110,7 @@ def test_a_delixi_parameter_is_no_echo_of_its_query(register: str, echo: int) ->
     assert {(row.value == 0, row.status) for row in rows} == {(register == "output_frequency", "ok")}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", usually(*KINDS))
 def test_a_fault_while_the_core_repeats_the_bus_cycle(kind: str) -> None:
     """Nothing is polled at a rate: that goes without the poller's thread until something fails."""

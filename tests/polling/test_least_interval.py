@@ -83,6 +83,7 @@ def test_it_is_asked_no_sooner_and_all_its_registers_share_its_turns(
     assert sum(counts) >= 0.9 * wanted
 
 
+@pytest.mark.slow
 def test_the_others_are_polled_as_fast_as_before_but_for_its_own_exchanges() -> None:
     (drive, sim), (other, its_sim) = slow(), quick(2)
 
@@ -97,6 +98,7 @@ def test_the_others_are_polled_as_fast_as_before_but_for_its_own_exchanges() -> 
     assert sim.early == 0
 
 
+@pytest.mark.slow
 def test_a_stop_waits_for_the_interval_at_most_and_all_else_waits_for_it() -> None:
     (drive, sim), (other, its_sim) = slow(), quick(2)
     drives = [polled(drive, drive.readings()), polled(other, other.readings())]

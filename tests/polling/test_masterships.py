@@ -189,6 +189,7 @@ def test_a_line_is_listened_to_before_its_first_request(mastership: Mastership, 
         assert time.monotonic() - begun >= LONGEST + Slow.response_timeout
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("port", ["pty", "tcp://127.0.0.1:0"])
 def test_nothing_is_sent_while_the_master_before_may_still_be_there(port: str) -> None:
     """The guard is longer than the longest frame and the time-out, which are listened to on ptys alone."""
@@ -334,6 +335,7 @@ def test_rows_of_other_lines_go_on_while_lines_come_and_go(mastership: Mastershi
         assert max(later - at for at, later in pairwise(due)) < S  # of 0.02 s each, on a machine that is busy
 
 
+@pytest.mark.slow
 def test_a_name_that_is_taken_or_unknown_is_one_sentence(mastership: Mastership) -> None:
     hold(mastership)
     with lines(None) as (_, (hall, yard)), Poller(plant(hall), mastership=mastership) as poller:
@@ -348,6 +350,7 @@ def test_a_name_that_is_taken_or_unknown_is_one_sentence(mastership: Mastership)
         Rows(poller).settle("pump")
 
 
+@pytest.mark.slow
 def test_a_bridged_port_is_refused_and_nothing_changes(mastership: Mastership) -> None:
     hold(mastership)
     bridged = line("rfc2217://127.0.0.1:1", quick("fan", 1, None), name="yard")

@@ -49,6 +49,7 @@ def test_every_row_is_handed_out_once_the_last_ones_before_closing_returns(polle
     assert rows_of(poller) == []
 
 
+@pytest.mark.slow
 def test_a_slow_function_holds_no_line_up(poller: Poller) -> None:
     go_on, entered = threading.Event(), threading.Event()
     rows: list[Row] = []
@@ -68,6 +69,7 @@ def test_a_slow_function_holds_no_line_up(poller: Poller) -> None:
     assert len(rows) == summary["samples"] + summary["misses"]
 
 
+@pytest.mark.slow
 def test_a_function_that_fails_is_logged_at_once_and_raised_by_closing(
     poller: Poller, caplog: pytest.LogCaptureFixture
 ) -> None:

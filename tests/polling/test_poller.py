@@ -339,6 +339,7 @@ def test_what_the_poll_says_of_a_reply(fault: str, pump: SimulatedDrive) -> None
     polling.check_summary()
 
 
+@pytest.mark.slow
 def test_a_drive_that_answers_every_second_time(pump: SimulatedDrive) -> None:
     turns = itertools.cycle([True, False])
     wire = Faulty([pump], lambda reply: reply if next(turns) else b"", unpaced=True)
@@ -350,6 +351,7 @@ def test_a_drive_that_answers_every_second_time(pump: SimulatedDrive) -> None:
     polling.check_summary()
 
 
+@pytest.mark.slow
 def test_a_silence_that_is_too_short_for_the_drive() -> None:
     """It takes a request that comes before its own silence is over for the rest of the frame before."""
     strict = simulated(Brisk(1, name="pump-1"))
@@ -442,6 +444,7 @@ def test_polling_goes_on_where_a_stop_has_opened_the_port_again(port: str) -> No
     polling.check_summary()
 
 
+@pytest.mark.slow
 def test_a_line_that_is_lost_does_not_disturb_the_others(port: str, tmp_path: Path) -> None:
     link = tmp_path / "hall-2"
     lines = [
@@ -598,6 +601,7 @@ def test_what_is_not_answered_by_the_end_has_a_row(
     polling.check_summary()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("leaves", ["the poll", "the drive"])
 def test_a_slot_that_is_not_over_at_the_end_was_not_missed(responder: tuple[int, str], leaves: str) -> None:
     """Every healthy run ends so: the next value is due already, or about to be."""

@@ -28,6 +28,7 @@ class Stubborn(SimulatedDrive):
         return super().read(function, start, count)
 
 
+@pytest.mark.slow
 @patient
 def test_a_refused_register_is_set_aside_and_its_neighbours_are_read() -> None:
     with Simulator([Wire([Stubborn(Toy(1))], unpaced=True)]) as simulator:

@@ -75,6 +75,7 @@ def test_without_a_thread_a_stop_opens_the_port_and_polling_goes_on(
     until(lambda: any(row.status == "ok" for row in rows_of(hall.poller)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("threads", [0, 1])
 def test_lines_are_opened_though_the_system_gives_few_threads(
     hall: Plant, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, threads: int
@@ -107,6 +108,7 @@ def test_lines_are_opened_though_the_system_gives_few_threads(
         drive.stop()
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
 def test_a_stop_opens_the_port_once_the_poller_has_failed(
     hall: Plant, monkeypatch: pytest.MonkeyPatch

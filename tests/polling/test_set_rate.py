@@ -185,6 +185,7 @@ def test_a_register_that_is_refused_costs_the_others_nothing_at_a_new_rate() -> 
     assert {counts[register.name] for register in (CURRENT, FREQUENCY, STATUS)} <= {49, 50, 51}
 
 
+@pytest.mark.slow
 def test_a_silent_drive_s_rate_is_changed_while_it_rests() -> None:
     pump, silent = toy(1), SimulatedDrive(toy(2))
     silent.deaf_until = float("inf")
@@ -223,6 +224,7 @@ def test_a_drive_that_left_and_comes_back_has_the_rates_it_is_added_with() -> No
         assert set(values(made.run(10)).values()) <= {99, 100, 101}
 
 
+@pytest.mark.slow
 def test_what_is_no_rate_changes_nothing(two: ClockedLines) -> None:
     for drive, register, every, sentence in (
         ("pump-3", None, 1.0, r"pump-3 is not polled here; did you mean pump-\d"),

@@ -90,6 +90,7 @@ def test_a_device_that_takes_fewer_is_read_in_blocks_that_it_takes() -> None:
     assert {count for _, count in sim.asked} == {6}
 
 
+@pytest.mark.slow
 def test_what_was_refused_for_a_while_is_read_as_a_whole_again(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(refusals, "SET_ASIDE_NS", 2_000_000_000)
     drive = family(WIDE)(1, name="pump-1")
@@ -108,6 +109,7 @@ def test_what_was_refused_for_a_while_is_read_as_a_whole_again(monkeypatch: pyte
     assert set(sim.asked) == {(0, WIDE)}
 
 
+@pytest.mark.slow
 def test_trials_of_the_whole_make_no_rows(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(refusals, "SET_ASIDE_NS", 1_000_000_000)
     drive = family(WIDE)(1, name="pump-1")
@@ -155,6 +157,7 @@ def test_a_dead_drive_is_never_split_and_is_read_as_a_whole_when_it_comes() -> N
     assert values(rows) == right(range(WIDE))
 
 
+@pytest.mark.slow
 def test_a_drive_that_falls_silent_is_not_split() -> None:
     drive = family(WIDE)(1, name="pump-1")
     sim = Picky(drive)

@@ -50,6 +50,7 @@ class MisprintedToy(Toy):
         return {Toy.mystery: (1, 1), Toy.acceleration_time: (2, 9)}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("lost", [1, 5])
 def test_a_lost_request_does_not_slow_it_for_good(lost: int) -> None:
     pump = Toy(1, name="pump")

@@ -30,6 +30,7 @@ def path(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_every_format_is_read_as_the_same_table(path: Path) -> None:
     found = multidrop.read(path)
     assert found.metadata == METADATA
@@ -39,6 +40,7 @@ def test_every_format_is_read_as_the_same_table(path: Path) -> None:
     assert [each for rows in multidrop.read(str(path)) for each in rows] == rows_of(table)
 
 
+@pytest.mark.slow
 def test_pandas_and_polars_get_times_with_their_type(path: Path) -> None:
     pytest.importorskip("pandas", reason="needs pandas")
     polars = pytest.importorskip("polars", reason="needs polars")

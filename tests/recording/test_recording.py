@@ -131,6 +131,7 @@ def test_pyarrow_opens_arrows(tmp_path: Path) -> None:
     assert rows_of(table) == RECORDED
 
 
+@pytest.mark.slow
 def test_polars_opens_all(tmp_path: Path) -> None:
     polars = pytest.importorskip("polars", reason="needs polars")
     physical = polars.col("time").to_physical()
@@ -156,6 +157,7 @@ def test_pandas_opens_parquet_and_csv(tmp_path: Path) -> None:
         assert list(frame["status"]) == [row.status for row in RECORDED]
 
 
+@pytest.mark.slow
 def test_duckdb_opens_parquet_and_csv(tmp_path: Path) -> None:
     duckdb = pytest.importorskip("duckdb", reason="needs duckdb")
     columns = "epoch_ns(time), monotonic_ns, uncertainty_ns, drive, register, value, status"

@@ -222,6 +222,7 @@ def turns() -> list[Row]:
     return rows
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("_unpainted")
 def test_what_was_used_of_a_line(tmp_path: Path) -> None:
     look = load(record(tmp_path / "it.arrows", turns(), ABOUT | {"planned": PLANNED}))
@@ -509,6 +510,7 @@ def test_a_panel_has_room_for_so_many_lanes_only(tmp_path: Path) -> None:
     assert "(16 more lanes: choose with --drive)" in axes.get_title(loc="left")
 
 
+@pytest.mark.slow
 def test_states_that_change_faster_than_can_be_drawn_hide_none(tmp_path: Path) -> None:
     rows = [row(at / 100, "che", "status", 1 + at % 2) for at in range(20_000)]
     rows[10_001] = row(100.01, "che", "status", 4)

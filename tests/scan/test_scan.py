@@ -144,6 +144,7 @@ def test_all_eight_are_found_at_their_settings_and_nothing_else(
     assert not any(finding.doubt for finding in findings)
 
 
+@pytest.mark.slow
 @pytest.mark.story
 def test_only_reads_are_sent(whole_scan: tuple[Line, list[object]]) -> None:
     line, _ = whole_scan

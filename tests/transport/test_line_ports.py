@@ -129,6 +129,7 @@ def server() -> Iterator[SerialServer]:
         server.close()
 
 
+@pytest.mark.slow
 @pyserials_own
 def test_a_port_without_a_descriptor(server: SerialServer) -> None:
     with Bus(server.url, baudrate=19200, format="8E1") as bus:
@@ -137,6 +138,7 @@ def test_a_port_without_a_descriptor(server: SerialServer) -> None:
         assert (far.baudrate, far.bytesize, far.parity, far.stopbits) == (19200, 8, "E", 1)
 
 
+@pytest.mark.slow
 @pyserials_own
 def test_a_port_without_a_descriptor_is_polled(server: SerialServer) -> None:
     toy = polled(Toy(1, baudrate=19200), [Toy.output_current])
@@ -146,6 +148,7 @@ def test_a_port_without_a_descriptor_is_polled(server: SerialServer) -> None:
         assert server.port.baudrate == 19200
 
 
+@pytest.mark.slow
 @pyserials_own
 def test_a_port_without_a_descriptor_has_one_kind_of_settings(server: SerialServer) -> None:
     slow, fast = Toy(1, baudrate=9600), Toy(2, baudrate=19200)

@@ -136,6 +136,7 @@ def flooding() -> Iterator[tuple[str, threading.Event]]:
     listener.close()
 
 
+@pytest.mark.slow
 @pyserials_own
 def test_a_flood_that_nobody_reads_fills_no_memory() -> None:
     with flooding() as (url, sent):
@@ -173,6 +174,7 @@ class HeldUp:
         return b""
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="this system does not say when a request was written")
 def test_a_request_that_waited_behind_another_is_never_sent() -> None:
     """It was given up meanwhile, and may be a start."""

@@ -157,6 +157,7 @@ def test_reads_at_once_go_into_completions_of_their_own(bus: Bus, monkeypatch: p
     assert len(set(asked)) == 2
 
 
+@pytest.mark.slow
 def test_a_read_that_failed_keeps_its_completion(bus: Bus, monkeypatch: pytest.MonkeyPatch) -> None:
     gone = bus.attach(Toy, 3)
     asked = given(bus, monkeypatch)

@@ -218,6 +218,7 @@ def toy() -> SimulatedDrive:
     return simulated(Toy(1, name="pump"))
 
 
+@pytest.mark.slow
 def test_a_bus_has_statistics(toy: SimulatedDrive) -> None:
     with Simulator([Wire([toy], unpaced=True)]) as sim, Bus(sim.wires[0].path) as bus:
         pump, nobody = bus.attach(Toy, 1, name="pump"), bus.attach(Toy, 2, name="nobody")

@@ -149,6 +149,7 @@ def test_a_name_by_the_place_is_whatever_is_plugged_in_there(
     found.close()
 
 
+@pytest.mark.slow
 def test_another_line_is_not_polled_and_a_stop_is_not_sent_to_its_drive(
     tmp_path: Path, sysfs: Sysfs, caplog: pytest.LogCaptureFixture
 ) -> None:
