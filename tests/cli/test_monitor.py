@@ -167,6 +167,14 @@ def test_history_has_a_gap_where_a_value_was_missed(watched: LivePlant) -> None:
     assert sparkline([1, 2], 0) == ""
 
 
+def test_history_is_one_register_s(tmp_path: Path) -> None:
+    live = LivePlant(a_plant(tmp_path, 1))
+    for second, values in enumerate([{"status": 3.0}, {"output_frequency": 50.0}]):
+        live.add(from_rows([row("drive-1", name, value) for name, value in values.items()]))
+        live.tick(100.0 + second, told(10, 1000, 0.9, 1))
+    assert list(live.drives[0].history) == [None, 50.0]
+
+
 # ---- how it looks ----
 
 
