@@ -230,6 +230,12 @@ def test_the_least_width_has_the_age_and_all_keys(tmp_path: Path, name: str) -> 
         assert lines[-1].endswith("s stop   S stop all   q quit")
 
 
+def test_no_heading_is_cut(watched: LivePlant) -> None:
+    widths = range(LEAST_WIDTH, 160)
+    headings = [texts(overview(watched, Position(), (width, 24), NOW, BLOCKS))[2] for width in widths]
+    assert [heading for heading in headings if "~" in heading] == []
+
+
 def test_a_wide_overview_has_long_names_whole(tmp_path: Path) -> None:
     live = LivePlant(a_plant(tmp_path, 1))
     live.drives[0].polled.drive.name = name = "conveyor-of-the-bottling-hall-south-12"
