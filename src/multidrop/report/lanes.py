@@ -109,9 +109,7 @@ def draw_lanes(axes: Axes, lanes: Sequence[Lane], recording: Recording) -> None:
             begin, end = _merged(lane, name, span)
             widths = np.maximum(end - begin, span * NARROWEST)
             bars = list(zip(days(begin), widths / 86400e9, strict=True))
-            axes.broken_barh(
-                bars, (row - 0.36, 0.72), **(of_drive if lane.is_bit else styles[name])
-            )
+            axes.broken_barh(bars, (row - 0.36, 0.72), **(of_drive if lane.is_bit else styles[name]))
             if not lane.is_bit:
                 text = label(name).lower()
                 fitting = begin[widths > span * LETTER * (len(text) + 2)][:MOST_TEXTS]
