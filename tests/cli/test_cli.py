@@ -473,6 +473,16 @@ Where the document errs or is silent, the safest reading is taken:
 - The example of function 06"""
 
 
+def test_a_sheet_leaves_indented_lines_of_notes_as_they_are(run: Run, tmp_path: Path) -> None:
+    notes = "Two words:\n    0 off\n    1 on\n* one\n* two"
+    docstring = f'"""Mine.\n\n{notes}"""'.replace("\n", "\n    ")
+    (tmp_path / "mine.py").write_text(
+        "from multidrop import Drive, reading\n\n\n"
+        f"class Mine(Drive):\n    {docstring}\n\n    speed = reading(1)\n"
+    )
+    assert run("models", f"{tmp_path / 'mine.py'}:Mine")[1].endswith(f"Mine.\n\n{notes}\n")
+
+
 def test_a_sheet_wraps_its_notes_as_paragraphs(run: Run) -> None:
     _, out, _ = run("models", "erman-er-g-220")
     assert NOTES in out

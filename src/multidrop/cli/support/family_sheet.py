@@ -42,9 +42,10 @@ def sheet(family: type[Drive]) -> str:
     notes = inspect.cleandoc(family.__doc__ or "")
     for block in notes.split("\n\n") if notes else ():
         lines.append("")
-        for paragraph in re.split(r"\n(?=- )", block):
-            item = "  " if paragraph.startswith("- ") else ""
-            lines += wrapped(" ".join(paragraph.split()), "", item)
+        for paragraph in re.split(r"\n(?=[-*] |    )", block):  # an indented line is one that stays a line
+            item = "  " if paragraph[:2] in ("- ", "* ") else ""
+            first = " " * (len(paragraph) - len(paragraph.lstrip()))
+            lines += wrapped(" ".join(paragraph.split()), first, first + item)
     return "\n".join(lines)
 
 
