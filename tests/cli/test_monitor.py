@@ -505,6 +505,21 @@ def test_a_stop_that_fails_in_any_way_is_seen(
     assert f"stopping drive-1 failed: {words}" in seen(monitor)
 
 
+def test_a_stop_that_has_failed_is_not_said_to_be_repeated(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monitor, poller = a_monitor(tmp_path, monkeypatch)
+
+    def fail(*details: object) -> None:
+        monitor._show_message("the stop is repeated for 30 s at least")
+        raise OSError("no such port")
+
+    monkeypatch.setattr(poller, "perform", fail)
+    for key in "sy":
+        monitor._obey(key)
+    assert monitor._at.message == "stopping drive-1 failed"
+
+
 def test_leaving_under_a_stop_needs_a_yes_and_waits_for_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
