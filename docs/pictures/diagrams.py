@@ -45,8 +45,8 @@ DIAGRAMS = {
     "exchange": Diagram(
         46,
         [
-            ("client", [Span(3.6, 12.0, "request, 8 characters", "request")]),
-            ("drive", [Span(14.0, 40.0, "reply, 25 characters", "reply")]),
+            ("client", [Span(3.6, 12.0, "request", "request")]),
+            ("drive", [Span(14.0, 40.0, "reply", "reply")]),
             (
                 "",
                 [
@@ -58,7 +58,7 @@ DIAGRAMS = {
                 ],
             ),
         ],
-        note="9600 baud, 8N1: 1.04 ms a character; t3.5 = 3.6 ms; response delay 2 ms; 40 ms in all",
+        note="9600 baud, 8N1: 8 characters, response delay 2 ms, 25 characters; t3.5 = 3.6 ms; 40 ms in all",
     ),
     "blocks": Diagram(
         72,

@@ -19,7 +19,7 @@ from multidrop.cli import COMMANDS, main
 from multidrop.cli.fleet import ACTIONS as FLEET
 from multidrop.drive import Advice, Refused, carry_out
 from multidrop.drives import MODELS, ErmanERG220, InnovertIBD, InvtCHE
-from multidrop.drives.registry import SHIPPED
+from multidrop.drives.registry import SHIPPED, find_model
 
 
 def test_help_lists_every_command(run: Run) -> None:
@@ -456,12 +456,37 @@ def test_the_list_of_families_is_at_most_80_columns_wide(run: Run) -> None:
     assert [family.title for family in MODELS.values() if family.title not in titles] == []
 
 
-@pytest.mark.parametrize("name", MODELS)
+@table("name", [*MODELS, *SHIPPED])
 def test_every_sheet_is_at_most_80_columns_wide(run: Run, name: str) -> None:
     _, out, _ = run("models", name)
     too_wide = [line for line in out.splitlines() if len(line) > 80]
     assert not too_wide
-    assert all(register in out for register in MODELS[name].registers)
+    assert all(register in out for register in find_model(name).registers)
+
+
+NOTES = """
+Where the document errs or is silent, the safest reading is taken:
+
+- The example of function 04 has the checksum of function 03's, and its reply a
+  byte count of 10H for 5 registers: a reply must have the byte count that was
+  asked for.
+- The example of function 06"""
+
+
+def test_a_sheet_leaves_indented_lines_of_notes_as_they_are(run: Run, tmp_path: Path) -> None:
+    notes = "Two words:\n    0 off\n    1 on\n* one\n* two"
+    docstring = f'"""Mine.\n\n{notes}"""'.replace("\n", "\n    ")
+    (tmp_path / "mine.py").write_text(
+        "from multidrop import Drive, reading\n\n\n"
+        f"class Mine(Drive):\n    {docstring}\n\n    speed = reading(1)\n"
+    )
+    assert run("models", f"{tmp_path / 'mine.py'}:Mine")[1].endswith(f"Mine.\n\n{notes}\n")
+
+
+def test_a_sheet_wraps_its_notes_as_paragraphs(run: Run) -> None:
+    _, out, _ = run("models", "erman-er-g-220")
+    assert NOTES in out
+    assert "no refusal.\n\nNo ranges, defaults" in out
 
 
 # ---- signals ----

@@ -151,7 +151,7 @@ def test_a_plan_reckons_with_the_time_of_switching(run: Run, tmp_path: Path) -> 
     free = json.loads(run("plan", path, "--json")[1])["lines"]["hall-1"]
     assert (free["switches"], free["switching_ms"]) == (2, 0)
     told = " ".join(run("plan", path)[1].split())
-    assert "2 times in a bus cycle the line changes its settings; what that takes a poll tells" in told
+    assert "2 times in a bus cycle the line changes its settings; `multidrop poll` tells how long" in told
     path.write_text(path.read_text().replace("port =", 'switching = "3 ms"\nport ='))
     dear = json.loads(run("plan", path, "--json")[1])["lines"]["hall-1"]
     assert dear["cycle_ms"] - free["cycle_ms"] == pytest.approx(6)

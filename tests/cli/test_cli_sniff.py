@@ -424,7 +424,7 @@ def test_mistaken_calls_are_told_in_a_sentence(run: Run, tmp_path: Path, capture
     cut = tmp_path / "cut.pcapng"
     cut.write_bytes(capture.read_bytes()[:-5])
     for words, status, sentence in (
-        (["sniff"], 2, "name a PORT to listen to, or a capture with --replay FILE"),
+        (["sniff"], 2, "name a PORT to listen to, or a capture with --replay FILE, and not both"),
         (["sniff", "--replay", capture, "--out", "a.csv"], 2, "a.csv: a capture's name ends in .pcapng"),
         (["decode", none], 2, f"{none}: No such file or directory"),
         (["decode", text], 2, f"{text} is not a capture: it does not begin like pcap or pcapng"),

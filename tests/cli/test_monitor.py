@@ -167,6 +167,14 @@ def test_history_has_a_gap_where_a_value_was_missed(watched: LivePlant) -> None:
     assert sparkline([1, 2], 0) == ""
 
 
+def test_history_is_one_register_s(tmp_path: Path) -> None:
+    live = LivePlant(a_plant(tmp_path, 1))
+    for second, values in enumerate([{"status": 3.0}, {"output_frequency": 50.0}]):
+        live.add(from_rows([row("drive-1", name, value) for name, value in values.items()]))
+        live.tick(100.0 + second, told(10, 1000, 0.9, 1))
+    assert list(live.drives[0].history) == [None, 50.0]
+
+
 # ---- how it looks ----
 
 
@@ -220,6 +228,12 @@ def test_the_least_width_has_the_age_and_all_keys(tmp_path: Path, name: str) -> 
     assert cell_len(shown[3].rstrip()) == len(shown[2].rstrip())  # in line with its heading
     for lines in (shown, texts(page(live.drives[0], {}, Position(), size, NOW))):
         assert lines[-1].endswith("s stop   S stop all   q quit")
+
+
+def test_no_heading_is_cut(watched: LivePlant) -> None:
+    widths = range(LEAST_WIDTH, 160)
+    headings = [texts(overview(watched, Position(), (width, 24), NOW, BLOCKS))[2] for width in widths]
+    assert [heading for heading in headings if "~" in heading] == []
 
 
 def test_a_wide_overview_has_long_names_whole(tmp_path: Path) -> None:
@@ -489,6 +503,21 @@ def test_a_stop_that_fails_in_any_way_is_seen(
     words = str(failure) or "RuntimeError"
     assert f"stopping all drives on hall-1 failed: {words}" in seen(monitor)
     assert f"stopping drive-1 failed: {words}" in seen(monitor)
+
+
+def test_a_stop_that_has_failed_is_not_said_to_be_repeated(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monitor, poller = a_monitor(tmp_path, monkeypatch)
+
+    def fail(*details: object) -> None:
+        monitor._show_message("the stop is repeated for 30 s at least")
+        raise OSError("no such port")
+
+    monkeypatch.setattr(poller, "perform", fail)
+    for key in "sy":
+        monitor._obey(key)
+    assert monitor._at.message == "stopping drive-1 failed"
 
 
 def test_leaving_under_a_stop_needs_a_yes_and_waits_for_it(

@@ -11,10 +11,14 @@ from typing import Any
 
 import pytest
 from gateways import Served, served
-from lines import until
+from lines import line, plant, polled, until
 
 from multidrop import NoReply
+from multidrop.drives import ErmanERG220, InvtCHE
 from multidrop.gateway import side_reads
+from multidrop.gateway.describe import describe
+from multidrop.gateway.hub import Hub
+from multidrop.gateway.rights import May
 
 MAY = '[serve.may]\nwrite = ["pump-1.setpoint"]\nverbs = ["pump-1.start"]\n'
 
@@ -50,6 +54,14 @@ def test_the_description_has_what_the_plant_file_and_the_manual_say(gateway: Ser
     for right, may in ((1, []), (2, ["pump-1.setpoint"])):
         headers = {"authorization": gateway.bearer(list(gateway.secrets)[right])}
         assert gateway.get("/api/plant", **headers).json["may"]["write"] == may
+
+
+def test_drives_of_one_line_have_their_own_speeds() -> None:
+    drives = [polled(drive, drive.readings()) for drive in (ErmanERG220(1), InvtCHE(2), InvtCHE(3))]
+    hub = Hub(plant(line("/dev/null", *drives)))
+    (told,) = describe(hub, May(), None, revision=1, version="1", is_demo=False)["lines"]
+    assert told["speed"] == "38400 8N1, 9600 8N1"
+    assert [drive["speed"] for drive in told["drives"]] == ["38400 8N1", "9600 8N1", "9600 8N1"]
 
 
 def test_a_frame_has_values_with_their_own_times(gateway: Served) -> None:

@@ -398,6 +398,16 @@ def test_the_timing_diagrams_are_what_their_tables_say(monkeypatch: pytest.Monke
         assert (DOCS / "pictures" / f"{name}.svg").read_text("utf-8") == diagrams.draw(name)
 
 
+def test_no_text_of_a_timing_diagram_leaves_its_box(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(DOCS / "pictures"))
+    diagrams = importlib.import_module("diagrams")
+    for name in diagrams.DIAGRAMS:
+        boxes = re.findall(r"<rect x=.*? width='([\d.]+)'.*?<text[^>]*>([^<]*)<", diagrams.draw(name))
+        assert boxes
+        letter = 7.0  # px, of a wide font such as DejaVu Sans
+        assert [text for width, text in boxes if len(text) * letter > float(width)] == []
+
+
 @pytest.mark.uncounted
 @pytest.mark.long
 def test_the_pages_are_built_without_a_warning(tmp_path: Path) -> None:

@@ -64,7 +64,7 @@ def plant(renamed: dict[str, str]) -> dict[str, Any]:
             "drives": [
                 {
                     "name": renamed.get(name, name), "family": FAMILIES[(2 * n + (i > 5)) % 5],
-                    "address": i + 1, "key": KEY, "registers": REGISTERS,
+                    "address": i + 1, "speed": SPEEDS[n], "key": KEY, "registers": REGISTERS,
                     "verbs": ["start", "stop", "reset_fault", "emergency_stop"],
                 }
                 for i, name in enumerate(names.split())

@@ -107,7 +107,7 @@ def test_plan_and_models_say_it_of_a_user_s_own_class_alone(
     main(["models", f"{SUPPORT / 'meter.py'}:Meter"])
     told = " ".join(capsys.readouterr().out.split())
     assert "reading all readings in 5 requests with readable_gaps" in told
-    assert "read 04H, 125 at most, as the standard has it: the class states no limit" in told
+    assert "read 04H, 125 at most, as the standard has it: the family states no limit" in told
     for model in (*MODELS, *SHIPPED):
         main(["models", model])
         told = " ".join(capsys.readouterr().out.split())

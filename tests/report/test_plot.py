@@ -472,6 +472,15 @@ def test_no_state_has_the_colour_of_a_drive(tmp_path: Path) -> None:
     assert of_bit == of_drives[1]
 
 
+def test_a_state_of_one_row_is_seen(tmp_path: Path) -> None:
+    """A pale bar of a pixel is not, without an edge."""
+    rows = [row(at, "che", "status", 3 if at == 500 else None) for at in range(1000)]
+    (axes,) = plot(states(tmp_path, rows))[0].axes
+    (bars,) = axes.collections
+    assert bars.get_linewidth()[0] > 0
+    assert sum(bars.get_edgecolor()[0][:3]) < 1.5  # grey, and darker than half
+
+
 def test_bits_are_a_lane_each_and_not_a_sum(tmp_path: Path) -> None:
     rows = [row(at, "yd", "status", value) for at, value in enumerate((0, 16, 18, 2, 2 + 64, 1e308, 0.5, 0))]
     (axes,) = plot(states(tmp_path, rows))[0].axes
@@ -544,6 +553,14 @@ def test_what_has_no_room_is_named(run: Run, tmp_path: Path) -> None:
         f"{tmp_path}/it.png\nnot shown: r{MOST_PANELS}; r{MOST_PANELS + 1} (choose with --register)\n",
         "",
     )
+
+
+@pytest.mark.usefixtures("_unpainted")
+def test_what_has_no_room_is_named_once(tmp_path: Path) -> None:
+    """Numbers and states of one name are two panels."""
+    rows = [row(0, "pump", f"r{number}", 1) for number in range(MOST_PANELS)]
+    rows += [row(0, drive, "status", 1) for drive in ("pump", "che")]
+    assert plot(states(tmp_path, rows))[1] == ["status"]
 
 
 @pytest.mark.usefixtures("_unpainted")

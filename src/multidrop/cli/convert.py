@@ -12,8 +12,8 @@ from multidrop.recording import FORMATS, convert, open_reader
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("source", metavar="A", type=Path, help="a recording; its end may be missing")
-    parser.add_argument("target", metavar="B", type=Path, help=f"a new file: {', '.join(FORMATS)}")
+    parser.add_argument("source", metavar="RECORDING", type=Path, help="its end may be missing")
+    parser.add_argument("target", metavar="FILE", type=Path, help=f"a new file: {', '.join(FORMATS)}")
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -128,7 +128,8 @@ def _switching(plan: _PredictedLine) -> str:
     times = f"{plan.prediction.switches} times in a bus cycle the line changes its settings"
     if plan.line.switching:
         return f"{times}, {duration_text(plan.line.switching)} each"
-    return f'{times}; what that takes a poll tells: add it to the line, such as switching = "2 ms"'
+    how_long = "`multidrop poll` tells how long that takes"
+    return f'{times}; {how_long}: add it to the line, such as switching = "2 ms"'
 
 
 def _row(rate: Rate) -> Row:

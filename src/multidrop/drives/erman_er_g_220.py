@@ -115,7 +115,6 @@ class ErmanERG220(Drive):
       a kept START through. START is written off even where nobody confirms a stop: either may get through.
     - Exception 03 is used for any bad address and 04 says "on write": neither is a device failure.
     - The models -03 and -04 of the same make have another map: see `identify`.
-
     - A setpoint is written between the minimum and the maximum frequency, for which the drive has no
       refusal.
 

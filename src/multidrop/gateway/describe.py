@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Sequence
 from enum import Flag
 from typing import Any, cast
@@ -47,11 +46,11 @@ def describe(
 
 
 def _line(hub: Hub, line: PlantLine) -> dict[str, Any]:
-    speeds = Counter(str(polled.drive.settings) for polled in line.drives)
+    speeds = dict.fromkeys(str(polled.drive.settings) for polled in line.drives)
     return {
         "name": line.name,
         "port": line.port,
-        "speed": speeds.most_common(1)[0][0] if speeds else "",
+        "speed": ", ".join(speeds),
         "drives": [_drive(hub, polled) for polled in line.drives],
     }
 
@@ -64,6 +63,7 @@ def _drive(hub: Hub, polled: PolledDrive) -> dict[str, Any]:
         "family": drive.model or type(drive).__name__,
         "title": drive.title,
         "address": drive.address,
+        "speed": str(drive.settings),
         "key": _key_registers(drive, periods),
         "registers": [
             _register(register)

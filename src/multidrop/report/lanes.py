@@ -104,14 +104,12 @@ def draw_lanes(axes: Axes, lanes: Sequence[Lane], recording: Recording) -> None:
     span = max(recording.end - recording.begin, 1)
     shown: set[str] = set()
     for row, lane in enumerate(lanes):
-        of_drive = {"facecolor": line_style(recording.drives.index(lane.drive))["color"]}
+        of_drive = {"facecolor": line_style(recording.drives.index(lane.drive))["color"], "linewidth": 0}
         for name in _longest_first(lane):
             begin, end = _merged(lane, name, span)
             widths = np.maximum(end - begin, span * NARROWEST)
             bars = list(zip(days(begin), widths / 86400e9, strict=True))
-            axes.broken_barh(
-                bars, (row - 0.36, 0.72), linewidth=0, **(of_drive if lane.is_bit else styles[name])
-            )
+            axes.broken_barh(bars, (row - 0.36, 0.72), **(of_drive if lane.is_bit else styles[name]))
             if not lane.is_bit:
                 text = label(name).lower()
                 fitting = begin[widths > span * LETTER * (len(text) + 2)][:MOST_TEXTS]
@@ -138,7 +136,7 @@ def name_bar(axes: Axes, text: str, at: float, row: int) -> None:
 
 def _style(number: int) -> dict[str, Any]:
     hatch = HATCHES[number // len(COLOURS) % len(HATCHES)]
-    return {"facecolor": COLOURS[number % len(COLOURS)], "hatch": hatch, "edgecolor": TEXT}
+    return {"facecolor": COLOURS[number % len(COLOURS)], "hatch": hatch, "edgecolor": TEXT, "linewidth": 0.5}
 
 
 def _longest_first(lane: Lane) -> list[str]:

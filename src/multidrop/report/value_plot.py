@@ -102,7 +102,7 @@ def plot(
     label_time(axes[-1])
     axes[-1].set_xlim(day(recording.begin), day(max(recording.end, recording.begin + 1_000_000)))
     _add_drives(figure, contents, recording, has_misses=any(series.missed.any() for series in chosen))
-    return figure, [panel.title for panel in panels[len(shown) :]]
+    return figure, list(dict.fromkeys(panel.title for panel in panels[len(shown) :]))
 
 
 # ---- what is shown ----

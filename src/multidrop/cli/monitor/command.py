@@ -280,6 +280,7 @@ class Monitor:
         try:
             self._at.message, failures = work()
         except Exception as failure:  # any failure of a stop must be seen
+            self._at.message = f"{what} failed"
             failures = [f"{what} failed: {str(failure) or type(failure).__name__}"]
         clock = datetime.now(UTC)
         self._at.failures += [f"{clock:%H:%M:%S} {failure}" for failure in failures]

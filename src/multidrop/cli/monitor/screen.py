@@ -142,7 +142,7 @@ def _columns(plant: LivePlant, width: int) -> dict[str, int]:
     if width >= WIDE:
         columns["DELAY"] = 8
     left = max(0, width - 1 - sum(columns.values()) - len(columns))
-    more = min(left // 3, 26) if left >= len("HISTORY") else left
+    more = min(left // 3, left - len("HISTORY"), 26) if left >= len("HISTORY") else left
     columns["FAULT"] += more
     if left > more:
         columns["HISTORY"] = left - more

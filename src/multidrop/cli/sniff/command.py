@@ -41,7 +41,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     if (arguments.port is None) == (arguments.replay is None):
-        raise ValueError("name a PORT to listen to, or a capture with --replay FILE")
+        raise ValueError("name a PORT to listen to, or a capture with --replay FILE, and not both")
     if arguments.out:
         check_capture(arguments.out)
     plant = load_plant(arguments.plant) if arguments.plant else None

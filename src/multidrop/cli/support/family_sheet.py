@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import re
 from collections.abc import Iterator
 from enum import Flag
 from typing import Any
@@ -35,13 +36,16 @@ def sheet(family: type[Drive]) -> str:
             for name, meaning in entries.items():
                 lines += wrapped(meaning, f"  {name:<{width}}  ", " " * 8)
     for table in dict.fromkeys(register.table for register in family.registers.values()):
-        lines += ["", _table_heading(table, family), *_registers(family, table)]
+        lines += ["", *wrapped(_table_heading(table, family), "", "  "), *_registers(family, table)]
     if family.texts:
         lines += ["", "texts (read on demand)", *aligned(map(_text_row, family.texts.values()), "<<<<<")]
-    if family.__doc__:
+    notes = inspect.cleandoc(family.__doc__ or "")
+    for block in notes.split("\n\n") if notes else ():
         lines.append("")
-        for line in inspect.cleandoc(family.__doc__).splitlines():
-            lines += wrapped(line) or [""]
+        for paragraph in re.split(r"\n(?=[-*] |    )", block):  # an indented line is one that stays a line
+            item = "  " if paragraph[:2] in ("- ", "* ") else ""
+            first = " " * (len(paragraph) - len(paragraph.lstrip()))
+            lines += wrapped(" ".join(paragraph.split()), first, first + item)
     return "\n".join(lines)
 
 
@@ -124,7 +128,7 @@ def _table_heading(table: Table, family: type[Drive]) -> str:
     codes = []
     if table.read is not None:
         is_stated = stated_limit(family, table) or table.carrier not in (Carrier.BIT, Carrier.WORD)
-        stated = "" if is_stated else ", as the standard has it: the class states no limit"
+        stated = "" if is_stated else ", as the standard has it: the family states no limit"
         codes.append(f"read {table.read:02X}H, {read_limit(family, table)} at most{stated}")
     if table.write is not None:
         codes.append(f"write {table.write:02X}H")

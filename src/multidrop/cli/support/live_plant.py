@@ -93,8 +93,9 @@ class LiveDrive:
         return not row.value and values is not None and issubclass(values, Flag)
 
     def remember(self) -> None:
-        """Add a point of history: the frequency, or the register polled first."""
-        name = FREQUENCY if FREQUENCY in self.newest else next(iter(self.newest), "")
+        """Add a point of history: the frequency where it is polled, else the register polled first."""
+        polled = [poll.register.name for poll in self.polled.polls]
+        name = FREQUENCY if FREQUENCY in polled else next(iter(polled), "")
         fresh = name in self.newest and name not in self.missed
         self.history.append(self.newest[name].value if fresh else None)
 

@@ -56,7 +56,7 @@ function build({ spec, line }) {
   const where = [
     `${spec.family} · address ${spec.address} on `,
     named(line.name),
-    line.speed ? ` · ${line.speed}` : "",
+    ` · ${spec.speed}`,
   ];
   const keys = KEYS.filter(([part]) => spec.key?.[part]).map(([part, title]) => {
     const value = makeValue();
