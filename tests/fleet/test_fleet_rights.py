@@ -271,6 +271,7 @@ def test_without_tls_there_is_a_warning(run: Run, tmp_path: Path) -> None:
         (["gw-1,gw.2"], "the gateway's name 'gw.2' may have letters"),
         (["gw-1,operator"], "'operator' is there twice"),
         (["gw-1", "--ca", "ca.pem"], "TLS needs all of --ca, --cert and --key: paths on the servers"),
+        (["gw-1", "--nats", "tls://a:4222"], "tls://a:4222 needs all of --ca, --cert and --key"),
         (["gw-1", "--nats", "nats://a:64000"], "nats://a:64000 is no address of a NATS server"),
         (["gw-1", "--nats", "nats://a:port"], "nats://a:port is no address of a NATS server"),
     ],

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -37,7 +38,7 @@ def run(arguments: argparse.Namespace) -> int:
     if not gateways:
         raise ValueError("name all gateways, such as `multidrop fleet rights gw-1,gw-2,gw-3`")
     folder, urls = arguments.folder, urls_of(arguments)
-    tls = _tls(arguments)
+    tls = _tls(arguments, urls)
     written = write_files(folder, gateways, urls, tls)
     if arguments.json:
         print_text(json.dumps([str(path) for path in written], indent=2))
@@ -51,12 +52,13 @@ def run(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _tls(arguments: argparse.Namespace) -> TlsFiles | None:
+def _tls(arguments: argparse.Namespace, urls: Sequence[str]) -> TlsFiles | None:
     from multidrop.fleet.server_files import TlsFiles
 
     files = (arguments.cert, arguments.key, arguments.ca)
-    if not any(files):
+    secure = next((url for url in urls if url.startswith("tls:")), "TLS" if any(files) else None)
+    if secure is None:
         return None
     if not all(files):
-        raise ValueError("TLS needs all of --ca, --cert and --key: paths on the servers")
+        raise ValueError(f"{secure} needs all of --ca, --cert and --key: paths on the servers")
     return TlsFiles(*files)
