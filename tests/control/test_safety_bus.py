@@ -786,6 +786,70 @@ def test_a_ramp_without_a_known_acceleration_needs_a_rate(monkeypatch: pytest.Mo
     assert [int(each[12:17].replace(" ", ""), 16) for each in line.written] == [200, 400]  # 0.01 % of 50 Hz
 
 
+@pytest.mark.parametrize("model", ["yd1000", "invt-che", "innovert-ibd"])
+def test_nothing_of_a_ramp_to_what_the_drive_does_not_take_is_sent(
+    monkeypatch: pytest.MonkeyPatch, model: str
+) -> None:
+    line, drive, _ = one(monkeypatch, MAKE[model](1))
+    drive.set_frequency(10)
+    line.frames.clear()
+    for hz in (5000.0, -5.0, float("inf"), float("nan")):
+        with pytest.raises(ValueError, match="Hz|finite"):
+            ramp(drive, hz, rate=5.0)
+    assert line.written == []
+    ramp(drive, 11, rate=5.0)
+    assert len(line.written) == 1
+
+
+def test_a_ramp_looks_at_the_drive_s_own_limit_first(monkeypatch: pytest.MonkeyPatch) -> None:
+    line, drive, _ = one(monkeypatch, YD1000(1))
+    drive.set_frequency(10)
+    line.frames.clear()
+    with pytest.raises(Refused, match=r"82\.50 Hz is above maximum_frequency, which is 80 Hz"):
+        ramp(drive, 82.5)
+    assert line.written == []
+
+
+class ShareToy(Toy):
+    """Its setpoint is a share of what its class does not tell."""
+
+    share = setting(0x16, "%", step=0.01, span=(0, 100), kept=Kept.RAM)
+    setpoint_name = "share"
+
+    @verb
+    def set_frequency(self, hz: float) -> Script[None]:
+        yield from self._hold(self.share, hz / 80 * 100)
+
+
+def test_a_ramp_of_a_share_of_nobody_knows_what_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    line = SimulatedBus(monkeypatch, simulated(ShareToy(1)))
+    with pytest.raises(Refused, match=r"is in %: a ramp needs maximum_frequency, which is not declared"):
+        ramp(line.attach(ShareToy(1, name="toy")), 20.0, rate=5.0)
+    assert line.written == []
+
+
+class AliasToy(Toy):
+    """Its setpoint is kept in EEPROM, and written to an address that is not."""
+
+    frequency = setting(0x15, "Hz", step=0.01, span=(0, 50), kept=Kept.EEPROM, ram_address=0x115)
+
+    @verb
+    def set_frequency(self, hz: float) -> Script[None]:
+        yield from self._hold(self.frequency, hz)
+
+
+def test_a_ramp_by_an_alias_in_ram_wears_nothing(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    line = SimulatedBus(monkeypatch, simulated(AliasToy(1)), ledger=tmp_path / "wear.sqlite")
+    toy = line.attach(AliasToy(1))
+    ramp(toy, 10, rate=8.0)
+    assert [frame[:17] for frame in line.written] == [
+        "01 06 01 15 01 90",
+        "01 06 01 15 03 20",
+        "01 06 01 15 03 E8",
+    ]
+    assert Ledger(tmp_path / "wear.sqlite").wear(0) == []
+
+
 def test_a_ramp_from_a_setpoint_that_nobody_knows_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     line = SimulatedBus(monkeypatch)
     toy = line.attach(Toy(1, name="toy"))
