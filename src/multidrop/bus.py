@@ -59,7 +59,7 @@ class Bus:
     and all writes are noted in the file `audit`.
 
     A write is not sent when it is late by `expiry` seconds: since the verb was called, but for the time that
-    its own reads may take. It is not sent either once a stop was called: that ends all that may move a motor
+    its own steps may take. It is not sent either once a stop was called: that ends all that may move a motor
     and was called before it, on any thread, with Overtaken. A drive is on one bus at a time. Leaving the
     `with` block, or closing, waits for the stops that are under way and closes the port; it sends nothing,
     unless `stop_on_exit` was called, and nothing that moves a motor is sent after it.

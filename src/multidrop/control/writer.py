@@ -161,7 +161,8 @@ class Writer:
         expires_ns = call.expires_ns
         before, call.sent, call.is_confirmed = (call.sent, call.is_confirmed), what, False
         try:
-            completion = self._exchanges.carry_out(drive, request, expires_ns, permit=call.permit)
+            with call.look():
+                completion = self._exchanges.carry_out(drive, request, expires_ns, permit=call.permit)
         except NotMaster as failure:
             if not failure.is_sent:
                 call.sent, call.is_confirmed = before
