@@ -736,6 +736,16 @@ def test_a_staggered_start_stops_what_it_started_at_the_first_failure(
     assert all_stopped(line, sims)
 
 
+def test_a_gap_that_is_no_time_starts_no_motor(monkeypatch: pytest.MonkeyPatch) -> None:
+    line, drive, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
+    drive.set_frequency(20)
+    line.frames.clear()
+    for gap in (-1.0, float("nan"), float("inf")):
+        with pytest.raises(ValueError, match=r"^gap = .* s is no time between two starts$"):
+            start_staggered([drive, drive], gap)
+    assert line.frames == []
+
+
 def test_all_that_was_started_is_stopped_though_the_system_gives_no_thread(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -6,6 +6,7 @@ import threading
 from collections.abc import Sequence
 from contextlib import suppress
 from contextvars import copy_context
+from math import inf
 
 from multidrop.control.rules import conditions, raw_count, wears
 from multidrop.drive.family import Drive
@@ -22,6 +23,8 @@ def start_staggered(drives: Sequence[Drive], gap: float, direction: Direction | 
     When one fails, it and all that were started before are stopped, and its failure is raised. None is
     started whose stop was called, on any thread, after this call began.
     """
+    if not 0 <= gap < inf:
+        raise ValueError(f"gap = {gap:g} s is no time between two starts")
     calls = [drive.begin_call("start") for drive in drives]
     for number, (drive, call) in enumerate(zip(drives, calls, strict=True)):
         try:
