@@ -804,7 +804,7 @@ def test_nothing_of_a_ramp_to_what_the_drive_does_not_take_is_sent(
     drive.set_frequency(10)
     line.frames.clear()
     for hz in (5000.0, -5.0, float("inf"), float("nan")):
-        with pytest.raises(ValueError, match="Hz|finite"):
+        with pytest.raises(ValueError, match=r"Hz|finite"):
             ramp(drive, hz, rate=5.0)
     assert line.written == []
     ramp(drive, 11, rate=5.0)
