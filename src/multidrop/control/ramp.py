@@ -25,6 +25,8 @@ def start_staggered(drives: Sequence[Drive], gap: float, direction: Direction | 
     """
     if not 0 <= gap < inf:
         raise ValueError(f"gap = {gap:g} s is no time between two starts")
+    for drive in drives:
+        drive.check_confirmed("start")
     calls = [drive.begin_call("start") for drive in drives]
     for number, (drive, call) in enumerate(zip(drives, calls, strict=True)):
         try:
@@ -80,6 +82,7 @@ def ramp(drive: Drive, hz: float, *, rate: float | None = None, every: float = 0
 def _ramp(drive: Drive, hz: float, rate: float | None, every: float) -> Script[None]:
     if not every > 0:
         raise ValueError(f"every = {every:g} s is not above 0")
+    drive.check_confirmed("set_frequency")
     register = drive.register(drive.setpoint_name)
     if wears(drive, register) is not Kept.RAM:
         raise Refused(f"the setpoint of {drive.name} may be kept in EEPROM, which a ramp would wear out")

@@ -13,7 +13,7 @@ from multidrop.control.echo_check import EchoCheck
 from multidrop.control.identity import IdentityCheck
 from multidrop.control.outcome import Effect, Outcome
 from multidrop.control.records import WriteRecords
-from multidrop.control.rules import conditions, raw_count, wears
+from multidrop.control.rules import check_known, conditions, raw_count, wears
 from multidrop.core import Completion, Failure, Message, build_request
 from multidrop.drive.family import Drive
 from multidrop.drive.register import Register
@@ -57,6 +57,7 @@ class Writer:
         register, value = step.register, step.value
         raw = raw_count(drive, register, value)
         asked = register.decode(raw)
+        check_known(drive, register, raw)
         self.identity_check.check(drive, call.look)
         carry_out(conditions(drive, register, asked), lambda step: self._look(drive, step, call))
         kept = wears(drive, register)
