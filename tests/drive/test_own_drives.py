@@ -187,7 +187,7 @@ def test_nor_is_it_commanded_by_what_is_made_of_verbs(monkeypatch: pytest.Monkey
 
     line = SimulatedBus(monkeypatch, simulated(Combined(1)))
     pump = line.attach(Combined(1, name="pump"))
-    with pytest.raises(Refused, match="is not sent to pump: .*declare confirmed = 1"):
+    with pytest.raises(Refused, match=r"is not sent to pump: .*declare confirmed = 1"):
         command_it(pump)
     assert line.frames == []
     line.bus.detach(pump)
