@@ -820,6 +820,35 @@ def test_a_ramp_looks_at_the_drive_s_own_limit_first(monkeypatch: pytest.MonkeyP
     assert line.written == []
 
 
+def test_a_ramp_goes_on_from_a_setpoint_that_was_plainly_written(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It cannot be read: from the one of set_frequency it would be a jump."""
+    line, drive, _ = one(monkeypatch, InnovertIBD(1, confirmed=1))
+    drive.set_frequency(40)
+    line.bus.write(drive, drive.frequency, 10.0)
+    line.frames.clear()
+    ramp(drive, 14, rate=4.0)
+    assert [int(each[12:17].replace(" ", ""), 16) / 100 for each in line.written] == [12.0, 14.0]
+
+
+def test_a_ramp_goes_on_from_no_setpoint_that_is_in_doubt(monkeypatch: pytest.MonkeyPatch) -> None:
+    line, drive, _ = one(monkeypatch, InnovertIBD(1, confirmed=1))
+    drive.set_frequency(40)
+    line.loses = is_write
+    with pytest.raises(Unconfirmed):
+        line.bus.write(drive, drive.frequency, 10.0)
+    for act in (lambda: ramp(drive, 14, rate=4.0), drive.start):
+        with pytest.raises(Refused, match="cannot say its setpoint"):
+            act()
+
+
+def test_a_ramp_goes_on_from_no_setpoint_before_a_broadcast(monkeypatch: pytest.MonkeyPatch) -> None:
+    line, drive, _ = one(monkeypatch, InnovertIBD(1, confirmed=1))
+    drive.set_frequency(40)
+    line.bus.broadcast(drive.frequency, 0)
+    with pytest.raises(Refused, match="cannot say its setpoint"):
+        ramp(drive, 14, rate=4.0)
+
+
 class ShareToy(Toy):
     """Its setpoint is a share of what its class does not tell."""
 

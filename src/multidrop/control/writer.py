@@ -96,6 +96,8 @@ class Writer:
         why = self._echo.why_doubtful(drive)
         if not why:
             return outcome
+        if outcome.register.name == drive.setpoint_name:
+            drive.commanded = None
         unknown = Unconfirmed(drive.name, _in_words(outcome.register, outcome.asked), why)
         return replace(outcome, effect=Effect.UNCONFIRMED, failure=unknown)
 
@@ -141,12 +143,17 @@ class Writer:
         request, asked = write_request(drive, register, raw), register.decode(raw)
         what = _in_words(register, asked)
         log = self.records.log if call else self.records.log_later
+        is_setpoint = register.name == drive.setpoint_name
+        if is_setpoint:
+            drive.commanded = None  # until it is known, also where a plain write changes it
         with self._logged(drive, request, what, log):
             completion = self._carry_out(drive, request, what, call, timeout)
             outcome = self._outcome(drive, register, asked, completion, call)
             is_unconfirmed = outcome.effect is Effect.UNCONFIRMED
             if is_unconfirmed and build_request(drive.framing, request) in completion.raw:
                 self._echo.probe(drive, insists=call is None)
+        if is_setpoint and outcome.effect is Effect.DONE:
+            drive.commanded = outcome.value
         if call:
             call.is_confirmed = not is_unconfirmed
             call.unverified = outcome
