@@ -118,7 +118,7 @@ static int may_have_news(const struct md_port *port)
     return port->turn.whose == MD_NOBODYS || port->turn.line.listened_ns;
 }
 
-/* A network's far end that is gone is a lost port, and not the end of a process that has SIGPIPE's default. */
+/* A far end that is gone is a lost port, and not the end of a process that has SIGPIPE's default. */
 static void bear_broken_pipes(void)
 {
 #ifndef _WIN32

@@ -81,8 +81,8 @@ static void *take_calls(void *argument)
     return NULL;
 }
 
-/* A program may have given SIGPIPE its default back, which is its death: a far end that hears nothing any more
- * ends the port alone. */
+/* A program may have given SIGPIPE its default back, which is its death: a far end that is gone ends the port
+ * alone. */
 static void check_a_broken_pipe_is_a_lost_port(void)
 {
     struct subject subject;
