@@ -381,6 +381,7 @@ class Bus:
         and on SIGHUP, of a terminal that is closed, unless the program handles or ignores that one.
         The signal is held until that is done, and then does what it did before; three within a second cut
         it short, with a message on standard error. From the signal on nothing that moves a motor is sent.
+        Python handles it in the main thread: where that waits for a reply, when it has come or timed out.
         Without this call leaving sends nothing: the motors go on as they are. Call it from the main thread.
         """
         self._leaving.stop_on_exit()
