@@ -5,6 +5,7 @@
 
 #include <errno.h>
 #include <sched.h>
+#include <signal.h>
 #include <stdlib.h>
 #ifdef __linux__
 #include <sys/prctl.h>
@@ -117,11 +118,23 @@ static int may_have_news(const struct md_port *port)
     return port->turn.whose == MD_NOBODYS || port->turn.line.listened_ns;
 }
 
+/* A far end that is gone is a lost port, and not the end of a process that has SIGPIPE's default. */
+static void bear_broken_pipes(void)
+{
+#ifndef _WIN32
+    sigset_t pipes;
+    sigemptyset(&pipes);
+    sigaddset(&pipes, SIGPIPE);
+    pthread_sigmask(SIG_BLOCK, &pipes, NULL);
+#endif
+}
+
 static void *run(void *argument)
 {
     struct md_engine *engine = argument;
     void *ready[READY];
     int is_woken;
+    bear_broken_pipes();
 #ifdef __linux__
     prctl(PR_SET_TIMERSLACK, 1UL, 0UL, 0UL, 0UL); /* the default is 50 us */
 #endif

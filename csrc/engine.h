@@ -33,7 +33,7 @@ struct md_port {
     struct md_rs485 rs485;
     struct md_turn turn;
 
-    int is_unheard;       /* another master may have been since the last request */
+    uint32_t heard_term;  /* of its mastership, before which it was listened to last */
     struct md_port *next; /* of those that wait to be opened */
     int is_opened, open_error, is_closed;
 };
@@ -57,6 +57,7 @@ struct md_engine {
 struct md_mastership {
     int64_t until_ns;         /* of CLOCK_BOOTTIME; read and written atomically; 0: it does not hold */
     int64_t guard_ns;         /* from the end of one master to the beginning of the next */
+    uint32_t term;            /* how often it began to hold: another may have been master before each */
     struct md_engine *engine; /* that looks at it; NULL: none does yet */
 #ifdef __linux__
     timer_t timer;

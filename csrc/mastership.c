@@ -83,11 +83,14 @@ int md_mastership_holds(const struct md_mastership *mastership)
     return until_ns && md_boottime_ns() < until_ns;
 }
 
-/* The timer comes first: no request leaves by a deadline that nobody watches. */
+/* The timer comes first: no request leaves by a deadline that nobody watches. Then the term, before the
+ * deadline: none leaves by a new one before the line was listened to. */
 int md_mastership_extend(struct md_mastership *mastership, int64_t until_ns, int64_t kill_ns)
 {
     if (set_timer(mastership, kill_ns))
         return -1;
+    if (!md_mastership_holds(mastership))
+        __atomic_add_fetch(&mastership->term, 1, __ATOMIC_SEQ_CST);
     __atomic_store_n(&mastership->until_ns, until_ns, __ATOMIC_SEQ_CST);
     return 0;
 }

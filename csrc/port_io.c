@@ -53,13 +53,13 @@ static int may_send(struct md_port *port)
 {
     struct md_line *line = &port->turn.line;
     if (!md_mastership_holds(port->mastership)) {
-        port->is_unheard = 1;
         md_line_abandon(line, MD_NOT_MASTER, 0);
         return 0;
     }
-    if (!port->is_unheard || line->exchange->insists)
+    uint32_t term = md_load(&port->mastership->term);
+    if (port->heard_term == term || line->tx_at > 0 || line->exchange->insists)
         return 1;
-    port->is_unheard = 0;
+    port->heard_term = term;
     return !md_listen_begin(line, md_now_ns(), port->mastership->guard_ns);
 }
 

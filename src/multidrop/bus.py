@@ -59,7 +59,7 @@ class Bus:
     and all writes are noted in the file `audit`.
 
     A write is not sent when it is late by `expiry` seconds: since the verb was called, but for the time that
-    its own reads may take. It is not sent either once a stop was called: that ends all that may move a motor
+    its own steps may take. It is not sent either once a stop was called: that ends all that may move a motor
     and was called before it, on any thread, with Overtaken. A drive is on one bus at a time. Leaving the
     `with` block, or closing, waits for the stops that are under way and closes the port; it sends nothing,
     unless `stop_on_exit` was called, and nothing that moves a motor is sent after it.
@@ -381,6 +381,7 @@ class Bus:
         and on SIGHUP, of a terminal that is closed, unless the program handles or ignores that one.
         The signal is held until that is done, and then does what it did before; three within a second cut
         it short, with a message on standard error. From the signal on nothing that moves a motor is sent.
+        Python handles it in the main thread: where that waits for a reply, when it has come or timed out.
         Without this call leaving sends nothing: the motors go on as they are. Call it from the main thread.
         """
         self._leaving.stop_on_exit()

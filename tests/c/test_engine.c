@@ -2,6 +2,7 @@
 #include "internal.h"
 
 #include <assert.h>
+#include <errno.h>
 #include <fcntl.h>
 #include <pthread.h>
 #include <string.h>
@@ -80,11 +81,34 @@ static void *take_calls(void *argument)
     return NULL;
 }
 
+/* A program may have given SIGPIPE its default back, which is its death: a far end that is gone ends the port
+ * alone. */
+static void check_a_broken_pipe_is_a_lost_port(void)
+{
+    struct subject subject;
+    struct md_completion found;
+    int ends[2];
+    make(&subject);
+    int made = socketpair(AF_UNIX, SOCK_STREAM, 0, ends);
+    assert(made == 0);
+    fcntl(ends[0], F_SETFL, O_NONBLOCK);
+    shutdown(ends[1], SHUT_RD);
+    struct md_port *port = md_port_open(engine, ends[0], -1, MD_NO_TRANSACTIONS, ROOM);
+    assert(port);
+    md_port_carry_out(port, &subject.exchange, 0, 0, &found, NULL);
+    assert(found.result == MD_LINE_LOST && found.error == EPIPE && !found.sent_ns);
+    md_port_stop(port);
+    md_port_free(port);
+    close(ends[0]);
+    close(ends[1]);
+}
+
 int main(void)
 {
     engine = md_engine_start();
     row_queue = md_row_queue_new(16, 2);
     assert(engine && row_queue);
+    check_a_broken_pipe_is_a_lost_port();
     pthread_t clients[CLIENTS], taker;
     uint32_t numbers[CLIENTS];
     pthread_create(&taker, NULL, take_calls, NULL);

@@ -136,16 +136,36 @@ static void check_sent(const struct md_exchange *exchange)
     assert(atomic_load(&looks_written) > before);
 }
 
-/* 256 characters of 0.1 ms, and 5 ms. */
-static void check_listens_first(void)
+static void check_listens_no_more(void)
 {
-    struct md_completion found = carry_out(&reading);
-    assert(found.sent_ns - found.begun_ns >= 30 * MS && atomic_load(&written) == REQUEST);
+    struct md_completion found;
     int tries = 0;
     do /* a busy machine may hold one up for as long */
         found = carry_out(&reading);
     while (found.sent_ns - found.begun_ns >= 30 * MS && tries++ < 20);
     assert(found.sent_ns - found.begun_ns < 30 * MS);
+}
+
+/* 256 characters of 0.1 ms, and 5 ms. */
+static void check_listens_first(void)
+{
+    struct md_completion found = carry_out(&reading);
+    assert(found.sent_ns - found.begun_ns >= 30 * MS && atomic_load(&written) == REQUEST);
+    check_listens_no_more();
+}
+
+/* Nothing was asked while it did not hold: another may have been master all the same. */
+static void check_listens_after_a_lapse(void)
+{
+    extend(1000);
+    atomic_fetch_add(&boottime_ns, 1000);
+    extend(1000);
+    check_listens_first();
+    md_mastership_end(mastership);
+    extend(1000);
+    check_listens_first();
+    extend(2000); /* before its end: nobody was master meanwhile */
+    check_listens_no_more();
 }
 
 /* A master before us may send for so long. */
@@ -266,6 +286,7 @@ int main(void)
     extend(1000);
     check_sent(&stop);
     check_listens_first();
+    check_listens_after_a_lapse();
     check_guard_comes_first();
     check_deadline();
     check_rest_is_held_back();

@@ -366,6 +366,12 @@ def test_a_line_in_trouble_does_not_fill_the_disk(tmp_path: Path, monkeypatch: p
     )
 
 
+@pytest.mark.parametrize("most_files", [0, -1])
+def test_a_recorder_that_may_keep_no_file_is_refused(tmp_path: Path, most_files: int) -> None:
+    with pytest.raises(ValueError, match=f"most_files = {most_files} would keep no capture"):
+        FlightRecorder(tmp_path, ["hall-1"], most_files=most_files)
+
+
 def test_no_more_is_kept_in_memory_than_allowed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     one_flight = Flight(tmp_path, monkeypatch, most_bytes=1000)
     one_flight.pass_(200, "hall-1: the port was lost")

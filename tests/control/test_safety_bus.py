@@ -736,6 +736,16 @@ def test_a_staggered_start_stops_what_it_started_at_the_first_failure(
     assert all_stopped(line, sims)
 
 
+def test_a_gap_that_is_no_time_starts_no_motor(monkeypatch: pytest.MonkeyPatch) -> None:
+    line, drive, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
+    drive.set_frequency(20)
+    line.frames.clear()
+    for gap in (-1.0, float("nan"), float("inf")):
+        with pytest.raises(ValueError, match=r"^gap = .* s is no time between two starts$"):
+            start_staggered([drive, drive], gap)
+    assert line.frames == []
+
+
 def test_all_that_was_started_is_stopped_though_the_system_gives_no_thread(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -784,6 +794,99 @@ def test_a_ramp_without_a_known_acceleration_needs_a_rate(monkeypatch: pytest.Mo
         ramp(drive, 20.0)
     ramp(drive, 2.0, rate=2.0)
     assert [int(each[12:17].replace(" ", ""), 16) for each in line.written] == [200, 400]  # 0.01 % of 50 Hz
+
+
+@pytest.mark.parametrize("model", ["yd1000", "invt-che", "innovert-ibd"])
+def test_nothing_of_a_ramp_to_what_the_drive_does_not_take_is_sent(
+    monkeypatch: pytest.MonkeyPatch, model: str
+) -> None:
+    line, drive, _ = one(monkeypatch, MAKE[model](1))
+    drive.set_frequency(10)
+    line.frames.clear()
+    for hz in (5000.0, -5.0, float("inf"), float("nan")):
+        with pytest.raises(ValueError, match=r"Hz|finite"):
+            ramp(drive, hz, rate=5.0)
+    assert line.written == []
+    ramp(drive, 11, rate=5.0)
+    assert len(line.written) == 1
+
+
+def test_a_ramp_looks_at_the_drive_s_own_limit_first(monkeypatch: pytest.MonkeyPatch) -> None:
+    line, drive, _ = one(monkeypatch, YD1000(1))
+    drive.set_frequency(10)
+    line.frames.clear()
+    with pytest.raises(Refused, match=r"82\.50 Hz is above maximum_frequency, which is 80 Hz"):
+        ramp(drive, 82.5)
+    assert line.written == []
+
+
+def test_a_ramp_goes_on_from_a_setpoint_that_was_plainly_written(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It cannot be read: from the one of set_frequency it would be a jump."""
+    line, drive, _ = one(monkeypatch, InnovertIBD(1, confirmed=1))
+    drive.set_frequency(40)
+    line.bus.write(drive, drive.frequency, 10.0)
+    line.frames.clear()
+    ramp(drive, 14, rate=4.0)
+    assert [int(each[12:17].replace(" ", ""), 16) / 100 for each in line.written] == [12.0, 14.0]
+
+
+def test_a_ramp_goes_on_from_no_setpoint_that_is_in_doubt(monkeypatch: pytest.MonkeyPatch) -> None:
+    line, drive, _ = one(monkeypatch, InnovertIBD(1, confirmed=1))
+    drive.set_frequency(40)
+    line.loses = is_write
+    with pytest.raises(Unconfirmed):
+        line.bus.write(drive, drive.frequency, 10.0)
+    for act in (lambda: ramp(drive, 14, rate=4.0), drive.start):
+        with pytest.raises(Refused, match="cannot say its setpoint"):
+            act()
+
+
+def test_a_ramp_goes_on_from_no_setpoint_before_a_broadcast(monkeypatch: pytest.MonkeyPatch) -> None:
+    line, drive, _ = one(monkeypatch, InnovertIBD(1, confirmed=1))
+    drive.set_frequency(40)
+    line.bus.broadcast(drive.frequency, 0)
+    with pytest.raises(Refused, match="cannot say its setpoint"):
+        ramp(drive, 14, rate=4.0)
+
+
+class ShareToy(Toy):
+    """Its setpoint is a share of what its class does not tell."""
+
+    share = setting(0x16, "%", step=0.01, span=(0, 100), kept=Kept.RAM)
+    setpoint_name = "share"
+
+    @verb
+    def set_frequency(self, hz: float) -> Script[None]:
+        yield from self._hold(self.share, hz / 80 * 100)
+
+
+def test_a_ramp_of_a_share_of_nobody_knows_what_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    line = SimulatedBus(monkeypatch, simulated(ShareToy(1)))
+    with pytest.raises(Refused, match=r"is in %: a ramp needs maximum_frequency, which is not declared"):
+        ramp(line.attach(ShareToy(1, name="toy")), 20.0, rate=5.0)
+    assert line.written == []
+
+
+class AliasToy(Toy):
+    """Its setpoint is kept in EEPROM, and written to an address that is not."""
+
+    frequency = setting(0x15, "Hz", step=0.01, span=(0, 50), kept=Kept.EEPROM, ram_address=0x115)
+
+    @verb
+    def set_frequency(self, hz: float) -> Script[None]:
+        yield from self._hold(self.frequency, hz)
+
+
+def test_a_ramp_by_an_alias_in_ram_wears_nothing(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    line = SimulatedBus(monkeypatch, simulated(AliasToy(1)), ledger=tmp_path / "wear.sqlite")
+    toy = line.attach(AliasToy(1))
+    ramp(toy, 10, rate=8.0)
+    assert [frame[:17] for frame in line.written] == [
+        "01 06 01 15 01 90",
+        "01 06 01 15 03 20",
+        "01 06 01 15 03 E8",
+    ]
+    assert Ledger(tmp_path / "wear.sqlite").wear(0) == []
 
 
 def test_a_ramp_from_a_setpoint_that_nobody_knows_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -51,6 +51,7 @@ def test_a_setpoint_that_may_be_an_echo_is_not_confirmed(
     for write in (lambda: line.bus.write(drive, drive.frequency, 25.0), lambda: drive.set_frequency(25.0)):
         with pytest.raises(Unconfirmed, match="echo"):
             write()
+        assert drive.commanded is None  # neither a start nor a ramp trusts it
 
 
 def test_an_echo_that_shows_at_the_next_read_confirmed_nothing(monkeypatch: pytest.MonkeyPatch) -> None:

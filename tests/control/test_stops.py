@@ -14,7 +14,7 @@ from typing import Any
 
 import pytest
 from motors import MAKE, STARTS
-from simulated_bus import SimulatedBus, is_write, one
+from simulated_bus import EXCHANGE_TIME, SimulatedBus, is_write, one
 from tables import table
 
 from multidrop.bus import Bus
@@ -742,6 +742,16 @@ def test_looks_that_take_their_time_are_no_delay(monkeypatch: pytest.MonkeyPatch
     line = SimulatedBus(monkeypatch, simulated(Sleepy(1)))
     line.attach(Sleepy(1, confirmed=1)).start()
     assert len(writes(line)) == 1
+
+
+def test_writes_that_take_their_time_are_no_delay(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A ramp has more of them than one after another take in the time of one call."""
+    line, drive, _ = one(monkeypatch, YD1000(1))
+    drive.set_frequency(1)
+    before = len(writes(line))
+    ramp(drive, 51, rate=0.5, every=1)
+    assert len(writes(line)) - before == 100
+    assert 100 * EXCHANGE_TIME > 1.0  # the expiry of a call
 
 
 @table("expiry", [0, -1, float("nan"), float("inf"), 10**30, True, "1"])

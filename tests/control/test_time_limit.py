@@ -117,6 +117,13 @@ def test_a_bus_s_own_expiry_counts_where_it_is_shorter(line: SimulatedBus) -> No
         line.bus.drives[0].set_frequency(20)
 
 
+def test_a_limit_that_is_no_number_is_past(line: SimulatedBus) -> None:
+    before = len(written(line))
+    with written_before(lambda: float("nan")), pytest.raises(Expired):
+        line.bus.drives[0].set_frequency(20)
+    assert len(written(line)) == before
+
+
 def test_a_stop_is_sent_whenever_it_is(line: SimulatedBus) -> None:
     before = len(written(line))
     with within(line, 0):

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 from simulated_bus import SimulatedBus
 
+from multidrop.control.ramp import ramp, start_staggered
 from multidrop.core import Message
 from multidrop.drive import Condition, Direction, Drive, Script, State, insist, read, write
 from multidrop.drive.declare import command, reading, setting
@@ -160,6 +161,38 @@ def test_what_may_move_the_motor_of_an_unknown_drive_needs_its_owner_s_word(
     line.bus.detach(pump)
     command_it(line, line.attach(Pump(1, confirmed=1)))
     assert len(line.written) == 1
+
+
+@pytest.mark.parametrize("name", ["start_staggered", "ramp", "run_at"])
+def test_nor_is_it_commanded_by_what_is_made_of_verbs(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+    class Combined(Pump):
+        """Its author has made one verb of two."""
+
+        setpoint_name = "target"
+
+        @verb
+        def run_at(self, hz: float) -> Script[None]:
+            """Start it at this frequency."""
+            yield from self.set_frequency.script(hz)
+            yield from self.start.script()
+
+    def command_it(pump: Combined) -> None:
+        acts = {
+            "start_staggered": lambda: start_staggered([pump], 1.0),
+            "ramp": lambda: ramp(pump, 20.0, rate=5.0),
+            "run_at": lambda: pump.run_at(20.0),
+        }
+        pump.commanded = 10.0
+        acts[name]()
+
+    line = SimulatedBus(monkeypatch, simulated(Combined(1)))
+    pump = line.attach(Combined(1, name="pump"))
+    with pytest.raises(Refused, match=r"is not sent to pump: .*declare confirmed = 1"):
+        command_it(pump)
+    assert line.frames == []
+    line.bus.detach(pump)
+    command_it(line.attach(Combined(1, confirmed=1)))
+    assert line.written
 
 
 @pytest.mark.parametrize("name", ["stop", "coast"])

@@ -356,6 +356,14 @@ def test_the_line_of_telegraf_and_esphome(tmp_path: Path) -> None:
     assert str(only(tmp_path, "node.yaml", node + sensor).line) == "9600, 8E1"
 
 
+def test_a_controller_that_is_no_address_is_named(tmp_path: Path) -> None:
+    plugin = '[[inputs.modbus]]\ncontroller = "{}"\n'
+    for controller in ("tcp://gate:99999", "tcp://gate:modbus", "tcp://[fe80::1"):
+        named = rf"t\.conf: controller = '{re.escape(controller)}' is no address: "
+        with pytest.raises(ValueError, match=named):
+            devices(tmp_path, "t.conf", plugin.format("tcp://hall") + plugin.format(controller))
+
+
 def test_addresses_that_are_not_side_by_side_are_no_number(tmp_path: Path) -> None:
     field = '{{ name = "{}", byte_order = "ABCD", data_type = "UINT32", address = {} }}'
     listed = ", ".join(

@@ -20,7 +20,7 @@ from examples import usually
 from lines import HOST_LATE, PATIENCE, line, plant, polled, rows_of, until
 from toy import Toy
 
-from multidrop import Mastership, NoSuchPort, NotMaster
+from multidrop import Bus, Mastership, NoSuchPort, NotMaster
 from multidrop.core import RowQueue
 from multidrop.plant.loader import PlantError
 from multidrop.plant.model import PlantLine, PolledDrive
@@ -363,6 +363,19 @@ def test_a_bridged_port_is_refused_and_nothing_changes(mastership: Mastership) -
             poller.adopt(plant(bridged))
         assert list(poller.buses) == ["hall"]
         Rows(poller).settle("pump")
+
+
+def test_a_line_is_listened_to_again_after_a_lapse_in_which_nothing_was_asked(mastership: Mastership) -> None:
+    hold(mastership)
+    wire = Wire([simulated(Quick(1))], unpaced=True)
+    with Simulator([wire]), Bus(wire.path, mastership=mastership) as bus:
+        pump = bus.attach(Quick(1))
+        bus.read(pump, CURRENT)
+        mastership.end()
+        hold(mastership)
+        begun = time.monotonic()
+        bus.read(pump, CURRENT)
+        assert time.monotonic() - begun >= mastership.guard_s
 
 
 def test_many_ports_are_opened_side_by_side_and_closed_at_once(mastership: Mastership) -> None:

@@ -15,6 +15,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from itertools import count, pairwise
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import given
@@ -27,6 +28,7 @@ from toy import Status, Toy
 
 from multidrop.bus import Bus
 from multidrop.errors import Unconfirmed
+from multidrop.transport import bridge as bridge_module
 from multidrop.transport.bridge import MOST_AGE, MOST_STALL_MS, Bridge, hand_on_nothing_late
 from multidrop.transport.exchange import WRITE_TIMEOUT
 from multidrop.transport.rfc2217 import MOST_CHUNKS, MOST_RECEIVED, RFC2217Port, Telnet
@@ -193,6 +195,30 @@ def test_a_request_that_waited_behind_another_is_never_sent() -> None:
     until(later)
     bridge.close()
     assert b"start" not in port.written
+
+
+class AsOnWindows:
+    """A socket without the calls that POSIX alone has."""
+
+    def __init__(self, whole: socket.socket) -> None:
+        self._whole = whole
+
+    def __getattr__(self, name: str) -> Any:
+        if name in ("recvmsg", "sendmsg"):
+            raise AttributeError(name)
+        return getattr(self._whole, name)
+
+
+def test_a_bridge_passes_requests_on_where_sockets_tell_no_times(monkeypatch: pytest.MonkeyPatch) -> None:
+    ours, theirs = socket.socketpair()
+    monkeypatch.setattr(bridge_module, "_STAMPED", False)
+    monkeypatch.setattr(bridge_module, "_pair", lambda: (AsOnWindows(ours), theirs))
+    port = HeldUp()
+    port.free.set()
+    bridge = Bridge(port)  # type: ignore[arg-type]
+    theirs.send(b"request")
+    until(lambda: port.written == [b"request"])
+    bridge.close()
 
 
 def test_a_bridge_for_which_there_are_no_threads_is_a_port_that_failed(

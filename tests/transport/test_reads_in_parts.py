@@ -42,6 +42,12 @@ def test_a_refused_register_is_refused_by_itself(monkeypatch: pytest.MonkeyPatch
     assert caught.value.register == "r3"
     assert sim.asked[-1] == (3, 1)
     assert len(sim.asked) <= 11
+    sim.asked.clear()
+    with pytest.raises(DriveRefused, match=r"^pump-1 refuses r3: "):
+        bus.bus.read_many(drive, drive.registers.values())
+    assert sim.asked == [(3, 1)]  # what comes to nothing costs the line no more
+    sim.missing.clear()
+    assert bus.bus.read_many(drive, drive.registers.values()) == right(range(WIDE))
     others = [register for register in drive.registers.values() if register.address != 3]
     assert bus.bus.read_many(drive, others) == right(set(range(WIDE)) - {3})
 

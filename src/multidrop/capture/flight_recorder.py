@@ -36,6 +36,8 @@ class FlightRecorder:
         most_bytes: int = 16 << 20,
         most_files: int = 64,
     ) -> None:
+        if most_files < 1:
+            raise ValueError(f"most_files = {most_files} would keep no capture")
         self.directory = Path(directory)
         self.written: list[Path] = []
         self._lines = lines

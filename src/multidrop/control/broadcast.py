@@ -61,6 +61,9 @@ class Broadcaster:
             self._latches.rise(drives)
         else:
             check_author()
+        if register.name == first.setpoint_name:
+            for drive in drives:
+                drive.commanded = None
         try:
             self._writer.broadcast(first, register, raw)
         finally:

@@ -22,9 +22,9 @@ class Call:
     """One call of a verb, `verb`, or of a plain write.
 
     Nothing of it is written once a stop was called, nor when it is late by more than `expiry` seconds.
-    Its lateness is the time since it began, less what its own steps may take: its reads, by the drive's
-    document, and the waits of its script. So a process that was held up sends nothing, nor does one whose
-    machine slept. Its first write is not sent after `limit_ns` either, a time of CLOCK_BOOTTIME.
+    Its lateness is the time since it began, less what its own steps may take: its reads and writes, by the
+    drive's document, and the waits of its script. So a process that was held up sends nothing, nor does one
+    whose machine slept. Its first write is not sent after `limit_ns` either, a time of CLOCK_BOOTTIME.
     """
 
     def __init__(

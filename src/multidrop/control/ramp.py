@@ -6,11 +6,12 @@ import threading
 from collections.abc import Sequence
 from contextlib import suppress
 from contextvars import copy_context
+from math import inf
 
-from multidrop.control.rules import wears
+from multidrop.control.rules import conditions, raw_count, wears
 from multidrop.drive.family import Drive
 from multidrop.drive.register import Register
-from multidrop.drive.script import Script, read, wait
+from multidrop.drive.script import Script, Write, read, wait
 from multidrop.drive.state import Direction
 from multidrop.drive.table import Kept
 from multidrop.errors import Refused
@@ -22,6 +23,10 @@ def start_staggered(drives: Sequence[Drive], gap: float, direction: Direction | 
     When one fails, it and all that were started before are stopped, and its failure is raised. None is
     started whose stop was called, on any thread, after this call began.
     """
+    if not 0 <= gap < inf:
+        raise ValueError(f"gap = {gap:g} s is no time between two starts")
+    for drive in drives:
+        drive.check_confirmed("start")
     calls = [drive.begin_call("start") for drive in drives]
     for number, (drive, call) in enumerate(zip(drives, calls, strict=True)):
         try:
@@ -68,7 +73,8 @@ def ramp(drive: Drive, hz: float, *, rate: float | None = None, every: float = 0
     """Bring the setpoint to `hz` in steps, one in `every` seconds, at `rate` Hz/s.
 
     The rate is the drive's own (maximum frequency / acceleration time) where these can be read and
-    none is given, and never above it. Refused for a setpoint that every step would store in EEPROM.
+    none is given, and never above it. Refused for a setpoint that every step would store in EEPROM. For one
+    that the drive does not take nothing is sent, and this raises as `set_frequency`.
     """
     drive.perform(_ramp(drive, hz, rate, every))
 
@@ -76,6 +82,7 @@ def ramp(drive: Drive, hz: float, *, rate: float | None = None, every: float = 0
 def _ramp(drive: Drive, hz: float, rate: float | None, every: float) -> Script[None]:
     if not every > 0:
         raise ValueError(f"every = {every:g} s is not above 0")
+    drive.check_confirmed("set_frequency")
     register = drive.register(drive.setpoint_name)
     if wears(drive, register) is not Kept.RAM:
         raise Refused(f"the setpoint of {drive.name} may be kept in EEPROM, which a ramp would wear out")
@@ -88,11 +95,29 @@ def _ramp(drive: Drive, hz: float, rate: float | None, every: float) -> Script[N
         raise ValueError(f"rate = {rate:g} Hz/s is more than the drive's own, {own:g} Hz/s")
     step = (rate or own or 0.0) * every
     at = yield from _present(drive, register)
+    yield from _check(drive, hz)
     while at != hz:
         at = min(at + step, hz) if hz > at else max(at - step, hz)
         yield from drive.set_frequency.script(round(at, 2) if at != hz else hz)
         if at != hz:
             yield from wait(every)
+
+
+def _check(drive: Drive, hz: float) -> Script[None]:
+    """Raise what keeps this setpoint from being written: else the ramp would go up to the limit first."""
+    commanded = drive.commanded
+    script = drive.set_frequency.script(hz)
+    try:
+        step = next(script)
+        while not isinstance(step, Write):
+            step = script.send((yield step))
+    except StopIteration:  # it would write nothing
+        return
+    finally:
+        script.close()
+        drive.commanded = commanded
+    raw = raw_count(drive, step.register, step.value)
+    yield from conditions(drive, step.register, step.register.decode(raw))
 
 
 def _own_rate(drive: Drive) -> Script[float | None]:
@@ -111,4 +136,11 @@ def _present(drive: Drive, register: Register[float]) -> Script[float]:
     held = (yield from read(register)) if register.readable else drive.commanded
     if held is None:
         raise Refused(f"{drive.name} cannot say its setpoint: call set_frequency before a ramp")
-    return held * drive.option["maximum_frequency"] / 100 if register.unit == "%" else held
+    if register.unit != "%":
+        return held
+    most = drive.option.get("maximum_frequency")
+    if most is None:
+        raise Refused(
+            f"{register.name} of {drive.name} is in %: a ramp needs maximum_frequency, which is not declared"
+        )
+    return held * most / 100

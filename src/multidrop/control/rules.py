@@ -43,20 +43,26 @@ def raw_count(drive: Drive, register: Register[T], value: T) -> float:
         raise _refusal(register, str(mistake), f"{drive.name}: {mistake}") from mistake
 
 
-def check_plain(drive: Drive, register: Register[Any], raw: float) -> None:
-    """Raise Refused unless a plain write may do this: only a verb moves a motor or resets a fault.
+def check_known(drive: Drive, register: Register[Any], raw: float) -> None:
+    """Raise Refused unless the drive is known to be of its class, where this may command the motor.
 
-    A command that moves nothing by itself is sent to a drive that is known to be of its class. What a file
-    calls harmless is believed where its stop was checked with it.
+    A stop needs no such knowledge. What a file calls harmless is believed where its stop was checked with it.
     """
     is_unproven = bool(drive.declared_in) and "confirmed" in drive.options  # any address may be the wrong one
     if is_harmless(register, raw):
         if is_unproven and not is_stop(drive, register, raw):
             drive.check_confirmed(register.name)
-        return
-    if (register.access is Access.COMMAND or is_unproven) and not register.commands:
+    elif register.access is Access.COMMAND or register.commands or is_unproven:
         drive.check_confirmed(register.name)
-    if not register.commands:
+
+
+def check_plain(drive: Drive, register: Register[Any], raw: float) -> None:
+    """Raise Refused unless a plain write may do this: only a verb moves a motor or resets a fault.
+
+    A command that moves nothing by itself is sent to a drive that is known to be of its class.
+    """
+    if is_harmless(register, raw) or not register.commands:
+        check_known(drive, register, raw)
         return
     verbs = [name for name in VERBS if name in _MOVING and _has(drive, name)]
     advice = Advice(

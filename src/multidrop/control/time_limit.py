@@ -40,7 +40,8 @@ def checked_expiry(expiry: float, what: str) -> float:
 def _called(limit: Limit) -> float:
     if not callable(limit):
         raise TypeError(f"limit = {limit!r} is no function that returns a time of CLOCK_MONOTONIC in ns")
-    return limit()
+    at_ns = limit()
+    return at_ns if at_ns == at_ns else 0  # NaN is later than nothing, and no call would be too late
 
 
 @contextmanager

@@ -13,7 +13,7 @@ from multidrop.control.echo_check import EchoCheck
 from multidrop.control.identity import IdentityCheck
 from multidrop.control.outcome import Effect, Outcome
 from multidrop.control.records import WriteRecords
-from multidrop.control.rules import conditions, raw_count, wears
+from multidrop.control.rules import check_known, conditions, raw_count, wears
 from multidrop.core import Completion, Failure, Message, build_request
 from multidrop.drive.family import Drive
 from multidrop.drive.register import Register
@@ -57,6 +57,7 @@ class Writer:
         register, value = step.register, step.value
         raw = raw_count(drive, register, value)
         asked = register.decode(raw)
+        check_known(drive, register, raw)
         self.identity_check.check(drive, call.look)
         carry_out(conditions(drive, register, asked), lambda step: self._look(drive, step, call))
         kept = wears(drive, register)
@@ -95,6 +96,8 @@ class Writer:
         why = self._echo.why_doubtful(drive)
         if not why:
             return outcome
+        if outcome.register.name == drive.setpoint_name:
+            drive.commanded = None
         unknown = Unconfirmed(drive.name, _in_words(outcome.register, outcome.asked), why)
         return replace(outcome, effect=Effect.UNCONFIRMED, failure=unknown)
 
@@ -140,12 +143,17 @@ class Writer:
         request, asked = write_request(drive, register, raw), register.decode(raw)
         what = _in_words(register, asked)
         log = self.records.log if call else self.records.log_later
+        is_setpoint = register.name == drive.setpoint_name
+        if is_setpoint:
+            drive.commanded = None  # until it is known, also where a plain write changes it
         with self._logged(drive, request, what, log):
             completion = self._carry_out(drive, request, what, call, timeout)
             outcome = self._outcome(drive, register, asked, completion, call)
             is_unconfirmed = outcome.effect is Effect.UNCONFIRMED
             if is_unconfirmed and build_request(drive.framing, request) in completion.raw:
                 self._echo.probe(drive, insists=call is None)
+        if is_setpoint and outcome.effect is Effect.DONE:
+            drive.commanded = outcome.value
         if call:
             call.is_confirmed = not is_unconfirmed
             call.unverified = outcome
@@ -161,7 +169,8 @@ class Writer:
         expires_ns = call.expires_ns
         before, call.sent, call.is_confirmed = (call.sent, call.is_confirmed), what, False
         try:
-            completion = self._exchanges.carry_out(drive, request, expires_ns, permit=call.permit)
+            with call.look():
+                completion = self._exchanges.carry_out(drive, request, expires_ns, permit=call.permit)
         except NotMaster as failure:
             if not failure.is_sent:
                 call.sent, call.is_confirmed = before

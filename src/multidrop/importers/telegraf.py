@@ -41,8 +41,12 @@ def _line(plugin: Mapping[str, Any]) -> LineSettings:
     """Return the line of a plugin: a controller of file:///dev/ttyUSB0 or tcp://host:port, and its mode."""
     controller, mode = str(plugin.get("controller", "")), str(plugin.get("transmission_mode", ""))
     if controller.startswith("tcp://"):
-        parts = urlsplit(controller)
-        return network_settings(parts.hostname, parts.port or 502, is_rtu=mode.lower() == "rtuovertcp")
+        try:
+            parts = urlsplit(controller)
+            host, port = parts.hostname, parts.port or 502
+        except ValueError as mistake:
+            raise ValueError(f"controller = {controller[:200]!r} is no address: {mistake}") from mistake
+        return network_settings(host, port, is_rtu=mode.lower() == "rtuovertcp")
     keys = {"baudrate": "baud_rate", "bits": "data_bits", "parity": "parity", "stop": "stop_bits"}
     given = {key: plugin[theirs] for key, theirs in keys.items() if theirs in plugin}
     return serial_settings(given, port=controller.removeprefix("file://"), framing=mode)

@@ -82,23 +82,27 @@ class LineSet:
     # ---- coming ----
 
     def fill(self, declared: Sequence[PlantLine]) -> None:
-        """Add all these lines; none is open after LineError for a port, or ValueError."""
-        found = [bus for _, bus in sorted(self.open(declared), key=lambda opened: opened[0])]
-        buses = [bus for bus in found if isinstance(bus, Bus)]
+        """Add all these lines; none is open after LineError for a port, ValueError, or an interruption."""
+        buses: dict[int, Bus] = {}
+        failures: dict[int, OSError] = {}
         with ExitStack() as stack:
-            for bus in buses:
-                stack.callback(bus.close)  # unless all goes well
-            for failure in found:
-                if isinstance(failure, OSError):
-                    raise failure
-            for line, bus in zip(declared, buses, strict=True):
-                self.add(line, bus)
+            for place, bus in self.open(declared):
+                if isinstance(bus, OSError):
+                    failures[place] = bus
+                else:
+                    buses[place] = bus
+                    stack.callback(bus.close)  # unless all goes well
+            if failures:
+                raise failures[min(failures)]
+            for place, line in enumerate(declared):
+                self.add(line, buses[place])
             stack.pop_all()
 
     def open(self, declared: Sequence[PlantLine]) -> Iterator[tuple[int, Bus | OSError]]:
         """Open the ports of these lines side by side.
 
-        Yields each line's place here as soon as it is done, with the bus, or why there is none.
+        Yields each line's place here as soon as it is done, with the bus, or why there is none. Where it does
+        not go to the end, those that it has not given are closed.
         """
         if len(declared) < 2:
             yield from enumerate(map(self._opened, declared))
@@ -112,7 +116,8 @@ class LineSet:
                     place, line = left.popleft()
                     done.put((place, _settled(partial(self._opened, line))))
 
-        with ThreadPoolExecutor(OPENING, "multidrop opening") as pool:
+        pool = ThreadPoolExecutor(OPENING, "multidrop opening")
+        try:
             try:
                 for _ in range(min(OPENING, len(declared))):
                     pool.submit(work)
@@ -121,6 +126,13 @@ class LineSet:
             for _ in declared:
                 place, opened = done.get()
                 yield place, opened.result()
+        finally:
+            left.clear()
+            pool.shutdown()
+            while not done.empty():
+                _, opened = done.get()
+                if not opened.exception() and isinstance(bus := opened.result(), Bus):
+                    bus.close()
 
     def _opened(self, line: PlantLine) -> Bus | OSError:
         try:

@@ -101,14 +101,21 @@ class Bridge:
         with suppress(*PORT_FAILURES):
             while not self._closing.is_set():
                 try:
-                    request, stamps, _, _ = self._ours.recvmsg(MOST_CHUNK, socket.CMSG_SPACE(_TIMESPEC.size))
+                    request, is_fresh = self._take()
                 except TimeoutError:
                     continue
                 if not request:
                     break
-                if _is_fresh(stamps):
+                if is_fresh:
                     self._port.write(request)
         self._hang_up()
+
+    def _take(self) -> tuple[bytes, bool]:
+        """Return what the core sends, and whether it was written just now; Windows has no `recvmsg`."""
+        if not _STAMPED:
+            return self._ours.recv(MOST_CHUNK), True
+        request, stamps, _, _ = self._ours.recvmsg(MOST_CHUNK, socket.CMSG_SPACE(_TIMESPEC.size))
+        return request, _is_fresh(stamps)
 
     def _in(self) -> None:
         with suppress(*PORT_FAILURES):
@@ -145,7 +152,5 @@ class Bridge:
 
 def _is_fresh(stamps: list[tuple[int, int, bytes]]) -> bool:
     """Return True for a request that was written just now, False in doubt, as when the clock was set."""
-    if not _STAMPED:
-        return True
     written = [_TIMESPEC.unpack(stamp) for _, kind, stamp in stamps if kind == _SO_TIMESTAMPNS]
     return any(abs(time.time() - seconds - ns / 1e9) <= MOST_AGE for seconds, ns in written)

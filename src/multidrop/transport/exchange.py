@@ -130,11 +130,6 @@ class Exchanges:
                     raise
                 except (DriveRefused, NoReply, BadReply) as failure:
                     parts = self._parts(drive, prepared, read, failure)
-                    if not parts and isinstance(failure, DriveRefused) and len(read.block.registers) == 1:
-                        raise refusal_of(drive, failure.code, read.block.registers[0].name) from None
-                    if not parts:
-                        raise
-                prepared.parts[read.block] = parts
             wanted += [prepared.prepare(part) for part in reversed(parts)]
         if None in found.values():
             raise no_value(drive, {name: found[name] for name in plan.names})
@@ -143,20 +138,29 @@ class Exchanges:
     def _parts(
         self, drive: Drive, prepared: PreparedReads, read: PreparedRead, failure: Exception
     ) -> tuple[Block, ...]:
-        """Return the blocks to ask for instead of one that failed; none where that would not help."""
+        """Return the blocks to ask for instead of one that failed; raise why it did where that is no help."""
         block = read.block
         if isinstance(failure, DriveRefused):
-            is_whole = failure.code == ILLEGAL_FUNCTION or drive.is_passing(failure.code)
-            return () if is_whole else halves(drive, block)
-        if not read.may_be_too_long or block in prepared.answered:
-            return ()
-        try:  # is it there at all?
-            self._ask(drive, prepared.prepare(least(drive, block)).exchange, 1)
+            helps = failure.code != ILLEGAL_FUNCTION and not drive.is_passing(failure.code)
+        else:
+            helps = read.may_be_too_long and block not in prepared.answered and self._is_there(drive, block)
+        if helps and (parts := halves(drive, block)):
+            prepared.parts[block] = parts
+            return parts
+        if isinstance(failure, DriveRefused) and len(block.registers) == 1:
+            prepared.ask_first(block)
+            raise refusal_of(drive, failure.code, block.registers[0].name) from None
+        raise failure
+
+    def _is_there(self, drive: Drive, block: Block) -> bool:
+        """Return True where the drive answers the least part of this block."""
+        try:
+            self._ask(drive, self._prepare(drive).prepare(least(drive, block)).exchange, 1)
         except (NoReply, BadReply):
-            return ()
+            return False
         except DriveRefused:
             pass
-        return halves(drive, block)
+        return True
 
     def value(
         self,
@@ -195,8 +199,7 @@ class Exchanges:
             return register.decode(b"".join(self._ask(drive, read, 1).data for read in asked))
         (block,) = blocks(other, [register])
         read = PreparedRead(other, block, self.peer(drive))
-        insisting = make_read(other, block, self.peer(drive), insists=True)
-        found = read.decode(self._ask(drive, insisting, 1))
+        found = read.decode(self._ask(drive, read.insisting(other, 0.0), 1))
         if None in found.values():
             raise no_value(drive, found)
         return found[register.name]
@@ -232,11 +235,9 @@ class Exchanges:
             self._note_answer(drive, completion)
             try:
                 good_reply(drive, completion)  # raises
-            except (NoReply, BadReply):
-                if not attempts:
-                    raise
-            except DriveRefused as refusal:
-                if not attempts or refusal.code not in drive.damaged:
+            except (NoReply, BadReply, DriveRefused) as failure:
+                is_final = isinstance(failure, DriveRefused) and failure.code not in drive.damaged
+                if not attempts or is_final:
                     raise
             completion = self._carry_out(drive, exchange)
         return completion

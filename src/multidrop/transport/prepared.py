@@ -106,3 +106,10 @@ class PreparedReads:
         self.prepare = prepare
         self.parts: dict[Block, tuple[Block, ...]] = {}  # of blocks that the drive does not answer as a whole
         self.answered: set[Block] = set()  # blocks that may have been too long, and are not
+
+    def ask_first(self, block: Block) -> None:
+        """Ask for a block that is refused before the other parts of its whole, which are in vain without."""
+        for whole, parts in [*self.parts.items()]:
+            if block in parts:
+                self.parts[whole] = (block, *(part for part in parts if part != block))
+                self.ask_first(whole)
