@@ -95,6 +95,7 @@ void md_port_fence(struct md_port *port, struct md_mastership *mastership)
     md_engine_enter(port->engine);
     __atomic_store_n(&mastership->engine, port->engine, __ATOMIC_SEQ_CST);
     port->mastership = mastership;
+    port->heard_term = 0; /* perhaps of another one */
     md_engine_leave(port->engine);
 }
 

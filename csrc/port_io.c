@@ -53,6 +53,7 @@ static int may_send(struct md_port *port)
 {
     struct md_line *line = &port->turn.line;
     if (!md_mastership_holds(port->mastership)) {
+        port->heard_term = 0;
         md_line_abandon(line, MD_NOT_MASTER, 0);
         return 0;
     }

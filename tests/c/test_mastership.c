@@ -286,6 +286,8 @@ int main(void)
     extend(1000);
     check_sent(&stop);
     check_listens_first();
+    md_port_fence(port, mastership); /* as if by another, of as many terms */
+    check_listens_first();
     check_listens_after_a_lapse();
     check_guard_comes_first();
     check_deadline();
