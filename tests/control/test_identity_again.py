@@ -120,6 +120,31 @@ def test_a_stop_of_a_drive_that_was_silent_asks_nothing_first(model: str) -> Non
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("model", ["innovert-ibd", "delixi-native"])
+def test_a_setpoint_that_cannot_be_read_is_forgotten_once_the_drive_may_have_lost_its_power(
+    model: str,
+) -> None:
+    with known(model) as (bus, drive, received):
+        drive.set_frequency(10)
+        be_silent(bus, drive, received)
+        bus.peer(drive).c.answered_ns -= 2 * PAUSE_NS
+        with pytest.raises(Refused, match="cannot say its setpoint: call set_frequency before start"):
+            drive.start()
+        assert received.writes == []
+        drive.set_frequency(10)
+        drive.start()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("model", ["innovert-ibd", "delixi-native"])
+def test_a_setpoint_is_kept_where_one_reply_was_lost(model: str) -> None:
+    with known(model) as (bus, drive, received):
+        drive.set_frequency(10)
+        be_silent(bus, drive, received)
+        drive.start()
+
+
+@pytest.mark.slow
 def test_what_polling_missed_counts_too() -> None:
     """Also while the drive was interrupted, its line was polled: nobody has to ask by hand."""
     sim = simulated(MAKE["invt-che"](1))

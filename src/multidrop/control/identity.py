@@ -95,7 +95,9 @@ class IdentityCheck:
         self._know(drive, port, silences)
 
     def _know(self, drive: Drive, port: object, silences: int) -> None:
-        pauses = self._exchanges.peer(drive).pauses
+        pauses, before = self._exchanges.peer(drive).pauses, self._known.get(drive)
+        if before and before.silences != silences and before.pauses != pauses:
+            _forget_setpoint(drive)
         self._known[drive] = _Look(port, silences, pauses, clock.now_ns(), _slept_ns())
 
     def _read(self, drive: Drive, step: Step, attempts: int, *, insists: bool = False) -> object:
@@ -191,6 +193,12 @@ class IdentityCheck:
         except (BusError, ValueError):
             return False
         return True
+
+
+def _forget_setpoint(drive: Drive) -> None:
+    """Forget what a drive cannot say: silent for so long, it may have lost it with its power."""
+    if drive.setpoint_name in drive.registers and not drive.register(drive.setpoint_name).readable:
+        drive.commanded = None
 
 
 def _slept_ns() -> int:
