@@ -160,6 +160,10 @@ def test_check_and_its_mistakes(run: Run, tmp_path: Path) -> None:
         f'multidrop: {plant.path}: [serve]: listen = 80 is not right; write listen = "127.0.0.1:8750"',
         f'multidrop: {plant.path}: [serve.may]: stop = 1 is not right; write stop = "token"',
     ]
+    plant.path.write_text(plant.path.read_text().replace("address = 2", "address = 1"))
+    _, _, also = run("serve", "--check", plant.path)
+    assert len(also.splitlines()) == 3
+    assert set(errors.splitlines()) < set(also.splitlines())
 
 
 @pytest.mark.parametrize("command", ["check", "plan"])

@@ -63,11 +63,10 @@ def run(arguments: argparse.Namespace) -> int:
     if not arguments.plant:
         raise ValueError("name a plant file, or try `multidrop serve --demo`")
     _require_server()
-    from multidrop.gateway.settings import read_settings
+    from multidrop.gateway.settings import read_plant
 
     def read() -> tuple[Plant, ServeSettings]:
-        plant = plant_of(arguments.plant, arguments)
-        return plant, read_settings(plant, os.environ)
+        return read_plant(lambda: plant_of(arguments.plant, arguments), os.environ)
 
     plant, settings = read()
     if arguments.check:

@@ -224,11 +224,7 @@ def _unknown_names(plant: Plant, settings: UnitSettings) -> Iterator[str]:
         ("ports", "line", settings.ports, lines),
     ):
         for name in given:
-            if name not in known:
+            if known and name not in known:
                 near = difflib.get_close_matches(name, known, n=2)
-                hint = (
-                    f"did you mean {' or '.join(near)}?"
-                    if near
-                    else f"there are {', '.join(known) or 'none'}"
-                )
+                hint = f"did you mean {' or '.join(near)}?" if near else f"there are {', '.join(known)}"
                 yield f"{key}: there is no {kind} {name!r}; {hint}"
