@@ -96,6 +96,18 @@ def test_a_raw_count_stays_within_its_column(
     until_met(page, lambda: min(states.evaluate_all(width)) >= 120)  # px, for "overcurrent"
 
 
+@pytest.mark.parametrize("size", [(1440, 900), (768, 1024), (390, 844)])
+def test_no_word_of_a_state_is_cut(opened: Opener, size: tuple[int, int]) -> None:
+    page = opened()
+    page.set_viewport_size(dict(zip(("width", "height"), size, strict=True)))
+    words = page.locator("#table .word", has_text="overcurrent in acceleration")
+    parts = "([word]) => [word.scrollWidth - word.clientWidth, word.clientHeight]"
+    until_met(page, lambda: words.count() == 1)
+    too_wide, height = words.evaluate_all(parts)
+    assert too_wide <= 0
+    assert height <= 2 * 14 * 1.2 + 1  # px: two lines, so no word of it is broken
+
+
 def test_what_is_wrong_has_a_shape_and_a_word_beside_its_colour(opened: Opener) -> None:
     page = opened()
     state = cell(page, "conveyor-2", "state")
