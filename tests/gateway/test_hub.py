@@ -205,6 +205,31 @@ def test_what_an_overfull_line_reads_holds_until_three_rounds_are_over(tmp_path:
     assert not is_fresh(hub)
 
 
+def holds_s(hub: Hub, register: str = "output_frequency") -> float:
+    row = hub.newest("pump-1", register)
+    assert row is not None
+    assert hub.holds_s("pump-1", register) == row.holds_ns / SECOND
+    return row.holds_ns / SECOND
+
+
+def test_one_long_pause_lets_no_value_hold_for_longer(hub: Hub) -> None:
+    """A poller that stood still for a minute reads once, and stands still again."""
+    for at in (8, 9, 10, 610):
+        hub.take(all_of(at, FORWARD, 25))
+    assert holds_s(hub) == 1
+    hub.pass_time(610 * PERIOD + SECOND + 1)
+    assert not is_fresh(hub)
+    assert hub.seen("pump-1") == Shown("unknown", NOT_ASKED)
+
+
+def test_what_a_line_that_is_slower_than_planned_reads_holds_for_three_of_its_rounds(hub: Hub) -> None:
+    for at in (0, 50, 90, 150):
+        hub.take(all_of(at, FORWARD, 25))
+    assert holds_s(hub) == pytest.approx(3 * 4)  # the shorter one of the latest two rounds
+    hub.take(all_of(151, FORWARD, 25))
+    assert holds_s(hub) == 1
+
+
 def test_rows_of_a_drive_that_is_gone_are_dropped(hub: Hub) -> None:
     hub.take(rows((10, STATUS, FORWARD), drive="pump-9"))
     assert "pump-9" not in list(hub.drives)

@@ -149,7 +149,7 @@ class Hub:
             row = (time, monotonic_ns, value, status)
             if status == 0:
                 if cell.good is not None and cell.newest is cell.good:
-                    cell.interval_ns = monotonic_ns - cell.good[1]
+                    cell.intervals_ns = cell.intervals_ns[1], monotonic_ns - cell.good[1]
                 cell.good = row
             cell.newest = row
             if monotonic_ns > self.now_ns:
