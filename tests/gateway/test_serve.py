@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import http.client
 import json
+import os
 import shutil
 import signal
 import socket
 import ssl
 import subprocess
 import time
-from contextlib import ExitStack, closing
+from contextlib import ExitStack, closing, suppress
 from pathlib import Path
 from typing import Any
 
@@ -113,6 +114,36 @@ def test_sigterm_ends_it_while_viewers_wait(tmp_path: Path) -> None:
         _, errors = process.communicate(timeout=PATIENCE)
         assert process.returncode == 0
         assert "Traceback" not in errors
+
+
+@pytest.mark.long
+def test_a_stop_waits_for_no_log_that_nobody_reads(tmp_path: Path) -> None:
+    """As where somebody pressed Ctrl-S in the terminal, or the journal stands still."""
+    with simulated_plant(tmp_path, '[serve]\nlisten = "127.0.0.1:0"\n[serve.may]\nstop = "anyone"\n') as path:
+        unread, log = os.pipe()
+        words = [*MULTIDROP, "serve", str(path)]
+        with (
+            os.fdopen(unread),
+            os.fdopen(log, "wb"),
+            subprocess.Popen(words, stdout=subprocess.PIPE, stderr=log, text=True) as process,
+        ):
+            try:
+                assert process.stdout is not None
+                port = int(process.stdout.readline().rstrip("/\n").rpartition(":")[2])
+                os.set_blocking(log, False)  # for the gateway's end too, for a moment
+                with suppress(BlockingIOError):
+                    while True:
+                        os.write(log, bytes(1))
+                os.set_blocking(log, True)
+                connection = http.client.HTTPConnection("127.0.0.1", port, timeout=PATIENCE)
+                with closing(connection):
+                    connection.request("POST", "/api/stop", "{}", {"content-type": "application/json"})
+                    found = json.loads(connection.getresponse().read())
+                assert [one["done"] for one in found.values()] == [True, True]
+                process.send_signal(signal.SIGTERM)
+                assert process.wait(PATIENCE) == 0
+            finally:
+                process.kill()
 
 
 @pytest.mark.long
