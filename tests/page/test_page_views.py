@@ -108,6 +108,20 @@ def test_no_word_of_a_state_is_cut(opened: Opener, size: tuple[int, int]) -> Non
     assert height <= 2 * 14 * 1.2 + 1  # px: two lines, so no word of it is broken
 
 
+@pytest.mark.parametrize("size", [(1440, 900), (768, 1024)])
+def test_why_a_port_is_lost_is_shown_whole(
+    opened: Opener, gateway: FakeGateway, size: tuple[int, int]
+) -> None:
+    lines = fake_plant.lines()
+    why = "could not open port /dev/serial/by-id/usb-FTDI_FT232R_USB_UART-if00: No such file or directory"
+    gateway.changes = {"lines": lines | {"hall-3": lines["hall-3"] | {"lost": why}}}
+    page = opened()
+    page.set_viewport_size(dict(zip(("width", "height"), size, strict=True)))
+    head = page.locator("#table .linehead").last
+    until_met(page, lambda: why in head.inner_text())
+    assert head.evaluate("head => head.scrollWidth - head.clientWidth") <= 0
+
+
 def test_what_is_wrong_has_a_shape_and_a_word_beside_its_colour(opened: Opener) -> None:
     page = opened()
     state = cell(page, "conveyor-2", "state")

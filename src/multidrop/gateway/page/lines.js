@@ -41,7 +41,7 @@ function card(line, told) {
       { class: "note" },
       `${line.port}${line.speed ? ` · ${line.speed}` : ""} · ${count(line.drives.length, "drive")}`,
     ),
-    frame.lost ? make("p", { class: "bad" }, glyph("port"), ` The port is lost: ${frame.lost}`) : null,
+    frame.lost ? make("p", { class: "warn" }, glyph("port"), ` The port is lost: ${frame.lost}`) : null,
     figures(frame),
     told ? misses(told.minutes) : null,
     delays(line, told?.drives ?? {}),

@@ -169,6 +169,5 @@ export function drawHead(h) {
           ? `${misses} missed in the last minute`
           : "none missed",
   );
-  setClass(h.missed, "fault", Boolean(lost));
-  setClass(h.missed, "warn", !lost && misses > 0);
+  setClass(h.missed, "warn", Boolean(lost) || misses > 0);
 }
