@@ -350,7 +350,7 @@ def test_many_stops_of_a_silent_drive_hold_no_other_up(tmp_path: Path) -> None:
         until(lambda: gateway.gateway.commands.stops["pump-2"] == 40)
         begun = monotonic()
         assert gateway.post("/api/stop", {"drives": ["pump-1"]}).json["pump-1"]["done"] is True
-        assert monotonic() - begun < 6.0  # s; it was 17
+        assert monotonic() - begun < 12.0  # s, of which 3 are its ramp: it was 20
         gateway.sims["pump-2"].deaf_until = 0.0
         assert [call.result().json["pump-2"]["done"] for call in calls] == [True] * 40
         assert stands(gateway, "pump-2")

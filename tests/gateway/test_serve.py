@@ -118,7 +118,7 @@ def test_sigterm_ends_it_while_viewers_wait(tmp_path: Path) -> None:
 
 @pytest.mark.long
 def test_a_stop_waits_for_no_log_that_nobody_reads(tmp_path: Path) -> None:
-    """As where somebody pressed Ctrl-S in the terminal, or the journal stands still."""
+    """Somebody pressed Ctrl-S in the terminal, or the journal stands still."""
     with simulated_plant(tmp_path, '[serve]\nlisten = "127.0.0.1:0"\n[serve.may]\nstop = "anyone"\n') as path:
         unread, log = os.pipe()
         words = [*MULTIDROP, "serve", str(path)]
