@@ -112,7 +112,6 @@ class Worker:
             "value": column("d", [float((at + turn) % 30 if at % 10 > 1 else 0) for at in range(size)]),
             "valid": memoryview(b"\xff" * (size // 8 + 1)),
         }
-        self.gateway.hub.pass_time(now_ns)
         self.batch = Batch(GivenColumns(rows), *self._names)
         self.gateway.hub.take(self.batch)
 

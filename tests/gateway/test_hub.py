@@ -25,9 +25,25 @@ PERIOD = SECOND // 10
 DRIVES = ("pump-1", "pump-2", "pump-9")
 
 
+class HubClock:
+    """The present time, by the clock that rows have, and for how long the machine slept; both in ns."""
+
+    def __init__(self) -> None:
+        self.now_ns = 10 * PERIOD
+        self.slept_ns = 0
+
+    def __call__(self) -> tuple[int, int]:
+        return self.now_ns, self.slept_ns
+
+
 @pytest.fixture
-def hub(tmp_path: Path) -> Hub:
-    return Hub(written(tmp_path))
+def clock() -> HubClock:
+    return HubClock()
+
+
+@pytest.fixture
+def hub(tmp_path: Path, clock: HubClock) -> Hub:
+    return Hub(written(tmp_path), clock)
 
 
 def rows(*found: tuple[int, int, int | Status], drive: str = "pump-1") -> Batch:
@@ -96,13 +112,15 @@ def test_a_status_alone_shows_a_fault(hub: Hub) -> None:
     assert hub.seen("pump-1").fault == "OC1_OVERCURRENT_ACCELERATING"
 
 
-def test_one_lost_reply_is_no_silence_and_many_are(hub: Hub) -> None:
+def test_one_lost_reply_is_no_silence_and_many_are(hub: Hub, clock: HubClock) -> None:
     hub.take(all_of(10, FORWARD, 25))
     for at in range(11, 20):
         hub.take(rows(*((at, register, Status.NO_REPLY) for register in range(4))))
+        clock.now_ns = at * PERIOD
         assert hub.state("pump-1") == "runs", at
     hub.take(rows(*((21, register, Status.NO_REPLY) for register in range(4))))
     hub.take(rows(*((22, register, Status.NOT_ASKED) for register in range(4))))
+    clock.now_ns = 22 * PERIOD
     assert hub.seen("pump-1") == Shown("silent", "not asked: drive is silent")
     assert hub.seen("pump-1").why_silent == "not asked: drive is silent"
     assert hub.seen("pump-1").fault is None
@@ -120,38 +138,39 @@ def test_a_drive_that_refuses_is_not_silent(hub: Hub) -> None:
     assert hub.state("pump-1") == "unknown"
 
 
-def test_a_line_is_lost_where_all_its_newest_rows_say_so(hub: Hub) -> None:
+def test_a_line_is_lost_where_all_its_newest_rows_say_so(hub: Hub, clock: HubClock) -> None:
     hub.take(all_of(10, FORWARD, 25))
     assert lost_of(hub, "hall") is None
     hub.take(rows(*((30, register, Status.LINE_LOST) for register in range(3))))
     assert lost_of(hub, "hall") is None
     hub.take(rows((31, FAULT, Status.LINE_LOST)))
     assert lost_of(hub, "hall") == "port lost"
+    clock.now_ns = 31 * PERIOD
     assert hub.seen("pump-1") == Shown("silent", "port lost")
 
 
-def test_values_grow_old_where_no_row_comes(hub: Hub) -> None:
+def test_values_grow_old_where_nothing_comes(hub: Hub, clock: HubClock) -> None:
+    """Neither a row, nor a turn of the gateway's loop: the process may have stood still until just now."""
     hub.take(all_of(10, FORWARD, 25))
-    hub.pass_time(10 * PERIOD + SECOND)
+    clock.now_ns += SECOND
     assert is_fresh(hub)
-    hub.pass_time(10 * PERIOD + SECOND + 1)
+    assert hub.state("pump-1") == "runs"
+    clock.now_ns += 1
     assert not is_fresh(hub)
-    assert hub.state("pump-1") == "unknown"
+    assert hub.seen("pump-1") == Shown("unknown", NOT_ASKED)
 
 
-def test_what_was_read_before_the_machine_slept_is_not_fresh(tmp_path: Path) -> None:
+def test_what_was_read_before_the_machine_slept_is_not_fresh(hub: Hub, clock: HubClock) -> None:
     """The monotonic clock, and so each row's age by it, stood still meanwhile."""
-    clock = [10 * PERIOD, 0]
-    hub = Hub(written(tmp_path), lambda: (clock[0], clock[1]))
     hub.take(all_of(10, FORWARD, 25))
     assert hub.state("pump-1") == "runs"
-    clock[:] = [11 * PERIOD + 1, 8 * 3600 * SECOND]  # no row, and no look at the time, came in between
+    clock.now_ns, clock.slept_ns = 11 * PERIOD + 1, 8 * 3600 * SECOND  # no row, and no look, in between
     assert not is_fresh(hub)
     assert hub.seen("pump-1") == Shown("unknown", NOT_ASKED)
     assert not any(fresh for *_, fresh in hub.known("pump-1"))
     hub.take(all_of(11, FORWARD, 25))  # just before it slept, and not taken until now
     assert not is_fresh(hub)
-    clock[0] = 12 * PERIOD
+    clock.now_ns = 12 * PERIOD
     hub.take(all_of(12, FORWARD, 25))
     assert is_fresh(hub)
     assert hub.state("pump-1") == "runs"
@@ -172,28 +191,23 @@ def test_two_clocks_that_are_not_read_at_once_are_no_sleep(tmp_path: Path) -> No
         assert is_fresh(hub)
 
 
-def test_a_value_that_is_overdue_is_not_fresh(hub: Hub) -> None:
-    hub.take(all_of(10, FORWARD, 25))
-    hub.take(rows((10 + 11, STATUS, STANDBY), drive="pump-2"))  # time passes elsewhere
-    assert not is_fresh(hub)
-    assert hub.seen("pump-1") == Shown("unknown", NOT_ASKED)
-
-
-def test_what_is_read_seldom_is_fresh_for_longer(tmp_path: Path) -> None:
+def test_what_is_read_seldom_is_fresh_for_longer(tmp_path: Path, clock: HubClock) -> None:
     path = written(tmp_path).path
     path.write_text(path.read_text().replace("100 ms", "10 s"))
-    hub = Hub(load_plant(path))
+    hub = Hub(load_plant(path), clock)
     hub.take(all_of(10, FORWARD, 25))
-    hub.take(rows((10 + 290, STATUS, STANDBY), drive="pump-2"))
+    clock.now_ns = (10 + 300) * PERIOD
     assert is_fresh(hub)
-    hub.take(rows((10 + 301, STATUS, STANDBY), drive="pump-2"))
+    clock.now_ns += 1
     assert not is_fresh(hub)
 
 
-def test_what_an_overfull_line_reads_holds_until_three_rounds_are_over(tmp_path: Path) -> None:
+def test_what_an_overfull_line_reads_holds_until_three_rounds_are_over(
+    tmp_path: Path, clock: HubClock
+) -> None:
     path = written(tmp_path, "", *(f"pump-{n}" for n in range(1, 31))).path
     path.write_text(path.read_text().replace("baudrate = 38400", "baudrate = 1200"))
-    hub = Hub(load_plant(path))
+    hub = Hub(load_plant(path), clock)
     cycle_s = hub.plant.metadata()["planned"]["hall"]["cycle_ms"] / 1000
     assert cycle_s > 1  # where 0.1 s are asked for
     hub.take(all_of(10, FORWARD, 25))
@@ -201,8 +215,33 @@ def test_what_an_overfull_line_reads_holds_until_three_rounds_are_over(tmp_path:
     assert row is not None
     assert hub.holds_s("pump-1", "output_frequency") == row.holds_ns / SECOND == pytest.approx(3 * cycle_s)
     assert is_fresh(hub)
-    hub.pass_time(10 * PERIOD + row.holds_ns + 1)
+    clock.now_ns += row.holds_ns + 1
     assert not is_fresh(hub)
+
+
+def holds_s(hub: Hub, register: str = "output_frequency") -> float:
+    row = hub.newest("pump-1", register)
+    assert row is not None
+    assert hub.holds_s("pump-1", register) == row.holds_ns / SECOND
+    return row.holds_ns / SECOND
+
+
+def test_one_long_pause_lets_no_value_hold_for_longer(hub: Hub, clock: HubClock) -> None:
+    """A poller that stood still for a minute reads once, and stands still again."""
+    for at in (8, 9, 10, 610):
+        hub.take(all_of(at, FORWARD, 25))
+    assert holds_s(hub) == 1
+    clock.now_ns = 610 * PERIOD + SECOND + 1
+    assert not is_fresh(hub)
+    assert hub.seen("pump-1") == Shown("unknown", NOT_ASKED)
+
+
+def test_what_a_line_that_is_slower_than_planned_reads_holds_for_three_of_its_rounds(hub: Hub) -> None:
+    for at in (0, 50, 90, 150):
+        hub.take(all_of(at, FORWARD, 25))
+    assert holds_s(hub) == pytest.approx(3 * 4)  # the shorter one of the latest two rounds
+    hub.take(all_of(151, FORWARD, 25))
+    assert holds_s(hub) == 1
 
 
 def test_rows_of_a_drive_that_is_gone_are_dropped(hub: Hub) -> None:

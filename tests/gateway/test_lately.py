@@ -6,12 +6,17 @@ import weakref
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 from gateways import written
 
 from multidrop.core import Counters, Status
+from multidrop.gateway.hub import Hub
 from multidrop.gateway.lately import MINUTES, Lately
+from multidrop.gateway.metrics import Figures, families_of
+from multidrop.gateway.views import look_at_lines
 from multidrop.transport.statistics import LineStatistics, line_statistics
 
 MINUTE_MS = 60_000
@@ -53,6 +58,20 @@ def test_figures_of_a_line_are_those_of_the_last_seconds(lately: Lately) -> None
     assert lately.line("hall")["rate"] == 10.0
     assert lately.drive_figures("pump-1")["missed"] == pytest.approx(2 / 600, abs=1e-3)
     assert lately.line("roof")["rate"] is None
+
+
+def test_what_no_reply_said_and_no_reading_is_not_known_and_never_0(lately: Lately, tmp_path: Path) -> None:
+    assert lately.line("hall")["misses"] is None
+    for second in range(100):
+        lately.tick(float(second), second * 1000, {"hall": reading(second)})  # no reply has a delay
+    assert lately.line("hall")["p99"] is None
+    plant = written(tmp_path)
+    gateway: Any = SimpleNamespace(plant=plant, hub=Hub(plant), lately=lately)
+    drive = look_at_lines(gateway)["hall"]["drives"]["pump-1"]
+    assert (drive["p50"], drive["p99"]) == (None, None)
+    families = families_of(gateway.hub, lately.newest, Figures("0", 0, 0, 0, {}, []))
+    (delays,) = [one for one in families if one.name == "multidrop_response_delay_seconds"]
+    assert delays.samples == [("_count", {"line": "hall", "drive": "pump-1"}, 0.0)]
 
 
 def test_another_line_of_a_name_is_not_set_against_the_one_before(lately: Lately) -> None:

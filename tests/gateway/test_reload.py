@@ -99,7 +99,11 @@ def test_a_file_with_mistakes_changes_nothing(tmp_path: Path) -> None:
         told = reload(gateway)
         assert told["done"] is False
         assert told["text"] == "the plant goes on as before: the file has mistakes"
-        assert [mistake.partition(": ")[0] for mistake in told["mistakes"]] == [str(path)] * 3
+        lines = told["mistakes"]
+        assert [mistake.partition(": ")[0] for mistake in lines] == [str(path)] * 3
+        path.write_text(path.read_text() + '[serve]\nlisten = 80\n[serve.may]\nwrite = ["pump-9.setpoint"]\n')
+        (of_serve,) = [one for one in reload(gateway)["mistakes"] if one not in lines]
+        assert of_serve == f'{path}: [serve]: listen = 80 is not right; write listen = "127.0.0.1:8750"'
         path.write_text(good + '[serve]\nlisten = 80\n[serve.may]\nwrite = ["pump-9.setpoint"]\n')
         mistakes = reload(gateway)["mistakes"]
         assert mistakes == [

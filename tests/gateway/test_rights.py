@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import http.client
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 
 import pytest
 from gateways import Served, served
-from lines import until
+from lines import PATIENCE, until
 
 from multidrop.gateway.rights import MOST_WRONG, Right
 
@@ -199,6 +200,23 @@ def test_wrong_tokens_are_looked_at_five_times_a_minute(tmp_path: Path) -> None:
         assert gateway.get("/api/plant", **elsewhere).status == 200
         now[0] += 60.0
         assert gateway.get("/api/plant", **right).status == 200
+
+
+def test_nobody_behind_a_proxy_is_shut_out_in_the_name_of_another_address(tmp_path: Path) -> None:
+    """A proxy such as HAProxy adds a header of its own behind the one that its client sent."""
+    with served(tmp_path, CLOSED, behind_proxy=True) as gateway:
+        for at in range(MOST_WRONG):
+            connection = http.client.HTTPConnection("127.0.0.1", gateway.gateway.port, timeout=PATIENCE)
+            with closing(connection):
+                connection.putrequest("GET", "/api/plant")
+                for address in ("10.0.0.1", "10.0.0.66"):
+                    connection.putheader("x-forwarded-for", address)
+                connection.putheader("authorization", f"Bearer wrong-{at}")
+                connection.endheaders()
+                assert connection.getresponse().status == 401
+        anna = {"x_forwarded_for": "10.0.0.1", "authorization": gateway.bearer(Right.STOP)}
+        assert gateway.get("/api/plant", **anna).status == 200
+        assert gateway.get("/api/plant", **anna | {"x_forwarded_for": "10.0.0.66"}).status == 429
 
 
 def test_a_token_that_was_taken_away_shuts_nobody_out(tmp_path: Path) -> None:

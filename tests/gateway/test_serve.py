@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import http.client
 import json
+import os
 import shutil
 import signal
 import socket
 import ssl
 import subprocess
 import time
-from contextlib import ExitStack, closing
+from contextlib import ExitStack, closing, suppress
 from pathlib import Path
 from typing import Any
 
@@ -116,6 +117,36 @@ def test_sigterm_ends_it_while_viewers_wait(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
+def test_a_stop_waits_for_no_log_that_nobody_reads(tmp_path: Path) -> None:
+    """Somebody pressed Ctrl-S in the terminal, or the journal stands still."""
+    with simulated_plant(tmp_path, '[serve]\nlisten = "127.0.0.1:0"\n[serve.may]\nstop = "anyone"\n') as path:
+        unread, log = os.pipe()
+        words = [*MULTIDROP, "serve", str(path)]
+        with (
+            os.fdopen(unread),
+            os.fdopen(log, "wb"),
+            subprocess.Popen(words, stdout=subprocess.PIPE, stderr=log, text=True) as process,
+        ):
+            try:
+                assert process.stdout is not None
+                port = int(process.stdout.readline().rstrip("/\n").rpartition(":")[2])
+                os.set_blocking(log, False)  # for the gateway's end too, for a moment
+                with suppress(BlockingIOError):
+                    while True:
+                        os.write(log, bytes(1))
+                os.set_blocking(log, True)
+                connection = http.client.HTTPConnection("127.0.0.1", port, timeout=PATIENCE)
+                with closing(connection):
+                    connection.request("POST", "/api/stop", "{}", {"content-type": "application/json"})
+                    found = json.loads(connection.getresponse().read())
+                assert [one["done"] for one in found.values()] == [True, True]
+                process.send_signal(signal.SIGTERM)
+                assert process.wait(PATIENCE) == 0
+            finally:
+                process.kill()
+
+
+@pytest.mark.long
 def test_tls(tmp_path: Path) -> None:
     certificate(tmp_path, "own")
     serve = '[serve]\nlisten = "127.0.0.1:0"\ncertificate = "own.pem"\nkey = "own.key"\ntokens = "tokens"\n'
@@ -160,6 +191,10 @@ def test_check_and_its_mistakes(run: Run, tmp_path: Path) -> None:
         f'multidrop: {plant.path}: [serve]: listen = 80 is not right; write listen = "127.0.0.1:8750"',
         f'multidrop: {plant.path}: [serve.may]: stop = 1 is not right; write stop = "token"',
     ]
+    plant.path.write_text(plant.path.read_text().replace("address = 2", "address = 1"))
+    _, _, also = run("serve", "--check", plant.path)
+    assert len(also.splitlines()) == 3
+    assert set(errors.splitlines()) < set(also.splitlines())
 
 
 @pytest.mark.parametrize("command", ["check", "plan"])

@@ -5,13 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from gateways import certificate, written
+from gateways import certificate, plant_text, written
 from tables import table
 
-from multidrop import PlantError
+from multidrop import PlantError, load_plant
 from multidrop.gateway.listener import listen
 from multidrop.gateway.rights import Right, digest, new_token, read_tokens
-from multidrop.gateway.settings import read_settings
+from multidrop.gateway.settings import read_plant, read_settings
 
 SHA = digest("secret")
 
@@ -106,6 +106,32 @@ verbs = ["pump-1.fly"]
         f"[serve]: audit {tmp_path}/no/such/folder/audit.jsonl cannot be written: No such file or directory",
     ]
     assert sorted(found) == sorted(expected)
+
+
+def test_mistakes_in_the_lines_hide_none_of_the_table(tmp_path: Path) -> None:
+    serve = """
+[serve]
+listen = 80
+[serve.may]
+look = "everybody"
+write = ["pump-1.setpoint"]
+[serve.modbus]
+may = "all"
+units = { pump-1 = 7 }
+"""
+    path = tmp_path / "plant.toml"
+    path.write_text(plant_text("/dev/ttyUSB0", ["pump-1"], serve).replace("invt-che", "invt-chx"))
+    with pytest.raises(PlantError) as wrong:
+        read_plant(lambda: load_plant(path), {})
+    assert [mistake.split(": ")[1] for mistake in wrong.value.mistakes] == [
+        'line "hall", drive "pump-1"',
+        "[serve]",
+        "[serve.may]",
+        "[serve.modbus]",
+    ]
+    path.write_text("no TOML")
+    with pytest.raises(PlantError, match="is not TOML"):
+        read_plant(lambda: load_plant(path), {})
 
 
 @pytest.mark.slow

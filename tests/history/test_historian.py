@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from math import inf, nan
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -10,9 +11,9 @@ import pytest
 from gateways import serving, simulated_plant
 from histories import NOON, SECOND, batch
 
-from multidrop import Plant, open_reader
+from multidrop import Buckets, Plant, open_reader
 from multidrop.core.columns import Names
-from multidrop.gateway.historian import HistorySettings, build
+from multidrop.gateway.historian import HistorySettings, as_json, build
 
 MS = 1_000_000
 
@@ -33,6 +34,12 @@ def test_a_folder_that_cannot_be_is_one_sentence(tmp_path: Path) -> None:
     with pytest.raises(OSError, match="folder /sys/history cannot be written: ") as failure:
         build(HistorySettings(folder="/sys/history"), inside)
     assert "Errno" not in str(failure.value)
+
+
+def test_a_number_without_end_is_null() -> None:
+    """JSON has none, and the plot of all the others would be refused."""
+    found = as_json(Buckets(0, MS, [1, 2], [0, 0], [-inf, 1.0], [nan, 1.5], [inf, 2.0]))
+    assert [found[key] for key in ("least", "mean", "most")] == [[None, 1.0], [None, 1.5], [None, 2.0]]
 
 
 @pytest.mark.slow

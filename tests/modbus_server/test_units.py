@@ -14,7 +14,7 @@ from multidrop.drives import MODELS, InnovertIBD, InvtCHE
 from multidrop.drives.registry import find_model
 from multidrop.gateway.modbus_settings import ModbusSettings
 from multidrop.gateway.units import MAIN, StopWrite, Unit, Units
-from multidrop.plant.model import Plant, PlantLine, Polled, PolledDrive
+from multidrop.plant.model import PolledDrive
 
 FAMILIES = Path(__file__).parents[2] / "src" / "multidrop" / "families"
 
@@ -158,18 +158,6 @@ def test_declared_addresses_are_registers_texts_and_gaps() -> None:
     assert unit.writable(Carrier.BIT, 3) is Meter.relay
     assert unit.writable(Carrier.WORD, 9) is None
     assert unit.writable(Carrier.WORD, 3) is None
-
-
-def test_what_is_read_as_fast_as_the_line_allows_has_the_planned_cycle_as_its_period() -> None:
-    drives = [InnovertIBD(address, name=f"pump-{address}", baudrate=4800) for address in range(1, 31)]
-    fast = tuple(Polled(register, None) for register in InnovertIBD.readings())
-    line = PlantLine("hall", "/dev/hall", 4800, None, tuple(PolledDrive(drive, fast) for drive in drives))
-    plant = Plant((line,), Path("plant.toml"))
-    found = Units(plant, ModbusSettings()).find(MAIN, 1)
-    assert found is not None
-    periods = {poll.every for poll in found.polled.polls}
-    assert periods == {plant.metadata()["planned"]["hall"]["cycle_ms"] / 1e3}
-    assert min(period or 0 for period in periods) > 1
 
 
 def test_the_settings_are_checked_against_the_plant() -> None:

@@ -398,6 +398,35 @@ def test_what_is_no_command_is_told(
     assert known.commands.noted == []
 
 
+@pytest.mark.parametrize(("drive", "verb"), [("pump-1", "\ud800"), ("x" * 65_521, "")])
+def test_an_answer_that_cannot_be_sent_costs_the_others_nothing(
+    broker: Broker, listener: Listener, start: Start, drive: str, verb: str
+) -> None:
+    """A verb that is no UTF-8, and a topic whose answer's would be too long: 65,536 bytes."""
+    known, running = start(commands=True)
+    listener.wait_for(has("multidrop/gateway", b"online"))
+    outbox = running._part._brokers[0].outbox
+    before = outbox.dropped
+    command = {"verb": verb, "drive": "pump-1", "time": now_ms()}
+    publish(broker, f"multidrop/{drive}/act", json.dumps(command).encode())
+    until(lambda: outbox.dropped > before)
+    known.hub.values[("pump-1", "output_frequency")] = 50.0
+    running.step()
+    listener.wait_for(
+        lambda one: one.topic == "multidrop/pump-1" and json_of(one)["values"]["output_frequency"] == 50.0
+    )
+
+
+def test_a_number_without_end_is_null(listener: Listener, start: Start) -> None:
+    """JSON has none: who reads the message would lose all other values with it."""
+    known, running = start()
+    listener.wait_for(has("multidrop/pump-1"))
+    known.hub.values[("pump-1", "output_frequency")] = float("inf")
+    running.step()
+    said = listener.wait_for(lambda one: one.topic == "multidrop/pump-1" and b"49.5" not in one.payload)
+    assert b'"output_frequency": null' in said.payload
+
+
 def test_without_the_key_nothing_is_listened_to(broker: Broker, listener: Listener, start: Start) -> None:
     known, running = start()
     listener.wait_for(has("multidrop/gateway", b"online"))

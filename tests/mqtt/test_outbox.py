@@ -51,6 +51,17 @@ def test_what_waits_says_what_is_so_when_it_is_sent() -> None:
     assert wire.sent == [("state", b"new")]
 
 
+def test_a_message_that_cannot_be_made_holds_up_no_other() -> None:
+    wire = Wire()
+    outbox = Outbox(wire.send)
+    outbox.put(Publication("told", "\ud800".encode))
+    outbox.put(said("state"))
+    assert wire.sent == [("state", b"")]
+    assert outbox.dropped == 1
+    outbox.acknowledge([1])
+    assert outbox.is_idle
+
+
 def test_a_lost_connection_forgets_what_waits_and_counts_it() -> None:
     wire = Wire()
     outbox = Outbox(wire.send)

@@ -41,6 +41,19 @@ def test_gateways_lines_and_moves(opened: Opener) -> None:
     ]
 
 
+@pytest.mark.parametrize("width", [768, 390])
+def test_its_tables_fit_a_small_screen(opened: Opener, width: int) -> None:
+    page = opened("#/fleet")
+    page.set_viewport_size({"width": width, "height": 844})
+    await_note(page, "Looked at once a second")
+    tables = page.locator("#fleet .scroll")
+    until_met(page, lambda: tables.count() == 3)
+    wide = "tables => tables.map(table => table.scrollWidth - table.clientWidth)"
+    until_met(page, lambda: max(tables.evaluate_all(wide)) <= 0)
+    lag = "getComputedStyle(document.querySelectorAll('#fleet-gateways td')[6], '::before').content"
+    until(page, f"{lag} === '\"Lag \"'")  # beside the value: the table's head is not there
+
+
 def test_what_is_old_is_marked_with_its_age_and_why(opened: Opener, gateway: FakeGateway) -> None:
     page = opened("#/fleet")
     await_note(page, "Looked at once a second")

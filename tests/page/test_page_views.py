@@ -96,6 +96,32 @@ def test_a_raw_count_stays_within_its_column(
     until_met(page, lambda: min(states.evaluate_all(width)) >= 120)  # px, for "overcurrent"
 
 
+@pytest.mark.parametrize("size", [(1440, 900), (768, 1024), (390, 844)])
+def test_no_word_of_a_state_is_cut(opened: Opener, size: tuple[int, int]) -> None:
+    page = opened()
+    page.set_viewport_size(dict(zip(("width", "height"), size, strict=True)))
+    words = page.locator("#table .word", has_text="overcurrent in acceleration")
+    parts = "([word]) => [word.scrollWidth - word.clientWidth, word.clientHeight]"
+    until_met(page, lambda: words.count() == 1)
+    too_wide, height = words.evaluate_all(parts)
+    assert too_wide <= 0
+    assert height <= 2 * 14 * 1.2 + 1  # px: two lines, so no word of it is broken
+
+
+@pytest.mark.parametrize("size", [(1440, 900), (768, 1024)])
+def test_why_a_port_is_lost_is_shown_whole(
+    opened: Opener, gateway: FakeGateway, size: tuple[int, int]
+) -> None:
+    lines = fake_plant.lines()
+    why = "could not open port /dev/serial/by-id/usb-FTDI_FT232R_USB_UART-if00: No such file or directory"
+    gateway.changes = {"lines": lines | {"hall-3": lines["hall-3"] | {"lost": why}}}
+    page = opened()
+    page.set_viewport_size(dict(zip(("width", "height"), size, strict=True)))
+    head = page.locator("#table .linehead").last
+    until_met(page, lambda: why in head.inner_text())
+    assert head.evaluate("head => head.scrollWidth - head.clientWidth") <= 0
+
+
 def test_what_is_wrong_has_a_shape_and_a_word_beside_its_colour(opened: Opener) -> None:
     page = opened()
     state = cell(page, "conveyor-2", "state")

@@ -23,7 +23,7 @@ from multidrop.gateway import frames
 from multidrop.gateway import gateway as gateway_module
 from multidrop.gateway.gateway import Gateway
 from multidrop.gateway.rights import Right, Token, new_token
-from multidrop.gateway.settings import ServeSettings, read_settings
+from multidrop.gateway.settings import ServeSettings, read_plant
 from multidrop.sim import SimulatedDrive, Simulator, Wire, simulated
 
 NAMES = {Right.LOOK: "looker", Right.STOP: "stopper", Right.WRITE: "writer"}
@@ -145,8 +145,7 @@ def served(
         written(folder, serve, *names, port=simulator.wires[0].path)
 
         def read() -> tuple[Plant, ServeSettings]:
-            plant = load_plant(folder / "plant.toml")
-            found = read_settings(plant, environment or {})
+            plant, found = read_plant(lambda: load_plant(folder / "plant.toml"), environment or {})
             return plant, replace(found, port=0, **{"tokens": known, **settings})
 
         gateway = Gateway(*read(), read=read)

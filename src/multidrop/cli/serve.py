@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING
 
 from multidrop.cli.support.demo_plant import DRIVES, demo_port, plant_file, simulator, start_motors
 from multidrop.cli.support.extras import require_extra
+from multidrop.cli.support.log_thread import LogThread
 from multidrop.cli.support.output import print_text, warn
 from multidrop.cli.support.plants import add_port_option, plant_of
 from multidrop.cli.support.signals import on_end_signals, on_reload_signal
@@ -63,11 +64,10 @@ def run(arguments: argparse.Namespace) -> int:
     if not arguments.plant:
         raise ValueError("name a plant file, or try `multidrop serve --demo`")
     _require_server()
-    from multidrop.gateway.settings import read_settings
+    from multidrop.gateway.settings import read_plant
 
     def read() -> tuple[Plant, ServeSettings]:
-        plant = plant_of(arguments.plant, arguments)
-        return plant, read_settings(plant, os.environ)
+        return read_plant(lambda: plant_of(arguments.plant, arguments), os.environ)
 
     plant, settings = read()
     if arguments.check:
@@ -204,8 +204,7 @@ def _time(record: logging.LogRecord) -> str:
 
 @contextmanager
 def _logging(form: str, level: int) -> Iterator[None]:
-    handler = logging.StreamHandler(sys.stderr)
-    handler.setFormatter(_JsonFormatter() if form == "json" else _TextFormatter())
+    handler = LogThread(sys.stderr, _JsonFormatter() if form == "json" else _TextFormatter())
     levels = {"multidrop": level, "uvicorn": logging.WARNING, "asyncio": logging.WARNING}
     loggers = {logging.getLogger(name): wanted for name, wanted in levels.items()}
     before = {logger: logger.level for logger in loggers}
@@ -218,3 +217,4 @@ def _logging(form: str, level: int) -> Iterator[None]:
         for logger, old in before.items():
             logger.removeHandler(handler)
             logger.setLevel(old)
+        handler.close()

@@ -29,6 +29,7 @@ from multidrop import (
 )
 from multidrop.gateway.clock import boottime_ns, monotonic_ns
 from multidrop.gateway.command_threads import begin_stops, in_thread
+from multidrop.gateway.repeated_stops import RepeatedStops, stop_one
 from multidrop.gateway.rights import NEVER_THIS_WAY, Caller, May, Right
 from multidrop.gateway.stops_amid_reload import ChangingLines, drives_of, names_of, stop_meant
 from multidrop.gateway.told import Told as Told
@@ -66,6 +67,7 @@ class Commands:
         self._under_way: dict[str, int] = {}  # writes, by line
         self.stops: Counter[str] = Counter()  # that were called, by drive
         self._stopped_ns: dict[str, int] = {}  # when the latest one was
+        self._repeated = RepeatedStops()
         self._ended_ns: dict[str, int] = {}  # by drive
         self.plant_ns: int | None = None  # when the plant was read anew (CLOCK_BOOTTIME)
 
@@ -112,27 +114,33 @@ class Commands:
         """Stop these drives of a plant."""
         there, wanted = drives_of(plant), dict.fromkeys(wanted)
         told: dict[str, Told] = {}
-        works: list[tuple[StopWork, list[str]]] = []
+        works: list[tuple[StopWork, list[Drive]]] = []
+        once: list[Drive] = []
         for line in plant.lines:
             here = {polled.drive.name: polled.drive for polled in line.drives if polled.drive.name in wanted}
             self._note_stop(here)
-            if here and len(here) == len(line.drives):
-                works.append((partial(self._stop_line, line.name, list(here)), list(here)))
+            new = [drive for drive in here.values() if self._repeated.of(drive) is None]
+            once += [drive for drive in here.values() if drive not in new]
+            if new and len(new) == len(line.drives):
+                works.append((partial(self._stop_line, line.name, list(here)), new))
             else:
-                works += [(partial(_stop_one, drive), [name]) for name, drive in here.items()]
+                works += [(partial(stop_one, drive), [drive]) for drive in new]
         for name in wanted:
             if name not in there:
                 told[name] = failed(ValueError(f"there is no drive {name!r}"))
-        for found in await asyncio.gather(*self._begin_stops(works, caller)):
+        begun = self._begin_stops(works, caller)
+        again = [self._repeated.send_once(drive, caller) for drive in once]
+        for found in await asyncio.gather(*begun, *again):
             told |= found
         return {name: told[name] for name in wanted if name in told}
 
     def _begin_stops(
-        self, works: Sequence[tuple[StopWork, list[str]]], caller: Caller
+        self, works: Sequence[tuple[StopWork, list[Drive]]], caller: Caller
     ) -> list[asyncio.Future[dict[str, Told]]]:
         begun = begin_stops([work for work, _ in works], caller)
         for future, (_, drives) in zip(begun, works, strict=True):
-            future.add_done_callback(partial(self._note_end, drives))
+            future.add_done_callback(partial(self._note_end, [drive.name for drive in drives]))
+            self._repeated.note(drives, future)
         return begun
 
     def _stop_line(self, line: str, names: list[str], seconds: float | None) -> dict[str, Told]:
@@ -205,7 +213,7 @@ class Commands:
             listed = {drive} | {name for name in names if f"{name}.{verb}" in self.may.verbs}
             here = [name for name in names if name in there and name in listed]
             self._note_stop(here)
-            works = [(partial(_stop_by, there[name], verb, arguments), [name]) for name in here]
+            works = [(partial(_stop_by, there[name], verb, arguments), [there[name]]) for name in here]
             rest = self._stop(plant, [name for name in names if name not in here], caller)
             ends = await asyncio.gather(*self._begin_stops(works, caller), rest)
             return {name: told for end in ends for name, told in end.items()}
@@ -253,14 +261,6 @@ class Commands:
     def _end(self, line: str, drive: str) -> None:
         self._under_way[line] -= 1
         self._note_end([drive])
-
-
-def _stop_one(drive: Drive, seconds: float | None) -> dict[str, Told]:
-    try:
-        drive.stop(seconds=seconds)
-    except Exception as failure:  # whatever it is: everybody must see it
-        return {drive.name: failed(failure)}
-    return {drive.name: Told(True, "stopped: seen to stand")}
 
 
 def _stop_by(drive: Drive, verb: str, arguments: Mapping[str, Any], seconds: float | None) -> dict[str, Told]:

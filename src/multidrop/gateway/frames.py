@@ -226,7 +226,7 @@ class Frames:
         if n not in self._encoded:
             told = newest if known is None else {"n": newest["n"], "since": n, **changes(known, newest)}
             plain = json.dumps(told, separators=(",", ":"), allow_nan=False).encode()
-            self._encoded[n] = Encoded(newest["n"], plain, gzip.compress(plain, 6, mtime=0))
+            self._encoded[n] = Encoded(newest["n"], plain, gzip.compress(plain, 9, mtime=0))
         return self._encoded[n]
 
     def _build(self) -> None:

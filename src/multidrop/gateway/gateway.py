@@ -17,7 +17,7 @@ import uvicorn
 
 import multidrop
 from multidrop import Batch, Bus, Ledger, LineError, Plant, Poller
-from multidrop.gateway.clock import boottime_ns, monotonic_ns, now_and_slept_ns, utc_ms
+from multidrop.gateway.clock import boottime_ns, now_and_slept_ns, utc_ms
 from multidrop.gateway.commands import Commands
 from multidrop.gateway.connections import Connections, Watched
 from multidrop.gateway.events import Events
@@ -179,7 +179,6 @@ class Gateway:
 
     def hand_out(self, poller: Poller) -> None:
         """Give each batch to the hub and to all parts; amid a reload, what is of the plant of before."""
-        self.hub.pass_time(monotonic_ns())
         while self.newcomers.has_room and (batch := poller.take()):
             self._has_news = True
             self.feed(batch if self.plant_coming is None else self.newcomers.keep(batch, self.plant, poller))

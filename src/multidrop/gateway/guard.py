@@ -185,7 +185,7 @@ class Guard:
         peer = str(client[0]) if client else ""
         if not self._behind_proxy:
             return peer
-        told = headers.get("x-forwarded-for", "").rpartition(",")[2].strip()
+        told = ",".join(headers.getlist("x-forwarded-for")).rpartition(",")[2].strip()
         return told[:64] or peer
 
 

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from importlib import import_module
+from math import isfinite
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Protocol
@@ -137,7 +138,7 @@ class Historian:
         range_ns = begin * MS_NS, end * MS_NS
         found = await asyncio.to_thread(self.history.buckets, names, *range_ns, points)
         step = next(iter(found.values())).step
-        return {"step_ms": step / MS_NS, "series": {name: _as_json(made) for name, made in found.items()}}
+        return {"step_ms": step / MS_NS, "series": {name: as_json(made) for name, made in found.items()}}
 
     def export(self, names: Sequence[str], begin: int, end: int, kind: str) -> Iterator[bytes]:
         """Return a file of these series, or of all, piece by piece: "csv" or "parquet".
@@ -160,13 +161,18 @@ class Historian:
                     yield piece
 
 
-def _as_json(made: Buckets) -> dict[str, Any]:
+def as_json(made: Buckets) -> dict[str, Any]:
+    """Return buckets as JSON can have them: a float's infinity is null there."""
     return {
         "time": [time // MS_NS for time in made.times],
-        "least": made.least,
-        "mean": made.mean,
-        "most": made.most,
+        "least": _finite(made.least),
+        "mean": _finite(made.mean),
+        "most": _finite(made.most),
         "missed": made.missed,
         "unit": made.unit,
         "left_out": made.left_out,
     }
+
+
+def _finite(values: Sequence[float | None]) -> list[float | None]:
+    return [None if value is None or not isfinite(value) else value for value in values]

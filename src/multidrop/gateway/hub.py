@@ -67,8 +67,6 @@ class _Watched:
         self.cycle_ns = cycle_ns  # of its line, as planned
         self.reader = StateReader(polled.drive)
         self.cells: dict[str, RegisterRows] = {}
-        self.seen = Shown(UNKNOWN, None)
-        self.seen_at = -1, -1  # batch and time
 
     def cell(self, register: str) -> RegisterRows:
         """Return the cell of a register, which is new where it was not known."""
@@ -87,7 +85,6 @@ class Hub:
 
     def __init__(self, plant: Plant, clock: Callable[[], tuple[int, int]] = lambda: (0, 0)) -> None:
         self.plant = plant
-        self.now_ns = 0  # of the monotonic clock
         self._clock = clock
         _, self._slept_ns = clock()
         self._woke_ns = 0  # when a sleep was noticed, by the monotonic clock
@@ -149,11 +146,9 @@ class Hub:
             row = (time, monotonic_ns, value, status)
             if status == 0:
                 if cell.good is not None and cell.newest is cell.good:
-                    cell.interval_ns = monotonic_ns - cell.good[1]
+                    cell.intervals_ns = cell.intervals_ns[1], monotonic_ns - cell.good[1]
                 cell.good = row
             cell.newest = row
-            if monotonic_ns > self.now_ns:
-                self.now_ns = monotonic_ns
             if time > self.time:
                 self.time = time
         self.taken += 1
@@ -162,20 +157,23 @@ class Hub:
         watched = self._watched.get(drive)
         return watched.cell(register) if watched else None
 
-    def pass_time(self, monotonic_ns: int) -> None:
-        """Take the present time: values grow old even where no row comes."""
-        self.now_ns = max(self.now_ns, monotonic_ns)
-
     def woke_ns(self) -> int:
         """Return when the latest sleep of the machine was noticed (CLOCK_MONOTONIC); 0 without one.
 
         What was asked for before is no longer the present.
         """
+        return self._times()[1]
+
+    def _times(self) -> tuple[int, int]:
+        """Return the present time, and when the latest sleep was noticed.
+
+        The clock is read at each look: this process may have stood still until just now.
+        """
         now_ns, slept_ns = self._clock()
         if slept_ns > self._slept_ns + LEAST_SLEEP_NS:
-            self._woke_ns = self.now_ns = max(now_ns, self.now_ns + 1)
+            self._woke_ns = now_ns + 1
         self._slept_ns = max(slept_ns, self._slept_ns)
-        return self._woke_ns
+        return now_ns, self._woke_ns
 
     # ---- values ----
 
@@ -209,7 +207,8 @@ class Hub:
         watched = self._watched.get(drive)
         if watched is None:
             return
-        woke_ns, now_ns, cells = self.woke_ns(), self.now_ns, watched.cells
+        now_ns, woke_ns = self._times()
+        cells = watched.cells
         for name in watched.names:
             cell = cells.get(name)
             if cell is None:
@@ -242,16 +241,10 @@ class Hub:
     def seen(self, drive: str) -> Shown:
         """Return a drive's state, with its fault or the reason why it is silent."""
         watched = self._watched.get(drive)
-        if watched is None:
-            return Shown(UNKNOWN, None)
-        self.woke_ns()  # which is another time, if it slept
-        now = self.taken, self.now_ns
-        if watched.seen_at != now:
-            watched.seen, watched.seen_at = self._look(watched), now
-        return watched.seen
+        return Shown(UNKNOWN, None) if watched is None else self._look(watched)
 
     def _look(self, watched: _Watched) -> Shown:
-        fresh = FreshValues(watched.cells, self.now_ns, self._woke_ns)
+        fresh = FreshValues(watched.cells, *self._times())
         found = watched.reader.state(fresh)
         if found is not None and found.condition is not Condition.UNKNOWN:
             fault = found.fault or UNNAMED

@@ -15,19 +15,22 @@ Known = tuple[str, KeptRow | None, KeptRow | None, bool]  # register, newest row
 class RegisterRows:
     """One register of one drive."""
 
-    __slots__ = ("good", "interval_ns", "least_ns", "newest", "since_ns")
+    __slots__ = ("good", "intervals_ns", "least_ns", "newest", "since_ns")
 
     def __init__(self, least_ns: int, since_ns: int = 0) -> None:
         self.since_ns = since_ns  # rows of before are another drive's, which had the name
         self.newest: KeptRow | None = None
         self.good: KeptRow | None = None
         self.least_ns = least_ns  # of its intervals, as planned
-        self.interval_ns = 0  # between its latest two samples, with no miss between them
+        self.intervals_ns = 0, 0  # the latest two between samples with no miss between them
 
     @property
     def holds_ns(self) -> int:
-        """The time for which its value is the present one."""
-        return max(STALE_NS, STALE_PERIODS * max(self.least_ns, self.interval_ns))
+        """The time for which its value is the present one.
+
+        Its line may be slower than planned; but one long interval is a pause, and not how often it is asked.
+        """
+        return max(STALE_NS, STALE_PERIODS * max(self.least_ns, min(self.intervals_ns)))
 
     def is_fresh(self, now_ns: int, woke_ns: int) -> bool:
         """Return True while its newest value is the present one, and from after the machine woke."""

@@ -81,8 +81,8 @@ class Lately:
             "used": used,
             "planned": round(self._planned.get(name, 0.0), 4),
             "rate": rate,
-            "p99": None if minute is None else _ms(minute.delays.p99),
-            "misses": sum(minute.misses.values()) if minute else 0,
+            "p99": _p99(minute) if minute else None,
+            "misses": sum(minute.misses.values()) if minute else None,
         }
 
     def _use(self, name: str) -> tuple[float | None, float | None]:
@@ -155,12 +155,13 @@ def asked_of(statistics: Statistics) -> int:
 
 def _of_minute(statistics: Statistics) -> dict[str, Any]:
     asked = asked_of(statistics)
-    delays = statistics.delays
     return {
         "missed": round(1 - statistics.samples / asked, 4) if asked else None,
-        "p99": _ms(delays.p99) if delays.replies else None,
+        "p99": _p99(statistics),
     }
 
 
-def _ms(seconds: float) -> float:
-    return round(seconds * 1e3, 3)
+def _p99(statistics: Statistics) -> float | None:
+    """Return the 99th percentile of the response delays in ms; None where nothing replied."""
+    delays = statistics.delays
+    return round(delays.p99 * 1e3, 3) if delays.replies else None

@@ -106,8 +106,9 @@ def _drive_families(statistics: Mapping[str, LineStatistics]) -> Iterator[Metric
     delays: list[Sample] = []
     for labels, drive in drives:
         found = drive.delays
-        for quantile, value in (("0.5", found.p50), ("0.9", found.p90), ("0.99", found.p99)):
-            delays.append(("", {**labels, "quantile": quantile}, value))
+        if found.replies:
+            for quantile, value in (("0.5", found.p50), ("0.9", found.p90), ("0.99", found.p99)):
+                delays.append(("", {**labels, "quantile": quantile}, value))
         delays.append(("_count", labels, float(found.replies)))
     yield MetricFamily(
         "multidrop_response_delay_seconds", "summary", "From a request's end to its reply's begin.", delays

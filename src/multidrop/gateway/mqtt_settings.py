@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
+from math import isfinite
 from pathlib import Path
 from typing import Any
 
@@ -94,8 +95,10 @@ def shown(register: Register[Any], value: float) -> float | str:
 
 
 def fresh_values(hub: Hub, drive: str) -> dict[str, float | str | None]:
-    """Return the values of a drive's polled registers; None for one that is not fresh."""
+    """Return the values of a drive's polled registers; None for one that is not fresh, or no number."""
     return {
-        name: shown(register, good[2]) if is_fresh and good is not None and newest is good else None
+        name: shown(register, good[2])
+        if is_fresh and good is not None and newest is good and isfinite(good[2])
+        else None
         for register, (name, newest, good, is_fresh) in zip(hub.polled(drive), hub.known(drive), strict=True)
     }

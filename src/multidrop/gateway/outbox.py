@@ -6,11 +6,14 @@ made when it is sent. Pure: `send` does the sending.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Iterable
 from typing import NamedTuple
 
 MOST_UNDER_WAY = 64  # messages that were sent, and not acknowledged: two lines' drives go at once
 MOST_WAITING = 4096  # topics; more than any plant has
+
+_log = logging.getLogger("multidrop.gateway.mqtt")
 
 
 class Publication(NamedTuple):
@@ -51,7 +54,13 @@ class Outbox:
         """Send what waits, as far as there is room."""
         while self._waiting and len(self._under_way) < MOST_UNDER_WAY:
             topic = next(iter(self._waiting))
-            number = self._send(self._waiting[topic])
+            try:
+                number = self._send(self._waiting[topic])
+            except Exception as failure:  # no broker takes this one; all others are sent
+                del self._waiting[topic]
+                self.dropped += 1
+                _log.warning("what was to be said on %.100r cannot be sent: %r", topic, failure)
+                continue
             if number is None:
                 return
             del self._waiting[topic]

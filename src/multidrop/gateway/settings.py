@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 import ssl
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import MISSING, Field, dataclass, field, fields
 from pathlib import Path
 from typing import Any
@@ -81,8 +81,26 @@ class Folders:
         return self._beside / name
 
 
+def read_plant(load: Callable[[], Plant], environment: Mapping[str, str]) -> tuple[Plant, ServeSettings]:
+    """Return a plant and what its `[serve]` says. Raises PlantError with all mistakes in both."""
+    try:
+        plant = load()
+    except PlantError as wrong:
+        if wrong.rest is None:
+            raise
+        try:
+            read_settings(wrong.rest, environment)
+        except PlantError as also:
+            raise PlantError((*wrong.mistakes, *also.mistakes)) from None
+        raise
+    return plant, read_settings(plant, environment)
+
+
 def read_settings(plant: Plant, environment: Mapping[str, str]) -> ServeSettings:
-    """Return what `[serve]` of a plant says. Raises PlantError with all mistakes in it."""
+    """Return what `[serve]` of a plant says. Raises PlantError with all mistakes in it.
+
+    In a plant without lines no name of a drive or a line is looked up.
+    """
     place = TomlPlace(plant.path, ("[serve]",))
     folders = Folders(plant.path, environment)
     given = place.check(dict(plant.serve), _SERVE)
@@ -175,9 +193,10 @@ def _may(table: Any, plant: Plant, place: TomlPlace) -> May:
     for key in ("look", "stop"):
         if given.get(key, "anyone") not in ("anyone", "token"):
             place.wrong(f'{key} = "{given[key]}" is neither "anyone" nor "token"')
+    named = given if plant.lines else {}
     listed = {
         key: frozenset(
-            entry for entry in given.get(key, ()) if place.attempt(check_listed, plant, key, entry)
+            entry for entry in named.get(key, ()) if place.attempt(check_listed, plant, key, entry)
         )
         for key in MAY_LISTS
     }

@@ -5,10 +5,9 @@ from __future__ import annotations
 import difflib
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import replace
 from typing import Any, NamedTuple, Protocol
 
-from multidrop import Carrier, Plant, Polled, PolledDrive, Register
+from multidrop import Carrier, Plant, PolledDrive, Register
 from multidrop.gateway.common_block import CommonBlock
 from multidrop.gateway.drive_words import DriveWords, reading_function
 from multidrop.gateway.pdu import WriteRequest
@@ -32,7 +31,6 @@ class Unit:
 
     def __init__(self, line: str, polled: PolledDrive) -> None:
         self.line = line
-        self.polled = polled
         self.drive = polled.drive
         self.words = DriveWords(polled)
         self.common = CommonBlock(polled)
@@ -152,26 +150,12 @@ class Units:
 
 def _by_port(plant: Plant, settings: UnitSettings) -> Mapping[str, Mapping[int, list[Unit]]]:
     found: dict[str, dict[int, list[Unit]]] = defaultdict(lambda: defaultdict(list))
-    planned = _cycles(plant)
     for line in plant.lines:
         port = line.name if line.name in settings.ports else MAIN
         for polled in line.drives:
             number = settings.units.get(polled.drive.name, polled.drive.address)
-            found[port][number].append(Unit(line.name, _with_periods(polled, planned.get(line.name, 0.0))))
+            found[port][number].append(Unit(line.name, polled))
     return found
-
-
-def _cycles(plant: Plant) -> dict[str, float]:
-    """Return the planned cycle of each line that polls anything, in s."""
-    lines = tuple(line for line in plant.lines if any(polled.polls for polled in line.drives))
-    planned = replace(plant, lines=lines).metadata()["planned"] if lines else {}
-    return {name: plan["cycle_ms"] / 1e3 for name, plan in planned.items()}
-
-
-def _with_periods(polled: PolledDrive, cycle_s: float) -> PolledDrive:
-    """Return the same with the planned cycle for registers that are read as fast as the line allows."""
-    polls = [Polled(poll.register, cycle_s if poll.every is None else poll.every) for poll in polled.polls]
-    return PolledDrive(polled.drive, tuple(polls))
 
 
 def _clashes(port: str, units: Mapping[int, list[Unit]]) -> Iterator[str]:
@@ -224,11 +208,7 @@ def _unknown_names(plant: Plant, settings: UnitSettings) -> Iterator[str]:
         ("ports", "line", settings.ports, lines),
     ):
         for name in given:
-            if name not in known:
+            if known and name not in known:
                 near = difflib.get_close_matches(name, known, n=2)
-                hint = (
-                    f"did you mean {' or '.join(near)}?"
-                    if near
-                    else f"there are {', '.join(known) or 'none'}"
-                )
+                hint = f"did you mean {' or '.join(near)}?" if near else f"there are {', '.join(known)}"
                 yield f"{key}: there is no {kind} {name!r}; {hint}"

@@ -47,10 +47,11 @@ def _delays(statistics: Statistics | None) -> dict[str, Any] | None:
     }
 
 
-def _usual_delays(statistics: Statistics) -> dict[str, float]:
-    """Return the median and the 99th percentile of the response delays, in ms."""
+def _usual_delays(statistics: Statistics) -> dict[str, float | None]:
+    """Return the median and the 99th percentile of the response delays, in ms; None where nothing replied."""
     delays = statistics.delays
-    return {"p50": round(delays.p50 * 1e3, 3), "p99": round(delays.p99 * 1e3, 3)}
+    quantiles = {"p50": delays.p50, "p99": delays.p99}
+    return {name: round(s * 1e3, 3) if delays.replies else None for name, s in quantiles.items()}
 
 
 def _wear(ledger: Ledger, port: str, address: int) -> list[dict[str, Any]]:

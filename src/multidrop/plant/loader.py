@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -19,11 +20,15 @@ from multidrop.toml_check import Key, TomlPlace, duration_of, read_document
 
 
 class PlantError(ValueError):
-    """All errors of a plant file; `mistakes` has a sentence for each: its place, and what would be right."""
+    """All errors of a plant file; `mistakes` has a sentence for each: its place, and what would be right.
 
-    def __init__(self, mistakes: tuple[str, ...]) -> None:
+    `rest` is the plant without its lines, where they have mistakes and the file is TOML.
+    """
+
+    def __init__(self, mistakes: tuple[str, ...], rest: Plant | None = None) -> None:
         super().__init__("\n".join(mistakes))
         self.mistakes = mistakes
+        self.rest = rest
 
 
 def load_plant(path: Path | str) -> Plant:
@@ -33,9 +38,10 @@ def load_plant(path: Path | str) -> Plant:
     document = place.attempt(read_document, path, "plant file")
     given = {} if document is None else place.check(document, _PLANT)
     lines = tuple(_line(table, at) for table, at in place.inside("line", given.get("line", [])))
+    plant = Plant(lines, path, given.get("serve", {}))
     if place.config_errors:
-        raise PlantError(tuple(place.config_errors))
-    return Plant(lines, path, given.get("serve", {}))
+        raise PlantError(tuple(place.config_errors), None if document is None else replace(plant, lines=()))
+    return plant
 
 
 _PLANT = {

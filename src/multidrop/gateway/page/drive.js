@@ -52,7 +52,8 @@ export function show(name, isOpen) {
 }
 
 function build({ spec, line }) {
-  parts = { shape: make("span"), word: make("span"), age: make("span", { class: "sub-age" }), keys: [] };
+  parts = { shape: make("span"), word: make("span"), age: make("span"), keys: [] };
+  parts.says = make("span", {}, parts.shape, " ", parts.word);
   const where = [
     `${spec.family} · address ${spec.address} on `,
     named(line.name),
@@ -70,7 +71,7 @@ function build({ spec, line }) {
       { class: "panelhead" },
       make("h2", { tabindex: "-1" }, named(spec.name)),
       make("p", {}, where),
-      make("p", { class: "stateline" }, parts.shape, parts.word, parts.age),
+      make("p", { class: "stateline" }, parts.says, parts.age),
       make(
         "div",
         { class: "acts" },
@@ -110,7 +111,7 @@ export function draw() {
   const words_ =
     is === "fault" ? `fault: ${store.frame.drives[chosen].fault ?? "unknown"}` : (STATES[is] ?? is);
   put(parts.word, isLive(t) || !store.frame ? words_ : `last: ${words_}`);
-  parts.word.className = `stateword ${is}`;
+  parts.says.className = `stateword ${is}`;
   put(parts.age, age === null ? "never answered" : `last reply ${clock.lasting(age)} ago`);
   registers.draw(t);
 }

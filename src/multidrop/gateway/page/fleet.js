@@ -88,9 +88,9 @@ function draw() {
   note("gateways", members.flatMap(troubles).join("; "), true);
   note("lines", `${all.length} lines, ${free.length} without a master${more}`, free.length > 0);
   note("moves", `Times are ${clock.zoneName()}; a dash stands for a master that nobody saw.`, false);
-  fill(find("#fleet-gateways"), members.map(gateway).map(row));
-  fill(find("#fleet-lines"), sorted.map(line).map(row));
-  fill(find("#fleet-moves"), moves.map(move).map(row));
+  drawTable("gateways", members.map(gateway));
+  drawTable("lines", sorted.map(line));
+  drawTable("moves", moves.map(move));
 }
 
 function note(id, text, isBad) {
@@ -114,13 +114,21 @@ function drawAge(age, isOld) {
   setClass(find("#fleet"), "stale", isOld);
 }
 
-const row = ([first, ...others]) =>
-  make(
-    "tr",
-    {},
-    make("th", { scope: "row" }, first),
-    others.map(one => make("td", {}, one)),
+// Draw rows of cells; each cell knows its column's head, which a narrow screen shows beside it.
+function drawTable(id, made) {
+  const heads = TABLES[id][1];
+  fill(
+    find(`#fleet-${id}`),
+    made.map(([first, ...others]) =>
+      make(
+        "tr",
+        {},
+        make("th", { scope: "row" }, first),
+        others.map((one, i) => make("td", { "data-head": heads[i + 1] }, one)),
+      ),
+    ),
   );
+}
 
 // Return the cells of a gateway. What it does not say itself is not known.
 function gateway([name, { host, session, began_ms: began, lines, says }]) {

@@ -41,7 +41,7 @@ function card(line, told) {
       { class: "note" },
       `${line.port}${line.speed ? ` · ${line.speed}` : ""} · ${count(line.drives.length, "drive")}`,
     ),
-    frame.lost ? make("p", { class: "bad" }, glyph("port"), ` The port is lost: ${frame.lost}`) : null,
+    frame.lost ? make("p", { class: "warn" }, glyph("port"), ` The port is lost: ${frame.lost}`) : null,
     figures(frame),
     told ? misses(told.minutes) : null,
     delays(line, told?.drives ?? {}),
@@ -53,7 +53,7 @@ function figures({ used = null, planned = null, rate = null, p99 = null, misses:
   const bar = make("span", {
     class: "use",
     role: "img",
-    "aria-label": `${share(used)} used of ${share(planned)} planned`,
+    "aria-label": `${share(used)} used, ${share(planned)} planned`,
   });
   const [part, mark] = [make("i"), make("u")];
   part.style.width = `${Math.min(1, used ?? 0) * 100}%`;

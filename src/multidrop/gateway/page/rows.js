@@ -155,7 +155,7 @@ export function drawHead(h) {
   h.used.style.width = `${Math.min(1, used ?? 0) * 100}%`;
   h.planned.style.left = `${Math.min(1, planned ?? 0) * 100}%`;
   h.planned.hidden = planned === null;
-  const words = `${share(used)} of ${share(planned)} planned`;
+  const words = `${share(used)} used, ${share(planned)} planned`;
   put(h.share, ` ${words}`);
   if (h.bar.getAttribute("aria-label") !== words) h.bar.setAttribute("aria-label", words);
   put(h.rate, rate === null ? "" : `${rate.toFixed(1)} exchanges/s`);
@@ -169,6 +169,5 @@ export function drawHead(h) {
           ? `${misses} missed in the last minute`
           : "none missed",
   );
-  setClass(h.missed, "fault", Boolean(lost));
-  setClass(h.missed, "warn", !lost && misses > 0);
+  setClass(h.missed, "warn", Boolean(lost) || misses > 0);
 }
