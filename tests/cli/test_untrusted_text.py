@@ -39,11 +39,11 @@ def test_what_prints_stays_as_it_is() -> None:
 
 
 @pytest.mark.parametrize("form", ["text", "json"])
-def test_a_gateway_s_log_has_one_line_for_whoever_asks(capsys: pytest.CaptureFixture[str], form: str) -> None:
+def test_a_gateway_s_log_has_one_line_for_whoever_asks(capfd: pytest.CaptureFixture[str], form: str) -> None:
     """A caller's address may be told by a proxy, and a drive's name by a topic of MQTT."""
     with _logging(form, logging.INFO):
         logging.getLogger("multidrop.gateway").warning("stop of %s, asked for by %s", TRAP, "anna")
-    (line,) = capsys.readouterr().err.removesuffix("\n").split("\n")
+    (line,) = capfd.readouterr().err.removesuffix("\n").split("\n")
     assert "asked for by anna" in line
     assert not set(line) & {"\x1b", "\r", "\0"}
     assert form == "json" or line.isprintable()
