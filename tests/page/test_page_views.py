@@ -74,6 +74,19 @@ def line_of_one(number: int, most: float) -> dict[str, Any]:
     return line | {"drives": [drive | {"registers": registers}]}
 
 
+def test_a_motor_s_speed_is_not_called_its_frequency(opened: Opener, gateway: FakeGateway) -> None:
+    line = line_of_one(0, 50)
+    (drive,) = line["drives"]
+    names = {"output_frequency": "motor_speed"}
+    registers = [r | {"name": names.get(r["name"], r["name"])} for r in drive["registers"]]
+    drive |= {"registers": registers, "key": drive["key"] | {"frequency": "motor_speed"}}
+    gateway.plant_changes = {"lines": [line]}
+    page = opened()
+    page.get_by_role("link", name="pump-1").click()
+    page.locator("#panel dt", has_text="Motor speed").wait_for()
+    assert page.locator("#panel dt", has_text="Frequency").count() == 0
+
+
 @pytest.mark.parametrize(
     "size", [(1440, 900), (1366, 768), (1200, 800), (1181, 800), (820, 1180), (390, 844)]
 )

@@ -16,6 +16,7 @@ const KEYS = [
   ["setpoint", "Setpoint"],
   ["current", "Current"],
 ];
+const TITLES = { motor_speed: "Motor speed" }; // of what stands for a frequency that a family does not tell
 
 let chosen = null,
   parts = null;
@@ -62,7 +63,8 @@ function build({ spec, line }) {
   const keys = KEYS.filter(([part]) => spec.key?.[part]).map(([part, title]) => {
     const value = makeValue();
     parts.keys.push([spec.key[part], value]);
-    return make("div", {}, make("dt", {}, title), make("dd", {}, value.whole));
+    const told = TITLES[spec.key[part]] ?? title;
+    return make("div", {}, make("dt", {}, told), make("dd", {}, value.whole));
   });
   fill(
     panel(),
