@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import argparse
 import logging
 import os
+import sys
 from contextlib import suppress
 
 import pytest
 from lines import until
 
+from multidrop.cli.fleet import serve
 from multidrop.cli.support import log_thread
 from multidrop.cli.support.log_thread import LogThread
 
@@ -57,3 +60,17 @@ def test_all_lines_are_there_when_it_is_closed_and_a_reader_that_goes_harms_nobo
             handler.handle(record("unread"))
         handler.close()
         assert not handler._thread.is_alive()
+
+
+def test_a_gateway_of_a_fleet_waits_for_nobody_who_reads_its_log(monkeypatch: pytest.MonkeyPatch) -> None:
+    async def work(_: argparse.Namespace) -> int:
+        logging.getLogger("multidrop.fleet").warning("a stop of pump-1")
+        return 7
+
+    monkeypatch.setattr(serve, "_serve", work)
+    unread, log = os.pipe()
+    with os.fdopen(unread) as reader, os.fdopen(log, "w") as stream:
+        fill(log)
+        monkeypatch.setattr(sys, "stderr", stream)
+        assert serve.run(argparse.Namespace()) == 7
+        assert reader.readline().strip() == "multidrop: a stop of pump-1"

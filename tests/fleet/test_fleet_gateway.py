@@ -10,6 +10,7 @@ import sys
 import time
 from contextlib import closing
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -20,7 +21,9 @@ from serial_hall import SerialHall
 require_module("nats")
 require_module("pyarrow")
 
+from multidrop.fleet import gateway as fleet_gateway  # noqa: E402
 from multidrop.fleet import names  # noqa: E402
+from multidrop.fleet.forwarder import ForwarderState  # noqa: E402
 from multidrop.fleet.gateway import FleetGateway  # noqa: E402
 
 PATIENCE_S = 60.0
@@ -51,6 +54,29 @@ def test_who_waits_for_the_session_of_another_of_its_name_answers_nothing(tmp_pa
         asked = Asked("state")
         await gateway._answer(asked)
         assert [answer["session"] for answer in asked.answers] == [7]
+        await gateway._close()
+
+    asyncio.run(main())
+
+
+@pytest.mark.parametrize(("trouble", "is_forwarded"), [(None, True), ("the stream is full", False)])
+def test_what_is_left_at_the_end_is_waited_for_unless_the_stream_takes_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, trouble: str | None, is_forwarded: bool
+) -> None:
+    monkeypatch.setattr(fleet_gateway, "FORWARD_S", PATIENCE_S)
+    monkeypatch.setattr(fleet_gateway, "IN_TROUBLE_S", 0.0)
+
+    async def main() -> None:
+        gateway = FleetGateway("gw-1", ["nats://127.0.0.1:1"], tmp_path)
+        taken = iter([0, 0, 1])  # messages of the spool's two that the stream has at each look
+        forwarder: Any = SimpleNamespace(state=lambda: ForwarderState(0, next(taken, 2), trouble))
+        spool, gateway.forwarder = gateway.spool, forwarder
+        monkeypatch.setattr(gateway, "spool", SimpleNamespace(state=lambda: SimpleNamespace(newest=2)))
+        forwarding = asyncio.create_task(asyncio.sleep(PATIENCE_S))
+        await gateway._forward_the_rest(forwarding)
+        assert (next(taken, None) is None) == is_forwarded
+        forwarding.cancel()
+        gateway.spool = spool
         await gateway._close()
 
     asyncio.run(main())

@@ -10,8 +10,8 @@ import os
 import sys
 import threading
 import webbrowser
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable
+from contextlib import AbstractContextManager, suppress
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING
 from multidrop.cli.support.demo_plant import DRIVES, demo_port, plant_file, simulator, start_motors
 from multidrop.cli.support.extras import require_extra
 from multidrop.cli.support.log_thread import LogThread
-from multidrop.cli.support.output import print_text, warn
+from multidrop.cli.support.output import logging_by, print_text, warn
 from multidrop.cli.support.plants import add_port_option, plant_of
 from multidrop.cli.support.signals import on_end_signals, on_reload_signal
 from multidrop.drive.named_verbs import verbs_of
@@ -202,19 +202,6 @@ def _time(record: logging.LogRecord) -> str:
     return datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds")
 
 
-@contextmanager
-def _logging(form: str, level: int) -> Iterator[None]:
+def _logging(form: str, level: int) -> AbstractContextManager[None]:
     handler = LogThread(sys.stderr, _JsonFormatter() if form == "json" else _TextFormatter())
-    levels = {"multidrop": level, "uvicorn": logging.WARNING, "asyncio": logging.WARNING}
-    loggers = {logging.getLogger(name): wanted for name, wanted in levels.items()}
-    before = {logger: logger.level for logger in loggers}
-    for logger, wanted in loggers.items():
-        logger.addHandler(handler)
-        logger.setLevel(wanted)
-    try:
-        yield
-    finally:
-        for logger, old in before.items():
-            logger.removeHandler(handler)
-            logger.setLevel(old)
-        handler.close()
+    return logging_by(handler, {"multidrop": level, "uvicorn": logging.WARNING, "asyncio": logging.WARNING})

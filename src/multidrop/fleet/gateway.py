@@ -36,7 +36,8 @@ from multidrop.fleet.task_end import end_tasks
 SPOOL_BYTES = 10_000_000_000
 STATE = {"state": str, "lines": int, "margin_s": float, "troubles": dict, "spool": dict}
 SPOOL = {"bytes": int, "lost": int}
-FORWARD_S = 3.0  # for what is left at the end; the rest is forwarded after the next start
+FORWARD_S = 10.0  # for what is left at the end; the rest is forwarded after the next start
+IN_TROUBLE_S = 3.0  # the same, where the stream takes nothing
 ENDING_S = 0.05
 
 _log = logging.getLogger("multidrop.fleet")
@@ -108,7 +109,7 @@ class FleetGateway:
                 with suppress(asyncio.CancelledError):
                     await member
                 await self.lines.close()
-            await asyncio.to_thread(self.spool.sync, FORWARD_S)
+            await asyncio.to_thread(self.spool.sync, IN_TROUBLE_S)
             await self._forward_the_rest(forwarding)
         finally:
             await end_tasks(forwarding)
@@ -122,9 +123,11 @@ class FleetGateway:
     async def _forward_the_rest(self, forwarding: asyncio.Task[None]) -> None:
         assert self.forwarder is not None
         loop = asyncio.get_running_loop()
-        ends = loop.time() + FORWARD_S
-        while not forwarding.done() and loop.time() < ends:
-            if (self.forwarder.state().last or 0) >= self.spool.state().newest:
+        begun = loop.time()
+        while not forwarding.done():
+            state = self.forwarder.state()
+            is_late = loop.time() - begun > (IN_TROUBLE_S if state.trouble else FORWARD_S)
+            if is_late or (state.last or 0) >= self.spool.state().newest:
                 return
             await asyncio.sleep(ENDING_S)
 

@@ -63,10 +63,10 @@ def require_fleet() -> None:
         require_extra(library, "fleet", "fleet")
 
 
-def run_action(work: Callable[[], Coroutine[Any, Any, int]], level: int = logging.ERROR) -> int:
-    """Run an action in an event loop of its own, and print what the fleet logs from this level on."""
+def run_action(work: Callable[[], Coroutine[Any, Any, int]]) -> int:
+    """Run an action in an event loop of its own, and print the errors that the fleet logs."""
     require_fleet()
-    with logging_to(warn, "multidrop.fleet", level):
+    with logging_to(warn, "multidrop.fleet", logging.ERROR):
         return asyncio.run(work())
 
 

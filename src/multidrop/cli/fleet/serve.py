@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import argparse
+import asyncio
 import logging
+import sys
 from contextlib import AsyncExitStack
-from functools import partial
 from pathlib import Path
 
-from multidrop.cli.fleet.connection import STATE, add_address_arguments, run_action, state_folder, urls_of
+from multidrop.cli.fleet.connection import STATE, add_address_arguments, require_fleet, state_folder, urls_of
+from multidrop.cli.support.log_thread import LogThread
 from multidrop.cli.support.nats import nats_options
-from multidrop.cli.support.output import print_text
+from multidrop.cli.support.output import logging_by, print_text
 from multidrop.cli.support.signals import on_end_signals
+from multidrop.printable import printable
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -30,7 +33,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    return run_action(partial(_serve, arguments), logging.INFO)
+    require_fleet()
+    with logging_by(LogThread(sys.stderr, _SentenceFormatter()), {"multidrop.fleet": logging.INFO}):
+        return asyncio.run(_serve(arguments))
+
+
+class _SentenceFormatter(logging.Formatter):
+    """Sentences as `warn` prints them."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        return "\n".join(f"multidrop: {printable(line)}" for line in record.getMessage().splitlines())
 
 
 async def _serve(arguments: argparse.Namespace) -> int:

@@ -19,10 +19,11 @@ class LogThread(logging.Handler):
     def __init__(self, stream: TextIO, formatter: logging.Formatter) -> None:
         super().__init__()
         self.setFormatter(formatter)
-        # Its own: Python flushes that of `stream` when it ends, and would wait for one that is held up.
-        self._file = os.fdopen(
-            os.dup(stream.fileno()), "w", buffering=1, encoding=stream.encoding, errors="backslashreplace"
-        )
+        self._stream = self._file = stream
+        with suppress(OSError):  # a stream in memory has no file
+            # Its own: Python flushes that of `stream` when it ends, and would wait for one that is held up.
+            own = os.dup(stream.fileno())
+            self._file = os.fdopen(own, "w", 1, encoding=stream.encoding, errors="backslashreplace")
         self._waiting: queue.Queue[str | None] = queue.Queue(MOST_WAITING)
         self._lost = 0
         self._thread = threading.Thread(target=self._write, name="multidrop log", daemon=True)
@@ -51,8 +52,9 @@ class LogThread(logging.Handler):
                     self.format(logging.LogRecord("multidrop", logging.WARNING, "", 0, said, None, None))
                 )
             self._put(line)
-        with suppress(OSError):
-            self._file.close()
+        if self._file is not self._stream:
+            with suppress(OSError):
+                self._file.close()
 
     def _put(self, line: str) -> None:
         with suppress(OSError):  # a full disk, or a reader that is gone

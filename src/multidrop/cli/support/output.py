@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import shlex
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from io import TextIOWrapper
 from typing import TextIO
@@ -55,12 +55,22 @@ class _Handler(logging.Handler):
 @contextmanager
 def logging_to(show: Callable[[str], object], logger_name: str, level: int) -> Iterator[None]:
     """Hand the messages of this logger, from this level on, to `show`."""
-    logger, handler = logging.getLogger(logger_name), _Handler(show, level)
-    before = logger.level
-    logger.addHandler(handler)
-    logger.setLevel(level)
+    with logging_by(_Handler(show, level), {logger_name: level}):
+        yield
+
+
+@contextmanager
+def logging_by(handler: logging.Handler, levels: Mapping[str, int]) -> Iterator[None]:
+    """Hand the messages of these loggers, from these levels on, to a handler, which is closed at the end."""
+    loggers = {logging.getLogger(name): level for name, level in levels.items()}
+    before = {logger: logger.level for logger in loggers}
+    for logger, level in loggers.items():
+        logger.addHandler(handler)
+        logger.setLevel(level)
     try:
         yield
     finally:
-        logger.removeHandler(handler)
-        logger.setLevel(before)
+        for logger, level in before.items():
+            logger.removeHandler(handler)
+            logger.setLevel(level)
+        handler.close()
