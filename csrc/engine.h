@@ -33,7 +33,7 @@ struct md_port {
     struct md_rs485 rs485;
     struct md_turn turn;
 
-    uint32_t heard_term;  /* of its mastership, before which it was listened to last; 0: none */
+    uint32_t heard_term;  /* of its mastership, for which it was listened to last; 0: none */
     struct md_port *next; /* of those that wait to be opened */
     int is_opened, open_error, is_closed;
 };

@@ -37,7 +37,8 @@ SPOOL_BYTES = 10_000_000_000
 STATE = {"state": str, "lines": int, "margin_s": float, "troubles": dict, "spool": dict}
 SPOOL = {"bytes": int, "lost": int}
 FORWARD_S = 10.0  # for what is left at the end; the rest is forwarded after the next start
-IN_TROUBLE_S = 3.0  # the same, where the stream takes nothing
+IN_TROUBLE_S = 3.0  # the same, where something is wrong with the stream
+SYNC_S = 3.0  # for the disk, before that
 ENDING_S = 0.05
 
 _log = logging.getLogger("multidrop.fleet")
@@ -109,7 +110,7 @@ class FleetGateway:
                 with suppress(asyncio.CancelledError):
                     await member
                 await self.lines.close()
-            await asyncio.to_thread(self.spool.sync, IN_TROUBLE_S)
+            await asyncio.to_thread(self.spool.sync, SYNC_S)
             await self._forward_the_rest(forwarding)
         finally:
             await end_tasks(forwarding)
