@@ -47,7 +47,7 @@ void md_echo_keep(struct md_line *line)
 {
     if (line->rx_len > line->tx_len || memcmp(line->rx, line->tx, line->rx_len) != 0) {
         md_tap_put(line->tap, MD_NOISE, line->completion->sent_ns, line->rx, line->rx_len);
-        line->rx_len = 0;
+        line->rx_len = line->rx_from = 0;
     }
     line->completion->stale -= line->rx_len;
     line->completion->skipped = line->rx_len;

@@ -159,6 +159,20 @@ def test_a_late_answer_is_counted_once(line: LineDriver, drive: Peer) -> None:
 
 
 @pytest.mark.usefixtures("proof")
+def test_a_reply_is_found_behind_a_late_one_amid_its_request(line: LineDriver, drive: Peer) -> None:
+    """The port took the request in two parts, and the late answer came between them."""
+    line.begin(exchange(Message(1, 4, 50, 1), drive))
+    while line.want != "write":
+        line.now += MS
+    line.take(3)
+    line.receive(reply(1111))
+    assert drive.counters().late == 1
+    line.take()
+    line.receive(build_reply(Framing.RTU, Message(1, 4, data=words(2222))))
+    assert (line.want, line.completion.reply.data) == ("done", words(2222))
+
+
+@pytest.mark.usefixtures("proof")
 def test_a_reply_is_found_where_the_line_babbled_before_its_request(line: LineDriver, drive: Peer) -> None:
     """A late answer was among what came."""
     line.begin(exchange(Message(1, 4, 50, 1), drive))
