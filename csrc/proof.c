@@ -53,7 +53,7 @@ void md_proof_end(const struct md_exchange *exchange, int result)
 
 void md_proof_came_late(struct md_drive *drive, const struct md_owed *owed)
 {
-    for (uint32_t i = 0; i < drive->proof_count; i++)
+    for (uint32_t i = 0; i < MD_MOST_PROOFS && i < drive->proof_count; i++)
         if (md_owed_is_same(owed, drive->proofs[i]))
             drive->vain[i] = ANSWERED;
 }

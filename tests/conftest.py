@@ -16,6 +16,7 @@ from commands import Run
 from examples import examples
 from hypothesis import HealthCheck, settings
 from patient import await_turns, be_patient
+from peers import require_module
 
 from multidrop.cli import main
 
@@ -144,6 +145,7 @@ def _patient_module() -> Iterator[None]:
 @pytest.fixture
 def _unpainted(monkeypatch: pytest.MonkeyPatch) -> None:
     """Leave out what takes the time of a picture: its pixels; for tests of what is said beside it."""
+    require_module("matplotlib")
 
     def savefig(figure: object, file: IO[bytes], **options: object) -> None:
         file.write(b"\x89PNG\r\n\x1a\n")

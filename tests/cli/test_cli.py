@@ -552,6 +552,7 @@ def test_a_stream_that_the_caller_has_closed_is_no_failure(
     assert "Traceback" not in done.stderr
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("closed", [0, 1, 2])
 def test_no_file_is_opened_in_the_place_of_a_closed_stream(closed: int) -> None:
     """A serial port there would get what is printed."""

@@ -99,6 +99,7 @@ def test_json_has_the_figures(run: Run, fitting: Path) -> None:
     }
 
 
+@pytest.mark.slow
 def test_what_does_not_fit_is_status_1_and_says_what_would_help(run: Run, crowded: Path) -> None:
     status, out, err = run("plan", crowded)
     assert (status, err) == (1, "")

@@ -13,6 +13,7 @@ from captures import write
 from commands import Run
 from examples import usually
 from frames import PRINTED
+from peers import require_module
 from recordings import record, row
 from tables import table
 from terminals import MULTIDROP
@@ -129,7 +130,8 @@ ALL_AT_ONCE = rf"_$x^{{$\frac%s{{0}}{TRAP}"
 @pytest.mark.filterwarnings("ignore:Glyph")
 @pytest.mark.parametrize("name", usually(ALL_AT_ONCE, "_hidden", "$x^{$", "\\frac"))
 def test_names_in_a_picture_are_no_mathematics_and_in_its_legend(tmp_path: Path, name: str) -> None:
-    from multidrop.report import load, plot, plot_page, report_page  # matplotlib, for 0.5 s
+    require_module("matplotlib")
+    from multidrop.report import load, plot, plot_page, report_page
 
     rows = [
         row(at, name, register, at) for at in range(3) for register in (name, "output_frequency", "fault")
@@ -172,6 +174,7 @@ def section_length(path: Path) -> int:
     return int(struct.unpack_from("<I", path.read_bytes(), 4)[0])
 
 
+@pytest.mark.slow
 def test_commands_print_through_what_spells_out() -> None:
     """A `print` of its own is only for what is no text of others: help, drawing, questions."""
     ours = {"__init__.py", "support/output.py", "support/confirm.py", "poll/live_table.py", "scan.py"}

@@ -161,6 +161,7 @@ for number in range(200):
 """
 
 
+@pytest.mark.slow
 def test_processes_do_not_mix_their_lines(tmp_path: Path) -> None:
     path = tmp_path / "audit.jsonl"
     writers = [subprocess.Popen([sys.executable, "-c", WRITER, str(path), name]) for name in "ab"]

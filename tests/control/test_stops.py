@@ -425,6 +425,7 @@ def test_a_stop_is_repeated_as_long_as_the_line_is_deaf(monkeypatch: pytest.Monk
     assert not sim.motor.energised
 
 
+@pytest.mark.slow
 def test_a_stop_gives_up_when_its_caller_says_so_and_tells_what_is_known(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -124,6 +124,7 @@ def any_port(request: pytest.FixtureRequest) -> Iterator[str]:
         server.close()
 
 
+@pytest.mark.slow
 def test_a_child_opens_lines_of_its_own(port: str) -> None:
     def open_another() -> float:
         with Bus(other.wires[0].path) as bus:
@@ -136,6 +137,7 @@ def test_a_child_opens_lines_of_its_own(port: str) -> None:
         assert current(bus) == 3.25
 
 
+@pytest.mark.slow
 def test_a_child_of_a_child_too(port: str) -> None:
     def open_it() -> float:
         with Bus(port) as bus:
@@ -212,6 +214,7 @@ def test_a_lock_that_was_held_does_not_hold_a_child_up(port: str) -> None:
         assert current(bus) == 3.25
 
 
+@pytest.mark.slow
 def test_an_inherited_poller_is_closed_and_has_no_rows(port: str) -> None:
     def look() -> list[Any]:
         found = [poller.take(), poller.summary()["lines"].keys(), poller.fileno() > 0]

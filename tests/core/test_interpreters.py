@@ -5,6 +5,8 @@ from __future__ import annotations
 import subprocess
 import sys
 
+import pytest
+
 CODE = """
 try:
     import _interpreters as interpreters
@@ -28,6 +30,7 @@ print("and here it works:", Bus.__name__)
 """
 
 
+@pytest.mark.slow
 def test_a_sub_interpreter_is_refused_and_the_main_one_is_served() -> None:
     done = subprocess.run([sys.executable, "-c", CODE], capture_output=True, text=True, check=True)
     refused = (

@@ -125,6 +125,7 @@ class Walk:
             self.line.lose(5)
 
 
+@pytest.mark.slow
 @table("seed", range(5))
 def test_no_walk_leaves_the_table(seed: int) -> None:
     ways = {state: {state} | after({state}) for state in STATES.values()}

@@ -59,6 +59,7 @@ def test_a_struct_lives_as_long_as_its_owner() -> None:
     assert len({place(each) for each in [*kept, *more]}) == len(kept) + len(more)
 
 
+@pytest.mark.slow
 def test_threads_get_memory_of_their_own() -> None:
     with ThreadPoolExecutor(8) as threads:
         made = list(threads.map(new_drive, range(4000)))

@@ -127,6 +127,7 @@ def numbers(draw: st.DrawFn) -> tuple[NumberFormat, str, float, float, float]:
     )
 
 
+@pytest.mark.slow
 @settings(max_examples=examples(400))
 @given(numbers())
 @example((NumberFormat.U64, "CDAB", 1, 0, 2**64 - 1))
@@ -160,6 +161,7 @@ def test_a_number_of_any_format_order_step_and_offset(
     assert number_format in (NumberFormat.U64, NumberFormat.I64) or value == row.value
 
 
+@pytest.mark.slow
 @settings(max_examples=examples(300), deadline=None)
 @given(numbers().filter(lambda case: case[0] in WRITTEN and case[0] not in FLOATS))
 @example((NumberFormat.U64, "BADC", 1, 0, 2**64 - 1))
@@ -280,6 +282,7 @@ def test_a_field_may_have_names() -> None:
 # ---- no value ----
 
 
+@pytest.mark.slow
 @settings(max_examples=examples(300))
 @given(numbers().filter(lambda case: case[0] not in DIGITS), st.data())
 @example((NumberFormat.U64, "CDAB", 1, 0, 2**64 - 2), None)
@@ -412,6 +415,7 @@ def test_a_power_of_ten_is_that_of_the_scale_register(
 # ---- into a recording ----
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("suffix", [".arrows", ".csv", ".parquet"])
 @settings(max_examples=10, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(cases=st.lists(numbers(), min_size=1, max_size=20))

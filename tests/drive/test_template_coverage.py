@@ -207,6 +207,7 @@ def test_every_layout_of_the_importers_is_read(bench: Any, tmp_path: Path) -> No
     }
 
 
+@pytest.mark.slow
 def test_the_script_prints_its_tables(tmp_path: Path) -> None:
     (tmp_path / "a.json").write_text(wb([*HELD, *LACKING]))
     (tmp_path / "b.json").write_text("{")
@@ -219,6 +220,7 @@ def test_the_script_prints_its_tables(tmp_path: Path) -> None:
     assert lines[-1].startswith(f"not read: {tmp_path / 'b.json'}: ")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("folder", "sentence"), [("none", "is no folder"), (".", "has no template")])
 def test_a_folder_without_templates_is_told(tmp_path: Path, folder: str, sentence: str) -> None:
     command = [*SCRIPT, str(tmp_path / folder)]

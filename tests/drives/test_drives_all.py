@@ -221,6 +221,7 @@ def test_an_unknown_scale_is_not_written(family: type[Drive]) -> None:
     ]
 
 
+@pytest.mark.slow
 @table("family, register", registers(lambda each: not each.values))
 def test_a_raw_count_survives_its_value(family: type[Drive], register: Register[Any]) -> None:
     low, high = (0, 1) if register.number_format is NumberFormat.BIT else (0, 0xFFFF)

@@ -9,6 +9,7 @@ import pytest
 from commands import Run
 from families import Meter, write_meter
 from lines import ANY_PORT
+from peers import require_module
 from simulated_bus import SimulatedBus
 
 from multidrop import INPUT, Bus, Drive, Refused, load_family, load_plant, open_reader
@@ -139,7 +140,7 @@ def test_a_plant_of_two_files_from_the_wire_to_the_report(
         (row.drive, row.register): row.value for batch in open_reader("decoded.arrows") for row in batch
     }
     assert decoded["meter-1", "voltage"] == 230.5
-    pytest.importorskip("matplotlib")
+    require_module("matplotlib")
     assert run("plot", "run.arrows", "--register", "voltage")[0] == 0
     assert run("report", "run.arrows")[0] == 0
 

@@ -52,6 +52,7 @@ def mutated(data: bytes, chosen: random.Random) -> bytes:
     return data
 
 
+@pytest.mark.slow
 @settings(max_examples=examples(300))
 @given(st.sampled_from(SEEDS), st.integers(0, 2**32))
 def test_a_damaged_file_is_taken_or_refused(seed: bytes, number: int) -> None:

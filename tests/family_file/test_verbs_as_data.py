@@ -324,6 +324,7 @@ def test_a_jog_names_its_direction_and_ends_by_a_stop(monkeypatch: pytest.Monkey
     assert words(line)[-1] == "2000 0001"
 
 
+@pytest.mark.slow
 def test_an_else_of_a_stop_is_sent_when_the_motor_turns_on(monkeypatch: pytest.MonkeyPatch) -> None:
     line, drive, sim = on_a_bus(monkeypatch, "enum")
     sim.motor.target = 20

@@ -59,6 +59,7 @@ def told(name: str, document: dict[str, Any]) -> list[str]:
     return place.config_errors
 
 
+@pytest.mark.slow
 @settings(max_examples=examples(40))
 @given(name=st.sampled_from(NAMES), sections=st.dictionaries(st.sampled_from(SECTIONS), VALUES))
 def test_any_sections_are_told_about(name: str, sections: dict[str, Any]) -> None:

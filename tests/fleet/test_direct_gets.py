@@ -159,12 +159,14 @@ def test_nothing_is_asked_again_before_answers_came_in_time() -> None:
     assert questions(100, [LateWay(0.9) for _ in range(3)], Spare()) == 100
 
 
+@pytest.mark.slow
 def test_a_cluster_that_is_slow_is_not_asked_again_and_again() -> None:
     ways, spare = [LateWay(0.9) for _ in range(3)], full()
     assert 300 < questions(300, ways, spare) < 300 + MOST_SPARE
     assert questions(300, ways, spare) == 300
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("late", [2, 5, 20])
 def test_where_one_read_of_some_is_late_few_questions_are_asked_again(late: int) -> None:
     ways, spare = [LateWay(0.9) for _ in range(3)], full()

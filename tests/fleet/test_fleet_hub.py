@@ -147,6 +147,7 @@ def test_messages_of_several_answers(running: Cluster, monkeypatch: pytest.Monke
     asyncio.run(live())
 
 
+@pytest.mark.slow
 def test_what_is_missing_or_doubled_is_told_and_counted(
     running: Cluster, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -402,6 +403,7 @@ def test_a_second_hub_of_one_database_waits_for_the_end_of_the_first(empty: Post
     other.close()
 
 
+@pytest.mark.slow
 def test_rows_behind_a_place_that_another_hub_has_moved_are_refused(empty: Postgres) -> None:
     """Behind a pooler several may have the same lock."""
     sink = PostgresSink(empty.where)
@@ -413,6 +415,7 @@ def test_rows_behind_a_place_that_another_hub_has_moved_are_refused(empty: Postg
     assert empty.ask("select count(*) from multidrop.exchanges") == [(0,)]
 
 
+@pytest.mark.slow
 def test_no_database(empty: Postgres) -> None:
     sink = PostgresSink(f"{empty.where} connect_timeout=2".replace(f"port={empty.port}", "port=1"))
     with pytest.raises(SinkError, match=r"PostgreSQL: .*Connection refused"):

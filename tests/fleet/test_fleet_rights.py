@@ -299,6 +299,7 @@ def test_a_denial_of_this_very_request_alone_says_that_it_reached_nobody() -> No
         denials.check_request("stop.line-2", "_INBOX", 0)
 
 
+@pytest.mark.slow
 def test_a_creds_file_of_nats_is_taken_as_it_is(tmp_path: Path) -> None:
     path = tmp_path / "gw-1.creds"
     path.write_text("-----BEGIN NATS USER JWT-----\ney\n------END NATS USER JWT------\n")

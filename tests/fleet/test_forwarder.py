@@ -299,6 +299,7 @@ def test_an_old_server(tmp_path: Path) -> None:
         asyncio.run(connect(servers.urls))
 
 
+@pytest.mark.slow
 def test_no_such_stream(running: Cluster, tmp_path: Path) -> None:
     async def live() -> None:
         async with client_of(running) as client:

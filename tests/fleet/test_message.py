@@ -33,6 +33,7 @@ def test_the_rows_come_back() -> None:
     assert rows_of(unpack(message.data)) == sorted(wanted, key=lambda row: (row[0], row[3:5]))
 
 
+@pytest.mark.slow
 def test_pyarrow_alone_opens_it() -> None:
     """By the table in the module's docstring, and no function of ours."""
     (message,) = packed(example())
@@ -93,6 +94,7 @@ def test_a_message_is_no_larger_than_it_may_be() -> None:
     )
 
 
+@pytest.mark.slow
 def test_a_message_has_no_more_rows_than_codes_have_room_for() -> None:
     found = packed(*(numbered(first, 1000) for first in range(0, 7000, 1000)))
     assert [message.rows for message in found] == [MOST_ROWS, 70_000 - MOST_ROWS]

@@ -56,6 +56,7 @@ def in_vain(shares: dict[str, str]) -> list[str]:
     return [line for line, gateway in shares.items() if names.owner_bucket(line) in BESIDE[gateway]]
 
 
+@pytest.mark.slow
 @table("number", [2, 3, 4, 5, 20])
 @table("lines", [7, 12, 40, 1000])
 def test_lines_are_where_they_are_not_avoided_and_the_bound_holds(lines: int, number: int) -> None:

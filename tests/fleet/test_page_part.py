@@ -145,6 +145,7 @@ def test_a_viewers_key_is_enough(tmp_path: Path) -> None:
         assert json.loads(watched.stdout)["lines"]["hall"]["master"] is None
 
 
+@pytest.mark.slow
 def test_servers_that_are_not_there_are_told(tmp_path: Path) -> None:
     [port] = free_ports(1)
     with served(tmp_path, f'[serve.fleet]\nnats = ["nats://127.0.0.1:{port}"]\n') as gateway:

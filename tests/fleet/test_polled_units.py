@@ -190,6 +190,7 @@ def test_rows_of_a_hubs_folder_have_a_column_for_each_unit(kept: Path, tmp_path:
             assert (max(columns["value_1 [V]"]), min(columns["value_1"])) == (16, 20)
 
 
+@pytest.mark.slow
 def test_a_file_of_a_hub_is_read_by_its_folder(kept: Path) -> None:
     with pytest.raises(ValueError, match="a file of `multidrop hub`: read its folder by"):
         multidrop.read(min((kept / "rows").iterdir()))

@@ -66,6 +66,7 @@ def test_a_stream_that_is_full_leaves_room_for_records(run: Run, tmp_path: Path)
         assert (status, json.loads(out)["lines"]["new"]) == (0, 1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [1, pytest.param(3, marks=pytest.mark.long)])
 def test_servers_that_have_less_room_are_one_sentence(run: Run, tmp_path: Path, number: int) -> None:
     with cluster(tmp_path / "nats", number) as small:

@@ -202,6 +202,7 @@ def test_a_server_without_jetstream_is_one_sentence(tmp_path: Path, monkeypatch:
             server.kill()
 
 
+@pytest.mark.slow
 def test_a_bucket_without_a_leader_is_no_quorum(fleet: Cluster, monkeypatch: pytest.MonkeyPatch) -> None:
     """A server that is alone answers some seconds after the others' death, and names no leader."""
     told = setup.ask
@@ -217,6 +218,7 @@ def test_a_bucket_without_a_leader_is_no_quorum(fleet: Cluster, monkeypatch: pyt
         asyncio.run(_check(fleet))
 
 
+@pytest.mark.slow
 def test_a_leader_that_is_being_elected_is_waited_for(
     fleet: Cluster, monkeypatch: pytest.MonkeyPatch
 ) -> None:

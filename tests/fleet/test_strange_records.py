@@ -283,6 +283,7 @@ def test_an_answer_that_is_no_state_is_one_sentence(one: Cluster, answer: bytes,
     asyncio.run(_with_path(one, work))
 
 
+@pytest.mark.slow
 def test_a_refusal_of_the_servers_is_one_sentence(one: Cluster, tmp_path: Path) -> None:
     async def work(path: ServerPath) -> None:
         with pytest.raises(ServerError, match="NATS refuses: "):

@@ -179,6 +179,7 @@ def test_what_changed_makes_the_newer_one_of_the_older_and_says_nothing_else(
     assert changes(now, now) == {}
 
 
+@pytest.mark.slow
 @given(st.lists(st.tuples(plants, st.integers(0, 9)), min_size=2, max_size=12), st.integers(0, 2**32))
 def test_each_viewer_has_the_newest_whole_however_late_it_comes(
     pictures: list[tuple[dict[str, Any], int]], begin: int

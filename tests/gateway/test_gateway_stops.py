@@ -156,6 +156,7 @@ def test_a_stop_whose_client_is_cut_off_within_its_body_is_sent(tmp_path: Path) 
         until(lambda: stands(gateway, "pump-1") and stands(gateway, "pump-2"))
 
 
+@pytest.mark.slow
 def test_a_stop_without_the_right_is_not_sent_whatever_its_body_is(tmp_path: Path) -> None:
     with served(tmp_path, MAY.replace('stop = "anyone"\n', "")) as gateway, calling(gateway) as client:
         start(gateway, "pump-1", "pump-2")
@@ -164,6 +165,7 @@ def test_a_stop_without_the_right_is_not_sent_whatever_its_body_is(tmp_path: Pat
         assert gateway.gateway.commands.stops == {}
 
 
+@pytest.mark.slow
 def test_one_drive_is_stopped_and_the_other_runs_on(tmp_path: Path) -> None:
     with served(tmp_path, MAY) as gateway:
         start(gateway, "pump-1", "pump-2")
@@ -251,6 +253,7 @@ def test_a_stop_waits_for_no_write(tmp_path: Path, monkeypatch: pytest.MonkeyPat
         assert all(text.endswith(" was not sent: 8 others are under way on line hall") for text in refused)
 
 
+@pytest.mark.slow
 def test_what_was_asked_for_before_a_stop_is_not_sent_after_it(tmp_path: Path) -> None:
     """A command whose thread begins only after the stop was called finds that out."""
     begun: list[threading.Thread] = []
@@ -280,6 +283,7 @@ def test_what_was_asked_for_before_a_stop_is_not_sent_after_it(tmp_path: Path) -
         assert commands.called == 4
 
 
+@pytest.mark.slow
 def test_a_stop_is_sent_where_the_system_gives_no_thread(tmp_path: Path) -> None:
     class NoThread(threading.Thread):
         def start(self) -> None:

@@ -202,6 +202,7 @@ def test_what_is_read_seldom_is_fresh_for_longer(tmp_path: Path, clock: HubClock
     assert not is_fresh(hub)
 
 
+@pytest.mark.slow
 def test_what_an_overfull_line_reads_holds_until_three_rounds_are_over(
     tmp_path: Path, clock: HubClock
 ) -> None:

@@ -34,6 +34,7 @@ def lately(tmp_path: Path) -> Lately:
     return Lately(written(tmp_path))
 
 
+@pytest.mark.slow
 def test_an_hour_of_minutes_and_no_hour_of_readings(lately: Lately) -> None:
     alive: list[weakref.ref[LineStatistics]] = []
     for second in range(0, 70 * 60 + 31, 5):

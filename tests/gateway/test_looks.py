@@ -116,6 +116,7 @@ def test_a_silent_drives_values_are_said_to_be_old(gateway: Served) -> None:
     assert gateway.get("/api/alarms?from=0&to=1").json["alarms"] == []
 
 
+@pytest.mark.slow
 def test_a_fault_is_told_in_the_drives_words(gateway: Served) -> None:
     gateway.sims["pump-1"].trip(4)  # type: ignore[attr-defined]
     gateway.await_state("pump-1", "fault")

@@ -65,6 +65,7 @@ def test_a_port_that_is_lost_later_says_why_too(tmp_path: Path) -> None:
         until(lambda: gateway.status == "STATUS=polling 0 lines; 1 lost")
 
 
+@pytest.mark.slow
 def test_no_port_at_all_is_told_and_waited_for(tmp_path: Path) -> None:
     plant = written(tmp_path, SERVE, port=str(tmp_path / "nosuch"))
     gateway = Gateway(plant, read_settings(plant, {}))

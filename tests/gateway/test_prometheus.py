@@ -113,6 +113,7 @@ def test_prometheus_scrapes_each_second_and_a_silent_drive_is_stale(tmp_path: Pa
             until(lambda: prometheus.drives() == {"pump-1", "pump-2"})
 
 
+@pytest.mark.slow
 def test_promtool_finds_nothing_to_say_of_the_metrics(tmp_path: Path) -> None:
     program = require_program("promtool")
     with served(tmp_path, '[serve.history]\nfolder = "history"\n', "pump-1", 'the \\"old\\" fan') as gateway:

@@ -173,6 +173,7 @@ def test_drives_come_and_go_and_a_line_that_is_the_same_goes_on(tmp_path: Path) 
         assert gateway.gateway.failures == {}
 
 
+@pytest.mark.slow
 def test_a_port_that_is_not_there_is_told(tmp_path: Path) -> None:
     with two_lines(tmp_path) as (gateway, _):
         roof = gateway.gateway.plant.lines[1].port

@@ -109,6 +109,7 @@ def test_a_part_that_fails_in_another_way_changes_nothing(
     until(lambda: status_of(first, 21) == [3])
 
 
+@pytest.mark.slow
 def test_a_part_whose_port_is_lost_meanwhile_is_told(
     gateway: Served, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -139,6 +140,7 @@ def test_a_part_whose_port_is_lost_meanwhile_is_told(
     assert parts(gateway) == {"modbus": "ok"}
 
 
+@pytest.mark.slow
 def test_a_part_that_takes_its_time_to_open_holds_no_stop_up(
     gateway: Served, monkeypatch: pytest.MonkeyPatch
 ) -> None:

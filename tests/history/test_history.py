@@ -230,6 +230,7 @@ def test_files_that_are_replaced_under_a_reader(tmp_path: Path) -> None:
     assert left == flat([*rows[:2], rows[3]])
 
 
+@pytest.mark.slow
 def test_names_that_come_later(tmp_path: Path) -> None:
     rows = random_rows(1, NOON, 60)
     later = [row._replace(drive="насос, «новый»", register="torque") for row in random_rows(2, NOON, 60)]

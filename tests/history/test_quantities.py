@@ -83,6 +83,7 @@ def test_two_units_are_no_series(tmp_path: Path, how: str, points: int) -> None:
     assert (sum(other.n), other.unit, other.left_out) == (120, "A", ())
 
 
+@pytest.mark.slow
 def test_a_range_of_one_unit_has_that(tmp_path: Path, how: str) -> None:
     recorded(tmp_path, AMPERE, PERCENT)
     kept(tmp_path, how, 2)

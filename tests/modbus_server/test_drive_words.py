@@ -10,6 +10,7 @@ import struct
 from enum import IntEnum
 from typing import Any, NamedTuple
 
+import pytest
 from batches import UTC_0, completion
 from completions import add_rows
 from examples import PART
@@ -107,6 +108,7 @@ def test_whole_counts_always_have_words(
     assert exact_data(register, value) == raw
 
 
+@pytest.mark.slow
 def test_every_count_of_a_word_has_words() -> None:
     """Every seventh by default."""
     for step in (0.1, 0.01, -0.25):

@@ -236,6 +236,7 @@ def direct_words(bus: Bus, drive: SimulatedDrive, register: Any) -> list[int]:
     return list(struct.unpack(f">{register.words}H", data))
 
 
+@pytest.mark.slow
 def test_a_setpoint_is_written_and_read_back(
     rig: Rig, master: Master, request: pytest.FixtureRequest
 ) -> None:

@@ -121,6 +121,7 @@ def test_it_says_goodbye(broker: Broker, listener: Listener, tmp_path: Path) -> 
     listener.wait_for(has("multidrop/gateway", b"offline"))
 
 
+@pytest.mark.slow
 def test_a_broker_that_stands_still_holds_up_nothing(
     broker: Broker, listener: Listener, start: Start
 ) -> None:

@@ -69,6 +69,7 @@ def test_state_is_kept_and_the_broker_says_that_the_gateway_is_gone(broker: Brok
         listener.close()
 
 
+@pytest.mark.slow
 def test_commands_go_through_the_rules(broker: Broker, start: Start) -> None:
     listener = Listener(broker)
 
@@ -96,6 +97,7 @@ def test_commands_go_through_the_rules(broker: Broker, start: Start) -> None:
         listener.close()
 
 
+@pytest.mark.slow
 def test_a_command_that_the_broker_keeps_is_not_carried_out(broker: Broker, start: Start) -> None:
     listener = Listener(broker)
     try:

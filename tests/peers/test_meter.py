@@ -85,6 +85,7 @@ def test_all_40_values_of_a_poll_are_the_server_s(tmp_path: Path, stated: bool) 
     assert {(row.register, row.value) for row in rows if row.value is not None} == set(HELD.items())
 
 
+@pytest.mark.slow
 def test_all_40_values_read_by_hand_are_the_server_s(tmp_path: Path) -> None:
     meter = load_family(FAMILY)
     with served(tmp_path) as port, Bus(port) as bus:

@@ -53,6 +53,7 @@ def server(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[tuple[str
             process.kill()
 
 
+@pytest.mark.slow
 @patient
 def test_registers_and_coils_are_read(server: tuple[str, str]) -> None:
     port, framing = server
@@ -69,6 +70,7 @@ def test_registers_and_coils_are_read(server: tuple[str, str]) -> None:
         }
 
 
+@pytest.mark.slow
 @patient
 def test_any_address_may_be_asked_for(server: tuple[str, str]) -> None:
     """Registers and coils that nothing declares hold what the servers' own sources say."""
@@ -84,6 +86,7 @@ def test_any_address_may_be_asked_for(server: tuple[str, str]) -> None:
         assert refusal.value.code == 2
 
 
+@pytest.mark.slow
 @patient
 def test_what_is_written_is_what_is_read_back(server: tuple[str, str]) -> None:
     port, framing = server
@@ -93,6 +96,7 @@ def test_what_is_written_is_what_is_read_back(server: tuple[str, str]) -> None:
             assert bus.write(device, device.register(name), value) == value
 
 
+@pytest.mark.slow
 @patient
 def test_an_exception_is_the_device_s_refusal(server: tuple[str, str]) -> None:
     port, framing = server
@@ -112,6 +116,7 @@ def test_another_address_is_silence(server: tuple[str, str]) -> None:
             bus.read(device, device.register("current"))
 
 
+@pytest.mark.slow
 @patient
 def test_the_command_line_reads_and_writes_it_too(
     server: tuple[str, str], capsys: pytest.CaptureFixture[str]

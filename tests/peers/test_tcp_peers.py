@@ -57,6 +57,7 @@ def server(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[str]:
         process.kill()
 
 
+@pytest.mark.slow
 @patient
 def test_registers_and_coils_are_read(server: str) -> None:
     with Bus(server) as bus:
@@ -64,6 +65,7 @@ def test_registers_and_coils_are_read(server: str) -> None:
         assert bus.read_many(device, Device.registers.values()) == HELD
 
 
+@pytest.mark.slow
 @patient
 def test_what_is_written_is_what_is_read_back(server: str) -> None:
     with Bus(server) as bus:
@@ -72,6 +74,7 @@ def test_what_is_written_is_what_is_read_back(server: str) -> None:
             assert bus.write(device, device.register(name), value) == value
 
 
+@pytest.mark.slow
 @patient
 def test_an_exception_is_the_device_s_refusal(server: str) -> None:
     with Bus(server) as bus:
@@ -81,6 +84,7 @@ def test_an_exception_is_the_device_s_refusal(server: str) -> None:
         assert refusal.value.code == 2
 
 
+@pytest.mark.slow
 def test_all_values_of_a_poll_are_the_server_s(server: str, tmp_path: Path) -> None:
     path = tmp_path / "plant.toml"
     path.write_text(
@@ -95,6 +99,7 @@ def test_all_values_of_a_poll_are_the_server_s(server: str, tmp_path: Path) -> N
     assert {(row.register, row.value) for row in rows if row.value is not None} == set(HELD.items())
 
 
+@pytest.mark.slow
 @patient
 def test_the_command_line_reads_and_writes_it_too(server: str, capsys: pytest.CaptureFixture[str]) -> None:
     where = [server, DEVICE, str(ADDRESS)]

@@ -38,6 +38,7 @@ def spans(drive: Drive, *names: str) -> list[tuple[int, int]]:
 # ---- nothing stated ----
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("table", "most", "apart"), [(HOLDING, 125, 1), (INPUT, 125, 1), (COIL, 2000, 8), (DISCRETE, 2000, 8)]
 )

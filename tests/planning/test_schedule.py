@@ -454,6 +454,7 @@ KINDS = st.lists(
 )
 
 
+@pytest.mark.slow
 @given(KINDS, st.lists(st.integers(0, 60) | st.just(700), min_size=30, max_size=60))
 def test_no_drift_no_burst_whatever_stalls(
     kinds: list[tuple[int, int | None, int, int]], stalls: list[int]

@@ -132,6 +132,7 @@ def test_what_is_the_same_stays_the_same() -> None:
 # ---- changes on an open port ----
 
 
+@pytest.mark.slow
 def test_rates_and_registers_change_on_the_open_port() -> None:
     with clocked(hall(*pumps())) as made:
         made.run(2)
@@ -157,6 +158,7 @@ def test_rates_and_registers_change_on_the_open_port() -> None:
         assert made.opened == ["port of hall"]
 
 
+@pytest.mark.slow
 def test_drives_come_go_and_move_to_another_address() -> None:
     with clocked(hall(*pumps())) as made:
         made.run(2)
@@ -178,6 +180,7 @@ def test_drives_come_go_and_move_to_another_address() -> None:
         assert made.opened == ["port of hall"]
 
 
+@pytest.mark.slow
 def test_a_drive_becomes_one_of_another_family() -> None:
     drives = [InnovertIBD(7, name="pump"), InvtCHE(7, name="pump")]
     registers = [drive.readings()[:4] for drive in drives]
@@ -198,6 +201,7 @@ def test_a_drive_becomes_one_of_another_family() -> None:
     assert_rate(rows, "fan", 5, 0.1)
 
 
+@pytest.mark.slow
 def test_a_line_with_a_new_name_keeps_its_port() -> None:
     with clocked(hall(*pumps()), yard(*fans())) as made:
         made.run(2)
@@ -241,6 +245,7 @@ def test_every_slot_of_a_line_that_goes_has_a_row() -> None:
     assert (made.now - times[-1]) / S > 2.9
 
 
+@pytest.mark.slow
 def test_one_line_is_added_and_removed() -> None:
     with clocked(hall(*pumps())) as made:
         made.run(1)
@@ -271,6 +276,7 @@ def test_all_lines_may_go_and_others_come() -> None:
         assert values(made.run(2))["fan-2", "status"] > 20
 
 
+@pytest.mark.slow
 def test_a_plant_is_adopted_before_the_polling_too() -> None:
     made = clocked(hall(*pumps()))
     made.poller.adopt(plant(hall(toy("pump-1", 1, 0.2)), yard(*fans())))
@@ -344,6 +350,7 @@ def test_a_drive_that_takes_another_s_place_knows_what_that_is_asked_yet() -> No
 # ---- ports that are not there ----
 
 
+@pytest.mark.slow
 def test_a_port_that_is_not_there_is_told_and_waited_for() -> None:
     with clocked(hall(*pumps())) as made:
         made.run(1)
@@ -527,6 +534,7 @@ def test_rows_under_a_name_are_told_apart_by_their_time() -> None:
     assert told == {(name, True) for name in before}
 
 
+@pytest.mark.slow
 def test_what_has_a_name_anew_is_counted_from_its_own_beginning() -> None:
     with clocked(hall(*pumps())) as made:
         made.run(20)
@@ -549,6 +557,7 @@ def test_what_has_a_name_anew_is_counted_from_its_own_beginning() -> None:
         assert last.since(third).seconds == last.seconds == pytest.approx(2, abs=0.5)
 
 
+@pytest.mark.slow
 def test_a_name_s_code_stays_the_same() -> None:
     with clocked(hall(*pumps())) as made:
         made.run(1)

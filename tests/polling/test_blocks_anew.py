@@ -38,6 +38,7 @@ def asked_together(rows: list[Row]) -> set[bool]:
     return {count == len(NAMES) for count in Counter(row.monotonic_ns for row in rows).values()}
 
 
+@pytest.mark.slow
 @table(("document", "truth"), [(SOON, LATE), (LATE, SOON)], ids=["later", "sooner"])
 @table("every", [None, 0.75], ids=["in turn", "at a rate"])
 def test_blocks_are_those_of_the_response_delay_that_was_measured(
@@ -75,6 +76,7 @@ def test_other_drives_keep_their_place_in_the_round() -> None:
     assert rows[at : at + 6] == [(drive.name, name) for drive in drives for name in NAMES]
 
 
+@pytest.mark.slow
 def test_a_drive_that_answers_now_soon_and_now_late_costs_no_memory() -> None:
     drive = Wide(1, name="pump-1")
     sim = SimulatedDrive(Wide(1), response_delay=SOON)

@@ -98,6 +98,7 @@ def test_an_adapter_that_always_echoes_is_known_for_it(name: str) -> None:
     assert {row.status for row in story.rows[begun:]} <= {"ok", "poll ended"}
 
 
+@pytest.mark.slow
 @table("echo", [0, 1], ids=["no echo", "an echo"])
 @table("register", ["dc_bus_voltage", "output_frequency"], ids=["a value", "a zero"])
 def test_a_delixi_parameter_is_no_echo_of_its_query(register: str, echo: int) -> None:

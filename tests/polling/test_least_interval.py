@@ -148,6 +148,7 @@ def test_a_write_is_not_late_because_its_drive_rests(monkeypatch: pytest.MonkeyP
     assert patient.expires_ns - eager.expires_ns == 2 * S
 
 
+@pytest.mark.slow
 def test_the_prediction_knows_it() -> None:
     drive, sim = slow()
     wanted = planned(drive, [(register, None) for register in drive.readings()])

@@ -81,6 +81,7 @@ def test_from_a_rate_to_as_fast_as_possible_and_back(two: ClockedLines) -> None:
     assert set(values(two.run(10)).values()) <= {10, 11}
 
 
+@pytest.mark.slow
 def test_the_first_value_at_a_new_rate_comes_at_once(two: ClockedLines) -> None:
     two.poller.set_rate("pump-1", "fault", 3600.0)
     two.run(1)
@@ -132,6 +133,7 @@ def test_every_value_is_its_own_register_s_while_rates_change() -> None:
     assert told["samples"] >= total
 
 
+@pytest.mark.slow
 def test_memory_is_bounded_over_many_rates() -> None:
     with clocked(polled(toy(), ALL, 0.1)) as made:
         line = only_line(made)

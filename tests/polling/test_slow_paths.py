@@ -76,6 +76,7 @@ def path_of(monkeypatch: pytest.MonkeyPatch) -> Callable[..., tuple[Bus, PathLin
     return made
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "slow"), READS)
 def test_what_a_bus_reads_over_a_slow_path_is_true(
     name: str,
@@ -89,6 +90,7 @@ def test_what_a_bus_reads_over_a_slow_path_is_true(
     read_truly(opened, line, drives)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "slow"), ASKED)
 def test_what_a_bus_is_asked_for_over_a_slow_path_is_true(
     name: str,

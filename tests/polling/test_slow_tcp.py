@@ -133,6 +133,7 @@ def path_of(
     return made
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "slow"), ON_PATHS)
 def test_what_a_bus_reads_over_a_slow_path_is_true(
     name: str,
@@ -145,6 +146,7 @@ def test_what_a_bus_reads_over_a_slow_path_is_true(
     read_truly(opened, line, drives)
 
 
+@pytest.mark.slow
 @table("seconds", [0.0, 0.6, 4.0])
 def test_what_became_of_a_write_over_a_slow_path_is_true(
     seconds: float, path_of: Callable[..., tuple[Bus, PathLine]]
@@ -169,6 +171,7 @@ def test_what_became_of_a_write_over_a_slow_path_is_true(
     assert done > 10
 
 
+@pytest.mark.slow
 @table("seconds", [0.0, 0.6])
 @table("model", FAMILIES)
 def test_a_stop_over_a_slow_path_is_seen_to_be_done(

@@ -61,6 +61,7 @@ def test_registers_at_the_same_addresses_and_groups_stay_together() -> None:
 # ---- polled ----
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("every", [None, 0.5])
 def test_one_refused_register_costs_its_neighbours_a_few_requests_and_no_more(every: float | None) -> None:
     drive = family(WIDE)(1, name="pump-1")
@@ -77,6 +78,7 @@ def test_one_refused_register_costs_its_neighbours_a_few_requests_and_no_more(ev
     assert all(row.value is not None for row in rows if row.register != "r7")
 
 
+@pytest.mark.slow
 def test_a_device_that_takes_fewer_is_read_in_blocks_that_it_takes() -> None:
     drive = family(WIDE)(1, name="pump-1")
     sim = Picky(drive, most=8)

@@ -22,6 +22,7 @@ PUMP = "pump-1.output_frequency"
 SPEED = "pump-1.motor_speed"
 
 
+@pytest.mark.slow
 def test_pandas_gets_times_with_their_type() -> None:
     pytest.importorskip("pandas", reason="needs pandas")
     frame = example().to_pandas()
@@ -33,6 +34,7 @@ def test_pandas_gets_times_with_their_type() -> None:
     assert list(frame["status"]) == [row.status for row in EXAMPLE]
 
 
+@pytest.mark.slow
 def test_polars_gets_times_with_their_type() -> None:
     polars = pytest.importorskip("polars", reason="needs polars")
     frame = example().to_polars()
@@ -191,6 +193,7 @@ def test_drives_whose_columns_would_be_one_are_told() -> None:
         rows.wide()
 
 
+@pytest.mark.slow
 def test_many_rows_against_pandas_own_pivot() -> None:
     pandas = pytest.importorskip("pandas", reason="needs pandas")
     rows = [

@@ -55,6 +55,7 @@ def test_pandas_and_polars_get_times_with_their_type(path: Path) -> None:
     )
 
 
+@pytest.mark.slow
 def test_the_wide_form_joins_what_is_in_several_batches(path: Path) -> None:
     wide = multidrop.read(path).wide("pump-1.output_frequency", "pump-1.motor_speed")
     table = pa.table(wide).drop(["time"]).to_pydict()

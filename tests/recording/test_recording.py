@@ -86,6 +86,7 @@ def test_batches_that_are_read_are_arrow_too(tmp_path: Path, suffix: str) -> Non
     assert [row for batch in found for row in rows_of(batch)] == RECORDED
 
 
+@pytest.mark.slow
 @every_format
 def test_a_recording_never_takes_the_place_of_another(tmp_path: Path, suffix: str) -> None:
     path = record(tmp_path / f"a{suffix}")
@@ -145,6 +146,7 @@ def test_polars_opens_all(tmp_path: Path) -> None:
     assert times.to_list() == [row.time for row in RECORDED]
 
 
+@pytest.mark.slow
 def test_pandas_opens_parquet_and_csv(tmp_path: Path) -> None:
     pandas = pytest.importorskip("pandas", reason="needs pandas")
     for frame in (
@@ -474,6 +476,7 @@ def test_recordings_from_before_are_read_and_converted(tmp_path: Path) -> None:
     assert (tmp_path / "b.arrows").stat().st_size < path.stat().st_size * 0.6
 
 
+@pytest.mark.slow
 def test_pandas_and_duckdb_take_arrows_through_pyarrow(tmp_path: Path) -> None:
     pandas = pytest.importorskip("pandas", reason="needs pandas")
     duckdb = pytest.importorskip("duckdb", reason="needs duckdb")

@@ -138,6 +138,7 @@ def test_names_that_would_fill_the_memory_are_damage(
         rows(open_reader(path))
 
 
+@pytest.mark.slow
 def test_random_cuts_of_csv_lose_only_the_last_line(tmp_path: Path) -> None:
     path = tmp_path / "a.csv"
     lengths = record(path, 3)
@@ -271,6 +272,7 @@ except RecordingError as failure:
 """
 
 
+@pytest.mark.slow
 @pytest.mark.uncounted
 @pytest.mark.parametrize("suffix", usually(*FORMATS))
 def test_disk_that_becomes_full(tmp_path: Path, suffix: str) -> None:

@@ -14,6 +14,7 @@ import pytest
 from batches import METADATA, SECOND, UTC_0, example
 from commands import Run
 from examples import usually
+from peers import require_module
 from recordings import ABOUT, record, row
 
 import multidrop.cli.support.extras
@@ -31,6 +32,7 @@ def _imported() -> None:
     global np, Recording, load, plot, plot_page, png, report_page, _about, _drives
     global MOST_REASONS, delays, draw_rates, miss_shares, reasons_of, line_uses
     global MOST_LANES, MOST_PANELS, MOST_POINTS, thinned
+    require_module("matplotlib")
     import numpy as np
 
     from multidrop.report import Recording, load, plot, plot_page, png, report_page
@@ -41,6 +43,7 @@ def _imported() -> None:
     from multidrop.report.value_plot import MOST_PANELS, MOST_POINTS, thinned
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seconds", [0.01, 0.3, 2, 7, 90, 4000, 200_000])
 def test_no_two_ticks_of_the_time_say_the_same(seconds: float) -> None:
     from multidrop.report.style import day, label_time, new_figure
@@ -267,6 +270,7 @@ def test_a_plan_that_makes_no_sense_is_none(tmp_path: Path, planned: Any) -> Non
     assert line_uses(look) == []
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("_unpainted")
 def test_a_report_says_that_there_is_no_plan(tmp_path: Path) -> None:
     assert "does not carry a plan" in report_page(load(record(tmp_path / "it.arrows", turns())))
@@ -286,6 +290,7 @@ def test_the_plan_is_what_polling_carries(tmp_path: Path) -> None:
     assert told["hall-1"]["drives"]["pump"]["character_ms"] == pytest.approx(10 / 9.6, abs=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("_unpainted")
 def test_a_line_polled_at_rates_has_no_bus_cycle(tmp_path: Path) -> None:
     planned = json.loads(json.dumps(PLANNED))
@@ -379,6 +384,7 @@ def test_no_line_and_no_state_leads_across_a_pause(tmp_path: Path) -> None:
     assert seconds == [0.2, 60.2]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("drives", "name"), [(30, "drive"), (12, "conveyor-of-the-bottling-hall-south")])
 def test_a_long_legend_takes_no_room_from_the_plot(tmp_path: Path, drives: int, name: str) -> None:
     rows = [row(at, f"{name}-{n:02}", "output_frequency", n) for at in range(3) for n in range(drives)]
@@ -555,6 +561,7 @@ def test_what_has_no_room_is_named(run: Run, tmp_path: Path) -> None:
     )
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("_unpainted")
 def test_what_has_no_room_is_named_once(tmp_path: Path) -> None:
     """Numbers and states of one name are two panels."""
@@ -563,6 +570,7 @@ def test_what_has_no_room_is_named_once(tmp_path: Path) -> None:
     assert plot(states(tmp_path, rows))[1] == ["status"]
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("_unpainted")
 def test_the_report_is_one_page_that_needs_nothing_else(look: Recording) -> None:
     page = report_page(look)
@@ -715,6 +723,7 @@ def test_metadata_that_is_nested_too_deeply_is_a_sentence(run: Run, tmp_path: Pa
 # ---- the commands ----
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("_unpainted")
 def test_plot_and_report_need_nothing_but_the_file(run: Run, ramp: Path, tmp_path: Path) -> None:
     here = tmp_path / "ramp.arrows"

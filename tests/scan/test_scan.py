@@ -153,6 +153,7 @@ def test_only_reads_are_sent(whole_scan: tuple[Line, list[object]]) -> None:
     assert not any(drive.counters.writes for drive in line.wire.drives)
 
 
+@pytest.mark.slow
 def test_the_usual_settings_come_first() -> None:
     line = Line(Pair([simulated(each) for each in ALL_EIGHT]))
     soon = [each for each in ALL_EIGHT if each.settings == type(each)(1, framing=each.framing).settings]
@@ -166,6 +167,7 @@ def test_the_usual_settings_come_first() -> None:
     assert line.seconds < 15
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("format", ["8N1", "8E1"])
 def test_a_sweep_takes_little_more_than_its_silences_and_time_outs(format: str) -> None:
     nobody = Pair([simulated(YD1000(9))])
@@ -355,6 +357,7 @@ def test_a_drive_of_no_family_is_unknown() -> None:
     assert (answering.address, answering.models) == (7, ())
 
 
+@pytest.mark.slow
 def test_a_family_of_one_s_own_is_found() -> None:
     line = Line(Pair([SimulatedDrive(Toy(7, baudrate=19200)), simulated(InvtCHE(2))]))
     families = [*FAMILIES, Unsure]
@@ -495,6 +498,7 @@ def questions(plan: Sequence[Sweep]) -> Iterator[bytes]:
         yield build_request(sweep.framing, sweep.request.to(1))
 
 
+@pytest.mark.slow
 def test_every_question_is_a_read_of_the_documents() -> None:
     for sweep in sweeps(FAMILIES):
         assert sweep.request.function in READS[sweep.framing]
@@ -513,6 +517,7 @@ class Bare(SimulatedIBD):
         return super().read(function, start, count)
 
 
+@pytest.mark.slow
 def test_an_ibd_that_does_not_show_its_line_is_named_in_doubt() -> None:
     bare = InnovertIBD(3), InnovertIBD(4, framing="ascii")
     line = Line(Pair([Bare(each) for each in bare]))
@@ -543,6 +548,7 @@ class Anything(SimulatedDrive):
         return [0] * count
 
 
+@pytest.mark.slow
 def test_a_device_that_answers_everything_is_of_no_family() -> None:
     line = Line(Pair([Anything(Toy(7))]))
     (answering,) = found(line, sweeps(FAMILIES, baudrates=[9600]))

@@ -117,6 +117,7 @@ def test_scraps_of_text_are_nothing(text: bytes) -> None:
     assert Receiver(Framing.ASCII, CHARACTER, 1.0).feed(text, 0.0) == []
 
 
+@pytest.mark.slow
 @table("framing", list(Framing))
 def test_anything_at_all_is_survived_within_bounds(framing: Framing) -> None:
     randomness = random.Random(1)

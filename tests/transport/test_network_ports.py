@@ -209,6 +209,7 @@ class AsOnWindows:
         return getattr(self._whole, name)
 
 
+@pytest.mark.slow
 def test_a_bridge_passes_requests_on_where_sockets_tell_no_times(monkeypatch: pytest.MonkeyPatch) -> None:
     ours, theirs = socket.socketpair()
     monkeypatch.setattr(bridge_module, "_STAMPED", False)

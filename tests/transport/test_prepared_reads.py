@@ -75,6 +75,7 @@ def given(
     return asked
 
 
+@pytest.mark.slow
 def test_registers_that_are_read_again_are_planned_once(bus: Bus, counted: Counted) -> None:
     one, other = bus.attach(PatientToy, 1), bus.attach(PatientToy, 2)
     first = bus.read_many(one, WANTED)
@@ -87,6 +88,7 @@ def test_registers_that_are_read_again_are_planned_once(bus: Bus, counted: Count
     assert counted.since() == (1, 2)
 
 
+@pytest.mark.slow
 def test_a_drive_that_left_leaves_nothing_behind(bus: Bus, counted: Counted) -> None:
     drive = bus.attach(PatientToy, 1)
     bus.read_many(drive, WANTED)
