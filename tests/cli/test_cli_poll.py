@@ -89,6 +89,7 @@ def test_poll_in_segments(plant: Path, tmp_path: Path) -> None:
     assert done.stdout.endswith(f" in segments of {tmp_path}/run.arrows\n")
 
 
+@pytest.mark.usefixtures("_unpainted")
 def test_a_segment_is_to_be_named_where_there_is_no_whole_recording(run: Run, tmp_path: Path) -> None:
     for number in (1, 2):
         with open_writer(tmp_path / f"run.0000000{number}.arrows", METADATA) as writer:

@@ -14,13 +14,15 @@ import pytest
 from batches import METADATA, SECOND, UTC_0, example
 from commands import Run
 from examples import usually
-from peers import require_module
+from peers import require_installed
 from recordings import ABOUT, record, row
 
 import multidrop.cli.support.extras
 from multidrop.plant.loader import load_plant
 from multidrop.polling.batch import Row
 from multidrop.recording import open_writer
+
+require_installed("matplotlib")
 
 PNG = b"\x89PNG\r\n\x1a\n"
 REQUEST_9600 = 9 * 10 / 9600  # 8 characters of the request and the first one of the reply
@@ -32,7 +34,6 @@ def _imported() -> None:
     global np, Recording, load, plot, plot_page, png, report_page, _about, _drives
     global MOST_REASONS, delays, draw_rates, miss_shares, reasons_of, line_uses
     global MOST_LANES, MOST_PANELS, MOST_POINTS, thinned
-    require_module("matplotlib")
     import numpy as np
 
     from multidrop.report import Recording, load, plot, plot_page, png, report_page

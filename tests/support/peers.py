@@ -6,6 +6,7 @@ import importlib
 import os
 import shutil
 import subprocess
+from importlib.util import find_spec
 from pathlib import Path
 from types import ModuleType
 from typing import NoReturn
@@ -42,7 +43,13 @@ def require_module(name: str) -> ModuleType:
         _missing(f"the Python module {name} is not installed")
 
 
+def require_installed(name: str) -> None:
+    """Look for the module without importing it, at the head of a file whose tests need it."""
+    if find_spec(name) is None:
+        _missing(f"the Python module {name} is not installed")
+
+
 def _missing(reason: str) -> NoReturn:
     if os.environ.get("CI"):
         pytest.fail(f"{reason}, and CI must have it")
-    pytest.skip(reason)
+    pytest.skip(reason, allow_module_level=True)
