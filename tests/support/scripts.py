@@ -95,12 +95,18 @@ class Wire:
         )
         text = frame(self.drive, step.register, step.value)
         self.sent.append(text)
+        is_setpoint = step.register.name == self.drive.setpoint_name
+        if is_setpoint:
+            self.drive.commanded = None
         if self.loses.get(text):
             raise self.loses[text].pop(0)
         self.say(self.turns.get(text, {}))
         if step.register.name not in self.says:
             self.held[step.register.name] = step.value
-        return self._said(step.register)
+        held = self._said(step.register)
+        if is_setpoint and held == step.value:
+            self.drive.commanded = held
+        return held
 
     def _said(self, register: Register[Any]) -> Any:
         if register.name in self.held:

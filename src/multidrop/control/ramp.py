@@ -105,7 +105,6 @@ def _ramp(drive: Drive, hz: float, rate: float | None, every: float) -> Script[N
 
 def _check(drive: Drive, hz: float) -> Script[None]:
     """Raise what keeps this setpoint from being written: else the ramp would go up to the limit first."""
-    commanded = drive.commanded
     script = drive.set_frequency.script(hz)
     try:
         step = next(script)
@@ -115,7 +114,6 @@ def _check(drive: Drive, hz: float) -> Script[None]:
         return
     finally:
         script.close()
-        drive.commanded = commanded
     raw = raw_count(drive, step.register, step.value)
     yield from conditions(drive, step.register, step.register.decode(raw))
 

@@ -67,6 +67,8 @@ class Writer:
                 with call.look(), suppress(NoValue):
                     held = self._exchanges.value(drive, register)
                 if held == asked:
+                    if register.name == drive.setpoint_name:
+                        drive.commanded = asked
                     return Outcome(drive.name, register, asked, Effect.DONE, held=asked)
             call.check(_in_words(register, asked))  # a write that is not sent is not counted
             self.records.count(drive, register, kept)
@@ -144,15 +146,21 @@ class Writer:
         what = _in_words(register, asked)
         log = self.records.log if call else self.records.log_later
         is_setpoint = register.name == drive.setpoint_name
-        if is_setpoint:
-            drive.commanded = None  # until it is known, also where a plain write changes it
+        take_back = drive.begin_setpoint() if is_setpoint else lambda: None
         with self._logged(drive, request, what, log):
-            completion = self._carry_out(drive, request, what, call, timeout)
+            try:
+                completion = self._carry_out(drive, request, what, call, timeout)
+            except Exception as failure:
+                if _is_unsent(failure):
+                    take_back()
+                raise
             outcome = self._outcome(drive, register, asked, completion, call)
             is_unconfirmed = outcome.effect is Effect.UNCONFIRMED
             if is_unconfirmed and build_request(drive.framing, request) in completion.raw:
                 self._echo.probe(drive, insists=call is None)
-        if is_setpoint and outcome.effect is Effect.DONE:
+        if outcome.effect is Effect.REFUSED:
+            take_back()
+        elif is_setpoint and outcome.effect is Effect.DONE:
             drive.commanded = outcome.value
         if call:
             call.is_confirmed = not is_unconfirmed
@@ -234,20 +242,24 @@ class Writer:
         """Log the write also when its outcome never comes: the port failed, or somebody pressed Ctrl-C."""
         try:
             yield
-        except (Expired, Overtaken, NotAttached, NoReply):  # it was not sent
-            raise
-        except (LineError, NotMaster) as failure:
-            if not failure.is_sent:
-                raise
-            log(drive, request, what, Effect.UNCONFIRMED, str(failure))
-            raise Unconfirmed(drive.name, what, failure.reason) from failure
         except BaseException as failure:
+            if _is_unsent(failure):
+                raise
             log(drive, request, what, Effect.UNCONFIRMED, str(failure) or type(failure).__name__)
+            if isinstance(failure, (LineError, NotMaster)):
+                raise Unconfirmed(drive.name, what, failure.reason) from failure
             raise
 
 
 def _in_words(register: Register[Any], value: Any) -> str:
     return f"{register.name} = {register.format(value)}"
+
+
+def _is_unsent(failure: BaseException) -> bool:
+    """Return True where a write ended so before anything of it was sent."""
+    if isinstance(failure, (LineError, NotMaster)):
+        return not failure.is_sent
+    return isinstance(failure, (Expired, Overtaken, NotAttached, NoReply))
 
 
 def _is_under_way(failure: DriveRefused) -> bool:

@@ -11,6 +11,7 @@ from typing import Any
 
 from multidrop.core import Framing
 from multidrop.drive.declaration_check import DeclarationError, declaration_errors
+from multidrop.drive.known_setpoint import KnownSetpoint
 from multidrop.drive.manual_facts import ManualFacts
 from multidrop.drive.options import Option, checked_options, confirmation, doubt
 from multidrop.drive.read_limits import limit_errors
@@ -107,7 +108,7 @@ class Drive(ManualFacts):
             raise ValueError(f"the name {name!r} is not one line of printable characters")
         self.option = checked_options(self.title or type(self).__name__, self.options, options)
         self.ram = frozenset(self._in_ram(name) for name in ram)
-        self.commanded: float | None = None  # setpoint that set_frequency wrote last
+        self._known_setpoint = KnownSetpoint()
         self.perform: Callable[[Script[Any]], Any] = self._perform_nowhere
         self.check_identity: Callable[[], None] = lambda: None  # until a bus has its own
         self.begin_call: Callable[[str], Any] = lambda verb: None  # its permit, which a stop ends
@@ -120,6 +121,19 @@ class Drive(ManualFacts):
         where = f"on {self.bus.line.port}" if self.bus else "not attached"
         line = f"{self.framing}, {self.settings}"
         return f"<{type(self).__name__} {self.name!r}, address {self.address}, {line}, {where}>"
+
+    @property
+    def commanded(self) -> float | None:
+        """The setpoint that was written last; None where it is not known that the drive holds it."""
+        return self._known_setpoint.value
+
+    @commanded.setter
+    def commanded(self, held: float | None) -> None:
+        self._known_setpoint.value = held
+
+    def begin_setpoint(self) -> Callable[[], None]:
+        """Know no setpoint until a write of it has ended; return what takes that back, as it was not sent."""
+        return self._known_setpoint.begin_write()
 
     def _move_nowhere(self, script: Script[Any], call: Any) -> Any:
         self.check_identity()
@@ -140,12 +154,10 @@ class Drive(ManualFacts):
 
     def _hold(self, register: Register[float], value: float) -> Script[None]:
         """Write the setpoint; NotDone when the drive then holds another value."""
-        self.commanded = None
         held = yield from write(register, value)
         if held != register.decode(register.encode(value)):
             what = f"{register.name} = {register.format(value)}"
             raise NotDone(self.name, what, f"the drive holds {register.format(held)}")
-        self.commanded = held
 
     def _setpoint_in_force(self) -> Script[None]:
         """Raise Refused unless the setpoint is known, is not 0, and is still the one that was written."""
@@ -247,5 +259,5 @@ class Drive(ManualFacts):
 # Names that a register cannot have.
 TAKEN_NAMES = frozenset(
     {*dir(Drive), *("address", "framing", "settings", "agreed_silence", "response_delay", "name")}
-    | {"option", "ram", "commanded", "perform", "check_identity"}
+    | {"option", "ram", "perform", "check_identity"}
 )

@@ -59,9 +59,7 @@ def _prepare_verb(drive: Drive, request: CommandRequest) -> Prepared:
     arguments = verb_arguments(verb, request.options)
     if verb in _MOVING:
         drive.check_confirmed(verb)
-    commanded = drive.commanded
     next(getattr(drive, verb).script(**arguments), None)  # raises for what the family forbids
-    drive.commanded = commanded  # which set_frequency forgets before its write
     told = "".join(f", {name} = {getattr(value, 'value', value)}" for name, value in arguments.items())
 
     def work() -> CommandAnswer:

@@ -1,0 +1,163 @@
+"""The setpoint that a drive is known to hold, after each end that a write of it can have."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import pytest
+from simulated_bus import SimulatedBus, is_write, one
+
+from multidrop import DelixiModbus, DelixiNative, Drive, ErmanERG220, InnovertIBD
+from multidrop.control import records
+from multidrop.core import Message, build_reply
+from multidrop.drive.known_setpoint import KnownSetpoint
+from multidrop.errors import BusError, DriveRefused, Expired, NotDone, Refused, Unconfirmed
+
+UNREADABLE = [
+    pytest.param(lambda: InnovertIBD(1, maximum_frequency=50), id="innovert-ibd"),
+    pytest.param(lambda: DelixiNative(1), id="delixi-native"),
+]
+every_unreadable = pytest.mark.parametrize("make", UNREADABLE)
+Make = Callable[[], Drive]
+
+
+def told(monkeypatch: pytest.MonkeyPatch, make: Make) -> tuple[SimulatedBus, Drive]:
+    """Return a bus and its drive, which was told 20 Hz."""
+    bus, drive, _ = one(monkeypatch, make())
+    drive.set_frequency(20)
+    assert drive.commanded is not None
+    bus.frames.clear()
+    return bus, drive
+
+
+@every_unreadable
+def test_what_a_rule_refuses_changes_nothing(monkeypatch: pytest.MonkeyPatch, make: Make) -> None:
+    bus, drive = told(monkeypatch, make)
+    known = drive.commanded
+    with pytest.raises((Refused, ValueError)):
+        drive.set_frequency(-1)
+    assert bus.written == []
+    assert drive.commanded == known
+    drive.start()
+
+
+@every_unreadable
+def test_what_was_never_sent_changes_nothing(monkeypatch: pytest.MonkeyPatch, make: Make) -> None:
+    """Its turn came too late; a stop that ends it before its turn is told by the core in the same way."""
+    bus, drive = told(monkeypatch, make)
+    known = drive.commanded
+    bus.queue_time = 60.0
+    with pytest.raises(Expired):
+        drive.set_frequency(30)
+    assert bus.written == []
+    assert drive.commanded == known
+
+
+def refused(request: Message) -> bytes | None:
+    if not is_write(request):
+        return None
+    return bytes(build_reply(InnovertIBD(1).framing, replace(request, exception=4)))
+
+
+def test_what_the_drive_refuses_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    bus, drive = told(monkeypatch, lambda: InnovertIBD(1, maximum_frequency=50))
+    known = drive.commanded
+    bus.answers = refused
+    with pytest.raises(DriveRefused):
+        drive.set_frequency(30)
+    bus.answers = lambda request: None
+    assert drive.commanded == known
+    drive.start()
+
+
+@every_unreadable
+@pytest.mark.parametrize("arrives", [True, False])
+def test_after_a_lost_reply_nothing_is_known_and_no_motor_starts(
+    monkeypatch: pytest.MonkeyPatch, make: Make, arrives: bool
+) -> None:
+    bus, drive = told(monkeypatch, make)
+    if arrives:
+        bus.loses = is_write
+    else:
+        bus.deafens = is_write
+    with pytest.raises(Unconfirmed):
+        drive.set_frequency(30)
+    bus.loses = bus.deafens = lambda request: False
+    bus.frames.clear()
+    assert drive.commanded is None
+    with pytest.raises(Refused, match="cannot say its setpoint: call set_frequency before start"):
+        drive.start()
+    assert bus.written == []
+
+
+def test_what_a_drive_takes_as_another_value_is_not_what_it_was_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    _, drive, sim = one(monkeypatch, ErmanERG220(1))
+    drive.set_frequency(20)
+    take = type(sim).answer
+
+    def held_back(sim: object, request: Message, seconds: float) -> Message | None:
+        """Confirm a write and hold what was held before."""
+        if not is_write(request):
+            return take(sim, request, seconds)  # type: ignore[arg-type]
+        return request
+
+    monkeypatch.setattr(type(sim), "answer", held_back)
+    with pytest.raises(NotDone):
+        drive.set_frequency(30)
+    assert drive.commanded is None
+
+
+def test_a_stored_setpoint_that_is_held_already_is_known_without_a_write(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(records, "LEAST_INTERVAL", 0.0)
+    bus, drive, _ = one(monkeypatch, DelixiModbus(1))
+    drive.set_frequency(20)
+    drive.commanded = None  # as for a program that begins anew
+    bus.frames.clear()
+    drive.set_frequency(20)
+    assert bus.written == []
+    assert drive.commanded == 20
+
+
+def test_a_plain_write_tells_the_setpoint_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    bus, drive = told(monkeypatch, lambda: InnovertIBD(1, maximum_frequency=50))
+    bus.bus.write(drive, drive.register("frequency"), 30)
+    assert drive.commanded == 30
+    bus.loses = is_write
+    with pytest.raises(BusError):
+        bus.bus.write(drive, drive.register("frequency"), 40)
+    assert drive.commanded is None
+
+
+# ---- writes on several threads ----
+
+
+def test_a_write_that_changed_nothing_leaves_what_another_one_wrote() -> None:
+    setpoint = KnownSetpoint()
+    setpoint.value = 20.0
+    take_back = setpoint.begin_write()
+    setpoint.begin_write()
+    setpoint.value = 30.0
+    take_back()
+    assert setpoint.value == 30.0
+
+
+def test_a_write_whose_end_is_unknown_is_not_taken_back_by_another_one() -> None:
+    setpoint = KnownSetpoint()
+    setpoint.value = 20.0
+    take_back = setpoint.begin_write()
+    setpoint.begin_write()  # its reply is lost
+    take_back()
+    assert setpoint.value is None
+
+
+def test_writes_that_changed_nothing_leave_what_was_known_before_both() -> None:
+    setpoint = KnownSetpoint()
+    setpoint.value = 20.0
+    first, second = setpoint.begin_write(), setpoint.begin_write()
+    second()
+    assert setpoint.value is None
+    first()
+    assert setpoint.value == 20.0
