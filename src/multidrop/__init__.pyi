@@ -10,6 +10,7 @@ from multidrop.control.outcome import Seen as Seen
 from multidrop.control.outcome import Stopped as Stopped
 from multidrop.control.ramp import ramp as ramp
 from multidrop.control.ramp import start_staggered as start_staggered
+from multidrop.control.repeated_stops import RepeatedStops as RepeatedStops
 from multidrop.control.time_limit import written_before as written_before
 from multidrop.core import Echo as Echo
 from multidrop.core import Framing as Framing

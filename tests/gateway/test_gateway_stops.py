@@ -7,13 +7,12 @@ import http.client
 import json
 import socket
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
 from time import monotonic
 from types import SimpleNamespace
-from typing import Any
 
 import pytest
 from broken_part import BrokenFeed
@@ -21,14 +20,12 @@ from gateways import Served, served, written
 from lines import PATIENCE, until
 from tables import table
 
-from multidrop import PlantError, Unconfirmed
+from multidrop import PlantError
 from multidrop.gateway import parts, request_fields
 from multidrop.gateway.command_threads import begin_stops
 from multidrop.gateway.parts import Part
-from multidrop.gateway.repeated_stops import RepeatedStops
 from multidrop.gateway.rights import Caller, Right
 from multidrop.gateway.settings import read_settings
-from multidrop.gateway.told import Told
 
 MAY = """[serve.may]
 stop = "anyone"
@@ -360,69 +357,6 @@ def test_many_stops_of_a_silent_drive_hold_no_other_up(tmp_path: Path) -> None:
         assert stands(gateway, "pump-2")
 
 
-class NotedStops:
-    """A drive that notes its stops, each of which lasts until it is let go."""
-
-    name = "pump"
-
-    def __init__(self) -> None:
-        self.calls: list[float | None] = []
-        self.turns = threading.Semaphore(0)
-        self.under_way = {"pump": "no stop was sent yet"}
-        self.bus = SimpleNamespace(stops_under_way=lambda: self.under_way)
-
-    def stop(self, seconds: float | None) -> None:
-        self.calls.append(seconds)
-        assert self.turns.acquire(timeout=PATIENCE)
-        raise Unconfirmed("pump", "the stop", "no reply")
-
-
-def test_a_stop_beside_one_that_is_repeated_is_sent_once_after_its_call() -> None:
-    async def live() -> None:
-        pump, caller, stops = NotedStops(), Caller("anyone", "page", "", Right.STOP), RepeatedStops()
-        drive: Any = pump
-        repeated = asyncio.get_running_loop().create_future()
-        stops.note([drive], repeated)
-        called = [stops.send_once(drive, caller) for _ in range(5)]
-        await until_met(
-            lambda: pump.calls == [0.0]
-        )  # the first one's; the others wait for its answer, together
-        pump.turns.release()
-        await until_met(lambda: pump.calls == [0.0, 0.0])
-        called.append(stops.send_once(drive, caller))  # it comes too late for that one
-        pump.turns.release(2)
-        await until_met(lambda: pump.calls == [0.0, 0.0, 0.0] and not stops._sent)
-        await asyncio.sleep(0.05)  # all of them await the one that is repeated
-        assert not any(one.done() for one in called)
-        called[1].cancel()  # its client is gone
-        repeated.set_result({"pump": Told(True, "stopped")})
-        assert all([(await one)["pump"].is_done for one in called if one is not called[1]])
-        assert stops.of(drive) is None
-
-    asyncio.run(live())
-
-
-def test_a_stop_is_repeated_on_where_the_one_beside_it_is_given_up() -> None:
-    async def live() -> None:
-        pump, caller, stops = NotedStops(), Caller("anyone", "page", "", Right.STOP), RepeatedStops()
-        drive: Any = pump
-        before = asyncio.get_running_loop().create_future()
-        stops.note([drive], before)
-        pump.turns.release()
-        stops.send_once(drive, caller).cancel()  # its client is gone, and it goes on
-        called = stops.send_once(drive, caller)
-        pump.turns.release()
-        await until_met(lambda: len(pump.calls) == 2 and not stops._sent)
-        await asyncio.sleep(0.05)
-        before.set_result({"pump": Told(False, "no reply")})
-        await until_met(lambda: pump.calls[-1] is None)  # repeated as if it had been called alone
-        assert pump.calls.count(None) == 1  # for both
-        pump.turns.release()
-        assert (await called)["pump"].is_done is False
-
-    asyncio.run(live())
-
-
 @pytest.mark.long
 def test_a_stop_of_a_drive_that_runs_again_is_no_part_of_its_line_s_before(tmp_path: Path) -> None:
     """That one goes on for a silent drive alone, and has seen this one stand."""
@@ -440,12 +374,6 @@ def test_a_stop_of_a_drive_that_runs_again_is_no_part_of_its_line_s_before(tmp_p
         assert not whole.done()
         gateway.sims["pump-2"].deaf_until = 0.0
         whole.result()
-
-
-async def until_met(met: Callable[[], bool]) -> None:
-    async with asyncio.timeout(PATIENCE):
-        while not met():
-            await asyncio.sleep(0.002)
 
 
 @pytest.mark.slow

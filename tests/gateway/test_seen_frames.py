@@ -218,13 +218,13 @@ def test_a_stop_that_is_called_as_a_start_begins_ends_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with served(tmp_path, MAY) as gateway:
-        act = commands_module._act
+        act = commands_module.act_one
 
         def act_after_a_stop(drive: Drive, **given: Any) -> Told:
             gateway.gateway.commands._note_stop([drive.name])
             return act(drive, **given)
 
-        monkeypatch.setattr(commands_module, "_act", act_after_a_stop)
+        monkeypatch.setattr(commands_module, "act_one", act_after_a_stop)
         told = gateway.command("/api/act", START, authorization=gateway.bearer(Right.WRITE)).json
         assert (told["done"], "start was not sent" in told["text"]) == (False, True)
         assert commands(gateway) == []

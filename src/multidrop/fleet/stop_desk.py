@@ -13,7 +13,7 @@ from functools import partial
 from hashlib import sha256
 from typing import Any
 
-from multidrop import Bus, drive_meant, written_by
+from multidrop import Bus, Drive, RepeatedStops, drive_meant, written_by
 from multidrop.fleet.command_desk import HOLD_S, WAY
 from multidrop.fleet.command_log import CommandLog
 from multidrop.fleet.command_words import (
@@ -44,6 +44,7 @@ class StopDesk:
         self._offers = offers
         self._log = log
         self._stops: dict[tuple[int, object], asyncio.Task[CommandAnswer]] = {}  # by line and message
+        self._repeated = RepeatedStops(stop_drive)
         self._notes: set[asyncio.Task[None]] = set()
 
     async def stop(self, line: str, data: bytes) -> CommandAnswer | None:
@@ -87,12 +88,11 @@ class StopDesk:
         return CommandAnswer(CommandOutcome.UNDER_WAY, text, self.gateway, drives=drives)
 
     async def _stop(self, held: HeldLine, request: StopRequest) -> CommandAnswer:
-        """Begin the stops of all drives side by side."""
+        """Begin the stops of all drives side by side; of a drive whose stop is repeated, one more is sent."""
         self._offers.void(held.name, request.drives, CALLED)
         drives = held.drives
         names = list(drives) if request.drives is None else list(dict.fromkeys(request.drives))
-        works = _works(held.bus, drives, names)
-        waited = begin_stops([partial(_stopped_by, request.by, work) for work in works])
+        waited = self._begin(held.bus, drives, names, request.by)
         printed = [spelt(name) for name in names]
         _log.warning("stop of %s, asked for by %s", ", ".join(printed), request.by)
         record = {"id": request.id, "line": held.name, "what": "stop", "drives": printed, "by": request.by}
@@ -107,6 +107,20 @@ class StopDesk:
         self._note({"step": "over", **record, **answer.as_json()})
         return answer
 
+    def _begin(
+        self, bus: Bus, drives: Mapping[str, Drive], names: list[str], by: str
+    ) -> list[asyncio.Future[Answers]]:
+        there = [drives[name] for name in names if name in drives]
+        new = [drive for drive in there if self._repeated.of(drive) is None]
+        whole: list[tuple[StopWork, list[Drive]]] = [(partial(_stop_line, bus), new)]
+        single = [(partial(stop_drive, drive), [drive]) for drive in new]
+        works = whole if drives and len(new) == len(drives) else single
+        begun = begin_stops([partial(_stopped_by, by, work) for work, _ in works])
+        for number, (_, stopped) in enumerate(works):  # the last one may be of several, without threads
+            self._repeated.note(stopped, begun[min(number, len(begun) - 1)])
+        again = partial(_begin_stop, by)
+        return [*begun, *(self._repeated.send_once(drive, again) for drive in there if drive not in new)]
+
     def _note(self, record: Mapping[str, Any]) -> None:
         """Note it, in the order of the calls, whoever waits for the stop."""
         task = asyncio.create_task(self._write(record))
@@ -120,11 +134,8 @@ class StopDesk:
             _log.warning("a stop is not in the log of commands: %s", failure)
 
 
-def _works(bus: Bus, drives: Mapping[str, Any], names: list[str]) -> list[StopWork]:
-    """Return what stops them: the line as a whole where all of its drives are meant."""
-    if drives and drives.keys() <= set(names):
-        return [partial(_stop_line, bus)]
-    return [partial(stop_drive, drives[name]) for name in names if name in drives]
+def _begin_stop(by: str, work: StopWork) -> asyncio.Future[Answers]:
+    return begin_stops([partial(_stopped_by, by, work)])[0]
 
 
 def _stopped_by(by: str, work: StopWork, seconds: float | None) -> Answers:

@@ -38,6 +38,11 @@ def begin_stops(works: Sequence[Callable[[float | None], R]], caller: Caller) ->
     return begun
 
 
+def begin_stop(work: Callable[[float | None], R], caller: Caller) -> asyncio.Future[R]:
+    """Begin one stop, as `begin_stops` does."""
+    return begin_stops([work], caller)[0]
+
+
 def in_thread(work: Callable[[], R], caller: Caller) -> asyncio.Future[R]:
     """Do work in a thread of its own, in this caller's name; it goes on though its waiter is cancelled."""
     loop = asyncio.get_running_loop()

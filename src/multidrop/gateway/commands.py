@@ -12,24 +12,22 @@ import logging
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
-from math import inf, isfinite
-from typing import Any, Protocol
+from math import inf
+from typing import Protocol
 
 from multidrop import (
     Bus,
-    BusError,
     Drive,
-    Effect,
     Plant,
     Refused,
-    Register,
+    RepeatedStops,
     drive_meant,
     verb_arguments,
     written_before,
 )
 from multidrop.gateway.clock import boottime_ns, monotonic_ns
-from multidrop.gateway.command_threads import begin_stops, in_thread
-from multidrop.gateway.repeated_stops import RepeatedStops, stop_one
+from multidrop.gateway.command_threads import begin_stop, begin_stops, in_thread
+from multidrop.gateway.drive_works import act_one, stop_by, stop_one, write_one
 from multidrop.gateway.rights import NEVER_THIS_WAY, Caller, May, Right
 from multidrop.gateway.stops_amid_reload import ChangingLines, drives_of, names_of, stop_meant
 from multidrop.gateway.told import Told as Told
@@ -67,7 +65,8 @@ class Commands:
         self._under_way: dict[str, int] = {}  # writes, by line
         self.stops: Counter[str] = Counter()  # that were called, by drive
         self._stopped_ns: dict[str, int] = {}  # when the latest one was
-        self._repeated = RepeatedStops()
+        self._repeated = {verb: RepeatedStops(partial(stop_by, verb)) for verb in STOPPING}
+        self._repeated["stop"] = RepeatedStops(stop_one)
         self._ended_ns: dict[str, int] = {}  # by drive
         self.plant_ns: int | None = None  # when the plant was read anew (CLOCK_BOOTTIME)
 
@@ -112,14 +111,14 @@ class Commands:
 
     async def _stop(self, plant: Plant, wanted: Iterable[str], caller: Caller) -> dict[str, Told]:
         """Stop these drives of a plant."""
-        there, wanted = drives_of(plant), dict.fromkeys(wanted)
+        there, wanted, repeated = drives_of(plant), dict.fromkeys(wanted), self._repeated["stop"]
         told: dict[str, Told] = {}
         works: list[tuple[StopWork, list[Drive]]] = []
         once: list[Drive] = []
         for line in plant.lines:
             here = {polled.drive.name: polled.drive for polled in line.drives if polled.drive.name in wanted}
             self._note_stop(here)
-            new = [drive for drive in here.values() if self._repeated.of(drive) is None]
+            new = [drive for drive in here.values() if repeated.of(drive) is None]
             once += [drive for drive in here.values() if drive not in new]
             if new and len(new) == len(line.drives):
                 works.append((partial(self._stop_line, line.name, list(here)), new))
@@ -128,19 +127,19 @@ class Commands:
         for name in wanted:
             if name not in there:
                 told[name] = failed(ValueError(f"there is no drive {name!r}"))
-        begun = self._begin_stops(works, caller)
-        again = [self._repeated.send_once(drive, caller) for drive in once]
+        begun = self._begin_stops(works, caller, repeated)
+        again = [repeated.send_once(drive, partial(begin_stop, caller=caller)) for drive in once]
         for found in await asyncio.gather(*begun, *again):
             told |= found
         return {name: told[name] for name in wanted if name in told}
 
     def _begin_stops(
-        self, works: Sequence[tuple[StopWork, list[Drive]]], caller: Caller
+        self, works: Sequence[tuple[StopWork, list[Drive]]], caller: Caller, repeated: RepeatedStops[Told]
     ) -> list[asyncio.Future[dict[str, Told]]]:
         begun = begin_stops([work for work, _ in works], caller)
         for future, (_, drives) in zip(begun, works, strict=True):
             future.add_done_callback(partial(self._note_end, [drive.name for drive in drives]))
-            self._repeated.note(drives, future)
+            repeated.note(drives, future)
         return begun
 
     def _stop_line(self, line: str, names: list[str], seconds: float | None) -> dict[str, Told]:
@@ -163,7 +162,7 @@ class Commands:
             return denied(caller, Right.WRITE, f"a write of {what}")
         if what not in self.may.write:
             return failed(not_listed(what, "write"))
-        work = partial(_write, register=register, value=value)
+        work = partial(write_one, register=register, value=value)
         return await self._carry_out(drive, caller, f"{what} = {value!r}", work, admit)
 
     async def act(
@@ -194,28 +193,31 @@ class Commands:
         except ValueError as mistake:
             return failed(mistake)
         if verb in STOPPING:
-            return await self._carry_out_stop(drive, verb, arguments, caller)
-        work = partial(_act, verb=verb, arguments=arguments)
+            return await self._carry_out_stop(drive, verb, caller)
+        work = partial(act_one, verb=verb, arguments=arguments)
         return await self._carry_out(drive, caller, what, work, admit)
 
-    async def _carry_out_stop(
-        self, drive: str, verb: str, arguments: Mapping[str, Any], caller: Caller
-    ) -> Told:
+    async def _carry_out_stop(self, drive: str, verb: str, caller: Caller) -> Told:
         """Carry out a verb that stops the motor: neither writes under way nor other stops keep it back.
 
         Another drive that a reload makes it mean as well is stopped on its ramp, unless its verb is listed.
         """
         self.called += 1
         _log.warning("%s.%s, asked for by %s", drive, verb, caller.by)
+        repeated = self._repeated[verb]
 
         async def stop(plant: Plant, names: list[str]) -> dict[str, Told]:
             there = drives_of(plant)
             listed = {drive} | {name for name in names if f"{name}.{verb}" in self.may.verbs}
             here = [name for name in names if name in there and name in listed]
             self._note_stop(here)
-            works = [(partial(_stop_by, there[name], verb, arguments), [there[name]]) for name in here]
+            new = [there[name] for name in here if repeated.of(there[name]) is None]
+            once = [there[name] for name in here if there[name] not in new]
+            works = [(partial(stop_by, verb, drive), [drive]) for drive in new]
+            begun = self._begin_stops(works, caller, repeated)
+            again = [repeated.send_once(drive, partial(begin_stop, caller=caller)) for drive in once]
             rest = self._stop(plant, [name for name in names if name not in here], caller)
-            ends = await asyncio.gather(*self._begin_stops(works, caller), rest)
+            ends = await asyncio.gather(*begun, *again, rest)
             return {name: told for end in ends for name, told in end.items()}
 
         return as_one(await stop_meant(self._lines, [drive], stop))
@@ -261,39 +263,3 @@ class Commands:
     def _end(self, line: str, drive: str) -> None:
         self._under_way[line] -= 1
         self._note_end([drive])
-
-
-def _stop_by(drive: Drive, verb: str, arguments: Mapping[str, Any], seconds: float | None) -> dict[str, Told]:
-    limit = {} if seconds is None else {"seconds": seconds}
-    return {drive.name: _act(drive, verb, {**arguments, **limit})}
-
-
-def _write(drive: Drive, register: str, value: float) -> Told:
-    bus: Bus | None = drive.bus
-    if bus is None:
-        return failed(ValueError(f"{drive.name} is on no line any more"))
-    try:
-        known = drive.register(register)
-        outcome = bus.try_write(drive, known, _typed(known, value))
-    except Exception as failure:  # whatever it is: its caller must see it
-        return failed(failure)
-    if outcome.effect is Effect.DONE:
-        return Told(True, str(outcome))
-    return Told(False, str(outcome), outcome.failure or BusError(str(outcome)))
-
-
-def _typed(register: Register[Any], value: float) -> Any:
-    """Return a number as the register takes it: a choice by its raw count, which is never rounded."""
-    if register.values is None:
-        return value
-    if isinstance(value, float) and (not isfinite(value) or value != int(value)):
-        raise ValueError(f"{register.name} takes the number of a choice, not {value!r}")
-    return register.decode(value)
-
-
-def _act(drive: Drive, verb: str, arguments: Mapping[str, Any]) -> Told:
-    try:
-        getattr(drive, verb)(**arguments)
-    except Exception as failure:  # whatever it is: its caller must see it
-        return failed(failure)
-    return Told(True, f"{drive.name}: {verb} is done")
