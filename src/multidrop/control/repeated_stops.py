@@ -10,7 +10,6 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Callable, Iterable
 from functools import partial
-from time import monotonic
 from typing import Generic, Protocol, TypeVar
 
 from multidrop.drive.family import Drive
@@ -20,7 +19,7 @@ BEGINNING_S = 0.25  # in which a stop that was called need not be under way yet
 
 
 class EndedStop(Protocol):
-    """What became of one drive's stop."""
+    """The end of one drive's stop."""
 
     @property
     def is_done(self) -> bool:
@@ -52,7 +51,7 @@ class RepeatedStops(Generic[E]):
     def note(self, drives: Iterable[Drive], stops: EndedStops[E]) -> None:
         """Note that a stop of these drives is under way, and repeated."""
         self._repeated = {drive: one for drive, one in self._repeated.items() if not one[0].done()}
-        self._repeated |= dict.fromkeys(drives, (stops, monotonic()))
+        self._repeated |= dict.fromkeys(drives, (stops, _now()))
 
     def of(self, drive: Drive) -> EndedStops[E] | None:
         """Return the stop of this drive that is repeated; None without one.
@@ -64,7 +63,7 @@ class RepeatedStops(Generic[E]):
             return None
         bus = drive.bus
         goes_on = bus is not None and drive.name in bus.stops_under_way()
-        return stops if goes_on or monotonic() - called < BEGINNING_S else None
+        return stops if goes_on or _now() - called < BEGINNING_S else None
 
     def send_once(self, drive: Drive, begin: BeginStop[E]) -> EndedStops[E]:
         """Send a stop once more, and return what becomes of the one that is repeated.
@@ -77,11 +76,11 @@ class RepeatedStops(Generic[E]):
         return asyncio.shield(task)
 
     async def _send_and_await(self, drive: Drive, begin: BeginStop[E]) -> dict[str, E]:
-        ends = monotonic() + REPEATED_S
+        ends = _now() + REPEATED_S
         told = (await asyncio.shield(self._soon(drive, begin)))[drive.name]
         if (repeated := self.of(drive)) is not None:
             told = (await asyncio.shield(repeated))[drive.name]
-        if not told.is_done and monotonic() < ends:
+        if not told.is_done and _now() < ends:
             if (repeated := self.of(drive)) is None:
                 repeated = begin(partial(self._stop, drive))
                 self.note([drive], repeated)
@@ -110,3 +109,7 @@ class RepeatedStops(Generic[E]):
     def _forget(self, drive: Drive, sent: EndedStops[E]) -> None:
         if self._sent.get(drive) is sent:
             del self._sent[drive]
+
+
+def _now() -> float:
+    return asyncio.get_running_loop().time()
