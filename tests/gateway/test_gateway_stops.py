@@ -20,12 +20,13 @@ from gateways import Served, served, written
 from lines import PATIENCE, until
 from tables import table
 
-from multidrop import PlantError
-from multidrop.gateway import parts, request_fields
+from multidrop import Drive, PlantError
+from multidrop.gateway import drive_works, parts, request_fields
 from multidrop.gateway.command_threads import begin_stops
 from multidrop.gateway.parts import Part
 from multidrop.gateway.rights import Caller, Right
 from multidrop.gateway.settings import read_settings
+from multidrop.gateway.told import Told
 
 MAY = """[serve.may]
 stop = "anyone"
@@ -355,6 +356,30 @@ def test_many_stops_of_a_silent_drive_hold_no_other_up(tmp_path: Path) -> None:
         gateway.sims["pump-2"].deaf_until = 0.0
         assert [call.result().json["pump-2"]["done"] for call in calls] == [True] * 40
         assert stands(gateway, "pump-2")
+
+
+@pytest.mark.slow
+def test_of_many_coasts_of_a_silent_drive_one_is_repeated(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    repeated: list[float | None] = []
+    act = drive_works.act_one
+
+    def noted(drive: Drive, verb: str, arguments: dict[str, float | None]) -> Told:
+        repeated.append(arguments["seconds"])
+        return act(drive, verb, arguments)
+
+    monkeypatch.setattr(drive_works, "act_one", noted)
+    coast = {"drive": "pump-1", "verb": "coast", "options": {}}
+    with served(tmp_path, MAY) as gateway, ThreadPoolExecutor(9) as callers:
+        gateway.sims["pump-1"].deaf_until = float("inf")
+        calls = [callers.submit(gateway.post, "/api/act", coast)]
+        until(lambda: "pump-1" in gateway.gateway.bus("hall").stops_under_way())
+        calls += [callers.submit(gateway.post, "/api/act", coast) for _ in range(8)]
+        until(lambda: gateway.gateway.commands.stops["pump-1"] == 9)
+        gateway.sims["pump-1"].deaf_until = 0.0
+        assert [call.result().json["done"] for call in calls] == [True] * 9
+    assert repeated.count(None) == 1
 
 
 @pytest.mark.long
