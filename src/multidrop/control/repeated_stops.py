@@ -65,6 +65,12 @@ class RepeatedStops(Generic[E]):
         goes_on = bus is not None and drive.name in bus.stops_under_way()
         return stops if goes_on or _now() - called < BEGINNING_S else None
 
+    def divided(self, drives: Iterable[Drive]) -> tuple[list[Drive], list[Drive]]:
+        """Return those whose stop is to be begun, and noted, and those whose stop is to be sent once more."""
+        drives = [*drives]
+        again = [drive for drive in drives if self.of(drive) is not None]
+        return [drive for drive in drives if drive not in again], again
+
     def send_once(self, drive: Drive, begin: BeginStop[E]) -> EndedStops[E]:
         """Send a stop once more, and return what becomes of the one that is repeated.
 

@@ -110,8 +110,7 @@ class StopDesk:
     def _begin(
         self, bus: Bus, drives: Mapping[str, Drive], names: list[str], by: str
     ) -> list[asyncio.Future[Answers]]:
-        there = [drives[name] for name in names if name in drives]
-        new = [drive for drive in there if self._repeated.of(drive) is None]
+        new, once = self._repeated.divided(drives[name] for name in names if name in drives)
         whole: list[tuple[StopWork, list[Drive]]] = [(partial(_stop_line, bus), new)]
         single = [(partial(stop_drive, drive), [drive]) for drive in new]
         works = whole if drives and len(new) == len(drives) else single
@@ -119,7 +118,7 @@ class StopDesk:
         for number, (_, stopped) in enumerate(works):  # the last one may be of several, without threads
             self._repeated.note(stopped, begun[min(number, len(begun) - 1)])
         again = partial(_begin_stop, by)
-        return [*begun, *(self._repeated.send_once(drive, again) for drive in there if drive not in new)]
+        return [*begun, *(self._repeated.send_once(drive, again) for drive in once)]
 
     def _note(self, record: Mapping[str, Any]) -> None:
         """Note it, in the order of the calls, whoever waits for the stop."""

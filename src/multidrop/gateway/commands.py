@@ -118,8 +118,8 @@ class Commands:
         for line in plant.lines:
             here = {polled.drive.name: polled.drive for polled in line.drives if polled.drive.name in wanted}
             self._note_stop(here)
-            new = [drive for drive in here.values() if repeated.of(drive) is None]
-            once += [drive for drive in here.values() if drive not in new]
+            new, others = repeated.divided(here.values())
+            once += others
             if new and len(new) == len(line.drives):
                 works.append((partial(self._stop_line, line.name, list(here)), new))
             else:
@@ -211,8 +211,7 @@ class Commands:
             listed = {drive} | {name for name in names if f"{name}.{verb}" in self.may.verbs}
             here = [name for name in names if name in there and name in listed]
             self._note_stop(here)
-            new = [there[name] for name in here if repeated.of(there[name]) is None]
-            once = [there[name] for name in here if there[name] not in new]
+            new, once = repeated.divided(there[name] for name in here)
             works = [(partial(stop_by, verb, drive), [drive]) for drive in new]
             begun = self._begin_stops(works, caller, repeated)
             again = [repeated.send_once(drive, partial(begin_stop, caller=caller)) for drive in once]
