@@ -117,7 +117,8 @@ def test_what_is_not_well_beside_the_lines_is_told(opened: Opener, gateway: Fake
 
 def test_a_silent_drive_keeps_its_last_value_with_its_age(opened: Opener) -> None:
     page = opened("#/drives/labeller")
-    assert cell(page, "labeller", "state").inner_text().strip().startswith("silent for ")
+    state = cell(page, "labeller", "state")  # "last: silent for" while the page itself waits for news
+    until_met(page, lambda: state.inner_text().strip().startswith("silent for "))
     assert re.search(r"Hz\d\d s old", cell(page, "labeller", "frequency").inner_text().replace("\n", ""))
     assert "since then: no reply" in cell(page, "labeller", "frequency").locator(".value").get_attribute(
         "title"

@@ -47,7 +47,7 @@ class Plant:
 
 
 @pytest.fixture
-def hall(tmp_path: Path) -> Iterator[Plant]:
+def hall(tmp_path: Path, _turns_awaited: None) -> Iterator[Plant]:
     with ExitStack() as stack:
         yield Plant(tmp_path / "hall", stack)
 

@@ -27,7 +27,9 @@ let plots = [],
   told = null,
   waiting = null,
   serial = 0,
-  isShown = false;
+  isShown = false,
+  isDragged = false, // over a plot, which must not be made anew meanwhile
+  isDue = false; // drawing, once the mouse is let go
 
 export function begin() {
   onPlant(() => {
@@ -68,6 +70,8 @@ export function begin() {
       make("div", { id: "marks" }),
     ),
   );
+  find("#trend-plots").addEventListener("mousedown", () => (isDragged = true));
+  for (const end of ["mouseup", "blur"]) addEventListener(end, letGo); // the plots have had it by then
   picker.begin(find("#picker"), ask);
   markers.begin(
     () => plots,
@@ -178,8 +182,15 @@ async function fetchAll() {
   }
 }
 
+function letGo() {
+  isDragged = false;
+  if (isDue) draw();
+}
+
 // Draw what was told last; on another size, theme or time zone too.
 export function draw() {
+  isDue = isDragged;
+  if (isDue) return;
   for (const { plot } of plots) plot.destroy();
   plots = [];
   const place = find("#trend-plots");
