@@ -160,8 +160,8 @@ class Writer:
                 self._echo.probe(drive, insists=call is None)
         if outcome.effect is Effect.REFUSED:
             take_back()
-        elif is_setpoint and outcome.effect is Effect.DONE:
-            drive.commanded = outcome.value
+        elif is_setpoint:
+            drive.commanded = outcome.value if outcome.effect is Effect.DONE else None
         if call:
             call.is_confirmed = not is_unconfirmed
             call.unverified = outcome
