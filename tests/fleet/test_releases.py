@@ -1,4 +1,4 @@
-"""Lines are let go for others only while these can claim them."""
+"""Lines are let go for others only while these can claim them, and will be able to in the next moment."""
 
 from __future__ import annotations
 
@@ -11,28 +11,32 @@ from peers import require_module
 require_module("nats")
 
 from multidrop.fleet import names, releases  # noqa: E402
-from multidrop.fleet.releases import Releases  # noqa: E402
+from multidrop.fleet.cluster import Cluster, Replica  # noqa: E402
+from multidrop.fleet.releases import WAIT_S, Releases  # noqa: E402
 
 LINES = {names.owner_bucket(line): line for line in (f"line-{at}" for at in range(30))}  # one of each bucket
 
 
 class Trial:
-    """Releases of a gateway, and the buckets that have a leader."""
+    """Releases of a gateway, the buckets that have a leader, and those of which a server is silent."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.led = set(names.OWNERS)
+        self.maimed: set[str] = set()
         self.asked: list[str] = []
         self.changes = 0
+        self.now_s = 0.0
         nowhere: Any = None
-        self.releases = Releases(lambda: nowhere, self.note)
-        monkeypatch.setattr(releases, "has_leader", self.has_leader)
+        self.releases = Releases(lambda: nowhere, self.note, lambda: self.now_s)
+        monkeypatch.setattr(releases, "known_cluster", self.known_cluster)
 
     def note(self) -> None:
         self.changes += 1
 
-    async def has_leader(self, path: Any, bucket: str) -> bool:
+    async def known_cluster(self, path: Any, bucket: str) -> Cluster:
         self.asked.append(bucket)
-        return bucket in self.led
+        silent = Replica("n3", is_current=bucket not in self.maimed, is_offline=False, active_ns=0)
+        return Cluster("n1" if bucket in self.led else "", (silent,))
 
     def look(self) -> None:
         asyncio.run(self.releases.look())
@@ -65,3 +69,46 @@ def test_nothing_is_asked_where_no_line_is_to_be_released_and_nothing_is_believe
     trial.look()
     trial.led.clear()
     assert trial.releases.due({LINES["own_2"]}) == set()
+
+
+def test_a_line_waits_while_a_server_of_its_bucket_is_silent(monkeypatch: pytest.MonkeyPatch) -> None:
+    trial = Trial(monkeypatch)
+    trial.maimed = {"own_1"}
+    lines = set(LINES.values())
+    trial.releases.due(lines)
+    trial.look()
+    assert trial.releases.due(lines) == lines - {LINES["own_1"]}
+    trial.maimed.clear()
+    trial.look()
+    assert trial.changes == 2
+    assert trial.releases.due(lines) == lines
+
+
+def test_a_server_that_is_silent_for_long_is_not_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    trial = Trial(monkeypatch)
+    trial.maimed = {"own_1"}
+    line = {LINES["own_1"]}
+    trial.releases.due(line)
+    trial.look()
+    trial.now_s = WAIT_S - 1
+    trial.look()
+    assert trial.releases.due(line) == set()
+    trial.now_s = WAIT_S
+    trial.look()
+    assert trial.releases.due(line) == line
+    trial.maimed.clear()  # it is heard, and silent again: it is waited for anew
+    trial.look()
+    trial.maimed = {"own_1"}
+    trial.look()
+    assert trial.releases.due(line) == set()
+
+
+def test_who_is_in_haste_waits_for_a_leader_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    trial = Trial(monkeypatch)
+    trial.maimed = set(names.OWNERS)
+    trial.led.remove("own_2")
+    lines = set(LINES.values())
+    trial.releases.due(lines, 0)
+    trial.look()
+    assert trial.releases.due(lines, 0) == lines - {LINES["own_2"]}
+    assert trial.releases.due(lines) == set()

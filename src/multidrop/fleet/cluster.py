@@ -44,6 +44,11 @@ class Cluster(NamedTuple):
         return servers[place % len(servers)]
 
     @property
+    def has_silent(self) -> bool:
+        """Say whether one of them is silent."""
+        return any(follower.is_silent for follower in self.followers)
+
+    @property
     def ready(self) -> list[str]:
         """Return the followers that could lead now."""
         return [follower.name for follower in self.followers if follower.is_ready]

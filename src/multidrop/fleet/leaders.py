@@ -17,13 +17,16 @@ async def cluster_at(path: ServerPath, bucket: str) -> Cluster | None:
     return cluster_of(await ask(path, f"STREAM.INFO.KV_{bucket}"))
 
 
+async def known_cluster(path: ServerPath, bucket: str) -> Cluster:
+    """Return the servers of a bucket, of which one alone leads; nobody leads where none answers."""
+    with suppress(FleetError):
+        return await cluster_at(path, bucket) or Cluster(path.server_name)
+    return Cluster()
+
+
 async def has_leader(path: ServerPath, bucket: str) -> bool:
     """Say whether a bucket has a leader that answers: else no record of it can be written."""
-    try:
-        cluster = await cluster_at(path, bucket)
-    except FleetError:
-        return False
-    return cluster is None or bool(cluster.leader)
+    return bool((await known_cluster(path, bucket)).leader)
 
 
 async def have_leaders(path: ServerPath) -> bool:

@@ -18,7 +18,7 @@ from multidrop.fleet import names
 from multidrop.fleet.buckets import ask
 from multidrop.fleet.cluster import Cluster
 from multidrop.fleet.errors import FleetError
-from multidrop.fleet.leaders import cluster_at
+from multidrop.fleet.leaders import known_cluster
 from multidrop.fleet.servers import ServerPath
 from multidrop.fleet.task_end import end_tasks
 
@@ -38,13 +38,13 @@ class LeaseTerms:
 
     async def keep_ahead(self, path: ServerPath) -> None:
         """Hand over what is due, one bucket after the other: through us at most one waits for an election."""
-        looks = [asyncio.create_task(_cluster(path, bucket)) for bucket in names.LEASES]
+        looks = [asyncio.create_task(_named(path, bucket)) for bucket in names.LEASES]
         has_silent, found = False, 0
         try:
             for look in asyncio.as_completed(looks):
                 bucket, cluster = await look
                 found += bool(cluster.leader)
-                if cluster.leader and any(follower.is_silent for follower in cluster.followers):
+                if cluster.leader and cluster.has_silent:
                     has_silent, ready = True, cluster.ready
                     if ready and self._is_due(bucket) and not await _hand_over(path, bucket, ready[0]):
                         return
@@ -63,11 +63,8 @@ class LeaseTerms:
         return True
 
 
-async def _cluster(path: ServerPath, bucket: str) -> tuple[str, Cluster]:
-    """Return what is known of the servers of a bucket; nothing where none answers."""
-    with suppress(FleetError):
-        return bucket, await cluster_at(path, bucket) or Cluster()
-    return bucket, Cluster()
+async def _named(path: ServerPath, bucket: str) -> tuple[str, Cluster]:
+    return bucket, await known_cluster(path, bucket)
 
 
 async def _hand_over(path: ServerPath, bucket: str, server: str) -> bool:
@@ -77,7 +74,7 @@ async def _hand_over(path: ServerPath, bucket: str, server: str) -> bool:
         await ask(path, f"STREAM.LEADER.STEPDOWN.KV_{bucket}", wanted)
     with suppress(TimeoutError):
         async with asyncio.timeout(DONE_S):
-            while (await _cluster(path, bucket))[1].leader != server:
+            while (await known_cluster(path, bucket)).leader != server:
                 await asyncio.sleep(LOOK_S)
             return True
     return False

@@ -34,7 +34,7 @@ from multidrop.fleet.life_lock import LifeLock
 from multidrop.fleet.line_keeper import LineKeeper, Lines, TakenLine
 from multidrop.fleet.own_machine import OwnMachine, avoided_by
 from multidrop.fleet.ownership import decide, owner_of
-from multidrop.fleet.releases import Releases
+from multidrop.fleet.releases import WAIT_S, Releases
 from multidrop.fleet.servers import ServerPath
 from multidrop.fleet.share_records import ShareRecords
 from multidrop.fleet.shares import Sharers, Shares
@@ -296,5 +296,5 @@ class Member:
             is_draining=self.is_draining,
         )
         gone = {line for line in owned if not self.records.is_in_plant(line)}
-        self.keeper.releasing = gone | self._releases.due(step.releases)
+        self.keeper.releasing = gone | self._releases.due(step.releases, 0 if self.is_draining else WAIT_S)
         self.keeper.claim(step.claims)

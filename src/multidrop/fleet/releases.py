@@ -1,37 +1,52 @@
 """Releases: which lines may be let go for another gateway now: those that it can claim at once.
 
-A line is closed before it is given away, and is nobody's until that is stored. While its bucket has no leader
-nothing is stored, so it is better polled where it is.
+A line is closed before it is given away, and is nobody's until that is stored and the other one has claimed
+it. While its bucket has no leader nothing is stored, so it is better polled where it is. So it is while a
+server of the bucket is silent: one that is cut off asks for votes in newer terms, and once it is heard again
+the leader may lose its office for seconds, between giving away and claiming.
 """
 
 from __future__ import annotations
 
 import asyncio
+import time
 from collections.abc import Callable, Set
 
-from multidrop.fleet.leaders import has_leader
+from multidrop.fleet.leaders import known_cluster
 from multidrop.fleet.names import owner_bucket
 from multidrop.fleet.servers import ServerPath
 
 LOOK_S = 0.05  # between looks while lines are to be released
+WAIT_S = 60.0  # for a silent server; one that is silent for longer is not waited for
 
 
 class Releases:
-    """The lines that should be others', and which of their buckets had a leader a moment ago.
+    """The lines that should be others', and how the servers of their buckets were a moment ago.
 
     `on_change` is called when more or fewer of them may be let go.
     """
 
-    def __init__(self, path: Callable[[], ServerPath], on_change: Callable[[], object]) -> None:
+    def __init__(
+        self,
+        path: Callable[[], ServerPath],
+        on_change: Callable[[], object],
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
         self._path = path
         self._on_change = on_change
+        self._clock = clock
         self._lines: Set[str] = frozenset()
-        self._led: set[str] = set()
+        self._led: dict[str, float | None] = {}  # buckets with a leader; since when a server of it is silent
 
-    def due(self, lines: Set[str]) -> set[str]:
-        """Return those of these lines that may be let go now; the others are waited for."""
+    def due(self, lines: Set[str], wait_s: float = WAIT_S) -> set[str]:
+        """Return those of these lines that may be let go now; the others are waited for.
+
+        `wait_s` says for how long a silent server holds them up.
+        """
         self._lines = lines
-        return {line for line in lines if owner_bucket(line) in self._led}
+        waited_since = self._clock() - wait_s
+        ready = {bucket for bucket, since in self._led.items() if since is None or since <= waited_since}
+        return {line for line in lines if owner_bucket(line) in ready}
 
     async def watch(self) -> None:
         """Look at the buckets of the lines that are to be released, for ever."""
@@ -40,10 +55,13 @@ class Releases:
             await asyncio.sleep(LOOK_S)
 
     async def look(self) -> None:
-        """Ask for the leaders once; nothing is asked where no line is to be released."""
+        """Ask for the servers once; nothing is asked where no line is to be released."""
         buckets = sorted({owner_bucket(line) for line in self._lines})
-        answers = await asyncio.gather(*(has_leader(self._path(), bucket) for bucket in buckets))
-        led = {bucket for bucket, is_led in zip(buckets, answers, strict=True) if is_led}
-        if led != self._led:
-            self._led = led
+        found = await asyncio.gather(*(known_cluster(self._path(), bucket) for bucket in buckets))
+        now, before, self._led = self._clock(), self._led, {}
+        for bucket, cluster in zip(buckets, found, strict=True):
+            if cluster.leader:
+                since = before.get(bucket)
+                self._led[bucket] = (now if since is None else since) if cluster.has_silent else None
+        if self._led != before:
             self._on_change()
