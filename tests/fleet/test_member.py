@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import math
 import time
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager, suppress
@@ -16,8 +17,10 @@ from peers import require_module
 require_module("nats")
 
 from multidrop.fleet import member as member_module  # noqa: E402
-from multidrop.fleet import names  # noqa: E402
+from multidrop.fleet import names, releases  # noqa: E402
 from multidrop.fleet.buckets import Bucket  # noqa: E402
+from multidrop.fleet.cluster import Cluster as Servers  # noqa: E402
+from multidrop.fleet.cluster import Replica  # noqa: E402
 from multidrop.fleet.errors import Conflict  # noqa: E402
 from multidrop.fleet.lease import Lease, boottime_ns  # noqa: E402
 from multidrop.fleet.lease_bucket import LeaseBucket  # noqa: E402
@@ -166,6 +169,29 @@ def test_a_drained_gateway_gives_all_away_and_takes_none(fleet: Cluster) -> None
             await asyncio.sleep(0.5)
             assert not drained.polled
 
+    asyncio.run(main())
+
+
+def test_with_a_silent_server_only_a_drained_gateway_gives_lines_away(
+    fleet: Cluster, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    silent = Replica("n3", is_current=False, is_offline=True, active_ns=0)
+
+    async def maimed(*_: object) -> Servers:
+        return Servers("n1", (silent,))
+
+    async def main() -> None:
+        async with gateways(fleet, "a", "b", terms=LONG) as running:
+            await until(running.are_shared, "start")
+            monkeypatch.setattr(releases, "known_cluster", maimed)
+            joined, drained = await running.join("c"), running.members["b"]
+            await until(lambda: "c" in drained.wanted.values(), "its share")
+            await asyncio.sleep(1.0)
+            assert not joined.polled
+            drained.drain()
+            await until(lambda: not drained.polled and running.all_are_polled(), "drain")
+
+    monkeypatch.setattr(member_module, "WAIT_S", math.inf)
     asyncio.run(main())
 
 
