@@ -93,13 +93,13 @@ class FleetDrill:
             if node.process.poll() is not None:
                 node.start()
         self.nats.wait()
-        for name in GATEWAYS:
-            running = self.gateways.get(name)
-            if running is None or running.poll() is not None:
-                self.start(name)
-        self.wait(lambda: self.hall.are_polled(0.5), "all lines are polled")
+
+        def are_polled() -> bool:
+            self._start_what_died()
+            return self.hall.are_polled(0.5)
 
         def is_shared() -> bool:
+            self._start_what_died()
             found = self.status()
             return len(found["gateways"]) == len(GATEWAYS) and all(
                 one["lines"]
@@ -109,9 +109,17 @@ class FleetDrill:
                 for one in found["gateways"].values()
             )
 
+        self.wait(are_polled, "all lines are polled")
         self.wait(is_shared, "each gateway has lines, a whole lease, and paths to three nodes")
         self.wait(self.are_leaders_home, "each node leads one bucket of the leases")
         time.sleep(1.0)
+
+    def _start_what_died(self) -> None:
+        """Start gateways that are not there: the kernel kills one that a busy machine lets stand still."""
+        for name in GATEWAYS:
+            running = self.gateways.get(name)
+            if running is None or running.poll() is not None:
+                self.start(name)
 
     def are_leaders_home(self) -> bool:
         """Say whether each node leads one bucket of each group: else one deed does what two would do."""
