@@ -26,6 +26,7 @@ from terminals import closing_terminal
 from toy import Status, Toy
 
 import multidrop.cli
+from multidrop.bus import Bus
 from multidrop.cli.support.confirm import confirm
 from multidrop.control import eeprom_ledger as ledger
 from multidrop.core import Message
@@ -448,6 +449,28 @@ def test_a_start_that_is_interrupted_says_what_was_sent_and_how_to_stop_it(run: 
     assert len(received.starts) == 1
     assert "multidrop: interrupted\nmultidrop: invt-che@1: control = FORWARD " in err
     assert f"multidrop: to stop it, type: multidrop stop {words[0]} invt-che 1 --option=maximum" in err
+
+
+@patient
+@pytest.mark.parametrize(
+    ("place", "told"), [("__init__", "nothing of the start was sent"), ("close", "start is done")]
+)
+def test_an_interruption_at_either_end_of_the_port_says_what_was_sent(
+    run: Run, che: Che, monkeypatch: pytest.MonkeyPatch, place: str, told: str
+) -> None:
+    received, words = che
+    carry_out = getattr(Bus, place)
+
+    def pressed(*args: Any, **details: Any) -> None:
+        if place == "close":  # nothing is left behind
+            carry_out(*args, **details)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Bus, place, pressed)
+    status, _, err = run("start", *words, "--frequency", 20, "--yes")
+    assert (status, len(received.starts)) == (130, int(place == "close"))
+    assert f"multidrop: interrupted\nmultidrop: invt-che@1: {told}\n" in err
+    assert "multidrop: to stop it, type: multidrop stop " in err
 
 
 @patient

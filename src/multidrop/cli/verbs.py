@@ -78,7 +78,8 @@ def run(arguments: argparse.Namespace) -> int:
         drive.check_confirmed(arguments.command)
         confirm(f"{_QUESTIONS[arguments.command]} {drive.name} on {target.port}?", arguments)
     limit = {"seconds": arguments.seconds} if arguments.command in STOPS else {}
-    with target.open_bus(_audit_file(arguments)) as bus, _annotating(arguments.command, target) as known:
+    with _annotating(arguments.command, target) as known, target.open_bus(_audit_file(arguments)) as bus:
+        known.clear()
         if hz is not None and arguments.command != "set-frequency":
             drive.set_frequency(hz)
         state = verb(*parameters, **limit)
@@ -131,8 +132,11 @@ def _audit_file(arguments: argparse.Namespace) -> str | None:
 
 @contextmanager
 def _annotating(command: str, target: Target) -> Iterator[list[str]]:
-    """Add notes to an interruption: what is known of the verb, and the command that stops the motor."""
-    known: list[str] = []
+    """Add notes to an interruption: what is known of the verb, and the command that stops the motor.
+
+    One that comes while the port is opened or closed is told of too.
+    """
+    known = [f"{target.drive.name}: nothing of the {command} was sent"]
     try:
         yield known
     except KeyboardInterrupt as interruption:
