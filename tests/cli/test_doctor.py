@@ -400,6 +400,26 @@ def test_an_exception_to_the_look_for_an_echo_is_no_foreign_traffic(
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("code", [0x0A, 0x0B])
+def test_a_gateway_s_exception_is_no_answer_of_the_drive(run: Run, responder: Any, code: int) -> None:
+    """It means that the device is not reached (application protocol V1.1b3, section 7)."""
+    end = responder(lambda request: build_reply(Framing.RTU, Message(request[0], request[1], exception=code)))
+    status, out, _ = run("doctor", end.path, "--model", "invt-che", "--address", "9")
+    told = " ".join(out.split())
+    assert (status, "begins to answer" in told) == (1, False)
+    assert f"in 20 requests: a gateway answered for it, with exception {code:02X} -> check its" in told
+
+
+@pytest.mark.slow
+def test_a_drive_that_refuses_is_there_and_its_code_is_told(run: Run, responder: Any) -> None:
+    end = responder(lambda request: build_reply(Framing.RTU, Message(request[0], request[1], exception=6)))
+    status, out, _ = run("doctor", end.path, "--model", "invt-che", "--address", "9")
+    told = " ".join(out.split())
+    assert (status, "invt-che@9 begins to answer after" in told) == (0, True)
+    assert "replies were exceptions: 06" in told
+
+
+@pytest.mark.slow
 def test_only_what_was_sent_is_counted(run: Run, responder: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """A silent drive is not asked again while its late answer may come; that was no request."""
     end = responder(lambda request: b"")

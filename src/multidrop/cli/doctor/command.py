@@ -18,6 +18,7 @@ from multidrop.cli.doctor.findings import (
     Finding,
     adapter_finding,
     echo_finding,
+    is_gateway_s,
     latency_finding,
     low_latency_finding,
     round_trip_finding,
@@ -267,9 +268,11 @@ def _round_trip(port: str, rs485: RS485, drive: Drive | None) -> Finding:
     sent = characters_on_wire(drive.framing, len(build_request(drive.framing, poll.request)))
     wire = (sent + 1) * drive.settings.character
     shows_bits = "://" not in port and not is_pseudo_terminal(str(Path(port).resolve()))
-    seen = [(done.first_ns - done.sent_ns) / 1e9 for done in completions if done.result > 0]
+    answered = [done for done in completions if done.result > 0]
+    refusals = [code for done in answered if (code := done.reply.exception)]
+    seen = [(done.first_ns - done.sent_ns) / 1e9 for done in answered if not is_gateway_s(drive, done)]
     delays = sorted(max(0.0, delay - wire) if shows_bits else delay for delay in seen)
-    return round_trip_finding(drive, delays, len(completions), 0.0 if shows_bits else wire)
+    return round_trip_finding(drive, delays, len(completions), 0.0 if shows_bits else wire, refusals)
 
 
 def _repeat(line: Line, poll: Exchange) -> Iterator[Completion]:
