@@ -14,7 +14,6 @@ from multidrop.drive.timing import Settings
 LATENCY_MS = 1  # a larger latency timer is worth changing
 ROUNDS = 20
 SLOW_S = 0.005  # a larger excess over a drive's usual response delay is reported
-OF_GATEWAYS = (0x0A, 0x0B)  # no path, and no response from the device (application protocol V1.1b3, 7)
 
 
 _LEVELS = {RS485.RTS_UP: "on", RS485.RTS_DOWN: "off"}
@@ -114,12 +113,6 @@ def _answered_finding(found: Completion, sent: bytes, settings: Settings) -> Fin
     )
 
 
-def is_gateway_s(drive: Drive, found: Completion) -> bool:
-    """Return True for the exception that a gateway sends where it does not reach its device."""
-    code = found.reply.exception
-    return code in OF_GATEWAYS and code not in drive.exceptions
-
-
 def round_trip_finding(
     drive: Drive, delays: list[float], asked: int, wire: float = 0.0, refusals: Collection[int] = ()
 ) -> Finding:
@@ -132,7 +125,7 @@ def round_trip_finding(
     """
     codes = ", ".join(f"{code:02X}" for code in sorted(set(refusals)))
     if not delays:
-        unreached = f": a gateway answered for it, with exception {codes}" if refusals else ""
+        unreached = f": exception {codes} came, as from a gateway that does not reach it" if refusals else ""
         return Finding(
             "round trip",
             f"{drive.name} did not answer once in {counted(asked, 'request')}{unreached}",
