@@ -1,4 +1,4 @@
-"""What a class says of its line, its manual and its verbs: each mistake is told when the class is made."""
+"""Facts of a class, of its line, its manual and its verbs: each mistake is told when the class is made."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Check what a drive's class says of its line, its manual and its verbs, before any of it is used."""
+"""Check what a drive's class says of its line and its manual, before any of it is used."""
 
 from __future__ import annotations
 
@@ -12,7 +12,6 @@ from multidrop.drive.line_facts import LONGEST_SILENCE
 from multidrop.drive.options import Option
 from multidrop.drive.table import Table
 from multidrop.drive.timing import Settings
-from multidrop.drive.verbs import VERBS, Verb
 
 LONGEST_TIME = 60.0  # s; what is more was meant in ms
 MOST_CHARACTERS = 1000
@@ -29,12 +28,11 @@ _SPANS = {
 }
 _TRUTHS = ("answers_every_read", "broadcasts", "identity_is_inferred")
 _TEXTS = ("model", "title", "manual", "remote", "line_parameters", "no_broadcasts", "watchdog")
-_SENDING = (*VERBS, "identify")
 
 
 def fact_errors(family: Any) -> list[str]:
     """Return a sentence for each error in what a class says besides its registers."""
-    checks = (_times, _choices, _formats, _codes, _by_table, _words, _options, _verbs)
+    checks = (_times, _choices, _formats, _codes, _by_table, _words, _options)
     found = [sentence for check in checks for sentence in check(family)]
     registers = {*family.registers, *family.texts}  # one that has a fact's name is told as a register
     return [sentence for sentence in found if re.split(r"\W", sentence)[0] not in registers]
@@ -140,10 +138,3 @@ def _options(family: Any) -> Iterator[str]:
             yield f'options[{name!r}] = {option!r} is no option, such as Option("s", (1, 60), "…")'
         elif not _are(option.span, _is_number) or len(option.span) != 2 or option.span[0] > option.span[1]:
             yield f"options[{name!r}]: span = {option.span!r} is not the smallest and the largest value"
-
-
-def _verbs(family: Any) -> Iterator[str]:
-    """Find methods that would be called and send nothing: a generator that nobody carries out."""
-    for name in _SENDING:
-        if not isinstance(getattr(family, name), Verb):
-            yield f"{name}: it is no verb, and a call of it would send nothing: write @verb above it"

@@ -21,7 +21,7 @@ from multidrop.drive.scale_check import scale_errors
 from multidrop.drive.script import Script, read, until, write
 from multidrop.drive.state import Condition, Direction, State
 from multidrop.drive.text import Text, text_errors
-from multidrop.drive.verbs import MOVING, verb
+from multidrop.drive.verbs import MOVING, verb, verb_errors
 from multidrop.errors import Advice, NotAttached, NotDone, Refused, Unconfirmed, Unsupported
 
 START_TIME = 5.0  # s, after which a motor that was started must be seen to run
@@ -50,7 +50,7 @@ class Drive(ManualFacts):
         found = cls._declared(Register)
         cls.registers = found
         cls.texts = cls._declared(Text)
-        wrong = fact_errors(cls)
+        wrong = fact_errors(cls) + verb_errors(cls)
         options = cls.options = cls._all_options() if isinstance(cls.options, Mapping) else {}
         wrong += declaration_errors(found, TAKEN_NAMES, options) + text_errors(cls.texts, TAKEN_NAMES)
         if wrong := wrong or scale_errors(cls) or list(limit_errors(cls)):
