@@ -225,7 +225,10 @@ def test_a_sheet_says_what_its_class_says_of_moving_the_motor(run: Run, tmp_path
     _, out, _ = run("models", family)
     _, _, registers = out.partition("holding registers")
     remarks = [line.strip() for line in registers.splitlines() if line.startswith(" " * 8)]
-    assert remarks == ["a write moves nothing", "kept: not stated; a write may move the motor"]
+    assert remarks == [
+        "a write starts, stops and resets nothing",
+        "kept: not stated; a write may move the motor",
+    ]
     _, out, _ = run("models", family, "--json")
     told = {register["name"]: register["moves"] for register in json.loads(out)["registers"]}
     assert told == {"speed": False, "jog_bit": True, "unsaid": None}
@@ -402,7 +405,16 @@ def test_a_family_s_json_has_every_register(run: Run) -> None:
             ],
         ),
         ("delixi-modbus", ["P04.30 address", "P00.00 must be 2 (RS-485), and P00.01 1", "0 ASCII_7N2"]),
-        ("delixi-native", ["delixi formats 8N1", "delixi silence none", "P00.00 must be 2", "0 N81, 1 E81"]),
+        (
+            "delixi-native",
+            [
+                "delixi formats 8N1",
+                "delixi silence none",
+                "until measured, less than 80 ms by its document; none after 150 ms",
+                "P00.00 must be 2",
+                "0 N81, 1 E81",
+            ],
+        ),
         (
             "yd1000",
             [
@@ -443,7 +455,8 @@ def test_a_family_s_json_has_what_bounds_a_value(run: Run) -> None:
     assert "F802" in sheet["line_parameters"]
     assert "reset_fault" in sheet["remote"]
     _, out, _ = run("models", "delixi-native", "--json")
-    assert json.loads(out)["needed_silence_s"] == {"delixi": 0}
+    sheet = json.loads(out)
+    assert (sheet["needed_silence_s"], sheet["answering_time_s"]) == ({"delixi": 0}, 0.08)
     _, out, _ = run("models", "erman-er-g-220", "--json")
     assert "address 0" in json.loads(out)["no_broadcasts"]
 

@@ -26,6 +26,7 @@ from terminals import closing_terminal
 from toy import Status, Toy
 
 import multidrop.cli
+from multidrop.bus import Bus
 from multidrop.cli.support.confirm import confirm
 from multidrop.control import eeprom_ledger as ledger
 from multidrop.core import Message
@@ -448,6 +449,61 @@ def test_a_start_that_is_interrupted_says_what_was_sent_and_how_to_stop_it(run: 
     assert len(received.starts) == 1
     assert "multidrop: interrupted\nmultidrop: invt-che@1: control = FORWARD " in err
     assert f"multidrop: to stop it, type: multidrop stop {words[0]} invt-che 1 --option=maximum" in err
+
+
+def pressed_at(place: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Have Ctrl-C pressed where a bus is opened or closed."""
+    carry_out = getattr(Bus, place)
+
+    def pressed(*args: Any, **details: Any) -> None:
+        if place == "close":  # nothing is left behind
+            carry_out(*args, **details)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Bus, place, pressed)
+
+
+@patient
+@pytest.mark.parametrize(
+    ("place", "told"), [("__init__", "nothing of the start was sent"), ("close", "start is done")]
+)
+def test_an_interruption_at_either_end_of_the_port_says_what_was_sent(
+    run: Run, che: Che, monkeypatch: pytest.MonkeyPatch, place: str, told: str
+) -> None:
+    received, words = che
+    pressed_at(place, monkeypatch)
+    status, _, err = run("start", *words, "--frequency", 20, "--yes")
+    assert (status, len(received.starts)) == (130, int(place == "close"))
+    assert f"multidrop: interrupted\nmultidrop: invt-che@1: {told}\n" in err
+    assert "multidrop: to stop it, type: multidrop stop " in err
+
+
+@pytest.mark.parametrize(
+    ("place", "status", "told"),
+    [
+        ("__init__", Status(0), "toy@1: nothing of the write was sent\n"),
+        ("close", Status(0), "toy@1: acceleration_time = 20.0 s: done (read back)\n"),
+        (
+            "close",
+            Status.RUNNING,
+            "acceleration_time of toy@1 is not written: it changes only while the motor",
+        ),
+    ],
+)
+def test_a_write_that_is_interrupted_at_either_end_of_the_port_says_what_was_sent(
+    run: Run,
+    port: str,
+    toy: SimulatedDrive,
+    monkeypatch: pytest.MonkeyPatch,
+    place: str,
+    status: Status,
+    told: str,
+) -> None:
+    toy["status"] = status
+    pressed_at(place, monkeypatch)
+    ended, _, err = run("write", port, TOY, 1, "acceleration_time", 20, "--yes")
+    assert ended == 130
+    assert f"multidrop: interrupted\nmultidrop: {told}" in err
 
 
 @patient

@@ -5,10 +5,12 @@ from __future__ import annotations
 import json
 import os
 import re
+import socketserver
 import struct
 import threading
 import tty
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -372,6 +374,22 @@ class Responder:
         os.close(self._slave)
 
 
+@contextmanager
+def frame_server(answer: Callable[[bytes], bytes]) -> Iterator[str]:
+    """Serve one client after another on a port of this machine, as a far end that answers each piece."""
+
+    class Handler(socketserver.BaseRequestHandler):
+        def handle(self) -> None:
+            while piece := self.request.recv(4096):
+                self.request.sendall(answer(piece))
+
+    with socketserver.ThreadingTCPServer(("127.0.0.1", 0), Handler) as server:
+        server.daemon_threads = True
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        yield "{}:{}".format(*server.server_address)
+        server.shutdown()
+
+
 @pytest.fixture
 def responder() -> Iterator[Callable[[Callable[[bytes], bytes]], Responder]]:
     made: list[Responder] = []
@@ -400,10 +418,51 @@ def test_an_exception_to_the_look_for_an_echo_is_no_foreign_traffic(
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("code", [0x0A, 0x0B])
+def test_a_gateway_s_exception_is_no_answer_of_the_drive(run: Run, responder: Any, code: int) -> None:
+    """It means that the device is not reached (application protocol V1.1b3, section 7)."""
+    end = responder(lambda request: build_reply(Framing.RTU, Message(request[0], request[1], exception=code)))
+    status, out, _ = run("doctor", end.path, "--model", "invt-che", "--address", "9")
+    told = " ".join(out.split())
+    assert (status, "begins to answer" in told) == (1, False)
+    assert f"in 20 requests: exception {code:02X} came, as from a gateway that does not reach it" in told
+
+
+@pytest.mark.slow
+def test_a_gateway_that_says_that_a_drive_is_silent_speaks_its_framing(run: Run) -> None:
+    """Nor do bytes without a frame in them prove that it speaks the other one."""
+
+    def answered(request: bytes) -> bytes:
+        if request[2:4] != b"\0\0":
+            return b"what is that"
+        return request[:4] + b"\0\3" + request[6:7] + bytes([request[7] | 0x80, 0x0B])
+
+    with frame_server(answered) as address:
+        status, out, _ = run("doctor", f"tcp://{address}", "--model", "invt-che", "--address", "9")
+        told = " ".join(out.split())
+        assert (status, "other way" in told) == (1, False)
+        assert "in 20 requests: exception 0B came, as from a gateway that does not reach it" in told
+        status, out, _ = run("doctor", f"socket://{address}", "--model", "invt-che", "--address", "9")
+        assert "the far end speaks Modbus TCP, and not RTU over TCP" in " ".join(out.split())
+    with frame_server(lambda request: b"" if request[2:4] == b"\0\0" else b"what is that") as address:
+        _, out, _ = run("doctor", f"tcp://{address}", "--model", "invt-che", "--address", "9")
+        assert "RTU over TCP was tried too, and not answered either" in " ".join(out.split())
+
+
+@pytest.mark.slow
+def test_a_drive_that_refuses_is_there_and_its_code_is_told(run: Run, responder: Any) -> None:
+    end = responder(lambda request: build_reply(Framing.RTU, Message(request[0], request[1], exception=6)))
+    status, out, _ = run("doctor", end.path, "--model", "invt-che", "--address", "9")
+    told = " ".join(out.split())
+    assert (status, "invt-che@9 begins to answer after" in told) == (0, True)
+    assert "replies were exceptions: 06" in told
+
+
+@pytest.mark.slow
 def test_only_what_was_sent_is_counted(run: Run, responder: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """A silent drive is not asked again while its late answer may come; that was no request."""
     end = responder(lambda request: b"")
-    monkeypatch.setattr("multidrop.cli.doctor.command.MOST_S", 1.0)
+    monkeypatch.setattr("multidrop.cli.doctor.round_trip.MOST_S", 1.0)
     status, out, _ = run("doctor", end.path, "--model", "invt-che", "--address", "9")
     told = " ".join(out.split())
     assert status == 1

@@ -122,7 +122,7 @@ import scales as table
 class Fan(Drive):
     speed = reading(1, "rpm", step=STEP)
 
-    def later(self):
+    def step_later(self):
         import scales
         return scales
 """
@@ -141,7 +141,7 @@ def test_a_file_imports_the_modules_beside_it_and_no_other_directory_s(tmp_path:
         find_model("fan.py:Fan", with_scales(tmp_path / f"plant-{step}", step)) for step in (0.1, 0.5)
     )
     assert (one.registers["speed"].step, two.registers["speed"].step) == (0.1, 0.5)
-    later = [family.later(None) for family in (one, two)]  # type: ignore[attr-defined]
+    later = [family.step_later(None) for family in (one, two)]  # type: ignore[attr-defined]
     assert [module.STEP for module in later] == [0.1, 0.5]
     assert sys.path == before
     assert {name for name in {*sys.modules} - names if not name.startswith("multidrop")} == set()
@@ -151,7 +151,7 @@ def test_a_module_beside_a_file_is_run_once(tmp_path: Path) -> None:
     directory = with_scales(tmp_path / "plant", 0.1)
     (directory / "other.py").write_text(USES_SCALES)
     families = [find_model(f"{name}.py:Fan", directory) for name in ("fan", "other")]
-    assert len({id(family.later(None)) for family in families}) == 1  # type: ignore[attr-defined]
+    assert len({id(family.step_later(None)) for family in families}) == 1  # type: ignore[attr-defined]
 
 
 def test_modules_beside_a_file_may_import_each_other(tmp_path: Path) -> None:

@@ -138,6 +138,18 @@ def test_what_an_older_ledger_counted_still_counts(tmp_path: Path, old: str) -> 
         assert [(each.cell.port, each.writes) for each in ledger.wear(1003.0)] == [(now, 3)]
 
 
+@pytest.mark.parametrize("old", ["link", "socket://10.0.0.7:4001"])
+def test_what_an_older_ledger_counted_under_another_spelling_counts(tmp_path: Path, old: str) -> None:
+    (tmp_path / "device").touch()
+    (tmp_path / "link").symlink_to("device")
+    entered = old if "://" in old else f"{tmp_path}/{old}"
+    spelt = "rfc2217://10.0.0.7:4001" if "://" in old else f"{tmp_path}/device"
+    ledger = Ledger(tmp_path / "wear", budget=1)
+    assert ledger.enter(LedgerCell(entered, 1, "m", "r"), 1000.0, 0.0) == ""
+    cell = LedgerCell(port_identity.of_name(spelt), 1, "m", "r", spelt)
+    assert "written 1 times in a year" in ledger.enter(cell, 1001.0, 0.0)
+
+
 # ---- what wears ----
 
 

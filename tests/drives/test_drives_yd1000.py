@@ -164,6 +164,7 @@ def test_what_a_change_of_the_line_needs() -> None:
     at_once = {register.address for register in YD1000.registers.values() if "at once" in register.note}
     assert (later, at_once) == ({0x0800, 0x0801}, {0x0802, 0x0803})
     assert YD1000.address_setting.span == (0, 63)
+    assert "Up to 31 before version V104" in YD1000.address_setting.note
     assert YD1000.communication_timeout.span == (0, 100)
 
 

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import pytest
 from lines import line, plant, polled
 
-from multidrop import Drive, setting
+from multidrop import Drive, NumberFormat, reading, setting
 from multidrop.drives import MODELS, DelixiModbus, InvtCHE
 from multidrop.gateway.common_block import CURRENT, FREQUENCY, NO_NUMBER, SETPOINT, CommonBlock
 from multidrop.gateway.describe import describe
@@ -81,3 +81,31 @@ def test_home_assistant_writes_raw_counts_as_what_they_are() -> None:
     found = json.loads(discovery(Fan(1), [Fan.pressure], topics, **details))  # type: ignore[arg-type]
     assert found["cmps"]["pressure_set"]["unit_of_measurement"] == "raw count"
     assert "unit_of_measurement" not in found["cmps"]["pressure"]
+
+
+class Transmitter(Drive):
+    """A user's own, of whose numbers each has its own digits."""
+
+    pressure = setting(1, "Pa", number_format=NumberFormat.F32, moves=False)
+    level = setting(3, "m", step=0.01, moves=False)
+    power = reading(4, "W", scale_register="power_scale")
+    power_scale = reading(5, number_format=NumberFormat.I16)
+
+
+def test_the_page_knows_no_digits_of_a_float() -> None:
+    hub = Hub(plant(line("/dev/null", polled(Transmitter(1), Transmitter.readings()))))
+    told = describe(hub, May(), None, revision=1, version="1", is_demo=False)
+    registers = {each["name"]: each for each in told["lines"][0]["drives"][0]["registers"]}
+    assert [registers[name]["digits"] for name in ("pressure", "level", "power")] == [None, 2, None]
+    assert [registers[name]["step"] for name in ("pressure", "level")] == [None, 0.01]
+
+
+def test_home_assistant_rounds_no_float() -> None:
+    topics = dict.fromkeys(("set", "stop", "state", "gateway", "available"), "topic")
+    details = {"prefix": "", "version": "1", "every_s": 1.0, "writable": ["pressure", "level"]}
+    drive = Transmitter(1, name="tank")
+    said = json.loads(discovery(drive, drive.registers.values(), topics, takes_commands=True, **details))
+    parts = said["cmps"]
+    shown = [parts[name].get("suggested_display_precision") for name in ("pressure", "level", "power")]
+    assert shown == [None, 2, None]
+    assert [parts[f"{name}_set"]["step"] for name in ("pressure", "level")] == [0.001, 0.01]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import struct
 import time
 from typing import Any
 
@@ -27,6 +28,40 @@ EDGE = """async () => {
   const { width, height } = ctx.canvas;
   return [...ctx.getImageData(width - 1, height - 24, 1, 24).data].some(value => value > 0);
 }"""
+
+
+TELL_NUMBERS = """async numbers => {
+  const { text } = await import("/page/values.js");
+  return numbers.map(([value, digits]) => text(value, { kind: "number", digits }));
+}"""
+
+
+def test_a_number_is_told_with_its_digits_or_as_the_float_that_it_is(opened: Opener) -> None:
+    single = struct.unpack(">f", struct.pack(">f", 0.1))[0]  # as the core delivers it: 0.10000000149011612
+    told = {
+        (12.5, 1): "12.5",
+        (12.0, 2): "12.00",
+        (12.5, None): "12.5",
+        (230.0, None): "230",
+        (single, None): "0.1",
+        (-16777216.0, None): "-16777216",
+        (1 / 3, None): "0.333333333333",  # a double
+    }
+    assert opened().evaluate(TELL_NUMBERS, [list(each) for each in told]) == list(told.values())
+
+
+def test_plots_and_markers_tell_floats_too(opened: Opener, gateway: FakeGateway) -> None:
+    line = fake_plant.plant({})["lines"][0]
+    floats = [r | {"digits": None, "step": None} for r in line["drives"][0]["registers"]]
+    gateway.plant_changes = {
+        "lines": [line | {"drives": [d | {"registers": floats} for d in line["drives"]]}]
+    }
+    page = opened("#/trends?drive=pump-2&from=1764075600000&to=1764079200000")
+    plot, fraction = page.locator("#trend-plots .plotbox").first, r"\d+\.\d+"
+    until_met(page, lambda: re.search(f" {fraction} Hz", plot.get_attribute("aria-label") or "") is not None)
+    page.get_by_role("button", name="Marker A").press("Enter")
+    cell = page.locator("#marks tbody tr td").first
+    until_met(page, lambda: re.fullmatch(fraction, cell.inner_text()) is not None)
 
 
 def test_a_daemon_that_stays_away_is_told_of_in_one_sentence(opened: Opener, gateway: FakeGateway) -> None:

@@ -85,6 +85,7 @@ def facts(family: type[Drive]) -> dict[str, Any]:
         "needed_silence_s": {str(framing): needed_silence(family, framing) for framing in family.framings},
         "response_delay_s": family(family.addresses[0]).response_delay,
         "response_delay_characters": family.response_delay_characters,
+        "answering_time_s": family.answering_time or None,
         "response_timeout_s": family.response_timeout,
         "turnaround_delay_s": family.turnaround_delay,
         "broadcasts": family.broadcasts,

@@ -12,7 +12,14 @@ from multidrop.cli import DONE, MISTAKE, STOPS
 from multidrop.cli.support.arguments import add_json_argument, add_writing_arguments, duration
 from multidrop.cli.support.confirm import confirm
 from multidrop.cli.support.output import command_line, print_text, warn
-from multidrop.cli.support.target import Target, add_target_arguments, check_words, number_of, target_of
+from multidrop.cli.support.target import (
+    Target,
+    add_target_arguments,
+    check_words,
+    number_of,
+    target_of,
+    telling_what_was_sent,
+)
 from multidrop.cli.support.values import as_json, nearest_value
 from multidrop.control.audit_log import AuditLog
 from multidrop.control.stop_attempt import LEAST_S
@@ -78,7 +85,8 @@ def run(arguments: argparse.Namespace) -> int:
         drive.check_confirmed(arguments.command)
         confirm(f"{_QUESTIONS[arguments.command]} {drive.name} on {target.port}?", arguments)
     limit = {"seconds": arguments.seconds} if arguments.command in STOPS else {}
-    with target.open_bus(_audit_file(arguments)) as bus, _annotating(arguments.command, target) as known:
+    with _annotating(arguments.command, target) as known, target.open_bus(_audit_file(arguments)) as bus:
+        known.clear()
         if hz is not None and arguments.command != "set-frequency":
             drive.set_frequency(hz)
         state = verb(*parameters, **limit)
@@ -132,12 +140,10 @@ def _audit_file(arguments: argparse.Namespace) -> str | None:
 @contextmanager
 def _annotating(command: str, target: Target) -> Iterator[list[str]]:
     """Add notes to an interruption: what is known of the verb, and the command that stops the motor."""
-    known: list[str] = []
     try:
-        yield known
+        with telling_what_was_sent(target.drive, command) as known:
+            yield known
     except KeyboardInterrupt as interruption:
-        for text in known:
-            interruption.add_note(text)
         if command != "state":
             interruption.add_note(f"to stop it, type: {command_line(('multidrop', 'stop', *target.words))}")
         raise

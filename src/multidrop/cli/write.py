@@ -9,7 +9,12 @@ import sys
 from multidrop.cli.support.arguments import add_json_argument, add_writing_arguments
 from multidrop.cli.support.confirm import confirm
 from multidrop.cli.support.output import print_text
-from multidrop.cli.support.target import add_target_arguments, check_words, target_of
+from multidrop.cli.support.target import (
+    add_target_arguments,
+    check_words,
+    target_of,
+    telling_what_was_sent,
+)
 from multidrop.cli.support.values import as_json, nearest_value
 from multidrop.control.outcome import Effect
 from multidrop.control.rules import check_plain, raw_count, refused
@@ -34,8 +39,10 @@ def run(arguments: argparse.Namespace) -> int:
     value = nearest_value(register, register.parse(words[1]))
     check_plain(drive, register, raw_count(drive, register, value))  # before a port is opened
     confirm(f"Write {register.name} = {register.format(value)} to {drive.name} on {target.port}?", arguments)
-    with target.open_bus(arguments.audit) as bus:
+    with telling_what_was_sent(drive, "write") as known, target.open_bus(arguments.audit) as bus:
+        known.clear()
         outcome = bus.try_write(drive, register, value)
+        known.append(str(outcome))
     if arguments.json:
         held = outcome.asked if outcome.held is None else outcome.held
         record = {"drive": drive.name, "register": register.name} | as_json(register, held)

@@ -37,17 +37,18 @@ def declaration_errors(
 
     `taken` are names that every drive uses for something else; `bounds` are those of the class's options.
     """
-    found = []
+    found, sound = [], []
     for name, register in registers.items():
         if name in taken:
             found.append(f"{name}: this is a name that every drive has for something else; call it otherwise")
         if register.name != name:
             found.append(f"{name}: this is the register {register.name} already; declare one of its own")
         wrong = [sentence for check in _CHECKS for sentence in check(register)]
-        found += [f"{name}: {sentence}" for sentence in wrong or _later(register, registers, bounds)]
-    if not found:
-        found += _shared(list(registers.values()))
-    return found
+        wrong = wrong or list(_later(register, registers, bounds))
+        found += [f"{name}: {sentence}" for sentence in wrong]
+        if not wrong:
+            sound.append(register)
+    return [*found, *_shared(sound)]
 
 
 # ---- one register, each fact by itself ----

@@ -11,6 +11,7 @@ from typing import Any
 
 from multidrop.core import Framing
 from multidrop.drive.declaration_check import DeclarationError, declaration_errors
+from multidrop.drive.fact_check import fact_errors
 from multidrop.drive.known_setpoint import KnownSetpoint
 from multidrop.drive.manual_facts import ManualFacts
 from multidrop.drive.options import Option, checked_options, confirmation, doubt
@@ -20,7 +21,7 @@ from multidrop.drive.scale_check import scale_errors
 from multidrop.drive.script import Script, read, until, write
 from multidrop.drive.state import Condition, Direction, State
 from multidrop.drive.text import Text, text_errors
-from multidrop.drive.verbs import MOVING, verb
+from multidrop.drive.verbs import MOVING, verb, verb_errors
 from multidrop.errors import Advice, NotAttached, NotDone, Refused, Unconfirmed, Unsupported
 
 START_TIME = 5.0  # s, after which a motor that was started must be seen to run
@@ -44,13 +45,14 @@ class Drive(ManualFacts):
     bus: Any = None  # the one that it is attached to
 
     def __init_subclass__(cls) -> None:
-        """Collect the registers. Raises DeclarationError with all that is wrong with them."""
+        """Collect the registers. Raises DeclarationError with all that is wrong with the class."""
         super().__init_subclass__()
         found = cls._declared(Register)
         cls.registers = found
         cls.texts = cls._declared(Text)
-        cls.options = cls._all_options()
-        wrong = declaration_errors(found, TAKEN_NAMES, cls.options) + text_errors(cls.texts, TAKEN_NAMES)
+        wrong = fact_errors(cls) + verb_errors(cls)
+        options = cls.options = cls._all_options() if isinstance(cls.options, Mapping) else {}
+        wrong += declaration_errors(found, TAKEN_NAMES, options) + text_errors(cls.texts, TAKEN_NAMES)
         if wrong := wrong or scale_errors(cls) or list(limit_errors(cls)):
             raise DeclarationError(cls.__name__, wrong)
         if not cls.formats:

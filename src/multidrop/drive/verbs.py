@@ -100,3 +100,18 @@ class Verb(Generic[P, R]):
 
 
 verb = Verb
+
+
+def verb_errors(family: Any) -> list[str]:
+    """Return a sentence for each method that has a verb's name and is none.
+
+    A call of it would send nothing: it makes a generator that nobody carries out. A register of such a name
+    is told as that.
+    """
+    return [
+        f"{name}: it is no verb, and a call of it would send nothing: write @verb above it"
+        for name in (*VERBS, "identify")
+        if name not in family.registers
+        and name not in family.texts
+        and not isinstance(getattr(family, name), Verb)
+    ]

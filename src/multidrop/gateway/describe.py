@@ -84,6 +84,11 @@ def _key_registers(drive: Drive, periods: dict[str, float]) -> dict[str, str | N
     return found
 
 
+def digits_of(register: Register[Any]) -> int | None:
+    """Return the digits behind the point; None where each value has its own, as of a float."""
+    return None if register.is_float or register.scale_register else register.decimals
+
+
 def _register(register: Register[Any]) -> dict[str, Any]:
     values = register.values
     least, most = register.span or (None, None)
@@ -93,7 +98,7 @@ def _register(register: Register[Any]) -> dict[str, Any]:
     return {
         "name": register.name,
         "unit": register.value_unit,
-        "digits": register.decimals,
+        "digits": digits_of(register),
         "kind": kind,
         "words": words,
         "access": register.access.value,
@@ -101,5 +106,5 @@ def _register(register: Register[Any]) -> dict[str, Any]:
         "note": register.note,
         "least": least,
         "most": most,
-        "step": register.step,
+        "step": None if register.is_float else register.step,
     }

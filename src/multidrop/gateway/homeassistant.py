@@ -8,6 +8,7 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 from multidrop import Drive, Register
+from multidrop.gateway.describe import digits_of
 
 DISCOVERY = "homeassistant"
 CLASSES = {  # device_class of a unit
@@ -21,6 +22,7 @@ CLASSES = {  # device_class of a unit
     "h": "duration",
     "s": "duration",
 }
+LEAST_STEP = 0.001  # that Home Assistant takes
 STALE_PERIODS = 3  # after which a sensor is unavailable
 # Home Assistant's own clock dates a command: one that a broker held up is refused.
 COMMAND = '{"value": {{ value }}, "time": {{ (now().timestamp() * 1000) | int }}}'
@@ -101,7 +103,8 @@ def _sensor(name: str, register: Register[Any], every_s: float) -> dict[str, Any
         if register.unit in CLASSES:
             found["device_class"] = CLASSES[register.unit]
         found["state_class"] = "total_increasing" if register.unit == "kWh" else "measurement"
-        found["suggested_display_precision"] = register.decimals
+        if (digits := digits_of(register)) is not None:
+            found["suggested_display_precision"] = digits
     return found
 
 
@@ -113,7 +116,7 @@ def _number(name: str, register: Register[Any], topic: str) -> dict[str, Any]:
         "command_topic": f"{topic}/{register.name}",
         "command_template": COMMAND,
         "retain": False,
-        "step": float(register.scale),
+        "step": LEAST_STEP if register.is_float else max(LEAST_STEP, abs(float(register.scale))),
     }
     if register.value_unit:
         found["unit_of_measurement"] = register.value_unit

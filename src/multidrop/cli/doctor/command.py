@@ -6,24 +6,21 @@ import argparse
 import json
 import os
 import sys
-import time
 from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
 
-from multidrop.bus import Bus
 from multidrop.cli.doctor.adapter import com_description, find_adapter, low_latency, rs485_mode
 from multidrop.cli.doctor.findings import (
-    ROUNDS,
     Finding,
     adapter_finding,
     echo_finding,
     latency_finding,
     low_latency_finding,
-    round_trip_finding,
     rs485_finding,
 )
 from multidrop.cli.doctor.other_way import other_way_finding, unit_finding
+from multidrop.cli.doctor.round_trip import measure
 from multidrop.cli.support.arguments import add_json_argument
 from multidrop.cli.support.output import print_text
 from multidrop.cli.support.plants import (
@@ -37,13 +34,11 @@ from multidrop.cli.support.plants import (
 from multidrop.cli.support.values import wrapped
 from multidrop.core import (
     RS485,
-    Completion,
     Exchange,
     Framing,
     Message,
     Peer,
     build_request,
-    characters_on_wire,
     is_pseudo_terminal,
 )
 from multidrop.drive.family import Drive
@@ -57,10 +52,7 @@ from multidrop.transport.line import Line
 from multidrop.transport.mixed_up import other_port
 from multidrop.transport.peers import LEAST_TIMEOUT
 from multidrop.transport.port_identity import lasting_name
-from multidrop.transport.prepared import make_exchange
 
-MOST_S = 5.0  # that all rounds take, where the drive is slow or silent
-LOOK_S = 0.05  # between attempts to send a request that was held back
 NOBODY = 247  # the address of the request that looks for an echo
 SETTING_UP_COM = "while it has the port, multidrop makes it raw, and sets each drive's baud rate and format"
 SETTING_UP = (
@@ -149,9 +141,9 @@ def _findings(port: str, rs485: RS485, drive: Drive | None, settings: Settings) 
         yield from _local(port, rs485)
     nobody = Message(NOBODY, 0x03, 0, 1)
     yield unit_finding(port, nobody, settings) if speaks_tcp(port) else _echo(port, rs485, settings)
-    measured = _round_trip(port, rs485, drive)
+    measured, speaks = measure(port, rs485, drive)
     yield measured
-    if not other_port(port) or (drive and not measured.is_failure):
+    if not other_port(port) or speaks:
         return
     if drive and (block := first_block(drive)):
         yield other_way_finding(port, block.request, settings)
@@ -246,46 +238,6 @@ def _echo(port: str, rs485: RS485, settings: Settings) -> Finding:
     finally:
         line.close()
     return echo_finding(found, build_request(Framing.RTU, request), settings)
-
-
-def _round_trip(port: str, rs485: RS485, drive: Drive | None) -> Finding:
-    if drive is None:
-        return Finding(
-            "round trip",
-            "not measured: a drive must answer",
-            "name one with --model and --address, or one of a plant file; `multidrop scan` finds those "
-            "that are there",
-        )
-    block = first_block(drive)
-    if block is None:
-        return Finding("round trip", f"not measured: nothing of it can be read ({drive.name})")
-    with Bus(port, rs485=rs485) as bus:
-        bus.attach(drive)
-        poll = make_exchange(drive, block.request, bus.peer(drive))
-        completions = list(_repeat(bus.line, poll))
-    # Time of the request and the reply's first character: unknown on a network and on a pseudo-terminal.
-    sent = characters_on_wire(drive.framing, len(build_request(drive.framing, poll.request)))
-    wire = (sent + 1) * drive.settings.character
-    shows_bits = "://" not in port and not is_pseudo_terminal(str(Path(port).resolve()))
-    seen = [(done.first_ns - done.sent_ns) / 1e9 for done in completions if done.result > 0]
-    delays = sorted(max(0.0, delay - wire) if shows_bits else delay for delay in seen)
-    return round_trip_finding(drive, delays, len(completions), 0.0 if shows_bits else wire)
-
-
-def _repeat(line: Line, poll: Exchange) -> Iterator[Completion]:
-    """Send ROUNDS requests, or those that fit into MOST_S, and return what became of each.
-
-    A request that is held back, because an earlier answer may still come, does not count.
-    """
-    end = time.monotonic() + MOST_S
-    count = 0
-    while count < ROUNDS and (time.monotonic() < end or not count):
-        found = line.carry_out(poll)
-        if found.sent_ns:
-            count += 1
-            yield found
-        else:
-            time.sleep(LOOK_S)
 
 
 def _text(findings: list[Finding]) -> Iterator[str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass
 
 from multidrop.cli.doctor.adapter import Adapter, RS485Mode
@@ -112,17 +113,22 @@ def _answered_finding(found: Completion, sent: bytes, settings: Settings) -> Fin
     )
 
 
-def round_trip_finding(drive: Drive, delays: list[float], asked: int, wire: float = 0.0) -> Finding:
+def round_trip_finding(
+    drive: Drive, delays: list[float], asked: int, wire: float = 0.0, refusals: Collection[int] = ()
+) -> Finding:
     """Judge the delays of the replies to `asked` requests.
 
     `delays` are sorted, in s, from the request's last bit to the reply's first. Where the port does not
     show bits, as a network, they begin when the request was handed over; `wire` is then the time, in s, of
-    the request and the first character on a wire.
+    the request and the first character on a wire. `refusals` are the codes of replies that are exceptions:
+    a gateway's are none of the drive's, and have no delay.
     """
+    codes = ", ".join(f"{code:02X}" for code in sorted(set(refusals)))
     if not delays:
+        unreached = f": exception {codes} came, as from a gateway that does not reach it" if refusals else ""
         return Finding(
             "round trip",
-            f"{drive.name} did not answer once in {counted(asked, 'request')}",
+            f"{drive.name} did not answer once in {counted(asked, 'request')}{unreached}",
             "check its address, baud rate, format, wiring and power; `multidrop scan` looks for it",
             is_failure=True,
         )
@@ -132,6 +138,8 @@ def round_trip_finding(drive: Drive, delays: list[float], asked: int, wire: floa
     since = f", from when its request was handed over ({alone})" if wire else ""
     lost = f"; {asked - len(delays)} of {asked} requests stayed without a good reply"
     what = f"{drive.name} begins to answer after {figures}{since}{lost if len(delays) < asked else ''}"
+    if refusals:
+        what += f"; {len(refusals)} replies were exceptions: {codes}"
     if median - wire - drive.response_delay > SLOW_S:
         rest = "the adapter's or the network's" if wire else "the adapter's"
         return Finding(

@@ -8,7 +8,7 @@ from multidrop.drive.network import speaks_tcp
 from multidrop.drive.timing import Settings
 from multidrop.errors import LineError
 from multidrop.transport.line import Line
-from multidrop.transport.mixed_up import other_port, spoken_on
+from multidrop.transport.mixed_up import mixed_up, other_port, spoken_on
 
 TIMEOUT = 2.0  # s: a gateway waits for its drives first
 
@@ -39,7 +39,7 @@ def other_way_finding(port: str, request: Message, settings: Settings) -> Findin
         found = ask_once(other, request, settings)
     except LineError as failure:
         return Finding("other way", f"{way} was not tried: {failure.reason}")
-    if found.result > 0 or found.raw:
+    if found.result > 0 or mixed_up(port, found.raw):  # any other bytes prove nothing
         return Finding(
             "other way",
             f"the far end speaks {way}, and not {spoken_on(port)}",

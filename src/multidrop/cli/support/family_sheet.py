@@ -60,7 +60,7 @@ def _lines_of(family: type[Drive]) -> Iterator[tuple[str, str]]:
         yield f"{framing} formats", ", ".join(formats)
     for framing in family.framings:
         yield f"{framing} silence", _silence(family, framing)
-    yield "response", f"{_response_delay(family)} until measured; none after {_ms(family.response_timeout)}"
+    yield "response", _response(family)
     pause = f"yes; then {_ms(family.turnaround_delay)} of pause"
     yield "broadcast", pause if family.broadcasts else family.no_broadcasts
     if family.least_interval:
@@ -105,6 +105,11 @@ def _silence(family: type[Drive], framing: Framing) -> str:
 def needed_silence(family: type[Drive], framing: Framing) -> float:
     """Return the silence in s at the family's default baud rate."""
     return family(family.addresses[0], framing=framing).needed_silence()
+
+
+def _response(family: type[Drive]) -> str:
+    stated = f", less than {_ms(family.answering_time)} by its document" if family.answering_time else ""
+    return f"{_response_delay(family)} until measured{stated}; none after {_ms(family.response_timeout)}"
 
 
 def _response_delay(family: type[Drive]) -> str:
@@ -177,7 +182,7 @@ def _remarks(register: Register[Any]) -> Iterator[str]:
     if register.broadcast:
         yield "may be broadcast: " + ", ".join(f"{raw:04X}H" for raw in register.broadcast)
     if register.moves is not None:
-        yield "a write may move the motor" if register.moves else "a write moves nothing"
+        yield "a write may move the motor" if register.moves else "a write starts, stops and resets nothing"
     if register.harmless is not None:
         harmless = ", ".join(_word(register, raw) for raw in register.harmless)
         yield f"verbs alone write it, but for {harmless}" if harmless else "verbs alone write it"

@@ -3,6 +3,7 @@
 import * as clock from "./clock.js";
 import { colour, fill, find, make, named, tableHead } from "./dom.js";
 import { label } from "./history.js";
+import { number } from "./values.js";
 
 const marks = { A: null, B: null }; // ms
 let plots = () => [],
@@ -98,7 +99,7 @@ export function draw() {
   const rows = plots().flatMap(({ plot, drives, spec, register, unit }) =>
     drives.map((drive, k) => {
       const [a, b] = [at(plot, 3 + 3 * k, marks.A), at(plot, 3 + 3 * k, marks.B)],
-        write = v => (v === null ? "–" : v.toFixed(spec.digits ?? 0));
+        write = v => (v === null ? "–" : number(v, spec.digits));
       return make(
         "tr",
         {},

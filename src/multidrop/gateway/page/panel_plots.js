@@ -223,7 +223,7 @@ export function draw() {
       tables.map(t => t.slice(0, 2)).concat([[tables[0][0], tables[0][2], tables[0][3]]]),
     );
     plot.setData(joined);
-    const words_ = summary(words(specs[0].name), tables[0][1], unit(specs[0]), specs[0].digits ?? 0);
+    const words_ = summary(words(specs[0].name), tables[0][1], unit(specs[0]), specs[0].digits);
     if (box.getAttribute("aria-label") !== words_) box.setAttribute("aria-label", words_);
   }
 }

@@ -2,6 +2,7 @@
 
 import * as clock from "./clock.js";
 import { colour } from "./dom.js";
+import { number } from "./values.js";
 
 export const COLOURS = ["c1", "c2", "c3", "c4", "c5", "c6"];
 export const DASHES = [[], [6, 4], [2, 3], [10, 3, 2, 3]]; // a series has a shape too, not its colour alone
@@ -85,6 +86,6 @@ export function summary(what, values, unit, digits) {
   if (!there.length) return `${what}: no values`;
   const low = there.reduce((a, b) => Math.min(a, b)),
     high = there.reduce((a, b) => Math.max(a, b));
-  const [from, to, last] = [low, high, there[there.length - 1]].map(value => value.toFixed(digits));
+  const [from, to, last] = [low, high, there[there.length - 1]].map(value => number(value, digits));
   return `${what}: ${from} to ${to} ${unit}, last ${last} ${unit}`;
 }

@@ -7,7 +7,7 @@ import * as markers from "./markers.js";
 import * as picker from "./picker.js";
 import { COLOURS, join, line, makePlot, summary, wide } from "./plots.js";
 import { store } from "./store.js";
-import { words } from "./values.js";
+import { number, words } from "./values.js";
 
 // Make the plot of one quantity of these drives. `set` shows the span that was dragged over.
 export function makeTrend(place, { register, unit, drives }, told, { view, set, count }) {
@@ -44,7 +44,7 @@ export function makeTrend(place, { register, unit, drives }, told, { view, set, 
         .replace(")", ", 0.22)"),
     });
     tables.push([time, most, least, mean]);
-    said.push(summary(name, mean, unit, spec.digits ?? 0));
+    said.push(summary(name, mean, unit, spec.digits));
   }
   const height = Math.max(150, Math.min(300, (innerHeight - 300) / count));
   const plot = makePlot(box, join(tables), {
@@ -79,8 +79,9 @@ function under(u, drives, spec) {
   if (i === null || i === undefined || u.data[0][i] === undefined) return [];
   return [
     make("span", {}, clock.time(u.data[0][i] * 1000)),
-    ...drives.map((name, k) =>
-      make("span", {}, named(name), ` ${u.data[3 + 3 * k][i]?.toFixed(spec.digits ?? 0) ?? "–"}`),
-    ),
+    ...drives.map((name, k) => {
+      const value = u.data[3 + 3 * k][i] ?? null;
+      return make("span", {}, named(name), ` ${value === null ? "–" : number(value, spec.digits)}`);
+    }),
   ];
 }

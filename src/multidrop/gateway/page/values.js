@@ -21,7 +21,18 @@ export function text(value, register) {
   if (register?.kind === "words")
     return register.words?.[value] ? `${words(register.words[value])} (${value})` : String(value);
   if (register?.kind === "bits") return bits(value, register.words ?? {});
-  return Number(value).toFixed(register?.digits ?? 0);
+  return number(Number(value), register?.digits);
+}
+
+// Return a number with these digits behind the point; without them, as of a float, all that it has.
+export function number(value, digits) {
+  if (Number.isInteger(digits)) return value.toFixed(digits);
+  if (Math.fround(value) === value)
+    for (let most = 1; most < 10; most++) {
+      const told = Number(value.toPrecision(most));
+      if (Math.fround(told) === value) return String(told);
+    }
+  return String(Number(value.toPrecision(12)));
 }
 
 function bits(value, names) {

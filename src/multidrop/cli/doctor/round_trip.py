@@ -1,0 +1,84 @@
+"""Measure how soon a drive begins to answer, for `doctor`."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+from multidrop.bus import Bus
+from multidrop.cli.doctor.findings import ROUNDS, Finding, round_trip_finding
+from multidrop.core import (
+    RS485,
+    Completion,
+    Exchange,
+    Failure,
+    Framing,
+    build_request,
+    characters_on_wire,
+    is_pseudo_terminal,
+)
+from multidrop.drive.family import Drive
+from multidrop.planning.blocks import first_block
+from multidrop.transport.line import Line
+from multidrop.transport.prepared import make_exchange
+
+MOST_S = 5.0  # that all rounds take, where the drive is slow or silent
+LOOK_S = 0.05  # between attempts to send a request that was held back
+OF_GATEWAYS = (0x0A, 0x0B)  # no path, and no response from the device (application protocol V1.1b3, 7)
+
+
+def measure(port: str, rs485: RS485, drive: Drive | None) -> tuple[Finding, bool]:
+    """Return the finding, and True where the far end has answered anything in the port's framing."""
+    if drive is None:
+        return Finding(
+            "round trip",
+            "not measured: a drive must answer",
+            "name one with --model and --address, or one of a plant file; `multidrop scan` finds those "
+            "that are there",
+        ), False
+    block = first_block(drive)
+    if block is None:
+        return Finding("round trip", f"not measured: nothing of it can be read ({drive.name})"), False
+    with Bus(port, rs485=rs485) as bus:
+        bus.attach(drive)
+        poll = make_exchange(drive, block.request, bus.peer(drive))
+        completions = list(_repeat(bus.line, poll))
+    # Time of the request and the reply's first character: unknown on a network and on a pseudo-terminal.
+    sent = characters_on_wire(drive.framing, len(build_request(drive.framing, poll.request)))
+    wire = (sent + 1) * drive.settings.character
+    shows_bits = "://" not in port and not is_pseudo_terminal(str(Path(port).resolve()))
+    its_own = [done for done in completions if done.result > 0 and not _is_gateway_s(drive, done)]
+    seen = [(done.first_ns - done.sent_ns) / 1e9 for done in its_own]
+    delays = sorted(max(0.0, delay - wire) if shows_bits else delay for delay in seen)
+    refusals = [code for done in completions if (code := _exception(drive, done))]
+    wire = 0.0 if shows_bits else wire
+    return round_trip_finding(drive, delays, len(completions), wire, refusals), bool(delays or refusals)
+
+
+def _exception(drive: Drive, done: Completion) -> int:
+    """Return the code of a reply that is an exception, also of a gateway's; else 0."""
+    if drive.framing is Framing.TCP and done.result == Failure.NO_REPLY and done.raw:
+        return done.raw[-1]  # the core takes a gateway's for silence there
+    return done.reply.exception if done.result > 0 else 0
+
+
+def _is_gateway_s(drive: Drive, done: Completion) -> bool:
+    """Return True for the exception that a gateway sends where it does not reach its device."""
+    return done.reply.exception in OF_GATEWAYS and done.reply.exception not in drive.exceptions
+
+
+def _repeat(line: Line, poll: Exchange) -> Iterator[Completion]:
+    """Send ROUNDS requests, or those that fit into MOST_S, and return what became of each.
+
+    A request that is held back, because an earlier answer may still come, does not count.
+    """
+    end = time.monotonic() + MOST_S
+    count = 0
+    while count < ROUNDS and (time.monotonic() < end or not count):
+        found = line.carry_out(poll)
+        if found.sent_ns:
+            count += 1
+            yield found
+        else:
+            time.sleep(LOOK_S)
