@@ -219,7 +219,7 @@ def test_start_needs_a_setpoint_that_is_still_there() -> None:
 
 def test_a_start_that_has_no_effect_is_unconfirmed_and_says_what_to_set() -> None:
     wire = Wire(ErmanERG220(1), STOPPED)
-    with pytest.raises(Unconfirmed, match=r"not seen to run; b\.001 must be 2"):
+    with pytest.raises(Unconfirmed, match=r"to run; stop it, or it may start later; b\.001 must be 2"):
         wire.drive.start()
     assert wire.sent.count(START_ON) == 1
 

@@ -187,8 +187,8 @@ class Drive(ManualFacts):
     def _started(self) -> Script[None]:
         """Wait until the motor is seen to run; NotDone when the drive trips, Unconfirmed when it does not."""
         if not (yield from until(self._runs, limit=START_TIME)):
-            reason = f"after {START_TIME:g} s it is not seen to run; {self.remote}"
-            raise Unconfirmed(self.name, "the start", reason)
+            seen = f"after {START_TIME:g} s it is not seen to run; stop it, or it may start later"
+            raise Unconfirmed(self.name, "the start", f"{seen}; {self.remote}")
 
     def _runs(self) -> Script[bool]:
         state = yield from self.state.script()
