@@ -63,6 +63,8 @@ def test_each_path_is_at_a_server_of_its_own_and_so_is_each_leader(fleet: Cluste
 class OneDeaf:
     """A path on which the leader of one bucket of lines' masters says this, or nothing."""
 
+    server_name = "n1"
+
     def __init__(self, said: bytes | None) -> None:
         self.said = said
 
