@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import time
 from collections.abc import Mapping
 from contextlib import redirect_stdout
 from io import StringIO
@@ -12,12 +13,15 @@ from unittest.mock import patch
 
 from multidrop.cli import main
 
+LOOK_S = 0.25  # before each look, which takes as much of the processor as seconds of a gateway
+
 
 def fleet_status(environment: Mapping[str, str]) -> dict[str, Any]:
     """Return the state of a fleet, an empty one while its servers give none, as amid an election.
 
     It is asked for in this process, because tests do so again and again.
     """
+    time.sleep(LOOK_S)
     with patch.dict(os.environ, environment), redirect_stdout(StringIO()) as out:
         status = main(["fleet", "status", "--json"])
     if status and not out.getvalue():
