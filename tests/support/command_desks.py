@@ -76,6 +76,11 @@ class Desks:
         return [(one.name, one.raw) for one in self.sim.counters.writes]
 
     @property
+    def written(self) -> set[str]:
+        """Return what was written: a stop is sent again where a busy machine is late with the drive's reply."""
+        return {name for name, _ in self.writes}
+
+    @property
     def notes(self) -> list[dict[str, Any]]:
         return list(read_audit(self.path)) if self.path.exists() else []
 
