@@ -88,6 +88,16 @@ def test_figures_of_a_dead_daemon_look_old_and_nothing_is_said_of_misses(
     assert "counted yet" not in page.locator("#lines").inner_text()
 
 
+def test_faults_that_come_before_the_first_frame_last_for_as_long_as_they_do(
+    opened: Opener, gateway: FakeGateway
+) -> None:
+    gateway.is_silent = True
+    page = opened("#/faults", live=False)
+    lasted = page.locator("#faults td").get_by_text("so far").last
+    lasted.wait_for()
+    assert lasted.inner_text() == "87 min so far"
+
+
 def test_what_lasted_when_the_daemon_died_is_not_known_to_last_on(
     opened: Opener, gateway: FakeGateway
 ) -> None:

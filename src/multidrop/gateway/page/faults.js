@@ -77,7 +77,8 @@ function row(alarm) {
     to = Math.ceil((alarm.ended ?? now()) + AROUND_MS);
   const where = alarm.drive ? `#/drives/${encodeURIComponent(alarm.drive)}` : "#/lines";
   const t = now(),
-    seen = alarm.ended ?? (isLive(t) ? t : store.time), // of a dead daemon nothing lasts on
+    isNew = isLive(t) || store.frame === null, // before the first frame the daemon has just told the list
+    seen = alarm.ended ?? (isNew ? t : store.time), // of a dead daemon nothing lasts on
     lasted = `${clock.lasting(seen - alarm.time)}${isLasting ? " so far" : ""}`;
   return make(
     "tr",
