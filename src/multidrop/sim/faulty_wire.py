@@ -136,9 +136,14 @@ class FaultyWire(Wire):
 
     @property
     def wake(self) -> float | None:
-        held_until = self._held.begin if self._held else None
-        times = [super().wake, self._back_at, held_until, *[stray.next_at for stray in self._stray]]
-        return min([at for at in times if at is not None], default=None)
+        times = [stray.next_at for stray in self._stray]
+        if self._held:
+            times.append(self._held.begin)
+        if self._back_at is not None:
+            times.append(self._back_at)
+        if (first := super().wake) is not None:
+            times.append(first)
+        return min(times, default=None)
 
     def _hang_up(self, now: float) -> None:
         self.where = self.path  # a TCP port keeps its number
