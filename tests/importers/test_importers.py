@@ -273,7 +273,7 @@ def test_yaml_that_would_be_costly_is_refused(tmp_path: Path, text: str, told: s
 
 
 def test_no_more_is_declared_than_a_family_holds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """What is beyond that would be looked at in vain: a large file has ten times as many."""
+    """To look at what is beyond that would be in vain: a large file has ten times as many."""
     declared: list[str] = []
 
     def noted(found: ImportedRegister) -> Register[Any]:
