@@ -128,6 +128,7 @@ ALL_AT_ONCE = rf"_$x^{{$\frac%s{{0}}{TRAP}"
 @pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:Glyph")
+@pytest.mark.usefixtures("_laid_out")
 @pytest.mark.parametrize("name", usually(ALL_AT_ONCE, "_hidden", "$x^{$", "\\frac"))
 def test_names_in_a_picture_are_no_mathematics_and_in_its_legend(tmp_path: Path, name: str) -> None:
     require_module("matplotlib")

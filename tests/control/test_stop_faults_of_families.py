@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from errno import EMFILE
+from functools import cache
 from itertools import count
 from pathlib import Path
 from types import FrameType
@@ -22,14 +23,18 @@ from multidrop.control.stop_all import stop_together
 from multidrop.drive import Drive
 from multidrop.sim import MotorDrive
 
+
+@cache
+def of_file(name: str) -> type[Drive]:
+    return class_of(document_of(name))
+
+
 FAMILIES: dict[str, Callable[[int], Drive]] = {
     **MAKE,
     "a profile": ALL["abb-acs355"],
     "a shipped file": ALL["shipped delta-ms300"],
-    "a file of words": lambda address: class_of(document_of("abb"))(
-        address, confirmed=1, reference_maximum=50
-    ),
-    "a file of coils": lambda address: class_of(document_of("coil"))(address, confirmed=1),
+    "a file of words": lambda address: of_file("abb")(address, confirmed=1, reference_maximum=50),
+    "a file of coils": lambda address: of_file("coil")(address, confirmed=1),
 }
 FAILURES: dict[str, Callable[[], BaseException]] = {
     "signal": KeyboardInterrupt,
@@ -41,9 +46,14 @@ SCRIPTS = tuple(str(HOME / name) for name in ("drives", "profiles", "family_file
 ATTEMPT = (str(HOME / "control/stop_attempt.py"), str(HOME / "drive/family.py"))
 
 
+@cache
+def has_lines_that_count(file: str) -> bool:
+    return file.startswith((*SCRIPTS, *ATTEMPT))
+
+
 def counts(frame: FrameType) -> bool:
     code = frame.f_code
-    return code.co_filename.startswith((*SCRIPTS, *ATTEMPT)) or code is stop_together.__code__
+    return has_lines_that_count(code.co_filename) or code is stop_together.__code__
 
 
 @pytest.fixture

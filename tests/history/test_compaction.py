@@ -18,7 +18,9 @@ from histories import DAY, METADATA, NOON, SECOND, check_buckets, random_rows, r
 
 from multidrop import read
 from multidrop.history import compact as compact_module
+from multidrop.history import database
 from multidrop.history.compact import compact, main
+from multidrop.history.database import connect
 from multidrop.history.folder import listing, parquet_files
 from multidrop.history.history import History
 from multidrop.polling.batch import Row
@@ -108,6 +110,23 @@ def test_days_that_are_over_become_one_file_of_tens(tmp_path: Path) -> None:
     assert [(file.first, file.last) for file in tens] == [(1, 2), (3, 4), (5, 5)]
     assert len(parquet_files(tmp_path / "rows")) == 5
     check(tmp_path, [row for some in rows for row in some])
+
+
+@pytest.mark.long
+def test_one_database_compacts_all_and_none_where_there_is_nothing_to_do(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    opened: list[str] = []
+
+    def noted(memory: str, spill: Path) -> Any:
+        opened.append(memory)
+        return connect(memory, spill)
+
+    monkeypatch.setattr(database, "connect", noted)
+    record(tmp_path, segments())
+    for _ in range(2):
+        compact(tmp_path, 6)
+        assert len(opened) == 1
 
 
 class BrokenOff(BaseException):

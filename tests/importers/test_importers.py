@@ -15,8 +15,9 @@ from imported import ESPHOME, HOME, IOBROKER, MODPOLL, NEURON, OWN, SUNSPEC, TEL
 
 from multidrop import load_family
 from multidrop.drive.register import Access, Register
-from multidrop.importers import family_text, plant_text, read_devices
-from multidrop.importers.device import ImportedDevice
+from multidrop.importers import family_text, plant_text, read_devices, settling
+from multidrop.importers.device import ImportedDevice, ImportedRegister
+from multidrop.importers.settling import declare
 
 
 def devices(folder: Path, name: str, contents: str | dict[str, Any]) -> list[ImportedDevice]:
@@ -269,6 +270,23 @@ def test_yaml_that_would_be_costly_is_refused(tmp_path: Path, text: str, told: s
     (tmp_path / "a.yaml").write_text(text)
     with pytest.raises(ValueError, match=re.escape(told)):
         read_devices(tmp_path / "a.yaml")
+
+
+def test_no_more_is_declared_than_a_family_holds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """To look at what is beyond that would be in vain: a large file has ten times as many."""
+    declared: list[str] = []
+
+    def noted(found: ImportedRegister) -> Register[Any]:
+        declared.append(found.name)
+        return declare(found)
+
+    monkeypatch.setattr(settling, "MOST_REGISTERS", 2)
+    monkeypatch.setattr(settling, "declare", noted)
+    rows = "".join(f"r{address},{address},uint16\n" for address in (1, 99_999, 2, 3, 4))
+    device = only(tmp_path, "a.csv", f"name,address,type\n{rows}")
+    assert [register.name for register in device.registers] == ["r1", "r2"]
+    assert told(device)[-2:] == [f"{name}: a family has at most 2 registers" for name in ("r3", "r4")]
+    assert declared[-1] == "r2"
 
 
 # ---- of any file ----

@@ -145,6 +145,17 @@ def test_a_device_that_is_silent_to_long_requests_is_read_in_shorter_ones(
 
 
 @pytest.mark.long
+def test_while_it_is_silent_to_long_requests_it_is_asked_at_its_rate() -> None:
+    """The one register that tells whether it is there is asked for as often as the block was to be."""
+    drive = family(WIDE)(1, name="pump-1")
+    sim = Picky(drive, silent_beyond=1)
+    with clocked_line_of(drive, sim, every=5.0) as clocked:
+        rows = clocked.run(600)
+    assert len(values(rows)) == WIDE
+    assert max(Counter(sim.asked).values()) <= 2 * 600 / 5  # r0 is one of the parts at last
+
+
+@pytest.mark.long
 def test_a_dead_drive_is_never_split_and_is_read_as_a_whole_when_it_comes() -> None:
     drive = family(WIDE)(1, name="pump-1")
     sim = Picky(drive)

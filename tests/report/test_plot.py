@@ -664,10 +664,11 @@ def with_odd(about: Any, odd: Any) -> Iterator[Any]:
 def test_metadata_that_makes_no_sense_is_left_out(tmp_path: Path, odd: Any) -> None:
     """All parts of it are read before a picture is drawn."""
     about = {"plant": "hall.toml", "planned": PLANNED, "drives": ABOUT["drives"]}
+    rows = turns()[:30]
     for number, metadata in enumerate(with_odd(about, odd)):
         if not isinstance(metadata, dict):
             continue  # is no recording
-        look = load(record(tmp_path / f"{number}.arrows", turns()[:30], metadata))
+        look = load(record(tmp_path / f"{number}.arrows", rows, metadata, pieces=1))
         assert all(
             np.isfinite([each.utilisation, each.rate("pump"), each.cycle or 0]).all()
             for each in line_uses(look)

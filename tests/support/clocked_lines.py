@@ -193,8 +193,9 @@ class ClockedPort:
 
     def _advance(self, received: bytes) -> int:
         self._received += received
+        now = self._clocked.now
         for _ in range(10_000):
-            want = lib.md_turn_want(self._turn, self._wake, self._clocked.now)
+            want = lib.md_turn_want(self._turn, self._wake, now)
             wake = int(self._wake[0])
             if want == lib.MD_DONE:
                 self._receive()
@@ -205,7 +206,7 @@ class ClockedPort:
                     return NEVER
             elif want == lib.MD_READ and self._received:
                 self._receive()
-            elif want == lib.MD_WAIT or wake > self._clocked.now:
+            elif want == lib.MD_WAIT or wake > now:
                 return wake
         raise AssertionError("the line never waits")
 

@@ -82,9 +82,14 @@ def rows_in(history: History, *of: object) -> list[Row]:
 
 def check_buckets(found: Buckets, rows: Iterable[Row], series: str) -> None:
     """Compare with what plain Python makes of the rows."""
-    mine = [row for row in rows if f"{row.drive}.{row.register}" == series]
+    drive, _, register = series.rpartition(".")
+    mine: dict[int, list[float | None]] = {}
+    for row in rows:
+        if (row.drive, row.register) == (drive, register):
+            mine.setdefault((row.time - found.begin) // found.step, []).append(row.value)
     for number, begin in enumerate(found.times):
-        here = [row.value for row in mine if begin <= row.time < begin + found.step]
+        assert begin == found.begin + number * found.step
+        here = mine.get(number, [])
         values = [value for value in here if value is not None]
         assert (found.n[number], found.missed[number]) == (len(values), len(here) - len(values))
         if values:

@@ -50,8 +50,11 @@ class PathWire(ClockedWire):
 
     @property
     def wake(self) -> float | None:
-        arrival = self._path[0][0] if self._path else None
-        return min((time for time in (super().wake, arrival) if time is not None), default=None)
+        first = super().wake
+        if not self._path:
+            return first
+        arrival = self._path[0][0]
+        return arrival if first is None else min(first, arrival)
 
 
 def constant(seconds: float) -> Delay:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any, NamedTuple
 
 Document = dict[str, Any]
@@ -16,7 +17,7 @@ Path = tuple[str | int, ...]
 
 class Edit(NamedTuple):
     name: str
-    document: Document
+    document: Callable[[], Document]  # makes it, each time anew: most edits are only counted
 
 
 def at(document: Any, path: Path) -> Any:
@@ -36,21 +37,21 @@ def put(document: Document, path: Path, value: Any) -> Edit:
     def change(parent: Any, key: Any) -> None:
         parent[key] = copy.deepcopy(value)
 
-    return Edit(f"{shown(path)} = {value!r}", edited(document, path, change))
+    return Edit(f"{shown(path)} = {value!r}", partial(edited, document, path, change))
 
 
 def dropped(document: Document, path: Path) -> Edit:
     def change(parent: Any, key: Any) -> None:
         del parent[key]
 
-    return Edit(f"without {shown(path)}", edited(document, path, change))
+    return Edit(f"without {shown(path)}", partial(edited, document, path, change))
 
 
 def inserted(document: Document, path: Path, value: Any) -> Edit:
     def change(parent: Any, key: Any) -> None:
         parent.insert(key, copy.deepcopy(value))
 
-    return Edit(f"{shown(path)} gets {value!r}", edited(document, path, change))
+    return Edit(f"{shown(path)} gets {value!r}", partial(edited, document, path, change))
 
 
 def shown(path: Path) -> str:
@@ -203,11 +204,11 @@ def other_harmless(document: Document) -> Iterator[Edit]:
                 yield put(document, (kind, name, key), value)
             for other_kind in ("setting", "reading", "command"):
                 if other_kind != kind:
-                    moved = dropped(document, (kind, name)).document
+                    moved = dropped(document, (kind, name)).document()
                     moved.setdefault(other_kind, {})[name] = {
                         key: value for key, value in table.items() if key not in ("harmless", "broadcast")
                     }
-                    yield Edit(f"{kind}.{name} is a {other_kind}", moved)
+                    yield Edit(f"{kind}.{name} is a {other_kind}", partial(copy.deepcopy, moved))
             for other in ("setting", "command"):
                 alias = {key: value for key, value in table.items() if key not in ("harmless", "broadcast")}
                 yield (
@@ -221,9 +222,9 @@ def other_looks(document: Document) -> Iterator[Edit]:
     looks = document["look"]
     for name, look in looks.items():
         yield put(document, ("look", f"{name}_"), look)
-        renamed = dropped(document, ("look", name)).document
+        renamed = dropped(document, ("look", name)).document()
         renamed["look"][f"{name}_"] = look
-        yield Edit(f"{name} is called {name}_", renamed)
+        yield Edit(f"{name} is called {name}_", partial(copy.deepcopy, renamed))
         for other in looks:
             if other != name:
                 yield put(document, ("look", name), looks[other])
@@ -283,10 +284,10 @@ def other_states(document: Document) -> Iterator[Edit]:
                 yield put(document, ("state", look), word)
                 first = copy.deepcopy(document)
                 first["state"] = {look: word, **states}
-                yield Edit(f"state begins with {look} = {word}", first)
+                yield Edit(f"state begins with {look} = {word}", partial(copy.deepcopy, first))
     backwards = copy.deepcopy(document)
     backwards["state"] = dict(reversed(states.items()))
-    yield Edit("state backwards", backwards)
+    yield Edit("state backwards", partial(copy.deepcopy, backwards))
 
 
 def other_setpoints(document: Document) -> Iterator[Edit]:

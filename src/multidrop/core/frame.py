@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any
@@ -59,7 +60,7 @@ def to_c(message: Message) -> Any:
                 "start": message.start,
                 "count": message.count,
                 "data_len": len(message.data),
-                "data": list(message.data),
+                "data": message.data,
             },
         )
     except OverflowError as mistake:
@@ -112,6 +113,15 @@ def parse_reply(framing: Framing, received: bytes, request: Message) -> tuple[in
     found = ffi.new("struct md_message *")
     used = lib.md_parse_reply(framing, received, len(received), to_c(request), found)
     return used, from_c(found) if used > 0 else None
+
+
+def find_replies(framing: Framing, received: bytes, request: Message) -> Iterator[bytes]:
+    """Yield each reply to `request`, at whatever byte of `received` it begins."""
+    asked, reply, source = to_c(request), ffi.new("struct md_message *"), ffi.from_buffer(received)
+    for at in range(len(received)):
+        used = lib.md_parse_reply(framing, source + at, len(received) - at, asked, reply)
+        if used > 0:
+            yield received[at : at + used]
 
 
 def reply_length(framing: Framing, request: Message) -> int:

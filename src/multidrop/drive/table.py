@@ -13,6 +13,8 @@ class Kept(Enum):
     EEPROM = "EEPROM"
     UNKNOWN = "not stated"
 
+    __hash__ = object.__hash__  # each member is one object: ten times as fast as by name, which Enum takes
+
 
 class Carrier(Enum):
     """Field of a frame that carries a table's values."""
@@ -21,6 +23,8 @@ class Carrier(Enum):
     WORD = "word"
     LONG = "four bytes"  # Delixi's D3..D0
     NUMBER = "parameter number"  # Delixi's P1P0
+
+    __hash__ = object.__hash__  # as above
 
 
 @dataclass(frozen=True)

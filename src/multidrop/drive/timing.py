@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
+from functools import cached_property
 
 
 @dataclass(frozen=True)
@@ -33,13 +34,13 @@ class Settings:
     def stopbits(self) -> int:
         return int(self.format[2])
 
-    @property
+    @cached_property
     def character(self) -> float:
         """Seconds of one character: start bit, data bits, parity bit if any, stop bits."""
         bits = 1 + self.databits + (self.parity != "N") + self.stopbits
         return bits / self.baudrate
 
-    @property
+    @cached_property
     def t3_5(self) -> float:
         """Silence between RTU frames, s: 3.5 characters, fixed above 19200 (serial-line guide 2.5.1.1)."""
         return 1.75e-3 if self.baudrate > 19200 else 3.5 * self.character

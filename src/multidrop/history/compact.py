@@ -11,12 +11,12 @@ import os
 import shutil
 import sys
 from collections.abc import Iterator
-from contextlib import suppress
+from contextlib import closing, suppress
 from itertools import groupby
 from pathlib import Path
 from typing import Any
 
-from multidrop.history.database import connect, copy_out, insert, insert_units, kept_metadata, with_units
+from multidrop.history.database import Database, copy_out, insert, insert_units, kept_metadata, with_units
 from multidrop.history.folder import STEM, HistoryFile, file_name, parquet_files, widest
 from multidrop.history.quantities import units_of
 from multidrop.polling.batch import Rows
@@ -67,18 +67,20 @@ def compact(folder: Path, below: int, *, merge_rows: bool = False) -> None:
     for name in ("rows", "tens", "damaged"):
         (folder / name).mkdir(exist_ok=True)
     clean(folder)
-    for number, path in segments_of(folder / STEM):
-        if number < below:
-            _compact_segment(folder, number, path)
-    if merge_rows:
-        rows = widest(parquet_files(folder / "rows"))
-        _make_tens(folder, rows[:-1])  # first: behind a merged file those without tens would not be found
-        for part in (part for run in finished(rows, 3600, set()) for part in _parts(run)):
-            _merge_rows(folder, part)
-    for seconds in (3600, 86400):
-        tens = widest(parquet_files(folder / "tens"))
-        for run in finished(tens, seconds, _without_tens(folder, tens)):
-            _merge(folder, run)
+    with closing(Database(MEMORY, folder / ".spill")) as database:
+        for number, path in segments_of(folder / STEM):
+            if number < below:
+                _compact_segment(database, folder, number, path)
+        if merge_rows:
+            rows = widest(parquet_files(folder / "rows"))
+            # first: behind a merged file those without tens would not be found
+            _make_tens(database, folder, rows[:-1])
+            for part in (part for run in finished(rows, 3600, set()) for part in _parts(run)):
+                _merge_rows(database, folder, part)
+        for seconds in (3600, 86400):
+            tens = widest(parquet_files(folder / "tens"))
+            for run in finished(tens, seconds, _without_tens(folder, tens)):
+                _merge(database, folder, run)
 
 
 def clean(folder: Path) -> None:
@@ -113,9 +115,9 @@ def _put_away(folder: Path, path: Path, is_damaged: bool) -> None:
             path.unlink()
 
 
-def _compact_segment(folder: Path, number: int, path: Path) -> None:
+def _compact_segment(database: Database, folder: Path, number: int, path: Path) -> None:
     damage: list[str] = []
-    with connect(MEMORY, folder / ".spill") as database:
+    with database.cursor() as cursor:
         metadata = {}
         try:
             reader = ArrowsReader(path)
@@ -127,15 +129,15 @@ def _compact_segment(folder: Path, number: int, path: Path) -> None:
         except ValueError as error:
             damage.append(str(error))
         else:
-            insert(database, _readable(reader, damage))
-            insert_units(database, units_of(metadata))
-            database.execute(TOLD)
+            insert(cursor, _readable(reader, damage))
+            insert_units(cursor, units_of(metadata))
+            cursor.execute(TOLD)
             bounds = "select min(epoch_ns(time)), max(epoch_ns(time)), count(*) from recorded"
-            least, most, rows = database.execute(bounds).fetchone()
+            least, most, rows = cursor.execute(bounds).fetchone()
             if rows:
                 name = file_name(number, number, least, most)
-                _write(database, TENS.format("told"), folder / "tens" / name)
-                _write(database, ROWS, folder / "rows" / name, metadata)
+                _write(cursor, TENS.format("told"), folder / "tens" / name)
+                _write(cursor, ROWS, folder / "rows" / name, metadata)
     for sentence in damage:
         print(sentence, file=sys.stderr)
     _put_away(folder, path, bool(damage))
@@ -189,11 +191,11 @@ def finished(tens: list[HistoryFile], seconds: int, missing: set[int]) -> list[l
     ]
 
 
-def _merge(folder: Path, run: list[HistoryFile]) -> None:
+def _merge(database: Database, folder: Path, run: list[HistoryFile]) -> None:
     begin, end = min(file.begin for file in run), max(file.end for file in run)
     name = file_name(run[0].first, run[-1].last, begin * 10**9, end * 10**9)
-    with connect(MEMORY, folder / ".spill") as database:
-        _write(database, MERGED.format(with_units(file.path for file in run)), folder / "tens" / name)
+    with database.cursor() as cursor:
+        _write(cursor, MERGED.format(with_units(file.path for file in run)), folder / "tens" / name)
     for file in run:
         file.path.unlink(missing_ok=True)
 
@@ -214,25 +216,25 @@ def _parts(run: list[HistoryFile]) -> Iterator[list[HistoryFile]]:
         yield part
 
 
-def _merge_rows(folder: Path, part: list[HistoryFile]) -> None:
+def _merge_rows(database: Database, folder: Path, part: list[HistoryFile]) -> None:
     """Make one file of these, with the metadata of the last one."""
     begin, end = min(file.begin for file in part), max(file.end for file in part)
     name = file_name(part[0].first, part[-1].last, begin * 10**9, end * 10**9)
-    with connect(MEMORY, folder / ".spill") as database:
-        metadata = kept_metadata(database, part[-1].path)
+    with database.cursor() as cursor:
+        metadata = kept_metadata(cursor, part[-1].path)
         query = MERGED_ROWS.format(with_units(file.path for file in part))
-        _write(database, query, folder / "rows" / name, metadata)
+        _write(cursor, query, folder / "rows" / name, metadata)
     for file in part:
         file.path.unlink(missing_ok=True)
 
 
-def _make_tens(folder: Path, rows: list[HistoryFile]) -> None:
+def _make_tens(database: Database, folder: Path, rows: list[HistoryFile]) -> None:
     """Make the tens of files of rows that have none."""
     missing = _without_tens(folder, widest(parquet_files(folder / "tens")))
     for file in rows:
         if file.first in missing:
-            with connect(MEMORY, folder / ".spill") as database:
-                _write(database, TENS.format(with_units([file.path])), folder / "tens" / file.path.name)
+            with database.cursor() as cursor:
+                _write(cursor, TENS.format(with_units([file.path])), folder / "tens" / file.path.name)
 
 
 def be_low() -> None:

@@ -38,6 +38,27 @@ def connect(memory: str, spill: Path | None = None) -> Any:
     return duckdb.connect(config=settings)
 
 
+class Database:
+    """A database in memory that is opened when it is first needed: that takes 20 ms of processor time."""
+
+    def __init__(self, memory: str, spill: Path) -> None:
+        self._memory = memory
+        self._spill = spill
+        self._opened: Any = None
+
+    def cursor(self) -> Any:
+        """Return a cursor, to be closed: its temporary tables end with it. Raises MissingDuckDB."""
+        if self._opened is None:
+            self._opened = connect(self._memory, self._spill)
+        return self._opened.cursor()
+
+    def close(self) -> None:
+        """Close it, if it is open; the next cursor opens it again."""
+        if self._opened is not None:
+            self._opened.close()
+            self._opened = None
+
+
 class ArrowStream:
     """Batches in the form that DuckDB reads; it asks for them again at each query."""
 

@@ -11,7 +11,7 @@ from pathlib import Path
 from tempfile import gettempdir
 from typing import Any, TypeVar
 
-from multidrop.history.database import connect, texts_of_metadata
+from multidrop.history.database import Database, texts_of_metadata
 from multidrop.history.folder import HistoryFile, Listing, listing
 from multidrop.history.growing import GrowingSegment
 from multidrop.history.quantities import Known, known_by
@@ -38,15 +38,13 @@ class Sources:
         self._bounds: dict[int, tuple[int, int]] = {}  # of times in closed segments
         self._known: dict[int, Known] = {}  # quantities in segments
         self._changing = threading.Lock()
-        self._database: Any = None
+        self._database = Database(MEMORY, Path(gettempdir()) / f"multidrop-history-{os.getpid()}")
 
     def close(self) -> None:
         with self._changing:
             while self._growing:
                 self._growing.popitem()[1].let_go()
-            if self._database is not None:
-                self._database.close()
-                self._database = None
+            self._database.close()
 
     def listing(self) -> Listing:
         """List the files that hold the history now, and close those that no longer do."""
@@ -129,8 +127,6 @@ class Sources:
     def cursor(self) -> Any:
         """Return a cursor of DuckDB, to be closed. Raises ImportError."""
         with self._changing:
-            if self._database is None:
-                self._database = connect(MEMORY, Path(gettempdir()) / f"multidrop-history-{os.getpid()}")
             return self._database.cursor()
 
     def again(self, act: Callable[[Listing], T]) -> T:

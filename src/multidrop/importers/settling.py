@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -22,32 +23,33 @@ _PLACE = Path("entry")
 
 def settle(device: ImportedDevice) -> None:
     """Move what a family cannot hold to the device's `lost`, with the sentence of the library."""
-    registers, held = device.registers, dict[str, Register[Any]]()
-    device.registers = []
-    for found in registers:
+    held = _keep(device, device.registers, declare, MOST_REGISTERS, "registers")
+    _keep(device, device.texts, declare_text, MOST_TEXTS, "texts")
+    _settle_together(device, held)
+
+
+def _keep(
+    device: ImportedDevice,
+    listed: list[ImportedRegister],
+    declare: Callable[[ImportedRegister], Any],
+    most: int,
+    kind: str,
+) -> dict[str, Any]:
+    """Leave in a list what one family can hold; return what it declares, by name."""
+    held: dict[str, Any] = {}
+    kept: list[ImportedRegister] = []
+    for found in listed:
+        if len(kept) == most:
+            device.lose(found.name, f"a family has at most {most} {kind}")
+            continue
         try:
             held[found.name] = declare(found)
         except ValueError as refusal:
             device.lose(found.name, str(refusal))
         else:
-            device.registers.append(found)
-    texts, device.texts = device.texts, []
-    for found in texts:
-        try:
-            declare_text(found)
-        except ValueError as refusal:
-            device.lose(found.name, str(refusal))
-        else:
-            device.texts.append(found)
-    for kept, most, kind in (
-        (device.registers, MOST_REGISTERS, "registers"),
-        (device.texts, MOST_TEXTS, "texts"),
-    ):
-        for found in kept[most:]:
-            device.lose(found.name, f"a family has at most {most} {kind}")
-            held.pop(found.name, None)
-        del kept[most:]
-    _settle_together(device, held)
+            kept.append(found)
+    listed[:] = kept
+    return held
 
 
 def declare(found: ImportedRegister, access: Access = Access.READING) -> Register[Any]:

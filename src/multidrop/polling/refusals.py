@@ -121,7 +121,8 @@ class Refusals:
         elif not peer.has_answered and drive.address not in self._probes:
             jobs = [other for other in self._schedule.jobs if other.owner is drive]
             if all(other.may_be_too_long for other in jobs):
-                probe = self._probes[drive.address] = self._maker.make(drive, least(drive, job.block), None)
+                block = least(drive, job.block)
+                probe = self._probes[drive.address] = self._maker.make(drive, block, job.period_ns)
                 self._schedule.add(probe, now_ns)
 
     def _end_probes(self) -> None:

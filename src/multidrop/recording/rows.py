@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from array import array
 from collections.abc import Iterable, Iterator, Sequence
-from itertools import accumulate
+from itertools import accumulate, pairwise
 from typing import Any
 
 from multidrop.polling.batch import Row, Rows, assemble
@@ -43,8 +43,11 @@ def _values(column: Any) -> Iterable[Any]:
 
 def texts_of(column: Any) -> Iterator[str]:
     """Yield each row's text of a column."""
-    ends, text = memoryview(column.buffer(1)), bytes(column.buffer(2))
-    return (text[ends[at] : ends[at + 1]].decode(errors="replace") for at in range(column.length))
+    ends, text = memoryview(column.buffer(1))[: column.length + 1], bytes(column.buffer(2))
+    if text.isascii():  # decoded once: names and statuses mostly are
+        letters = text.decode("ascii")
+        return (letters[begin:end] for begin, end in pairwise(ends))
+    return (text[begin:end].decode(errors="replace") for begin, end in pairwise(ends))
 
 
 def from_rows(rows: Sequence[Row]) -> RecordedRows:

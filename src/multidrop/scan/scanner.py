@@ -17,7 +17,7 @@ from multidrop.core import (
     Message,
     Peer,
     build_request,
-    parse_reply,
+    find_replies,
     reply_length,
 )
 from multidrop.drive.family import Drive
@@ -164,10 +164,7 @@ def _late(sweep: Sweep, earlier: Sequence[int], completion: Completion) -> list[
     found = []
     for address in earlier:
         request = sweep.request.to(address)
-        frame = build_request(sweep.framing, request)
-        for at in range(len(completion.raw)):
-            used, _ = parse_reply(sweep.framing, completion.raw[at:], request)
-            if used > 0 and completion.raw[at : at + used] != frame:
-                found.append(address)
-                break
+        replies = find_replies(sweep.framing, completion.raw, request)
+        if any(reply != build_request(sweep.framing, request) for reply in replies):
+            found.append(address)
     return found

@@ -51,9 +51,10 @@ class FaultyWire(Wire):
 
     def _strikes(self, fault: str) -> bool:
         rate: float = getattr(self.faults, fault)
-        strikes = rate > 0 and self._random.random() < rate
-        self.struck[fault] += strikes
-        return strikes
+        if rate <= 0 or self._random.random() >= rate:
+            return False
+        self.struck[fault] += 1
+        return True
 
     def _damaged(self, frame: bytes) -> bytes:
         """Return the frame with at most one damage, which every checksum shows."""
@@ -78,6 +79,9 @@ class FaultyWire(Wire):
 
     def _deliver(self, group: ReceiverGroup, frames: Sequence[Frame]) -> None:
         if not frames:
+            return
+        if not self.faults.start_noise:
+            super()._deliver(group, frames)
             return
         before = self._running()
         super()._deliver(group, frames)
@@ -120,8 +124,10 @@ class FaultyWire(Wire):
         if self._held and now >= self._held.begin:
             held, self._held = self._held, None
             super()._send(held.data, held.begin, held.character)
-        data = super().advance(now) + b"".join(stray.take(now) for stray in self._stray)
-        self._stray = [stray for stray in self._stray if stray.end > now]
+        data = super().advance(now)
+        if self._stray:
+            data += b"".join([stray.take(now) for stray in self._stray])
+            self._stray = [stray for stray in self._stray if stray.end > now]
         if self._back_at is None:
             return data
         if now >= self._back_at:
@@ -130,10 +136,14 @@ class FaultyWire(Wire):
 
     @property
     def wake(self) -> float | None:
-        times = [super().wake, self._back_at, *(stray.next_at for stray in self._stray)]
+        times = [stray.next_at for stray in self._stray]
         if self._held:
             times.append(self._held.begin)
-        return min((at for at in times if at is not None), default=None)
+        if self._back_at is not None:
+            times.append(self._back_at)
+        if (first := super().wake) is not None:
+            times.append(first)
+        return min(times, default=None)
 
     def _hang_up(self, now: float) -> None:
         self.where = self.path  # a TCP port keeps its number

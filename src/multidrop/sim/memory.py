@@ -58,7 +58,11 @@ class Memory:
             self.make_readable(text.table, self._addresses(text))
 
     def _cell(self, table: Table, address: int) -> MemoryCell:
-        return self._cells.setdefault((_space(table), address), MemoryCell(table, address))
+        place = _space(table), address
+        cell = self._cells.get(place)
+        if cell is None:
+            cell = self._cells[place] = MemoryCell(table, address)
+        return cell
 
     def _declare(self, register: Register[Any]) -> None:
         table = register.table

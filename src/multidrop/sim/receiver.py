@@ -14,6 +14,8 @@ MOST_RTU = 256
 TCP_HEAD, MOST_TCP = 6, 260  # bytes before the unit id, and of a frame
 MOST_TEXT = 513
 LEAST_RTU = 4  # address, function, CRC
+# Function codes of requests: where none follows a byte, no request begins with it.
+_REQUESTS = frozenset(code for code in range(256) if parse_request(Framing.RTU, bytes([1, code]))[0] == 0)
 
 
 @dataclass(frozen=True)
@@ -94,7 +96,9 @@ class Receiver:
         """
         pending = False
         data = bytes(self._buffer[-MOST_RTU:])
-        for at in range(len(data)):
+        for at, code in enumerate(data[1:]):
+            if code not in _REQUESTS:
+                continue
             used, message = parse_request(Framing.RTU, data[at:])
             after = len(data) - at - used
             if message is not None and not (pending and after):

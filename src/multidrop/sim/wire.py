@@ -127,7 +127,10 @@ class Wire:
     def advance(self, now: float) -> bytes:
         """Let time pass until `now`; return the bytes that reach the client meanwhile."""
         for group in self._groups:
-            self._deliver(group, group.receiver.silence(now))
+            if frames := group.receiver.silence(now):
+                self._deliver(group, frames)
+        if not self._outgoing:
+            return b""
         received = bytearray()
         while self._outgoing:
             received += self._outgoing[0].take(now)
@@ -141,8 +144,7 @@ class Wire:
     @property
     def wake(self) -> float | None:
         """The time of the next call to `advance`; None: when the next bytes have come."""
-        silences = [group.receiver.silent_at for group in self._groups]
-        times = [at for at in silences if at is not None]
+        times = [at for group in self._groups if (at := group.receiver.silent_at) is not None]
         if self._outgoing:
             times.append(self._outgoing[0].next_at)
         return min(times, default=None)
@@ -155,7 +157,8 @@ class Wire:
         for frame in frames:
             for sim in group.addressed(frame):
                 if self._keeps_silence(sim, frame) and (reply := sim.receive(frame)) is not None:
-                    reply = replace(reply, transaction=frame.transaction)
+                    if frame.transaction:  # of Modbus TCP alone
+                        reply = replace(reply, transaction=frame.transaction)
                     data = self.distort(build_reply(sim.drive.framing, reply))
                     self._send(data, frame.end + sim.delay * self._pace, group.receiver.character)
 
