@@ -77,7 +77,7 @@ class Desks:
 
     @property
     def written(self) -> set[str]:
-        """Return what was written: a stop is sent again where a busy machine is late with the drive's reply."""
+        """Return what was written: a stop is sent again where a busy machine is late with a reply."""
         return {name for name, _ in self.writes}
 
     @property
