@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 from commands import TOY, Run
+from kills import BoundProcess
 from tables import table
 
 from multidrop.cli import COMMANDS, main
@@ -538,7 +539,7 @@ def test_a_full_disk_under_the_output_is_a_sentence(words: list[str]) -> None:
 @pytest.mark.long
 @table("words", PRINTING)
 def test_a_reader_who_has_seen_enough_is_no_failure(words: list[str]) -> None:
-    with subprocess.Popen(in_a_process(words), stdout=subprocess.PIPE, stderr=subprocess.PIPE) as command:
+    with BoundProcess(in_a_process(words), stdout=subprocess.PIPE, stderr=subprocess.PIPE) as command:
         assert command.stdout is not None
         command.stdout.close()
         command.stdout = None

@@ -20,6 +20,7 @@ from typing import Any
 import pytest
 from commands import TOY, Run
 from examples import usually
+from kills import BoundProcess
 from lines import PATIENCE, Faulty, patient, until
 from motors import ReceivedRequests
 from terminals import closing_terminal
@@ -404,7 +405,7 @@ def test_a_port_in_use_is_a_sentence(run: Run, port: str) -> None:
         "print('held', flush=True); sys.stdin.read()"
     )
     words = [sys.executable, "-c", holder, port]
-    with subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as other:
+    with BoundProcess(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as other:
         assert other.stdout is not None
         assert other.stdout.readline() == b"held\n"
         assert run("read", port, TOY, 1) == (1, "", f"multidrop: {port}: it is in use by another program\n")

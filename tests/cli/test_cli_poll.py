@@ -13,6 +13,7 @@ import pytest
 from batches import METADATA, counting
 from commands import TOY_IS_RUN, Run, multidrop, plant_file, running
 from examples import usually
+from kills import BoundProcess
 from lines import Faulty, line, polled, until
 from recordings import recorded
 from terminals import on_terminal
@@ -356,7 +357,7 @@ def test_a_demo_takes_the_place_of_a_demo_only(run: Run, tmp_path: Path) -> None
 def test_a_demo_that_is_killed_leaves_no_simulator(tmp_path: Path) -> None:
     ports = tmp_path / "ports"
     words = [sys.executable, "-c", SIMULATING, str(plant_file(tmp_path)), str(ports)]
-    with subprocess.Popen(words, stdout=subprocess.PIPE) as process:
+    with BoundProcess(words, stdout=subprocess.PIPE) as process:
         assert process.stdout is not None
         process.stdout.readline()
         assert (ports / "hall-1").is_symlink()

@@ -13,6 +13,7 @@ from typing import Any
 
 import pytest
 from examples import usually
+from kills import BoundProcess
 from lines import PATIENCE, until
 from motors import ReceivedRequests
 
@@ -235,7 +236,7 @@ def lines(count: int) -> Iterator[tuple[list[list[ReceivedRequests]], list[str]]
 @contextmanager
 def client(how: str, ports: list[str]) -> Iterator[subprocess.Popen[str]]:
     words = [sys.executable, "-c", CLIENT, how, *ports]
-    with subprocess.Popen(
+    with BoundProcess(
         words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, stdin=subprocess.DEVNULL, text=True
     ) as process:
         assert process.stdout is not None

@@ -9,6 +9,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from kills import BoundProcess
 from lines import PATIENCE
 from simulated_bus import SimulatedBus
 from tables import table
@@ -224,7 +225,7 @@ def test_a_simulator_in_another_process_is_known_until_it_is_killed(tmp_path: Pa
         "import time\nfrom multidrop.sim.port import PtyPort\nfrom multidrop.drive.timing import Settings\n"
         "port = PtyPort(Settings(9600, '8N1'), None)\nprint(port.path, flush=True)\ntime.sleep(3600)"
     )
-    with subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True) as process:
+    with BoundProcess([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
         device = process.stdout.readline().strip()
         held = os.open(device, os.O_RDWR | os.O_NOCTTY)  # or another test's simulator has the same next

@@ -15,6 +15,7 @@ from typing import Any
 import checksums
 import pytest
 from examples import usually
+from kills import BoundProcess
 
 from multidrop.bus import Bus
 from multidrop.control.audit_log import AuditLog, read_audit
@@ -67,7 +68,7 @@ def test_leaving_stops_only_when_it_was_asked_for(ending: str, opted: str) -> No
     then, number, status = ENDINGS[ending]
     with pump() as (sim, port):
         words = [sys.executable, "-c", CLIENT.format(then=then), port, opted]
-        with subprocess.Popen(
+        with BoundProcess(
             words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, stdin=subprocess.DEVNULL, text=True
         ) as client:
             assert client.stdout is not None

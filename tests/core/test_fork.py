@@ -15,6 +15,7 @@ from typing import Any
 
 import pytest
 import toy
+from kills import BoundProcess
 from lines import PATIENCE, plant, polled, rows_of, until
 from lines import line as declared
 from serial_server import SerialServer
@@ -326,7 +327,7 @@ def test_a_child_stops_no_motor(end: str) -> None:
     act, status = ENDS[end]
     with Simulator([Wire([sim], unpaced=True)]) as simulator:
         words = [sys.executable, "-W", "ignore", "-c", PARENT.format(end=act), simulator.wires[0].path]
-        with subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as parent:
+        with BoundProcess(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as parent:
             assert parent.stdout is not None
             assert parent.stdout.readline() == f"{int(status)}\n"
             assert [write.raw for write in sim.counters.writes if write.name == "control"] == [1]

@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 import pytest
+from kills import BoundProcess
 from tables import table
 
 import multidrop
@@ -41,7 +42,7 @@ def keeper(guard_s: float, seconds: float, then: str = "pass") -> Iterator[subpr
     """A process with a mastership of so many seconds; its first line is the deadline."""
     words = [sys.executable, "-c", KEEPER, str(guard_s), str(seconds), then]
     pipe = subprocess.PIPE
-    with subprocess.Popen(words, stdin=pipe, stdout=pipe, text=True) as process:
+    with BoundProcess(words, stdin=pipe, stdout=pipe, text=True) as process:
         try:
             yield process
         finally:

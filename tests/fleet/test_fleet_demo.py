@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 from commands import MULTIDROP, Run
+from kills import BoundProcess
 from lines import PATIENCE, until
 from peers import require_module
 from tables import table
@@ -249,7 +250,7 @@ def await_nothing_left(folder: str) -> None:
 @contextmanager
 def begun() -> Iterator[tuple[subprocess.Popen[str], str]]:
     """Yield the demo with its folder, when all its processes are started."""
-    with subprocess.Popen([*MULTIDROP, "fleet", "demo"], stdout=subprocess.PIPE, text=True) as demo:
+    with BoundProcess([*MULTIDROP, "fleet", "demo"], stdout=subprocess.PIPE, text=True) as demo:
         assert demo.stdout is not None
         folder = ""
         for line in demo.stdout:

@@ -14,6 +14,7 @@ from typing import Any
 
 import pytest
 from commands import Run
+from kills import BoundProcess
 from nats_clusters import Cluster
 from peers import require_module
 from tables import table
@@ -177,7 +178,7 @@ def test_without_a_terminal_it_says_what_works(run: Run) -> None:
 def test_a_line_a_second_until_it_is_interrupted(fleet: Cluster) -> None:
     command = [sys.executable, "-m", "multidrop", "fleet", "watch", "--json"]
     environment = {**os.environ, "MULTIDROP_NATS": ",".join(fleet.urls)}
-    with subprocess.Popen(
+    with BoundProcess(
         command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     ) as process:
         assert process.stdout is not None

@@ -19,6 +19,7 @@ import pytest
 import spool_filler
 from disks import full_at, read_only_directory
 from examples import usually
+from kills import BoundProcess
 from lines import until
 from spooled import exchanges_in, numbered, rows_in, rows_of
 
@@ -183,7 +184,7 @@ def test_kills_at_any_moment(folder: Path, kills: int, longest_s: float) -> None
     for run in range(kills):
         words = [sys.executable, spool_filler.__file__, str(folder), str(run * 1_000_000)]
         here = {**os.environ, "PYTHONPATH": str(support)}
-        with subprocess.Popen(words, stdout=subprocess.PIPE, text=True, env=here) as child:
+        with BoundProcess(words, stdout=subprocess.PIPE, text=True, env=here) as child:
             assert child.stdout is not None
             least = [int(child.stdout.readline()) for _ in range(2)][1]  # none yet, and the first that are
             time.sleep(dice.uniform(0, longest_s))

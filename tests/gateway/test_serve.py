@@ -18,6 +18,7 @@ from typing import Any
 import pytest
 from commands import MULTIDROP, Run, multidrop
 from gateways import certificate, get, served, serving, simulated_plant, written
+from kills import BoundProcess
 from lines import PATIENCE, until
 
 from multidrop.gateway.listener import listen
@@ -239,7 +240,7 @@ def test_mistaken_calls(run: Run, words: tuple[str, ...], sentence: str) -> None
 @pytest.mark.slow
 @pytest.mark.parametrize("words", [["demo", "--web"], ["serve", "--demo"]])
 def test_the_demo_is_live_and_everybody_here_may_stop_it(words: list[str]) -> None:
-    with subprocess.Popen([*MULTIDROP, *words, "--no-browser"], stdout=subprocess.PIPE, text=True) as process:
+    with BoundProcess([*MULTIDROP, *words, "--no-browser"], stdout=subprocess.PIPE, text=True) as process:
         try:
             assert process.stdout is not None
             port = int(process.stdout.readline().strip().rstrip("/").rpartition(":")[2])

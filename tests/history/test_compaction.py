@@ -15,6 +15,7 @@ from typing import Any
 import pytest
 from examples import usually
 from histories import DAY, METADATA, NOON, SECOND, check_buckets, random_rows, record, rows_in
+from kills import BoundProcess
 
 from multidrop import read
 from multidrop.history import compact as compact_module
@@ -189,7 +190,7 @@ def test_killed_in_the_middle(tmp_path: Path) -> None:
     words = [sys.executable, "-m", "multidrop.history.compact", str(tmp_path), "--below", "6"]
     dice, delay = random.Random(1), 0.2
     for _ in range(40):
-        with subprocess.Popen(words) as child:
+        with BoundProcess(words) as child:
             time.sleep(dice.uniform(0, delay))
             child.send_signal(signal.SIGKILL)
             ended = child.wait()

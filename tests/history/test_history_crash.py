@@ -16,6 +16,7 @@ import pytest
 from examples import usually
 from histories import NOON
 from history_recorder import RUN, STEP
+from kills import BoundProcess
 
 from multidrop.history.compact import main as compact
 from multidrop.history.folder import listing
@@ -29,9 +30,7 @@ def killed_recorder(folder: Path, run: int, dice: random.Random) -> int:
     """Let it record for a while, and kill it; return how many rows it said that it had written."""
     words = [sys.executable, history_recorder.__file__, str(folder), str(run)]
     here = {**os.environ, "PYTHONPATH": str(SUPPORT)}
-    with subprocess.Popen(
-        words, stdout=subprocess.PIPE, text=True, env=here, start_new_session=True
-    ) as child:
+    with BoundProcess(words, stdout=subprocess.PIPE, text=True, env=here, start_new_session=True) as child:
         assert child.stdout is not None
         assert child.stdout.readline()  # it is recording
         with History(folder) as history:  # a reader while it records

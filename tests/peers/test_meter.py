@@ -11,6 +11,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
+from kills import BoundProcess
 from lines import HOST_LATE, rows_of, until
 from meter import ADDRESSES
 from peers import require_module
@@ -53,7 +54,7 @@ def served(folder: Path, *options: str) -> Iterator[str]:
     values.write_text(json.dumps({"floats": floats, "serial_number": SERIAL_NUMBER}))
     with linked_ptys() as (theirs, ours):
         command = [sys.executable, str(SERVER), theirs, str(UNIT), str(values), *options]
-        with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        with BoundProcess(command, stdout=subprocess.PIPE, text=True) as process:
             assert process.stdout is not None
             assert process.stdout.readline() == "ready\n"
             yield ours

@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+from kills import BoundProcess
 from lines import patient
 from peers import build_with_libmodbus, require_module
 from ptys import linked_ptys
@@ -46,7 +47,7 @@ def server(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[tuple[str
     command = COMMANDS[request.param](tmp_path)
     with linked_ptys() as (theirs, ours):
         started = [theirs if word == "PORT" else word for word in command]
-        with subprocess.Popen(started, stdout=subprocess.PIPE, text=True) as process:
+        with BoundProcess(started, stdout=subprocess.PIPE, text=True) as process:
             assert process.stdout is not None
             assert process.stdout.readline() == "ready\n"
             yield ours, request.param.split()[1]

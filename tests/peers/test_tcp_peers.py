@@ -9,6 +9,7 @@ from pathlib import Path
 from urllib.parse import urlsplit
 
 import pytest
+from kills import BoundProcess
 from lines import HOST_LATE, patient, rows_of, until
 from peers import build_with_libmodbus, require_module, require_program
 
@@ -49,7 +50,7 @@ def libmodbus(built: Path) -> list[str]:
 def server(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[str]:
     """The server's port, as we name it."""
     made: Callable[[Path], list[str]] = request.param
-    with subprocess.Popen(made(tmp_path), stdout=subprocess.PIPE, text=True) as process:
+    with BoundProcess(made(tmp_path), stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
         ready, number = process.stdout.readline().split()
         assert ready == "ready"
@@ -112,7 +113,7 @@ def test_the_command_line_reads_and_writes_it_too(server: str, capsys: pytest.Ca
 
 @pytest.mark.slow
 def test_another_unit_of_pymodbus_is_silence(tmp_path: Path) -> None:
-    with subprocess.Popen(pymodbus(tmp_path), stdout=subprocess.PIPE, text=True) as process:
+    with BoundProcess(pymodbus(tmp_path), stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
         port = f"tcp://127.0.0.1:{process.stdout.readline().split()[1]}"
         with Bus(port) as bus, pytest.raises(NoReply, match=r"name the port socket://127\.0\.0\.1:\d+"):

@@ -20,6 +20,7 @@ from batches import DRIVES, METADATA, REGISTERS, SECOND, UTC_0, block, completio
 from completions import add_rows
 from disks import full_at, read_only_directory
 from examples import examples, usually
+from kills import BoundProcess
 from recordings import rows_of
 from tables import table
 from toy import Toy
@@ -229,7 +230,7 @@ def test_killed_while_writing(tmp_path: Path, suffix: str) -> None:
             str(path),
             str(Path(__file__).parents[1] / "support"),
         ]
-        with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as writing:
+        with BoundProcess(command, stdout=subprocess.PIPE, text=True) as writing:
             assert writing.stdout is not None
             while int(writing.stdout.readline()) < until:
                 pass

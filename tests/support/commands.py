@@ -9,6 +9,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import IO
 
+from kills import BoundProcess
+
 from multidrop.drives.registry import find_model
 
 MULTIDROP = [sys.executable, "-m", "multidrop"]
@@ -41,7 +43,7 @@ def multidrop(*words: object, most_bytes: int | None = None) -> subprocess.Compl
 @contextmanager
 def running(*words: object) -> Iterator[tuple[subprocess.Popen[str], IO[str]]]:
     """A command under way, and what it prints."""
-    with subprocess.Popen([*MULTIDROP, *map(str, words)], stdout=subprocess.PIPE, text=True) as process:
+    with BoundProcess([*MULTIDROP, *map(str, words)], stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
         try:
             yield process, process.stdout

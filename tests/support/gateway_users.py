@@ -20,6 +20,7 @@ from collections.abc import Awaitable, Callable, Iterator, Mapping
 from contextlib import closing, contextmanager, suppress
 from typing import Any, NamedTuple
 
+from kills import BoundProcess
 from simulated_pumps import FIRST_READING, POLLED, UNPOLLED
 
 VIEWERS, STALLED, MASTERS = 5, 10, 2
@@ -249,7 +250,7 @@ class GatewayUsers:
 def gateway_users(place: Place) -> Iterator[GatewayUsers]:
     """Let them come, in a process of their own; the MQTT listener is mosquitto_sub."""
     words = [sys.executable, __file__, json.dumps(place)]
-    with subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
+    with BoundProcess(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
         try:
             yield GatewayUsers(process)
         finally:

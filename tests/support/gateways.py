@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 
 import pytest
 from commands import MULTIDROP
+from kills import BoundProcess
 from lines import PATIENCE, until
 
 from multidrop import InvtCHE, Plant, load_plant
@@ -214,7 +215,7 @@ def simulated_plant(folder: Path, serve: str) -> Iterator[Path]:
 def serving(path: Path, *options: str, **environment: str) -> Iterator[tuple[subprocess.Popen[str], str]]:
     """The command, once it is ready, and the address that it prints."""
     words = [*MULTIDROP, "serve", str(path), *options]
-    with subprocess.Popen(
+    with BoundProcess(
         words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=os.environ | environment
     ) as process:
         try:

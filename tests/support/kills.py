@@ -4,7 +4,22 @@ from __future__ import annotations
 
 import subprocess
 from collections.abc import Iterable
-from typing import Any
+from types import TracebackType
+from typing import Any, AnyStr
+
+
+class BoundProcess(subprocess.Popen[AnyStr]):
+    """A process that is killed where its block fails: `Popen` waits for its end, which may never come."""
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        failure: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        if failure is not None:
+            self.kill()
+        super().__exit__(kind, failure, traceback)
 
 
 def kill_all(processes: Iterable[subprocess.Popen[Any]]) -> None:

@@ -18,6 +18,8 @@ from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 from typing import Any
 
+from kills import BoundProcess
+
 from multidrop import load_plant
 from multidrop.profiles.delta import DeltaControl
 from multidrop.sim import MotorDrive, Wire, serve, simulated
@@ -134,7 +136,7 @@ def simulated_pumps(plant: Path, *before: str) -> Iterator[SimulatedPumps]:
     `before` are words that the command begins with, such as `nice`.
     """
     words = [*before, sys.executable, __file__, str(plant)]
-    with subprocess.Popen(
+    with BoundProcess(
         words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, start_new_session=True
     ) as process:
         assert process.stdout is not None

@@ -16,6 +16,7 @@ from contextlib import contextmanager
 from typing import Any
 
 from commands import MULTIDROP
+from kills import BoundProcess
 from lines import until
 
 
@@ -50,7 +51,7 @@ def sniffing(port: str, *words: object, patient: bool = False) -> Iterator[Sniff
     program = [sys.executable, "-c", PATIENT] if patient else MULTIDROP
     command = [*program, "sniff", port, "--json", *map(str, words)]
     pipe = subprocess.PIPE
-    with subprocess.Popen(command, stdout=pipe, stderr=pipe, text=True) as process:
+    with BoundProcess(command, stdout=pipe, stderr=pipe, text=True) as process:
         assert process.stdout is not None
         assert process.stderr is not None
         assert process.stderr.readline() == f"listening on {port}, Ctrl-C ends\n"

@@ -15,6 +15,7 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import pytest
+from kills import BoundProcess
 from motors import ReceivedRequests
 from wine_console import Console, Wine
 
@@ -34,7 +35,7 @@ def wine() -> Iterator[Wine]:
     """Wine, with a server that no vanishing terminal takes along: a leader of a session would get it."""
     found = Wine(Path(FOLDER))
     subprocess.run(["wineserver", "-w"], env=found.environment, check=True)
-    with subprocess.Popen(["wineserver", "-f", "-p"], env=found.environment) as server:
+    with BoundProcess(["wineserver", "-f", "-p"], env=found.environment) as server:
         found.begin()
         yield found
         subprocess.run(["wineserver", "-k"], env=found.environment, check=False)

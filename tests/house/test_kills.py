@@ -1,0 +1,23 @@
+"""A test that fails ends what it started, and does not wait for it for ever."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import pytest
+from kills import BoundProcess
+
+TESTS = Path(__file__).parents[1]
+SLEEPS = [sys.executable, "-c", "import time; time.sleep(3600)"]
+
+
+def test_a_process_ends_with_a_block_that_fails() -> None:
+    with pytest.raises(ZeroDivisionError), BoundProcess(SLEEPS) as process:
+        raise ZeroDivisionError
+    assert process.returncode
+
+
+def test_no_block_of_a_test_waits_for_a_process_that_nobody_ends() -> None:
+    unbound = "with subprocess." + "Popen("
+    assert [str(path) for path in TESTS.rglob("*.py") if unbound in path.read_text("utf-8")] == []
