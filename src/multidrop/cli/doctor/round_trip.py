@@ -12,11 +12,12 @@ from multidrop.core import (
     RS485,
     Completion,
     Exchange,
-    Failure,
     Framing,
+    Message,
     build_request,
     characters_on_wire,
     is_pseudo_terminal,
+    parse_reply,
 )
 from multidrop.drive.family import Drive
 from multidrop.planning.blocks import first_block
@@ -51,16 +52,19 @@ def measure(port: str, rs485: RS485, drive: Drive | None) -> tuple[Finding, bool
     its_own = [done for done in completions if done.result > 0 and not _is_gateway_s(drive, done)]
     seen = [(done.first_ns - done.sent_ns) / 1e9 for done in its_own]
     delays = sorted(max(0.0, delay - wire) if shows_bits else delay for delay in seen)
-    refusals = [code for done in completions if (code := _exception(drive, done))]
+    refusals = [code for done in completions if (code := _exception(drive.framing, poll.request, done))]
     wire = 0.0 if shows_bits else wire
     return round_trip_finding(drive, delays, len(completions), wire, refusals), bool(delays or refusals)
 
 
-def _exception(drive: Drive, done: Completion) -> int:
+def _exception(framing: Framing, request: Message, done: Completion) -> int:
     """Return the code of a reply that is an exception, also of a gateway's; else 0."""
-    if drive.framing is Framing.TCP and done.result == Failure.NO_REPLY and done.raw:
-        return done.raw[-1]  # the core takes a gateway's for silence there
-    return done.reply.exception if done.result > 0 else 0
+    if done.result > 0:
+        return done.reply.exception
+    if framing is not Framing.TCP:
+        return 0
+    _, taken_for_silence = parse_reply(framing, done.raw, request)  # the core does so with a gateway's
+    return taken_for_silence.exception if taken_for_silence else 0
 
 
 def _is_gateway_s(drive: Drive, done: Completion) -> bool:
