@@ -17,7 +17,7 @@ LOOK_S = 0.25  # before each look, which takes as much of the processor as secon
 
 
 def fleet_status(environment: Mapping[str, str]) -> dict[str, Any]:
-    """Return the state of a fleet, an empty one while its servers give none, as amid an election.
+    """Return the state of a fleet in a moment, an empty one while its servers give none, as amid an election.
 
     It is asked for in this process, because tests do so again and again.
     """
