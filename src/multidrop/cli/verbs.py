@@ -11,15 +11,9 @@ from typing import Any
 from multidrop.cli import DONE, MISTAKE, STOPS
 from multidrop.cli.support.arguments import add_json_argument, add_writing_arguments, duration
 from multidrop.cli.support.confirm import confirm
+from multidrop.cli.support.interruption import telling_what_was_sent
 from multidrop.cli.support.output import command_line, print_text, warn
-from multidrop.cli.support.target import (
-    Target,
-    add_target_arguments,
-    check_words,
-    number_of,
-    target_of,
-    telling_what_was_sent,
-)
+from multidrop.cli.support.target import Target, add_target_arguments, check_words, number_of, target_of
 from multidrop.cli.support.values import as_json, nearest_value
 from multidrop.control.audit_log import AuditLog
 from multidrop.control.stop_attempt import LEAST_S

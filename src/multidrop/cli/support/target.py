@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,7 +13,6 @@ from multidrop.cli.support.plants import add_port_option, is_plant, plant_of
 from multidrop.core import RS485, Echo
 from multidrop.drive.family import Drive
 from multidrop.drives.registry import find_model
-from multidrop.errors import BusError
 from multidrop.plant.drive_names import drive_meant
 
 _BY_HAND = ("PORT", "MODEL", "ADDRESS")
@@ -152,20 +150,3 @@ def _option(text: str) -> tuple[str, float]:
         return name.replace("-", "_"), float(value)
     except ValueError:
         raise argparse.ArgumentTypeError(f"{text!r} is not NAME=VALUE with a number as its value") from None
-
-
-@contextmanager
-def telling_what_was_sent(drive: Drive, command: str) -> Iterator[list[str]]:
-    """Add notes to an interruption, also to one that comes while the port is opened or closed.
-
-    The notes are those of the list, which begins with the one that nothing was sent, and the failure under
-    which the port was being closed.
-    """
-    known = [f"{drive.name}: nothing of the {command} was sent"]
-    try:
-        yield known
-    except KeyboardInterrupt as interruption:
-        before = interruption.__context__
-        for text in [*known, *([str(before)] if isinstance(before, BusError) else [])]:
-            interruption.add_note(text)
-        raise
