@@ -429,12 +429,14 @@ class ClockedLines:
 
     def _look(self, end_ns: int) -> None:
         """Let time pass until then, or until the poller is called."""
+        wake = end_ns
         while self.now < end_ns:
             wake = self._settle()
             if self._queue and self._queue.has_called:
                 return
             self.now = min(max(wake, self.now + 1), end_ns)
-        self._settle()
+        if wake <= end_ns:  # else nothing happens just then, and the next look begins with the same
+            self._settle()
 
     def _settle(self) -> int:
         """All that happens now; when something happens next."""
