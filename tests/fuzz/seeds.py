@@ -1,6 +1,6 @@
 """Seeds of the fuzzers: the documents' own frames, captures of them, and files that are right.
 
-python tests/fuzz/seeds.py HARNESS DIRECTORY
+python tests/fuzz/seeds.py DIRECTORY HARNESS...    into HARNESS-seeds in the directory, for each of them
 """
 
 from __future__ import annotations
@@ -197,9 +197,12 @@ SEEDS: dict[str, Callable[[], Iterator[bytes]]] = {
 }
 
 
-def main(harness: str, directory: str) -> None:
-    for number, seed in enumerate(SEEDS[harness]()):
-        (Path(directory) / f"seed-{number}").write_bytes(seed)
+def main(directory: str, *harnesses: str) -> None:
+    for harness in harnesses:
+        into = Path(directory) / f"{harness}-seeds"
+        into.mkdir()
+        for number, seed in enumerate(SEEDS[harness]()):
+            (into / f"seed-{number}").write_bytes(seed)
 
 
 if __name__ == "__main__":
