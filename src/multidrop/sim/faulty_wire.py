@@ -136,8 +136,6 @@ class FaultyWire(Wire):
 
     @property
     def wake(self) -> float | None:
-        if not self._stray and self._held is None and self._back_at is None:  # as nearly always
-            return super().wake
         times = [stray.next_at for stray in self._stray]
         if self._held:
             times.append(self._held.begin)
