@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 from controlled_loop import run_controlled
-from fleets import HandClock, MemoryBucket, NotedMastership
+from fleets import GatedBucket, HandClock, MemoryBucket, NotedMastership
 from peers import require_module
 from tables import table
 
@@ -171,6 +171,74 @@ def test_a_late_answer_of_an_earlier_session_is_not_counted() -> None:
     asyncio.run(main())
 
 
+def test_renewals_that_are_stored_but_not_answered_when_a_session_ends_begin_nothing() -> None:
+    """Else the engine might send again, and the kernel's timer would run for a gateway without a session."""
+
+    async def main() -> None:
+        trial = Trial()
+        gates = [GatedBucket(f"lease_{path}", answers=True) for path in range(3)]
+        trial.buckets = [*gates]
+        lease = trial.lease()
+        assert await lease.try_to_begin()
+        trial.clock.pass_s(1)
+        for bucket in gates:
+            bucket.shut()
+        renewals = [asyncio.create_task(lease.renew_once(path)) for path in range(3)]
+        await asyncio.gather(*(bucket.arrived.wait() for bucket in gates))
+        await lease.end()
+        for bucket in gates:
+            bucket.open()
+        await asyncio.gather(*renewals)
+        assert (lease.until, lease.held) == (0, [None, None, None])
+        assert trial.masterships[0].events == ["extend", "end"]
+
+    asyncio.run(main())
+
+
+def test_a_late_path_of_an_ended_session_is_none_of_the_next_one() -> None:
+    async def main() -> None:
+        trial = Trial()
+        late = GatedBucket("lease_2", answers=True)
+        trial.buckets[2] = late
+        late.is_down = True
+        lease = trial.lease()
+        assert await lease.try_to_begin()
+        late.is_down = False
+        late.shut()
+        taking = asyncio.create_task(lease.renew_once(2))
+        await late.arrived.wait()
+        await lease.end()
+        assert await lease.try_to_begin()
+        before = lease.held[2]
+        late.open()
+        await taking
+        assert trial.values()[2]["session"] == 1
+        assert before is None
+        assert lease.held[2] is None
+
+    asyncio.run(main())
+
+
+def test_who_stands_still_between_the_clock_and_the_kernels_timer_goes_on() -> None:
+    """A timer that is set to the past would kill; the engine refuses it, and nothing else happens."""
+
+    class StandingStill(NotedMastership):
+        def extend(self, until_ns: int) -> None:
+            self.clock.pass_s(3)
+            raise ValueError("past")
+
+    async def main() -> None:
+        trial = Trial()
+        lease = trial.lease()
+        lease._mastership = StandingStill(trial.clock)
+        assert await lease.try_to_begin()
+        await renew(lease)
+        assert lease.until == 0
+        assert not lease.is_valid
+
+    asyncio.run(main())
+
+
 def test_sessions_are_numbered_by_the_record_and_by_no_clock() -> None:
     """CLOCK_BOOTTIME begins anew when a machine does."""
 
@@ -219,6 +287,35 @@ def test_two_that_begin_at_once_are_never_both_valid() -> None:
         begun = await asyncio.gather(first.try_to_begin(), second.try_to_begin())
         assert sum(begun) == 1
         assert [first.is_valid, second.is_valid] == begun
+
+    asyncio.run(main())
+
+
+def test_a_session_that_has_not_begun_takes_no_path_that_another_one_lives_by() -> None:
+    """The first one's renewal of path 0 comes before the second one's taking of it; path 2 was renewed all
+    the time."""
+
+    async def main() -> None:
+        trial = Trial()
+        gate = trial.buckets[0] = GatedBucket("lease_0")
+        first, second = trial.lease(), trial.lease()
+        assert await first.try_to_begin()
+        for _ in range(5):
+            assert not await second.try_to_begin()
+            trial.clock.pass_s(0.5)
+            await first.renew_once(2)
+        assert not first.is_valid
+        gate.shut()
+        beginning = asyncio.create_task(second.try_to_begin())
+        await gate.arrived.wait()
+        await first.renew_once(0)
+        await second.renew_once(2)
+        gate.open()
+        assert not await beginning
+        assert first.is_valid
+        await renew(first)
+        assert first.is_valid
+        assert not second.is_valid
 
     asyncio.run(main())
 
@@ -290,6 +387,44 @@ def test_two_machines_without_an_id_prove_nothing_to_each_other(
             assert not await trial.lease(lock=lock).try_to_begin()
 
     asyncio.run(main())
+
+
+def test_a_copy_of_a_disk_proves_nothing_and_neither_does_a_machine_that_was_started_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The machine's id, the path and the lock's own id are copied; the kernel's boot is not."""
+
+    async def main() -> None:
+        trial = Trial()
+        machine, boot = tmp_path / "machine-id", tmp_path / "boot_id"
+        machine.write_text("copied\n", "utf-8")
+        boot.write_text("first\n", "utf-8")
+        monkeypatch.setattr(life_lock, "IDS", (machine, boot))
+        lock = LifeLock(tmp_path / "a.lock")
+        assert await trial.lease(lock=lock).try_to_begin()
+        lock.close()
+        boot.write_text("second\n", "utf-8")
+        with closing(LifeLock(tmp_path / "a.lock")) as lock:
+            assert not await trial.lease(lock=lock).try_to_begin()
+            boot.write_text("first\n", "utf-8")
+            assert await trial.lease(lock=lock).try_to_begin()
+
+    asyncio.run(main())
+
+
+@pytest.mark.parametrize("empty", [0, 1])
+def test_without_one_of_its_ids_a_machine_has_none(
+    empty: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ids = (tmp_path / "machine-id", tmp_path / "boot_id")
+    for path in ids:
+        path.write_text("something\n", "utf-8")
+    monkeypatch.setattr(life_lock, "IDS", ids)
+    assert life_lock.machine_id() == "something.something"
+    ids[empty].write_text("\n", "utf-8")
+    assert life_lock.machine_id() == ""
+    ids[empty].unlink()
+    assert life_lock.machine_id() == ""
 
 
 # ---- those who watch ----
@@ -624,6 +759,40 @@ def test_a_path_that_was_down_at_the_beginning_is_taken_later() -> None:
         trial.buckets[2].is_down = False
         await renew(lease)
         assert lease.held[2] is not None
+
+    asyncio.run(main())
+
+
+def test_a_path_with_another_beginning_of_the_same_number_is_taken_later() -> None:
+    """A gateway of this name that died while it began has left it; two paths are ours, so it is over."""
+
+    async def main() -> None:
+        trial = Trial()
+        trial.buckets[2].is_down = True
+        lease = trial.lease()
+        assert await lease.try_to_begin()
+        trial.buckets[2].is_down = False
+        trial.buckets[2].store("a", {**trial.buckets[0].records["a"].value, "nonce": "of another"})
+        await renew(lease)
+        assert lease.held[2] is not None
+        assert trial.values()[2]["nonce"] == trial.values()[0]["nonce"]
+
+    asyncio.run(main())
+
+
+def test_a_path_that_was_ended_before_its_taking_was_known_makes_a_session_weak() -> None:
+    async def main() -> None:
+        trial = Trial()
+        trial.buckets[2].loses_answers = True
+        lease = trial.lease()
+        assert await lease.try_to_begin()
+        assert lease.held[2] is None
+        trial.buckets[2].loses_answers = False
+        trial.buckets[2].store("a", {**trial.values()[2], "ended": True, "by": "b"})
+        assert not lease.is_weak
+        await renew(lease)
+        assert lease.held[2] is None
+        assert lease.is_weak
 
     asyncio.run(main())
 
