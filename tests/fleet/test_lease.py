@@ -68,6 +68,43 @@ def test_a_session_begins_on_all_paths_and_counts_from_what_was_sent() -> None:
     asyncio.run(main())
 
 
+def test_a_renewal_counts_from_what_was_sent() -> None:
+    async def main() -> None:
+        trial = Trial()
+        lease = trial.lease()
+        assert await lease.try_to_begin()
+        trial.clock.pass_s(1)
+        sent = trial.clock.now
+        for bucket in trial.buckets:
+            bucket.before_put = lambda key: trial.clock.pass_s(0.25)
+        await lease.renew_once(0)
+        await lease.renew_once(1)
+        assert lease.until == trial.masterships[0].until == sent + USUAL.lease
+
+    asyncio.run(main())
+
+
+def test_a_taking_that_was_stored_and_not_answered_counts_for_nothing_until_it_is_renewed() -> None:
+    """When it was sent is not known any more."""
+
+    async def main() -> None:
+        trial = Trial()
+        trial.buckets[2].loses_answers = True
+        lease, began = trial.lease(), trial.clock.now
+        assert await lease.try_to_begin()
+        trial.buckets[2].loses_answers = False
+        trial.clock.pass_s(1)
+        await lease.renew_once(2)  # finds its record
+        assert lease.held[2] is not None
+        trial.clock.pass_s(0.5)
+        await lease.renew_once(1)
+        assert lease.until == began + USUAL.lease
+        await lease.renew_once(2)
+        assert lease.until == began + 1.5 * SECOND + USUAL.lease
+
+    asyncio.run(main())
+
+
 def test_the_deadline_is_the_second_latest() -> None:
     async def main() -> None:
         trial = Trial()
@@ -140,8 +177,10 @@ def test_a_renewal_without_an_answer_is_found_again_and_not_counted() -> None:
         for bucket in trial.buckets:
             bucket.loses_answers = True
         trial.clock.pass_s(1)
-        await renew(lease)
-        assert lease.until == until
+        for _ in range(2):
+            await renew(lease)
+            lease._extend()  # as after the next answer
+            assert lease.until == until
         for bucket in trial.buckets:
             bucket.loses_answers = False
         await renew(lease)
@@ -280,6 +319,24 @@ def test_a_stranger_of_the_same_name_waits_for_a_lease() -> None:
     asyncio.run(main())
 
 
+def test_one_path_that_is_free_is_not_taken() -> None:
+    """Else a gateway that waits would take the paths of another one of its name one after the other."""
+
+    async def main() -> None:
+        trial = Trial()
+        first, second = trial.lease(), trial.lease()
+        assert await first.try_to_begin()
+        for _ in range(8):
+            assert not await second.try_to_begin()
+            trial.clock.pass_s(0.5)
+            await first.renew_once(0)
+            await first.renew_once(2)
+        assert [value["nonce"] for value in trial.values()] == [first._nonce] * 3
+        assert first.is_valid
+
+    asyncio.run(main())
+
+
 def test_two_that_begin_at_once_are_never_both_valid() -> None:
     async def main() -> None:
         trial = Trial()
@@ -412,6 +469,14 @@ def test_a_copy_of_a_disk_proves_nothing_and_neither_does_a_machine_that_was_sta
     asyncio.run(main())
 
 
+def test_a_machines_id_has_the_kernels_boot_in_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    own = tmp_path / "machine-id"
+    own.write_text("of a trial", "utf-8")
+    monkeypatch.setattr(life_lock, "IDS", (own, *life_lock.IDS[1:]))
+    boot = Path("/proc/sys/kernel/random/boot_id").read_text("ascii").strip()
+    assert life_lock.machine_id() == f"of a trial.{boot}"
+
+
 @pytest.mark.parametrize("empty", [0, 1])
 def test_without_one_of_its_ids_a_machine_has_none(
     empty: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -497,6 +562,42 @@ def test_what_is_judged_is_what_is_ended() -> None:
         assert not observer.is_over("a", 1)
         await renew(lease)
         assert not lease.is_over
+
+    asyncio.run(main())
+
+
+def test_a_record_that_was_read_and_not_judged_yet_is_not_stale() -> None:
+    """Of many records some are read while others are asked for; a gateway may be judged in between."""
+
+    async def main() -> None:
+        trial = Trial()
+        lease, observer = trial.lease(), trial.observer()
+        assert await lease.try_to_begin()
+        await look(observer)
+        trial.clock.pass_s(USUAL.lease / SECOND)
+        await look(observer)
+        assert [*observer.dead()] == ["a"]
+        await renew(lease)
+        for path in range(2):
+            observer.paths[path].take(trial.buckets[path].records["a"])
+        assert not observer.dead()
+        assert not await observer.end_the_dead()
+
+    asyncio.run(main())
+
+
+def test_nobody_ends_himself() -> None:
+    """Such an end would count for all others at once."""
+
+    async def main() -> None:
+        trial = Trial()
+        lease, observer = trial.lease("b"), trial.observer("b")
+        assert await lease.try_to_begin()
+        await look(observer)
+        trial.clock.pass_s(2 * USUAL.lease / SECOND)
+        await look(observer)
+        assert not await observer.end_the_dead()
+        assert not any(value["ended"] for value in trial.values("b"))
 
     asyncio.run(main())
 
