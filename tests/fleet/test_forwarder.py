@@ -23,16 +23,15 @@ from multidrop.fleet import forwarder as forwarder_module
 from multidrop.fleet import samples_stream
 from multidrop.fleet.forwarder import Forwarder
 from multidrop.fleet.message import MOST_BYTES, unpack
+from multidrop.fleet.sample_reader import StreamMessage, read_after
 from multidrop.fleet.samples_stream import (
     StreamError,
-    StreamMessage,
     about,
     connect,
     create_stream,
     digest_of,
     last_of,
     publish,
-    read_after,
     subject_of,
 )
 from multidrop.fleet.spool import Spool
