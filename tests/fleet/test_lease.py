@@ -295,6 +295,33 @@ def test_sessions_are_numbered_by_the_record_and_by_no_clock() -> None:
     asyncio.run(main())
 
 
+def test_no_number_of_a_session_is_used_twice_whatever_others_write() -> None:
+    """Else lines that others know to be nobody's would be those of a session that polls them."""
+
+    async def main() -> None:
+        trial = Trial()
+        lease = trial.lease()
+        for number in (1, 2, 3):
+            assert await lease.try_to_begin()
+            assert lease.session == number
+            old = trial.values()[0]
+            await lease.end()
+        for bucket in trial.buckets:
+            bucket.store("a", {**old, "session": 1, "ended": True})
+        assert await lease.try_to_begin()
+        assert lease.session == 4
+        await lease.end()
+        for bucket in trial.buckets:
+            bucket.store("a", None)  # as a record that is none of ours is read
+        after, newest = trial.lease(), trial.buckets[0].last  # of another process
+        assert not await after.try_to_begin()
+        trial.clock.pass_s(USUAL.lease / SECOND)
+        assert await after.try_to_begin()
+        assert after.session == newest + 1 > 4
+
+    asyncio.run(main())
+
+
 def test_a_stranger_of_the_same_name_waits_for_a_lease() -> None:
     async def main() -> None:
         trial = Trial()

@@ -80,6 +80,7 @@ class Lease:
         self._note = note
         self._nonce = uuid.uuid4().hex
         self._watched: list[SeenRevision | None] = [None] * len(buckets)
+        self._newest = 0  # session of this process: no number is used twice, whatever others write
         self._ended: set[int] = set()  # paths that others have ended in this session, for good
 
     # ---- what others ask ----
@@ -138,9 +139,10 @@ class Lease:
         if len(free) < self.terms.needed:
             self.trouble = self._rival(known)
             return False
-        session = 1 + max(record.value["session"] if record.value else 0 for record in known.values())
+        session = 1 + max(self._newest, *(map(_least_session, known.values())))
         self._nonce, self._ended = uuid.uuid4().hex, set()
-        self.session, self.began_ms = session, time.time_ns() // 1_000_000
+        self.session = self._newest = session
+        self.began_ms = time.time_ns() // 1_000_000
         await asyncio.gather(*(self._take(path, record) for path, record in free.items()))
         if self.is_over:
             await self.end()
@@ -288,3 +290,8 @@ class Lease:
                 await self._buckets[path].put(self.name, value, revision)
 
         await asyncio.gather(*(write(path, mine.revision) for path, mine in enumerate(held) if mine))
+
+
+def _least_session(record: Record) -> int:
+    """Return a number that no session before was above, also where somebody has written nonsense."""
+    return int(record.value["session"]) if record.value else record.revision

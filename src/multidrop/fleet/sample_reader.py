@@ -18,11 +18,16 @@ from multidrop.fleet.batch_client import (
 )
 from multidrop.fleet.samples_stream import ANSWER_S, LOST, SEQUENCE, STREAM, StreamError, number_of, silent
 
+BY_SERVER = b"\r\nNats-Stream: "  # of each message that a server gives out of a stream
 SUBJECT = f"$JS.API.DIRECT.GET.{STREAM}"
 
 
 class StreamMessage(NamedTuple):
-    """A message as the hub reads it; `sequence` 0 stands for a header that is missing or no number."""
+    """A message as the hub reads it; `sequence` 0 stands for a header that is missing or no number.
+
+    It is 0 too for an answer of a server: whoever may ask for a stored message may have it sent anywhere, and
+    so into the stream as another gateway's.
+    """
 
     place: int
     gateway: str
@@ -91,7 +96,7 @@ def _stream_message(stored: DirectMessage, headers: bytes) -> StreamMessage:
         stored.sequence,
         gateway,
         log,
-        number_of(last_header(headers, SEQUENCE)),
+        0 if headers.count(BY_SERVER) > 1 else number_of(last_header(headers, SEQUENCE)),
         number_of(last_header(headers, LOST)),
         stored.data,
     )
