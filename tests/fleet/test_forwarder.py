@@ -159,6 +159,29 @@ def test_after_any_doubt_each_message_is_there_once(running: Cluster, tmp_path: 
     asyncio.run(live())
 
 
+def test_answers_of_servers_among_a_logs_messages_are_passed_over(running: Cluster, tmp_path: Path) -> None:
+    """Whoever asks a server anything may have its answer sent there: nothing is sent again, and nothing kept
+    back."""
+
+    async def live() -> None:
+        spool = filled(tmp_path / "spool", 2)
+        subject = subject_of("gateway-1", spool.log)
+        answers = [{}, {"Nats-Stream": "KV_own_0", samples_stream.SEQUENCE: "99"}]
+        async with client_of(running) as client, forwarding(spool, client) as forwarder:
+            await until(lambda: forwarder.state().last == 2)
+            for number, headers in enumerate(answers, 3):
+                assert await publish(client, subject, b"{}", headers)
+                spool.append(numbered(number * 5, 5))
+                assert await asyncio.to_thread(spool.sync, PATIENCE_S)
+                await until(lambda number=number: forwarder.state().last == number)
+            assert (forwarder.state().sent, spool.state().acknowledged) == (4, 4)
+            sequences = [one.sequence for one in await stored(client) if one.data != b"{}"]
+            assert sequences == [1, 2, 3, 4]
+        spool.close()
+
+    asyncio.run(live())
+
+
 class Refusing:
     """A client to whose first messages the stream says that it has no room, as full servers do."""
 

@@ -16,9 +16,17 @@ from multidrop.fleet.batch_client import (
     last_header,
     stored_message,
 )
-from multidrop.fleet.samples_stream import ANSWER_S, LOST, SEQUENCE, STREAM, StreamError, number_of, silent
+from multidrop.fleet.samples_stream import (
+    ANSWER_S,
+    BY_SERVER,
+    LOST,
+    SEQUENCE,
+    STREAM,
+    StreamError,
+    number_of,
+    silent,
+)
 
-BY_SERVER = b"\r\nNats-Stream: "  # of each message that a server gives out of a stream
 SUBJECT = f"$JS.API.DIRECT.GET.{STREAM}"
 
 
@@ -96,7 +104,7 @@ def _stream_message(stored: DirectMessage, headers: bytes) -> StreamMessage:
         stored.sequence,
         gateway,
         log,
-        0 if headers.count(BY_SERVER) > 1 else number_of(last_header(headers, SEQUENCE)),
+        0 if headers.count(f"\r\n{BY_SERVER}: ".encode()) > 1 else number_of(last_header(headers, SEQUENCE)),
         number_of(last_header(headers, LOST)),
         stored.data,
     )

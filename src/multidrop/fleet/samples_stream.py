@@ -23,6 +23,7 @@ from multidrop.fleet.servers import OLDEST
 
 STREAM = "samples"
 SEQUENCE, DIGEST, LOST = "Multidrop-Sequence", "Multidrop-Digest", "Multidrop-Lost"
+BY_SERVER = "Nats-Stream"  # a header of each message that a server gives out of a stream
 EXPECTED = "Nats-Expected-Last-Subject-Sequence"
 ANSWER_S = 5.0  # for an answer: a new leader takes 4 to 9 s, so that is asked again
 NO_MESSAGE, NO_STREAM, WRONG_SEQUENCE = 10037, 10059, 10071  # error codes of JetStream
@@ -49,7 +50,10 @@ class StreamAbout(NamedTuple):
 
 
 class LastMessage(NamedTuple):
-    """The newest message of a subject: its place in the stream, its number in the log, its digest."""
+    """The newest message of a subject: its place in the stream, its number in the log, its digest.
+
+    The number is 0 where it is none of a gateway, but an answer of a server that somebody had sent there.
+    """
 
     place: int
     sequence: int
@@ -152,7 +156,8 @@ async def last_of(client: Client, subject: str) -> LastMessage | None:
         message = found["message"]
         lines = base64.b64decode(message.get("hdrs", "")).decode("utf-8", "replace").splitlines()
         headers = {name.strip(): value.strip() for name, _, value in (line.partition(":") for line in lines)}
-        return LastMessage(int(message["seq"]), number_of(headers.get(SEQUENCE)), headers.get(DIGEST, ""))
+        number = 0 if BY_SERVER in headers else number_of(headers.get(SEQUENCE))
+        return LastMessage(int(message["seq"]), number, headers.get(DIGEST, ""))
 
 
 async def publish(client: Client, subject: str, data: bytes, headers: dict[str, str]) -> int | None:
