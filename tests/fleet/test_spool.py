@@ -308,13 +308,15 @@ def test_a_full_disk_takes_what_was_forwarded_first(folder: Path, monkeypatch: p
 
 
 @pytest.mark.slow
-def test_a_full_disk_does_not_take_the_newest_message_which_says_what_comes_next(
-    folder: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(("acknowledged", "left"), [(None, [1, 2, 3]), (0, [1, 2, 3]), (1, [2, 3]), (3, [3])])
+def test_a_full_disk_takes_neither_what_the_stream_lacks_nor_the_newest_which_says_what_comes_next(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, acknowledged: int | None, left: list[int]
 ) -> None:
     monkeypatch.setattr(spool_module, "AGAIN_S", 0.001)
     filled(folder, 3)
     spool = Spool(folder, GATEWAY)
-    spool.acknowledge(3)
+    if acknowledged is not None:
+        spool.acknowledge(acknowledged)
     attempts, really = [0], spool._remove_acknowledged
 
     def counted() -> None:
@@ -325,10 +327,10 @@ def test_a_full_disk_does_not_take_the_newest_message_which_says_what_comes_next
     with full_at(100):
         spool.append(numbered(15, 5))
         until(lambda: attempts[0] > 5)
-        assert [path.name[:12] for path in sorted(folder.glob("*.arrows"))] == ["000000000003"]
+        assert [int(path.name[:12]) for path in sorted(folder.glob("*.arrows"))] == left
     assert spool.sync(30.0)
     spool.close()
-    assert spool.state().newest == 4
+    assert (spool.state().newest, spool.state().lost) == (4, 0)
 
 
 def test_a_disk_that_stands_still_holds_nobody_up(spool: Spool, monkeypatch: pytest.MonkeyPatch) -> None:
