@@ -85,7 +85,7 @@ def test_a_renewal_counts_from_what_was_sent() -> None:
 
 
 def test_a_taking_that_was_stored_and_not_answered_counts_for_nothing_until_it_is_renewed() -> None:
-    """When it was sent is not known any more."""
+    """The moment of its sending is not known any more."""
 
     async def main() -> None:
         trial = Trial()
@@ -594,7 +594,7 @@ def test_what_is_judged_is_what_is_ended() -> None:
 
 
 def test_a_record_that_was_read_and_not_judged_yet_is_not_stale() -> None:
-    """Of many records some are read while others are asked for; a gateway may be judged in between."""
+    """Some records are read while others are asked for; a gateway may be judged in between."""
 
     async def main() -> None:
         trial = Trial()
