@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import os
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -20,6 +21,7 @@ from multidrop import Seen, Stopped, read_audit
 
 require_module("nats")
 
+from multidrop.fleet import command_log  # noqa: E402
 from multidrop.fleet.command_desk import MOST_WRITES  # noqa: E402
 from multidrop.fleet.command_words import (  # noqa: E402
     CommandAnswer,
@@ -115,6 +117,36 @@ def _is_held_up(desk: Desks) -> None:
     assert answer.outcome is NOT_SENT
     assert "did not come within" in answer.text
     assert desk.writes == []
+
+
+def test_what_a_stop_makes_void_on_its_way_to_the_drive_is_not_sent(tmp_path: Path) -> None:
+    """The library asks again right before it sends."""
+    with desks(tmp_path) as desk:
+        token = desk.offered()
+        offer = desk.desk.offers.find(token)
+        assert offer is not None
+        work = offer.prepared.work
+
+        def made_void() -> CommandAnswer:
+            desk.desk.offers.void(LINE, ["pump"], "a stop was called")
+            return work()
+
+        offer.prepared = offer.prepared._replace(work=made_void)
+        assert asyncio.run(desk.do(token)).outcome is NOT_SENT
+        assert desk.writes == []
+
+
+def test_a_command_is_on_the_disk_before_it_is_sent(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with desks(tmp_path) as desk:
+        synced: list[tuple[int, int]] = []  # lines of the log, and writes that the drive had by then
+
+        def sync(file: int) -> None:
+            os.fsync(file)
+            synced.append((len(desk.notes), len(desk.writes)))
+
+        monkeypatch.setattr(command_log, "_sync", sync)
+        assert asyncio.run(desk.do(desk.offered())).is_done
+        assert synced == [(1, 0), (2, 1)]
 
 
 def while_noted(desk: Desks, deed: Callable[[], object]) -> CommandAnswer:

@@ -8,6 +8,7 @@ import threading
 import unittest.mock
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -39,6 +40,7 @@ class HeardPath:
 
         class Asked:
             data = json.dumps({"id": "one", "by": "anna", **what}).encode()
+            reply = "_INBOX.anna.1"
 
             async def respond(self, data: bytes) -> None:
                 answered.set_result(data)
@@ -93,6 +95,32 @@ def test_a_line_that_is_let_go_answers_for_its_stops_until_it_is_closed(tmp_path
 
     with desks(tmp_path) as made:
         asyncio.run(main())
+
+
+def test_a_stop_is_carried_out_and_answered_to_an_inbox_alone(tmp_path: Path) -> None:
+    """An answer that goes to a record of the plant would take its line from all gateways."""
+    answered: list[str] = []
+
+    async def main() -> None:
+        path = HeardPath()
+        subjects = CommandSubjects("gw-1", [path], made.lines, made.log)  # type: ignore[list-item]
+        subjects.open(LINE, {"may": MAY})
+        await settled(subjects)
+        for number, reply in enumerate(("$KV.plant.line-1", "", "_INBOX_UABC.1")):
+
+            async def respond(data: bytes, reply: str = reply) -> None:
+                answered.append(reply)
+
+            data = json.dumps({"id": f"stop {number}", "by": "anna", "drives": None}).encode()
+            await path.heard[names.stop_subject(LINE)](
+                SimpleNamespace(data=data, subject="", reply=reply, respond=respond)
+            )
+            await settled(subjects)
+            assert "control" in made.written
+
+    with desks(tmp_path) as made:
+        asyncio.run(main())
+    assert answered == ["_INBOX_UABC.1"]
 
 
 @pytest.mark.parametrize("may_wait", [True, False])

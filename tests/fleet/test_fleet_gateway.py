@@ -32,8 +32,9 @@ PATIENCE_S = 60.0
 class Asked:
     """A request, and the answers to it."""
 
-    def __init__(self, wanted: str) -> None:
+    def __init__(self, wanted: str, reply: str = "_INBOX.asker.1") -> None:
         self.subject = names.gateway_subject("gw-1", wanted)
+        self.reply = reply
         self.answers: list[dict[str, Any]] = []
 
     async def respond(self, data: bytes) -> None:
@@ -54,6 +55,27 @@ def test_who_waits_for_the_session_of_another_of_its_name_answers_nothing(tmp_pa
         asked = Asked("state")
         await gateway._answer(asked)
         assert [answer["session"] for answer in asked.answers] == [7]
+        await gateway._close()
+
+    asyncio.run(main())
+
+
+def test_whose_answer_would_go_elsewhere_than_to_an_inbox_is_not_heard(tmp_path: Path) -> None:
+    """The servers let it go there: a record of the plant is what its asker may not write. And an answer of a
+    server to somebody's request, sent here, has no inbox."""
+
+    async def main() -> None:
+        gateway = FleetGateway("gw-1", ["nats://127.0.0.1:1"], tmp_path)
+        gateway.member.lease.session = 7
+        for reply in ("", "$KV.plant.line-1", "stop.line-1", "samples.gw-2.log", "_INBOX", "_INBOXES.a"):
+            for wanted in ("state", "drain"):
+                asked: Any = Asked(wanted, reply)
+                await gateway._answer(asked)
+                assert (asked.answers, gateway.member.is_draining) == ([], False)
+        asked = Asked("drain", "_INBOX_UABC.1")
+        await gateway._answer(asked)
+        assert gateway.member.is_draining
+        assert asked.answers
         await gateway._close()
 
     asyncio.run(main())

@@ -5,8 +5,9 @@ from __future__ import annotations
 import asyncio
 import itertools
 import logging
+import os
 from collections.abc import Iterator, Mapping
-from contextlib import suppress
+from contextlib import closing, suppress
 from pathlib import Path
 from typing import Any
 
@@ -285,6 +286,29 @@ def commit_of(
     return Commit(stream, first, last, sources or {"a.x": last}, [table], len(table))
 
 
+def test_a_commit_has_its_name_once_it_is_on_the_disk(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The order of calls to the system is what a power cut would show."""
+    calls: list[str] = []
+    really_synced, really_renamed = os.fsync, Path.rename
+
+    def fsync(file: int) -> None:
+        calls.append(f"fsync {Path(f'/proc/self/fd/{file}').readlink().name[:9]}")
+        really_synced(file)
+
+    def rename(path: Path, other: Path) -> Path:
+        calls.append(f"rename {path.name[:9]}")
+        return really_renamed(path, other)
+
+    with closing(ParquetSink(tmp_path)) as sink:
+        sink.begin("then")
+        monkeypatch.setattr(os, "fsync", fsync)
+        monkeypatch.setattr(Path, "rename", rename)
+        sink.write(commit_of())
+    assert calls == ["fsync .00000001", "rename .00000001", "fsync rows"]
+
+
 def test_a_folder_of_another_stream_or_program_is_refused(tmp_path: Path) -> None:
     sink = ParquetSink(tmp_path)
     assert sink.begin("then") == KeptPlace(0, {})
@@ -409,8 +433,9 @@ def test_rows_behind_a_place_that_another_hub_has_moved_are_refused(empty: Postg
     sink = PostgresSink(empty.where)
     sink.begin("then")
     empty.ask("update multidrop.hub set place = 7 returning place")
-    with pytest.raises(SinkError, match="another hub writes into this database: end one of them"):
-        sink.write(commit_of())
+    for first in (1, 7, 9):  # behind it, and where messages would be passed over
+        with pytest.raises(SinkError, match="another hub writes into this database: end one of them"):
+            sink.write(commit_of(first=first, last=first))
     sink.close()
     assert empty.ask("select count(*) from multidrop.exchanges") == [(0,)]
 

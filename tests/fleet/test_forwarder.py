@@ -23,16 +23,15 @@ from multidrop.fleet import forwarder as forwarder_module
 from multidrop.fleet import samples_stream
 from multidrop.fleet.forwarder import Forwarder
 from multidrop.fleet.message import MOST_BYTES, unpack
+from multidrop.fleet.sample_reader import StreamMessage, read_after
 from multidrop.fleet.samples_stream import (
     StreamError,
-    StreamMessage,
     about,
     connect,
     create_stream,
     digest_of,
     last_of,
     publish,
-    read_after,
     subject_of,
 )
 from multidrop.fleet.spool import Spool
@@ -155,6 +154,29 @@ def test_after_any_doubt_each_message_is_there_once(running: Cluster, tmp_path: 
             await until(lambda: forwarder.state().last == 6)
             await asyncio.sleep(0.1)  # for late ones to be refused
             assert [one.sequence for one in await stored(client)] == [1, 2, 3, 4, 5, 6]
+        spool.close()
+
+    asyncio.run(live())
+
+
+def test_answers_of_servers_among_a_logs_messages_are_passed_over(running: Cluster, tmp_path: Path) -> None:
+    """Whoever asks a server anything may have its answer sent there: nothing is sent again, and nothing kept
+    back."""
+
+    async def live() -> None:
+        spool = filled(tmp_path / "spool", 2)
+        subject = subject_of("gateway-1", spool.log)
+        answers = [{}, {"Nats-Stream": "KV_own_0", samples_stream.SEQUENCE: "99"}]
+        async with client_of(running) as client, forwarding(spool, client) as forwarder:
+            await until(lambda: forwarder.state().last == 2)
+            for number, headers in enumerate(answers, 3):
+                assert await publish(client, subject, b"{}", headers)
+                spool.append(numbered(number * 5, 5))
+                assert await asyncio.to_thread(spool.sync, PATIENCE_S)
+                await until(lambda number=number: forwarder.state().last == number)
+            assert (forwarder.state().sent, spool.state().acknowledged) == (4, 4)
+            sequences = [one.sequence for one in await stored(client) if one.data != b"{}"]
+            assert sequences == [1, 2, 3, 4]
         spool.close()
 
     asyncio.run(live())

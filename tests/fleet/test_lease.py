@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 from controlled_loop import run_controlled
-from fleets import HandClock, MemoryBucket, NotedMastership
+from fleets import GatedBucket, HandClock, MemoryBucket, NotedMastership
 from peers import require_module
 from tables import table
 
@@ -64,6 +64,43 @@ def test_a_session_begins_on_all_paths_and_counts_from_what_was_sent() -> None:
         assert lease.session == 1
         assert lease.until <= began + 0.25 * SECOND + USUAL.lease
         assert trial.masterships[0].until == lease.until
+
+    asyncio.run(main())
+
+
+def test_a_renewal_counts_from_what_was_sent() -> None:
+    async def main() -> None:
+        trial = Trial()
+        lease = trial.lease()
+        assert await lease.try_to_begin()
+        trial.clock.pass_s(1)
+        sent = trial.clock.now
+        for bucket in trial.buckets:
+            bucket.before_put = lambda key: trial.clock.pass_s(0.25)
+        await lease.renew_once(0)
+        await lease.renew_once(1)
+        assert lease.until == trial.masterships[0].until == sent + USUAL.lease
+
+    asyncio.run(main())
+
+
+def test_a_taking_that_was_stored_and_not_answered_counts_for_nothing_until_it_is_renewed() -> None:
+    """The moment of its sending is not known any more."""
+
+    async def main() -> None:
+        trial = Trial()
+        trial.buckets[2].loses_answers = True
+        lease, began = trial.lease(), trial.clock.now
+        assert await lease.try_to_begin()
+        trial.buckets[2].loses_answers = False
+        trial.clock.pass_s(1)
+        await lease.renew_once(2)  # finds its record
+        assert lease.held[2] is not None
+        trial.clock.pass_s(0.5)
+        await lease.renew_once(1)
+        assert lease.until == began + USUAL.lease
+        await lease.renew_once(2)
+        assert lease.until == began + 1.5 * SECOND + USUAL.lease
 
     asyncio.run(main())
 
@@ -140,8 +177,10 @@ def test_a_renewal_without_an_answer_is_found_again_and_not_counted() -> None:
         for bucket in trial.buckets:
             bucket.loses_answers = True
         trial.clock.pass_s(1)
-        await renew(lease)
-        assert lease.until == until
+        for _ in range(2):
+            await renew(lease)
+            lease._extend()  # as after the next answer
+            assert lease.until == until
         for bucket in trial.buckets:
             bucket.loses_answers = False
         await renew(lease)
@@ -171,6 +210,74 @@ def test_a_late_answer_of_an_earlier_session_is_not_counted() -> None:
     asyncio.run(main())
 
 
+def test_renewals_that_are_stored_but_not_answered_when_a_session_ends_begin_nothing() -> None:
+    """Else the engine might send again, and the kernel's timer would run for a gateway without a session."""
+
+    async def main() -> None:
+        trial = Trial()
+        gates = [GatedBucket(f"lease_{path}", answers=True) for path in range(3)]
+        trial.buckets = [*gates]
+        lease = trial.lease()
+        assert await lease.try_to_begin()
+        trial.clock.pass_s(1)
+        for bucket in gates:
+            bucket.shut()
+        renewals = [asyncio.create_task(lease.renew_once(path)) for path in range(3)]
+        await asyncio.gather(*(bucket.arrived.wait() for bucket in gates))
+        await lease.end()
+        for bucket in gates:
+            bucket.open()
+        await asyncio.gather(*renewals)
+        assert (lease.until, lease.held) == (0, [None, None, None])
+        assert trial.masterships[0].events == ["extend", "end"]
+
+    asyncio.run(main())
+
+
+def test_a_late_path_of_an_ended_session_is_none_of_the_next_one() -> None:
+    async def main() -> None:
+        trial = Trial()
+        late = GatedBucket("lease_2", answers=True)
+        trial.buckets[2] = late
+        late.is_down = True
+        lease = trial.lease()
+        assert await lease.try_to_begin()
+        late.is_down = False
+        late.shut()
+        taking = asyncio.create_task(lease.renew_once(2))
+        await late.arrived.wait()
+        await lease.end()
+        assert await lease.try_to_begin()
+        before = lease.held[2]
+        late.open()
+        await taking
+        assert trial.values()[2]["session"] == 1
+        assert before is None
+        assert lease.held[2] is None
+
+    asyncio.run(main())
+
+
+def test_who_stands_still_between_the_clock_and_the_kernels_timer_goes_on() -> None:
+    """A timer that is set to the past would kill; the engine refuses it, and nothing else happens."""
+
+    class StandingStill(NotedMastership):
+        def extend(self, until_ns: int) -> None:
+            self.clock.pass_s(3)
+            raise ValueError("past")
+
+    async def main() -> None:
+        trial = Trial()
+        lease = trial.lease()
+        lease._mastership = StandingStill(trial.clock)
+        assert await lease.try_to_begin()
+        await renew(lease)
+        assert lease.until == 0
+        assert not lease.is_valid
+
+    asyncio.run(main())
+
+
 def test_sessions_are_numbered_by_the_record_and_by_no_clock() -> None:
     """CLOCK_BOOTTIME begins anew when a machine does."""
 
@@ -184,6 +291,33 @@ def test_sessions_are_numbered_by_the_record_and_by_no_clock() -> None:
         assert await after.try_to_begin()
         assert after.session == 2
         assert [value["session"] for value in trial.values()] == [2, 2, 2]
+
+    asyncio.run(main())
+
+
+def test_no_number_of_a_session_is_used_twice_whatever_others_write() -> None:
+    """Else lines that others know to be nobody's would be those of a session that polls them."""
+
+    async def main() -> None:
+        trial = Trial()
+        lease = trial.lease()
+        for number in (1, 2, 3):
+            assert await lease.try_to_begin()
+            assert lease.session == number
+            old = trial.values()[0]
+            await lease.end()
+        for bucket in trial.buckets:
+            bucket.store("a", {**old, "session": 1, "ended": True})
+        assert await lease.try_to_begin()
+        assert lease.session == 4
+        await lease.end()
+        for bucket in trial.buckets:
+            bucket.store("a", None)  # as a record that is none of ours is read
+        after, newest = trial.lease(), trial.buckets[0].last  # of another process
+        assert not await after.try_to_begin()
+        trial.clock.pass_s(USUAL.lease / SECOND)
+        assert await after.try_to_begin()
+        assert after.session == newest + 1 > 4
 
     asyncio.run(main())
 
@@ -212,6 +346,24 @@ def test_a_stranger_of_the_same_name_waits_for_a_lease() -> None:
     asyncio.run(main())
 
 
+def test_one_path_that_is_free_is_not_taken() -> None:
+    """Else a gateway that waits would take the paths of another one of its name one after the other."""
+
+    async def main() -> None:
+        trial = Trial()
+        first, second = trial.lease(), trial.lease()
+        assert await first.try_to_begin()
+        for _ in range(8):
+            assert not await second.try_to_begin()
+            trial.clock.pass_s(0.5)
+            await first.renew_once(0)
+            await first.renew_once(2)
+        assert [value["nonce"] for value in trial.values()] == [first._nonce] * 3
+        assert first.is_valid
+
+    asyncio.run(main())
+
+
 def test_two_that_begin_at_once_are_never_both_valid() -> None:
     async def main() -> None:
         trial = Trial()
@@ -219,6 +371,35 @@ def test_two_that_begin_at_once_are_never_both_valid() -> None:
         begun = await asyncio.gather(first.try_to_begin(), second.try_to_begin())
         assert sum(begun) == 1
         assert [first.is_valid, second.is_valid] == begun
+
+    asyncio.run(main())
+
+
+def test_a_session_that_has_not_begun_takes_no_path_that_another_one_lives_by() -> None:
+    """The first one's renewal of path 0 comes before the second one's taking of it; path 2 was renewed all
+    the time."""
+
+    async def main() -> None:
+        trial = Trial()
+        gate = trial.buckets[0] = GatedBucket("lease_0")
+        first, second = trial.lease(), trial.lease()
+        assert await first.try_to_begin()
+        for _ in range(5):
+            assert not await second.try_to_begin()
+            trial.clock.pass_s(0.5)
+            await first.renew_once(2)
+        assert not first.is_valid
+        gate.shut()
+        beginning = asyncio.create_task(second.try_to_begin())
+        await gate.arrived.wait()
+        await first.renew_once(0)
+        await second.renew_once(2)
+        gate.open()
+        assert not await beginning
+        assert first.is_valid
+        await renew(first)
+        assert first.is_valid
+        assert not second.is_valid
 
     asyncio.run(main())
 
@@ -292,6 +473,52 @@ def test_two_machines_without_an_id_prove_nothing_to_each_other(
     asyncio.run(main())
 
 
+def test_a_copy_of_a_disk_proves_nothing_and_neither_does_a_machine_that_was_started_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The machine's id, the path and the lock's own id are copied; the kernel's boot is not."""
+
+    async def main() -> None:
+        trial = Trial()
+        machine, boot = tmp_path / "machine-id", tmp_path / "boot_id"
+        machine.write_text("copied\n", "utf-8")
+        boot.write_text("first\n", "utf-8")
+        monkeypatch.setattr(life_lock, "IDS", (machine, boot))
+        lock = LifeLock(tmp_path / "a.lock")
+        assert await trial.lease(lock=lock).try_to_begin()
+        lock.close()
+        boot.write_text("second\n", "utf-8")
+        with closing(LifeLock(tmp_path / "a.lock")) as lock:
+            assert not await trial.lease(lock=lock).try_to_begin()
+            boot.write_text("first\n", "utf-8")
+            assert await trial.lease(lock=lock).try_to_begin()
+
+    asyncio.run(main())
+
+
+def test_a_machines_id_has_the_kernels_boot_in_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    own = tmp_path / "machine-id"
+    own.write_text("of a trial", "utf-8")
+    monkeypatch.setattr(life_lock, "IDS", (own, *life_lock.IDS[1:]))
+    boot = Path("/proc/sys/kernel/random/boot_id").read_text("ascii").strip()
+    assert life_lock.machine_id() == f"of a trial.{boot}"
+
+
+@pytest.mark.parametrize("empty", [0, 1])
+def test_without_one_of_its_ids_a_machine_has_none(
+    empty: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ids = (tmp_path / "machine-id", tmp_path / "boot_id")
+    for path in ids:
+        path.write_text("something\n", "utf-8")
+    monkeypatch.setattr(life_lock, "IDS", ids)
+    assert life_lock.machine_id() == "something.something"
+    ids[empty].write_text("\n", "utf-8")
+    assert life_lock.machine_id() == ""
+    ids[empty].unlink()
+    assert life_lock.machine_id() == ""
+
+
 # ---- those who watch ----
 
 
@@ -362,6 +589,42 @@ def test_what_is_judged_is_what_is_ended() -> None:
         assert not observer.is_over("a", 1)
         await renew(lease)
         assert not lease.is_over
+
+    asyncio.run(main())
+
+
+def test_a_record_that_was_read_and_not_judged_yet_is_not_stale() -> None:
+    """Some records are read while others are asked for; a gateway may be judged in between."""
+
+    async def main() -> None:
+        trial = Trial()
+        lease, observer = trial.lease(), trial.observer()
+        assert await lease.try_to_begin()
+        await look(observer)
+        trial.clock.pass_s(USUAL.lease / SECOND)
+        await look(observer)
+        assert [*observer.dead()] == ["a"]
+        await renew(lease)
+        for path in range(2):
+            observer.paths[path].take(trial.buckets[path].records["a"])
+        assert not observer.dead()
+        assert not await observer.end_the_dead()
+
+    asyncio.run(main())
+
+
+def test_nobody_ends_himself() -> None:
+    """Such an end would count for all others at once."""
+
+    async def main() -> None:
+        trial = Trial()
+        lease, observer = trial.lease("b"), trial.observer("b")
+        assert await lease.try_to_begin()
+        await look(observer)
+        trial.clock.pass_s(2 * USUAL.lease / SECOND)
+        await look(observer)
+        assert not await observer.end_the_dead()
+        assert not any(value["ended"] for value in trial.values("b"))
 
     asyncio.run(main())
 
@@ -624,6 +887,40 @@ def test_a_path_that_was_down_at_the_beginning_is_taken_later() -> None:
         trial.buckets[2].is_down = False
         await renew(lease)
         assert lease.held[2] is not None
+
+    asyncio.run(main())
+
+
+def test_a_path_with_another_beginning_of_the_same_number_is_taken_later() -> None:
+    """A gateway of this name that died while it began has left it; two paths are ours, so it is over."""
+
+    async def main() -> None:
+        trial = Trial()
+        trial.buckets[2].is_down = True
+        lease = trial.lease()
+        assert await lease.try_to_begin()
+        trial.buckets[2].is_down = False
+        trial.buckets[2].store("a", {**trial.buckets[0].records["a"].value, "nonce": "of another"})
+        await renew(lease)
+        assert lease.held[2] is not None
+        assert trial.values()[2]["nonce"] == trial.values()[0]["nonce"]
+
+    asyncio.run(main())
+
+
+def test_a_path_that_was_ended_before_its_taking_was_known_makes_a_session_weak() -> None:
+    async def main() -> None:
+        trial = Trial()
+        trial.buckets[2].loses_answers = True
+        lease = trial.lease()
+        assert await lease.try_to_begin()
+        assert lease.held[2] is None
+        trial.buckets[2].loses_answers = False
+        trial.buckets[2].store("a", {**trial.values()[2], "ended": True, "by": "b"})
+        assert not lease.is_weak
+        await renew(lease)
+        assert lease.held[2] is None
+        assert lease.is_weak
 
     asyncio.run(main())
 

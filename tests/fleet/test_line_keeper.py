@@ -19,7 +19,7 @@ from multidrop.fleet.buckets import Record  # noqa: E402
 from multidrop.fleet.lease import Lease  # noqa: E402
 from multidrop.fleet.lease_rules import SECOND, USUAL  # noqa: E402
 from multidrop.fleet.line_keeper import LineKeeper  # noqa: E402
-from multidrop.fleet.ownership import owner_of  # noqa: E402
+from multidrop.fleet.ownership import owner_of, owner_value  # noqa: E402
 from multidrop.fleet.share_records import ShareRecords  # noqa: E402
 
 
@@ -73,6 +73,85 @@ def test_a_claimed_line_takes_stops_at_once_and_commands_when_the_guard_is_over(
         assert may() == (True, True)
         trial.clock.pass_s(USUAL.lease / SECOND)
         assert may() == (False, False)
+
+    asyncio.run(main())
+
+
+def test_a_line_that_another_has_by_its_record_takes_neither_stops_nor_commands() -> None:
+    """It is about to be let go, and its new master answers."""
+
+    async def main() -> None:
+        trial = Trial()
+        await trial.claim()
+        trial.clock.pass_s(1)
+        assert trial.keeper.may_command("hall")
+        before = trial.records.owner("hall")
+        assert before
+        trial.records.owners[names.owner_bucket("hall")].take(
+            Record("hall", before.revision + 1, owner_value("b", 1, 0))
+        )
+        assert "hall" in trial.keeper.polled
+        assert not trial.keeper.may_stop("hall")
+        assert not trial.keeper.may_command("hall")
+
+    asyncio.run(main())
+
+
+def test_lines_are_let_go_while_there_is_time_to_close_them() -> None:
+    async def main() -> None:
+        trial = Trial()
+        await trial.claim()
+        trial.clock.pass_s(USUAL.lease / SECOND - line_keeper.SILENT_S - 0.001)
+        trial.keeper.reconcile()
+        assert trial.keeper.polled
+        assert not trial.keeper._at_work
+        trial.clock.pass_s(0.001)
+        assert trial.lease.is_valid
+        trial.keeper.reconcile()
+        await until(lambda: trial.keeper.is_silent)
+        assert trial.lines.taken == set()
+
+    asyncio.run(main())
+
+
+def test_what_waited_until_the_lease_was_over_is_neither_opened_nor_written() -> None:
+    async def main() -> None:
+        trial = Trial()
+        bucket: Any = trial.records.owners[names.owner_bucket("hall")].bucket
+        writing = trial.keeper._writing[bucket.name] = asyncio.Semaphore(0)
+        openings = trial.keeper._openings = asyncio.Semaphore(0)
+        assert await trial.lease.try_to_begin()
+        trial.keeper.claim({"hall": 0})
+        await asyncio.sleep(0)
+        trial.clock.pass_s(USUAL.lease / SECOND)
+        writing.release()
+        await until(lambda: trial.keeper.is_silent)
+        assert bucket.records == {}
+        for path in range(3):
+            await trial.lease.renew_once(path)
+        trial.keeper.claim({"hall": 0})
+        await until(lambda: bool(trial.records.owner("hall")))
+        trial.clock.pass_s(USUAL.lease / SECOND)
+        openings.release()
+        await until(lambda: trial.keeper.is_silent)
+        assert trial.lines.taken == set()
+
+    asyncio.run(main())
+
+
+def test_a_line_that_became_anothers_while_it_waited_is_not_opened() -> None:
+    async def main() -> None:
+        trial = Trial()
+        openings = trial.keeper._openings = asyncio.Semaphore(0)
+        assert await trial.lease.try_to_begin()
+        trial.keeper.claim({"hall": 0})
+        await until(lambda: bool(trial.records.owner("hall")))
+        trial.records.owners[names.owner_bucket("hall")].take(Record("hall", 9, owner_value("b", 1, 0)))
+        openings.release()
+        await until(lambda: trial.keeper.is_silent)
+        assert trial.lines.taken == set()
+
+    asyncio.run(main())
 
 
 def test_a_line_that_is_let_go_takes_no_stops() -> None:

@@ -125,3 +125,80 @@ def test_damaged_bytes_end_in_a_sentence() -> None:
             unpack(message.data[:length])
     with pytest.raises(MessageError):
         unpack(b"no Arrow at all")
+
+
+def named(*names: str | None) -> pa.DictionaryArray:
+    return pa.array(names, pa.utf8()).dictionary_encode()
+
+
+def times(*ns: int | None) -> pa.Array:
+    return pa.array(ns, pa.int64()).cast(pa.timestamp("ns", "UTC"))
+
+
+NAMELESS = pa.DictionaryArray.from_arrays(pa.array([0, 1], pa.int32()), pa.array(["a", None]))
+
+
+def written(**other: pa.Array) -> bytes:
+    """Return a message of two rows as another writer than ours would write it, with these columns."""
+    columns = {
+        "time": times(UTC_0, UTC_0),
+        "clock_ns": pa.array([5, 5], pa.int64()),
+        "uncertainty_us": pa.array([1, 2], pa.int32()),
+        "drive": named("fan", "fan"),
+        "register": named("speed", "torque"),
+        "value": pa.array([1.0, 2.0]),
+        "status": named("ok", "ok"),
+        "unit": named("Hz", None),
+    }
+    rows = pa.RecordBatch.from_pydict(columns | other)
+    sink = pa.BufferOutputStream()
+    with pa.ipc.new_stream(sink, rows.schema) as writer:
+        writer.write_batch(rows)
+    return bytes(sink.getvalue())
+
+
+@table(
+    ("column", "rows", "said"),
+    [
+        ("time", times(None, UTC_0), "its time is missing in some rows"),
+        ("clock_ns", pa.array([None, 5], pa.int64()), "its monotonic_ns is missing in some rows"),
+        ("drive", named("fan", None), "its drive is missing in some rows"),
+        ("register", named(None, "speed"), "its register is missing in some rows"),
+        ("status", named("ok", None), "its status is missing in some rows"),
+        ("drive", NAMELESS, "one drive has no name"),
+        ("status", NAMELESS, "one status has no name"),
+        ("unit", NAMELESS, "one unit has no name"),
+        ("drive", named("fan\0", "fan"), "one drive has a NUL character"),
+        ("register", named("speed", "\0"), "one register has a NUL character"),
+        ("status", named("ok", "o\0k"), "one status has a NUL character"),
+        ("unit", named("Hz", "\0"), "one unit has a NUL character"),
+        ("drive", named("f" * 1001, "fan"), "one drive is longer than 1000 bytes"),
+        ("register", named("speed", "ü" * 501), "one register is longer than 1000 bytes"),
+        ("uncertainty_us", pa.array([1, 1 << 31], pa.int64()), "Integer value 2147483648 not in range"),
+    ],
+)
+def test_rows_that_no_store_takes_are_no_message(column: str, rows: pa.Array, said: str) -> None:
+    """A hub that could not keep one message would never come to those behind it, of all gateways."""
+    with pytest.raises(MessageError, match=f"bytes are no message of samples: {said}"):
+        unpack(written(**{column: rows}))
+
+
+def test_another_writers_rows_are_rows() -> None:
+    assert rows_of(unpack(written()))[0][3:] == ("fan", "speed", 1.0, "ok", "Hz")
+    assert len(unpack(written(drive=named("ü" * 500, "fan")))) == 2
+
+
+@pytest.mark.slow
+def test_a_message_of_more_rows_than_ours_have_is_none() -> None:
+    many = MOST_ROWS + 1
+    columns = {
+        "time": pa.repeat(times(UTC_0)[0], many),
+        "clock_ns": pa.repeat(5, many),
+        "uncertainty_us": pa.repeat(pa.scalar(1, pa.int32()), many),
+        "value": pa.repeat(1.0, many),
+        **{
+            name: pa.repeat("a", many).dictionary_encode() for name in ("drive", "register", "status", "unit")
+        },
+    }
+    with pytest.raises(MessageError, match="it has 65537 rows, and 65536 are the most"):
+        unpack(written(**columns))

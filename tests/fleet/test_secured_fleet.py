@@ -10,7 +10,7 @@ import sys
 import time
 import urllib.request
 from collections.abc import Callable, Iterator
-from contextlib import suppress
+from contextlib import closing, suppress
 from pathlib import Path
 
 import pytest
@@ -30,11 +30,24 @@ from secured_clusters import (  # noqa: E402
     secured_cluster,
 )
 from secured_fleets import PATIENCE_S, SecuredFleet, multidrop, secured_fleet, until  # noqa: E402
+from spooled import numbered  # noqa: E402
 
 from multidrop.fleet import names  # noqa: E402
 from multidrop.fleet.errors import Conflict  # noqa: E402
 from multidrop.fleet.lease_bucket import LeaseBucket  # noqa: E402
+from multidrop.fleet.sample_reader import StreamMessage, read_after  # noqa: E402
+from multidrop.fleet.samples_stream import (  # noqa: E402
+    DIGEST,
+    LOST,
+    SEQUENCE,
+    connect,
+    digest_of,
+    publish,
+    subject_of,
+)
 from multidrop.fleet.servers import paths_of  # noqa: E402
+from multidrop.fleet.sources import SourceCheck  # noqa: E402
+from multidrop.fleet.spool import Spool  # noqa: E402
 
 AN_HOUR_AHEAD = """
 import time
@@ -113,6 +126,40 @@ def test_what_is_not_ones_right_is_one_sentence(
     if "serve" in words:
         filled += ["--folder", str(tmp_path / "gateway")]
     assert sentence.lower() in told(servers, user, *filled).lower()
+
+
+@pytest.mark.slow
+def test_a_stored_message_that_is_asked_for_into_anothers_samples_is_left_out(
+    servers: SecuredCluster, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """A server sends what is asked for wherever its asker says, with the headers that it was stored with."""
+
+    async def main() -> None:
+        with closing(Spool(tmp_path / "spool", "gw-b")) as spool:
+            spool.append(numbered(0, 10))
+            assert spool.sync(PATIENCE_S)
+            stored = spool.following(0)
+            assert stored
+            data, subject = stored.path.read_bytes(), subject_of("gw-b", spool.log)
+        gateway = await connect(servers.urls, **servers.options("gw-a"))
+        headers = {SEQUENCE: "1", DIGEST: digest_of(data), LOST: "0"}
+        assert await publish(gateway, "$KV.own_0.any", data, headers)
+        wanted = json.dumps({"last_by_subj": "$KV.own_0.any"}).encode()
+        await gateway.publish("$JS.API.DIRECT.GET.KV_own_0", wanted, reply=subject)
+        await gateway.flush()
+        await gateway.close()
+        client = await connect(servers.urls, **servers.options("hub"))
+        found: list[StreamMessage] = []
+        async with asyncio.timeout(PATIENCE_S):
+            while not found:
+                found = await read_after(client, 0, 10, 1 << 20)
+        await client.close()
+        [message] = found
+        assert (message.gateway, message.data, message.sequence) == ("gw-b", data, 0)
+        assert not SourceCheck({}).take(message)
+
+    asyncio.run(asyncio.wait_for(main(), PATIENCE_S))
+    assert "has no number and is left out" in caplog.text
 
 
 def other_ca(servers: SecuredCluster, folder: Path) -> list[str]:

@@ -136,6 +136,24 @@ def test_a_newest_file_cut_at_every_byte_loses_nothing_that_was_stored_before(
         shutil.rmtree(folder)
 
 
+def test_the_number_of_a_message_that_was_put_away_is_not_given_again_after_any_start(folder: Path) -> None:
+    """The stream may have had it whole: another one of this number would be taken for its copy."""
+    filled(folder, 2, exchanges=2)
+    newest = max(folder.glob("*.arrows"))
+    newest.write_bytes(newest.read_bytes()[:100])
+    for _ in range(2):
+        Spool(folder, GATEWAY).close()
+        assert [path.name for path in folder.glob("*.damaged")] == ["000000000002-20.damaged"]
+    spool = Spool(folder, GATEWAY)
+    assert spool.state().newest == 2
+    spool.append(numbered(4, 2))
+    spool.close()
+    assert sorted(path.name for path in folder.glob("*.arrows")) == [
+        "000000000001-20.arrows",
+        "000000000003-20.arrows",
+    ]
+
+
 def _is_whole(data: bytes) -> bool:
     try:
         return len(unpack(data)) == 20
@@ -287,6 +305,32 @@ def test_a_full_disk_takes_what_was_forwarded_first(folder: Path, monkeypatch: p
     spool.close()
     assert exchanges_in(rows_in(folder)) == list(range(10, 20))
     assert spool.state().lost == 0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("acknowledged", "left"), [(None, [1, 2, 3]), (0, [1, 2, 3]), (1, [2, 3]), (3, [3])])
+def test_a_full_disk_takes_neither_what_the_stream_lacks_nor_the_newest_which_says_what_comes_next(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, acknowledged: int | None, left: list[int]
+) -> None:
+    monkeypatch.setattr(spool_module, "AGAIN_S", 0.001)
+    filled(folder, 3)
+    spool = Spool(folder, GATEWAY)
+    if acknowledged is not None:
+        spool.acknowledge(acknowledged)
+    attempts, really = [0], spool._remove_acknowledged
+
+    def counted() -> None:
+        really()
+        attempts[0] += 1
+
+    monkeypatch.setattr(spool, "_remove_acknowledged", counted)
+    with full_at(100):
+        spool.append(numbered(15, 5))
+        until(lambda: attempts[0] > 5)
+        assert [int(path.name[:12]) for path in sorted(folder.glob("*.arrows"))] == left
+    assert spool.sync(30.0)
+    spool.close()
+    assert (spool.state().newest, spool.state().lost) == (4, 0)
 
 
 def test_a_disk_that_stands_still_holds_nobody_up(spool: Spool, monkeypatch: pytest.MonkeyPatch) -> None:

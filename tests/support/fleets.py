@@ -82,6 +82,35 @@ class MemoryBucket:
         return sorted(found, key=lambda record: record.revision)
 
 
+class GatedBucket(MemoryBucket):
+    """A bucket that holds puts up from `shut` until `open`: before they are stored, or only their answers."""
+
+    def __init__(self, name: str = "lease", *, answers: bool = False) -> None:
+        super().__init__(name)
+        self.arrived = asyncio.Event()
+        self._gate: asyncio.Event | None = None
+        self._held: asyncio.Event | None = None
+        self._holds_answers = answers
+
+    def shut(self) -> None:
+        """Hold up the next put alone."""
+        self._gate = asyncio.Event()
+
+    def open(self) -> None:
+        assert self._held is not None
+        self._held.set()
+
+    async def put(self, key: str, value: Any, revision: int) -> int:
+        self._gate, gate = None, self._gate
+        if gate is None:
+            return await super().put(key, value, revision)
+        self._held = gate
+        stored = await super().put(key, value, revision) if self._holds_answers else 0
+        self.arrived.set()
+        await gate.wait()
+        return stored or await super().put(key, value, revision)
+
+
 class NotedMastership:
     """Notes until when the engine may send, and refuses what the engine refuses."""
 

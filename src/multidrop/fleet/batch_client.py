@@ -176,12 +176,15 @@ def stored_message(headers: bytes, data: bytes) -> DirectMessage | None:
 
     The writer's own headers come first, whatever he calls them; the server's are the last ones.
     """
-    subject, sequence = _last(headers, b"\r\nNats-Subject: "), _last(headers, b"\r\nNats-Sequence: ")
-    if not subject or not sequence.isdigit():
+    subject, sequence = last_header(headers, "Nats-Subject"), last_header(headers, "Nats-Sequence")
+    if not subject or not (sequence.isascii() and sequence.isdigit()):
         return None
-    return DirectMessage(subject.decode("utf-8", "replace"), int(sequence), data)
+    return DirectMessage(subject, int(sequence), data)
 
 
-def _last(headers: bytes, name: bytes) -> bytes:
-    at = headers.rfind(name)
-    return headers[at + len(name) : headers.find(b"\r\n", at + len(name))] if at >= 0 else b""
+def last_header(headers: bytes, name: str) -> str:
+    """Return a header's text, the last one's where there are several; "" for none."""
+    sign = f"\r\n{name}: ".encode()
+    at = headers.rfind(sign)
+    found = headers[at + len(sign) : headers.find(b"\r\n", at + len(sign))] if at >= 0 else b""
+    return found.decode("utf-8", "replace")

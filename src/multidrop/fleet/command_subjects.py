@@ -84,7 +84,7 @@ async def _answer(message: Msg, heard: Heard) -> None:
     except Exception:
         _log.exception("a message to %s", message.subject)
         return
-    if answer is None:
+    if answer is None or not names.is_inbox(message.reply):
         return
     data = json.dumps(answer.as_json()).encode() if isinstance(answer, CommandAnswer) else encode(answer)
     with suppress(Exception):  # whoever asked may have gone

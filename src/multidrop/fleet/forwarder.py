@@ -125,10 +125,10 @@ class Forwarder:
         """Return the place and the sequence of the last message that the stream has of this log."""
         last = await last_of(self._client, self._subject)
         end_if_cancelled()
-        if last is None:
-            sequence = self._last or 0  # the stream keeps no message for ever
+        if last is None or last.sequence == 0:  # the stream keeps no message for ever, and others' are none
+            sequence = self._last or 0
             self._have(sequence)
-            return 0, sequence
+            return (last.place if last else 0), sequence
         if last.sequence > self._spool.state().newest:
             raise NotOurLog(SET_BACK.format(last.sequence, self._spool.log, "no such message"))
         stored = self._spool.stored(last.sequence)

@@ -145,7 +145,7 @@ class FleetGateway:
 
     async def _answer(self, message: Msg) -> None:
         """Answer a request about this gateway; without a session it may be about another of its name."""
-        if not self.member.lease.session:
+        if not self.member.lease.session or not names.is_inbox(message.reply):
             return
         if message.subject == names.gateway_subject(self.name, "drain"):
             self.member.drain()

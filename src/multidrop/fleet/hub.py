@@ -12,16 +12,14 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple, Protocol, TypeVar
 
-from nats.aio.client import Client
-
+from multidrop.fleet.batch_client import BatchClient
 from multidrop.fleet.message import MessageError, unpack
+from multidrop.fleet.sample_reader import StreamMessage, read_after
 from multidrop.fleet.samples_stream import (
     StreamAbout,
     StreamError,
-    StreamMessage,
     about,
     end_if_cancelled,
-    read_after,
 )
 from multidrop.fleet.sources import SourceCheck
 
@@ -99,7 +97,7 @@ class HubState(NamedTuple):
 class SampleHub:
     """Reads a stream into a sink: a commit each `every` s or million rows."""
 
-    def __init__(self, client: Client, sink: SampleSink, *, every: float = 10.0) -> None:
+    def __init__(self, client: BatchClient, sink: SampleSink, *, every: float = 10.0) -> None:
         self._client, self._sink, self._every = client, sink, every
         self._sources = SourceCheck({})
         self._place = self._end = self._rows = 0

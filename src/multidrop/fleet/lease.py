@@ -32,7 +32,10 @@ class MayPoll(Protocol):
     """The engine's right to send; `multidrop.Mastership` is one."""
 
     def extend(self, until_ns: int) -> object:
-        """Let the engine send until then, and put the kernel's timer off."""
+        """Let the engine send until then, and put the kernel's timer off.
+
+        Raises ValueError for a time that is past: then nothing has changed.
+        """
 
     def end(self) -> object:
         """Send nothing more, and call the timer off."""
@@ -77,6 +80,7 @@ class Lease:
         self._note = note
         self._nonce = uuid.uuid4().hex
         self._watched: list[SeenRevision | None] = [None] * len(buckets)
+        self._newest = 0  # session of this process: no number is used twice, whatever others write
         self._ended: set[int] = set()  # paths that others have ended in this session, for good
 
     # ---- what others ask ----
@@ -135,9 +139,10 @@ class Lease:
         if len(free) < self.terms.needed:
             self.trouble = self._rival(known)
             return False
-        session = 1 + max(record.value["session"] if record.value else 0 for record in known.values())
+        session = 1 + max(self._newest, *(map(_least_session, known.values())))
         self._nonce, self._ended = uuid.uuid4().hex, set()
-        self.session, self.began_ms = session, time.time_ns() // 1_000_000
+        self.session = self._newest = session
+        self.began_ms = time.time_ns() // 1_000_000
         await asyncio.gather(*(self._take(path, record) for path, record in free.items()))
         if self.is_over:
             await self.end()
@@ -170,12 +175,13 @@ class Lease:
         return f"a gateway called {self.name} is registered on {host}; waiting until its lease has run out"
 
     async def _take(self, path: int, record: Record) -> None:
-        sent = self.clock()
+        sent, nonce = self.clock(), self._nonce
         try:
             revision = await self._buckets[path].put(self.name, self._value(), record.revision)
         except (Conflict, FleetError):
             return
-        self.held[path] = Held(revision, sent)
+        if nonce == self._nonce:  # else the answer is to a session before
+            self.held[path] = Held(revision, sent)
 
     def _value(self, *, ended: bool = False) -> dict[str, Any]:
         return {
@@ -235,26 +241,38 @@ class Lease:
         if value and value["nonce"] == nonce and not value["ended"]:
             self.held[path] = Held(record.revision, held.sent)  # an older time than it could be
         elif record.revision > held.revision:
-            self.held[path] = None
-            self._ended.add(path)
-            _log.warning("%s: path %d of session %d was ended by another", self.name, path, self.session)
+            self._lose(path)
+
+    def _lose(self, path: int) -> None:
+        self.held[path] = None
+        self._ended.add(path)
+        _log.warning("%s: path %d of session %d was ended by another", self.name, path, self.session)
 
     async def _take_late(self, path: int) -> None:
-        """Take a path that could not be had when the session began."""
+        """Take a path that could not be had when the session began.
+
+        What stands there is over by the other paths, once we hold them. While we only try to, another gateway
+        of this name may live by it.
+        """
+        nonce = self._nonce
         record = await self._read(path)
-        if record is None:
+        if record is None or nonce != self._nonce or self.is_over:
             return
-        if record.value is None or record.value["session"] < self.session:  # that one is over by the others
+        value = record.value
+        if value is None or (value["session"] <= self.session and value["nonce"] != nonce):
             await self._take(path, record)
             self._extend()
-        elif record.value["nonce"] == self._nonce and not record.value["ended"]:
+        elif value["nonce"] == nonce and not value["ended"]:
             self.held[path] = Held(record.revision, 0)
+        else:
+            self._lose(path)
 
     def _extend(self) -> None:
         until = lease_rules.deadline([held.sent if held else None for held in self.held], self.terms)
         if until > self.until and lease_rules.may_send(self.clock(), until):
-            self.until = until
-            self._mastership.extend(until)
+            with suppress(ValueError):  # we stood still since that look at the clock
+                self._mastership.extend(until)
+                self.until = until
 
     # ---- and ends ----
 
@@ -264,6 +282,7 @@ class Lease:
         self.until = 0
         held, value = self.held, self._value(ended=True)
         self.session, self.held, self._ended = 0, [None] * len(held), set()
+        self._nonce = ""  # answers to renewals that are under way are not counted
         self._watched = [None] * len(held)
 
         async def write(path: int, revision: int) -> None:
@@ -271,3 +290,8 @@ class Lease:
                 await self._buckets[path].put(self.name, value, revision)
 
         await asyncio.gather(*(write(path, mine.revision) for path, mine in enumerate(held) if mine))
+
+
+def _least_session(record: Record) -> int:
+    """Return a number that no session before was above, also where somebody has written nonsense."""
+    return int(record.value["session"]) if record.value else record.revision

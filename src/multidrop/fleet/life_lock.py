@@ -12,6 +12,8 @@ from typing import Any
 from multidrop.fleet.errors import FleetError
 from multidrop.fleet.file_lock import lock
 
+IDS = (Path("/etc/machine-id"), Path("/proc/sys/kernel/random/boot_id"))
+
 
 class LifeLock:
     """A lock on a local file, held for life: who gets it knows that the one before has died.
@@ -48,7 +50,12 @@ class LifeLock:
 
 
 def machine_id() -> str:
-    """Return this machine's own id; "" where it has none, which proves nothing."""
+    """Return an id of this machine since it was started; "" where it has none, which proves nothing.
+
+    Copies of a disk have the machine's own id in common, and the lock's file with its id too. Who finds a
+    record of another boot waits: after a real one the lease has run out anyway.
+    """
     with suppress(OSError):
-        return Path("/etc/machine-id").read_text("utf-8", "replace").strip()
+        ids = [path.read_text("utf-8", "replace").strip() for path in IDS]
+        return ".".join(ids) if all(ids) else ""
     return ""

@@ -35,6 +35,7 @@ from multidrop.fleet.polled_units import PolledUnits
 
 MOST_BYTES = 900_000  # of a message: NATS takes 1 MiB from the factory, its headers included
 MOST_ROWS = 1 << 16
+MOST_NAME = 1000  # bytes of a name, a status or a unit; PostgreSQL has an index of names
 LONGEST_US = (1 << 31) - 1
 COMPRESSED = pa.ipc.IpcWriteOptions(compression=pa.Codec("zstd", 1))
 NAMED = pa.dictionary(pa.int32(), pa.utf8())  # of many messages together: more names than one has
@@ -136,14 +137,38 @@ def unpack(data: bytes | memoryview) -> Any:
         table.validate(full=True)
         columns = {name: table.column(name) for name in ("time", "clock_ns", "drive", "register", "status")}
         columns["monotonic_ns"] = pc.subtract(columns["time"].cast(pa.int64()), columns.pop("clock_ns"))
-        columns["uncertainty_ns"] = pc.multiply(table.column("uncertainty_us").cast(pa.int64()), 1000)
+        uncertainty_us = table.column("uncertainty_us").cast(pa.int32()).cast(pa.int64())
+        columns["uncertainty_ns"] = pc.multiply(uncertainty_us, 1000)
         columns["value"] = table.column("value")
         is_told = "unit" in table.schema.names
         columns["unit"] = table.column("unit") if is_told else pa.nulls(len(table), pa.utf8())
-        return pa.table([columns[name].cast(ROWS.field(name).type) for name in ROWS.names], schema=ROWS)
+        rows = pa.table([columns[name].cast(ROWS.field(name).type) for name in ROWS.names], schema=ROWS)
+        _check(rows)
     except (pa.ArrowException, KeyError, TypeError, ValueError, OSError, MemoryError) as error:
         first = (str(error) or type(error).__name__).splitlines()[0]
         raise MessageError(f"{len(data)} bytes are no message of samples: {first}") from error
+    return rows
+
+
+def _check(rows: Any) -> None:
+    """Raise ValueError for rows that no sink takes: all that is behind such a message would never be kept."""
+    if len(rows) > MOST_ROWS:
+        raise ValueError(f"it has {len(rows)} rows, and {MOST_ROWS} are the most")
+    for field, column in zip(rows.schema, rows.columns, strict=True):
+        if not field.nullable and column.null_count:
+            raise ValueError(f"its {field.name} is missing in some rows")
+        if pa.types.is_dictionary(field.type):
+            for chunk in column.chunks:
+                _check_names(field.name, chunk.dictionary)
+
+
+def _check_names(kind: str, names: Any) -> None:
+    if names.null_count:
+        raise ValueError(f"one {kind} has no name")
+    if (pc.max(pc.binary_length(names)).as_py() or 0) > MOST_NAME:
+        raise ValueError(f"one {kind} is longer than {MOST_NAME} bytes")
+    if pc.any(pc.match_substring(names, "\0")).as_py():
+        raise ValueError(f"one {kind} has a NUL character")
 
 
 def _microseconds(ns: Any) -> Any:

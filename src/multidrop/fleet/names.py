@@ -33,6 +33,15 @@ def owner_bucket(line: str) -> str:
     return OWNERS[zlib.crc32(line.encode()) % len(OWNERS)]
 
 
+def is_inbox(subject: str) -> bool:
+    """Say whether an asker waits for its answer there.
+
+    Servers let whoever is asked answer to any subject that the asker names, also to one that the asker may
+    not use: to a record of the plant, say. What a server itself answers comes without such a subject.
+    """
+    return subject.startswith(("_INBOX.", "_INBOX_"))
+
+
 def command_subject(line: str) -> str:
     """Return the subject on which a line's master is asked for an offer."""
     return f"cmd.{line}"

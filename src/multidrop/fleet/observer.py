@@ -1,7 +1,8 @@
 """Observer: watches the sessions of all gateways, and ends those that nobody renews.
 
 An end that a gateway wrote of its own session counts at once. One that another gateway wrote counts when the
-lease must have run out by our own clock too: nobody's haste, wrong clock or malice makes a second master.
+last renewal that we read is a lease old by our own clock too: nobody's haste or wrong clock makes a second
+master. Malice could, by an end right behind a renewal that followed a long silence and that we never read.
 """
 
 from __future__ import annotations

@@ -17,11 +17,13 @@ from typing import Any, NamedTuple
 from nats.aio.client import Client
 from nats.errors import Error, NoRespondersError
 
+from multidrop.fleet.batch_client import BatchClient
 from multidrop.fleet.refusals import failure_to_connect
 from multidrop.fleet.servers import OLDEST
 
 STREAM = "samples"
 SEQUENCE, DIGEST, LOST = "Multidrop-Sequence", "Multidrop-Digest", "Multidrop-Lost"
+BY_SERVER = "Nats-Stream"  # a header of each message that a server gives out of a stream
 EXPECTED = "Nats-Expected-Last-Subject-Sequence"
 ANSWER_S = 5.0  # for an answer: a new leader takes 4 to 9 s, so that is asked again
 NO_MESSAGE, NO_STREAM, WRONG_SEQUENCE = 10037, 10059, 10071  # error codes of JetStream
@@ -48,22 +50,14 @@ class StreamAbout(NamedTuple):
 
 
 class LastMessage(NamedTuple):
-    """The newest message of a subject: its place in the stream, its number in the log, its digest."""
+    """The newest message of a subject: its place in the stream, its number in the log, its digest.
+
+    The number is 0 where it is none of a gateway, but an answer of a server that somebody had sent there.
+    """
 
     place: int
     sequence: int
     digest: str
-
-
-class StreamMessage(NamedTuple):
-    """A message as the hub reads it; `sequence` 0 stands for a header that is missing or no number."""
-
-    place: int
-    gateway: str
-    log: str
-    sequence: int
-    lost: int  # rows that the gateway's spool had lost when it sent this
-    data: bytes
 
 
 def subject_of(gateway: str, log: str) -> str:
@@ -81,9 +75,9 @@ def end_if_cancelled() -> None:
         raise asyncio.CancelledError
 
 
-async def connect(servers: list[str], **options: Any) -> Client:
+async def connect(servers: list[str], **options: Any) -> BatchClient:
     """Return a connection that comes back by itself. Raises StreamError."""
-    client = Client()
+    client = BatchClient()
     try:
         async with asyncio.timeout(ANSWER_S):
             await client.connect(
@@ -162,7 +156,8 @@ async def last_of(client: Client, subject: str) -> LastMessage | None:
         message = found["message"]
         lines = base64.b64decode(message.get("hdrs", "")).decode("utf-8", "replace").splitlines()
         headers = {name.strip(): value.strip() for name, _, value in (line.partition(":") for line in lines)}
-        return LastMessage(int(message["seq"]), _number(headers.get(SEQUENCE)), headers.get(DIGEST, ""))
+        number = 0 if BY_SERVER in headers else number_of(headers.get(SEQUENCE))
+        return LastMessage(int(message["seq"]), number, headers.get(DIGEST, ""))
 
 
 async def publish(client: Client, subject: str, data: bytes, headers: dict[str, str]) -> int | None:
@@ -175,7 +170,7 @@ async def publish(client: Client, subject: str, data: bytes, headers: dict[str, 
     except NoRespondersError as failure:
         raise StreamError(f"no stream takes {subject}: it has no leader now, or there is none") from failure
     except (Error, OSError, TimeoutError) as failure:
-        raise _silent(client, failure) from failure
+        raise silent(client, failure) from failure
     found = _parsed(answer.data)
     if error := found.get("error"):
         if error.get("err_code") == WRONG_SEQUENCE:
@@ -185,58 +180,8 @@ async def publish(client: Client, subject: str, data: bytes, headers: dict[str, 
         return int(found["seq"])
 
 
-async def read_after(client: Client, place: int, messages: int, size: int) -> list[StreamMessage]:
-    """Return the next messages behind this place: so many and bytes at most, without a hole among them.
-
-    An empty list says that there is none now. Any replica may answer. Raises StreamError.
-    """
-    inbox = client.new_inbox()
-    wanted = {"seq": place + 1, "batch": messages, "max_bytes": size, "next_by_subj": f"{STREAM}.>"}
-    found: list[StreamMessage] = []
-    try:
-        subscribed = await client.subscribe(inbox)
-        try:
-            await client.publish(f"$JS.API.DIRECT.GET.{STREAM}", json.dumps(wanted).encode(), reply=inbox)
-            before = 0
-            while True:
-                message = await subscribed.next_msg(timeout=ANSWER_S)
-                headers = {str(name): value for name, value in (message.headers or {}).items()}
-                if "Nats-Sequence" not in headers:
-                    _check_end(headers)
-                    return found
-                if _number(headers.get("Nats-Last-Sequence")) != before:  # one was lost on the way here
-                    return found
-                found.append(_stream_message(headers, message.data))
-                before = found[-1].place
-        finally:
-            await subscribed.unsubscribe()
-    except (Error, OSError, TimeoutError) as failure:
-        if found:  # each is whole, and the next call goes on behind them
-            return found
-        raise failure if isinstance(failure, StreamError) else _silent(client, failure) from failure
-
-
-def _check_end(headers: Mapping[str, str]) -> None:
-    status = headers.get("Status", "")
-    if status == "503":
-        raise StreamError(f"there is no stream {STREAM!r}, or it has no leader now")
-    if status not in ("204", "404"):
-        raise StreamError(f"the stream {STREAM!r} gives nothing: {status} {headers.get('Description', '')}")
-
-
-def _stream_message(headers: Mapping[str, str], data: bytes) -> StreamMessage:
-    _, gateway, log, *_ = [*headers.get("Nats-Subject", "").split("."), "", "", ""]
-    return StreamMessage(
-        int(headers["Nats-Sequence"]),
-        gateway,
-        log,
-        _number(headers.get(SEQUENCE)),
-        _number(headers.get(LOST)),
-        data,
-    )
-
-
-def _number(text: str | None) -> int:
+def number_of(text: str | None) -> int:
+    """Return a header's number; 0 for one that is missing or none."""
     return int(text) if text and text.isascii() and text.isdigit() and len(text) < 19 else 0
 
 
@@ -247,7 +192,7 @@ async def _ask(client: Client, subject: str, what: Mapping[str, Any], *none: int
     except NoRespondersError as failure:
         raise StreamError("the servers of NATS run without JetStream, or have no quorum now") from failure
     except (Error, OSError, TimeoutError) as failure:
-        raise _silent(client, failure) from failure
+        raise silent(client, failure) from failure
     found = _parsed(answer.data)
     error = found.get("error")
     if not error:
@@ -278,8 +223,8 @@ def _as_wanted() -> Iterator[None]:
         raise StreamError("NATS answers something else than it was asked for") from None
 
 
-def _silent(client: Client, failure: Exception) -> StreamError:
-    """Say why nothing was answered: a server tells of missing rights beside the answer, not by it."""
+def silent(client: Client, failure: Exception) -> StreamError:
+    """Return why nothing was answered: a server tells of missing rights beside the answer, not by it."""
     last = client.last_error
     if last and "permissions violation" in str(last).lower():
         return StreamError(f"the rights of this connection do not suffice: {_text(last)}")

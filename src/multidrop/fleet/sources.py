@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping
 
-from multidrop.fleet.samples_stream import StreamMessage
+from multidrop.fleet.sample_reader import StreamMessage
 
 _log = logging.getLogger("multidrop.fleet.hub")
 

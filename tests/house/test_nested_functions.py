@@ -1,0 +1,35 @@
+"""A test that wraps its work in a function and never calls it proves nothing, and passes."""
+
+from __future__ import annotations
+
+import ast
+from pathlib import Path
+
+TESTS = Path(__file__).parents[1]
+FUNCTIONS = (ast.FunctionDef, ast.AsyncFunctionDef)
+
+
+def never_named(tree: ast.AST) -> list[str]:
+    """Return the functions within a function that nothing in it names, by their lines."""
+    found = []
+    for outer in ast.walk(tree):
+        if isinstance(outer, FUNCTIONS):
+            named = {node.id for node in ast.walk(outer) if isinstance(node, ast.Name)}
+            inner = [node for node in outer.body if isinstance(node, FUNCTIONS)]
+            lost = [one for one in inner if one.name not in named and not one.decorator_list]
+            found += [f"{one.name} in {outer.name}, line {one.lineno}" for one in lost]
+    return found
+
+
+def test_every_function_within_a_test_is_used() -> None:
+    found = {}
+    for path in sorted(TESTS.rglob("*.py")):
+        if lost := never_named(ast.parse(path.read_text("utf-8"))):
+            found[str(path.relative_to(TESTS))] = lost
+    assert found == {}
+
+
+def test_one_that_is_forgotten_is_found() -> None:
+    told = "def test_it():\n    async def main(): assert False\n"
+    assert never_named(ast.parse(told)) == ["main in test_it, line 2"]
+    assert never_named(ast.parse(told + "    run(main())\n")) == []
