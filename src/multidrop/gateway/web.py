@@ -196,9 +196,10 @@ class _Pages:
         begin, end = (number_in(query.get(key, ""), key) for key in ("from", "to"))
         try:
             async with self._queries:
-                return JSONResponse(await part.series(query.getlist("series"), begin, end, points))
+                found = await part.series(query.getlist("series"), begin, end, points)
         except ValueError as mistake:
             return _error(400, str(mistake))
+        return Response(found, media_type="application/json")
 
     async def export(self, request: Request) -> Response:
         part = self._history()
