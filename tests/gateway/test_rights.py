@@ -163,6 +163,18 @@ def test_methods_and_bodies(open_gateway: Served) -> None:
     assert post("/api/act", {"drive": "pump-1", "verb": "start", "options": []}, **writer).status == 400
 
 
+def test_texts_that_are_no_unicode_are_answered_like_others(open_gateway: Served) -> None:
+    post, writer = open_gateway.post, {"authorization": open_gateway.bearer(Right.WRITE)}
+    odd = "\ud800"
+    assert post("/api/token", {"token": odd}).status == 401
+    for named in ({"drive": odd, "register": "setpoint"}, {"drive": "pump-1", "register": odd}):
+        answer = open_gateway.command("/api/write", {**named, "value": 1.0}, **writer)
+        assert answer.status == 403
+        assert odd in answer.json["error"]
+    unknown = open_gateway.command("/api/act", {"drive": odd, "verb": "coast"}, **writer)
+    assert odd in unknown.json["error"]
+
+
 def test_the_page_keeps_its_token_where_no_script_sees_it(open_gateway: Served) -> None:
     told = open_gateway.post("/api/token", {"token": open_gateway.secrets[Right.WRITE]})
     assert told.json == {"name": "writer", "role": "write"}

@@ -60,7 +60,7 @@ class Token(NamedTuple):
 
 def digest(token: str) -> str:
     """Return a token's digest. Tokens are long and random, and need no slow hash."""
-    return hashlib.sha256(token.encode()).hexdigest()
+    return hashlib.sha256(token.encode(errors="surrogatepass")).hexdigest()
 
 
 def new_token(name: str, right: Right) -> tuple[str, Token]:
