@@ -220,6 +220,22 @@ def test_who_counts_as_being_here_is_not_widened_before_the_restart(tmp_path: Pa
         assert gateway.post("/api/stop").status == 401
 
 
+def test_who_may_look_is_not_widened_while_it_listens_where_it_did(tmp_path: Path) -> None:
+    """Those who reach the address of before are others than those who will reach the new one."""
+    serve = '[serve]\nlisten = "127.0.0.1:0"\ntokens = "tokens"\n[serve.may]\nlook = "token"\n'
+    with served(tmp_path, serve) as gateway:
+        edit(gateway, "127.0.0.1:0", "127.0.0.2:0")
+        edit(gateway, 'look = "token"', 'stop = "anyone"')
+        writer = {"authorization": gateway.bearer(Right.WRITE)}
+        told = gateway.post("/api/reload", {"confirm": True}, **writer).json
+        assert told["restart"] == ["listen of [serve] takes effect after a restart"]
+        assert gateway.get("/api/plant").status == 401
+        assert gateway.post("/api/stop").status == 401
+        edit(gateway, "127.0.0.2:0", "127.0.0.1:0")
+        assert gateway.post("/api/reload", {"confirm": True}, **writer).json["restart"] == []
+        assert gateway.get("/api/plant").json["may"]["role"] == "stop"
+
+
 def test_a_reload_needs_the_right_to_write_and_a_confirmation(tmp_path: Path) -> None:
     with served(tmp_path, MAY) as gateway:
         revision = gateway.gateway.revision

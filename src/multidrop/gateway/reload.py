@@ -133,8 +133,9 @@ class Reload:
 
     def _take_up_rights(self, settings: ServeSettings) -> None:
         gateway, may = self._gateway, settings.may
-        if settings.behind_proxy != gateway.settings.behind_proxy:
-            may = may.bounded_by(gateway.settings.may)  # who counts as being on this machine changes later
+        now = gateway.settings
+        if (settings.behind_proxy, settings.host) != (now.behind_proxy, now.host):
+            may = may.bounded_by(now.may)  # who reaches it, and counts as being here, changes later
         gateway.settings = replace(gateway.settings, names=settings.names, tokens=settings.tokens, may=may)
         gateway.commands.may = may
         gateway.own_names.replace(settings.names)
