@@ -11,7 +11,7 @@ import pytest
 from gateways import Served, served
 from lines import PATIENCE, until
 
-from multidrop.gateway.rights import MOST_WRONG, Right
+from multidrop.gateway.rights import MOST_WRONG, SCHEMES, OwnNames, Right
 
 MAY = '[serve.may]\nwrite = ["pump-1.setpoint"]\nverbs = ["pump-1.start", "pump-1.reset_fault"]\n'
 LOOPBACK_STOPS = MAY.replace("[serve.may]", '[serve.may]\nstop = "anyone"')
@@ -89,6 +89,7 @@ FOREIGN = {
     "no host name": ({"host": "plant.example/x"}, 421),
     "an empty name": ({"host": ""}, 421),
     "a page of another site": ({"origin": "http://evil.test"}, 403),
+    "the same port with TLS, which we have not": ({"host": "localhost", "origin": "https://localhost"}, 403),
     "another port of this machine": ({"origin": "http://localhost:1"}, 403),
     "a file, or a sandboxed frame": ({"origin": "null"}, 403),
     "a script of another site": ({"sec_fetch_site": "cross-site"}, 403),
@@ -104,6 +105,29 @@ def test_pages_that_are_not_ours_send_no_frame(open_gateway: Served, case: str) 
     before = open_gateway.gateway.commands.called
     assert open_gateway.post(*STOP, **headers).status == status
     assert open_gateway.gateway.commands.called == before
+
+
+ORIGINS = {  # with the host that was asked, and how: is it a page of ours?
+    ("https://plant.example", "plant.example", ("https",)): True,
+    ("https://plant.example:443", "plant.example", ("https",)): True,
+    ("https://plant.example:8443", "plant.example:8443", ("https",)): True,
+    ("http://plant.example", "plant.example", ("https",)): False,  # port 80, and we have 443
+    ("https://plant.example", "plant.example", ("http",)): False,
+    ("https://plant.example", "plant.example", SCHEMES): True,  # behind a proxy that has TLS
+    ("http://plant.example", "plant.example:443", SCHEMES): False,
+    ("https://plant.example.evil.test", "plant.example", ("https",)): False,
+    ("https://evil.test", "evil.test", ("https",)): False,
+    ("https:plant.example", "plant.example", ("https",)): False,
+    ("https://anna@plant.example", "plant.example", ("https",)): False,
+    ("null", "plant.example", SCHEMES): False,
+}
+
+
+@pytest.mark.parametrize("case", ORIGINS)
+def test_a_page_of_ours_has_our_scheme_host_and_port(case: tuple[str, str, tuple[str, ...]]) -> None:
+    origin, host, schemes = case
+    names = OwnNames(["plant.example"], "0.0.0.0", 443)
+    assert names.has_origin(origin, host, schemes) is ORIGINS[case]
 
 
 def test_our_own_page_and_programs_do(open_gateway: Served) -> None:
