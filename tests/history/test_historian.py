@@ -14,7 +14,7 @@ import pytest
 from gateways import serving, simulated_plant
 from histories import NOON, SECOND, batch
 
-from multidrop import Buckets, Plant, open_reader
+from multidrop import Buckets, History, Plant, open_reader
 from multidrop.core.columns import Names
 from multidrop.gateway import historian
 from multidrop.gateway.historian import MOST_BUCKETS, HistorySettings, as_json, build
@@ -74,6 +74,42 @@ def test_a_great_answer_is_refused_and_none_is_made_in_the_loop(
     asyncio.run(live())
 
 
+@pytest.mark.parametrize("kind", ["csv", "parquet"])
+def test_no_export_is_begun_in_the_loop(tmp_path: Path, kind: str) -> None:
+    """What thousands of files say of their rows takes seconds to read."""
+    readers: list[int] = []
+
+    class Noted(History):
+        def parting_of(self, *of: Any) -> Any:
+            readers.append(threading.get_ident())
+            return super().parting_of(*of)
+
+    async def live() -> None:
+        inside = SimpleNamespace(plant=Plant((), Path("plant.toml")), folder=tmp_path)
+        part = build(HistorySettings(), inside)
+        try:
+            part.history = Noted(part.history.folder)
+            await part.export([], 0, 1000, kind)
+            assert readers
+            assert threading.get_ident() not in readers
+        finally:
+            await part.close()
+
+    asyncio.run(live())
+
+
+def test_what_a_killed_process_left_of_its_exports_goes(tmp_path: Path) -> None:
+    left = tmp_path / "history" / ".export-x1y2"
+    left.mkdir(parents=True)
+    (left / "export.parquet").write_bytes(b"PAR1")
+    inside = SimpleNamespace(plant=Plant((), Path("plant.toml")), folder=tmp_path)
+    part = build(HistorySettings(), inside)
+    try:
+        assert not left.exists()
+    finally:
+        asyncio.run(part.close())
+
+
 @pytest.mark.slow
 def test_it_records_and_answers(tmp_path: Path) -> None:
     async def live() -> None:
@@ -98,12 +134,12 @@ def test_it_records_and_answers(tmp_path: Path) -> None:
         assert fan["mean"] == [None] * 10
         for kind in ("csv", "parquet"):
             path = tmp_path / f"got.{kind}"
-            path.write_bytes(b"".join(part.export(["pump-1.speed"], begin, end, kind)))
+            path.write_bytes(b"".join(await part.export(["pump-1.speed"], begin, end, kind)))
             assert [row for rows in open_reader(path) for row in rows] == list(taken)
         with pytest.raises(ValueError, match="is no series"):
-            part.export(["pump"], begin, end, "csv")
+            await part.export(["pump"], begin, end, "csv")
         with pytest.raises(ValueError, match="neither csv nor parquet"):
-            part.export([], begin, end, "xlsx")
+            await part.export([], begin, end, "xlsx")
         await part.close()
         await asyncio.wait_for(running, 60)
 

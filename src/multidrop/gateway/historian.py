@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import asyncio
 import json
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from importlib import import_module
 from math import isfinite
 from pathlib import Path
+from shutil import rmtree
 from tempfile import TemporaryDirectory
 from typing import Any, Protocol
 
@@ -28,6 +29,7 @@ from multidrop.gateway.metrics import counter
 
 MS_NS = 1_000_000
 PIECE = 1 << 16  # bytes of an export
+UNFINISHED = ".export-"  # begins the names of exports' own folders
 MOST_BUCKETS = 200_000  # of an answer: the page's 24 series on a screen of 8000 px, and 5 MB
 
 
@@ -90,6 +92,8 @@ class Historian:
             keep=parse_age(settings.keep),
             most=parse_size(settings.most),
         )
+        for left in folder.glob(f"{UNFINISHED}*"):  # by a process that was killed; nobody else records here
+            rmtree(left, ignore_errors=True)
         self.history = History(folder)
         self._over = asyncio.Event()
 
@@ -151,20 +155,23 @@ class Historian:
         pieces = (f"{json.dumps(name)}:{json.dumps(as_json(made))}" for name, made in found.items())
         return f'{{"step_ms":{step / MS_NS},"series":{{{",".join(pieces)}}}}}'.encode()
 
-    def export(self, names: Sequence[str], begin: int, end: int, kind: str) -> Iterator[bytes]:
+    async def export(self, names: Sequence[str], begin: int, end: int, kind: str) -> Iterator[bytes]:
         """Return a file of these series, or of all, piece by piece: "csv" or "parquet".
 
-        Raises as `series`, at once where the series or the times are wrong.
+        Raises as `series`, before the first piece where the series or the times are wrong.
         """
-        kinds: dict[str, Callable[..., Iterator[bytes]]] = {"csv": self.history.csv, "parquet": self._parquet}
-        if kind not in kinds:
+        return await asyncio.to_thread(self._export, kind, names or None, begin * MS_NS, end * MS_NS)
+
+    def _export(self, kind: str, names: Sequence[str] | None, begin: int, end: int) -> Iterator[bytes]:
+        if kind not in ("csv", "parquet"):
             raise ValueError(f"format = {kind!r} is neither csv nor parquet")
-        of = names or None, begin * MS_NS, end * MS_NS
-        self.history.read(*of)  # a mistake is told before the first piece
-        return kinds[kind](*of)
+        if kind == "csv":
+            return self.history.csv(names, begin, end)
+        self.history.read(names, begin, end)  # a mistake is told before the first piece
+        return self._parquet(names, begin, end)
 
     def _parquet(self, names: Sequence[str] | None, begin: int, end: int) -> Iterator[bytes]:
-        with TemporaryDirectory(prefix=".export-", dir=self.history.folder) as directory:
+        with TemporaryDirectory(prefix=UNFINISHED, dir=self.history.folder) as directory:
             path = Path(directory) / "export.parquet"
             self.history.export(path, names, begin, end)
             with path.open("rb") as file:

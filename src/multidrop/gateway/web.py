@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from starlette.applications import Starlette
 from starlette.requests import Request
-from starlette.responses import FileResponse, PlainTextResponse, Response, StreamingResponse
+from starlette.responses import FileResponse, PlainTextResponse, Response
 from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp, Receive, Scope, Send
@@ -19,6 +19,7 @@ from multidrop import Refused, expose_metrics
 from multidrop.gateway.audit import MOST_RECORDS, newest_records, time_asked
 from multidrop.gateway.commands import Admit, Told
 from multidrop.gateway.describe import describe
+from multidrop.gateway.exports import Exports
 from multidrop.gateway.frame_route import FrameRoute
 from multidrop.gateway.guard import COOKIE, Denied, Guard, Needed
 from multidrop.gateway.json_response import JsonResponse
@@ -34,7 +35,6 @@ if TYPE_CHECKING:
 PAGE = Path(__file__).parent / "page"
 MOST_QUERIES = 2  # of the history, and of the audit log, at the same time
 COOKIE_S = 30 * 24 * 3600
-KINDS = {"csv": "text/csv; charset=utf-8", "parquet": "application/vnd.apache.parquet"}
 RIGHTS_RULES = (NOT_ALLOWED, NOT_LISTED, NEVER_THIS_WAY)
 
 NEEDED: Mapping[str, Needed] = {
@@ -125,6 +125,7 @@ class _Pages:
     def __init__(self, gateway: Gateway) -> None:
         self._gateway = gateway
         self._queries = asyncio.Semaphore(MOST_QUERIES)
+        self._exports = Exports()
 
     async def index(self, request: Request) -> Response:
         page = PAGE / "index.html"
@@ -202,18 +203,10 @@ class _Pages:
         return Response(found, media_type="application/json")
 
     async def export(self, request: Request) -> Response:
-        part = self._history()
-        query = request.query_params
-        kind = query.get("format", "csv")
-        if kind not in KINDS:
-            return _error(400, f"format = {kind[:20]!r} is neither csv nor parquet")
+        part, query = self._history(), request.query_params
         begin, end = (number_in(query.get(key, ""), key) for key in ("from", "to"))
-        try:
-            chunks = part.export(query.getlist("series"), begin, end, kind)
-        except ValueError as mistake:
-            return _error(400, str(mistake))
-        name = {"content-disposition": f'attachment; filename="multidrop.{kind}"'}
-        return StreamingResponse(chunks, media_type=KINDS[kind], headers=name)
+        kind = query.get("format", "csv")
+        return await self._exports.respond(part, query.getlist("series"), begin, end, kind)
 
     def _history(self) -> Any:
         part = self._gateway.feeds.get("history")
