@@ -121,6 +121,29 @@ def test_it_says_goodbye(broker: Broker, listener: Listener, tmp_path: Path) -> 
     listener.wait_for(has("multidrop/gateway", b"offline"))
 
 
+def test_who_can_say_nothing_is_away_and_still_stops(
+    broker: Broker, listener: Listener, start: Start
+) -> None:
+    """What the broker keeps of the drives would pass for the present, for it has a connection."""
+    known, running = start(commands=True)
+    listener.wait_for(has("multidrop/gateway", b"online"))
+    state = known.hub.states.pop("pump-1")
+    running.step()
+    listener.wait_for(has("multidrop/gateway", b"offline"))
+    assert running._part.health() == "nothing can be said: KeyError: 'pump-1'"
+    running.step()  # once is enough
+    publish(broker, "multidrop/pump-1/stop", b"now")
+    listener.wait_for(has("multidrop/pump-1/told"))
+    assert known.commands.noted == [("stop", ["pump-1"])]
+    known.hub.states["pump-1"] = state
+    running.step()
+    listener.wait_for(has("multidrop/gateway", b"online"))
+    listener.wait_for(has("multidrop/pump-1/available", b"online"))
+    assert running._part.health() == ""
+    said = [one.payload for one in listener.all if one.topic == "multidrop/gateway"]
+    assert said == [b"online", b"offline", b"online"]
+
+
 @pytest.mark.slow
 def test_a_broker_that_stands_still_holds_up_nothing(
     broker: Broker, listener: Listener, start: Start
