@@ -156,9 +156,12 @@ def test_two_host_headers(open_gateway: Served) -> None:
 @pytest.mark.parametrize("path", ["/", "/api/plant", "/api/nothing", "/metrics", "/api/stop"])
 def test_no_answer_lets_itself_be_framed_or_guessed_at(open_gateway: Served, path: str) -> None:
     headers = open_gateway.get(path).headers
-    assert "frame-ancestors 'none'" in headers["content-security-policy"]
-    own = "self" if path == "/" else "none"
-    assert f"default-src '{own}'" in headers["content-security-policy"]
+    if path == "/":
+        policy = "default-src 'self'; base-uri 'none'; form-action 'none'; object-src 'none'"
+        assert headers["content-security-policy"] == f"{policy}; frame-ancestors 'none'"
+        assert headers["cross-origin-opener-policy"] == "same-origin"
+    else:
+        assert headers["content-security-policy"] == "default-src 'none'; frame-ancestors 'none'"
     assert headers["cross-origin-resource-policy"] == "same-origin"
     assert headers["x-content-type-options"] == "nosniff"
     assert "server" not in headers
@@ -236,6 +239,15 @@ def test_wrong_tokens_are_looked_at_five_times_a_minute(tmp_path: Path) -> None:
         assert gateway.get("/api/plant", **elsewhere).status == 200
         now[0] += 60.0
         assert gateway.get("/api/plant", **right).status == 200
+
+
+@pytest.mark.parametrize("told", [{}, {"x_forwarded_for": "127.0.0.1"}, {"x_forwarded_for": "10.0.0.7, ::1"}])
+def test_nobody_behind_a_proxy_counts_as_being_here(tmp_path: Path, told: dict[str, str]) -> None:
+    """It is on this machine itself, and may be wrong about its clients."""
+    with served(tmp_path, LOOPBACK_STOPS, behind_proxy=True) as gateway:
+        assert gateway.post(*STOP, **told).status == 401
+        assert gateway.get("/api/plant", **told).json["may"]["role"] == "look"
+        assert gateway.gateway.commands.called == 0
 
 
 def test_nobody_behind_a_proxy_is_shut_out_in_the_name_of_another_address(tmp_path: Path) -> None:
