@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 from broken_part import BrokenFeed
-from gateways import POLL, Answer, Served, plant_text, running, served, tokens
+from gateways import POLL, Answer, Served, certificate, plant_text, running, served, tokens
 from lines import HOST_LATE, PATIENCE, until
 
 import multidrop
@@ -218,6 +218,19 @@ def test_who_counts_as_being_here_is_not_widened_before_the_restart(tmp_path: Pa
         edit(gateway, "behind_proxy = false\n", f"behind_proxy = true\n{MAY}")
         assert reload(gateway)["restart"] == ["behind_proxy of [serve] takes effect after a restart"]
         assert gateway.post("/api/stop").status == 401
+
+
+def test_a_certificate_that_was_renewed_in_place_waits_for_a_restart(tmp_path: Path) -> None:
+    """Whoever renews it finds out from the reload, and not from browsers a month later."""
+    certificate(tmp_path, "own")
+    serve = '[serve]\ncertificate = "own.pem"\nkey = "own.key"\n'
+    with served(tmp_path, serve, tls=None) as gateway:
+        assert reload(gateway)["restart"] == []
+        certificate(tmp_path, "own")
+        assert reload(gateway)["restart"] == ["certificate of [serve] takes effect after a restart"]
+        assert gateway.get("/health").json["restart"] == [
+            "certificate of [serve] takes effect after a restart"
+        ]
 
 
 def test_who_may_look_is_not_widened_while_it_listens_where_it_did(tmp_path: Path) -> None:
