@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import asyncio
+import threading
 from typing import Any, NoReturn
 
 import pytest
+from lines import PATIENCE
 from modbus_gateway import plant_of
 
-from multidrop import InvtCHE, Plant, Refused
-from multidrop.gateway.commands import Commands
+from multidrop import Drive, InvtCHE, Plant, Refused
+from multidrop.gateway import commands
+from multidrop.gateway.commands import BUSY, Commands, Told
 from multidrop.gateway.rights import NEVER_THIS_WAY, NOT_ALLOWED, NOT_LISTED, Caller, May, Right
 from multidrop.gateway.verb_rules import STOPPING, VERBS
 
@@ -37,10 +40,10 @@ def rules_of(may: May, way: str, role: Right) -> dict[str, str | None]:
     caller = Caller("anna", way, "10.0.0.7", role)
 
     async def carried_out() -> dict[str, Any]:
-        commands = Commands(GuardedLines(), may)  # type: ignore[arg-type]
-        told: dict[str, Any] = {verb: await commands.act("mill", verb, {}, caller) for verb in VERBS}
-        told["write"] = await commands.write("mill", "setpoint", 10.0, caller)
-        stopped = await commands.stop(["mill"], caller)
+        control = Commands(GuardedLines(), may)  # type: ignore[arg-type]
+        told: dict[str, Any] = {verb: await control.act("mill", verb, {}, caller) for verb in VERBS}
+        told["write"] = await control.write("mill", "setpoint", 10.0, caller)
+        stopped = await control.stop(["mill"], caller)
         return told | {"stop all": stopped["mill"]}
 
     return {
@@ -78,3 +81,37 @@ def test_no_verb_comes_by_modbus_though_it_is_listed() -> None:
     """Nobody is asked there whether he means it."""
     rules = rules_of(ALL, "modbus", Right.WRITE)
     assert {rules[verb] for verb in VERBS} == {NEVER_THIS_WAY}
+
+
+def test_a_line_has_a_few_writes_under_way_and_takes_any_stop(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each has a thread, and a line that stands still would have any number of them."""
+    go_on = threading.Event()
+
+    def slow(drive: Drive, **command: object) -> Told:
+        assert go_on.wait(PATIENCE)
+        return Told(True, "done")
+
+    async def carry_out() -> None:
+        control = Commands(GuardedLines(), ALL)  # type: ignore[arg-type]
+        writer = Caller("anna", "http", "10.0.0.7", Right.WRITE)
+        some = [asyncio.ensure_future(control.write("mill", "setpoint", at, writer)) for at in range(8)]
+        await asyncio.sleep(0)  # each has begun
+        for further in (
+            control.write("mill", "setpoint", 9.0, writer),
+            control.act("mill", "start", {}, writer),
+        ):
+            told = await further
+            assert isinstance(told.error, Refused)
+            assert told.error.rule == BUSY
+        stopped = await control.stop(["mill"], writer)
+        assert not isinstance(stopped["mill"].error, Refused)
+        go_on.set()
+        await asyncio.gather(*some)
+        assert (await control.write("mill", "setpoint", 9.0, writer)).is_done  # there is room again
+
+    for work in ("write_one", "act_one"):
+        monkeypatch.setattr(commands, work, slow)
+    try:
+        asyncio.run(carry_out())
+    finally:
+        go_on.set()

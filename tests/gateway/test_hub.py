@@ -318,6 +318,20 @@ def test_ended_alarms_are_bounded() -> None:
     assert len(events.shown()) <= 21
 
 
+def test_a_frame_gives_no_value_that_is_overdue_or_was_missed_since(hub: Hub, clock: HubClock) -> None:
+    hub.take(rows((10, FREQUENCY, 25), (10, CURRENT, 12), (11, CURRENT, Status.NO_REPLY)))
+    for now, frequency, current in (
+        (12, [25.0], [None, "no reply", 12.0]),  # a miss is told at once
+        (25, [None, "overdue", 25.0], [None, "no reply", 12.0]),
+    ):
+        clock.now_ns = now * PERIOD
+        frame = frame_of(hub, Events(), Lately(hub.plant), {}, n=1, revision=1, time_ns=UTC_0 + clock.now_ns)
+        told = frame["drives"]["pump-1"]["values"]
+        assert [*told["output_frequency"][:1], *told["output_frequency"][2:4]] == frequency
+        assert [*told["output_current"][:1], *told["output_current"][2:4]] == current
+        assert told["fault"] == (None, told["fault"][1], "not asked yet")
+
+
 def test_an_age_is_right_though_a_clock_was_set_back_or_slept(hub: Hub, clock: HubClock) -> None:
     """One that is too short would make the last value of a silent drive a new one."""
     hub.take(rows((10, FREQUENCY, 25), (20, FREQUENCY, Status.NO_REPLY)))
