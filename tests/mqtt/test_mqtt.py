@@ -119,6 +119,8 @@ def test_it_says_goodbye(broker: Broker, listener: Listener, tmp_path: Path) -> 
     listener.wait_for(has("multidrop/gateway", b"online"))
     running.close()
     listener.wait_for(has("multidrop/gateway", b"offline"))
+    for drive in ("pump-1", FAN.name):  # the next plant file may have it no more
+        listener.wait_for(has(f"multidrop/{drive}/available", b"offline"))
 
 
 def test_who_can_say_nothing_is_away_and_still_stops(
@@ -474,7 +476,7 @@ def test_home_assistant_is_told_of_each_drive(broker: Broker, listener: Listener
     assert len({part["unique_id"] for part in parts.values()}) == len(parts)
     sensor = parts["output_frequency"]
     assert (sensor["unit_of_measurement"], sensor["device_class"]) == ("Hz", "frequency")
-    assert sensor["expire_after"] == 6
+    assert sensor["expire_after"] == parts["state"]["expire_after"] == 6
     assert "unit_of_measurement" not in parts["status"]
     assert parts["setpoint_set"]["command_topic"] == "multidrop/pump-1/set/setpoint"
 

@@ -120,6 +120,7 @@ class JsonTopics:
         left = _drives(self._plant) - _drives(plant)
         self._plant = plant
         for drive in sorted(left):
+            self._available.pop(drive, None)
             topics = [self._topic(drive), self._topic(drive, "available")]
             if self._settings.home_assistant:
                 topics.append(discovery_topic(self._settings.prefix, drive))
@@ -142,8 +143,14 @@ class JsonTopics:
         return len(list(self._hub.drives))
 
     def leave(self) -> None:
-        """Say that the gateway goes."""
+        """Say that the gateway goes, and of each drive that nothing more comes.
+
+        One that the plant file has no more when the gateway begins again is never spoken of again.
+        """
         self.outbox.put(self.will())
+        for drive in self._available:
+            self.outbox.put(self._kept(self._topic(drive, "available"), OFFLINE))
+        self._available.clear()
 
     def _state(self, drive: str) -> bytes:
         seen_ns = self._hub.seen_at(drive)
