@@ -17,6 +17,7 @@ from multidrop.gateway.events import Events
 from multidrop.gateway.frames import frame_of, lost_of
 from multidrop.gateway.hub import LEAST_SLEEP_NS, NOT_ASKED, Hub, Newest, Shown
 from multidrop.gateway.lately import Lately
+from multidrop.gateway.mqtt_settings import fresh_values
 from multidrop.polling.batch import Batch
 
 REGISTERS = ("status", "output_frequency", "output_current", "fault")
@@ -330,6 +331,8 @@ def test_a_frame_gives_no_value_that_is_overdue_or_was_missed_since(hub: Hub, cl
         assert [*told["output_frequency"][:1], *told["output_frequency"][2:4]] == frequency
         assert [*told["output_current"][:1], *told["output_current"][2:4]] == current
         assert told["fault"] == (None, told["fault"][1], "not asked yet")
+        said = {"status": None, "output_frequency": frequency[0], "output_current": None, "fault": None}
+        assert fresh_values(hub, "pump-1") == said  # by MQTT
 
 
 def test_an_age_is_right_though_a_clock_was_set_back_or_slept(hub: Hub, clock: HubClock) -> None:

@@ -14,7 +14,18 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from brokers import FAN, Broker, Listener, Published, Running, inside, mosquitto, publish, without_fan
+from brokers import (
+    FAN,
+    Broker,
+    Listener,
+    Published,
+    Running,
+    free_port,
+    inside,
+    mosquitto,
+    publish,
+    without_fan,
+)
 from examples import in_turn
 from gateways import served
 from lines import until
@@ -111,6 +122,39 @@ def test_the_broker_says_that_the_gateway_is_gone(listener: Listener, start: Sta
     running.cut(0)
     listener.wait_for(has("multidrop/gateway", b"offline"))
     listener.wait_for(has("multidrop/gateway", b"online"))
+
+
+def test_who_comes_later_hears_that_the_gateway_is_gone(
+    broker: Broker, listener: Listener, start: Start
+) -> None:
+    _, running = start()
+    listener.wait_for(has("multidrop/gateway", b"online"))
+    running._part._brokers[0]._client.reconnect_delay_set(3600, 3600)
+    running.cut(0)
+    listener.wait_for(has("multidrop/gateway", b"offline"))
+    later = Listener(broker)
+    try:
+        assert later.wait_for(has("multidrop/gateway")) == ("multidrop/gateway", True, b"offline")
+    finally:
+        later.close()
+
+
+def test_what_there_was_to_say_without_a_connection_is_counted(tmp_path: Path) -> None:
+    require_module("paho.mqtt.client")
+    part: Any = build(MqttSettings(f"mqtt://127.0.0.1:{free_port()}", sparkplug="works"), inside(tmp_path))
+    running = Running(part)
+    try:
+        of_json, of_sparkplug = (broker.outbox for broker in part._brokers)
+        assert (of_json.dropped, of_sparkplug.dropped) == (2, 2)  # of two drives
+        running.step()
+        assert (of_json.dropped, of_sparkplug.dropped) == (4, 2)  # nothing changed
+        part._speakers[0]._hub.values["pump-1", "output_frequency"] = 1.0
+        running.step()
+        assert (of_json.dropped, of_sparkplug.dropped) == (6, 3)
+        (dropped,) = (one for one in part.figures() if one.name == "multidrop_mqtt_dropped")
+        assert [value for _, _, value in dropped.samples] == [9]
+    finally:
+        running.close()
 
 
 def test_it_says_goodbye(broker: Broker, listener: Listener, tmp_path: Path) -> None:
