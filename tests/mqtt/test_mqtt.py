@@ -613,6 +613,39 @@ def test_metrics_say_in_words_what_they_count(broker: Broker, tmp_path: Path) ->
 # ---- another plant ----
 
 
+class PutMessages:
+    """An outbox that keeps what is put into it."""
+
+    def __init__(self) -> None:
+        self.put_in: list[Any] = []
+
+    def put(self, message: Any) -> None:
+        self.put_in.append(message)
+
+    def emptied(self) -> set[str]:
+        return {one.topic for one in self.put_in if one.is_retained and one.make() == b""}
+
+
+def test_a_drive_that_left_while_the_broker_was_away_is_taken_back_when_it_is_there(tmp_path: Path) -> None:
+    """What waits is dropped when a connection breaks; the topics would say old values for ever."""
+    known = inside(tmp_path)
+    whole = known.plant
+    topics = JsonTopics(MqttSettings(home_assistant=True), known, now_ms)
+    fan = f"multidrop/{FAN.name}"
+    expected = {fan, f"{fan}/available", discovery_topic("multidrop", FAN.name)}
+    topics.outbox = PutMessages()
+    topics.adopt(without_fan(known))
+    assert topics.outbox.emptied() == expected
+    topics.outbox = PutMessages()
+    topics.connected()
+    assert topics.outbox.emptied() == expected
+    known.hub.names.append(FAN.name)
+    topics.outbox = PutMessages()
+    topics.adopt(whole)
+    topics.connected()
+    assert topics.outbox.emptied() == set()
+
+
 def test_what_is_kept_of_a_drive_that_left_is_taken_back(
     broker: Broker, listener: Listener, start: Start
 ) -> None:
