@@ -47,7 +47,7 @@ def test_a_broker_s_writes_are_bounded_and_no_stop_is() -> None:
         )
         for value in range(MOST_UNDER_WAY + 2):
             orders.write("pump-1", "setpoint", value, NOW_MS)
-            await asyncio.sleep(0)  # it begins
+        await asyncio.sleep(0)  # they begin
         assert commands.begun == [*range(MOST_UNDER_WAY)]
         refused = f"not sent: {MOST_UNDER_WAY} others are under way"
         assert told == [(f"setpoint = {MOST_UNDER_WAY + at}", refused) for at in range(2)]
