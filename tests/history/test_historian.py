@@ -76,7 +76,7 @@ def test_a_great_answer_is_refused_and_none_is_made_in_the_loop(
 
 @pytest.mark.parametrize("kind", ["csv", "parquet"])
 def test_no_export_is_begun_in_the_loop(tmp_path: Path, kind: str) -> None:
-    """What thousands of files say of their rows takes seconds to read."""
+    """Thousands of files say of their rows what they are: to read that takes seconds."""
     readers: list[int] = []
 
     class Noted(History):

@@ -170,7 +170,7 @@ def test_it_says_goodbye(broker: Broker, listener: Listener, tmp_path: Path) -> 
 def test_who_can_say_nothing_is_away_and_still_stops(
     broker: Broker, listener: Listener, start: Start
 ) -> None:
-    """What the broker keeps of the drives would pass for the present, for it has a connection."""
+    """The values that the broker keeps would pass for the present, for it has a connection."""
     known, running = start(commands=True)
     listener.wait_for(has("multidrop/gateway", b"online"))
     state = known.hub.states.pop("pump-1")
@@ -627,7 +627,7 @@ class PutMessages:
 
 
 def test_a_drive_that_left_while_the_broker_was_away_is_taken_back_when_it_is_there(tmp_path: Path) -> None:
-    """What waits is dropped when a connection breaks; the topics would say old values for ever."""
+    """Messages that wait are dropped when a connection breaks; the topics would say old values for ever."""
     known = inside(tmp_path)
     whole = known.plant
     topics = JsonTopics(MqttSettings(home_assistant=True), known, now_ms)
