@@ -13,13 +13,13 @@ from typing import Any
 
 import pytest
 from broken_part import BrokenFeed
-from gateways import POLL, Answer, Served, certificate, plant_text, running, served, tokens
+from gateways import POLL, Answer, Served, certificate, plant_text, running, served, simulated_plant, tokens
 from lines import HOST_LATE, PATIENCE, until
 
 import multidrop
 from multidrop import Batch, Bus, InvtCHE, LineError, Plant, load_plant
 from multidrop.gateway.gateway import Gateway
-from multidrop.gateway.rights import Right
+from multidrop.gateway.rights import Right, new_token
 from multidrop.gateway.settings import ServeSettings, read_settings
 from multidrop.recording.segments import segments_of
 from multidrop.sim import Simulator, Wire, simulated
@@ -231,6 +231,34 @@ def test_a_certificate_that_was_renewed_in_place_waits_for_a_restart(tmp_path: P
         assert gateway.get("/health").json["restart"] == [
             "certificate of [serve] takes effect after a restart"
         ]
+
+
+def test_a_token_that_is_taken_away_counts_no_more_after_a_reload(tmp_path: Path) -> None:
+    secrets, known = tokens()
+    newer, newcomer = new_token("bert", Right.LOOK)
+    file = tmp_path / "tokens"
+    file.write_text("".join(f"{token.line}\n" for token in known))
+    serve = '[serve]\ntokens = "tokens"\n[serve.may]\nlook = "token"\n'
+    with simulated_plant(tmp_path, serve) as path:
+
+        def read() -> tuple[Plant, ServeSettings]:
+            plant = load_plant(path)
+            return plant, replace(read_settings(plant, {}), port=0)
+
+        gateway = Gateway(*read(), read=read)
+        with running(gateway):
+            client = Served(gateway, {}, secrets)
+
+            def answers() -> list[int]:
+                bearers = [*(client.bearer(right) for right in Right), f"Bearer {newer}"]
+                return [client.get("/api/plant", authorization=bearer).status for bearer in bearers]
+
+            assert answers() == [200, 200, 200, 401]
+            file.write_text(f"{known[-1].line}\n{newcomer.line}\n")
+            assert answers() == [200, 200, 200, 401]  # not before it is read
+            writer = {"authorization": client.bearer(Right.WRITE)}
+            assert client.post("/api/reload", {"confirm": True}, **writer).json["done"] is True
+            assert answers() == [401, 401, 200, 200]
 
 
 def test_who_may_look_is_not_widened_while_it_listens_where_it_did(tmp_path: Path) -> None:

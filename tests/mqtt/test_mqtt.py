@@ -507,6 +507,12 @@ def test_without_the_key_nothing_is_listened_to(broker: Broker, listener: Listen
     assert known.commands.noted == []
 
 
+def test_without_the_key_only_a_rebirth_is_asked_for(tmp_path: Path) -> None:
+    require_module("paho.mqtt.client")
+    part: Any = build(MqttSettings(sparkplug="works", node="line"), inside(tmp_path))
+    assert [speaker.topics() for speaker in part._speakers] == [[], [("spBv1.0/works/NCMD/line", 1)]]
+
+
 # ---- Home Assistant ----
 
 
