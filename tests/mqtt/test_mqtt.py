@@ -27,7 +27,7 @@ from brokers import (
     without_fan,
 )
 from examples import in_turn
-from gateways import served
+from gateways import certificate, served
 from lines import until
 from peers import require_module
 
@@ -567,6 +567,20 @@ def test_every_mistake_of_the_settings_is_told_at_once(tmp_path: Path) -> None:
     assert (
         sentences[0] == 'broker = "http://x" is no broker; write broker = "mqtt://broker:1883", or mqtts://'
     )
+
+
+def test_authorities_that_are_none_are_told_before_anything_is_polled(tmp_path: Path) -> None:
+    certificate(tmp_path, "own")
+    (tmp_path / "text.pem").write_text("no certificate\n", "ascii")
+    plant = inside(tmp_path).plant
+    for name, told in (
+        ("own.pem", []),
+        ("own.key", [f'authorities = "own.key": {tmp_path}/own.key has no certificates in PEM']),
+        ("text.pem", [f'authorities = "text.pem": {tmp_path}/text.pem has no certificates in PEM']),
+        ("none.pem", [f'authorities = "none.pem": there is no file {tmp_path}/none.pem']),
+    ):
+        settings = MqttSettings("mqtts://broker", authorities=name)
+        assert [one for one in settings.check(plant) if "authorities" in one] == told
 
 
 def test_a_drive_that_cannot_be_a_topic_is_told(tmp_path: Path) -> None:
