@@ -18,6 +18,7 @@ from lines import HOST_LATE, PATIENCE, until
 
 import multidrop
 from multidrop import Batch, Bus, InvtCHE, LineError, Plant, load_plant
+from multidrop.gateway.clock import boottime_ns
 from multidrop.gateway.gateway import Gateway
 from multidrop.gateway.rights import Right, new_token
 from multidrop.gateway.settings import ServeSettings, read_settings
@@ -256,9 +257,14 @@ def test_a_token_that_is_taken_away_counts_no_more_after_a_reload(tmp_path: Path
             assert answers() == [200, 200, 200, 401]
             file.write_text(f"{known[-1].line}\n{newcomer.line}\n")
             assert answers() == [200, 200, 200, 401]  # not before it is read
+            assert gateway.commands.plant_ns is None
+            begun_ns = boottime_ns()
             writer = {"authorization": client.bearer(Right.WRITE)}
             assert client.post("/api/reload", {"confirm": True}, **writer).json["done"] is True
             assert answers() == [401, 401, 200, 200]
+            read_ns = gateway.commands.plant_ns  # by which brokers' commands are judged
+            assert read_ns is not None
+            assert begun_ns <= read_ns <= boottime_ns()
 
 
 def test_who_may_look_is_not_widened_while_it_listens_where_it_did(tmp_path: Path) -> None:
