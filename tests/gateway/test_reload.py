@@ -18,6 +18,7 @@ from lines import HOST_LATE, PATIENCE, until
 
 import multidrop
 from multidrop import Batch, Bus, InvtCHE, LineError, Plant, load_plant
+from multidrop.gateway import side_reads
 from multidrop.gateway.clock import boottime_ns
 from multidrop.gateway.gateway import Gateway
 from multidrop.gateway.rights import Right, new_token
@@ -265,6 +266,27 @@ def test_a_token_that_is_taken_away_counts_no_more_after_a_reload(tmp_path: Path
             read_ns = gateway.commands.plant_ns  # by which brokers' commands are judged
             assert read_ns is not None
             assert begun_ns <= read_ns <= boottime_ns()
+
+
+def test_what_was_looked_at_before_a_reload_is_not_shown_after_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The name may be another drive's now, and this one answers no more."""
+    monkeypatch.setattr(side_reads, "PAUSE_S", 0.0)
+    with served(tmp_path, MAY) as gateway:
+        gateway.await_state("pump-1", "stands")
+
+        def values() -> list[object]:
+            told = gateway.get("/api/drive/pump-1").json["values"]
+            return [value for value, *_ in told.values() if value is not None]
+
+        until(values)
+        gateway.sims["pump-1"].deaf_until = float("inf")
+        gateway.await_state("pump-1", "silent")
+        assert values()
+        edit(gateway, MAY, "")
+        assert reload(gateway)["done"] is True
+        assert values() == []
 
 
 def test_who_may_look_is_not_widened_while_it_listens_where_it_did(tmp_path: Path) -> None:
