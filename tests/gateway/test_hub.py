@@ -14,8 +14,10 @@ from hypothesis import strategies as st
 from multidrop import load_plant
 from multidrop.core import Columns, Field, Names, NumberFormat, RowLayout, Status
 from multidrop.gateway.events import Events
-from multidrop.gateway.frames import lost_of
+from multidrop.gateway.frames import frame_of, lost_of
 from multidrop.gateway.hub import LEAST_SLEEP_NS, NOT_ASKED, Hub, Newest, Shown
+from multidrop.gateway.lately import Lately
+from multidrop.gateway.mqtt_settings import fresh_values
 from multidrop.polling.batch import Batch
 
 REGISTERS = ("status", "output_frequency", "output_current", "fault")
@@ -315,3 +317,39 @@ def test_ended_alarms_are_bounded() -> None:
     assert len(events.between(0, 9999)) <= 1001
     assert events.begun == 2000
     assert len(events.shown()) <= 21
+
+
+def test_a_frame_gives_no_value_that_is_overdue_or_was_missed_since(hub: Hub, clock: HubClock) -> None:
+    hub.take(rows((10, FREQUENCY, 25), (10, CURRENT, 12), (11, CURRENT, Status.NO_REPLY)))
+    for now, frequency, current in (
+        (12, [25.0], [None, "no reply", 12.0]),  # a miss is told at once
+        (25, [None, "overdue", 25.0], [None, "no reply", 12.0]),
+    ):
+        clock.now_ns = now * PERIOD
+        frame = frame_of(hub, Events(), Lately(hub.plant), {}, n=1, revision=1, time_ns=UTC_0 + clock.now_ns)
+        told = frame["drives"]["pump-1"]["values"]
+        assert [*told["output_frequency"][:1], *told["output_frequency"][2:4]] == frequency
+        assert [*told["output_current"][:1], *told["output_current"][2:4]] == current
+        assert told["fault"] == (None, told["fault"][1], "not asked yet")
+        said = {"status": None, "output_frequency": frequency[0], "output_current": None, "fault": None}
+        assert fresh_values(hub, "pump-1") == said  # by MQTT
+
+
+def test_an_age_is_right_though_a_clock_was_set_back_or_slept(hub: Hub, clock: HubClock) -> None:
+    """One that is too short would make the last value of a silent drive a new one."""
+    hub.take(rows((10, FREQUENCY, 25), (20, FREQUENCY, Status.NO_REPLY)))
+    asked_ns = UTC_0 + 10 * PERIOD
+    hour_ns = 3600 * SECOND
+    for told, utc_ns, now_ns, age_ms in (
+        ("as it is", asked_ns + 50 * PERIOD, 60 * PERIOD, 5_000),
+        ("UTC was set back", asked_ns - hour_ns, 60 * PERIOD, 5_000),
+        ("the machine slept", asked_ns + hour_ns, 60 * PERIOD, 3_600_000),
+    ):
+        clock.now_ns = now_ns
+        lately = Lately(hub.plant)
+        frame = frame_of(hub, Events(), lately, {}, n=1, revision=1, time_ns=utc_ns)
+        pump = frame["drives"]["pump-1"]
+        now, missed, status, last, then = pump["values"]["output_frequency"]
+        assert (now, status, last) == (None, "no reply", 25.0), told
+        assert pump["ages_ms"][then] == pump["ages_ms"][pump["seen"]] == age_ms, told
+        assert pump["ages_ms"][missed] == age_ms - 1_000, told

@@ -13,13 +13,15 @@ from typing import Any
 
 import pytest
 from broken_part import BrokenFeed
-from gateways import POLL, Answer, Served, plant_text, running, served, tokens
+from gateways import POLL, Answer, Served, certificate, plant_text, running, served, simulated_plant, tokens
 from lines import HOST_LATE, PATIENCE, until
 
 import multidrop
 from multidrop import Batch, Bus, InvtCHE, LineError, Plant, load_plant
+from multidrop.gateway import side_reads
+from multidrop.gateway.clock import boottime_ns
 from multidrop.gateway.gateway import Gateway
-from multidrop.gateway.rights import Right
+from multidrop.gateway.rights import Right, new_token
 from multidrop.gateway.settings import ServeSettings, read_settings
 from multidrop.recording.segments import segments_of
 from multidrop.sim import Simulator, Wire, simulated
@@ -218,6 +220,89 @@ def test_who_counts_as_being_here_is_not_widened_before_the_restart(tmp_path: Pa
         edit(gateway, "behind_proxy = false\n", f"behind_proxy = true\n{MAY}")
         assert reload(gateway)["restart"] == ["behind_proxy of [serve] takes effect after a restart"]
         assert gateway.post("/api/stop").status == 401
+
+
+def test_a_certificate_that_was_renewed_in_place_waits_for_a_restart(tmp_path: Path) -> None:
+    """Whoever renews it finds out from the reload, and not from browsers a month later."""
+    certificate(tmp_path, "own")
+    serve = '[serve]\ncertificate = "own.pem"\nkey = "own.key"\n'
+    with served(tmp_path, serve, tls=None) as gateway:
+        assert reload(gateway)["restart"] == []
+        certificate(tmp_path, "own")
+        assert reload(gateway)["restart"] == ["certificate of [serve] takes effect after a restart"]
+        assert gateway.get("/health").json["restart"] == [
+            "certificate of [serve] takes effect after a restart"
+        ]
+
+
+def test_a_token_that_is_taken_away_counts_no_more_after_a_reload(tmp_path: Path) -> None:
+    secrets, known = tokens()
+    newer, newcomer = new_token("bert", Right.LOOK)
+    file = tmp_path / "tokens"
+    file.write_text("".join(f"{token.line}\n" for token in known))
+    serve = '[serve]\ntokens = "tokens"\n[serve.may]\nlook = "token"\n'
+    with simulated_plant(tmp_path, serve) as path:
+
+        def read() -> tuple[Plant, ServeSettings]:
+            plant = load_plant(path)
+            return plant, replace(read_settings(plant, {}), port=0)
+
+        gateway = Gateway(*read(), read=read)
+        with running(gateway):
+            client = Served(gateway, {}, secrets)
+
+            def answers() -> list[int]:
+                bearers = [*(client.bearer(right) for right in Right), f"Bearer {newer}"]
+                return [client.get("/api/plant", authorization=bearer).status for bearer in bearers]
+
+            assert answers() == [200, 200, 200, 401]
+            file.write_text(f"{known[-1].line}\n{newcomer.line}\n")
+            assert answers() == [200, 200, 200, 401]  # not before it is read
+            assert gateway.commands.plant_ns is None
+            begun_ns = boottime_ns()
+            writer = {"authorization": client.bearer(Right.WRITE)}
+            assert client.post("/api/reload", {"confirm": True}, **writer).json["done"] is True
+            assert answers() == [401, 401, 200, 200]
+            read_ns = gateway.commands.plant_ns  # by which brokers' commands are judged
+            assert read_ns is not None
+            assert begun_ns <= read_ns <= boottime_ns()
+
+
+def test_what_was_looked_at_before_a_reload_is_not_shown_after_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The name may be another drive's now, and this one answers no more."""
+    monkeypatch.setattr(side_reads, "PAUSE_S", 0.0)
+    with served(tmp_path, MAY) as gateway:
+        gateway.await_state("pump-1", "stands")
+
+        def values() -> list[object]:
+            told = gateway.get("/api/drive/pump-1").json["values"]
+            return [value for value, *_ in told.values() if value is not None]
+
+        until(values)
+        gateway.sims["pump-1"].deaf_until = float("inf")
+        gateway.await_state("pump-1", "silent")
+        assert values()
+        edit(gateway, MAY, "")
+        assert reload(gateway)["done"] is True
+        assert values() == []
+
+
+def test_who_may_look_is_not_widened_while_it_listens_where_it_did(tmp_path: Path) -> None:
+    """Those who reach the address of before are others than those who will reach the new one."""
+    serve = '[serve]\nlisten = "127.0.0.1:0"\ntokens = "tokens"\n[serve.may]\nlook = "token"\n'
+    with served(tmp_path, serve) as gateway:
+        edit(gateway, "127.0.0.1:0", "127.0.0.2:0")
+        edit(gateway, 'look = "token"', 'stop = "anyone"')
+        writer = {"authorization": gateway.bearer(Right.WRITE)}
+        told = gateway.post("/api/reload", {"confirm": True}, **writer).json
+        assert told["restart"] == ["listen of [serve] takes effect after a restart"]
+        assert gateway.get("/api/plant").status == 401
+        assert gateway.post("/api/stop").status == 401
+        edit(gateway, "127.0.0.2:0", "127.0.0.1:0")
+        assert gateway.post("/api/reload", {"confirm": True}, **writer).json["restart"] == []
+        assert gateway.get("/api/plant").json["may"]["role"] == "stop"
 
 
 def test_a_reload_needs_the_right_to_write_and_a_confirmation(tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ import pytest
 from gateways import Served, served
 from lines import PATIENCE, until
 
-from multidrop.gateway.rights import MOST_WRONG, Right
+from multidrop.gateway.rights import MOST_WRONG, SCHEMES, OwnNames, Right
 
 MAY = '[serve.may]\nwrite = ["pump-1.setpoint"]\nverbs = ["pump-1.start", "pump-1.reset_fault"]\n'
 LOOPBACK_STOPS = MAY.replace("[serve.may]", '[serve.may]\nstop = "anyone"')
@@ -89,6 +89,7 @@ FOREIGN = {
     "no host name": ({"host": "plant.example/x"}, 421),
     "an empty name": ({"host": ""}, 421),
     "a page of another site": ({"origin": "http://evil.test"}, 403),
+    "the same port with TLS, which we have not": ({"host": "localhost", "origin": "https://localhost"}, 403),
     "another port of this machine": ({"origin": "http://localhost:1"}, 403),
     "a file, or a sandboxed frame": ({"origin": "null"}, 403),
     "a script of another site": ({"sec_fetch_site": "cross-site"}, 403),
@@ -104,6 +105,29 @@ def test_pages_that_are_not_ours_send_no_frame(open_gateway: Served, case: str) 
     before = open_gateway.gateway.commands.called
     assert open_gateway.post(*STOP, **headers).status == status
     assert open_gateway.gateway.commands.called == before
+
+
+ORIGINS = {  # with the host that was asked, and how: is it a page of ours?
+    ("https://plant.example", "plant.example", ("https",)): True,
+    ("https://plant.example:443", "plant.example", ("https",)): True,
+    ("https://plant.example:8443", "plant.example:8443", ("https",)): True,
+    ("http://plant.example", "plant.example", ("https",)): False,  # port 80, and we have 443
+    ("https://plant.example", "plant.example", ("http",)): False,
+    ("https://plant.example", "plant.example", SCHEMES): True,  # behind a proxy that has TLS
+    ("http://plant.example", "plant.example:443", SCHEMES): False,
+    ("https://plant.example.evil.test", "plant.example", ("https",)): False,
+    ("https://evil.test", "evil.test", ("https",)): False,
+    ("https:plant.example", "plant.example", ("https",)): False,
+    ("https://anna@plant.example", "plant.example", ("https",)): False,
+    ("null", "plant.example", SCHEMES): False,
+}
+
+
+@pytest.mark.parametrize("case", ORIGINS)
+def test_a_page_of_ours_has_our_scheme_host_and_port(case: tuple[str, str, tuple[str, ...]]) -> None:
+    origin, host, schemes = case
+    names = OwnNames(["plant.example"], "0.0.0.0", 443)
+    assert names.has_origin(origin, host, schemes) is ORIGINS[case]
 
 
 def test_our_own_page_and_programs_do(open_gateway: Served) -> None:
@@ -132,9 +156,12 @@ def test_two_host_headers(open_gateway: Served) -> None:
 @pytest.mark.parametrize("path", ["/", "/api/plant", "/api/nothing", "/metrics", "/api/stop"])
 def test_no_answer_lets_itself_be_framed_or_guessed_at(open_gateway: Served, path: str) -> None:
     headers = open_gateway.get(path).headers
-    assert "frame-ancestors 'none'" in headers["content-security-policy"]
-    own = "self" if path == "/" else "none"
-    assert f"default-src '{own}'" in headers["content-security-policy"]
+    if path == "/":
+        policy = "default-src 'self'; base-uri 'none'; form-action 'none'; object-src 'none'"
+        assert headers["content-security-policy"] == f"{policy}; frame-ancestors 'none'"
+        assert headers["cross-origin-opener-policy"] == "same-origin"
+    else:
+        assert headers["content-security-policy"] == "default-src 'none'; frame-ancestors 'none'"
     assert headers["cross-origin-resource-policy"] == "same-origin"
     assert headers["x-content-type-options"] == "nosniff"
     assert "server" not in headers
@@ -161,6 +188,18 @@ def test_methods_and_bodies(open_gateway: Served) -> None:
     )
     assert post("/api/write", {"drive": "", "register": "setpoint", "value": 1}, **writer).status == 400
     assert post("/api/act", {"drive": "pump-1", "verb": "start", "options": []}, **writer).status == 400
+
+
+def test_texts_that_are_no_unicode_are_answered_like_others(open_gateway: Served) -> None:
+    post, writer = open_gateway.post, {"authorization": open_gateway.bearer(Right.WRITE)}
+    odd = "\ud800"
+    assert post("/api/token", {"token": odd}).status == 401
+    for named in ({"drive": odd, "register": "setpoint"}, {"drive": "pump-1", "register": odd}):
+        answer = open_gateway.command("/api/write", {**named, "value": 1.0}, **writer)
+        assert answer.status == 403
+        assert odd in answer.json["error"]
+    unknown = open_gateway.command("/api/act", {"drive": odd, "verb": "coast"}, **writer)
+    assert odd in unknown.json["error"]
 
 
 def test_the_page_keeps_its_token_where_no_script_sees_it(open_gateway: Served) -> None:
@@ -200,6 +239,15 @@ def test_wrong_tokens_are_looked_at_five_times_a_minute(tmp_path: Path) -> None:
         assert gateway.get("/api/plant", **elsewhere).status == 200
         now[0] += 60.0
         assert gateway.get("/api/plant", **right).status == 200
+
+
+@pytest.mark.parametrize("told", [{}, {"x_forwarded_for": "127.0.0.1"}, {"x_forwarded_for": "10.0.0.7, ::1"}])
+def test_nobody_behind_a_proxy_counts_as_being_here(tmp_path: Path, told: dict[str, str]) -> None:
+    """It is on this machine itself, and may be wrong about its clients."""
+    with served(tmp_path, LOOPBACK_STOPS, behind_proxy=True) as gateway:
+        assert gateway.post(*STOP, **told).status == 401
+        assert gateway.get("/api/plant", **told).json["may"]["role"] == "look"
+        assert gateway.gateway.commands.called == 0
 
 
 def test_nobody_behind_a_proxy_is_shut_out_in_the_name_of_another_address(tmp_path: Path) -> None:

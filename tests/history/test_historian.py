@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import asyncio
+import json
+import threading
 from math import inf, nan
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 from gateways import serving, simulated_plant
 from histories import NOON, SECOND, batch
 
-from multidrop import Buckets, Plant, open_reader
+from multidrop import Buckets, History, Plant, open_reader
 from multidrop.core.columns import Names
-from multidrop.gateway.historian import HistorySettings, as_json, build
+from multidrop.gateway import historian
+from multidrop.gateway.historian import MOST_BUCKETS, HistorySettings, as_json, build
 
 MS = 1_000_000
 
@@ -42,21 +46,85 @@ def test_a_number_without_end_is_null() -> None:
     assert [found[key] for key in ("least", "mean", "most")] == [[None, 1.0], [None, 1.5], [None, 2.0]]
 
 
+def test_a_great_answer_is_refused_and_none_is_made_in_the_loop(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A stop comes through the loop: it would wait for whatever is reckoned there."""
+    makers: list[int] = []
+
+    def noted(made: Buckets) -> dict[str, Any]:
+        makers.append(threading.get_ident())
+        return as_json(made)
+
+    async def live() -> None:
+        inside = SimpleNamespace(plant=Plant((), Path("plant.toml")), folder=tmp_path)
+        part = build(HistorySettings(), inside)
+        try:
+            many = [f"pump-{at}.speed" for at in range(3)]
+            found = json.loads(await part.series([*many, *many], 0, 1000, MOST_BUCKETS // 1000))
+            assert list(found["series"]) == many
+            assert len(makers) == 3
+            assert threading.get_ident() not in makers
+            with pytest.raises(ValueError, match="3 series of 70000 points: an answer has 200000"):
+                await part.series(many, 0, 1000, 70_000)
+        finally:
+            await part.close()
+
+    monkeypatch.setattr(historian, "as_json", noted)
+    asyncio.run(live())
+
+
+@pytest.mark.parametrize("kind", ["csv", "parquet"])
+def test_no_export_is_begun_in_the_loop(tmp_path: Path, kind: str) -> None:
+    """Thousands of files say of their rows what they are: to read that takes seconds."""
+    readers: list[int] = []
+
+    class Noted(History):
+        def parting_of(self, *of: Any) -> Any:
+            readers.append(threading.get_ident())
+            return super().parting_of(*of)
+
+    async def live() -> None:
+        inside = SimpleNamespace(plant=Plant((), Path("plant.toml")), folder=tmp_path)
+        part = build(HistorySettings(), inside)
+        try:
+            part.history = Noted(part.history.folder)
+            await part.export([], 0, 1000, kind)
+            assert readers
+            assert threading.get_ident() not in readers
+        finally:
+            await part.close()
+
+    asyncio.run(live())
+
+
+def test_what_a_killed_process_left_of_its_exports_goes(tmp_path: Path) -> None:
+    left = tmp_path / "history" / ".export-x1y2"
+    left.mkdir(parents=True)
+    (left / "export.parquet").write_bytes(b"PAR1")
+    inside = SimpleNamespace(plant=Plant((), Path("plant.toml")), folder=tmp_path)
+    part = build(HistorySettings(), inside)
+    try:
+        assert not left.exists()
+    finally:
+        asyncio.run(part.close())
+
+
 @pytest.mark.slow
 def test_it_records_and_answers(tmp_path: Path) -> None:
     async def live() -> None:
         inside = SimpleNamespace(plant=Plant((), Path("plant.toml")), folder=tmp_path)
-        historian = build(HistorySettings(folder="kept"), inside)
-        running = asyncio.create_task(historian.run())
+        part = build(HistorySettings(folder="kept"), inside)
+        running = asyncio.create_task(part.run())
         taken = batch(Names(["pump-1"]), 0, range(100), NOON, SECOND)
-        historian.take(taken)
+        part.take(taken)
         for _ in range(600):
-            if historian.state.rows:
+            if part.state.rows:
                 break
             await asyncio.sleep(0.1)
-        assert historian.state == (100, 0, None)
+        assert part.state == (100, 0, None)
         begin, end = NOON // MS, NOON // MS + 100_000
-        found = await historian.series(["pump-1.speed", "fan.speed"], begin, end, 10)
+        found = json.loads(await part.series(["pump-1.speed", "fan.speed"], begin, end, 10))
         assert found["step_ms"] == 10_000
         pump, fan = found["series"]["pump-1.speed"], found["series"]["fan.speed"]
         assert pump["time"] == [begin + 10_000 * number for number in range(10)]
@@ -66,13 +134,13 @@ def test_it_records_and_answers(tmp_path: Path) -> None:
         assert fan["mean"] == [None] * 10
         for kind in ("csv", "parquet"):
             path = tmp_path / f"got.{kind}"
-            path.write_bytes(b"".join(historian.export(["pump-1.speed"], begin, end, kind)))
+            path.write_bytes(b"".join(await part.export(["pump-1.speed"], begin, end, kind)))
             assert [row for rows in open_reader(path) for row in rows] == list(taken)
         with pytest.raises(ValueError, match="is no series"):
-            historian.export(["pump"], begin, end, "csv")
+            await part.export(["pump"], begin, end, "csv")
         with pytest.raises(ValueError, match="neither csv nor parquet"):
-            historian.export([], begin, end, "xlsx")
-        await historian.close()
+            await part.export([], begin, end, "xlsx")
+        await part.close()
         await asyncio.wait_for(running, 60)
 
     asyncio.run(live())

@@ -30,6 +30,7 @@ from multidrop import (
     PortLost,
     Refused,
     Unconfirmed,
+    Unsupported,
     reading,
     setting,
 )
@@ -37,6 +38,7 @@ from multidrop.drives import DelixiNative, ErmanERG220, InnovertIBD, InvtCHE
 from multidrop.gateway.commands import BUSY, Told
 from multidrop.gateway.modbus_server import MOST_STOPS
 from multidrop.gateway.modbus_settings import ModbusSettings
+from multidrop.gateway.passing import PassingBusy
 from multidrop.gateway.rights import NOT_ALLOWED, NOT_LISTED, Caller, Right
 
 CHE_OUTPUT_VOLTAGE, CHE_SETPOINT, CHE_CONTROL = 0x3003, 0x2000, 0x1000  # CHE100 manual v1.4, p. 117
@@ -215,6 +217,8 @@ FAILURES = [
     (NotMaster("mill", "/dev/ttyUSB0"), 0x0A),
     (NotAttached("mill is on no bus"), 0x0A),
     (Expired("mill", "a read", 1.0), 0x06),
+    (PassingBusy("the line was not free for it"), 0x06),
+    (Unsupported("the document of mill has no such thing"), 0x01),
     (DriveRefused("mill", 2, "illegal address"), 0x02),
     (DriveRefused("mill", 0x11, "password"), 0x11),
     (ValueError("count = 100 is not from 1 to 16"), 0x03),

@@ -14,9 +14,20 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from brokers import FAN, Broker, Listener, Published, Running, inside, mosquitto, publish, without_fan
+from brokers import (
+    FAN,
+    Broker,
+    Listener,
+    Published,
+    Running,
+    free_port,
+    inside,
+    mosquitto,
+    publish,
+    without_fan,
+)
 from examples import in_turn
-from gateways import served
+from gateways import certificate, served
 from lines import until
 from peers import require_module
 
@@ -113,12 +124,70 @@ def test_the_broker_says_that_the_gateway_is_gone(listener: Listener, start: Sta
     listener.wait_for(has("multidrop/gateway", b"online"))
 
 
+def test_who_comes_later_hears_that_the_gateway_is_gone(
+    broker: Broker, listener: Listener, start: Start
+) -> None:
+    _, running = start()
+    listener.wait_for(has("multidrop/gateway", b"online"))
+    running._part._brokers[0]._client.reconnect_delay_set(3600, 3600)
+    running.cut(0)
+    listener.wait_for(has("multidrop/gateway", b"offline"))
+    later = Listener(broker)
+    try:
+        assert later.wait_for(has("multidrop/gateway")) == ("multidrop/gateway", True, b"offline")
+    finally:
+        later.close()
+
+
+def test_what_there_was_to_say_without_a_connection_is_counted(tmp_path: Path) -> None:
+    require_module("paho.mqtt.client")
+    part: Any = build(MqttSettings(f"mqtt://127.0.0.1:{free_port()}", sparkplug="works"), inside(tmp_path))
+    running = Running(part)
+    try:
+        of_json, of_sparkplug = (broker.outbox for broker in part._brokers)
+        assert (of_json.dropped, of_sparkplug.dropped) == (2, 2)  # of two drives
+        running.step()
+        assert (of_json.dropped, of_sparkplug.dropped) == (4, 2)  # nothing changed
+        part._speakers[0]._hub.values["pump-1", "output_frequency"] = 1.0
+        running.step()
+        assert (of_json.dropped, of_sparkplug.dropped) == (6, 3)
+        (dropped,) = (one for one in part.figures() if one.name == "multidrop_mqtt_dropped")
+        assert [value for _, _, value in dropped.samples] == [9]
+    finally:
+        running.close()
+
+
 def test_it_says_goodbye(broker: Broker, listener: Listener, tmp_path: Path) -> None:
     require_module("paho.mqtt.client")
     running = Running(build(MqttSettings(broker.address), inside(tmp_path)))
     listener.wait_for(has("multidrop/gateway", b"online"))
     running.close()
     listener.wait_for(has("multidrop/gateway", b"offline"))
+    for drive in ("pump-1", FAN.name):  # the next plant file may have it no more
+        listener.wait_for(has(f"multidrop/{drive}/available", b"offline"))
+
+
+def test_who_can_say_nothing_is_away_and_still_stops(
+    broker: Broker, listener: Listener, start: Start
+) -> None:
+    """The values that the broker keeps would pass for the present, for it has a connection."""
+    known, running = start(commands=True)
+    listener.wait_for(has("multidrop/gateway", b"online"))
+    state = known.hub.states.pop("pump-1")
+    running.step()
+    listener.wait_for(has("multidrop/gateway", b"offline"))
+    assert running._part.health() == "nothing can be said: KeyError: 'pump-1'"
+    running.step()  # once is enough
+    publish(broker, "multidrop/pump-1/stop", b"now")
+    listener.wait_for(has("multidrop/pump-1/told"))
+    assert known.commands.noted == [("stop", ["pump-1"])]
+    known.hub.states["pump-1"] = state
+    running.step()
+    listener.wait_for(has("multidrop/gateway", b"online"))
+    listener.wait_for(has("multidrop/pump-1/available", b"online"))
+    assert running._part.health() == ""
+    said = [one.payload for one in listener.all if one.topic == "multidrop/gateway"]
+    assert said == [b"online", b"offline", b"online"]
 
 
 @pytest.mark.slow
@@ -438,6 +507,12 @@ def test_without_the_key_nothing_is_listened_to(broker: Broker, listener: Listen
     assert known.commands.noted == []
 
 
+def test_without_the_key_only_a_rebirth_is_asked_for(tmp_path: Path) -> None:
+    require_module("paho.mqtt.client")
+    part: Any = build(MqttSettings(sparkplug="works", node="line"), inside(tmp_path))
+    assert [speaker.topics() for speaker in part._speakers] == [[], [("spBv1.0/works/NCMD/line", 1)]]
+
+
 # ---- Home Assistant ----
 
 
@@ -451,7 +526,7 @@ def test_home_assistant_is_told_of_each_drive(broker: Broker, listener: Listener
     assert len({part["unique_id"] for part in parts.values()}) == len(parts)
     sensor = parts["output_frequency"]
     assert (sensor["unit_of_measurement"], sensor["device_class"]) == ("Hz", "frequency")
-    assert sensor["expire_after"] == 6
+    assert sensor["expire_after"] == parts["state"]["expire_after"] == 6
     assert "unit_of_measurement" not in parts["status"]
     assert parts["setpoint_set"]["command_topic"] == "multidrop/pump-1/set/setpoint"
 
@@ -492,6 +567,20 @@ def test_every_mistake_of_the_settings_is_told_at_once(tmp_path: Path) -> None:
     assert (
         sentences[0] == 'broker = "http://x" is no broker; write broker = "mqtt://broker:1883", or mqtts://'
     )
+
+
+def test_authorities_that_are_none_are_told_before_anything_is_polled(tmp_path: Path) -> None:
+    certificate(tmp_path, "own")
+    (tmp_path / "text.pem").write_text("no certificate\n", "ascii")
+    plant = inside(tmp_path).plant
+    for name, told in (
+        ("own.pem", []),
+        ("own.key", [f'authorities = "own.key": {tmp_path}/own.key has no certificates in PEM']),
+        ("text.pem", [f'authorities = "text.pem": {tmp_path}/text.pem has no certificates in PEM']),
+        ("none.pem", [f'authorities = "none.pem": there is no file {tmp_path}/none.pem']),
+    ):
+        settings = MqttSettings("mqtts://broker", authorities=name)
+        assert [one for one in settings.check(plant) if "authorities" in one] == told
 
 
 def test_a_drive_that_cannot_be_a_topic_is_told(tmp_path: Path) -> None:
@@ -542,6 +631,39 @@ def test_metrics_say_in_words_what_they_count(broker: Broker, tmp_path: Path) ->
 
 
 # ---- another plant ----
+
+
+class PutMessages:
+    """An outbox that keeps what is put into it."""
+
+    def __init__(self) -> None:
+        self.put_in: list[Any] = []
+
+    def put(self, message: Any) -> None:
+        self.put_in.append(message)
+
+    def emptied(self) -> set[str]:
+        return {one.topic for one in self.put_in if one.is_retained and one.make() == b""}
+
+
+def test_a_drive_that_left_while_the_broker_was_away_is_taken_back_when_it_is_there(tmp_path: Path) -> None:
+    """Messages that wait are dropped when a connection breaks; the topics would say old values for ever."""
+    known = inside(tmp_path)
+    whole = known.plant
+    topics = JsonTopics(MqttSettings(home_assistant=True), known, now_ms)
+    fan = f"multidrop/{FAN.name}"
+    expected = {fan, f"{fan}/available", discovery_topic("multidrop", FAN.name)}
+    topics.outbox = PutMessages()
+    topics.adopt(without_fan(known))
+    assert topics.outbox.emptied() == expected
+    topics.outbox = PutMessages()
+    topics.connected()
+    assert topics.outbox.emptied() == expected
+    known.hub.names.append(FAN.name)
+    topics.outbox = PutMessages()
+    topics.adopt(whole)
+    topics.connected()
+    assert topics.outbox.emptied() == set()
 
 
 def test_what_is_kept_of_a_drive_that_left_is_taken_back(

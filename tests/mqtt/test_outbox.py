@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from multidrop.gateway.outbox import MOST_UNDER_WAY, Outbox, Publication
+from multidrop.gateway.outbox import MOST_UNDER_WAY, MOST_WAITING, Outbox, Publication
 
 
 class Wire:
@@ -82,3 +82,21 @@ def test_messages_that_arrive_together_make_room_at_once() -> None:
     assert len(wire.sent) == 2 * MOST_UNDER_WAY
     outbox.acknowledge([1, 2, 3 * MOST_UNDER_WAY])  # of a connection before
     assert len(wire.sent) == 2 * MOST_UNDER_WAY
+
+
+def test_no_more_topics_wait_than_the_bound_and_the_others_are_counted() -> None:
+    """Whoever sends commands names the topics of their answers."""
+    wire = Wire()
+    outbox = Outbox(wire.send)
+    wire.is_open = False
+    for at in range(MOST_WAITING + 10):
+        outbox.put(said(f"{at}"))
+    assert outbox.dropped == 10
+    outbox.put(said("0", b"newer"))  # a topic that waits already has its place
+    assert outbox.dropped == 11
+    wire.is_open = True
+    outbox.flush()
+    for number in range(1, MOST_WAITING + 1):
+        outbox.acknowledge([number])
+    assert [topic for topic, _ in wire.sent] == [f"{at}" for at in range(MOST_WAITING)]
+    assert wire.sent[0] == ("0", b"newer")

@@ -16,8 +16,8 @@ from sparkplug_host import ROOT, Host, command
 
 from multidrop.gateway.mqtt import MqttSettings, build
 from multidrop.gateway.outbox import Outbox, Publication
-from multidrop.gateway.sparkplug import read_command
-from multidrop.gateway.sparkplug_node import SparkplugNode
+from multidrop.gateway.sparkplug import DataType, Metric, payload, read_command
+from multidrop.gateway.sparkplug_node import STOP, SparkplugNode
 
 
 @pytest.fixture
@@ -195,6 +195,25 @@ def test_a_stop_is_sent_whatever_is_wrong_with_the_rest_of_its_payload(
 
     asyncio.run(receive())
     assert known.commands.noted == noted
+
+
+@pytest.mark.parametrize("is_retained", [False, True])
+def test_a_write_that_the_broker_kept_is_not_carried_out_and_a_stop_is(
+    tmp_path: Path, *, is_retained: bool
+) -> None:
+    """It comes at every connection, and it may be fresh when it comes first."""
+    known = inside(tmp_path)
+    node = SparkplugNode(MqttSettings(sparkplug="works", node="line", commands=True), known, lambda: 1_000)
+    given = [Metric(DataType.DOUBLE, 25.0, 1_000, "setpoint"), Metric(DataType.BOOLEAN, 1, 1_000, STOP)]
+
+    async def receive() -> None:
+        topic = ROOT.format("DCMD") + "/pump-1"
+        node.received(topic, payload(1_000, given, None), is_retained=is_retained)
+        await asyncio.gather(*asyncio.all_tasks() - {asyncio.current_task()})
+
+    asyncio.run(receive())
+    written = [] if is_retained else [("write", "pump-1", "setpoint", 25.0)]
+    assert known.commands.noted == [*written, ("stop", ["pump-1"])]
 
 
 def test_another_plant_is_a_death_of_what_left_and_a_birth_of_the_rest(

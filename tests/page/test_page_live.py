@@ -92,6 +92,33 @@ def test_an_old_value_is_never_shown_as_new(opened: Opener, gateway: FakeGateway
     assert cell(page, "pump-2", "frequency").locator(".bar").is_hidden()
 
 
+SET_BACK = """([name, register, known]) => import('/page/store.js').then(s => {
+  const frame = structuredClone(s.store.frame), [value] = frame.drives[name].values[register];
+  frame.time = String(BigInt(frame.time) - 3600n * 10n ** 9n);
+  if (!known) frame.drives[name].values[register] = [null, 0, 'not asked yet'];
+  s.takeFrame(frame);
+  const { age, isOld } = s.reading(name, register, s.store.time);
+  return [value, age, isOld];
+})"""
+
+
+def test_nothing_gets_young_where_the_daemon_s_clock_is_set_back(opened: Opener) -> None:
+    page = opened()
+    until(page, LIVE)
+    value, age, is_old = page.evaluate(SET_BACK, ["labeller", "output_frequency", True])
+    assert value is None
+    assert 42_000 <= age < 3_000_000
+    assert is_old
+    until(page, LIVE)
+    value, age, is_old = page.evaluate(SET_BACK, ["labeller", "output_frequency", False])  # started again
+    assert value is None
+    assert is_old
+    until(page, LIVE)
+    _, age, is_old = page.evaluate(SET_BACK, ["pump-1", "output_frequency", True])
+    assert age < 1000
+    assert not is_old
+
+
 def test_what_a_slow_line_read_seconds_ago_is_not_old(
     opened: Opener, gateway: FakeGateway, monkeypatch: pytest.MonkeyPatch
 ) -> None:

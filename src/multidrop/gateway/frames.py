@@ -27,6 +27,8 @@ WHOLE = -1  # the number of no frame: who has none is sent a whole one
 REMEMBERED = 6  # frames, the newest among them: a viewer may be a second behind
 LOST = ("port lost", "port refused its settings")  # statuses of all rows of a line that is not there
 
+Times = tuple[int, int]  # the same moment in UTC, and by CLOCK_MONOTONIC, both in ns
+
 
 class Encoded(NamedTuple):
     """A frame as it is sent, whole or as what changed since another one."""
@@ -68,42 +70,48 @@ def frame_of(
 def _drive(hub: Hub, name: str, time_ns: int) -> dict[str, Any]:
     """Return what a frame says of a drive; of a value that is known now that and the place of its time."""
     shown = hub.seen(name)
-    seen = hub.seen_at(name)
+    seen, answered_ns = hub.seen_at(name), hub.answered_ns(name)
+    now = time_ns, hub.now_ns()
     places = Places()
     values: dict[str, tuple[Any, ...]] = {}
     for register, newest, good, is_fresh in hub.known(name):
         if is_fresh and good is not None and newest is good:
-            values[register] = _finite(good[2]), places[good[0]]
+            values[register] = _finite(good[2]), places[good[:2]]
         else:
-            values[register] = _unknown(hub, newest, good, places, time_ns)
+            values[register] = _unknown(hub, newest, good, places, now)
     return {
         "state": shown.state,
         "fault": shown.fault,
         "why": shown.why_silent,
-        "seen": None if seen is None else places[seen],
-        "ages_ms": [time_ns // 1_000_000 - time // 1_000_000 for time in places],
+        "seen": None if seen is None or answered_ns is None else places[seen, answered_ns],
+        "ages_ms": [_age_ms(now, asked) for asked in places],
         "values": values,
     }
 
 
-class Places(dict[int, int]):
+def _age_ms(now: Times, asked: Times) -> int:
+    """Return the longer time of two clocks: one may have been set back, and the other stops in a sleep."""
+    return max(one // 1_000_000 - then // 1_000_000 for one, then in zip(now, asked, strict=True))
+
+
+class Places(dict[Times, int]):
     """The places of times in a list without doubles: what was read by one request has one time."""
 
-    def __missing__(self, time: int) -> int:
+    def __missing__(self, time: Times) -> int:
         self[time] = place = len(self)
         return place
 
 
 def _unknown(
-    hub: Hub, newest: KeptRow | None, good: KeptRow | None, places: Places, time_ns: int
+    hub: Hub, newest: KeptRow | None, good: KeptRow | None, places: Places, now: Times
 ) -> tuple[Any, ...]:
     """Return null, place of its time, status of what is not known now, and the last value and its time."""
     if newest is None:
-        return None, places[time_ns], "not asked yet"
-    last = () if good is None else (_finite(good[2]), places[good[0]])
+        return None, places[now], "not asked yet"
+    last = () if good is None else (_finite(good[2]), places[good[:2]])
     if newest[3]:
-        return None, places[newest[0]], hub.status(newest[3]), *last
-    return None, places[time_ns], "overdue", *last
+        return None, places[newest[:2]], hub.status(newest[3]), *last
+    return None, places[now], "overdue", *last
 
 
 def _finite(value: float) -> float | None:

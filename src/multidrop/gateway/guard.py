@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from http.cookies import CookieError, SimpleCookie
 from typing import Any, NamedTuple
 
@@ -11,7 +11,7 @@ from starlette.datastructures import Headers
 from starlette.responses import JSONResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from multidrop.gateway.rights import Caller, May, OwnNames, Right, Token, Tokens, is_loopback
+from multidrop.gateway.rights import SCHEMES, Caller, May, OwnNames, Right, Token, Tokens, is_loopback
 
 COOKIE = "multidrop"
 CSP = "default-src 'self'; base-uri 'none'; form-action 'none'; object-src 'none'; frame-ancestors 'none'"
@@ -114,7 +114,7 @@ class Guard:
             raise Denied(431, f"the headers are longer than {MOST_HEAD} bytes")
         if scope["method"] != needed.method and (scope["method"], needed.method) != ("HEAD", "GET"):
             raise Denied(405, f"{path[:100]!r} takes {needed.method} alone")
-        self._check_site(headers, hosts[0], needed)
+        self._check_site(headers, hosts[0], needed, SCHEMES if self._behind_proxy else (scope["scheme"],))
         if needed.right is None:
             return Caller(ANYONE, "page", self.address(scope, headers), Right.LOOK)
         return self._admit(scope, headers, needed.right)
@@ -128,10 +128,10 @@ class Guard:
             path = f"{head}/"
         return self._needed[path]
 
-    def _check_site(self, headers: Headers, host: str, needed: Needed) -> None:
+    def _check_site(self, headers: Headers, host: str, needed: Needed, schemes: Sequence[str]) -> None:
         """Refuse what another site's page sends: a browser says so, and nothing else has to."""
         origin = headers.get("origin")
-        if origin is not None and not self._names.has_origin(origin, host):
+        if origin is not None and not self._names.has_origin(origin, host, schemes):
             raise Denied(403, f"a page of {origin[:100]!r} asks, which is not this gateway's")
         site = headers.get("sec-fetch-site", "none")
         is_page = needed == Needed("GET", None) and headers.get("sec-fetch-mode") == "navigate"

@@ -51,7 +51,7 @@ def discovery(
 ) -> bytes:
     """Return the configuration of one drive: a sensor for each polled register, its state, and commands."""
     name = object_id(prefix, drive.name)
-    parts: dict[str, Any] = {"state": _state(name)}
+    parts: dict[str, Any] = {"state": _state(name, every_s)}
     for register in polled:
         parts[register.name] = _sensor(name, register, every_s)
     if takes_commands:
@@ -81,12 +81,18 @@ def discovery(
     ).encode()
 
 
-def _state(name: str) -> dict[str, Any]:
+def _expiry(every_s: float) -> int:
+    """Return the seconds after which a sensor that nothing more came for is unavailable."""
+    return max(2, round(STALE_PERIODS * every_s))
+
+
+def _state(name: str, every_s: float) -> dict[str, Any]:
     return {
         "p": "sensor",
         "unique_id": f"{name}-state",
         "name": "State",
         "value_template": "{{ value_json.state }}",
+        "expire_after": _expiry(every_s),
     }
 
 
@@ -96,7 +102,7 @@ def _sensor(name: str, register: Register[Any], every_s: float) -> dict[str, Any
         "unique_id": f"{name}-{register.name}",
         "name": register.name.replace("_", " "),
         "value_template": f"{{{{ value_json['values']['{register.name}'] }}}}",
-        "expire_after": max(2, round(STALE_PERIODS * every_s)),
+        "expire_after": _expiry(every_s),
     }
     if register.values is None and register.unit and register.step is not None:
         found["unit_of_measurement"] = register.unit

@@ -157,6 +157,10 @@ class Hub:
         watched = self._watched.get(drive)
         return watched.cell(register) if watched else None
 
+    def now_ns(self) -> int:
+        """Return the present time, as rows have it (CLOCK_MONOTONIC)."""
+        return self._times()[0]
+
     def woke_ns(self) -> int:
         """Return when the latest sleep of the machine was noticed (CLOCK_MONOTONIC); 0 without one.
 

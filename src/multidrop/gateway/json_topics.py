@@ -42,6 +42,7 @@ class JsonTopics:
         self._plant = inside.plant
         self._orders = Orders(inside.commands, settings.caller, utc_ms, self._tell)
         self._available: dict[str, bytes] = {}
+        self._left: set[str] = set()  # drives of which the broker is to keep nothing
 
     def _topic(self, *levels: str) -> str:
         return "/".join((self._settings.prefix, *levels))
@@ -65,6 +66,7 @@ class JsonTopics:
     def connected(self) -> None:
         self._available.clear()
         self.outbox.put(self._kept(self._topic("gateway"), ONLINE))
+        self._take_back()  # the connection may have broken before it was heard
         if self._settings.home_assistant:
             for drive in self._hub.drives:
                 self._discover(drive)
@@ -117,9 +119,13 @@ class JsonTopics:
 
     def adopt(self, plant: Plant) -> None:
         """Go on with another plant: what the broker keeps of drives that left is taken back."""
-        left = _drives(self._plant) - _drives(plant)
+        self._left = (self._left | _drives(self._plant)) - _drives(plant)
         self._plant = plant
-        for drive in sorted(left):
+        self._take_back()
+
+    def _take_back(self) -> None:
+        for drive in sorted(self._left):
+            self._available.pop(drive, None)
             topics = [self._topic(drive), self._topic(drive, "available")]
             if self._settings.home_assistant:
                 topics.append(discovery_topic(self._settings.prefix, drive))
@@ -142,8 +148,14 @@ class JsonTopics:
         return len(list(self._hub.drives))
 
     def leave(self) -> None:
-        """Say that the gateway goes."""
+        """Say that the gateway goes, and of each drive that nothing more comes.
+
+        One that the plant file has no more when the gateway begins again is never spoken of again.
+        """
         self.outbox.put(self.will())
+        for drive in self._available:
+            self.outbox.put(self._kept(self._topic(drive, "available"), OFFLINE))
+        self._available.clear()
 
     def _state(self, drive: str) -> bytes:
         seen_ns = self._hub.seen_at(drive)

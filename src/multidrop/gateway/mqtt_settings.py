@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import ssl
 from dataclasses import dataclass
 from math import isfinite
 from pathlib import Path
@@ -68,20 +69,36 @@ class MqttSettings:
         """Return a sentence for each file that cannot be read, and each drive that cannot be a topic."""
         names = [polled.drive.name for line in plant.lines for polled in line.drives]
         files = (("password", self.password), ("authorities", self.authorities))
-        return [
-            f'{key} = "{name}": there is no file {_beside(plant, name)}'
-            for key, name in files
-            if name and not _beside(plant, name).is_file()
-        ] + [
-            f"drive {name!r} cannot be a topic: give it a name without + # and /"
-            for name in names
-            if not LEVEL.fullmatch(name) or name == "gateway"
-        ]
+        return (
+            [
+                f'{key} = "{name}": there is no file {_beside(plant, name)}'
+                for key, name in files
+                if name and not _beside(plant, name).is_file()
+            ]
+            + [
+                f'authorities = "{self.authorities}": {path} has no certificates in PEM'
+                for path in [_beside(plant, self.authorities)]
+                if self.authorities and path.is_file() and not _has_certificates(path)
+            ]
+            + [
+                f"drive {name!r} cannot be a topic: give it a name without + # and /"
+                for name in names
+                if not LEVEL.fullmatch(name) or name == "gateway"
+            ]
+        )
 
     def login(self, plant: Plant) -> Login:
         """Return user, password and certificates. Raises OSError where the password cannot be read."""
         password = _beside(plant, self.password).read_text("utf-8").strip() if self.password else ""
         return Login(self.user, password, str(_beside(plant, self.authorities)) if self.authorities else None)
+
+
+def _has_certificates(path: Path) -> bool:
+    try:
+        ssl.create_default_context(cafile=str(path))
+    except OSError:  # as of text that is none
+        return False
+    return True
 
 
 def _beside(plant: Plant, name: str) -> Path:

@@ -90,6 +90,7 @@ class Orders:
             self.refuse(drive, what, f"{MOST_UNDER_WAY} others are under way")
         else:
             self._came.append(order)
+            self._under_way += 1  # before it begins: a broker may deliver many at once
             return True
         return False
 
@@ -101,7 +102,6 @@ class Orders:
         self._tell(drive, what, await work)
 
     async def _counted(self, work: Coroutine[Any, Any, None]) -> None:
-        self._under_way += 1
         try:
             await work
         finally:

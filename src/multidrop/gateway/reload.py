@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
@@ -104,7 +104,7 @@ class Reload:
             self.coming = None
             gateway.newcomers.release(gateway.feed)
         gateway.note_unopened(unopened)
-        self.mistakes, self.restart = (), tuple(_after_restart(self._begun_with, plant.serve))
+        self.mistakes, self.restart = (), tuple(self._after_restart(plant, settings))
         for sentence in self.restart:
             _log.warning("%s", sentence)
         _log.info("the plant file is in effect")
@@ -131,10 +131,21 @@ class Reload:
         gateway.newcomers.release(gateway.feed)
         gateway.guarded("frames", gateway.frames.note_news)
 
+    def _after_restart(self, plant: Plant, settings: ServeSettings) -> Iterator[str]:
+        """Yield a sentence for each key of [serve] that has changed, and that a running gateway keeps."""
+        before, now = self._begun_with, plant.serve
+        for key in dict.fromkeys((*before, *now)):
+            is_other = before.get(key) != now.get(key)
+            if key == "certificate":  # the file may be another one of the same name
+                is_other |= settings.certificate != self._gateway.settings.certificate
+            if is_other and key not in AT_ONCE:
+                yield f"{key} of [serve] {RESTART}"
+
     def _take_up_rights(self, settings: ServeSettings) -> None:
         gateway, may = self._gateway, settings.may
-        if settings.behind_proxy != gateway.settings.behind_proxy:
-            may = may.bounded_by(gateway.settings.may)  # who counts as being on this machine changes later
+        now = gateway.settings
+        if (settings.behind_proxy, settings.host) != (now.behind_proxy, now.host):
+            may = may.bounded_by(now.may)  # who reaches it, and counts as being here, changes later
         gateway.settings = replace(gateway.settings, names=settings.names, tokens=settings.tokens, may=may)
         gateway.commands.may = may
         gateway.own_names.replace(settings.names)
@@ -161,12 +172,3 @@ async def beside(work: Callable[[], R]) -> R:
 
 def _sentence(failure: Exception) -> str:
     return str(failure) or type(failure).__name__
-
-
-def _after_restart(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
-    """Return a sentence for each key of [serve] that has changed, and that a running gateway keeps."""
-    return [
-        f"{key} of [serve] {RESTART}"
-        for key in dict.fromkeys((*before, *now))
-        if key not in AT_ONCE and before.get(key) != now.get(key)
-    ]

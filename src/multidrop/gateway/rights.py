@@ -7,7 +7,7 @@ import hmac
 import re
 import secrets
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Container, Iterable
 from enum import IntEnum
 from functools import lru_cache
 from ipaddress import ip_address
@@ -21,6 +21,7 @@ NEVER_THIS_WAY = "never by this way"
 MOST_WRONG, WINDOW_S = 5, 60.0  # wrong tokens of an address, and within which time
 MOST_ADDRESSES = 10_000  # whose wrong tokens are remembered
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._@-]{0,63}")
+SCHEMES = ("http", "https")
 SHA256 = re.compile(r"[0-9a-f]{64}")
 
 
@@ -60,7 +61,7 @@ class Token(NamedTuple):
 
 def digest(token: str) -> str:
     """Return a token's digest. Tokens are long and random, and need no slow hash."""
-    return hashlib.sha256(token.encode()).hexdigest()
+    return hashlib.sha256(token.encode(errors="surrogatepass")).hexdigest()
 
 
 def new_token(name: str, right: Right) -> tuple[str, Token]:
@@ -184,10 +185,13 @@ class OwnNames:
         split = _split(host)
         return split is not None and split[0] in self._hosts
 
-    def has_origin(self, origin: str, host: str) -> bool:
-        """Return True for an Origin header of our own page: same host and port as the request itself."""
-        scheme, separator, rest = origin.partition("://")
-        if scheme not in ("http", "https") or not separator:
+    def has_origin(self, origin: str, host: str, schemes: Container[str]) -> bool:
+        """Return True for an Origin header of our own page: same host and port as the request itself.
+
+        `schemes` are those by which a page may have come.
+        """
+        scheme, _, rest = origin.partition("://")
+        if scheme not in schemes:
             return False
         ours, theirs = _split(host), _split(rest)
         if ours is None or theirs is None or theirs[0] not in self._hosts:

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import re
 import ssl
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import MISSING, Field, dataclass, field, fields
 from pathlib import Path
 from typing import Any
@@ -52,6 +53,7 @@ class ServeSettings:
     port: int = 8750
     names: tuple[str, ...] = ()
     tls: ssl.SSLContext | None = None
+    certificate: str = ""  # digest of its file and of the key's: they may be renewed in place
     behind_proxy: bool = False
     tokens: tuple[Token, ...] = ()
     may: May = May()  # noqa: RUF009 (it cannot change)
@@ -127,8 +129,9 @@ def read_settings(plant: Plant, environment: Mapping[str, str]) -> ServeSettings
     }
     if place.config_errors:
         raise PlantError(tuple(place.config_errors))
+    digest = _digest(folders.find(given[key]) for key in ("certificate", "key")) if tls else ""
     return ServeSettings(
-        host, port, names, tls, behind_proxy, tuple(tokens), may, audit, folders.state, parts
+        host, port, names, tls, digest, behind_proxy, tuple(tokens), may, audit, folders.state, parts
     )
 
 
@@ -254,6 +257,10 @@ def _check_readable(what: str, path: Path) -> bool:
             return True
     except OSError as failure:
         raise ValueError(f"{what} cannot be read: {failure.strerror}") from failure
+
+
+def _digest(paths: Iterable[Path]) -> str:
+    return hashlib.sha256(b"".join(path.read_bytes() for path in paths)).hexdigest()
 
 
 def _check_writable(path: Path) -> bool:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import json
 import logging
 from collections.abc import Mapping
 from pathlib import Path
@@ -11,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from starlette.applications import Starlette
 from starlette.requests import Request
-from starlette.responses import FileResponse, JSONResponse, PlainTextResponse, Response, StreamingResponse
+from starlette.responses import FileResponse, PlainTextResponse, Response
 from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp, Receive, Scope, Send
@@ -20,8 +19,10 @@ from multidrop import Refused, expose_metrics
 from multidrop.gateway.audit import MOST_RECORDS, newest_records, time_asked
 from multidrop.gateway.commands import Admit, Told
 from multidrop.gateway.describe import describe
+from multidrop.gateway.exports import Exports
 from multidrop.gateway.frame_route import FrameRoute
 from multidrop.gateway.guard import COOKIE, Denied, Guard, Needed
+from multidrop.gateway.json_response import JsonResponse
 from multidrop.gateway.metrics import families_of
 from multidrop.gateway.request_fields import body_of, caller_of, drives_to_stop, frame_in, number_in, text_in
 from multidrop.gateway.rights import NEVER_THIS_WAY, NOT_ALLOWED, NOT_LISTED, Right
@@ -34,7 +35,6 @@ if TYPE_CHECKING:
 PAGE = Path(__file__).parent / "page"
 MOST_QUERIES = 2  # of the history, and of the audit log, at the same time
 COOKIE_S = 30 * 24 * 3600
-KINDS = {"csv": "text/csv; charset=utf-8", "parquet": "application/vnd.apache.parquet"}
 RIGHTS_RULES = (NOT_ALLOWED, NOT_LISTED, NEVER_THIS_WAY)
 
 NEEDED: Mapping[str, Needed] = {
@@ -102,7 +102,7 @@ def make_app(gateway: Gateway) -> ASGIApp:
 
 
 def _error(status: int, sentence: str) -> Response:
-    return JSONResponse({"error": sentence}, status)
+    return JsonResponse({"error": sentence}, status)
 
 
 async def _denied(request: Request, failure: Exception) -> Response:
@@ -116,7 +116,7 @@ def _told(told: Told) -> dict[str, Any]:
 def _answer(told: Told) -> Response:
     """Return what became of a command: 403 where a right was missing, else 200 with what happened."""
     is_denied = isinstance(told.error, Refused) and told.error.rule in RIGHTS_RULES
-    return JSONResponse(_told(told) | ({"error": told.text} if is_denied else {}), 403 if is_denied else 200)
+    return JsonResponse(_told(told) | ({"error": told.text} if is_denied else {}), 403 if is_denied else 200)
 
 
 class _Pages:
@@ -125,6 +125,7 @@ class _Pages:
     def __init__(self, gateway: Gateway) -> None:
         self._gateway = gateway
         self._queries = asyncio.Semaphore(MOST_QUERIES)
+        self._exports = Exports()
 
     async def index(self, request: Request) -> Response:
         page = PAGE / "index.html"
@@ -147,26 +148,26 @@ class _Pages:
             mistakes=gateway.reload.mistakes,
             has_fleet="fleet" in gateway.feeds,
         )
-        return JSONResponse(described)
+        return JsonResponse(described)
 
     async def drive(self, request: Request) -> Response:
         try:
-            return JSONResponse(await look_at(self._gateway, request.path_params["name"]))
+            return JsonResponse(await look_at(self._gateway, request.path_params["name"]))
         except ValueError as unknown:
             return _error(404, str(unknown))
 
     async def lines(self, request: Request) -> Response:
-        return JSONResponse(look_at_lines(self._gateway))
+        return JsonResponse(look_at_lines(self._gateway))
 
     async def fleet(self, request: Request) -> Response:
         part: Any = self._gateway.feeds.get("fleet")
         if part is None:
             return _error(404, "no fleet is looked at; add [serve.fleet] to the plant file")
-        return JSONResponse(part.told())
+        return JsonResponse(part.told())
 
     async def health(self, request: Request) -> Response:
         health = health_of(self._gateway)
-        return JSONResponse(health, 503 if health["status"] == "failed" else 200)
+        return JsonResponse(health, 503 if health["status"] == "failed" else 200)
 
     async def metrics(self, request: Request) -> Response:
         gateway = self._gateway
@@ -179,13 +180,13 @@ class _Pages:
         before, count = time_asked(query), number_in(query.get("count", str(MOST_RECORDS)), "count")
         async with self._queries:
             found = await asyncio.to_thread(newest_records, self._gateway.settings.audit, before, count)
-        return JSONResponse(found)
+        return JsonResponse(found)
 
     async def alarms(self, request: Request) -> Response:
         query = request.query_params
         begin, end = (number_in(query.get(key, ""), key) for key in ("from", "to"))
         found = self._gateway.events.between(begin, end)
-        return JSONResponse({"alarms": [alarm._asdict() for alarm in found]})
+        return JsonResponse({"alarms": [alarm._asdict() for alarm in found]})
 
     # ---- history ----
 
@@ -196,23 +197,16 @@ class _Pages:
         begin, end = (number_in(query.get(key, ""), key) for key in ("from", "to"))
         try:
             async with self._queries:
-                return JSONResponse(await part.series(query.getlist("series"), begin, end, points))
+                found = await part.series(query.getlist("series"), begin, end, points)
         except ValueError as mistake:
             return _error(400, str(mistake))
+        return Response(found, media_type="application/json")
 
     async def export(self, request: Request) -> Response:
-        part = self._history()
-        query = request.query_params
-        kind = query.get("format", "csv")
-        if kind not in KINDS:
-            return _error(400, f"format = {kind[:20]!r} is neither csv nor parquet")
+        part, query = self._history(), request.query_params
         begin, end = (number_in(query.get(key, ""), key) for key in ("from", "to"))
-        try:
-            chunks = part.export(query.getlist("series"), begin, end, kind)
-        except ValueError as mistake:
-            return _error(400, str(mistake))
-        name = {"content-disposition": f'attachment; filename="multidrop.{kind}"'}
-        return StreamingResponse(chunks, media_type=KINDS[kind], headers=name)
+        kind = query.get("format", "csv")
+        return await self._exports.respond(part, query.getlist("series"), begin, end, kind)
 
     def _history(self) -> Any:
         part = self._gateway.feeds.get("history")
@@ -225,8 +219,7 @@ class _Pages:
     async def stop(self, request: Request) -> Response:
         drives = await drives_to_stop(request)
         told = await self._gateway.commands.stop(drives, caller_of(request))
-        said = json.dumps({name: _told(one) for name, one in told.items()})  # a name may be no UTF-8
-        return Response(said, media_type="application/json")
+        return JsonResponse({name: _told(one) for name, one in told.items()})
 
     async def write(self, request: Request) -> Response:
         body = await body_of(request)
@@ -257,7 +250,7 @@ class _Pages:
         if (await body_of(request)).get("confirm") is not True:
             raise Denied(400, 'a reload changes what is polled: confirm it with {"confirm": true}')
         told = await self._gateway.reload.carry_out(caller_of(request).by)
-        return JSONResponse(
+        return JsonResponse(
             {"done": told.is_done, "text": told.text, "mistakes": told.mistakes, "restart": told.restart}
         )
 
@@ -279,7 +272,7 @@ class _Pages:
             gateway.tokens.note_wrong(caller.address, secret, gateway.guard_clock())
             _log.warning("wrong token from %s", caller.address)
             raise Denied(401, "the token is wrong")
-        response = JSONResponse({"name": token.name, "role": token.right.name.lower()})
+        response = JsonResponse({"name": token.name, "role": token.right.name.lower()})
         is_secure = gateway.settings.tls is not None or gateway.settings.behind_proxy
         response.set_cookie(
             COOKIE, secret, max_age=COOKIE_S, httponly=True, samesite="strict", secure=is_secure
@@ -287,6 +280,6 @@ class _Pages:
         return response
 
     async def forget(self, request: Request) -> Response:
-        response = JSONResponse({})
+        response = JsonResponse({})
         response.delete_cookie(COOKIE, httponly=True, samesite="strict")
         return response

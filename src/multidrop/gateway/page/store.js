@@ -92,8 +92,7 @@ function merged(before, changes) {
 function keep(drive, register, [value, ms, status, lastValue, lastMs]) {
   drive.newest.set(register, { ms, status });
   if (value !== null) drive.good.set(register, { value, ms });
-  else if (lastMs > (drive.good.get(register)?.ms ?? 0))
-    drive.good.set(register, { value: lastValue, ms: lastMs });
+  else if (!Number.isNaN(lastMs)) drive.good.set(register, { value: lastValue, ms: lastMs });
   if (!drive.pasts.has(register)) drive.pasts.set(register, new Ring(most()));
   const isGood = status === "ok" && value !== null;
   drive.pasts.get(register).add(ms, isGood ? value : NaN);
@@ -107,7 +106,8 @@ function most() {
 
 // Return what is known of a register now, or null where nothing ever was:
 // {value, ms, status, age (ms), isOld}. `now` is the daemon's time; a value is old when the gateway says so,
-// a second after it where the newest request failed, or when the frame itself is old.
+// a second after it where the newest request failed, or when the frame itself is old. A time to come is one
+// of before the daemon's clock was set back.
 export function reading(name, register, now) {
   const drive = store.drives.get(name),
     newest = drive?.newest.get(register);
@@ -121,7 +121,7 @@ export function reading(name, register, now) {
     ms: good.ms,
     status,
     age,
-    isOld: (status !== "ok" && age > FAILED_LIMIT_MS) || !isLive(now),
+    isOld: (status !== "ok" && !(age >= 0 && age <= FAILED_LIMIT_MS)) || !isLive(now),
   };
 }
 

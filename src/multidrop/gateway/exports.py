@@ -1,0 +1,63 @@
+"""Exports: files of the history for those who ask for them, few at a time.
+
+Each takes a thread while its next piece is made, and a file of Parquet takes room on the history's disk.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Protocol
+
+from starlette.responses import Response, StreamingResponse
+from starlette.types import Receive, Scope, Send
+
+from multidrop.gateway.guard import Denied
+
+MOST_EXPORTS = 8  # under way
+KINDS = {"csv": "text/csv; charset=utf-8", "parquet": "application/vnd.apache.parquet"}
+
+
+class ExportingPart(Protocol):
+    """The part of the historian that is needed here."""
+
+    async def export(self, names: Sequence[str], begin: int, end: int, kind: str) -> Iterator[bytes]: ...
+
+
+class Exports:
+    """The exports that are under way."""
+
+    def __init__(self) -> None:
+        self.under_way = 0
+
+    async def respond(
+        self, part: ExportingPart, names: Sequence[str], begin: int, end: int, kind: str
+    ) -> Response:
+        """Return a file of these series. Raises Denied where it cannot be made, or not now."""
+        if kind not in KINDS:
+            raise Denied(400, f"format = {kind[:20]!r} is neither csv nor parquet")
+        if self.under_way >= MOST_EXPORTS:
+            raise Denied(503, f"{MOST_EXPORTS} exports are under way: try again when one has ended")
+        self.under_way += 1
+        try:
+            pieces = await part.export(names, begin, end, kind)
+        except BaseException as failure:
+            self.under_way -= 1
+            if isinstance(failure, ValueError):
+                raise Denied(400, str(failure)) from failure
+            raise
+        return _Export(self, pieces, kind)
+
+
+class _Export(StreamingResponse):
+    """One export, until its client has all of it or is gone."""
+
+    def __init__(self, exports: Exports, pieces: Iterator[bytes], kind: str) -> None:
+        name = {"content-disposition": f'attachment; filename="multidrop.{kind}"'}
+        super().__init__(pieces, media_type=KINDS[kind], headers=name)
+        self._exports = exports
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        try:
+            await super().__call__(scope, receive, send)
+        finally:
+            self._exports.under_way -= 1

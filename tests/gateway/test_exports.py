@@ -1,0 +1,62 @@
+"""Exports over HTTP: how many there are at a time, and what they hold up."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+from gateways import served
+from lines import PATIENCE, until
+
+from multidrop.gateway.exports import MOST_EXPORTS
+
+EXPORT = "/api/export?from=0&to=1&format={}"
+
+
+class SlowHistory:
+    """A history whose files come when the test lets them."""
+
+    def __init__(self) -> None:
+        self.begun = 0
+        self.go_on = threading.Event()
+
+    def take(self, batch: object) -> None: ...
+
+    async def export(self, names: Sequence[str], begin: int, end: int, kind: str) -> Iterator[bytes]:
+        if names:
+            raise ValueError(f"{names[0]!r} is no series")
+        return self._pieces()
+
+    def _pieces(self) -> Iterator[bytes]:
+        yield b"PAR1"
+        self.begun += 1
+        assert self.go_on.wait(PATIENCE)
+
+    async def close(self) -> None: ...
+
+
+def test_few_exports_go_on_at_a_time_and_hold_no_stop_up(tmp_path: Path) -> None:
+    with (
+        served(tmp_path, '[serve.may]\nstop = "anyone"\n') as gateway,
+        ThreadPoolExecutor(MOST_EXPORTS) as clients,
+    ):
+        part: Any = SlowHistory()
+        gateway.gateway.feeds["history"] = part
+        try:
+            for wrong in ("xlsx", "csv&series=pump"):  # takes nobody's place
+                for _ in range(2 * MOST_EXPORTS):
+                    assert gateway.get(EXPORT.format(wrong)).status == 400
+            paths = [EXPORT.format(("csv", "parquet")[at % 2]) for at in range(MOST_EXPORTS)]
+            exports = [clients.submit(gateway.get, path) for path in paths]
+            until(lambda: part.begun == MOST_EXPORTS)
+            refused = gateway.get(EXPORT.format("csv"))
+            assert (refused.status, refused.json["error"][:11]) == (503, "8 exports a")
+            assert gateway.post("/api/stop", {"drives": ["pump-1"]}).json["pump-1"]["done"] is True
+            assert gateway.get("/page/index.html").status == 200
+        finally:
+            part.go_on.set()
+        assert [done.result(PATIENCE).body for done in exports] == [b"PAR1"] * MOST_EXPORTS
+        until(lambda: gateway.get(EXPORT.format("csv")).status == 200)
