@@ -6,6 +6,7 @@ import re
 import time
 from typing import Any
 
+import fake_gateway
 import fake_plant
 import pytest
 from conftest import Opener
@@ -57,6 +58,17 @@ def test_a_daemon_that_hangs_is_told_of(opened: Opener, gateway: FakeGateway) ->
     gateway.is_silent = False
     until(page, LIVE)
     page.locator("#notice").wait_for(state="hidden")
+
+
+def test_a_viewer_s_clock_that_is_set_back_makes_nothing_live(
+    opened: Opener, gateway: FakeGateway, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(fake_gateway, "HOLD_S", 120)  # no answer tells of the daemon's clock
+    page = opened()
+    gateway.is_silent = True
+    page.evaluate("(now => { Date.now = () => now() - 3600e3; })(Date.now)")
+    until(page, STALE)
+    assert "sends no new values" in page.locator("#notice").inner_text()
 
 
 def test_the_page_lives_again_when_the_daemon_does(opened: Opener, gateway: FakeGateway) -> None:

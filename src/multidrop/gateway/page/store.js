@@ -9,7 +9,8 @@ const FAILED_LIMIT_MS = 1000; // and one whose newest request failed
 const UNSEEN_MS = 5000; // between two frames: what was then is not known
 export const LIVE_MS = 1500; // a frame comes each second at least
 
-export const store = { plant: null, frame: null, time: 0, isLost: false, drives: new Map() };
+// `time` of the frame is in ms of the daemon's clock, and `came` in ms of one that nobody sets.
+export const store = { plant: null, frame: null, time: 0, came: 0, isLost: false, drives: new Map() };
 store.lines = new Map();
 const watchers = [];
 
@@ -62,6 +63,7 @@ export function takeFrame(told) {
   const before = store.time;
   store.frame = frame;
   store.time = Number(BigInt(frame.time) / 1000000n);
+  store.came = performance.now();
   if (before && store.time - before > UNSEEN_MS) leaveGap(before + 1);
   for (const [name, drive] of store.drives) {
     const { ages_ms = [], values = {}, seen = null } = frame.drives[name] ?? {};
@@ -129,7 +131,10 @@ export function reading(name, register, now) {
 export const holdsFor = (name, register) =>
   1000 * (store.drives.get(name)?.registers.get(register)?.holds_s ?? UNPOLLED_S);
 
-export const isLive = now => store.frame !== null && !store.isLost && now - store.time < LIVE_MS;
+// Return how old the frame is in ms: the longer time of two clocks, for a viewer's may be set back.
+export const frameAge = now => Math.max(now - store.time, performance.now() - store.came);
+
+export const isLive = now => store.frame !== null && !store.isLost && frameAge(now) < LIVE_MS;
 
 // Return the age of the drive's newest good reply in ms, or null where there never was one.
 export function driveAge(name, now) {
