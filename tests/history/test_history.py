@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import random
+import stat
 import sys
+import tempfile
+from contextlib import closing
 from datetime import UTC, datetime, timedelta, timezone
 from pathlib import Path
 
@@ -15,6 +18,7 @@ from multidrop import History, open_reader
 from multidrop.history import growing, kept_series
 from multidrop.history.buckets import grid_of
 from multidrop.history.compact import compact
+from multidrop.history.database import Database
 from multidrop.polling.batch import Row
 from multidrop.recording.rows import from_rows
 from multidrop.recording.segments import SegmentWriter
@@ -353,3 +357,16 @@ def test_no_tens_are_reckoned_of_what_nobody_asked_for(tmp_path: Path) -> None:
             history.buckets(name, NOON, NOON + DAY)
             (segment,) = history._sources._growing.values()
             assert [".".join(one) for one in segment._tens] == SERIES[: number + 1][::-1]
+
+
+def test_what_duckdb_spills_goes_where_nobody_else_can_look(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    database = Database("100MB")
+    with closing(database.cursor()) as cursor:
+        [(spill,)] = cursor.execute("select current_setting('temp_directory')").fetchall()
+    assert [Path(spill)] == list(tmp_path.iterdir())
+    assert stat.S_IMODE(Path(spill).stat().st_mode) == 0o700
+    database.close()
+    assert list(tmp_path.iterdir()) == []

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Iterator, Mapping
+import weakref
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
+from shutil import rmtree
+from tempfile import mkdtemp
 from typing import Any
 
 from multidrop.history.kept_series import Series
@@ -39,24 +42,36 @@ def connect(memory: str, spill: Path | None = None) -> Any:
 
 
 class Database:
-    """A database in memory that is opened when it is first needed: that takes 20 ms of processor time."""
+    """A database in memory that is opened when it is first needed: that takes 20 ms of processor time.
 
-    def __init__(self, memory: str, spill: Path) -> None:
+    What has no room there goes to `spill`, or to a folder of its own for temporary files.
+    """
+
+    def __init__(self, memory: str, spill: Path | None = None) -> None:
         self._memory = memory
         self._spill = spill
         self._opened: Any = None
+        self._forget: Callable[[], object] = lambda: None
 
     def cursor(self) -> Any:
         """Return a cursor, to be closed: its temporary tables end with it. Raises MissingDuckDB."""
         if self._opened is None:
             self._opened = connect(self._memory, self._spill)
+            if self._spill is None:
+                self._make_spill()
         return self._opened.cursor()
+
+    def _make_spill(self) -> None:
+        folder = mkdtemp(prefix="multidrop-history-")  # nobody else can open it, or have put it there
+        self._forget = weakref.finalize(self, rmtree, folder, ignore_errors=True)
+        self._opened.execute("set temp_directory = ?", [folder])
 
     def close(self) -> None:
         """Close it, if it is open; the next cursor opens it again."""
         if self._opened is not None:
             self._opened.close()
             self._opened = None
+            self._forget()
 
 
 class ArrowStream:

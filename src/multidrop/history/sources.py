@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import json
-import os
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from tempfile import gettempdir
 from typing import Any, TypeVar
 
 from multidrop.history.database import Database, texts_of_metadata
@@ -38,7 +36,7 @@ class Sources:
         self._bounds: dict[int, tuple[int, int]] = {}  # of times in closed segments
         self._known: dict[int, Known] = {}  # quantities in segments
         self._changing = threading.Lock()
-        self._database = Database(MEMORY, Path(gettempdir()) / f"multidrop-history-{os.getpid()}")
+        self._database = Database(MEMORY)
 
     def close(self) -> None:
         with self._changing:
