@@ -22,11 +22,13 @@ from spooled import NOON, STEP, exchanges_in, numbered, rows_of
 from multidrop import History
 from multidrop.fleet import hub as hub_module
 from multidrop.fleet import samples_stream
+from multidrop.fleet.batch_client import BatchClient
 from multidrop.fleet.hub import Commit, HubState, KeptPlace, NotThisHubs, SampleHub, SampleSink, SinkError
 from multidrop.fleet.message import RowBuffer, unpack
 from multidrop.fleet.parquet_sink import ParquetSink
 from multidrop.fleet.postgres_sink import PostgresSink
-from multidrop.fleet.samples_stream import publish
+from multidrop.fleet.sample_reader import StreamMessage
+from multidrop.fleet.samples_stream import StreamError, publish
 
 LOG = "00112233aabbccdd"
 PATIENCE_S = 60.0
@@ -113,6 +115,34 @@ async def read_all(client: Client, sink: SampleSink, place: int) -> HubState:
         with suppress(asyncio.CancelledError):
             await task
     return hub.state()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("is_behind_for", [3, 10_000], ids=["looks", "ever"])
+def test_a_server_that_is_behind_ends_no_reading_of_all(
+    running: Cluster, monkeypatch: pytest.MonkeyPatch, is_behind_for: int
+) -> None:
+    looks = itertools.count()
+    read_after = hub_module.read_after
+
+    async def late(client: BatchClient, place: int, *most: int) -> list[StreamMessage]:
+        return [] if next(looks) < is_behind_for else await read_after(client, place, *most)
+
+    monkeypatch.setattr(hub_module, "read_after", late)
+    monkeypatch.setattr(hub_module, "BEHIND_S", 0.2 if is_behind_for > 3 else PATIENCE_S)
+
+    async def live() -> list[tuple[Any, ...]]:
+        async with client_of(running) as client:
+            await say(client, 1, message(5))
+            sink = Memory()
+            await SampleHub(client, sink).run(once=True)
+            return sink.rows()
+
+    if is_behind_for > 3:
+        with pytest.raises(StreamError, match=r"messages 1 to 1 of the stream are not given now"):
+            asyncio.run(live())
+    else:
+        assert exchanges_in(asyncio.run(live())) == list(range(5, 10))
 
 
 @pytest.mark.long

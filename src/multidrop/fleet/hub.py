@@ -15,12 +15,7 @@ from typing import Any, NamedTuple, Protocol, TypeVar
 from multidrop.fleet.batch_client import BatchClient
 from multidrop.fleet.message import MessageError, unpack
 from multidrop.fleet.sample_reader import StreamMessage, read_after
-from multidrop.fleet.samples_stream import (
-    StreamAbout,
-    StreamError,
-    about,
-    end_if_cancelled,
-)
+from multidrop.fleet.samples_stream import StreamAbout, StreamError, about, end_if_cancelled
 from multidrop.fleet.sources import SourceCheck
 
 MOST_READ = 64  # messages in one answer
@@ -28,6 +23,7 @@ MOST_READ_BYTES = 8 << 20
 MOST_ROWS = 1_000_000  # of one commit: 40 MB
 LOOKING_S = 0.2  # between questions to a stream that has nothing new
 AGAIN_S = 1.0  # after a failure
+BEHIND_S = 5.0  # for a server that answers, and has not yet all that its leader has
 
 T = TypeVar("T")
 _log = logging.getLogger("multidrop.fleet.hub")
@@ -133,7 +129,8 @@ class SampleHub:
         found = await about(self._client)
         end_if_cancelled()
         kept = await _on_thread(self._sink.begin, found.created)
-        self._stream, self._end, self._place = found.created, found.last, kept.place
+        self._stream, self._place = found.created, kept.place
+        self._end = found.last if found.first <= found.last else kept.place  # else it was emptied
         self._sources.last = dict(kept.sources)
         self._check_end(found)
         if found.first > kept.place + 1 and found.last > kept.place:
@@ -148,19 +145,22 @@ class SampleHub:
             )
 
     async def _commit(self, once: bool) -> bool:
-        """Gather messages and keep them; True where the stream had no more."""
+        """Gather messages and keep them; True where all is kept that the stream had when it was asked for."""
         messages: list[StreamMessage] = []
         tables: list[Any] = []
         rows, ends = 0, None
         is_end = False
+        behind = time.monotonic() + BEHIND_S
         while rows < MOST_ROWS and (ends is None or time.monotonic() < ends):
             place = messages[-1].place if messages else self._place
             found = await read_after(self._client, place, MOST_READ, MOST_READ_BYTES)
             end_if_cancelled()
             if not found:
-                if once:
+                if once and place >= self._end:
                     is_end = True
                     break
+                if once and not messages and time.monotonic() > behind:
+                    raise StreamError(f"messages {place + 1} to {self._end} of the stream are not given now")
                 await asyncio.sleep(LOOKING_S)
                 if not messages:
                     self._check_end(await about(self._client))
