@@ -362,7 +362,7 @@ def test_no_tens_are_reckoned_of_what_nobody_asked_for(tmp_path: Path) -> None:
 def test_what_duckdb_spills_goes_where_nobody_else_can_look(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    pytest.importorskip("duckdb")
+    pytest.importorskip("duckdb", reason="needs duckdb")
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     database = Database("100MB")
     with closing(database.cursor()) as cursor:
