@@ -191,6 +191,20 @@ def test_who_can_say_nothing_is_away_and_still_stops(
 
 
 @pytest.mark.slow
+def test_who_can_say_nothing_is_away_on_a_new_connection_too(listener: Listener, start: Start) -> None:
+    known, running = start()
+    listener.wait_for(has("multidrop/gateway", b"online"))
+    state = known.hub.states.pop("pump-1")
+    running.cut(0)
+    for said in (b"offline", b"online", b"offline"):  # by the will, by the new connection, and at once
+        listener.wait_for(has("multidrop/gateway", said))
+    known.hub.states["pump-1"] = state
+    running.step()
+    listener.wait_for(has("multidrop/gateway", b"online"))
+    listener.wait_for(has("multidrop/pump-1/available", b"online"))
+
+
+@pytest.mark.slow
 def test_a_broker_that_stands_still_holds_up_nothing(
     broker: Broker, listener: Listener, start: Start
 ) -> None:

@@ -64,8 +64,14 @@ class Speaker(Protocol):
     def received(self, topic: str, payload: bytes, *, is_retained: bool) -> None:
         """Take a message."""
 
+    def publish(self) -> None:
+        """Send what is new."""
+
     def pass_over(self) -> int:
         """Return how many messages would be sent now, had the broker a connection."""
+
+    def leave(self) -> None:
+        """Send that there will be nothing more to say."""
 
 
 class Broker:
@@ -80,6 +86,7 @@ class Broker:
         self._loop: asyncio.AbstractEventLoop | None = None
         self.outbox = Outbox(self._send)
         self.is_connected = False
+        self.failure = ""  # why the speaker cannot say anything now
         self._client: Any = Client(CallbackAPIVersion.VERSION2, client_id=name, clean_session=True)
         self._client.reconnect_delay_set(*RETRY_S)
         self._client.max_inflight_messages_set(0)  # the outbox has the bound
@@ -115,6 +122,36 @@ class Broker:
         self.is_connected = False
         self._client = None  # with it go the sockets by which paho wakes its thread
 
+    def publish(self) -> None:
+        """Let the speaker say what is new, or count what it would have said."""
+        had_failed = self.failure
+        self._let(self._speaker.publish if self.is_connected else self._pass_over)
+        if had_failed and not self.failure and self.is_connected:
+            self.begin_anew()
+
+    def begin_anew(self) -> None:
+        """Let the speaker say all, as on a new connection."""
+        self._let(self._speaker.connected)
+
+    def _pass_over(self) -> None:
+        self.outbox.dropped += self._speaker.pass_over()
+
+    def _let(self, say: Callable[[], None]) -> None:
+        """Let the speaker say something; one that fails is away, and hears commands all the same.
+
+        What the broker keeps of its drives would pass for the present otherwise.
+        """
+        try:
+            say()
+        except Exception as failure:
+            if not self.failure:
+                _log.exception("nothing can be said")
+                if self.is_connected:
+                    self._speaker.leave()
+            self.failure = f"nothing can be said: {type(failure).__name__}: {failure}"
+        else:
+            self.failure = ""
+
     @property
     def trouble(self) -> str:
         """Return that there is no connection, and why where it is known."""
@@ -140,7 +177,8 @@ class Broker:
         _log.info("connected to %s:%d", self._address.host, self._address.port)
         for topic, qos in self._speaker.topics():
             self._client.subscribe(topic, qos)
-        self._speaker.connected()
+        self.failure = ""  # of the connection before; one of this one is to be told on it
+        self.begin_anew()
 
     def _acknowledge(self) -> None:
         numbers = []

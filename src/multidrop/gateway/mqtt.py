@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import logging
 from collections.abc import Awaitable, Callable
 from typing import Any
 
@@ -15,8 +14,6 @@ from multidrop.gateway.metrics import counter
 from multidrop.gateway.mqtt_settings import MqttSettings as MqttSettings
 from multidrop.gateway.parts import Feed, Inside
 from multidrop.gateway.sparkplug_node import SparkplugNode
-
-_log = logging.getLogger("multidrop.gateway.mqtt")
 
 
 def build(settings: MqttSettings, inside: Inside) -> Feed:
@@ -34,7 +31,6 @@ class Mqtt:
         address, login = parse_broker(settings.broker), settings.login(inside.plant)
         self._every = settings.every_s
         self._speakers = speakers
-        self._failures: dict[str, str] = {}  # of those that cannot say anything, by kind
         self._brokers = []
         for speaker in speakers:
             name = f"{settings.prefix}-{inside.plant.path.stem}-{speaker.kind}"
@@ -50,35 +46,16 @@ class Mqtt:
         for broker, speaker in zip(self._brokers, self._speakers, strict=True):
             speaker.adopt(plant)
             if broker.is_connected:
-                speaker.connected()
+                broker.begin_anew()
 
     async def run(self, sleep: Callable[[float], Awaitable[object]] = asyncio.sleep) -> None:
         """Publish every so many seconds, until cancelled."""
         for broker in self._brokers:
             broker.open()
         while True:
-            for broker, speaker in zip(self._brokers, self._speakers, strict=True):
-                try:
-                    self._publish(broker, speaker)
-                except Exception as failure:  # whatever it is: stops are still listened to
-                    self._note_failure(broker, speaker, failure)
+            for broker in self._brokers:
+                broker.publish()
             await sleep(self._every)
-
-    def _publish(self, broker: Broker, speaker: Any) -> None:
-        if not broker.is_connected:
-            broker.outbox.dropped += speaker.pass_over()
-            return
-        speaker.publish()
-        if self._failures.pop(speaker.kind, None):
-            speaker.connected()
-
-    def _note_failure(self, broker: Broker, speaker: Any, failure: Exception) -> None:
-        """Say that the gateway is away: what the broker keeps of its drives is old from now on."""
-        if speaker.kind not in self._failures:
-            _log.exception("nothing can be said in %s", speaker.kind)
-            if broker.is_connected:
-                speaker.leave()
-        self._failures[speaker.kind] = f"nothing can be said: {type(failure).__name__}: {failure}"
 
     async def close(self) -> None:
         """Send the last messages and disconnect."""
@@ -89,8 +66,8 @@ class Mqtt:
 
     def health(self) -> str:
         """Return why a broker is not reached, or not told anything; "" is well."""
-        troubles = [broker.trouble for broker in self._brokers if not broker.is_connected]
-        return next(iter([*troubles, *self._failures.values()]), "")
+        troubles = [broker.failure if broker.is_connected else broker.trouble for broker in self._brokers]
+        return next(filter(None, troubles), "")
 
     def figures(self) -> list[MetricFamily]:
         """Return messages sent and dropped since the start, and how many connections there are."""
