@@ -5,11 +5,11 @@ from __future__ import annotations
 from urllib.parse import parse_qs
 
 from starlette.datastructures import Headers
-from starlette.responses import JSONResponse
 from starlette.types import Receive, Scope, Send
 
 from multidrop.gateway.frames import WHOLE, Frames
 from multidrop.gateway.guard import Denied
+from multidrop.gateway.json_response import JsonResponse
 from multidrop.gateway.request_fields import number_in
 
 _PLAIN = [(b"content-type", b"application/json"), (b"vary", b"accept-encoding")]
@@ -27,10 +27,10 @@ class FrameRoute:
             asked = parse_qs(scope["query_string"].decode("latin-1"), keep_blank_values=True)
             frame = await self._frames.after(number_in(asked.get("after", [str(WHOLE)])[-1], "after"))
         except Denied as denied:
-            await JSONResponse({"error": str(denied)}, denied.status)(scope, receive, send)
+            await JsonResponse({"error": str(denied)}, denied.status)(scope, receive, send)
             return
         except OverflowError as full:
-            await JSONResponse({"error": str(full)}, 503)(scope, receive, send)
+            await JsonResponse({"error": str(full)}, 503)(scope, receive, send)
             return
         status, headers, body = 304, list[tuple[bytes, bytes]](), b""
         if frame is not None:

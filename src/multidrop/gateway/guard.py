@@ -8,9 +8,9 @@ from http.cookies import CookieError, SimpleCookie
 from typing import Any, NamedTuple
 
 from starlette.datastructures import Headers
-from starlette.responses import JSONResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from multidrop.gateway.json_response import JsonResponse
 from multidrop.gateway.rights import SCHEMES, Caller, May, OwnNames, Right, Token, Tokens, is_loopback
 
 COOKIE = "multidrop"
@@ -95,7 +95,7 @@ class Guard:
         try:
             scope["caller"] = self._check(scope)
         except Denied as denied:
-            response = JSONResponse({"error": str(denied)}, denied.status)
+            response = JsonResponse({"error": str(denied)}, denied.status)
             if denied.status == 401:
                 response.headers["www-authenticate"] = "Bearer"
             await response(scope, receive, send_with_headers)
