@@ -150,7 +150,7 @@ class SampleHub:
         tables: list[Any] = []
         rows, ends = 0, None
         is_end = False
-        behind = time.monotonic() + BEHIND_S
+        patient_until = time.monotonic() + BEHIND_S
         while rows < MOST_ROWS and (ends is None or time.monotonic() < ends):
             place = messages[-1].place if messages else self._place
             found = await read_after(self._client, place, MOST_READ, MOST_READ_BYTES)
@@ -159,7 +159,7 @@ class SampleHub:
                 if once and place >= self._end:
                     is_end = True
                     break
-                if once and not messages and time.monotonic() > behind:
+                if once and not messages and time.monotonic() > patient_until:
                     raise StreamError(f"messages {place + 1} to {self._end} of the stream are not given now")
                 await asyncio.sleep(LOOKING_S)
                 if not messages:
