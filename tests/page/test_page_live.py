@@ -69,6 +69,8 @@ def test_a_viewer_s_clock_that_is_set_back_makes_nothing_live(
     page.evaluate("(now => { Date.now = () => now() - 3600e3; })(Date.now)")
     until(page, STALE)
     assert "sends no new values" in page.locator("#notice").inner_text()
+    age = cell(page, "pump-1", "age")
+    until_met(page, lambda: float(age.inner_text().removesuffix(" s")) >= 2)
 
 
 def test_the_page_lives_again_when_the_daemon_does(opened: Opener, gateway: FakeGateway) -> None:

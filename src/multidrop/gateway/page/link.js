@@ -27,8 +27,9 @@ function learnSkew(date, sent, received) {
 
 export const correction = () => (skew.least > 0 ? skew.least : skew.most < 0 ? skew.most : 0);
 
-// Return the daemon's time in ms.
-export const now = () => Date.now() + correction();
+// Return the daemon's time in ms; the later one by two clocks, for this device's may be set back.
+export const now = () =>
+  Math.max(Date.now() + correction(), store.time + performance.now() - store.came);
 
 const pause = ms => new Promise(done => setTimeout(done, ms));
 

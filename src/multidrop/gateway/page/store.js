@@ -131,10 +131,7 @@ export function reading(name, register, now) {
 export const holdsFor = (name, register) =>
   1000 * (store.drives.get(name)?.registers.get(register)?.holds_s ?? UNPOLLED_S);
 
-// Return how old the frame is in ms: the longer time of two clocks, for a viewer's may be set back.
-export const frameAge = now => Math.max(now - store.time, performance.now() - store.came);
-
-export const isLive = now => store.frame !== null && !store.isLost && frameAge(now) < LIVE_MS;
+export const isLive = now => store.frame !== null && !store.isLost && now - store.time < LIVE_MS;
 
 // Return the age of the drive's newest good reply in ms, or null where there never was one.
 export function driveAge(name, now) {

@@ -3,7 +3,7 @@
 import * as clock from "./clock.js";
 import { fill, find, glyph, make, named, put, say, setClass } from "./dom.js";
 import { correction, link, now } from "./link.js";
-import { LIVE_MS, frameAge, isLive, lasting, state, store } from "./store.js";
+import { LIVE_MS, isLive, lasting, state, store } from "./store.js";
 import { count } from "./values.js";
 
 const DEAD_MS = 3000;
@@ -27,7 +27,7 @@ export function showPlant() {
 // Draw the head anew. Called a few times a second.
 export function drawTop() {
   const t = now(),
-    age = frameAge(t),
+    age = t - store.time,
     isNow = isLive(t);
   const words =
     store.frame === null
