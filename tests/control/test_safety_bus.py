@@ -5,10 +5,12 @@ from __future__ import annotations
 import json
 import threading
 from collections.abc import Callable
+from contextlib import nullcontext, suppress
 from pathlib import Path
 from typing import Any
 
 import pytest
+from completions import completed
 from line_driver import MS, LineDriver
 from motors import MAKE, STARTS
 from simulated_bus import EXCHANGE_TIME, SimulatedBus, is_write, one
@@ -20,7 +22,7 @@ from multidrop.control.audit_log import read_audit
 from multidrop.control.eeprom_ledger import Ledger
 from multidrop.control.outcome import Effect, Seen
 from multidrop.control.ramp import ramp, start_staggered
-from multidrop.core import Completion, Exchange, Framing, Message, build_reply
+from multidrop.core import Completion, Exchange, Failure, Framing, Message, build_reply
 from multidrop.drive import Condition, Direction, Drive, Script, State, read, wait, write
 from multidrop.drive.declare import command, reading, setting
 from multidrop.drive.table import COIL, Kept
@@ -33,6 +35,7 @@ from multidrop.errors import (
     LineError,
     NoReply,
     NotDone,
+    NotMaster,
     Refused,
     Unconfirmed,
     Unsupported,
@@ -319,6 +322,20 @@ def test_a_raw_request_that_is_refused_is_noted_as_that(
     assert [entry["outcome"] for entry in read_audit(tmp_path / "audit")] == ["refused by the drive"]
 
 
+@pytest.mark.parametrize("is_lost", [False, True])
+def test_what_became_of_a_raw_request_is_noted(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, is_lost: bool
+) -> None:
+    line, drive, _ = one(monkeypatch, YD1000(1), audit=tmp_path / "audit")
+    line.loses = lambda request: is_lost
+    with pytest.raises(Unconfirmed) if is_lost else nullcontext():
+        line.bus.raw(drive, 6, 0x0000, b"\x00\x01")
+    line.bus.close()
+    (entry,) = read_audit(tmp_path / "audit")
+    assert entry["write"] == "raw request 01 06 00 00 00 01 48 0A"
+    assert entry["outcome"] == ("unconfirmed" if is_lost else "done")
+
+
 def test_a_drive_that_refuses_to_tell_its_watchdog(monkeypatch: pytest.MonkeyPatch) -> None:
     line, drive, _ = one(monkeypatch, YD1000(1))
     refusal = build_reply(Framing.RTU, Message(1, 3, exception=2))
@@ -338,6 +355,43 @@ def test_a_write_whose_turn_comes_too_late_is_not_sent(monkeypatch: pytest.Monke
     assert line.written == written
     drive.stop()  # is never too late
     assert len(line.written) == len(written) + 1
+
+
+class Tidy(Drive):
+    """A drive of a user's own whose start looks at the motor, whatever became of its write."""
+
+    current = reading(0x0F, "A")  # read before the first write
+    speed = reading(0x10, "rpm")
+    run = setting(0x20)
+
+    @verb
+    def start(self, direction: Direction | None = None) -> Script[None]:
+        """Start the motor."""
+        with suppress(Expired, NotMaster):
+            yield from write(self.run, 1)
+        yield from read(self.speed)
+
+
+@pytest.mark.parametrize("result", [Failure.EXPIRED, Failure.NOT_MASTER])
+def test_what_was_not_sent_is_not_called_unconfirmed(
+    monkeypatch: pytest.MonkeyPatch, result: Failure
+) -> None:
+    """Nor is it by a look that fails afterwards."""
+    line = SimulatedBus(monkeypatch, simulated(Tidy(1)))
+    drive = line.attach(Tidy(1, confirmed=1))
+    carry_out = line.carry_out
+
+    def carry_out_reads(exchange: Exchange, **details: Any) -> Completion:
+        is_held_back = is_write(exchange.request)
+        return (
+            completed(result, Message(0, 0), b"", at_ns=0) if is_held_back else carry_out(exchange, **details)
+        )
+
+    monkeypatch.setattr(line, "carry_out", carry_out_reads)
+    line.loses = lambda request: request.start == Tidy.speed.address
+    with pytest.raises(NoReply):
+        drive.start()
+    assert line.written == []
 
 
 # ---- faults on the way ----

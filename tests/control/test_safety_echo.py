@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 from simulated_bus import SimulatedBus, is_write, one
 
+from multidrop.control.audit_log import read_audit
 from multidrop.control.outcome import Effect
 from multidrop.core import Message, build_request
 from multidrop.drive import Drive
@@ -69,12 +72,16 @@ def test_an_echo_that_shows_at_the_next_read_confirmed_nothing(monkeypatch: pyte
     assert "the reply was the adapter's echo" in str(outcome.failure)
 
 
-def test_a_raw_request_that_may_be_an_echo_is_not_confirmed(monkeypatch: pytest.MonkeyPatch) -> None:
-    line, drive, _ = one(monkeypatch, InnovertIBD(1))
+def test_a_raw_request_that_may_be_an_echo_is_not_confirmed(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    line, drive, _ = one(monkeypatch, InnovertIBD(1), audit=tmp_path / "audit")
     line.bus.raw(drive, 6, 0x2001, b"\x07\xd0")
     dies_and_echoes(line, drive)
     with pytest.raises(Unconfirmed, match="echo"):
         line.bus.raw(drive, 6, 0x2001, b"\x07\xd0")
+    line.bus.close()
+    assert [entry["outcome"] for entry in read_audit(tmp_path / "audit")] == ["done", "unconfirmed"]
 
 
 def test_what_is_told_of_an_adapter_that_is_known_to_echo_is_believed(

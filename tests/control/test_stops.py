@@ -618,6 +618,28 @@ def test_an_unwritable_ledger_keeps_no_stop_back(
     assert "stops were not counted" in caplog.text
 
 
+def test_a_stop_whose_reply_is_lost_is_sent_again_before_anything_is_read(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """What this one holds could be read."""
+    line = SimulatedBus(monkeypatch, simulated(Own(1)))
+    drive = line.attach(Own(1))
+    lost: list[Message] = []
+
+    def loses(request: Message) -> bool:
+        """The first two replies to a stop."""
+        if is_write(request) and len(lost) < 2:
+            lost.append(request)
+        return is_write(request) and lost[-1] is request
+
+    line.loses = loses
+    drive.stop()
+    assert len(lost) == 2
+    asked = [is_write(request) for request, _ in line.frames]
+    sent = asked.index(True)  # its identity is read before
+    assert asked[sent : sent + 3] == [True, True, True]
+
+
 def test_a_spent_budget_keeps_no_stop_back_and_it_is_counted(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
