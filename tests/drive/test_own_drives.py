@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from enum import IntEnum
 from pathlib import Path
+from typing import ClassVar
 
 import pytest
 from simulated_bus import SimulatedBus
@@ -14,7 +15,7 @@ from multidrop.drive import Condition, Direction, Drive, Script, State, insist, 
 from multidrop.drive.declare import command, reading, setting
 from multidrop.drive.table import Kept
 from multidrop.drive.verbs import verb
-from multidrop.errors import Refused, Unconfirmed
+from multidrop.errors import DriveRefused, Refused, Unconfirmed
 from multidrop.plant.loader import load_plant
 from multidrop.sim import simulated
 
@@ -218,18 +219,32 @@ def test_a_class_that_says_what_it_is_needs_no_confirmation(monkeypatch: pytest.
     assert written(line) == [RUN]
 
 
+def acknowledged(request: Message) -> bytes | None:
+    """Exception 05 to a write."""
+    return bytes.fromhex("01 86 05 82 63") if request.function == 6 else None  # the CRC by pymodbus
+
+
 def test_what_is_still_under_way_is_not_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     """Exception 05: the server has accepted the request and is processing it (V1.1b3, section 7)."""
     line = SimulatedBus(monkeypatch, simulated(Known(1)))
     drive = line.attach(Known(1))
-
-    def acknowledged(request: Message) -> bytes | None:
-        return bytes.fromhex("01 86 05 82 63") if request.function == 6 else None  # the CRC by pymodbus
-
     line.answers = acknowledged
     with pytest.raises(Unconfirmed, match="its reply is code 05H, acknowledged, still working"):
         drive.start()
     assert written(line) == [RUN]
+
+
+def test_a_drive_s_own_meaning_of_05_is_a_refusal(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Locked(Known):
+        """One whose manual has another 05."""
+
+        exceptions: ClassVar = {5: "locked by its password"}
+
+    line = SimulatedBus(monkeypatch, simulated(Locked(1)))
+    drive = line.attach(Locked(1))
+    line.answers = acknowledged
+    with pytest.raises(DriveRefused, match="code 05H, locked by its password"):
+        drive.start()
 
 
 def test_a_setting_may_be_said_to_move_the_motor(monkeypatch: pytest.MonkeyPatch) -> None:
