@@ -500,6 +500,30 @@ def test_a_stop_that_is_called_wrongly_is_sent_before_it_says_so(monkeypatch: py
     assert not sim.motor.energised
 
 
+class Patient(Own):
+    """One whose stop waits for as long as its ramp takes, whatever the drive says."""
+
+    model = "patient"
+    title = "OWN 2"
+
+    @verb
+    def stop(self) -> Script[None]:
+        """Stop the motor."""
+        yield from write(self.run, 0)
+        yield from wait(20)
+        yield from read(self.speed)
+
+
+def test_a_stop_s_own_waits_take_no_longer_than_it_is_given(monkeypatch: pytest.MonkeyPatch) -> None:
+    line = SimulatedBus(monkeypatch, simulated(Patient(1)))
+    drive = line.attach(Patient(1))
+    begun = line.seconds
+    with pytest.raises(Unconfirmed, match="after 2 s, all that it was given"):
+        drive.stop(seconds=2)
+    assert 2 <= line.seconds - begun < 2.5
+    assert len(line.written) == 1
+
+
 def test_stop_all_takes_seconds_too(monkeypatch: pytest.MonkeyPatch) -> None:
     sims: list[Any] = [simulated(InvtCHE(1, maximum_frequency=50)), simulated(ErmanERG220(2))]
     line = SimulatedBus(monkeypatch, *sims)
