@@ -31,8 +31,8 @@ from multidrop.core import Columns, Counters, Names, Status
 from multidrop.gateway.connections import Connections, Watched
 from multidrop.gateway.frames import WHOLE
 from multidrop.gateway.gateway import Gateway
-from multidrop.gateway.mbap import ModbusClient, ModbusPort
 from multidrop.gateway.metrics import families_of
+from multidrop.gateway.modbus_clients import ModbusClient, ModbusPort
 from multidrop.gateway.modbus_server import ModbusServer
 from multidrop.gateway.modbus_settings import ModbusSettings
 from multidrop.gateway.settings import ServeSettings

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from multidrop import load_plant
-from multidrop.gateway import common_block, mbap, passing
+from multidrop.gateway import common_block, modbus_clients, passing
 from multidrop.gateway.modbus_codes import ModbusCode
 from multidrop.gateway.modbus_settings import ModbusSettings
 from multidrop.gateway.settings import read_settings
@@ -62,6 +62,7 @@ def test_the_limits_of_clients_are_as_the_page_says() -> None:
     text = REFERENCE.partition("## Clients")[2]
     numbers = [int(number) for number in re.findall(r"\d+", text)]
     assert numbers == [
-        *(mbap.MOST_CLIENTS, mbap.FORGETTABLE_S, mbap.MOST_UNDER_WAY),
-        *(passing.MOST_WAITING, mbap.IDLE_S, mbap.STALLED_S),
+        *(modbus_clients.MOST_CLIENTS, modbus_clients.FORGETTABLE_S, modbus_clients.MOST_UNDER_WAY),
+        *(passing.MOST_WAITING, modbus_clients.IDLE_S, modbus_clients.STALLED_S),
+        *(modbus_clients.MOST_BEHIND // 1024, 6, modbus_clients.MOST_UNTAKEN // 1024),
     ]

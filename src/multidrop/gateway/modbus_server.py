@@ -1,7 +1,6 @@
 """Modbus TCP server: what each request of a client reads or writes, and the answer to it.
 
-Reads come from the polled rows where they can, and else from the drive itself. A write goes through
-Commands, by the same rules as every other way in; of what moves a motor only a stop does.
+Reads come from polled rows where they can. A write is held to the rules of every way in; none starts a motor.
 """
 
 from __future__ import annotations
@@ -20,7 +19,8 @@ from multidrop.gateway.commands import Told
 from multidrop.gateway.common_block import STOP, CommonSource
 from multidrop.gateway.drive_words import Lack
 from multidrop.gateway.listener import listen
-from multidrop.gateway.mbap import SWEEP_S, Answer, MbapRequest, ModbusClient, ModbusPort
+from multidrop.gateway.mbap import MbapRequest
+from multidrop.gateway.modbus_clients import SWEEP_S, Answer, ModbusClient, ModbusPort
 from multidrop.gateway.modbus_codes import Declined, ModbusCode, code_of
 from multidrop.gateway.modbus_settings import ModbusSettings
 from multidrop.gateway.passing import LineShare, PassingBusy
