@@ -524,7 +524,36 @@ def test_without_the_key_nothing_is_listened_to(broker: Broker, listener: Listen
 def test_without_the_key_only_a_rebirth_is_asked_for(tmp_path: Path) -> None:
     require_module("paho.mqtt.client")
     part: Any = build(MqttSettings(sparkplug="works", node="line"), inside(tmp_path))
-    assert [speaker.topics() for speaker in part._speakers] == [[], [("spBv1.0/works/NCMD/line", 1)]]
+    assert [speaker.topics() for speaker in part._speakers] == [
+        [("multidrop/gateway", 0), ("multidrop/+/available", 0)],  # what was kept of drives that are no more
+        [("spBv1.0/works/NCMD/line", 1)],
+    ]
+
+
+@pytest.mark.parametrize("is_retained", [False, True])
+def test_without_the_key_a_broker_s_commands_are_nobody_s(tmp_path: Path, is_retained: bool) -> None:
+    """It may send what nobody asked it for."""
+    require_module("paho.mqtt.client")
+    known = inside(tmp_path)
+    part: Any = build(MqttSettings(sparkplug="works", node="line"), known)
+    stop = {"verb": "stop", "time": now_ms()}
+
+    async def receive() -> None:
+        for topic, payload in (
+            ("multidrop/stop", b"stop"),
+            ("multidrop/pump-1/stop", b"stop"),
+            ("multidrop/pump-1/act", json.dumps(stop).encode()),
+            ("multidrop/pump-1/set/setpoint", write_of(12.5, now_ms())),
+            ("multidrop", b"stop"),
+            ("elsewhere", b""),
+        ):
+            part._speakers[0].received(topic, payload, is_retained=is_retained)
+        for topic in ("spBv1.0/works/DCMD/line/pump-1", "spBv1.0", "multidrop/stop"):
+            part._speakers[1].received(topic, b"Device Control/Stop", is_retained=is_retained)
+        await asyncio.sleep(0)
+
+    asyncio.run(receive())
+    assert known.commands.noted == []
 
 
 # ---- Home Assistant ----

@@ -6,6 +6,7 @@ PREFIX/DRIVE/available and PREFIX/gateway say who is there; PREFIX/DRIVE/told sa
 from __future__ import annotations
 
 import json
+import logging
 from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
@@ -14,6 +15,7 @@ from multidrop import Plant, drive_meant
 from multidrop.gateway.commands import Told
 from multidrop.gateway.homeassistant import discovery, discovery_topic
 from multidrop.gateway.hub import SILENT
+from multidrop.gateway.left_behind import OFFLINE, ONLINE, LeftBehind
 from multidrop.gateway.mqtt_settings import MqttSettings, fresh_values
 from multidrop.gateway.orders import Orders
 from multidrop.gateway.outbox import Publication
@@ -24,9 +26,10 @@ EXAMPLES = {
     "set": '{"value": 25.0, "time": UTC in ms}',
     "act": '{"verb": "start", "drive": "pump-1", "time": UTC in ms}',
 }
-ONLINE, OFFLINE = b"online", b"offline"
 MOST_BYTES = 65_536  # of a write or a verb
 NOTHING = b""  # makes a broker forget what it kept of a topic
+
+_log = logging.getLogger("multidrop.gateway.mqtt")
 
 
 class JsonTopics:
@@ -43,6 +46,7 @@ class JsonTopics:
         self._orders = Orders(inside.commands, settings.caller, utc_ms, self._tell)
         self._available: dict[str, bytes] = {}
         self._left: set[str] = set()  # drives of which the broker is to keep nothing
+        self._left_behind = LeftBehind(settings.prefix, home_assistant=settings.home_assistant)
 
     def _topic(self, *levels: str) -> str:
         return "/".join((self._settings.prefix, *levels))
@@ -58,13 +62,15 @@ class JsonTopics:
         return self._kept(self._topic("gateway"), OFFLINE)
 
     def topics(self) -> list[tuple[str, int]]:
+        kept = [(topic, 0) for topic in self._left_behind.topics()]
         if not self._settings.commands:
-            return []
+            return kept
         once = [(self._topic("+", "set", "+"), 0), (self._topic("+", "act"), 0)]
-        return [*once, (self._topic("+", "stop"), 1), (self._topic("stop"), 1)]
+        return [(self._topic("+", "stop"), 1), (self._topic("stop"), 1), *once, *kept]
 
     def connected(self) -> None:
         self._available.clear()
+        self._left_behind.begin()
         self.outbox.put(self._kept(self._topic("gateway"), ONLINE))
         self._take_back()  # the connection may have broken before it was heard
         if self._settings.home_assistant:
@@ -74,12 +80,21 @@ class JsonTopics:
 
     def received(self, topic: str, payload: bytes, *, is_retained: bool) -> None:
         levels = topic.removeprefix(self._settings.prefix + "/").split("/")
-        if levels == ["stop"]:
-            self._orders.stop(None)
-        elif levels[-1] == "stop":
-            self._orders.stop([levels[0]])
+        is_stop = levels == ["stop"] or levels[1:] == ["stop"]
+        if not (is_stop or levels[1:] == ["act"] or (levels[1:2] == ["set"] and len(levels) == 3)):
+            if is_retained:
+                self._look_back(topic, payload)
+        elif not self._settings.commands:
+            _log.warning("the broker sent a command that nobody listens to: %.100r", topic)
+        elif is_stop:
+            self._orders.stop(None if levels == ["stop"] else [levels[0]])
         else:
             self._order(levels, payload, is_retained=is_retained)
+
+    def _look_back(self, topic: str, payload: bytes) -> None:
+        """Take back what the broker has kept since before of drives that are no more."""
+        for left in self._left_behind.hear(topic, payload, _drives(self._plant)):
+            self.outbox.put(self._kept(left, NOTHING))
 
     def _order(self, levels: list[str], payload: bytes, *, is_retained: bool) -> None:
         drive, *what = levels

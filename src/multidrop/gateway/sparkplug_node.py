@@ -71,6 +71,9 @@ class SparkplugNode:
 
     def received(self, topic: str, payload: bytes, *, is_retained: bool) -> None:
         levels = topic.split("/")
+        if levels[2:3] != ["NCMD"] and not (levels[2:3] == ["DCMD"] and self._settings.commands):
+            _log.warning("the broker sent a command that nobody listens to: %.100r", topic)
+            return
         try:
             sent_ms, metrics = read_command(payload)
         except ValueError as mistake:
