@@ -16,6 +16,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from multidrop.gateway import frames as module
+from multidrop.gateway.frame_route import FrameRoute
 from multidrop.gateway.frames import REMEMBERED, WHOLE, Encoded, Frames, changes
 from multidrop.gateway.gateway import Gateway
 from multidrop.gateway.settings import ServeSettings
@@ -224,15 +225,34 @@ def test_a_viewer_waits_and_is_let_go(frames: Frames, monkeypatch: pytest.Monkey
         assert first is not None
         assert await frames.after(first.n) is None
         monkeypatch.setattr(module, "WAIT_S", 1000.0)
-        waiting = [asyncio.create_task(frames.after(first.n)) for _ in range(2)]
+        waiting = [asyncio.create_task(frames.after(first.n)) for _ in range(3)]
         await asyncio.sleep(0)
+        assert [one.done() for one in waiting] == [False, False, True]
         with pytest.raises(OverflowError, match="2 viewers wait already"):
-            await frames.after(first.n)
+            await waiting.pop()
         frames.close()
         assert await asyncio.gather(*waiting) == [None, None]
         assert await frames.after(first.n) is None
 
     asyncio.run(watch())
+
+
+def test_a_viewer_too_many_is_told_so(frames: Frames, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "MOST_VIEWERS", 0)
+    sent: list[Any] = []
+
+    async def send(message: Any) -> None:
+        sent.append(message)
+
+    async def watch() -> None:
+        first = await frames.after(WHOLE)
+        assert first is not None
+        scope = {"type": "http", "query_string": f"after={first.n}".encode(), "headers": []}
+        await FrameRoute(frames)(scope, None, send)  # type: ignore[arg-type]
+
+    asyncio.run(watch())
+    assert [one.get("status") for one in sent] == [503, None]
+    assert json.loads(sent[1]["body"]) == {"error": "0 viewers wait already"}
 
 
 def test_a_frame_is_made_of_what_was_just_looked_at(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
