@@ -17,6 +17,12 @@ pytestmark = pytest.mark.long  # Chromium is started for each file
 
 DASH = "\u2013"
 BUSY_S = 20.0  # far beyond the promised 0.5 s: that is measured on a quiet machine
+EDGE = """cell => {
+  const text = document.createRange();
+  text.selectNodeContents(cell);
+  const { left, right } = text.getBoundingClientRect();
+  return [left, right];
+}"""
 FRESH = "tr.drive td.frequency .value:not(.old)"
 
 
@@ -320,3 +326,27 @@ def test_no_value_of_another_drive_or_in_another_unit_goes_on_under_its_name(
 ) -> None:
     page = opened("#/drives/pump-1")
     assert page.evaluate(TAKEN_ANEW, change) == kept
+
+
+@pytest.mark.parametrize("name", ["pump-1", "conveyor-2", "labeller", "tower-fan-2", "a" * 40])
+def test_a_phone_shows_each_drive_s_age_and_what_it_missed(
+    opened: Opener, gateway: FakeGateway, name: str
+) -> None:
+    if len(name) == 40:
+        gateway.renamed["pump-1"] = name
+    page = opened(size="phone")
+    row = page.locator("tr.drive", has=page.get_by_title(name, exact=True))
+    age, missed, state, current = (row.locator(f"td.{one}") for one in ("age", "missed", "state", "current"))
+    if name == "labeller":
+        assert re.fullmatch(r"silent for \d+ s", state.inner_text().strip())
+    else:
+        assert age.is_visible()
+        assert age.evaluate("td => getComputedStyle(td, '::before').content") == '"age "'
+        right, left = (one.evaluate(EDGE) for one in (age, current))
+        assert right[1] <= left[0]
+        assert state.evaluate(EDGE)[1] <= right[0]
+    share = {"labeller": "100 %", "tower-fan-2": "3.1 %"}.get(name)
+    assert missed.is_visible() is (share is not None)
+    if share:
+        assert missed.inner_text().replace("\n", "") == share
+    assert page.evaluate("document.documentElement.scrollWidth") == 390

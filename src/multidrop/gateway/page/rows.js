@@ -132,6 +132,7 @@ export function drawRow(r, t, full) {
   const missed = drive?.missed ?? null;
   put(r.missed, missed === null ? UNKNOWN : missed === 0 ? "0" : share(missed));
   setClass(r.missed, "warn", missed > 0);
+  setClass(r.missed, "none", missed === 0);
   return changed;
 }
 
