@@ -9,6 +9,7 @@ import tempfile
 from contextlib import closing
 from datetime import UTC, datetime, timedelta, timezone
 from pathlib import Path
+from typing import Any
 
 import pytest
 from examples import examples, usually
@@ -19,6 +20,7 @@ from multidrop.history import growing, kept_series
 from multidrop.history.buckets import grid_of
 from multidrop.history.compact import compact
 from multidrop.history.database import Database
+from multidrop.history.sources import Replaced, Sources
 from multidrop.polling.batch import Row
 from multidrop.recording.rows import from_rows
 from multidrop.recording.segments import SegmentWriter
@@ -371,3 +373,22 @@ def test_what_duckdb_spills_goes_where_nobody_else_can_look(
     assert stat.S_IMODE(Path(spill).stat().st_mode) == 0o700
     database.close()
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_slow_reader_outlasts_files_that_are_replaced_again_and_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """On a busy machine each look took as long as a file stood there."""
+    record(tmp_path, [random_rows(1, NOON, 100)])
+    replaced = iter(range(20))
+
+    def known(self: Sources, *given: Any) -> Any:
+        if next(replaced, None) is not None:
+            raise Replaced
+        return real(self, *given)
+
+    real = Sources.known
+    monkeypatch.setattr(Sources, "known", known)
+    with History(tmp_path) as history:
+        assert sum(map(len, history.read(None))) == 100
+    assert next(replaced, None) is None

@@ -17,7 +17,7 @@ from multidrop.history.quantities import Known, known_by
 T = TypeVar("T")
 ALWAYS = -(2**63), 2**63 - 1  # ns
 MEMORY = "200MB"  # of DuckDB
-MOST_TRIES = 5  # for files that are replaced
+MOST_TRIES = 50  # for files that are replaced: a busy machine takes longer than some of them last
 MOST_GROWING = 4  # segments of which what was learnt is kept
 FILES_AT_ONCE = 200  # of which metadata is read: a text may take 100 kB
 
