@@ -645,7 +645,7 @@ def test_an_unwritable_ledger_keeps_no_stop_back(
 def test_a_stop_whose_reply_is_lost_is_sent_again_before_anything_is_read(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """What this one holds could be read."""
+    """Though the drive could be asked what it holds."""
     line = SimulatedBus(monkeypatch, simulated(Own(1)))
     drive = line.attach(Own(1))
     lost: list[Message] = []
