@@ -27,6 +27,7 @@ from secured_clusters import (  # noqa: E402
     SecuredCluster,
     SecuredNode,
     certificates,
+    in_one_account,
     secured_cluster,
 )
 from secured_fleets import PATIENCE_S, SecuredFleet, multidrop, secured_fleet, until  # noqa: E402
@@ -130,11 +131,13 @@ def test_what_is_not_ones_right_is_one_sentence(
 
 @pytest.mark.slow
 def test_a_stored_message_that_is_asked_for_into_anothers_samples_is_left_out(
-    servers: SecuredCluster, tmp_path: Path, caplog: pytest.LogCaptureFixture
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """A server sends what is asked for wherever its asker says, with the headers that it was stored with."""
+    """Servers with an account for all send what is asked for wherever its asker says, with its headers."""
 
-    async def main() -> None:
+    async def main(servers: SecuredCluster) -> None:
+        made = multidrop(servers, "operator", "fleet", "init")
+        assert made.returncode == 0, made.stderr
         with closing(Spool(tmp_path / "spool", "gw-b")) as spool:
             spool.append(numbered(0, 10))
             assert spool.sync(PATIENCE_S)
@@ -158,7 +161,8 @@ def test_a_stored_message_that_is_asked_for_into_anothers_samples_is_left_out(
         assert (message.gateway, message.data, message.sequence) == ("gw-b", data, 0)
         assert not SourceCheck({}).take(message)
 
-    asyncio.run(asyncio.wait_for(main(), PATIENCE_S))
+    with secured_cluster(tmp_path / "nats", 1, change=in_one_account) as servers:
+        asyncio.run(asyncio.wait_for(main(servers), PATIENCE_S))
     assert "has no number and is left out" in caplog.text
 
 
@@ -320,12 +324,36 @@ def test_a_key_that_is_taken_away_is_told_of_and_its_lines_go_on(tmp_path: Path)
     """The servers read their rights again, and end the connections of who has none any more."""
     with secured_fleet(tmp_path, 1, ("gw-a", "gw-b")) as fleet:
         fleet.wait_for_polling()
-        fleet.servers.take_rights_of("gw-a")
+        fleet.servers.give_rights_to(["gw-b"])
         until(lambda: "admits nobody who says this" in fleet.log("gw-a"), "the sentence")
         until(lambda: "no line is polled" in fleet.log("gw-a"), "silence")
         fleet.wait_for_polling()
         assert fleet.running["gw-a"].poll() is None  # and tries again
         assert fleet.log("gw-a").count("admits nobody") < 10  # each connection says it once
+
+
+@pytest.mark.long
+def test_a_gateway_that_comes_shares_the_lines_and_ends_nobodys_session(tmp_path: Path) -> None:
+    """The servers read its rights while all others go on, and commands find it.
+
+    NATS 2.15 gives an account that it reads while it runs what others offer it when it reads that once more.
+    """
+    with secured_fleet(tmp_path, 3, ("gw-a", "gw-b")) as fleet:
+        fleet.wait_for_polling()
+        fleet.servers.give_rights_to(["gw-a", "gw-b", "gw-c"])
+        fleet.servers.reload()
+        fleet.start("gw-c")
+        until(lambda: bool(fleet.status()["gateways"].get("gw-c", {}).get("lines")), "its share")
+        fleet.wait_for_polling()
+        taken = fleet.status()["gateways"]
+        assert [taken[name]["session"] for name in GATEWAYS] == [1, 1, 1]
+        for number in range(6):
+            said = multidrop(fleet.servers, "commander", "fleet", "stop", f"drive-line-{number}")
+            assert said.returncode == 0, said
+        assert (tmp_path / "gw-c" / "commands.jsonl").read_text().count("drive-line-") > 0
+        assert fleet.hall.overlaps() == 0
+        for name in GATEWAYS:
+            assert "do not allow" not in fleet.log(name)
 
 
 @pytest.mark.long

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 import socket
 import subprocess
+import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager, suppress
 from pathlib import Path
@@ -14,6 +16,7 @@ from typing import Any
 from nats_clusters import PATIENCE_S, Cluster, Node, begun, server_program
 from peers import require_program
 
+from multidrop.fleet.accounts import STORE
 from multidrop.fleet.credentials import connect_options
 from multidrop.fleet.server_files import ROUTE_PORTS, TlsFiles, write_files
 
@@ -23,6 +26,13 @@ Change = Callable[[str], str]  # of rights.conf
 
 def _as_written(rights: str) -> str:
     return rights
+
+
+def in_one_account(rights: str) -> str:
+    """Return the rights of the same users in the account that has the streams, as it is without accounts."""
+    users = re.findall(r"\{ # .*?\n        \}\n      \}", rights, re.DOTALL)
+    assert users
+    return f"accounts {{ {STORE} {{ jetstream: enabled, users: [\n" + "\n".join(users) + "\n] } }\n"
 
 
 def certificates(folder: Path, host: str = "127.0.0.1") -> TlsFiles:
@@ -55,6 +65,10 @@ def ports_with_routes(number: int) -> list[int]:
     return found
 
 
+def _reloads(log: str) -> int:
+    return log.count("Reloaded server configuration")
+
+
 class SecuredNode(Node):
     """One server's process, with a file that was written for it."""
 
@@ -69,6 +83,9 @@ class SecuredNode(Node):
     def url(self) -> str:
         return f"tls://{self.host}:{self.port}"
 
+    def log(self) -> str:
+        return self._log.read_text("utf-8", "replace")
+
 
 class SecuredCluster(Cluster):
     """Servers, and the keys of all users."""
@@ -78,7 +95,6 @@ class SecuredCluster(Cluster):
     ) -> None:
         ports, monitors = ports_with_routes(number), ports_with_routes(number)
         self.folder = folder
-        self._gateways = gateways
         self.tls = certificates(folder / "tls")
         urls = [f"tls://127.0.0.1:{port}" for port in ports]
         write_files(folder, gateways, urls, self.tls, folder)
@@ -89,12 +105,20 @@ class SecuredCluster(Cluster):
     def key(self, user: str) -> Path:
         return self.folder / "keys" / f"{user}.key"
 
-    def take_rights_of(self, gateway: str) -> None:
-        """Write rights without this gateway's, and let the servers read them."""
-        left = [name for name in self._gateways if name != gateway]
-        write_files(self.folder, left, self.urls, self.tls, self.folder)
+    def give_rights_to(self, gateways: Sequence[str]) -> None:
+        """Write the rights of these gateways alone, and let the servers read them."""
+        write_files(self.folder, gateways, self.urls, self.tls, self.folder)
+        self.reload()
+
+    def reload(self) -> None:
+        """Let the servers read their files again, and wait until they have."""
+        done = [_reloads(node.log()) for node in self.nodes]
         for node in self.nodes:
             node.process.send_signal(signal.SIGHUP)
+        ends = time.monotonic() + PATIENCE_S
+        while any(_reloads(node.log()) == before for node, before in zip(self.nodes, done, strict=True)):
+            assert time.monotonic() < ends, "a server does not reload"
+            time.sleep(0.02)
 
     def options(self, user: str) -> dict[str, Any]:
         """Return the options of a connection as this user."""

@@ -1,7 +1,7 @@
 """Server files: the configuration of a fleet's NATS servers, and a secret key for each user.
 
     n1.conf, n2.conf …   a server each, with its route to the others; for that server alone
-    rights.conf          users by their public keys, and their rights; for all servers
+    rights.conf          users by their public keys, their rights and their accounts; for all servers
     keys/NAME.key        the secret key of a user; for its machine alone
     keys/routes          the servers' own password, as the servers' files have it
 
@@ -14,18 +14,18 @@ from __future__ import annotations
 import json
 import os
 import secrets
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 from urllib.parse import urlsplit
 
-from multidrop.fleet.credentials import inbox_of, new_seed, public_key
-from multidrop.fleet.rights import UserRights, rights_of
+from multidrop.fleet.accounts import accounts
+from multidrop.fleet.credentials import new_seed, public_key
+from multidrop.fleet.rights import rights_of
 
-ACCOUNT = "multidrop"
+CLUSTER = "multidrop"
 ROUTE_PORTS = 2000  # from a server's port to that of its routes: 4222 and 6222, as usual
 MOST_PORTS = 65535
-ANSWER = '{ max: 1, expires: "1m" }'  # of a request: a stop of many drives takes its time
 STORE = Path("/var/lib/nats")
 PINGS = 'ping_interval: "1s", ping_max: 2'  # of routes: a dead one is left after 3 s, and not after 60 to 90
 
@@ -85,7 +85,7 @@ def write_files(
     written |= {folder / f"{one.name}.conf": _server(one, servers, password, tls, store) for one in servers}
     for path, text in written.items():
         _write_secret(path, text + "\n")
-    (folder / "rights.conf").write_text("\n".join(_users(rights, public)) + "\n", "utf-8")
+    (folder / "rights.conf").write_text("\n".join(accounts(rights, public)) + "\n", "utf-8")
     return [*written, folder / "rights.conf"]
 
 
@@ -110,21 +110,6 @@ def _write_secret(path: Path, text: str) -> None:
     beside.replace(path)
 
 
-def _users(rights: Mapping[str, UserRights], public: Mapping[str, str]) -> Iterator[str]:
-    yield f"accounts {{ {ACCOUNT} {{ jetstream: enabled, users: ["
-    for name, one in rights.items():
-        inbox = f"{inbox_of(public[name])}.>"
-        yield f"  {{ # {name}"
-        yield f"    nkey: {public[name]}, permissions: {{"
-        yield f"      publish: {{ allow: {json.dumps(list(one.publish))} }}"
-        yield f"      subscribe: {{ allow: {json.dumps([inbox, *one.subscribe])} }}"
-        if one.answers:
-            yield f"      allow_responses: {ANSWER}"
-        yield "    }"
-        yield "  }"
-    yield "] } }"
-
-
 def _server(
     one: ServerAddress, servers: Sequence[ServerAddress], password: str, tls: TlsFiles | None, store: Path
 ) -> str:
@@ -140,7 +125,7 @@ def _server(
         user = f"{{ user: routes, password: {json.dumps(password)} }}"
         routes = [f"nats-route://routes:{password}@{other.host}:{other.routes}" for other in servers]
         lines += [
-            f'cluster {{ name: {ACCOUNT}, listen: "{one.host}:{one.routes}"',
+            f'cluster {{ name: {CLUSTER}, listen: "{one.host}:{one.routes}"',
             f"  authorization {user}",
             f"  routes: {json.dumps(routes)}",
             f"  {PINGS}",

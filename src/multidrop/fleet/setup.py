@@ -116,7 +116,7 @@ def no_quorum(path: ServerPath, failure: Exception) -> FleetError:
     if isinstance(failure, NobodyThere):
         return FleetError(
             f"no JetStream answers at {path.url}: the configuration of each server needs "
-            '`jetstream { store_dir: "/var/lib/nats" }`'
+            '`jetstream { store_dir: "/var/lib/nats" }`, and one that runs must read new rights twice'
         )
     return FleetError(
         f"the NATS servers around {path.url} have no quorum: more than half of them must run and reach each "

@@ -45,7 +45,8 @@ def run(arguments: argparse.Namespace) -> int:
     else:
         print_text(
             f"{folder}: copy rights.conf to each server, with the .conf of its name, and each key of keys/ "
-            "to the machine of its user alone, where --credentials names it"
+            "to the machine of its user alone, where --credentials names it. A server that runs must read "
+            "them twice: say `nats-server --signal reload` two times"
         )
     if tls is None:
         warn("without TLS the network reads samples and commands too: give --ca, --cert and --key")
