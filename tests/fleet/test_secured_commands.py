@@ -14,6 +14,9 @@ from peers import require_module
 require_module("nats")
 require_module("nkeys")
 
+from nats.aio.client import Client  # noqa: E402
+from nats.errors import NoRespondersError  # noqa: E402
+from nats.errors import TimeoutError as NatsTimeout  # noqa: E402
 from secured_clusters import GATEWAYS, SecuredCluster, secured_cluster  # noqa: E402
 
 from multidrop.fleet import names  # noqa: E402
@@ -22,22 +25,23 @@ from multidrop.fleet.command_subjects import CommandSubjects  # noqa: E402
 from multidrop.fleet.command_words import CommandOutcome  # noqa: E402
 from multidrop.fleet.fleet_commands import FleetCommands  # noqa: E402
 from multidrop.fleet.plant_store import store  # noqa: E402
-from multidrop.fleet.servers import paths_of  # noqa: E402
+from multidrop.fleet.servers import connect, paths_of  # noqa: E402
 from multidrop.fleet.setup import open_all, set_up  # noqa: E402
 
 pytestmark = [pytest.mark.slow, pytest.mark.long]
 
+PATIENCE_S = 30.0
 PLANT = {LINE: {"line": {"name": LINE, "drive": [{"name": "pump"}]}, "files": {}, "may": MAY}}
 
 
-@pytest.fixture
-def servers(tmp_path: Path) -> Iterator[SecuredCluster]:
-    with secured_cluster(tmp_path / "nats", 1) as running:
+@pytest.fixture(params=[1, 3])
+def servers(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[SecuredCluster]:
+    with secured_cluster(tmp_path / "nats", request.param) as running:
         yield running
 
 
 @asynccontextmanager
-async def commanded(servers: SecuredCluster, made: Desks) -> AsyncIterator[None]:
+async def commanded(servers: SecuredCluster, made: Desks) -> AsyncIterator[CommandSubjects]:
     """Take commands as a gateway of these rights."""
     operator = paths_of(servers.urls, servers.options("operator"))
     await set_up(operator)
@@ -50,7 +54,7 @@ async def commanded(servers: SecuredCluster, made: Desks) -> AsyncIterator[None]
         await subjects.begin()
         subjects.open(LINE, PLANT[LINE])
         await asyncio.gather(*subjects._tasks)
-        yield
+        yield subjects
     finally:
         for path in (*operator, *paths):
             await path.close()
@@ -75,3 +79,33 @@ def test_a_commander_may_and_a_viewer_may_not(servers: SecuredCluster, tmp_path:
 
     with desks(tmp_path) as made:
         asyncio.run(main(made))
+
+
+async def nobody_is_asked(asker: Client) -> bool:
+    """Say whether a server tells that it has nobody to ask, once it has heard so itself."""
+    while True:
+        try:
+            await asker.request(names.command_subject(LINE), b"{}", 1.0)
+        except NoRespondersError:
+            return True
+        except NatsTimeout:
+            continue
+        return False
+
+
+def test_where_nobody_polls_the_line_each_server_says_so(servers: SecuredCluster, tmp_path: Path) -> None:
+    """That nobody was asked is certain, though asker and gateway have accounts of their own."""
+
+    async def main(made: Desks) -> None:
+        async with commanded(servers, made) as subjects:
+            askers = [await connect(url, servers.options("commander")) for url in servers.urls]
+            assert not any([await nobody_is_asked(asker) for asker in askers])
+            subjects.shut(LINE)
+            await asyncio.gather(*subjects._tasks)
+            assert all([await nobody_is_asked(asker) for asker in askers])
+            for asker in askers:
+                await asker.close()
+        assert made.writes == []
+
+    with desks(tmp_path) as made:
+        asyncio.run(asyncio.wait_for(main(made), PATIENCE_S))

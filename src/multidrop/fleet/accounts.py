@@ -9,7 +9,7 @@ user has an account of its own, which the answers to it do not leave. Between ac
 | whoever commands | each gateway     | commands, stops and requests about the gateway, as streams           |
 | a gateway        | whoever commands | answers to his inbox, as a service                                   |
 
-A server sends nothing on to a stream's importers that came through a service, so no answer is taken for a stop.
+A server sends nothing on to a stream's importers that came through a service, so no answer becomes a stop.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ LAST_ANSWER = "10s"  # of several: none comes later, and the server remembers th
 ANSWER = '{ max: 1, expires: "1m" }'  # of a request: a stop of many drives takes its time
 _STORED = ("$JS.", "$KV.", f"{STREAM}.")
 _MANY = "$JS.API.DIRECT.GET."  # these have several answers each
-# In an account without JetStream a server itself answers to all of its API, unless this is imported: that it is
-# not enabled. Nobody may ask it.
+# In an account without JetStream a server answers to all of its API that it is not enabled, unless this
+# is imported. Nobody may ask it.
 _INFO = "$JS.API.INFO"
 
 
