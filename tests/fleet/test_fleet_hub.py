@@ -102,9 +102,9 @@ class Memory:
         return [row for commit in self.commits for table in commit.tables for row in rows_of(table)]
 
 
-async def read_all(client: Client, sink: SampleSink, place: int) -> HubState:
+async def read_all(client: Client, sink: SampleSink, place: int, every: float = 0.02) -> HubState:
     """Run a hub until it has kept so much."""
-    hub = SampleHub(client, sink, every=0.02)
+    hub = SampleHub(client, sink, every=every)
     task = asyncio.create_task(hub.run())
     try:
         async with asyncio.timeout(PATIENCE_S):
@@ -176,6 +176,27 @@ def test_messages_of_several_answers(running: Cluster, monkeypatch: pytest.Monke
             assert exchanges_in(sorted(sink.rows())) == list(range(5, 60))
 
     asyncio.run(live())
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("is_good", [True, False], ids=["rows", "garbage"])
+def test_a_commit_ends_where_it_has_much_in_memory(
+    running: Cluster, monkeypatch: pytest.MonkeyPatch, is_good: bool
+) -> None:
+    """Few rows may have long names, and what is left out was read too."""
+    monkeypatch.setattr(hub_module, "MOST_READ", 1)
+    monkeypatch.setattr(hub_module, "MOST_BYTES", 1000)
+    sink = Memory()
+
+    async def main() -> None:
+        async with client_of(running) as client:
+            for sequence in (1, 2, 3):
+                await say(client, sequence, message(sequence) if is_good else b"?" * 1000)
+            await read_all(client, sink, 3, every=3600.0)
+
+    asyncio.run(main())
+    assert [commit.last for commit in sink.commits] == [1, 2, 3]
+    assert len(sink.rows()) == (150 if is_good else 0)
 
 
 @pytest.mark.slow

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import random
 import struct
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 
 import pyarrow as pa
@@ -16,6 +17,7 @@ from tables import table
 from multidrop import Batch
 from multidrop.core import Columns, Field, Names, NumberFormat, RowLayout
 from multidrop.fleet.message import MOST_ROWS, MessageError, Packed, RowBuffer, unpack
+from multidrop.fleet.unpacked_size import unpacked_size
 
 
 def packed(*batches: Batch, most: int = 900_000) -> list[Packed]:
@@ -138,7 +140,7 @@ def times(*ns: int | None) -> pa.Array:
 NAMELESS = pa.DictionaryArray.from_arrays(pa.array([0, 1], pa.int32()), pa.array(["a", None]))
 
 
-def written(**other: pa.Array) -> bytes:
+def written(options: pa.ipc.IpcWriteOptions | None = None, **other: pa.Array) -> bytes:
     """Return a message of two rows as another writer than ours would write it, with these columns."""
     columns = {
         "time": times(UTC_0, UTC_0),
@@ -152,7 +154,7 @@ def written(**other: pa.Array) -> bytes:
     }
     rows = pa.RecordBatch.from_pydict(columns | other)
     sink = pa.BufferOutputStream()
-    with pa.ipc.new_stream(sink, rows.schema) as writer:
+    with pa.ipc.new_stream(sink, rows.schema, options=options) as writer:
         writer.write_batch(rows)
     return bytes(sink.getvalue())
 
@@ -202,3 +204,120 @@ def test_a_message_of_more_rows_than_ours_have_is_none() -> None:
     }
     with pytest.raises(MessageError, match="it has 65537 rows, and 65536 are the most"):
         unpack(written(**columns))
+
+
+BOMB = 1 << 28  # bytes
+ZSTD = pa.ipc.IpcWriteOptions(compression="zstd")
+OF_ONE_TEXT = {  # of so many rows: small as they are sent, and as they lie in memory, until they are cast
+    "unit": lambda rows: pa.RunEndEncodedArray.from_arrays([rows], pa.array(["f" * 9000])),
+    "value": lambda rows: pa.DictionaryArray.from_arrays(pa.repeat(0, rows), pa.array(["1" * 9000])),
+    "clock_ns": lambda rows: pa.RunEndEncodedArray.from_arrays([rows], pa.array([5])),
+}
+
+
+POOLS: list[pa.MemoryPool] = []  # what was allocated of one may outlive its test
+
+
+@pytest.fixture
+def most_allocated() -> Iterator[Callable[[], int]]:
+    """Return what tells how many bytes pyarrow had at most at a time since this began."""
+    before = pa.default_memory_pool()
+    pool = pa.proxy_memory_pool(pa.system_memory_pool())
+    POOLS.append(pool)
+    pa.set_memory_pool(pool)
+    yield lambda: int(pool.max_memory() or 0)
+    pa.set_memory_pool(before)
+
+
+def bomb(compression: str) -> bytes:
+    """Return a message with a large name of which only little is sent."""
+    options = pa.ipc.IpcWriteOptions(compression=compression)
+    data = written(options, drive=named("f" * BOMB, "fan"))
+    assert len(data) < BOMB / 200
+    return data
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("compression", ["zstd", "lz4"])
+def test_what_would_grow_beyond_measure_is_not_unpacked(
+    compression: str, most_allocated: Callable[[], int]
+) -> None:
+    data = bomb(compression)
+    before = most_allocated()
+    with pytest.raises(MessageError, match=r"it is 2684\d{5} bytes when unpacked, and 4194304 are the most"):
+        unpack(data)
+    assert most_allocated() - before < 1 << 20
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("column", OF_ONE_TEXT)
+def test_columns_that_would_grow_by_a_cast_are_no_message(
+    column: str, most_allocated: Callable[[], int]
+) -> None:
+    rows = 30_000
+    columns = {
+        "time": pa.repeat(times(UTC_0)[0], rows),
+        "clock_ns": pa.repeat(5, rows),
+        "uncertainty_us": pa.repeat(pa.scalar(1, pa.int32()), rows),
+        "value": pa.repeat(1.0, rows),
+        **{
+            name: pa.repeat("a", rows).dictionary_encode() for name in ("drive", "register", "status", "unit")
+        },
+    }
+    data = written(ZSTD, **(columns | {column: OF_ONE_TEXT[column](rows)}))
+    before = most_allocated()
+    with pytest.raises(MessageError, match=f"its {column} is of another type"):
+        unpack(data)
+    assert most_allocated() - before < 8 << 20
+
+
+def test_rows_that_take_no_bytes_are_counted_first(most_allocated: Callable[[], int]) -> None:
+    schema = pa.schema([("time", pa.null())])
+    rows = pa.RecordBatch.from_arrays([pa.Array.from_buffers(pa.null(), 1 << 30, [None])], schema=schema)
+    sink = pa.BufferOutputStream()
+    with pa.ipc.new_stream(sink, schema) as writer:
+        writer.write_batch(rows)
+    with pytest.raises(MessageError, match="its time is of another type"):
+        unpack(sink.getvalue())
+    assert most_allocated() < 1 << 20
+
+
+def test_an_older_version_of_the_format_is_no_message() -> None:
+    """It has another way to say that buffers are compressed."""
+    options = pa.ipc.IpcWriteOptions(metadata_version=pa.ipc.MetadataVersion.V4)
+    with pytest.raises(MessageError, match="it is in another version of the format"):
+        unpack(written(options))
+
+
+@pytest.mark.parametrize("options", [None, ZSTD, pa.ipc.IpcWriteOptions(compression="lz4")])
+def test_the_size_is_that_which_pyarrow_unpacks(options: pa.ipc.IpcWriteOptions | None) -> None:
+    """Texts of a kind are compressed, numbers by chance are not, and lists of nothing have no bytes."""
+    dice = random.Random(3)
+    data = written(
+        options,
+        drive=named("f" * 900, None),
+        value=pa.array([dice.random(), None]),
+        status=named("ok", "o" * 700),
+        unit=named(None, None),
+    )
+    with pa.ipc.open_stream(data) as reader:
+        (rows,) = list(reader)
+    names = ("drive", "register", "status", "unit")
+    buffers = [
+        *(buffer for name in rows.schema.names for buffer in rows.column(name).buffers()),
+        *(buffer for name in names for buffer in rows.column(name).dictionary.buffers()),
+    ]
+    assert unpacked_size(data) == sum(buffer.size for buffer in buffers if buffer)
+
+
+def test_a_message_is_split_before_it_is_too_large_to_be_unpacked() -> None:
+    """Long names of many drives take much more room than they are sent with."""
+    drives = Names([f"{number:0900d}" for number in range(6000)])
+    columns = Columns(6000)
+    for number in range(6000):
+        found = completion((number + 1) * SECOND, first_ns=(number + 1) * SECOND + 1, words=(1,))
+        assert add_rows(columns, block(number, 0), found, UTC_0)
+    messages = packed(Batch(columns, drives, REGISTERS))
+    assert sum(message.rows for message in messages) == 6000
+    assert len(messages) > 1
+    assert all(len(unpack(message.data)) == message.rows for message in messages)

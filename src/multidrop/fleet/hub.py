@@ -20,7 +20,8 @@ from multidrop.fleet.sources import SourceCheck
 
 MOST_READ = 64  # messages in one answer
 MOST_READ_BYTES = 8 << 20
-MOST_ROWS = 1_000_000  # of one commit: 40 MB
+MOST_ROWS = 1_000_000  # of one commit: 50 MB
+MOST_BYTES = 256 << 20  # of one commit, as they came and as rows; those of one answer come on top
 LOOKING_S = 0.2  # between questions to a stream that has nothing new
 AGAIN_S = 1.0  # after a failure
 BEHIND_S = 5.0  # for a server that answers, and has not yet all that its leader has
@@ -148,10 +149,10 @@ class SampleHub:
         """Gather messages and keep them; True where all is kept that the stream had when it was asked for."""
         messages: list[StreamMessage] = []
         tables: list[Any] = []
-        rows, ends = 0, None
+        rows, size, ends = 0, 0, None
         is_end = False
         patient_until = time.monotonic() + BEHIND_S
-        while rows < MOST_ROWS and (ends is None or time.monotonic() < ends):
+        while rows < MOST_ROWS and size < MOST_BYTES and (ends is None or time.monotonic() < ends):
             place = messages[-1].place if messages else self._place
             found = await read_after(self._client, place, MOST_READ, MOST_READ_BYTES)
             end_if_cancelled()
@@ -172,6 +173,7 @@ class SampleHub:
             made = await _on_thread(self._tables, found)
             tables += made
             rows += sum(map(len, made))
+            size += sum(len(one.data) for one in found) + sum(one.get_total_buffer_size() for one in made)
         if messages:
             commit = Commit(
                 self._stream, self._place + 1, messages[-1].place, dict(self._sources.last), tables, rows

@@ -19,6 +19,9 @@ stays true, and its last ten bits are noise.
 A unit is that of the description under which the row was polled: "" for a number without one, "raw count" for
 one whose step is not known, "names of yd1000" where numbers stand for this family's names. Older messages
 have no such column.
+
+Whoever has a gateway's key may send other bytes as a message: none is unpacked that says of itself that it is
+larger than 4 MiB then, or that has columns of other types, which may grow when they are cast.
 """
 
 from __future__ import annotations
@@ -32,10 +35,13 @@ import pyarrow.compute as pc
 
 from multidrop import BatchColumns
 from multidrop.fleet.polled_units import PolledUnits
+from multidrop.fleet.unpacked_size import unpacked_size
 
 MOST_BYTES = 900_000  # of a message: NATS takes 1 MiB from the factory, its headers included
 MOST_ROWS = 1 << 16
+MOST_UNPACKED = 4 << 20  # bytes: 2.4 MB of rows, and names
 MOST_NAME = 1000  # bytes of a name, a status or a unit; PostgreSQL has an index of names
+MOST_SAID = 300  # characters of what is wrong with a message
 LONGEST_US = (1 << 31) - 1
 COMPRESSED = pa.ipc.IpcWriteOptions(compression=pa.Codec("zstd", 1))
 NAMED = pa.dictionary(pa.int32(), pa.utf8())  # of many messages together: more names than one has
@@ -52,6 +58,12 @@ ROWS = pa.schema(  # as `unpack` gives them, and as recordings have them
         pa.field("unit", NAMED),
     ]
 )
+_TYPES: Mapping[str, Sequence[Any]] = {  # of what a message may have; names are dictionaries of utf8
+    "time": [TIMES],
+    "clock_ns": [pa.int64()],
+    "uncertainty_us": [pa.int32(), pa.int64()],
+    "value": [pa.float64()],
+}
 _KINDS = {"time": pa.int64(), "monotonic_ns": pa.int64(), "uncertainty_ns": pa.int64()}
 _KINDS |= {"drive": pa.uint16(), "register": pa.uint16(), "value": pa.float64(), "status": pa.uint16()}
 
@@ -132,8 +144,7 @@ def _continues(names: tuple[str, ...], known: tuple[str, ...]) -> bool:
 def unpack(data: bytes | memoryview) -> Any:
     """Return the rows of a message as a pyarrow.Table with the columns of `ROWS`. Raises MessageError."""
     try:
-        with pa.ipc.open_stream(data) as reader:
-            table = reader.read_all()
+        table = _table(data)
         table.validate(full=True)
         columns = {name: table.column(name) for name in ("time", "clock_ns", "drive", "register", "status")}
         columns["monotonic_ns"] = pc.subtract(columns["time"].cast(pa.int64()), columns.pop("clock_ns"))
@@ -145,15 +156,38 @@ def unpack(data: bytes | memoryview) -> Any:
         rows = pa.table([columns[name].cast(ROWS.field(name).type) for name in ROWS.names], schema=ROWS)
         _check(rows)
     except (pa.ArrowException, KeyError, TypeError, ValueError, OSError, MemoryError) as error:
-        first = (str(error) or type(error).__name__).splitlines()[0]
+        first = (str(error) or type(error).__name__).splitlines()[0][:MOST_SAID]
         raise MessageError(f"{len(data)} bytes are no message of samples: {first}") from error
     return rows
 
 
+def _table(data: bytes | memoryview) -> Any:
+    """Return what is in a stream of ours. Raises ValueError before anything is unpacked that is none."""
+    size = unpacked_size(data)
+    if size > MOST_UNPACKED:
+        raise ValueError(f"it is {size} bytes when unpacked, and {MOST_UNPACKED} are the most")
+    with pa.ipc.open_stream(data) as reader:
+        for field in reader.schema:
+            if not _is_ours(field):
+                raise ValueError(f"its {field.name} is of another type")
+        batches = []
+        rows = 0
+        for batch in reader:
+            rows += len(batch)
+            if rows > MOST_ROWS:
+                raise ValueError(f"it has {rows} rows, and {MOST_ROWS} are the most")
+            batches.append(batch)
+        return pa.Table.from_batches(batches, reader.schema)
+
+
+def _is_ours(field: Any) -> bool:
+    if field.name in ("drive", "register", "status", "unit"):
+        return bool(pa.types.is_dictionary(field.type) and field.type.value_type == pa.utf8())
+    return field.type in _TYPES.get(field.name, ())
+
+
 def _check(rows: Any) -> None:
     """Raise ValueError for rows that no sink takes: all that is behind such a message would never be kept."""
-    if len(rows) > MOST_ROWS:
-        raise ValueError(f"it has {len(rows)} rows, and {MOST_ROWS} are the most")
     for field, column in zip(rows.schema, rows.columns, strict=True):
         if not field.nullable and column.null_count:
             raise ValueError(f"its {field.name} is missing in some rows")
@@ -177,8 +211,9 @@ def _microseconds(ns: Any) -> Any:
 
 
 def _pieces(rows: Any, names: Mapping[str, Sequence[str]], most: int) -> Iterator[Packed]:
-    data = _stream(_coded(rows, names))
-    if len(data) <= most or len(rows) < 2:
+    coded = _coded(rows, names)
+    data = _stream(coded)
+    if (len(data) <= most and coded.get_total_buffer_size() <= MOST_UNPACKED) or len(rows) < 2:
         yield Packed(data, len(rows))
         return
     middle = len(rows) // 2
