@@ -1,15 +1,19 @@
 /* Nothing leaves but by a look at CLOCK_BOOTTIME right before write(2), and what becomes of what does not.
  * The clock is the test's, and so is write(2); the engine, its thread and the kernel's timer are real. */
 #define _GNU_SOURCE
+#include <signal.h>
 #include <stdint.h>
 #include <sys/types.h>
 #include <time.h>
 #include <unistd.h>
 
 static int told_clock(clockid_t clock, struct timespec *now);
+static int made_timer(clockid_t clock, struct sigevent *event, timer_t *timer);
 static ssize_t noted_write(int fd, const void *bytes, size_t len);
 #define clock_gettime told_clock
+#define timer_create made_timer
 #include "mastership.c"
+#undef timer_create
 #undef clock_gettime
 #define write noted_write
 #include "port_rs485.c"
@@ -38,6 +42,14 @@ static int told_clock(clockid_t clock, struct timespec *now)
     atomic_fetch_add(&looks, 1);
     *now = timespec_of(atomic_load(&boottime_ns));
     return 0;
+}
+
+/* A clock that stands while the machine sleeps would kill too late; while none sleeps nothing shows it. */
+static int made_timer(clockid_t clock, struct sigevent *event, timer_t *timer)
+{
+    assert(clock == CLOCK_BOOTTIME);
+    assert(event->sigev_notify == SIGEV_SIGNAL && event->sigev_signo == SIGKILL);
+    return timer_create(clock, event, timer);
 }
 
 /* Take no more than most_written bytes; each request and each rest of one has a look of its own. */
@@ -207,6 +219,17 @@ static void check_rest_is_held_back(void)
 
 /* ---- another master is there ---- */
 
+static void check_all_foreign_bytes_are_counted(void)
+{
+    struct md_line line = {.listen_ns = 5};
+    md_listen_hear(&line, 3, 10);
+    md_listen_hear(&line, 4, 20);
+    assert(line.foreign == 7 && line.listened_ns == 25);
+    line.transactions = 1; /* what comes is ours, late */
+    md_listen_hear(&line, 3, 30);
+    assert(line.foreign == 7 && line.listened_ns == 25);
+}
+
 static atomic_int is_babbling;
 
 static void *babble(void *argument)
@@ -292,6 +315,7 @@ int main(void)
     check_guard_comes_first();
     check_deadline();
     check_rest_is_held_back();
+    check_all_foreign_bytes_are_counted();
     check_other_master();
     md_mastership_end(mastership);
     assert(left_of_timer() == 0 && md_mastership_until_ns(mastership) == 0);
