@@ -17,6 +17,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tables import table
 
+import multidrop.drive
 import multidrop.drives
 from multidrop.core import (
     Message,
@@ -311,6 +312,50 @@ def test_drives_import_what_they_may() -> None:
                 room = node.module.split(".")[1]
                 finds = {"family_file"} if path.name == "registry.py" else set()
                 assert room in {"drive", "register", "drives"} | finds, f"{path.name} imports {node.module}"
+
+
+def scripts_of(tree: ast.AST) -> set[str]:
+    """Return the names of functions that do nothing but where what they return is gone through."""
+    return {
+        node.name
+        for node in ast.walk(tree)
+        if isinstance(node, ast.FunctionDef)
+        and node.returns is not None
+        and ast.unparse(node.returns).startswith(("Script[", "Generator[", "Iterator["))
+    }
+
+
+def forgotten(tree: ast.AST, scripts: set[str]) -> list[int]:
+    """Return the lines at which such a function is called, and what it returns is thrown away."""
+    calls = [node.value for node in ast.walk(tree) if isinstance(node, ast.Expr)]
+    found = []
+    for call in calls:
+        if isinstance(call, ast.Call):
+            name = call.func.attr if isinstance(call.func, ast.Attribute) else ast.unparse(call.func)
+            if name in scripts:
+                found.append(call.lineno)
+    return found
+
+
+def test_no_part_of_a_verb_is_called_and_not_carried_out() -> None:
+    """Without `yield from` a script does nothing, and nobody says so."""
+    rooms = (Path(multidrop.drives.__file__).parent, Path(multidrop.drive.__file__).parent)
+    trees = {path: ast.parse(path.read_text("utf-8")) for room in rooms for path in room.glob("*.py")}
+    scripts = {"script"}.union(*map(scripts_of, trees.values()))
+    assert {"read", "write", "insist", "wait", "until", "_started", "_stopped", "script"} <= scripts
+    assert {path.name: lines for path, tree in trees.items() if (lines := forgotten(tree, scripts))} == {}
+    carried_out = [
+        node
+        for tree in trees.values()
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Expr)
+        and isinstance(node.value, ast.YieldFrom)
+        and isinstance(node.value.value, ast.Call)
+    ]
+    assert len(carried_out) > 80
+    for node in carried_out:  # each would be found, were it forgotten
+        call = node.value.value  # type: ignore[attr-defined]
+        assert forgotten(ast.Module([ast.Expr(call)], []), scripts) == [call.lineno]
 
 
 def test_a_family_without_a_verb_says_so() -> None:

@@ -109,6 +109,14 @@ def test_jog_has_its_direction_too() -> None:
     assert [each[:17] for each in wire.sent] == ["01 06 20 00 00 13", "01 06 20 00 00 23"]
 
 
+@pytest.mark.parametrize("name", ["start", "jog"])
+def test_a_motor_that_is_not_seen_to_run_is_told_of(name: str) -> None:
+    wire = Wire(DelixiModbus(1), STANDING)
+    with pytest.raises(Unconfirmed, match="it is not seen to run; stop it, or it may start later"):
+        getattr(wire.drive, name)()
+    assert len(wire.sent) == 1
+
+
 def test_a_motor_that_turns_is_not_started_without_a_direction() -> None:
     wire = Wire(DelixiModbus(1), {**STANDING, **TURNING})
     with pytest.raises(Refused, match="name the direction"):
