@@ -123,6 +123,29 @@ def test_no_motor_is_started_that_could_run_later(status: int, sentence: str) ->
     assert wire.sent == [FIFTY]
 
 
+@pytest.mark.parametrize(
+    ("says", "sentence"),
+    [
+        ({"run_source": DelixiRunSource.KEYPAD}, "is not commanded by the line"),
+        ({"fault": DelixiFault.OC_OVERCURRENT}, "has a fault, OC_OVERCURRENT: see to it"),
+    ],
+)
+def test_a_drive_that_would_not_obey_is_not_started(says: dict[str, object], sentence: str) -> None:
+    wire = Wire(DelixiNative(1), STANDING | says, turns=TURNS)
+    wire.drive.set_frequency(50)
+    with pytest.raises(Refused, match=sentence):
+        wire.drive.start()
+    assert wire.sent == [FIFTY]
+
+
+def test_a_start_that_is_not_seen_is_told_of() -> None:
+    wire = Wire(DelixiNative(1), STANDING)
+    wire.drive.set_frequency(50)
+    with pytest.raises(Unconfirmed, match="it is not seen to run; stop it, or it may start later"):
+        wire.drive.start()
+    assert wire.sent == [FIFTY, FORWARD]
+
+
 def test_the_stored_setpoint() -> None:
     drive = DelixiNative(1)
     assert frame(drive, DelixiNative.stored_frequency, 50) == FIFTY_STORED
