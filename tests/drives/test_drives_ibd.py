@@ -210,6 +210,27 @@ def test_identity_is_its_own_address_or_its_owner_s_word() -> None:
         Wire(InnovertIBD(1, confirmed=1), {**says, **other}).drive.identify()
 
 
+SEEN = {
+    "output_current": 0.0,
+    "motor_speed": 0.0,
+    "acceleration_time": 10.0,
+    "run_source": IBDRunSource.LINE,
+    "terminals": 0x1800,
+}
+
+
+@pytest.mark.parametrize("name", SEEN)
+def test_a_drive_that_has_not_all_that_is_named_resembles_none(name: str) -> None:
+    def resembles(says: dict[str, object]) -> bool:
+        wire = Wire(InnovertIBD(1), says)
+        found = wire.run(wire.drive.resembles())
+        assert isinstance(found, bool)
+        return found
+
+    assert resembles(SEEN)
+    assert not resembles({**SEEN, name: DriveRefused("it", 2, "")})
+
+
 def test_stop_waits_until_neither_speed_nor_current_is_shown() -> None:
     wire = Wire(
         InnovertIBD(1),
