@@ -6,7 +6,7 @@ from pathlib import Path
 
 import checksums
 import pytest
-from scripts import Wire, rows, typed
+from scripts import Wire, frame, rows, typed
 from simulated_bus import one
 from tables import table
 
@@ -172,6 +172,13 @@ def test_a_jog_that_goes_on_through_the_stop_is_stopped_at_once() -> None:
     assert wire.sent == [STOP, STOP_JOG]
 
 
+def test_a_motor_that_coasts_on_is_told_of() -> None:
+    wire = Wire(InvtCHE(1, stop_time=20), {"status": CHEStatus.FORWARD})
+    with pytest.raises(Unconfirmed, match="20 s"):
+        wire.drive.coast()
+    assert wire.sent == [frame(InvtCHE(1), InvtCHE.control, CHEControl.COAST)]
+
+
 def test_a_jog_is_stopped_also_where_the_stop_is_refused() -> None:
     refusal = DriveRefused("drive", 0x12, "")
     turns = {STOP_JOG: {"status": CHEStatus.STANDBY}}
@@ -226,12 +233,14 @@ def test_a_fault_is_reset_before_a_start_and_not_by_it() -> None:
         Wire(InvtCHE(1), {"status": CHEStatus.FORWARD}).drive.reset_fault()
 
 
-def test_a_trip_while_starting_is_told() -> None:
+@table(("name", "word"), [("start", CHEControl.FORWARD), ("jog", CHEControl.JOG_FORWARD)])
+def test_a_trip_while_starting_is_told(name: str, word: CHEControl) -> None:
     tripped = {"status": CHEStatus.FAULT, "fault": CHEFault.OC1_OVERCURRENT_ACCELERATING}
-    wire = Wire(InvtCHE(1), STANDBY, turns={FORWARD: tripped})
+    sent = frame(InvtCHE(1), InvtCHE.control, word)
+    wire = Wire(InvtCHE(1), STANDBY, turns={sent: tripped})
     with pytest.raises(NotDone, match="tripped: OC1"):
-        wire.drive.start()
-    assert wire.sent == [FORWARD]
+        getattr(wire.drive, name)()
+    assert wire.sent == [sent]
 
 
 def test_the_setpoint_is_a_percentage_of_the_maximum_frequency() -> None:

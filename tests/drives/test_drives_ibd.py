@@ -210,6 +210,14 @@ def test_identity_is_its_own_address_or_its_owner_s_word() -> None:
         Wire(InnovertIBD(1, confirmed=1), {**says, **other}).drive.identify()
 
 
+def test_a_start_without_current_and_speed_is_told_of() -> None:
+    wire = Wire(InnovertIBD(1), STANDING | {"terminals": Terminals(0)})
+    wire.drive.set_frequency(50)
+    with pytest.raises(Unconfirmed, match="it is not seen to run; stop it, or it may start later"):
+        wire.drive.start()
+    assert wire.sent == [FIFTY[Framing.RTU], RUN[Framing.RTU]]
+
+
 SEEN = {
     "output_current": 0.0,
     "motor_speed": 0.0,
