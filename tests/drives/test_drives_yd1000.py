@@ -285,6 +285,13 @@ def test_options_of_start(options: dict[str, float], forward: int, reverse: int)
     assert wire.sent == words
 
 
+def test_a_motor_without_a_setpoint_is_not_started() -> None:
+    wire = Wire(YD1000(1), STANDING | {"frequency": 0.0}, turns=TURNS)
+    with pytest.raises(Refused, match=r"the setpoint of .* is 0: call set_frequency before start"):
+        wire.drive.start()
+    assert wire.sent == []
+
+
 def test_where_fnod_has_the_setpoint_1001h_is_not_looked_at() -> None:
     wire = Wire(YD1000(1, setpoint_by_fnod=1), STANDING, turns={yd_word(0x8400): TURNS[FORWARD]})
     wire.drive.start()
@@ -387,6 +394,10 @@ def test_coast() -> None:
     wire = Wire(YD1000(1), STANDING)
     wire.drive.coast()
     assert [each[:17] for each in wire.sent] == ["01 06 10 00 C8 00"]
+    assert wire.seconds == 0.1  # between two looks: the drive may show 0 for a moment
+    wire = Wire(YD1000(1), {**STANDING, "output_frequency": 3.0})
+    with pytest.raises(Unconfirmed, match="5 s"):
+        wire.drive.coast()
 
 
 def test_reset_is_sent_once_and_followed_by_a_stop() -> None:
