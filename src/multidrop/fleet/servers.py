@@ -60,7 +60,9 @@ class ServerPath:
     def is_local(self) -> bool:
         """Say whether its server runs on this machine: both ends of the connection have one address."""
         writer = getattr(self._client._transport, "_io_writer", None) if self._client else None
-        here, there = map(writer.get_extra_info, ("sockname", "peername")) if writer else (None, None)
+        if not writer or writer.is_closing():  # a closed connection with TLS has no addresses, and raises
+            return False
+        here, there = map(writer.get_extra_info, ("sockname", "peername"))
         return bool(here and there and here[0] == there[0])
 
     @property
