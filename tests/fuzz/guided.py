@@ -20,6 +20,8 @@ from readers import read
 import multidrop.capture
 import multidrop.drives.registry
 import multidrop.family_file
+import multidrop.fleet.message
+import multidrop.fleet.unpacked_size
 import multidrop.gateway.mbap
 import multidrop.gateway.modbus_server
 import multidrop.gateway.pdu
@@ -44,6 +46,8 @@ MODULES = (  # and of several
     multidrop.toml_check,
     multidrop.drives.registry,
     multidrop.sim.faults,
+    multidrop.fleet.message,
+    multidrop.fleet.unpacked_size,
     multidrop.gateway.mbap,
     multidrop.gateway.modbus_server,
     multidrop.gateway.pdu,

@@ -19,6 +19,7 @@ from multidrop.core import Splitter
 from multidrop.drive.register import Access
 from multidrop.family_file.errors import FamilyError
 from multidrop.family_file.loader import load_family
+from multidrop.fleet.message import MOST_ROWS, ROWS, MessageError, unpack
 from multidrop.importers import SUFFIXES, ImportedDevice, family_text, plant_text, read_devices
 from multidrop.planning.blocks import blocks
 from multidrop.plant.loader import PlantError, load_plant
@@ -149,6 +150,15 @@ def read_capture(path: Path) -> None:
         _pair(capture)
 
 
+def read_samples(path: Path) -> None:
+    """Read a message of a fleet's samples; what is wrong with it need not name the file."""
+    with suppress(MessageError):
+        rows = unpack(path.read_bytes())
+        assert rows.schema == ROWS
+        assert len(rows) <= MOST_ROWS
+        rows.validate(full=True)
+
+
 def _pair(capture: Capture) -> None:
     """The report is what the spans hold, and every byte of junk is counted."""
     pairings: list[Pairing] = []
@@ -206,6 +216,7 @@ READERS: dict[str, tuple[str, Callable[[Path], None]]] = {  # the file's suffix,
     "parquet": (".parquet", read_recording),
     "pcap": (".pcapng", read_capture),
     "mbap": (".bin", read_requests),
+    "samples": (".bin", read_samples),
 }
 
 

@@ -13,6 +13,7 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "support"))
 
+import pyarrow as pa
 from batches import counting, example
 from families import METER, METER_CSV
 from frames import PRINTED, Printed
@@ -21,6 +22,7 @@ from readers import PLANT
 
 from multidrop.capture import CaptureWriter, Side
 from multidrop.core import Framing, Message
+from multidrop.fleet.message import RowBuffer
 from multidrop.recording import open_writer
 
 EXCHANGES = [each for each in PRINTED if each.request is not None]
@@ -178,6 +180,19 @@ def requests() -> Iterator[bytes]:
         yield b"\x0b" + frame
 
 
+def samples() -> Iterator[bytes]:
+    """Yield messages of a fleet: compressed ones, and one that pyarrow wrote without compression."""
+    for batch in (example(), counting(3)):
+        buffer = RowBuffer()
+        buffer.add(batch.columns())
+        for message in buffer.messages(900_000):
+            yield message.data
+    with pa.ipc.open_stream(message.data) as reader, pa.BufferOutputStream() as bare:
+        with pa.ipc.new_stream(bare, reader.schema) as writer:
+            writer.write_table(reader.read_all())
+        yield bare.getvalue().to_pybytes()
+
+
 SEEDS: dict[str, Callable[[], Iterator[bytes]]] = {
     "frame": frame,
     "line": line,
@@ -194,6 +209,7 @@ SEEDS: dict[str, Callable[[], Iterator[bytes]]] = {
     "parquet": lambda: recorded(".parquet"),
     "pcap": captures,
     "mbap": requests,
+    "samples": samples,
 }
 
 
