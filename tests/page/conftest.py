@@ -7,6 +7,7 @@ import shutil
 from collections.abc import Callable, Iterator
 from typing import Any, NoReturn
 
+import fake_plant
 import pytest
 from fake_gateway import FakeGateway
 from network_changes import steady_network
@@ -53,6 +54,13 @@ def gateway() -> Iterator[FakeGateway]:
     gateway = FakeGateway()
     yield gateway
     gateway.kill()
+
+
+@pytest.fixture
+def few_drives(monkeypatch: pytest.MonkeyPatch) -> int:
+    """Have few drives in the plant, some of each state, and return their number: each takes time to draw."""
+    monkeypatch.setattr(fake_plant, "NAMES", fake_plant.FEW_NAMES)
+    return len(" ".join(fake_plant.FEW_NAMES).split())
 
 
 @pytest.fixture

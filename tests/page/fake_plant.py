@@ -12,6 +12,7 @@ NAMES = (
     "tower-fan-1 tower-fan-2 tower-fan-3 chilled-1 chilled-2 booster-1 booster-2 exhaust-1 exhaust-2 "
     "compressor",
 )
+FEW_NAMES = ("pump-1 pump-2 pump-4 conveyor-2", "filler-2 labeller", "booster-1")  # one or two of each state
 FAMILIES = ("innovert-ibd", "invt-che", "yd1000", "delixi-modbus", "erman-er-g-220")
 STANDING = {"pump-4", "mixer-2", "screw", "capper-2", "chilled-2", "exhaust-2"}
 FAULTS = {"conveyor-2": ("overcurrent in acceleration", 240), "booster-1": ("undervoltage", 5220)}

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from typing import Any
 
 PATIENCE_S = 60.0  # for what comes at once but on a machine that has much else to do
+LOOK_MS = 60  # each look takes four programs 2 ms of their processor
 LIVE = "document.querySelector('#link').textContent.trim() === 'live'"
 STALE = "document.body.classList.contains('stale')"
 VIEWS = ("#/drives", "#/drives/pump-3", "#/trends", "#/faults", "#/lines", "#/log")
@@ -41,7 +42,7 @@ def until_met(page: Any, met: Callable[[], object], what: str = "") -> None:
     end = time.monotonic() + PATIENCE_S
     while not met():
         assert time.monotonic() < end, f"not within {PATIENCE_S:g} s: {what}; {told(page)}"
-        page.wait_for_timeout(20)
+        page.wait_for_timeout(LOOK_MS)
 
 
 def until_still(page: Any) -> None:
