@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -104,9 +104,9 @@ class Model:
 
     # ---- all of them ----
 
-    def deadline(self, paths: tuple[PathState, ...]) -> int:
-        """Return until when the holder may send, relative to now."""
-        sent = [None if path.renewed is None else -path.renewed for path in paths]
+    def deadline(self, renewed: Iterable[int | None]) -> int:
+        """Return until when the holder may send, relative to now, by the newest renewal of each path."""
+        sent = [None if age is None else -age for age in renewed]
         return lease_rules.deadline(sent, self.terms)
 
     def search(self, most: int | None = None) -> tuple[int, tuple[PathState, ...] | None]:
@@ -145,15 +145,17 @@ class Model:
             yield (has_looked, *later)
         if has_looked:
             yield (False, *numbers)  # written
-        elif lease_rules.may_send(0, self.deadline(tuple(table.paths[number] for number in numbers))):
+        elif lease_rules.may_send(0, table.deadline(numbers)):
             yield (True, *numbers)
         for place, number in enumerate(numbers):
+            if number in numbers[:place]:
+                continue  # the same follows
+            others = numbers[:place] + numbers[place + 1 :]
             for after in table.steps[number]:
-                yield (has_looked, *sorted((*numbers[:place], after, *numbers[place + 1 :])))
+                yield (has_looked, *sorted([*others, after]))
 
     def is_killed(self, table: _PathTable, numbers: list[int]) -> bool:
-        until = self.deadline(tuple(table.paths[number] for number in numbers))
-        return self.has_timer and killed_at(until, self.terms) + self.lateness < 0
+        return self.has_timer and killed_at(table.deadline(numbers), self.terms) + self.lateness < 0
 
 
 class _PathTable:
@@ -165,11 +167,19 @@ class _PathTable:
         self._model = model
         self.steps: list[list[int]] = []
         self.later: list[int] = []
+        self._deadlines: dict[tuple[int | None, ...], int] = {}  # by the newest renewals
         self.number(PathState())
         for path in self.paths:  # it grows meanwhile
             after = {self.number(following) for following in model.path_steps(path)}
             self.steps.append(sorted(after - {self.number(path)}))
             self.later.append(self.number(model.grown_older(path)))
+
+    def deadline(self, numbers: list[int]) -> int:
+        """Return until when the holder may send where its paths are in these states."""
+        renewed = tuple([self.paths[number].renewed for number in numbers])
+        if renewed not in self._deadlines:
+            self._deadlines[renewed] = self._model.deadline(renewed)
+        return self._deadlines[renewed]
 
     def number(self, path: PathState) -> int:
         path = self._model.normal(path)
