@@ -29,7 +29,7 @@ HEADERS = {
     "X-Content-Type-Options": "nosniff",
     "Cross-Origin-Resource-Policy": "same-origin",
 }
-FRAMES_A_SECOND = 10
+FRAMES_A_SECOND = 5  # as the gateway itself gives at most
 REMEMBERED = 5  # frames
 HOLD_S = 20  # before a request for a frame is answered with 304
 
