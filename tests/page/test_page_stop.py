@@ -6,6 +6,7 @@ import threading
 import time
 from typing import Any
 
+import fake_gateway
 import pytest
 from conftest import SIZES, Opener
 from fake_gateway import FakeGateway
@@ -251,10 +252,13 @@ def test_a_stop_that_is_refused_was_not_sent(opened: Opener, gateway: FakeGatewa
 
 
 @pytest.mark.long
-def test_a_stop_waits_for_no_other_tab(browser: Any, gateway: FakeGateway, few_drives: int) -> None:
-    """Seven tabs hold all six connections of the browser for 20 s, because no frame comes."""
+def test_a_stop_waits_for_no_other_tab(
+    browser: Any, gateway: FakeGateway, few_drives: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Six tabs, its own among them, hold all six connections of the browser, because no frame comes."""
+    monkeypatch.setattr(fake_gateway, "HOLD_S", 120)
     context = browser.new_context()
-    pages = [context.new_page() for _ in range(7)]
+    pages = [context.new_page() for _ in range(6)]
     for page in pages:
         page.goto(gateway.url)
     for page in pages:
