@@ -226,11 +226,11 @@ def test_times_are_of_24_hours_in_utc_or_local_by_a_switch(opened: Opener) -> No
 
 @pytest.mark.long
 @pytest.mark.usefixtures("few_drives")
-def test_seven_tabs_are_live_at_once(browser: Any, gateway: FakeGateway) -> None:
+def test_nine_tabs_are_live_at_once(browser: Any, gateway: FakeGateway) -> None:
     """Browsers open six connections to a host for all tabs together."""
     gateway.clocked = "pump-1"
     context = browser.new_context(viewport={"width": 1440, "height": 900})
-    pages = [context.new_page() for _ in range(7)]
+    pages = [context.new_page() for _ in range(9)]
     for page in pages:
         page.goto(gateway.url)
     for page in pages:
