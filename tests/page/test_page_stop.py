@@ -255,10 +255,10 @@ def test_a_stop_that_is_refused_was_not_sent(opened: Opener, gateway: FakeGatewa
 def test_a_stop_waits_for_no_other_tab(
     browser: Any, gateway: FakeGateway, few_drives: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Six tabs, its own among them, hold all six connections of the browser, because no frame comes."""
+    """Nine tabs hold all six connections of the browser, because no frame comes."""
     monkeypatch.setattr(fake_gateway, "HOLD_S", 120)
     context = browser.new_context()
-    pages = [context.new_page() for _ in range(6)]
+    pages = [context.new_page() for _ in range(9)]
     for page in pages:
         page.goto(gateway.url)
     for page in pages:

@@ -33,8 +33,18 @@ export const now = () =>
 
 const pause = ms => new Promise(done => setTimeout(done, ms));
 
-// A command is about to be sent: give the connection free, and ask for the next frame behind it.
-addEventListener("command", () => under?.abort());
+// A command is about to be sent: give the connection free, and ask for the next frame behind it. All pages of
+// a browser have six connections together: so the others give theirs free too, and ask a little later.
+const pages = new BroadcastChannel("command");
+let restMs = 0; // before the next request
+addEventListener("command", () => {
+  pages.postMessage(null);
+  under?.abort();
+});
+pages.addEventListener("message", () => {
+  restMs = AGAIN_MS;
+  under?.abort();
+});
 
 // Ask for frames until the page is closed.
 export async function run() {
@@ -42,6 +52,8 @@ export async function run() {
     isKnown = false;
   for (;;) {
     try {
+      if (restMs) await pause(restMs);
+      restMs = 0;
       if (!isKnown) {
         takePlant(await get("api/plant"));
         [n, isKnown] = [NONE, true];
