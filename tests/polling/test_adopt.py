@@ -340,7 +340,7 @@ def test_a_drive_that_takes_another_s_place_knows_what_that_is_asked_yet() -> No
             lambda: made.poller.adopt(plant(hall(toy("pump-1", 1), polled(InvtCHE(5, name="new"), [], None))))
         )
         made.run(2)
-        adopting.join(60)
+        made.finish(adopting)
         new = ours.peer(ours.drives[1])
         assert new is not before
         assert before.exchanges > exchanges
@@ -520,7 +520,7 @@ def test_rows_under_a_name_are_told_apart_by_their_time() -> None:
         begun_ns = made.poller.polled_since
         adopting = made.beside(lambda: made.poller.adopt(named("b", "c", "a")))
         rows += made.run(2)
-        adopting.join(60)
+        made.finish(adopting)
         since_ns = made.poller.polled_since
     assert since_ns["stays"] == begun_ns["stays"]
     before = {"a": 1, "b": 2, "c": 5, "stays": 6}
@@ -568,7 +568,7 @@ def test_a_name_s_code_stays_the_same() -> None:
                 made._limit += S
                 made._turn.notify_all()
                 assert made._turn.wait_for(lambda: made._failure or made._rests, 60)
-            adopting.join(60)
+            made.finish(adopting)
             while batch := made.poller.take():
                 columns = batch.columns()
                 for code in set(columns.drive):
