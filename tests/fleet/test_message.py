@@ -6,6 +6,7 @@ import random
 import struct
 from collections.abc import Callable, Iterator
 from contextlib import suppress
+from typing import Any
 
 import pyarrow as pa
 import pytest
@@ -190,18 +191,22 @@ def test_another_writers_rows_are_rows() -> None:
     assert len(unpack(written(drive=named("ü" * 500, "fan")))) == 2
 
 
+def alike(rows: int) -> dict[str, Any]:
+    """Return the columns of so many rows, all of which are the same."""
+    names = ("drive", "register", "status", "unit")
+    return {
+        "time": pa.repeat(times(UTC_0)[0], rows),
+        "clock_ns": pa.repeat(5, rows),
+        "uncertainty_us": pa.repeat(pa.scalar(1, pa.int32()), rows),
+        "value": pa.repeat(1.0, rows),
+        **{name: pa.repeat("a", rows).dictionary_encode() for name in names},
+    }
+
+
 @pytest.mark.slow
 def test_a_message_of_more_rows_than_ours_have_is_none() -> None:
     many = MOST_ROWS + 1
-    columns = {
-        "time": pa.repeat(times(UTC_0)[0], many),
-        "clock_ns": pa.repeat(5, many),
-        "uncertainty_us": pa.repeat(pa.scalar(1, pa.int32()), many),
-        "value": pa.repeat(1.0, many),
-        **{
-            name: pa.repeat("a", many).dictionary_encode() for name in ("drive", "register", "status", "unit")
-        },
-    }
+    columns = alike(many)
     with pytest.raises(MessageError, match="it has 65537 rows, and 65536 are the most"):
         unpack(written(**columns))
 
@@ -255,15 +260,7 @@ def test_columns_that_would_grow_by_a_cast_are_no_message(
     column: str, most_allocated: Callable[[], int]
 ) -> None:
     rows = 30_000
-    columns = {
-        "time": pa.repeat(times(UTC_0)[0], rows),
-        "clock_ns": pa.repeat(5, rows),
-        "uncertainty_us": pa.repeat(pa.scalar(1, pa.int32()), rows),
-        "value": pa.repeat(1.0, rows),
-        **{
-            name: pa.repeat("a", rows).dictionary_encode() for name in ("drive", "register", "status", "unit")
-        },
-    }
+    columns = alike(rows)
     data = written(ZSTD, **(columns | {column: OF_ONE_TEXT[column](rows)}))
     before = most_allocated()
     with pytest.raises(MessageError, match=f"its {column} is of another type"):

@@ -124,15 +124,15 @@ def test_a_client_s_flood_lets_others_have_their_turn() -> None:
     run_controlled(main())
 
 
+def slowly(found: MbapRequest, _: ModbusClient) -> bytes:
+    """Answer after half a millisecond of the loop's clock."""
+    cast(ControlledLoop, asyncio.get_running_loop()).passing.now += 0.0005
+    return found.reply(b"")
+
+
 def test_requests_that_take_long_to_answer_let_others_have_their_turn_sooner() -> None:
     async def main() -> None:
-        loop = cast(ControlledLoop, asyncio.get_running_loop())
-
-        def long(found: MbapRequest, _: ModbusClient) -> bytes:
-            loop.passing.now += 0.0005
-            return found.reply(b"")
-
-        client, transport = connected(port_of(long))
+        client, transport = connected(port_of(slowly))
         client.data_received(b"".join(request(number, 1, 3, 0, 125) for number in range(100)))
         assert len(transactions(transport.written)) < 10
         await asyncio.sleep(1)
@@ -210,13 +210,7 @@ def test_writes_are_begun_as_they_come_and_in_their_order(is_stalled: bool) -> N
 
 def test_what_came_is_looked_at_for_a_while_before_others_have_their_turn() -> None:
     async def main() -> None:
-        loop = cast(ControlledLoop, asyncio.get_running_loop())
-
-        def long(found: MbapRequest, _: ModbusClient) -> bytes:
-            loop.passing.now += 0.0005
-            return found.reply(b"")
-
-        client, transport = connected(port_of(long))
+        client, transport = connected(port_of(slowly))
         client.data_received(writes(0, 100))
         assert len(transactions(transport.written)) < 10
         assert not transport.is_reading
