@@ -53,6 +53,11 @@ def take_frame(buffer: bytearray) -> bytes | None:
     return frame
 
 
+def function_of(frame: bytes) -> int:
+    """Return the function code of a whole frame."""
+    return frame[_FUNCTION]
+
+
 def request_of(frame: bytes) -> MbapRequest:
     """Return the request of a whole frame."""
     transaction, _, _, unit = _HEADER.unpack_from(frame)

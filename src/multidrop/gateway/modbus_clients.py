@@ -11,7 +11,7 @@ import logging
 from collections.abc import Awaitable, Callable
 from typing import Any, cast
 
-from multidrop.gateway.mbap import Garbage, MbapRequest, request_of, take_frame, take_request
+from multidrop.gateway.mbap import Garbage, MbapRequest, function_of, request_of, take_frame, take_request
 from multidrop.gateway.modbus_codes import ModbusCode
 from multidrop.gateway.pdu import WRITES
 
@@ -128,13 +128,12 @@ class ModbusClient(asyncio.Protocol):
             if frame is None:
                 break
             self.last_request = begun
-            request = request_of(frame)
-            if request.function in WRITES:
-                answers.append(self._answered(request))
+            if function_of(frame) in WRITES:
+                answers.append(self._answered(request_of(frame)))
             elif len(self._waiting) + len(frame) <= MOST_BEHIND:
                 self._waiting += frame
             else:
-                answers.append(request.exception(ModbusCode.BUSY))
+                answers.append(request_of(frame).exception(ModbusCode.BUSY))
             is_in_time = self._port.clock() - begun <= SLICE_S
         self._write(b"".join(answers))
         return is_in_time or not self._came
