@@ -38,6 +38,16 @@ class Record(NamedTuple):
     value: Any
 
 
+class Written(NamedTuple):
+    """The records that were replaced, at their new revisions, and the keys of those that were refused.
+
+    Any other may have been replaced or not: read it.
+    """
+
+    stored: list[Record]
+    refused: set[str]
+
+
 def bucket_settings(name: str, replicas: int) -> dict[str, Any]:
     """Return the stream that a bucket is: the newest record of each subject, on disk, on so many servers.
 
@@ -128,19 +138,20 @@ class Bucket:
             raise Conflict(f"{self.name}.{key} has another revision than {revision}")
         raise Unsure(f"NATS did not store {self.name}.{key}: {error.get('description')}")
 
-    async def put_all(self, records: Sequence[Record]) -> list[Record]:
-        """Replace records, each at the revision given with it; return the new revision of each that was.
+    async def put_all(self, records: Sequence[Record]) -> Written:
+        """Replace records, each at the revision given with it.
 
-        All are sent one behind the other, and the server decides each by itself. A record that is not
-        returned may have been replaced or not: read it.
+        All are sent one behind the other, and the server decides each by itself.
         """
         answers = await self.path().request_all([self._put(record) for record in records])
-        stored = []
+        written = Written([], set())
         for record, answer in zip(records, answers, strict=True):
             with suppress(Unsure):
-                if answer and not (said := _table(answer)).get("error"):
-                    stored.append(record._replace(revision=_revision(said)))
-        return stored
+                if answer and (said := _table(answer)).get("error"):
+                    written.refused.add(record.key)
+                elif answer:
+                    written.stored.append(record._replace(revision=_revision(said)))
+        return written
 
     def _put(self, record: Record) -> Request:
         value = record.value
@@ -174,7 +185,7 @@ class Bucket:
 
         At most 1000 at a time, in order. Nothing is kept for it on a server.
         """
-        wanted = {"seq": after + 1, "batch": BATCH, "next_by_subj": f"$KV.{self.name}.>"}
+        wanted = {"seq": after + 1, "batch": BATCH, "next_by_subj": ">"}
         subject = f"$JS.API.DIRECT.GET.KV_{self.name}"
         messages = await self.path().collect(subject, json.dumps(wanted).encode())
         return [self._record(*message) for message in messages]

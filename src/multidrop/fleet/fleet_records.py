@@ -13,10 +13,12 @@ from multidrop.fleet.buckets import Bucket, Follower, OnTake, Record
 from multidrop.fleet.errors import FleetError
 from multidrop.fleet.lease_bucket import LeaseBucket
 from multidrop.fleet.lease_rules import Terms
-from multidrop.fleet.moves import Moves
+from multidrop.fleet.moves import Move, Moves
 from multidrop.fleet.observer import Observer
-from multidrop.fleet.ownership import owner_of
+from multidrop.fleet.ownership import NOBODY, LineRecords, Owner, owner_by, owner_of
 from multidrop.fleet.servers import ServerPath
+
+_UNREAD: LineRecords = {}
 
 
 class FleetRecords:
@@ -31,16 +33,18 @@ class FleetRecords:
         self.observer = Observer(me, [LeaseBucket(bucket, path, me) for bucket in names.LEASES], terms)
         self.moves = Moves()
         self.owners = {
-            bucket: self._owner_follower(Bucket(bucket, path), partial(self._note_move, bucket))
+            bucket: self._owner_follower(Bucket(bucket, path), partial(self._note_owner, bucket))
             for bucket in names.OWNERS
         }
-        self._owned: dict[tuple[str, int], set[str]] = {}  # by gateway and session
+        self._of: dict[str, dict[str, Record | None]] = {}  # by line
+        self._owned: dict[Owner, set[str]] = {}  # the lines of which one record at least names this session
+        self._masters: dict[str, tuple[str, int]] = {}  # of each line, with the turn by which it has it
         self.plant = Follower(Bucket(names.PLANT, path), self._note_plant)
         self._has_plant_changed = False
         self._lines: tuple[str, ...] = ()
         self._on_change = on_change
         self._read: set[str] = set()  # buckets that were read at least once
-        self._is_complete = asyncio.Event()
+        self.is_complete = False  # each bucket was read once
         self._looks: dict[str, Callable[[], Awaitable[Any]]] = {
             names.PLANT: self._look_at_plant,
             **{name: partial(self.observer.look, at) for at, name in enumerate(names.LEASES)},
@@ -51,13 +55,13 @@ class FleetRecords:
         """Return what follows a bucket of lines' masters: here all of them."""
         return Follower(bucket, on_take)
 
-    async def complete(self) -> None:
-        """Wait until each bucket was read once."""
-        await self._is_complete.wait()
+    def of(self, line: str) -> LineRecords:
+        """Return the records of a line's master; none at all where none was read."""
+        return self._of.get(line, _UNREAD)
 
     def owner(self, line: str) -> Record | None:
-        """Return the record of a line's master."""
-        return self.owners[names.owner_bucket(line)].records.get(line)
+        """Return a record with the line's master; None where no two records agree."""
+        return owner_by(self.of(line))
 
     def lines(self) -> tuple[str, ...]:
         """Return the lines of the plant, by name; the same tuple while none came or went."""
@@ -68,7 +72,7 @@ class FleetRecords:
         return bool(record and record.value and "line" in record.value)
 
     def owned_by(self, gateway: str, session: int) -> set[str]:
-        """Return the lines whose records name this session."""
+        """Return the lines of which one record at least names this session."""
         return set(self._owned.get((gateway, session), ()))
 
     async def look(self) -> None:
@@ -94,8 +98,7 @@ class FleetRecords:
         if await self._looks[name]() or name not in self._read:
             self._on_change()
         self._read.add(name)
-        if len(self._read) == len(names.BUCKETS):
-            self._is_complete.set()
+        self.is_complete = len(self._read) == len(names.BUCKETS)
 
     async def _look_at_plant(self) -> bool:
         try:
@@ -108,15 +111,28 @@ class FleetRecords:
     def _note_plant(self, before: Record | None, record: Record) -> None:
         self._has_plant_changed = True
 
-    def _note_move(self, bucket: str, before: Record | None, record: Record) -> None:
-        self._owned.setdefault(owner_of(record), set()).add(record.key)
-        former = owner_of(before)
-        if former != owner_of(record) and former in self._owned:
-            self._owned[former].discard(record.key)
+    def _note_owner(self, bucket: str, before: Record | None, record: Record) -> None:
+        line, former, owner = record.key, owner_of(before), owner_of(record)
+        records = self._of.setdefault(line, dict.fromkeys(names.owner_buckets(line)))
+        records[bucket] = record
+        if former == owner:
+            return
+        self._owned.setdefault(owner, set()).add(line)
+        if former in self._owned and former not in map(owner_of, records.values()):
+            self._owned[former].discard(line)
             if not self._owned[former]:
                 del self._owned[former]  # sessions come and go for years
-        self.moves.note(before, record, is_next=self._is_next(bucket, before, record))
+        self._note_move(line)
 
-    def _is_next(self, bucket: str, before: Record | None, record: Record) -> bool:
-        """Say whether the record that was known before, or none, is the one that this record replaced."""
-        return before is not None or bucket in self._read
+    def _note_move(self, line: str) -> None:
+        """Note who has the line now, if that has changed, and who had it before, if no turn was missed."""
+        record = self.owner(line)
+        if not record:
+            return
+        (master, _), turn = owner_of(record), record.value["turn"]
+        before, seen = self._masters.get(line, (NOBODY, 0))
+        if turn != seen:
+            self._masters[line] = master, turn
+            known = before if turn == seen + 1 else None
+            if known != master:  # else it was claimed anew, for nobody knew whether it was given away
+                self.moves.add([Move(line, turn, record.value["since"], known, master)])

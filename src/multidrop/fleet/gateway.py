@@ -164,7 +164,6 @@ class FleetGateway:
             "session": member.lease.session,
             "margin_s": max(0.0, round(member.lease.left_s, 3)),
             "paths": [path.server_name for path in self.paths],
-            "avoids": [*member.own_machine.avoided],
             "lines": len(member.polled),
             "moves": member.keeper.moves,
             "troubles": dict(sorted(member.keeper.troubles.items())),

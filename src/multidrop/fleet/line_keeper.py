@@ -1,7 +1,7 @@
 """Line keeper: the work on a gateway's lines, one thing at a time on each: claim, poll, let go, give away.
 
-A line is polled only while its record names us and our present session, and while the lease is valid. Half a
-second before it runs out all lines are let go.
+A line is polled only while two of its records name us and our present session, and while the lease is valid.
+Half a second before it runs out all lines are let go.
 """
 
 from __future__ import annotations
@@ -9,15 +9,13 @@ from __future__ import annotations
 import asyncio
 import logging
 import time
-from collections.abc import Callable, Coroutine, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Coroutine, Iterable, Iterator, Mapping, Sequence
+from itertools import islice
 from typing import Any, NamedTuple, Protocol
 
-from multidrop.fleet import names
-from multidrop.fleet.buckets import Record
-from multidrop.fleet.errors import FleetError
 from multidrop.fleet.lease import Lease
-from multidrop.fleet.ownership import NOBODY, owner_of, owner_value
+from multidrop.fleet.owner_records import OwnerRecords
+from multidrop.fleet.ownership import Claim
 from multidrop.fleet.share_records import ShareRecords
 
 _log = logging.getLogger("multidrop.fleet")
@@ -25,7 +23,6 @@ _log = logging.getLogger("multidrop.fleet")
 SILENT_S = 0.5  # before the lease runs out: time for closing; the timer leaves guard / 2 more
 TAKE_AGAIN_S = 2.0  # after a line that could not be taken
 WRITTEN_AT_ONCE = 64  # records; more would keep the renewal of the lease waiting
-WRITERS = 2  # of them at a time in each bucket
 LINES_AT_ONCE = 32
 
 
@@ -58,18 +55,17 @@ class LineKeeper:
         self.lines = lines
         self.polled: dict[str, TakenLine] = {}
         self.troubles: dict[str, str] = {}  # lines that could not be taken, and why
-        self.moves = 0
         self.releasing: set[str] = set()  # ours, and to be given away
         self._lease = lease
         self._records = records
+        self._owners = OwnerRecords(lease, records, lambda: self.may_poll, self._take_new)
         self._on_change = on_change
         self._is_leaving = False
-        self._offered: dict[str, int] = {}  # the revisions at which lines were given away last, stored or not
         self._at_work: dict[str, asyncio.Task[None]] = {}  # by line: it is taken, let go or claimed
+        self._tasks: set[asyncio.Task[None]] = set()
         self._again_at: dict[str, float] = {}
         self._failure: BaseException | None = None
         self._has_failed = asyncio.Event()
-        self._writing = {bucket: asyncio.Semaphore(WRITERS) for bucket in names.OWNERS}
         self._openings = asyncio.Semaphore(LINES_AT_ONCE)
 
     @property
@@ -82,18 +78,18 @@ class LineKeeper:
         """Say whether no line is open, or about to be."""
         return not self.polled and not self._at_work
 
+    @property
+    def moves(self) -> int:
+        """Return how many lines were claimed and given away."""
+        return self._owners.moves
+
     def is_mine(self, line: str) -> bool:
-        """Say whether the line's record names us, and the line was not given away at this very revision."""
-        record = self._mine(line)
-        return record is not None and self._offered.get(line) != record.revision
+        """Say whether the line is ours by its records, and was not given away."""
+        return self._owners.is_mine(line)
 
-    def _mine(self, line: str) -> Record | None:
-        """Return the line's record where it names us and our present session."""
-        record = self._records.owner(line)
-        return record if owner_of(record) == (self._lease.name, self._lease.session) else None
-
-    def _owned(self) -> set[str]:
-        return self._records.owned_by(self._lease.name, self._lease.session)
+    def claim_of(self, line: str) -> Claim | None:
+        """Return what is to be written for a line to be ours; None where nothing can be now."""
+        return None if line in self._at_work else self._owners.claim_of(line)
 
     def may_stop(self, line: str) -> bool:
         """Say whether this is the line's master now: a stop waits for no guard, here or in the engine."""
@@ -113,10 +109,10 @@ class LineKeeper:
 
     # ---- all lines ----
 
-    def claim(self, claims: Mapping[str, int]) -> None:
-        """Claim lines, each at the revision of its record that was judged."""
-        free = {line: revision for line, revision in claims.items() if line not in self._at_work}
-        self._hand_over(free, self._lease.name, self._lease.session)
+    def claim(self, claims: Mapping[str, Claim]) -> None:
+        """Claim lines, each at the revisions of its records that were judged."""
+        for lines in _some_at_once(claims.keys() - self._at_work.keys()):
+            self._start(lines, self._owners.claim({line: claims[line] for line in lines}))
 
     def reconcile(self) -> None:
         """Let go of what is not ours any more, take what is, and give away what was let go.
@@ -126,7 +122,7 @@ class LineKeeper:
         valid = self.may_poll
         kept = {
             line
-            for line in (self._owned() if valid else ())
+            for line in (self._owners.owned() if valid else ())
             if line not in self.releasing and self._records.is_in_plant(line)
         }
         mine = {line: self._records.plant.records[line].revision for line in kept if self.is_mine(line)}
@@ -140,10 +136,11 @@ class LineKeeper:
             if now >= self._again_at.get(line, 0.0):
                 self._start([line], self._take(line))
         if valid:
-            left = self.releasing - self.polled.keys() - self._at_work.keys()
-            mine_still = {line: record for line in left if (record := self._mine(line))}
-            self._hand_over({line: record.revision for line, record in mine_still.items()}, NOBODY, 0)
-            self.claim({line: self._offered[line] for line in kept - mine.keys()})
+            left = (self.releasing & self._owners.owned()) - self.polled.keys() - self._at_work.keys()
+            for lines in _some_at_once(left):
+                self._start(lines, self._owners.give_away(lines))
+            doubted = filter(self._owners.doubted, kept - mine.keys())
+            self.claim({line: claim for line in doubted if (claim := self.claim_of(line))})
 
     async def let_all_go(self) -> None:
         """Let go of all lines, whatever is under way. Raises the error of a line that could not be."""
@@ -157,49 +154,16 @@ class LineKeeper:
         finally:
             self._is_leaving = False
 
-    # ---- who is whose ----
-
-    def _hand_over(self, revisions: Mapping[str, int], gateway: str, session: int) -> None:
-        """Claim lines, or give them away, each at this revision of its record: many in one go."""
-        value = owner_value(gateway, session, time.time_ns() // 1_000_000)
-        for bucket in self._writing:
-            records = [
-                Record(line, revision, value)
-                for line, revision in revisions.items()
-                if names.owner_bucket(line) == bucket
-            ]
-            for at in range(0, len(records), WRITTEN_AT_ONCE):
-                some = records[at : at + WRITTEN_AT_ONCE]
-                self._start([record.key for record in some], self._write_owners(bucket, some))
-
-    async def _write_owners(self, bucket: str, records: Sequence[Record]) -> None:
-        """Replace records: the server decides, by the revision of each. Lines that are ours now are taken."""
-        follower = self._records.owners[bucket]
-        async with self._writing[bucket]:
-            if not self.may_poll:
-                return
-            stored: list[Record] = []
-            self._offered |= {
-                record.key: record.revision for record in records if owner_of(record)[0] == NOBODY
-            }
-            with suppress(FleetError):
-                stored = await follower.bucket.put_all(records)
-        for record in stored:
-            follower.take(record)
-            self._offered.pop(record.key, None)
-            if self.is_mine(record.key) and self._records.is_in_plant(record.key):
-                self._start([record.key], self._take(record.key))
-        self.moves += len(stored)
-        self._records.doubt(bucket, {record.key for record in records} - {record.key for record in stored})
-
     # ---- one line ----
 
     def _start(self, lines: Sequence[str], work: Coroutine[Any, Any, None]) -> None:
         task = asyncio.create_task(work)
+        self._tasks.add(task)  # lines may be taken, and begin another one, before it is done
         self._at_work |= dict.fromkeys(lines, task)
         task.add_done_callback(lambda done: self._done(lines, done))
 
     def _done(self, lines: Sequence[str], task: asyncio.Task[None]) -> None:
+        self._tasks.discard(task)
         for line in lines:
             if self._at_work.get(line) is task:  # else the next work on it has begun
                 del self._at_work[line]
@@ -208,6 +172,10 @@ class LineKeeper:
         if failure and not self._failure:
             self._failure = failure  # a line that is not closed for certain
             self._has_failed.set()
+
+    def _take_new(self, line: str) -> None:
+        if self._records.is_in_plant(line):
+            self._start([line], self._take(line))
 
     async def _take(self, line: str) -> None:
         record = self._records.plant.records[line]
@@ -234,3 +202,10 @@ class LineKeeper:
     async def _let_go(self, line: str) -> None:
         await self.lines.let_go(line)
         self.polled.pop(line, None)
+
+
+def _some_at_once(lines: Iterable[str]) -> Iterator[list[str]]:
+    """Return lines as many at a time as are written at once."""
+    left = iter(lines)
+    while some := list(islice(left, WRITTEN_AT_ONCE)):
+        yield some

@@ -32,7 +32,6 @@ from multidrop.fleet.lease_rules import SECOND, USUAL, Terms
 from multidrop.fleet.lease_terms import LeaseTerms
 from multidrop.fleet.life_lock import LifeLock
 from multidrop.fleet.line_keeper import LineKeeper, Lines, TakenLine
-from multidrop.fleet.own_machine import OwnMachine, avoided_by
 from multidrop.fleet.ownership import decide, owner_of
 from multidrop.fleet.releases import WAIT_S, Releases
 from multidrop.fleet.servers import ServerPath
@@ -83,7 +82,6 @@ class Member:
         self.lease = Lease(name, own, mastership, lock=lock, terms=terms, note=self._note)
         self.records = ShareRecords(name, self.best, terms, self._wake, self._is_mine)
         self.keeper = LineKeeper(lines, self.lease, self.records, self._mark_dirty)
-        self.own_machine = OwnMachine()
         self._shares = Shares()
         self._share: set[str] = set()  # the lines that should be ours
         self._releases = Releases(self.best, self._mark_dirty)
@@ -146,7 +144,6 @@ class Member:
     def _note(self) -> dict[str, Any]:
         return {
             "draining": self.is_draining,
-            "avoids": [*self.own_machine.avoided],
             "lines": len(self.polled),
             "margin_ms": max(0, round(1000 * self.lease.left_s)),
         }
@@ -184,8 +181,11 @@ class Member:
     async def _live(self) -> None:
         while True:
             if not self.lease.session:
-                await self.records.complete()  # of a large plant this takes seconds, in which no lease runs
-                await self._look_at_own_machine()
+                while (
+                    not self.records.is_complete
+                ):  # of a large plant it takes seconds, in which no lease runs
+                    self._see(self.records.observer.sessions())
+                    await asyncio.sleep(STEP_S)
                 await self.lease.begin()
                 self._settled_at = self.lease.clock() + int(SETTLE_S * SECOND)
                 self._shares.begin_anew()
@@ -218,16 +218,11 @@ class Member:
                     _log.warning("%s: the lease was not renewed in time; no line is polled", self.name)
             await asyncio.sleep(GUARD_LOOK_S)
 
-    async def _look_at_own_machine(self) -> None:
-        with suppress(FleetError):  # it is looked at again, once a second
-            await self.own_machine.look(self.paths, self.best())
-
     async def _home(self) -> None:
         """Keep leaders ahead, and bring them home; one gateway does it, the first by name."""
         terms = LeaseTerms()
         while True:
             await asyncio.sleep(HOME_S)
-            await self._look_at_own_machine()
             if self.lease.is_valid and min(self.records.observer.sessions(), default="") == self.name:
                 with suppress(FleetError):
                     await terms.keep_ahead(self.best())
@@ -269,14 +264,18 @@ class Member:
                 self._claim_and_release()
             self.keeper.reconcile()
 
+    def _see(self, present: Mapping[str, Mapping[str, Any]]) -> list[str]:
+        """Return the other gateways that take lines; since when they are the same is noted."""
+        others = [name for name, value in present.items() if not value["draining"] and name != self.name]
+        self._shares.see(others, self.lease.clock())
+        return others
+
     async def _share_out(self, present: Mapping[str, Mapping[str, Any]]) -> None:
         """Make the shares anew where gateways or lines came or went."""
-        sharing = {
-            name: value for name, value in present.items() if not value["draining"] and name != self.name
-        }
+        sharing = self._see(present)
         if not self.is_draining and self.lease.session:
-            sharing[self.name] = self._note()
-        sharers = Sharers(tuple(sorted(sharing)), avoided_by(sharing), self.records.lines())
+            sharing.append(self.name)
+        sharers = Sharers(tuple(sorted(sharing)), self.records.lines())
         if await self._shares.make(sharers, self.lease.clock(), is_settled=self._is_settled):
             self._share = self._shares.of(self.name)
             self.records.want(self._share)
@@ -285,13 +284,12 @@ class Member:
     def _claim_and_release(self) -> None:
         me = (self.name, self.lease.session)
         owned = self.records.owned_by(*me)
-        known = {line for line in self._share if self.records.owner(line)}
         step = decide(
             me,
-            known | owned,
+            self._share | owned,
             self.wanted,
-            self.records.owner,
-            self.records.observer.is_over,
+            self.records.of,
+            self.keeper.claim_of,
             is_settled=self._is_settled,
             is_draining=self.is_draining,
         )

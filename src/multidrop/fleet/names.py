@@ -10,6 +10,7 @@ LEASES = tuple(f"lease_{path}" for path in range(3))
 OWNERS = tuple(f"own_{part}" for part in range(3))
 PLANT = "plant"
 BUCKETS = (*LEASES, *OWNERS, PLANT)
+_NAME = re.compile(r"[A-Za-z0-9_-]+")
 
 
 def checked_name(kind: str, name: str) -> str:
@@ -24,13 +25,14 @@ def checked_name(kind: str, name: str) -> str:
 
 def is_name(text: str) -> bool:
     """Say whether a subject can have this as one of its parts."""
-    return re.fullmatch(r"[A-Za-z0-9_-]+", text) is not None
+    return _NAME.fullmatch(text) is not None
 
 
 @functools.lru_cache(1 << 16)
-def owner_bucket(line: str) -> str:
-    """Return the bucket with the record of a line's master."""
-    return OWNERS[zlib.crc32(line.encode()) % len(OWNERS)]
+def owner_buckets(line: str) -> tuple[str, ...]:
+    """Return the buckets with the records of a line's master, in the order in which they are written."""
+    first = zlib.crc32(line.encode()) % len(OWNERS)
+    return OWNERS[first:] + OWNERS[:first]
 
 
 def is_inbox(subject: str) -> bool:

@@ -16,7 +16,7 @@ LEASE = {
     **dict.fromkeys(("nonce", "host", "machine", "lock", "lock_id"), str),
     **dict.fromkeys(("ended", "draining"), bool),
 }
-OWNER = {"gateway": str, "session": int, "since": int}
+OWNER = {"gateway": str, "session": int, "votes": int, "turn": int, "since": int}
 LINE = {"line": dict, "files": dict}
 SHAPES: Mapping[str, Mapping[str, type]] = {
     **dict.fromkeys(names.LEASES, LEASE),
@@ -42,7 +42,7 @@ def parsed(bucket: str, key: str, data: bytes) -> tuple[Any, str]:
     if len(data) > largest(bucket):
         return None, f"it has {len(data)} bytes, and {largest(bucket)} are the most"
     try:
-        value = json.loads(data)
+        value = json.loads(data.decode())  # else other encodings are looked for, in each of thousands
     except (ValueError, RecursionError):
         return None, "it is no JSON"
     mistake = misshapen(value, SHAPES.get(bucket, {})) or _CHECKS.get(bucket, _nothing)(key, value)
@@ -68,7 +68,7 @@ def _nothing(key: str, value: Any) -> str:
 def _mistake_of_line(key: str, value: Any) -> str:
     if value["line"].get("name") != key:
         return "it describes another line than its key names"
-    return "" if all(type(text) is str for text in value["files"].values()) else "one of its files is no text"
+    return "" if set(map(type, value["files"].values())) <= {str} else "one of its files is no text"
 
 
 _CHECKS: Mapping[str, Callable[[str, Any], str]] = {names.PLANT: _mistake_of_line}

@@ -1,9 +1,9 @@
 """Releases: which lines may be let go for another gateway now: those that it can claim at once.
 
 A line is closed before it is given away, and is nobody's until that is stored and the other one has claimed
-it. While its bucket has no leader nothing is stored, so it is better polled where it is. So it is while a
-server of the bucket is silent: one that is cut off asks for votes in newer terms, and once it is heard again
-the leader may lose its office for seconds, between giving away and claiming.
+it. While too few buckets have a leader nothing is stored, so it is better polled where it is. So it is while
+a server is silent: one that is cut off asks for votes in newer terms, and once it is heard again leaders may
+lose their office for seconds, between giving away and claiming.
 """
 
 from __future__ import annotations
@@ -12,8 +12,9 @@ import asyncio
 import time
 from collections.abc import Callable, Set
 
+from multidrop.fleet import names
 from multidrop.fleet.leaders import known_cluster
-from multidrop.fleet.names import owner_bucket
+from multidrop.fleet.ownership import NEEDED
 from multidrop.fleet.servers import ServerPath
 
 LOOK_S = 0.05  # between looks while lines are to be released
@@ -21,9 +22,9 @@ WAIT_S = 60.0  # for a silent server; one that is silent for longer is not waite
 
 
 class Releases:
-    """The lines that should be others', and how the servers of their buckets were a moment ago.
+    """The lines that should be others', and how the servers of all buckets were a moment ago.
 
-    `on_change` is called when more or fewer of them may be let go.
+    `on_change` is called when they may be let go, or may no more.
     """
 
     def __init__(
@@ -35,28 +36,28 @@ class Releases:
         self._path = path
         self._on_change = on_change
         self._clock = clock
-        self._lines: Set[str] = frozenset()
+        self._has_lines = False
         self._led: dict[str, float | None] = {}  # buckets with a leader; since when a server of it is silent
 
-    def due(self, lines: Set[str], wait_s: float = WAIT_S) -> set[str]:
-        """Return those of these lines that may be let go now; the others are waited for.
+    def due(self, lines: Set[str], wait_s: float = WAIT_S) -> Set[str]:
+        """Return these lines where they may be let go now, else none: they are waited for.
 
         `wait_s` says for how long a silent server holds them up.
         """
-        self._lines = lines
+        self._has_lines = bool(lines)
         waited_since = self._clock() - wait_s
-        ready = {bucket for bucket, since in self._led.items() if since is None or since <= waited_since}
-        return {line for line in lines if owner_bucket(line) in ready}
+        ready = sum(since is None or since <= waited_since for since in self._led.values())
+        return lines if ready >= NEEDED else set()
 
     async def watch(self) -> None:
-        """Look at the buckets of the lines that are to be released, for ever."""
+        """Look at the buckets while lines are to be released, for ever."""
         while True:
             await self.look()
             await asyncio.sleep(LOOK_S)
 
     async def look(self) -> None:
         """Ask for the servers once; nothing is asked where no line is to be released."""
-        buckets = sorted({owner_bucket(line) for line in self._lines})
+        buckets = names.OWNERS if self._has_lines else ()
         found = await asyncio.gather(*(known_cluster(self._path(), bucket) for bucket in buckets))
         now, before, self._led = self._clock(), self._led, {}
         for bucket, cluster in zip(buckets, found, strict=True):

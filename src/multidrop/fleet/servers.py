@@ -57,15 +57,6 @@ class ServerPath:
         return str(self._client._server_info.get("server_name", "")) if self._client else ""
 
     @property
-    def is_local(self) -> bool:
-        """Say whether its server runs on this machine: both ends of the connection have one address."""
-        writer = getattr(self._client._transport, "_io_writer", None) if self._client else None
-        if not writer or writer.is_closing():  # a closed connection with TLS has no addresses, and raises
-            return False
-        here, there = map(writer.get_extra_info, ("sockname", "peername"))
-        return bool(here and there and here[0] == there[0])
-
-    @property
     def version(self) -> tuple[int, int]:
         """Return the version of the server where it is."""
         assert self._client is not None

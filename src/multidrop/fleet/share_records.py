@@ -11,7 +11,6 @@ import time
 from collections.abc import Callable, Iterable
 from contextlib import suppress
 
-from multidrop.fleet import names
 from multidrop.fleet.buckets import FOLLOW_S, NONE_YET, Bucket, Follower, OnTake, Record
 from multidrop.fleet.fleet_records import FleetRecords
 from multidrop.fleet.lease_rules import Terms
@@ -23,27 +22,38 @@ DOUBT_S = 30.0  # longer than the election of a bucket's leader, which may still
 
 
 class ShareFollower(Follower):
-    """The records of a share's lines; revision 0 stands for a line that nobody ever had.
+    """The records of a share's lines in one bucket; revision 0 stands for a line that nobody ever had.
 
-    `is_mine` says whether a record names us and our present session.
+    `is_mine` says whether a record names us and our present session, `has` whether we have a line.
     """
 
-    def __init__(self, bucket: Bucket, on_take: OnTake, is_mine: Callable[[Record], bool]) -> None:
+    def __init__(
+        self, bucket: Bucket, on_take: OnTake, is_mine: Callable[[Record], bool], has: Callable[[str], bool]
+    ) -> None:
         super().__init__(bucket, on_take)
         self._is_mine = is_mine
+        self._has = has
         self._share: frozenset[str] = frozenset()
+        self._changing: frozenset[str] | None = (
+            frozenset()
+        )  # lines of it that may change; None: look for them
         self._doubted: dict[str, float] = {}  # lines whose writing failed or was not answered, since when
         self._is_urgent = asyncio.Event()
 
     def want(self, lines: Iterable[str]) -> None:
         """Follow these lines from now on."""
         self._share = frozenset(lines)
+        self._changing = None
         self._is_urgent.set()
 
     def doubt(self, lines: Iterable[str]) -> None:
         """Ask what became of lines that were to be handed over: again and again, for it may take a while."""
         self._doubted |= dict.fromkeys(lines, time.monotonic())
         self._is_urgent.set()
+
+    def look_anew(self) -> None:
+        """Find anew which lines may change: a record of one of them has, in this bucket or another."""
+        self._changing = None
 
     async def look(self) -> list[Record]:
         """Ask for what is not known of the share, or may change, and return what did."""
@@ -60,12 +70,16 @@ class ShareFollower(Follower):
     def _to_ask(self) -> list[str]:
         oldest = time.monotonic() - DOUBT_S
         self._doubted = {line: since for line, since in self._doubted.items() if since > oldest}
-        return sorted(self._doubted.keys() | {line for line in self._share if self._may_change(line)})
+        if self._changing is None:
+            self._changing = frozenset(line for line in self._share if self._may_change(line))
+        return sorted(self._doubted.keys() | self._changing)
 
     def _may_change(self, line: str) -> bool:
-        """Say whether a line is another gateway's, or unknown. Claiming a free one tells what it is."""
+        """Say whether a record is unknown, or another gateway's. Claiming a free one tells what it is."""
         record = self.records.get(line)
-        return record is None or (owner_of(record)[0] != NOBODY and not self._is_mine(record))
+        if record is None:
+            return True
+        return owner_of(record)[0] != NOBODY and not self._is_mine(record) and not self._has(line)
 
     async def rest(self) -> None:
         """Wait until the next look."""
@@ -89,20 +103,23 @@ class ShareRecords(FleetRecords):
         super().__init__(me, path, terms, on_change)
 
     def _owner_follower(self, bucket: Bucket, on_take: OnTake) -> ShareFollower:
-        self._shares[bucket.name] = ShareFollower(bucket, on_take, self._is_mine)
+        self._shares[bucket.name] = ShareFollower(bucket, on_take, self._is_mine, self._has)
         return self._shares[bucket.name]
 
-    def _is_next(self, bucket: str, before: Record | None, record: Record) -> bool:
-        """Say whether it was replaced by us, or was ours: else it may have been others' meanwhile, unseen."""
-        return self._is_mine(record) or (before is not None and self._is_mine(before))
+    def _has(self, line: str) -> bool:
+        record = self.owner(line)
+        return record is not None and self._is_mine(record)
+
+    def _note_owner(self, bucket: str, before: Record | None, record: Record) -> None:
+        super()._note_owner(bucket, before, record)
+        for share in self._shares.values():
+            share.look_anew()
 
     def want(self, lines: Iterable[str]) -> None:
         """Follow the masters of these lines from now on."""
-        parts: dict[str, list[str]] = {name: [] for name in self._shares}
-        for line in lines:
-            parts[names.owner_bucket(line)].append(line)
-        for name, part in parts.items():
-            self._shares[name].want(part)
+        wanted = frozenset(lines)
+        for share in self._shares.values():
+            share.want(wanted)
 
     def doubt(self, bucket: str, lines: Iterable[str]) -> None:
         """Ask what became of lines of this bucket that were to be handed over."""

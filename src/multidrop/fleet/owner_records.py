@@ -1,0 +1,156 @@
+"""Owner records: which lines are ours, and what is written to claim them and to give them away.
+
+What is given away is not ours any more from the moment before it is sent: it may be stored, at any time,
+though nobody answered. It is ours again once newer records say so.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
+
+from multidrop.fleet import names
+from multidrop.fleet.buckets import Record, Written
+from multidrop.fleet.errors import FleetError
+from multidrop.fleet.lease import Lease
+from multidrop.fleet.ownership import (
+    NEEDED,
+    NOBODY,
+    Claim,
+    Owner,
+    claim_of,
+    owner_of,
+    owner_value,
+    turn_of,
+)
+from multidrop.fleet.share_records import ShareRecords
+
+WRITERS = 2  # batches at a time in each bucket
+SPARE_S = 0.15  # after one bucket has answered, before records are written in the spare one
+
+
+class OwnerRecords:
+    """The records of lines as far as they name us, in our present session.
+
+    Nothing is written while `may_write` says no; `on_mine` is called with each line that has become ours.
+    """
+
+    def __init__(
+        self,
+        lease: Lease,
+        records: ShareRecords,
+        may_write: Callable[[], bool],
+        on_mine: Callable[[str], object],
+    ) -> None:
+        self.moves = 0
+        self._lease = lease
+        self._records = records
+        self._may_write = may_write
+        self._on_mine = on_mine
+        self._offered: dict[tuple[str, str], int] = {}  # by line and bucket, the revision given away last
+        self._writing = {bucket: asyncio.Semaphore(WRITERS) for bucket in names.OWNERS}
+
+    @property
+    def _me(self) -> Owner:
+        return self._lease.name, self._lease.session
+
+    def is_mine(self, line: str) -> bool:
+        """Say whether we have enough votes by records that were not given away at their very revisions."""
+        me, votes = self._me, 0
+        for bucket, record in self._records.of(line).items():
+            if owner_of(record) == me and record and self._offered.get((line, bucket)) != record.revision:
+                votes += record.value["votes"]
+        return votes >= NEEDED
+
+    def doubted(self, line: str) -> set[str]:
+        """Return the buckets in which the line was given away, and nobody knows whether that was stored."""
+        return {
+            bucket
+            for bucket, record in self._records.of(line).items()
+            if record and self._offered.get((line, bucket)) == record.revision
+        }
+
+    def _naming_us(self, line: str) -> dict[str, Record]:
+        records = self._records.of(line)
+        return {
+            bucket: record for bucket, record in records.items() if record and owner_of(record) == self._me
+        }
+
+    def owned(self) -> set[str]:
+        """Return the lines of which one record at least names us."""
+        return self._records.owned_by(*self._me)
+
+    def claim_of(self, line: str) -> Claim | None:
+        """Return what is to be written for a line to be ours; None where nothing can be."""
+        is_over = self._records.observer.is_over
+        return claim_of(self._me, self._records.of(line), is_over, self.doubted(line))
+
+    async def claim(self, claims: Mapping[str, Claim]) -> None:
+        """Write the first records of claims, and spare ones where a bucket takes much longer than another."""
+        now_ms, begun = utc_ms(), time.monotonic()
+        values = {
+            line: owner_value(self._me, claim.turn, now_ms, claim.votes) for line, claim in claims.items()
+        }
+        writes = self._write(
+            (bucket, Record(line, revision, values[line]))
+            for line, claim in claims.items()
+            for bucket, revision in claim.first.items()
+        )
+        await asyncio.wait(writes, return_when=asyncio.FIRST_COMPLETED)
+        done, late = await asyncio.wait(writes, timeout=max(SPARE_S, time.monotonic() - begun))
+        refused = set[str]().union(*(write.result() for write in done))
+        spare = self._write(
+            (bucket, Record(line, revision, values[line]))
+            for line in claims.keys() - refused
+            if not self.is_mine(line)
+            for bucket, revision in claims[line].spare.items()
+        )
+        await asyncio.gather(*late, *spare)
+
+    async def give_away(self, lines: Sequence[str]) -> None:
+        """Name nobody in each record of these lines that names us.
+
+        All of them are given away before one is sent: an answer to a late claim makes none ours meanwhile.
+        """
+        now_ms, nobody = utc_ms(), (NOBODY, 0)
+        given: list[tuple[str, Record]] = []
+        for line in lines:
+            ours = self._naming_us(line)
+            for bucket, record in ours.items():
+                self._offered[line, bucket] = record.revision
+                value = owner_value(nobody, turn_of(ours) + 1, now_ms, record.value["votes"])
+                given.append((bucket, record._replace(value=value)))
+        await asyncio.gather(*self._write(given))
+        self.moves += sum(not self._naming_us(line) for line in lines)
+
+    def _write(self, records: Iterable[tuple[str, Record]]) -> list[asyncio.Task[set[str]]]:
+        """Begin to replace records, each in this bucket; each task returns the lines that were refused."""
+        by_bucket: dict[str, list[Record]] = {}
+        for bucket, record in records:
+            by_bucket.setdefault(bucket, []).append(record)
+        return [asyncio.create_task(self._write_in(bucket, some)) for bucket, some in by_bucket.items()]
+
+    async def _write_in(self, bucket: str, records: Sequence[Record]) -> set[str]:
+        """Replace records: the server decides, by the revision of each. Lines that are ours now are taken."""
+        follower = self._records.owners[bucket]
+        async with self._writing[bucket]:
+            if not self._may_write():
+                return set()
+            written = Written([], set())
+            with suppress(FleetError):
+                written = await follower.bucket.put_all(records)
+        for record in written.stored:
+            was_mine = self.is_mine(record.key)
+            follower.take(record)
+            if self.is_mine(record.key) and not was_mine:
+                self.moves += 1
+                self._on_mine(record.key)
+        stored = {record.key for record in written.stored}
+        self._records.doubt(bucket, {record.key for record in records} - stored)
+        return written.refused
+
+
+def utc_ms() -> int:
+    return time.time_ns() // 1_000_000
