@@ -9,12 +9,12 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from fleets import Hall, HandClock, MemoryBucket, NotedLines, NotedMastership
+from fleets import GatedBucket, Hall, HandClock, MemoryBucket, NotedLines, NotedMastership
 from peers import require_module
 
 require_module("nats")
 
-from multidrop.fleet import line_keeper, names  # noqa: E402
+from multidrop.fleet import line_keeper, names, owner_records  # noqa: E402
 from multidrop.fleet.buckets import Record  # noqa: E402
 from multidrop.fleet.lease import Lease  # noqa: E402
 from multidrop.fleet.lease_rules import SECOND, USUAL  # noqa: E402
@@ -43,18 +43,61 @@ class Trial:
         nowhere: Any = None
         self.records = ShareRecords("a", lambda: nowhere, USUAL, lambda: None, self._is_mine)
         for name in names.OWNERS:
-            bucket: Any = MemoryBucket(name)
+            bucket: Any = GatedBucket(name)
             self.records.owners[name].bucket = bucket
+        self.buckets: list[Any] = [self.records.owners[name].bucket for name in names.owner_buckets("hall")]
         self.records.plant.take(Record("hall", 1, {"line": {"name": "hall"}}))
         self.keeper = LineKeeper(self.lines, self.lease, self.records, lambda: None)
 
     def _is_mine(self, record: Record) -> bool:
         return owner_of(record) == ("a", self.lease.session)
 
-    async def claim(self) -> None:
+    async def read(self) -> None:
+        """Read what the buckets have of the line."""
+        self.records.want(["hall"])
+        for follower in self.records.owners.values():
+            await follower.look()
+
+    async def read_and_begin(self) -> None:
         assert await self.lease.try_to_begin()
-        self.keeper.claim({"hall": 0})
+        await self.read()
+
+    async def claim(self) -> None:
+        await self.read_and_begin()
+        self.claim_now()
         await until(lambda: "hall" in self.keeper.polled and not self.keeper._at_work)
+
+    async def is_polled(self) -> None:
+        """Wait until the line is polled, while time passes."""
+        while "hall" not in self.keeper.polled or self.keeper._at_work:
+            await asyncio.sleep(0.001)
+
+    def claim_now(self) -> None:
+        claim = self.keeper.claim_of("hall")
+        assert claim
+        self.keeper.claim({"hall": claim})
+
+    def owner(self) -> tuple[str, int] | None:
+        """Return the owner whom enough votes name, by what the gateway knows."""
+        record = self.records.owner("hall")
+        return owner_of(record) if record else None
+
+    def is_taken_by_another(self, *places: int) -> None:
+        """Read that these of the line's records name another gateway."""
+        for place in places:
+            bucket = names.owner_buckets("hall")[place]
+            known = self.records.of("hall")[bucket]
+            revision = known.revision + 1 if known else 1
+            self.records.owners[bucket].take(Record("hall", revision, owner_value(("b", 1), 9, 0)))
+
+
+class DeadTrial(Trial):
+    """The same with a line whose last master is over."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        for bucket in self.buckets[:2]:
+            bucket.store("hall", owner_value(("", 0), 1, 0))
 
 
 def test_a_claimed_line_takes_stops_at_once_and_commands_when_the_guard_is_over() -> None:
@@ -85,11 +128,7 @@ def test_a_line_that_another_has_by_its_record_takes_neither_stops_nor_commands(
         await trial.claim()
         trial.clock.pass_s(1)
         assert trial.keeper.may_command("hall")
-        before = trial.records.owner("hall")
-        assert before
-        trial.records.owners[names.owner_bucket("hall")].take(
-            Record("hall", before.revision + 1, owner_value("b", 1, 0))
-        )
+        trial.is_taken_by_another(0)
         assert "hall" in trial.keeper.polled
         assert not trial.keeper.may_stop("hall")
         assert not trial.keeper.may_command("hall")
@@ -117,11 +156,11 @@ def test_lines_are_let_go_while_there_is_time_to_close_them() -> None:
 def test_what_waited_until_the_lease_was_over_is_neither_opened_nor_written() -> None:
     async def main() -> None:
         trial = Trial()
-        bucket: Any = trial.records.owners[names.owner_bucket("hall")].bucket
-        writing = trial.keeper._writing[bucket.name] = asyncio.Semaphore(0)
+        bucket = trial.buckets[0]
+        writing = trial.keeper._owners._writing[bucket.name] = asyncio.Semaphore(0)
         openings = trial.keeper._openings = asyncio.Semaphore(0)
-        assert await trial.lease.try_to_begin()
-        trial.keeper.claim({"hall": 0})
+        await trial.read_and_begin()
+        trial.claim_now()
         await asyncio.sleep(0)
         trial.clock.pass_s(USUAL.lease / SECOND)
         writing.release()
@@ -129,7 +168,7 @@ def test_what_waited_until_the_lease_was_over_is_neither_opened_nor_written() ->
         assert bucket.records == {}
         for path in range(3):
             await trial.lease.renew_once(path)
-        trial.keeper.claim({"hall": 0})
+        trial.claim_now()
         await until(lambda: bool(trial.records.owner("hall")))
         trial.clock.pass_s(USUAL.lease / SECOND)
         openings.release()
@@ -143,10 +182,10 @@ def test_a_line_that_became_anothers_while_it_waited_is_not_opened() -> None:
     async def main() -> None:
         trial = Trial()
         openings = trial.keeper._openings = asyncio.Semaphore(0)
-        assert await trial.lease.try_to_begin()
-        trial.keeper.claim({"hall": 0})
+        await trial.read_and_begin()
+        trial.claim_now()
         await until(lambda: bool(trial.records.owner("hall")))
-        trial.records.owners[names.owner_bucket("hall")].take(Record("hall", 9, owner_value("b", 1, 0)))
+        trial.is_taken_by_another(0)
         openings.release()
         await until(lambda: trial.keeper.is_silent)
         assert trial.lines.taken == set()
@@ -173,13 +212,13 @@ def test_a_line_is_let_go_before_it_is_given_away() -> None:
         await trial.claim()
         trial.keeper.releasing = {"hall"}
         trial.keeper.reconcile()
-        assert owner_of(trial.records.owner("hall")) == ("a", 1)
+        assert trial.owner() == ("a", 1)
         await until(lambda: trial.keeper.is_silent)
         assert trial.lines.taken == set()
-        assert owner_of(trial.records.owner("hall")) == ("a", 1)
+        assert trial.owner() == ("a", 1)
         trial.keeper.reconcile()
         await until(lambda: trial.keeper.is_silent)
-        assert owner_of(trial.records.owner("hall")) == ("", 0)
+        assert trial.owner() == ("", 0)
 
     asyncio.run(main())
 
@@ -190,11 +229,12 @@ def test_a_line_is_not_polled_again_while_it_may_have_been_given_away() -> None:
     async def main() -> None:
         trial = Trial()
         await trial.claim()
-        bucket: Any = trial.records.owners[names.owner_bucket("hall")].bucket
+        bucket = trial.buckets[0]
         trial.keeper.releasing = {"hall"}
         trial.keeper.reconcile()
         await until(lambda: trial.keeper.is_silent)
-        bucket.is_down = True
+        for one in trial.buckets:
+            one.is_down = True
         trial.keeper.reconcile()  # given away, and nobody answers
         await until(lambda: trial.keeper.is_silent)
         trial.keeper.releasing = set()  # it is to stay after all
@@ -202,11 +242,141 @@ def test_a_line_is_not_polled_again_while_it_may_have_been_given_away() -> None:
             trial.keeper.reconcile()
             await until(lambda: trial.keeper.is_silent)
             assert trial.lines.taken == set()
-        bucket.is_down = False
+        for one in trial.buckets:
+            one.is_down = False
         trial.keeper.reconcile()
         await until(lambda: "hall" in trial.keeper.polled and not trial.keeper._at_work)
         assert owner_of(bucket.records["hall"]) == ("a", 1)
         assert bucket.revision("hall") == 2  # what was given away at 1 can be stored no more
+
+    asyncio.run(main())
+
+
+def owners(trial: Trial) -> list[tuple[str, int]]:
+    """Return whom the records name that are stored, in the order in which they are written."""
+    return [owner_of(bucket.records.get("hall")) for bucket in trial.buckets]
+
+
+ME, NOBODY = ("a", 1), ("", 0)
+
+
+def test_a_line_that_nobody_ever_had_is_claimed_by_one_record() -> None:
+    async def main() -> None:
+        trial = Trial()
+        await trial.claim()
+        assert owners(trial) == [ME, NOBODY, NOBODY]
+        assert trial.keeper.moves == 1
+
+    asyncio.run(main())
+
+
+def test_a_line_of_a_dead_master_is_claimed_by_two() -> None:
+    async def main() -> None:
+        trial = DeadTrial()
+        await trial.claim()
+        assert owners(trial) == [ME, ME, NOBODY]
+        assert trial.keeper.moves == 1
+
+    asyncio.run(main())
+
+
+@pytest.mark.parametrize("place", [0, 1])
+def test_a_bucket_without_a_leader_holds_no_claim_up(place: int) -> None:
+    async def main() -> None:
+        trial = DeadTrial()
+        await trial.read_and_begin()
+        trial.buckets[place].is_down = True
+        trial.claim_now()
+        await until(lambda: "hall" in trial.keeper.polled and not trial.keeper._at_work)
+        assert owners(trial)[place] == NOBODY
+        assert owners(trial).count(ME) == 2
+
+    asyncio.run(main())
+
+
+def test_a_bucket_that_answers_late_holds_no_claim_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(owner_records, "SPARE_S", 0.0)
+
+    async def main() -> None:
+        trial = DeadTrial()
+        await trial.read_and_begin()
+        trial.buckets[0].shut()
+        trial.claim_now()
+        await asyncio.wait_for(trial.is_polled(), 10)
+        assert owners(trial) == [NOBODY, ME, ME]
+        trial.buckets[0].open()
+        await until(lambda: not trial.keeper._tasks)
+        assert owners(trial) == [ME, ME, ME]
+        assert trial.keeper.moves == 1
+
+    asyncio.run(main())
+
+
+def test_where_another_was_first_nothing_more_is_written() -> None:
+    async def main() -> None:
+        trial = DeadTrial()
+        await trial.read_and_begin()
+        trial.buckets[1].store("hall", owner_value(("b", 1), 2, 0))
+        trial.claim_now()
+        await until(lambda: not trial.keeper._tasks)
+        assert owners(trial) == [ME, ("b", 1), NOBODY]
+        assert not trial.keeper.polled
+
+    asyncio.run(main())
+
+
+def test_a_late_answer_makes_no_line_ours_that_is_being_given_away(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It would be opened between the two records that give it away, and be another's in the next moment."""
+    monkeypatch.setattr(owner_records, "SPARE_S", 0.0)
+
+    async def main() -> None:
+        trial = DeadTrial()
+        await trial.read_and_begin()
+        trial.buckets[0].shut()
+        trial.claim_now()
+        await asyncio.wait_for(trial.is_polled(), 10)
+        trial.keeper.releasing = {"hall"}
+        trial.keeper.reconcile()
+        await until(lambda: not trial.keeper.polled and not trial.keeper._at_work)
+        writers = trial.keeper._owners._writing[trial.buckets[1].name]
+        async with writers, writers:  # all that may write there are at work
+            trial.keeper.reconcile()
+            await until(lambda: owners(trial) == [NOBODY, ME, NOBODY])
+            trial.buckets[0].open()
+            await until(lambda: owners(trial)[0] == ME)
+            for _ in range(100):
+                await asyncio.sleep(0)
+            assert not trial.keeper.is_mine("hall")
+            assert trial.lines.taken == set()
+        await until(lambda: not trial.keeper._tasks)
+        assert trial.lines.taken == set()
+        assert owners(trial) == [ME, NOBODY, NOBODY]
+        trial.keeper.reconcile()
+        await until(lambda: owners(trial) == [NOBODY] * 3)
+
+    asyncio.run(main())
+
+
+def test_an_answer_that_is_late_does_not_undo_the_giving_away() -> None:
+    """The record was read before its answer came, and given away at once."""
+
+    async def main() -> None:
+        trial = Trial()
+        await trial.read_and_begin()
+        bucket = trial.buckets[0] = GatedBucket(trial.buckets[0].name, answers=True)
+        trial.records.owners[bucket.name].bucket = bucket  # type: ignore[assignment]
+        bucket.shut()
+        trial.claim_now()
+        await asyncio.wait_for(bucket.arrived.wait(), 10)
+        trial.records.doubt(bucket.name, ["hall"])
+        await trial.read()
+        assert trial.keeper.is_mine("hall")
+        bucket.is_down = True
+        await trial.keeper._owners.give_away(["hall"])
+        bucket.open()
+        await until(lambda: not trial.keeper._tasks)
+        assert not trial.keeper.is_mine("hall")
+        assert trial.lines.taken == set()
 
     asyncio.run(main())
 
@@ -255,8 +425,8 @@ class BrokenTrial(Trial):
         self.keeper.lines = self.broken
 
     async def claim(self) -> None:
-        assert await self.lease.try_to_begin()
-        self.keeper.claim({"hall": 0})
+        await self.read_and_begin()
+        self.claim_now()
         await until(lambda: "hall" in self.keeper.troubles and not self.keeper._at_work)
 
     async def try_again(self) -> None:
@@ -302,6 +472,6 @@ def test_of_a_line_that_another_has_by_now_no_trouble_is_told(monkeypatch: pytes
         trial.keeper.reconcile()
         assert trial.keeper.troubles == {}
         await until(lambda: trial.keeper.is_silent)
-        assert owner_of(trial.records.owner("hall")) == ("", 0)
+        assert trial.owner() == ("", 0)
 
     asyncio.run(main())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import random
 from collections import Counter
 
@@ -12,9 +13,17 @@ from tables import table
 require_module("nats")
 
 from multidrop.fleet import names  # noqa: E402
-from multidrop.fleet.balance import Balance  # noqa: E402
+from multidrop.fleet.balance import assign  # noqa: E402
 from multidrop.fleet.buckets import Record  # noqa: E402
-from multidrop.fleet.ownership import Step, decide, owner_value  # noqa: E402
+from multidrop.fleet.ownership import (  # noqa: E402
+    NEEDED,
+    Claim,
+    Step,
+    claim_of,
+    decide,
+    owner_by,
+    owner_value,
+)
 
 LINES = [f"hall-{hall}-line-{line}" for hall in range(20) for line in range(50)]
 GATEWAYS = [f"gw{at:02}" for at in range(20)]
@@ -25,109 +34,126 @@ def moved(before: dict[str, str], after: dict[str, str]) -> int:
 
 
 def test_nobody_has_more_than_110_percent_of_the_mean() -> None:
-    shares = Counter(Balance().assign(LINES, GATEWAYS).values())
+    shares = Counter(assign(LINES, GATEWAYS).values())
     assert sum(shares.values()) == len(LINES)
     assert max(shares.values()) <= 55
     assert min(shares.values()) >= 25
 
 
 def test_few_lines_move_when_a_gateway_leaves_or_comes() -> None:
-    balance = Balance()
-    all_of_them = balance.assign(LINES, GATEWAYS)
-    without = balance.assign(LINES, GATEWAYS[1:])
+    all_of_them = assign(LINES, GATEWAYS)
+    without = assign(LINES, GATEWAYS[1:])
     must = sum(gateway == GATEWAYS[0] for gateway in all_of_them.values())
     assert must <= moved(all_of_them, without) <= must + len(LINES) // 20
-    assert balance.assign(LINES, GATEWAYS) == all_of_them
 
 
 def test_all_gateways_find_the_same_in_any_order() -> None:
     lines, gateways = LINES[:], GATEWAYS[:]
     random.Random(1).shuffle(lines)
     random.Random(2).shuffle(gateways)
-    assert Balance().assign(lines, gateways) == Balance().assign(LINES, GATEWAYS)
+    assert assign(lines, gateways) == assign(LINES, GATEWAYS)
 
 
-# Each gateway beside one of three servers, each of which leads one bucket.
-BESIDE = {gateway: (names.OWNERS[at % 3],) for at, gateway in enumerate(GATEWAYS)}
+def weight(line: str, gateway: str, number: int) -> int:
+    """Return a pair's weight as the first version weighed it, in whole numbers of Python."""
+    own, other = (
+        int.from_bytes(hashlib.blake2b(name.encode(), digest_size=8).digest(), "big")
+        for name in (line, gateway)
+    )
+    return ((own ^ other) * 0x9E3779B97F4A7C15 & 0xFFFF_FFFF_FFFF_0000) | number
 
 
-def in_vain(shares: dict[str, str]) -> list[str]:
-    """Return the lines whose gateway avoids their bucket."""
-    return [line for line, gateway in shares.items() if names.owner_bucket(line) in BESIDE[gateway]]
-
-
-@pytest.mark.slow
-@table("number", [2, 3, 4, 5, 20])
-@table("lines", [7, 12, 40, 1000])
-def test_lines_are_where_they_are_not_avoided_and_the_bound_holds(lines: int, number: int) -> None:
-    """One of two gateways alone suits some of the buckets, and may have too little room for all of those."""
-    for at in range(max(1, 300 // lines)):
-        names_of_them = [f"trial-{at}-line-{line}" for line in range(lines)]
-        shares = Balance().assign(names_of_them, GATEWAYS[:number], BESIDE)
-        assert sorted(shares) == sorted(names_of_them)
-        most = -(-lines * 110 // (100 * number))
-        loads = Counter(shares.values())
-        assert max(loads.values()) <= most
-        for bucket in {names.owner_bucket(line) for line in in_vain(shares)}:
-            for gateway in GATEWAYS[:number]:
-                others = {names.owner_bucket(line) for line, name in shares.items() if name == gateway}
-                is_full = loads[gateway] == most and others == {bucket}
-                assert is_full or bucket in BESIDE[gateway], "a line could have been moved on"
-
-
-def test_few_lines_move_where_gateways_avoid_buckets_and_order_does_not_matter() -> None:
-    balance = Balance()
-    all_of_them = balance.assign(LINES, GATEWAYS, BESIDE)
-    without = balance.assign(LINES, GATEWAYS[1:], BESIDE)
-    must = sum(gateway == GATEWAYS[0] for gateway in all_of_them.values())
-    assert must <= moved(all_of_them, without) <= must + len(LINES) // 20
-    assert in_vain(all_of_them) == in_vain(without) == []
-    assert Balance().assign(LINES[::-1], GATEWAYS[::-1], BESIDE) == all_of_them
-
-
-def test_what_all_gateways_avoid_is_shared_as_if_nobody_did() -> None:
-    everything = dict.fromkeys(GATEWAYS, names.OWNERS)
-    assert Balance().assign(LINES, GATEWAYS, everything) == Balance().assign(LINES, GATEWAYS)
+@table("number", [1, 2, 3, 5, 20])
+@table("lines", [1, 7, 40, 333])
+def test_each_line_is_with_the_heaviest_gateway_that_has_room(lines: int, number: int) -> None:
+    """Versions that weigh otherwise would share the lines otherwise, and move them to and fro."""
+    room = dict.fromkeys(GATEWAYS[:number], -(-lines * 110 // (100 * number)))
+    wanted = {}
+    for line in sorted(LINES[:lines]):
+        weights = {weight(line, name, at): name for at, name in enumerate(room) if room[name]}
+        wanted[line] = weights[max(weights)]
+        room[wanted[line]] -= 1
+    assert assign(LINES[:lines], GATEWAYS[:number]) == wanted
 
 
 def test_no_gateway_no_share() -> None:
-    assert Balance().assign(LINES, []) == {}
+    assert assign(LINES, []) == {}
 
 
 ME = ("a", 7)
+BEFORE = ("a", 6)
 LIVING = ("b", 2)
 DEAD = ("c", 4)
+GIVEN = ("", 0)
+NEVER = None
+BUCKETS = ("first", "second", "third")
+
+
+def records_of(*owners: tuple[str, int] | None, alone: bool = False) -> dict[str, Record | None]:
+    """Return a line's records with these owners, at revisions from 11 on; the first `alone` has two votes."""
+    found: dict[str, Record | None] = {}
+    for at, (bucket, owner) in enumerate(zip(BUCKETS, owners, strict=True)):
+        value = owner and owner_value(owner, 5, 0, NEEDED if alone and not at else 1)
+        found[bucket] = Record("x", 11 + at if value else 0, value)
+    return found
+
+
+def is_over(name: str, session: int) -> bool:
+    return (name, session) in (DEAD, BEFORE)
 
 
 def one_step(
-    owner: tuple[str, int] | None, wanted: str, *, settled: bool = True, drains: bool = False
+    *owners: tuple[str, int] | None,
+    wanted: str = "a",
+    settled: bool = True,
+    drains: bool = False,
+    alone: bool = False,
 ) -> Step:
-    record = None if owner is None else Record("x", 9, owner_value(*owner, 0))
+    records = records_of(*owners, alone=alone)
     return decide(
         ME,
         ["x"],
         {"x": wanted},
-        lambda line: record,
-        lambda name, session: (name, session) == DEAD or (name == ME[0] and session < ME[1]),
+        lambda line: records,
+        lambda line: claim_of(ME, records, is_over),
         is_settled=settled,
         is_draining=drains,
     )
 
 
-NOTHING = Step({}, set())
+def claims(first: dict[str, int], spare: dict[str, int], turn: int = 6, votes: int = 1) -> Step:
+    return Step({"x": Claim(first, spare, turn, votes)}, set())
+
+
+NOTHING, GOES = Step({}, set()), Step({}, {"x"})
+ALL_FREE = claims({"first": 11, "second": 12}, {"third": 13})
 CASES = {
-    "mine stays": (one_step(ME, "a"), NOTHING),
-    "mine that is another's goes": (one_step(ME, "b"), Step({}, {"x"})),
-    "mine goes when I drain": (one_step(ME, "a", drains=True), Step({}, {"x"})),
-    "another's stays its": (one_step(LIVING, "b"), NOTHING),
-    "a living one's is waited for": (one_step(LIVING, "a"), NOTHING),
-    "a dead one's is claimed": (one_step(DEAD, "a", settled=False), Step({"x": 9}, set())),
-    "a dead one's is not mine by the balance": (one_step(DEAD, "b"), NOTHING),
-    "my session's before is claimed": (one_step(("a", 6), "a"), Step({"x": 9}, set())),
-    "one that was given away": (one_step(("", 0), "a", settled=False), Step({"x": 9}, set())),
-    "one that nobody had": (one_step(None, "a"), Step({"x": 0}, set())),
-    "one that nobody had, too early": (one_step(None, "a", settled=False), NOTHING),
-    "none while I drain": (one_step(None, "a", drains=True), NOTHING),
+    "mine stays": (one_step(ME, ME, DEAD), NOTHING),
+    "mine that is another's goes": (one_step(ME, ME, DEAD, wanted="b"), GOES),
+    "mine goes when I drain": (one_step(ME, ME, DEAD, drains=True), GOES),
+    "mine by its first record alone stays": (one_step(ME, NEVER, NEVER, alone=True), NOTHING),
+    "mine by its first record alone goes": (one_step(ME, NEVER, NEVER, alone=True, wanted="b"), GOES),
+    "another's stays its": (one_step(LIVING, LIVING, DEAD, wanted="b"), NOTHING),
+    "a living one's is waited for": (one_step(LIVING, LIVING, DEAD), NOTHING),
+    "a living one's by its first record alone": (one_step(LIVING, NEVER, NEVER, alone=True), NOTHING),
+    "a dead one's is claimed": (one_step(DEAD, DEAD, GIVEN, settled=False), ALL_FREE),
+    "a dead one's by its first record alone": (
+        one_step(DEAD, NEVER, NEVER, alone=True),
+        claims({"first": 11, "second": 0}, {"third": 0}),
+    ),
+    "a dead one's is not mine by the balance": (one_step(DEAD, DEAD, DEAD, wanted="b"), NOTHING),
+    "my session's before is claimed": (one_step(BEFORE, BEFORE, DEAD), ALL_FREE),
+    "one that was given away": (one_step(GIVEN, GIVEN, DEAD, settled=False), ALL_FREE),
+    "one that was given away in two buckets": (
+        one_step(LIVING, GIVEN, GIVEN),
+        claims({"second": 12, "third": 13}, {}),
+    ),
+    "one that I have half": (one_step(LIVING, ME, DEAD), claims({"third": 13}, {})),
+    "one that I have half, and another": (one_step(LIVING, ME, LIVING), NOTHING),
+    "one that I have half goes": (one_step(DEAD, ME, DEAD, wanted="b"), GOES),
+    "one that nobody had": (one_step(NEVER, NEVER, NEVER), claims({"first": 0}, {}, 1, NEEDED)),
+    "one that nobody had, too early": (one_step(NEVER, NEVER, NEVER, settled=False), NOTHING),
+    "none while I drain": (one_step(NEVER, NEVER, NEVER, drains=True), NOTHING),
 }
 
 
@@ -135,6 +161,51 @@ CASES = {
 def test_claims_and_releases(case: str) -> None:
     found, wanted = CASES[case]
     assert found == wanted
+
+
+def test_nothing_is_written_elsewhere_before_the_first_record_was_read() -> None:
+    records = records_of(DEAD, DEAD, DEAD)
+    records["first"] = None
+    assert claim_of(ME, records, is_over) is None
+    assert claim_of(ME, {}, is_over) is None
+
+
+def test_a_record_that_was_not_read_is_not_written() -> None:
+    records = records_of(DEAD, DEAD, DEAD)
+    records["second"] = None
+    assert claim_of(ME, records, is_over) == Claim({"first": 11, "third": 13}, {}, 6)
+    records["third"] = None
+    assert claim_of(ME, records, is_over) is None
+
+
+def test_what_was_given_away_in_doubt_is_claimed_at_that_revision() -> None:
+    records = records_of(ME, ME, LIVING)
+    assert claim_of(ME, records, is_over) is None
+    assert claim_of(ME, records, is_over, ["second"]) == Claim({"second": 12}, {}, 6)
+    assert claim_of(ME, records, is_over, ["first", "second"]) == Claim({"first": 11, "second": 12}, {}, 6)
+
+
+def owner_by_records(*owners: tuple[str, int] | None, alone: bool = False) -> tuple[str, int] | None:
+    record = owner_by(records_of(*owners, alone=alone))
+    return record and (record.value["gateway"], record.value["session"])
+
+
+def test_the_owner_is_whom_two_records_name_or_the_first_one_alone() -> None:
+    assert owner_by_records(LIVING, DEAD, LIVING) == LIVING
+    assert owner_by_records(LIVING, NEVER, NEVER, alone=True) == LIVING
+    assert owner_by_records(GIVEN, ME, GIVEN) == GIVEN
+    assert owner_by_records(LIVING, DEAD, ME) is None
+    assert owner_by_records(LIVING, NEVER, NEVER) is None
+
+
+def test_of_two_owners_the_newer_one_is_told() -> None:
+    """The first record of all names a dead session with two votes, while its bucket has no leader."""
+    records = records_of(DEAD, ME, ME, alone=True)
+    for bucket in ("second", "third"):
+        records[bucket] = Record("x", 20, owner_value(ME, 6, 0))
+    found = owner_by(records)
+    assert found
+    assert found.value["gateway"] == "a"
 
 
 @table("name", ["", "hall.1", "hall 1", "hall*", ">", "Größe", "a/b", "x\n"])
@@ -153,7 +224,8 @@ def test_a_name_that_would_do_is_said(name: str, better: str) -> None:
     assert names.is_name(better)
 
 
-def test_records_of_lines_are_in_all_three_buckets() -> None:
-    shares = Counter(map(names.owner_bucket, LINES))
-    assert set(shares) == set(names.OWNERS)
-    assert min(shares.values()) > len(LINES) / 4
+def test_records_of_lines_begin_in_all_three_buckets() -> None:
+    places = [names.owner_buckets(line) for line in LINES]
+    assert all(sorted(place) == sorted(names.OWNERS) for place in places)
+    shares = Counter(place[0] for place in places)
+    assert min(shares[bucket] for bucket in names.OWNERS) > len(LINES) / 4

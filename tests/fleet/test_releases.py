@@ -14,7 +14,7 @@ from multidrop.fleet import names, releases  # noqa: E402
 from multidrop.fleet.cluster import Cluster, Replica  # noqa: E402
 from multidrop.fleet.releases import WAIT_S, Releases  # noqa: E402
 
-LINES = {names.owner_bucket(line): line for line in (f"line-{at}" for at in range(30))}  # one of each bucket
+LINES = {"line-1", "line-2"}
 
 
 class Trial:
@@ -42,18 +42,17 @@ class Trial:
         asyncio.run(self.releases.look())
 
 
-def test_a_line_waits_until_its_bucket_is_known_to_have_a_leader(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_lines_wait_until_two_buckets_are_known_to_have_a_leader(monkeypatch: pytest.MonkeyPatch) -> None:
     trial = Trial(monkeypatch)
-    trial.led.remove("own_1")
-    lines = set(LINES.values())
-    assert trial.releases.due(lines) == set()
+    trial.led = {"own_1"}
+    assert trial.releases.due(LINES) == set()
     trial.look()
     assert trial.changes == 1
-    assert trial.releases.due(lines) == lines - {LINES["own_1"]}
-    trial.led = {"own_1"}
+    assert trial.releases.due(LINES) == set()
+    trial.led.add("own_2")
     trial.look()
     assert trial.changes == 2
-    assert trial.releases.due(lines) == {LINES["own_1"]}
+    assert trial.releases.due(LINES) == LINES
 
 
 def test_nothing_is_asked_where_no_line_is_to_be_released_and_nothing_is_believed_later(
@@ -62,53 +61,53 @@ def test_nothing_is_asked_where_no_line_is_to_be_released_and_nothing_is_believe
     trial = Trial(monkeypatch)
     trial.look()
     assert trial.asked == []
-    trial.releases.due({LINES["own_2"]})
+    trial.releases.due(LINES)
     trial.look()
-    assert trial.asked == ["own_2"]
-    trial.releases.due(set())
+    assert trial.asked == [*names.OWNERS]
+    assert trial.releases.due(set()) == set()
     trial.look()
     trial.led.clear()
-    assert trial.releases.due({LINES["own_2"]}) == set()
+    assert trial.releases.due(LINES) == set()
 
 
-def test_a_line_waits_while_a_server_of_its_bucket_is_silent(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_lines_wait_while_a_server_of_two_buckets_is_silent(monkeypatch: pytest.MonkeyPatch) -> None:
     trial = Trial(monkeypatch)
-    trial.maimed = {"own_1"}
-    lines = set(LINES.values())
-    trial.releases.due(lines)
+    trial.maimed = {"own_0", "own_1"}
+    trial.releases.due(LINES)
     trial.look()
-    assert trial.releases.due(lines) == lines - {LINES["own_1"]}
-    trial.maimed.clear()
+    assert trial.releases.due(LINES) == set()
+    trial.maimed.remove("own_0")
     trial.look()
     assert trial.changes == 2
-    assert trial.releases.due(lines) == lines
+    assert trial.releases.due(LINES) == LINES
 
 
 def test_a_server_that_is_silent_for_long_is_not_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
     trial = Trial(monkeypatch)
-    trial.maimed = {"own_1"}
-    line = {LINES["own_1"]}
-    trial.releases.due(line)
+    trial.maimed = {"own_0", "own_1"}
+    trial.releases.due(LINES)
     trial.look()
     trial.now_s = WAIT_S - 1
     trial.look()
-    assert trial.releases.due(line) == set()
+    assert trial.releases.due(LINES) == set()
     trial.now_s = WAIT_S
     trial.look()
-    assert trial.releases.due(line) == line
+    assert trial.releases.due(LINES) == LINES
     trial.maimed.clear()  # it is heard, and silent again: it is waited for anew
     trial.look()
-    trial.maimed = {"own_1"}
+    trial.maimed = {"own_0", "own_1"}
     trial.look()
-    assert trial.releases.due(line) == set()
+    assert trial.releases.due(LINES) == set()
 
 
-def test_who_is_in_haste_waits_for_a_leader_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_who_is_in_haste_waits_for_leaders_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     trial = Trial(monkeypatch)
     trial.maimed = set(names.OWNERS)
     trial.led.remove("own_2")
-    lines = set(LINES.values())
-    trial.releases.due(lines, 0)
+    trial.releases.due(LINES, 0)
     trial.look()
-    assert trial.releases.due(lines, 0) == lines - {LINES["own_2"]}
-    assert trial.releases.due(lines) == set()
+    assert trial.releases.due(LINES, 0) == LINES
+    assert trial.releases.due(LINES) == set()
+    trial.led.remove("own_1")
+    trial.look()
+    assert trial.releases.due(LINES, 0) == set()

@@ -17,12 +17,12 @@ from multidrop.fleet import buckets, names, share_records  # noqa: E402
 from multidrop.fleet.buckets import Bucket, Record  # noqa: E402
 from multidrop.fleet.errors import Unsure  # noqa: E402
 from multidrop.fleet.lease_rules import USUAL  # noqa: E402
-from multidrop.fleet.ownership import owner_of, owner_value  # noqa: E402
+from multidrop.fleet.ownership import NEEDED, owner_of, owner_value  # noqa: E402
 from multidrop.fleet.servers import paths_of  # noqa: E402
 from multidrop.fleet.setup import set_up  # noqa: E402
 from multidrop.fleet.share_records import ShareFollower, ShareRecords  # noqa: E402
 
-ME, OTHER, NOBODY = (owner_value(*who, 0) for who in (("a", 2), ("b", 1), ("", 0)))
+ME, OTHER, NOBODY = (owner_value(who, 1, 0) for who in (("a", 2), ("b", 1), ("", 0)))
 
 
 def is_mine(record: Record) -> bool:
@@ -35,7 +35,12 @@ class Trial:
     def __init__(self) -> None:
         self.bucket = MemoryBucket()
         made: Any = self.bucket
-        self.follower = ShareFollower(made, lambda *_: None, is_mine)
+        self.had: set[str] = set()
+        self.follower = ShareFollower(made, self.note, is_mine, self.had.__contains__)
+
+    def note(self, *_: object) -> None:
+        """Do what the records of a share do with each record."""
+        self.follower.look_anew()
 
     def looked(self) -> list[str]:
         """Look once, and return the lines that changed."""
@@ -61,7 +66,7 @@ def test_of_lines_that_are_free_or_ours_nothing_is_asked_again() -> None:
     assert not trial.asks()
 
 
-@pytest.mark.parametrize("value", [OTHER, owner_value("a", 1, 0)])
+@pytest.mark.parametrize("value", [OTHER, owner_value(("a", 1), 1, 0)])
 def test_a_line_of_another_session_is_asked_for_until_it_is_not(value: Any) -> None:
     trial = Trial()
     trial.bucket.store("line", value)
@@ -70,6 +75,17 @@ def test_a_line_of_another_session_is_asked_for_until_it_is_not(value: Any) -> N
     assert trial.asks()
     trial.bucket.store("line", NOBODY)
     assert trial.looked() == ["line"]
+    assert not trial.asks()
+
+
+def test_of_a_line_that_we_have_by_other_records_nothing_is_asked() -> None:
+    trial = Trial()
+    trial.bucket.store("line", OTHER)
+    trial.follower.want(["line"])
+    trial.looked()
+    assert trial.asks()
+    trial.had.add("line")
+    trial.follower.look_anew()
     assert not trial.asks()
 
 
@@ -118,43 +134,69 @@ def test_a_larger_share_is_asked_for_at_once() -> None:
     asyncio.run(main())
 
 
-def test_moves_into_a_share_are_told_with_the_master_before() -> None:
+FIRST, SECOND, _ = names.owner_buckets("line")
+
+
+def followed() -> ShareRecords:
     path: Any = None
-    records = ShareRecords("a", lambda: path, USUAL, lambda: None, is_mine)
-    bucket = MemoryBucket()
-    records.owners[names.owner_bucket("line")].bucket = bucket  # type: ignore[assignment]
-    bucket.store("line", OTHER)
-    records.want(["line"])
-    asyncio.run(records.owners[names.owner_bucket("line")].look())
-    assert [move.before for move in records.moves.newest(9)] == [None]
-    records.owners[names.owner_bucket("line")].take(Record("line", 9, ME))
-    assert [(move.before, move.after) for move in records.moves.newest(1)] == [("b", "a")]
+    return ShareRecords("a", lambda: path, USUAL, lambda: None, is_mine)
+
+
+def take(records: ShareRecords, revision: int, value: Any, *buckets: str) -> None:
+    for bucket in buckets:
+        records.owners[bucket].take(Record("line", revision, value))
+
+
+def moves_of(records: ShareRecords) -> list[tuple[str | None, str]]:
+    return [(move.before, move.after) for move in records.moves.newest(9)]
+
+
+def test_moves_are_told_with_the_master_before_once_two_records_say_so() -> None:
+    records = followed()
+    take(records, 1, owner_value(("b", 1), 1, 0, NEEDED), FIRST)
+    assert moves_of(records) == [("", "b")]
+    take(records, 2, owner_value(("a", 2), 2, 0), FIRST)
+    assert moves_of(records) == [("", "b")]
+    take(records, 3, owner_value(("a", 2), 2, 0), SECOND)
+    assert moves_of(records) == [("b", "a"), ("", "b")]
+
+
+def test_a_session_has_lines_of_which_one_record_names_it() -> None:
+    records = followed()
+    take(records, 1, OTHER, FIRST, SECOND)
+    take(records, 2, ME, FIRST)
+    assert records.owned_by("a", 2) == records.owned_by("b", 1) == {"line"}
+    take(records, 2, ME, SECOND)
     assert records.owned_by("a", 2) == {"line"}
     assert records.owned_by("b", 1) == set()
 
 
-@pytest.mark.parametrize("known", [None, OTHER])
-def test_who_did_not_follow_a_line_does_not_say_whose_it_was(known: Any) -> None:
+def test_who_did_not_follow_a_line_does_not_say_whose_it_was() -> None:
     """It was asked for in a cold start, or an hour ago, and was others' since then."""
-    path: Any = None
-    records = ShareRecords("a", lambda: path, USUAL, lambda: None, is_mine)
-    follower = records.owners[names.owner_bucket("line")]
-    follower.take(Record("line", 5 if known else 0, known))
-    follower.take(Record("line", 8, NOBODY))
-    follower.take(Record("line", 9, ME))
-    [move] = [move for move in records.moves.newest(9) if move.revision == 9]
-    assert (move.before, move.released) == (None, 8)
-    follower.take(Record("line", 10, NOBODY))  # we gave it away
-    assert [move.before for move in records.moves.newest(9) if move.revision == 10] == ["a"]
+    records = followed()
+    take(records, 8, owner_value(("b", 1), 8, 0), FIRST, SECOND)
+    assert moves_of(records) == [(None, "b")]
+    take(records, 11, owner_value(("a", 2), 11, 0), FIRST, SECOND)
+    assert moves_of(records)[0] == (None, "a")
+    take(records, 12, owner_value(("", 0), 12, 0), FIRST, SECOND)  # we gave it away
+    assert moves_of(records)[0] == ("a", "")
+
+
+def test_a_line_that_is_claimed_anew_by_its_master_has_not_moved() -> None:
+    """Nobody knew whether it was given away."""
+    records = followed()
+    take(records, 1, owner_value(("a", 2), 1, 0), FIRST, SECOND)
+    take(records, 2, owner_value(("a", 2), 2, 0), FIRST, SECOND)
+    assert moves_of(records) == [("", "a")]
+    take(records, 3, owner_value(("b", 1), 3, 0), FIRST, SECOND)
+    assert moves_of(records) == [("a", "b"), ("", "a")]
 
 
 def test_of_sessions_that_have_no_line_any_more_nothing_is_kept() -> None:
-    path: Any = None
-    records = ShareRecords("a", lambda: path, USUAL, lambda: None, is_mine)
-    follower = records.owners[names.owner_bucket("line")]
+    records = followed()
     for session in range(1, 1000):
-        follower.take(Record("line", session, owner_value("b", session, 0)))
-    follower.take(Record("line", 1000, owner_value("b", 999, 0)))
+        take(records, session, owner_value(("b", session), session, 0), FIRST, SECOND)
+    take(records, 1000, owner_value(("b", 999), 1000, 0), FIRST, SECOND)
     assert records.owned_by("b", 999) == {"line"}
     assert len(records._owned) == 1
 
@@ -195,9 +237,11 @@ def test_servers_give_the_newest_records_of_many_lines(one: Cluster) -> None:
         await set_up([path])
         bucket = Bucket("own_0", lambda: path)
         lines = [f"line-{at}" for at in range(1200)]
-        stored = await bucket.put_all([Record(line, 0, OTHER) for line in lines])
-        again = await bucket.put_all([record._replace(value=NOBODY) for record in stored[:10]])
-        follower = ShareFollower(bucket, lambda *_: None, is_mine)
+        stored, _ = await bucket.put_all([Record(line, 0, OTHER) for line in lines])
+        some = [record._replace(value=NOBODY) for record in stored[:10]]
+        again, refused = await bucket.put_all([*some, Record("line-20", 0, NOBODY)])
+        assert refused == {"line-20"}
+        follower = ShareFollower(bucket, lambda *_: follower.look_anew(), is_mine, lambda line: False)
         follower.want([*lines[:1100], "never had"])
         changed = await asyncio.wait_for(follower.look(), 60)
         newest = {record.key: record for record in (*stored[:1100], *again)}

@@ -15,8 +15,6 @@ from fleet_drills import GATEWAYS, FleetDrill
 from namespaces import Namespace, network
 from nats_clusters import cluster
 
-from multidrop.fleet import names
-
 NODES = 3
 
 
@@ -103,19 +101,6 @@ def drilled_in_network(folder: Path, lines: int = 12, seed: int = 1) -> Iterator
 
 class MachineDrill(FleetDrill):
     """Machines with a gateway and a node each."""
-
-    def settle(self) -> None:
-        """Wait, moreover, until no line's record dies with the line's master."""
-        super().settle()
-        self.wait(self.are_records_apart, "each gateway has lines whose records are led elsewhere")
-
-    def are_records_apart(self) -> bool:
-        found = self.status()
-        avoids = {name: one["says"] and one["says"]["avoids"] for name, one in found["gateways"].items()}
-        return all(avoids.values()) and not any(
-            names.owner_bucket(line) in avoids.get(one["master"], names.OWNERS)
-            for line, one in found["lines"].items()
-        )
 
     def kill_machine(self) -> None:
         name = self.random.choice(GATEWAYS)

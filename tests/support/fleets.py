@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from typing import Any
 
-from multidrop.fleet.buckets import Record
+from multidrop.fleet.buckets import Record, Written
 from multidrop.fleet.errors import Conflict, Unsure
 from multidrop.fleet.lease_rules import SECOND
 
@@ -48,14 +47,18 @@ class MemoryBucket:
             raise Unsure("no answer")
         return self.last
 
-    async def put_all(self, records: Sequence[Record]) -> list[Record]:
-        found = []
+    async def put_all(self, records: Sequence[Record]) -> Written:
+        written = Written([], set())
         for record in records:
-            with suppress(Conflict):
-                found.append(
-                    record._replace(revision=await self.put(record.key, record.value, record.revision))
-                )
-        return found
+            try:
+                revision = await self.put(record.key, record.value, record.revision)
+            except Conflict:
+                written.refused.add(record.key)
+            except Unsure:
+                continue
+            else:
+                written.stored.append(record._replace(revision=revision))
+        return written
 
     def store(self, key: str, value: Any) -> None:
         self.last += 1

@@ -115,14 +115,14 @@ class FleetRecords:
         line, former, owner = record.key, owner_of(before), owner_of(record)
         records = self._of.setdefault(line, dict.fromkeys(names.owner_buckets(line)))
         records[bucket] = record
-        if former == owner:
-            return
-        self._owned.setdefault(owner, set()).add(line)
-        if former in self._owned and former not in map(owner_of, records.values()):
-            self._owned[former].discard(line)
-            if not self._owned[former]:
-                del self._owned[former]  # sessions come and go for years
-        self._note_move(line)
+        if former != owner:
+            self._owned.setdefault(owner, set()).add(line)
+            if former in self._owned and former not in map(owner_of, records.values()):
+                self._owned[former].discard(line)
+                if not self._owned[former]:
+                    del self._owned[former]  # sessions come and go for years
+        if record.value:
+            self._note_move(line)
 
     def _note_move(self, line: str) -> None:
         """Note who has the line now, if that has changed, and who had it before, if no turn was missed."""

@@ -264,17 +264,17 @@ class Member:
                 self._claim_and_release()
             self.keeper.reconcile()
 
-    def _see(self, present: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    def _see(self, present: Mapping[str, Mapping[str, Any]]) -> set[str]:
         """Return the other gateways that take lines; since when they are the same is noted."""
-        others = [name for name, value in present.items() if not value["draining"] and name != self.name]
-        self._shares.see(others, self.lease.clock())
+        others = {name for name, value in present.items() if not value["draining"]} - {self.name}
+        self._shares.see(frozenset(others), self.lease.clock())
         return others
 
     async def _share_out(self, present: Mapping[str, Mapping[str, Any]]) -> None:
         """Make the shares anew where gateways or lines came or went."""
         sharing = self._see(present)
         if not self.is_draining and self.lease.session:
-            sharing.append(self.name)
+            sharing.add(self.name)
         sharers = Sharers(tuple(sorted(sharing)), self.records.lines())
         if await self._shares.make(sharers, self.lease.clock(), is_settled=self._is_settled):
             self._share = self._shares.of(self.name)

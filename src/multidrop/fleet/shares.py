@@ -24,14 +24,14 @@ class Shares:
     def __init__(self) -> None:
         self.wanted: dict[str, str] = {}  # each line's gateway
         self._made: Sharers | None = None
-        self._others: list[str] = []
+        self._others: frozenset[str] = frozenset()
         self._seen_at = 0
 
     def begin_anew(self) -> None:
         """Make them the next time, whatever was made: a session begins."""
         self._made = None
 
-    def see(self, others: list[str], now: int) -> None:
+    def see(self, others: frozenset[str], now: int) -> None:
         """Note the other gateways that are there."""
         if others != self._others:
             self._others, self._seen_at = others, now
