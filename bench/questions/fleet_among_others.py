@@ -46,7 +46,7 @@ def main() -> None:
     from nats_clusters import cluster
     from serial_hall import SerialHall
 
-    from multidrop.fleet.balance import Balance
+    from multidrop.fleet.balance import assign
     from multidrop.fleet.plant_store import read_plant
 
     tables.heading("Does a real gateway among a fleet's others keep the rate of its lines?")
@@ -54,7 +54,7 @@ def main() -> None:
     resource.setrlimit(resource.RLIMIT_NOFILE, (most_files, most_files))
     every = groups(arguments.gateways, 4)
     everywhere = nowhere(arguments.lines)
-    shares = Balance().assign(list(everywhere), [name for group in every for name in group])
+    shares = assign(list(everywhere), [name for group in every for name in group])
     own = [line for line, gateway in shares.items() if gateway == REAL]
 
     def run(words: Sequence[str]) -> Seen:

@@ -29,7 +29,7 @@ from multidrop.fleet.errors import Unsure  # noqa: E402
 from multidrop.fleet.servers import ServerPath, connect, paths_of  # noqa: E402
 from multidrop.fleet.setup import set_up  # noqa: E402
 
-OWNER = {"gateway": "gw-9", "session": 1, "since": 0}
+OWNER = {"gateway": "gw-9", "session": 1, "votes": 1, "turn": 1, "since": 0}
 SERVERS = (
     b"Nats-Stream: KV_own_0\r\nNats-Subject: $KV.own_0.a\r\nNats-Sequence: 7\r\nNats-Last-Sequence: 0\r\n\r\n"
 )
@@ -154,13 +154,14 @@ def test_each_of_many_records_is_replaced_at_its_own_revision_or_not(one: Cluste
         known = await bucket.put(b, OWNER, 0)
         value = {**OWNER, "session": 2}
         wanted = [Record(a, 0, value), Record(b, known + 5, value), Record(c, 0, value)]
-        stored = await bucket.put_all(wanted)
+        stored, refused = await bucket.put_all(wanted)
         assert [record.key for record in stored] == [a, c]
+        assert refused == {b}
         found = {record.key: record for record in await bucket.changes(0)}
         assert [found[a], found[c]] == stored
         assert found[b] == Record(b, known, OWNER)
         again = await bucket.put_all([record._replace(value=OWNER) for record in stored])
-        assert len(again) == 2
+        assert [record.key for record in again.stored] == [a, c]
 
     _with_path(one, work)
 

@@ -65,7 +65,7 @@ class Trial:
     async def claim(self) -> None:
         await self.read_and_begin()
         self.claim_now()
-        await until(lambda: "hall" in self.keeper.polled and not self.keeper._at_work)
+        await until(lambda: "hall" in self.keeper.polled and not self.keeper._tasks)
 
     async def is_polled(self) -> None:
         """Wait until the line is polled, while time passes."""

@@ -21,7 +21,7 @@ from multidrop.fleet.ownership import owner_value  # noqa: E402
 
 SPOOL = {"bytes": 1, "lost": 0, "behind": 0, "lag_s": 0.0, "trouble": None}
 STATE = {"state": "working", "lines": 1, "margin_s": 2.0, "troubles": {}, "trouble": "", "spool": SPOOL}
-MOVE = {"line": "line-1", "revision": 1, "at_ms": 7, "from": "gw-9", "to": "gw-1"}
+MOVE = {"line": "line-1", "turn": 5, "at_ms": 7, "from": "gw-9", "to": "gw-1"}
 
 
 class Answering:
@@ -61,7 +61,8 @@ def view(answers: dict[str, Any] | None = None) -> FleetView:
         line = f"line-{number}"
         plant.store(line, {"line": {"port": f"socket://h:{number}"}, "files": {}})
         if line in owned:
-            owners[names.owner_bucket(line)].store(line, owner_value(*owned[line], 1000 * number))
+            for bucket in names.owner_buckets(line)[:2]:
+                owners[bucket].store(line, owner_value(owned[line], 5, 1000 * number))
     made._is_checked = True
     return made
 

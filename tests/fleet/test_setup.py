@@ -60,16 +60,17 @@ def test_each_path_is_at_a_server_of_its_own_and_so_is_each_leader(fleet: Cluste
     asyncio.run(main())
 
 
-class OneDeaf:
-    """A path on which the leader of one bucket of lines' masters says this, or nothing."""
+class Deaf:
+    """A path on which the leaders of some buckets of lines' masters say this, or nothing."""
 
     server_name = "n1"
 
-    def __init__(self, said: bytes | None) -> None:
+    def __init__(self, said: bytes | None, *buckets: str) -> None:
         self.said = said
+        self.buckets = buckets
 
     async def request(self, subject: str, data: bytes) -> SimpleNamespace:
-        if not subject.endswith("own_1"):
+        if not subject.endswith(self.buckets):
             return SimpleNamespace(data=b'{"cluster":{"leader":"n1"}}')
         if self.said is None:
             raise Unsure("no answer")
@@ -80,9 +81,12 @@ class OneDeaf:
     ("said", "has"),
     [(b'{"cluster":{"leader":"n2"}}', True), (b"{}", True), (b'{"cluster":{}}', False), (None, False)],
 )
-def test_a_bucket_that_has_no_leader_takes_no_claims(said: bytes | None, has: bool) -> None:
-    path: Any = OneDeaf(said)
-    assert asyncio.run(have_leaders(path)) is has
+def test_lines_can_be_claimed_while_two_of_three_buckets_have_a_leader(said: bytes | None, has: bool) -> None:
+    for bucket in names.OWNERS:
+        one: Any = Deaf(said, bucket)
+        assert asyncio.run(have_leaders(one))
+        two: Any = Deaf(said, *(other for other in names.OWNERS if other != bucket))
+        assert asyncio.run(have_leaders(two)) is has
 
 
 def test_no_server_is_one_sentence() -> None:

@@ -15,7 +15,7 @@ require_module("nats")
 from multidrop.fleet import names, samples_stream, setup  # noqa: E402
 from multidrop.fleet.buckets import Bucket, Record, ask  # noqa: E402
 from multidrop.fleet.errors import FleetError, Unsure  # noqa: E402
-from multidrop.fleet.leaders import bring_leaders_home, has_leader, owners_led_by  # noqa: E402
+from multidrop.fleet.leaders import bring_leaders_home, cluster_at, has_leader  # noqa: E402
 from multidrop.fleet.lease_terms import LeaseTerms  # noqa: E402
 from multidrop.fleet.samples_stream import StreamError  # noqa: E402
 from multidrop.fleet.setup import check_buckets  # noqa: E402
@@ -92,7 +92,7 @@ def test_a_record_whose_storing_is_not_told_may_be_stored_or_not(name: str) -> N
     bucket = bucket_of({**STRANGE, **PARTS}[name])
     with pytest.raises(Unsure, match="what NATS answers "):
         asyncio.run(bucket.put("a", {}, 1))
-    assert asyncio.run(bucket.put_all([Record("a", 1, {})])) == []
+    assert asyncio.run(bucket.put_all([Record("a", 1, {})])) == ([], set())
 
 
 @pytest.mark.parametrize("name", [*STRANGE, *PARTS])
@@ -127,7 +127,7 @@ def test_a_bucket_s_servers_that_are_none_are_one_sentence_and_nothing_is_moved(
     monkeypatch.setattr(setup, "WAIT_S", 0.0)  # for the end of an election
     path: Any = Liar(CLUSTERS[name])
     with pytest.raises(Unsure, match="what NATS answers of a bucket's servers is none of JetStream's: "):
-        asyncio.run(owners_led_by({"n1"}, path))
+        asyncio.run(cluster_at(path, names.OWNERS[0]))
     with pytest.raises(FleetError, match="what NATS answers of a bucket's servers is none of JetStream's: "):
         asyncio.run(check_buckets(path))
     assert not asyncio.run(has_leader(path, names.OWNERS[0]))

@@ -46,7 +46,7 @@ LEASE = {
     },
     **{"ended": False, "draining": False},
 }
-OWNER = {"gateway": "gw-9", "session": 1, "since": 0}
+OWNER = {"gateway": "gw-9", "session": 1, "votes": 1, "turn": 1, "since": 0}
 LINE = {"line": {"name": "line-1"}, "files": {}}
 PATIENCE_S = 120.0
 
