@@ -60,6 +60,10 @@ STRANGE: dict[str, tuple[str, str, bytes, str]] = {
         *("own_1", "line-1", json.dumps({**OWNER, "session": "1"}).encode()),
         "its 'session' is not a whole number",
     ),
+    "three votes": (
+        *("own_1", "line-1", json.dumps({**OWNER, "votes": 3}).encode()),
+        "it has neither one vote nor two",
+    ),
     "true for a number": (
         *("lease_1", "gw-1", json.dumps({**LEASE, "session": True}).encode()),
         "its 'session' is not a whole number",

@@ -71,4 +71,11 @@ def _mistake_of_line(key: str, value: Any) -> str:
     return "" if set(map(type, value["files"].values())) <= {str} else "one of its files is no text"
 
 
-_CHECKS: Mapping[str, Callable[[str, Any], str]] = {names.PLANT: _mistake_of_line}
+def _mistake_of_owner(key: str, value: Any) -> str:
+    return "" if value["votes"] in (1, 2) else "it has neither one vote nor two"
+
+
+_CHECKS: Mapping[str, Callable[[str, Any], str]] = {
+    **dict.fromkeys(names.OWNERS, _mistake_of_owner),
+    names.PLANT: _mistake_of_line,
+}
