@@ -24,7 +24,7 @@ WAIT_S = 60.0  # for a silent server; one that is silent for longer is not waite
 class Releases:
     """The lines that should be others', and how the servers of all buckets were a moment ago.
 
-    `on_change` is called when they may be let go, or may no more.
+    `on_change` is called when more or fewer of them may be let go.
     """
 
     def __init__(
@@ -39,15 +39,18 @@ class Releases:
         self._has_lines = False
         self._led: dict[str, float | None] = {}  # buckets with a leader; since when a server of it is silent
 
-    def due(self, lines: Set[str], wait_s: float = WAIT_S) -> Set[str]:
-        """Return these lines where they may be let go now, else none: they are waited for.
+    def due(self, lines: Set[str], wait_s: float = WAIT_S) -> set[str]:
+        """Return those of these lines that may be let go now; the others are waited for.
 
-        `wait_s` says for how long a silent server holds them up.
+        Two records must be free to be written then, and the first one: it may have two votes. `wait_s` says
+        for how long a silent server holds lines up.
         """
         self._has_lines = bool(lines)
         waited_since = self._clock() - wait_s
-        ready = sum(since is None or since <= waited_since for since in self._led.values())
-        return lines if ready >= NEEDED else set()
+        ready = {bucket for bucket, since in self._led.items() if since is None or since <= waited_since}
+        if len(ready) < NEEDED:
+            return set()
+        return {line for line in lines if names.owner_buckets(line)[0] in ready}
 
     async def watch(self) -> None:
         """Look at the buckets while lines are to be released, for ever."""
