@@ -39,7 +39,7 @@ class Record(NamedTuple):
 
 
 class Written(NamedTuple):
-    """The records that were replaced, at their new revisions, and the keys of those that were refused.
+    """The records that were replaced, at their new revisions, and the keys of those that had another one.
 
     Any other may have been replaced or not: read it.
     """
@@ -147,10 +147,11 @@ class Bucket:
         written = Written([], set())
         for record, answer in zip(records, answers, strict=True):
             with suppress(Unsure):
-                if answer and (said := _table(answer)).get("error"):
-                    written.refused.add(record.key)
-                elif answer:
+                said = _table(answer or b"")
+                if not said.get("error"):
                     written.stored.append(record._replace(revision=_revision(said)))
+                elif said["error"].get("err_code") in _WRONG_REVISION:
+                    written.refused.add(record.key)
         return written
 
     def _put(self, record: Record) -> Request:

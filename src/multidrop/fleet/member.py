@@ -181,11 +181,7 @@ class Member:
     async def _live(self) -> None:
         while True:
             if not self.lease.session:
-                while (
-                    not self.records.is_complete
-                ):  # of a large plant it takes seconds, in which no lease runs
-                    self._see(self.records.observer.sessions())
-                    await asyncio.sleep(STEP_S)
+                await self._read_all()
                 await self.lease.begin()
                 self._settled_at = self.lease.clock() + int(SETTLE_S * SECOND)
                 self._shares.begin_anew()
@@ -201,6 +197,12 @@ class Member:
             await asyncio.sleep(LEAST_STEP_S)
             with suppress(TimeoutError):
                 await asyncio.wait_for(self._woken.wait(), STEP_S - LEAST_STEP_S)
+
+    async def _read_all(self) -> None:
+        """Wait until all was read: a large plant takes seconds, in which no lease could be renewed."""
+        while not self.records.is_complete:
+            self._see(self.records.observer.sessions())
+            await asyncio.sleep(STEP_S)
 
     async def _guard(self) -> None:
         """Close the lines before the lease has run out; only then is the kernel's timer called off."""

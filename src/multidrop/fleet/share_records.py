@@ -34,16 +34,14 @@ class ShareFollower(Follower):
         self._is_mine = is_mine
         self._has = has
         self._share: frozenset[str] = frozenset()
-        self._changing: frozenset[str] | None = (
-            frozenset()
-        )  # lines of it that may change; None: look for them
+        self._asked: frozenset[str] | None = frozenset()  # lines of it that may change; None: not known
         self._doubted: dict[str, float] = {}  # lines whose writing failed or was not answered, since when
         self._is_urgent = asyncio.Event()
 
     def want(self, lines: Iterable[str]) -> None:
         """Follow these lines from now on."""
         self._share = frozenset(lines)
-        self._changing = None
+        self._asked = None
         self._is_urgent.set()
 
     def doubt(self, lines: Iterable[str]) -> None:
@@ -53,7 +51,7 @@ class ShareFollower(Follower):
 
     def look_anew(self) -> None:
         """Find anew which lines may change: a record of one of them has, in this bucket or another."""
-        self._changing = None
+        self._asked = None
 
     async def look(self) -> list[Record]:
         """Ask for what is not known of the share, or may change, and return what did."""
@@ -70,9 +68,9 @@ class ShareFollower(Follower):
     def _to_ask(self) -> list[str]:
         oldest = time.monotonic() - DOUBT_S
         self._doubted = {line: since for line, since in self._doubted.items() if since > oldest}
-        if self._changing is None:
-            self._changing = frozenset(line for line in self._share if self._may_change(line))
-        return sorted(self._doubted.keys() | self._changing)
+        if self._asked is None:
+            self._asked = frozenset(line for line in self._share if self._may_change(line))
+        return sorted(self._doubted.keys() | self._asked)
 
     def _may_change(self, line: str) -> bool:
         """Say whether a record is unknown, or another gateway's. Claiming a free one tells what it is."""
