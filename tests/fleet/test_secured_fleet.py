@@ -263,23 +263,6 @@ def test_a_context_for_tls_believes_this_authority_alone(servers: SecuredCluster
     assert len(context.get_ca_certs()) == 1
 
 
-@pytest.mark.long
-def test_a_connection_that_a_server_ends_is_on_no_machine(servers: SecuredCluster) -> None:
-    """Python 3.11 has no addresses of a TLS connection that was closed twice: a gateway ended with that."""
-
-    async def main() -> None:
-        path = paths_of(servers.urls, servers.options("viewer"))[0]
-        await path.open()
-        assert path.is_local
-        writer = path._connected()._transport._io_writer
-        for _ in range(2):
-            writer.close()
-        assert not path.is_local
-        await path.close()
-
-    asyncio.run(asyncio.wait_for(main(), PATIENCE_S))
-
-
 # ---- a whole fleet ----
 
 
