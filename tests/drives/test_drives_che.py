@@ -32,6 +32,7 @@ from multidrop.drives.invt_che import (
     parameter,
     stored_parameter,
 )
+from multidrop.errors import BadReply, BusError, NoReply
 
 FORWARD = "01 06 10 00 00 01 4C CA"
 STOP = "01 06 10 00 00 05 4D 09"
@@ -185,6 +186,34 @@ def test_a_jog_is_stopped_also_where_the_stop_is_refused() -> None:
     wire = Wire(InvtCHE(1), {"status": CHEStatus.FORWARD}, {STOP: [refusal] * 3}, turns)
     wire.drive.stop()
     assert wire.sent == [STOP] * 3 + [STOP_JOG]
+
+
+def test_a_jog_is_stopped_also_where_nobody_confirms_the_stop() -> None:
+    """The drive may hear, though it is not heard: the stop that it did hear may not end a jog."""
+    lost = Unconfirmed("drive", "control = STOP", "no reply")
+    wire = Wire(InvtCHE(1), {"status": CHEStatus.FORWARD}, {STOP: [lost] * 3})
+    with pytest.raises(Unconfirmed, match="control = STOP"):
+        wire.drive.stop()
+    assert wire.sent == [STOP] * 3 + [STOP_JOG]
+
+
+@pytest.mark.parametrize(
+    "unseen",
+    [NoReply("drive"), BadReply("drive", "checksum", b""), DriveRefused("drive", 6, "busy")],
+    ids=lambda unseen: type(unseen).__name__,
+)
+def test_a_jog_is_stopped_also_where_nobody_says_whether_the_motor_turns(unseen: BusError) -> None:
+    wire = Wire(InvtCHE(1), {"status": unseen})
+    with pytest.raises(type(unseen)):
+        wire.drive.stop()
+    assert wire.sent == [STOP, STOP_JOG]
+
+
+def test_no_jog_is_stopped_where_another_drive_is_there() -> None:
+    wire = Wire(InvtCHE(1), {"status": CHEStatus.FORWARD}, {STOP: [Refused("another family is there")]})
+    with pytest.raises(Refused, match="another family"):
+        wire.drive.stop()
+    assert wire.sent == [STOP]
 
 
 def test_a_run_whose_drive_has_no_jog_to_stop_is_watched() -> None:

@@ -13,10 +13,11 @@ from simulated_bus import SimulatedBus, is_write, one
 from tables import table
 
 from multidrop.control.ramp import ramp
-from multidrop.core import Message
+from multidrop.core import Framing, Message, build_reply
 from multidrop.drive import Condition, Direction, Drive
 from multidrop.drives import YD1000, InnovertIBD, InvtCHE
 from multidrop.errors import DriveRefused, NoReply, NotDone, Refused, Unconfirmed
+from multidrop.profiles.invt import InvtControl
 from multidrop.sim import simulated
 
 FAULT = 4
@@ -99,7 +100,9 @@ def test_a_stop_whose_replies_are_lost(line: Line, lost: int, how: str) -> None:
     line.drive.stop()
     stops = line.writes[begun:]
     assert len(stops) > lost
-    assert all(stop == stops[0] for stop in stops[: lost + 1])
+    of_a_jog = {InvtControl.STOP_JOG} if line.drive.control.values is InvtControl else set()
+    assert stops[0].data[-1] not in of_a_jog
+    assert all(stop == stops[0] or stop.data[-1] in of_a_jog for stop in stops[: lost + 1])
     assert not any(line.starts_it(stop) for stop in stops)
     assert not line.sim.motor.energised
 
@@ -351,6 +354,47 @@ def test_a_jog_that_goes_on_through_a_stop_is_stopped_on_its_own(monkeypatch: py
     line.drive.set_frequency(20)
     line.drive.start()
     assert len(line.starts) == 2
+
+
+@pytest.mark.parametrize("is_refused", [False, True], ids=["not heard", "refused"])
+def test_a_jog_is_stopped_on_its_own_where_the_stop_is_not_confirmed(
+    monkeypatch: pytest.MonkeyPatch, is_refused: bool
+) -> None:
+    """Replies are lost, as where one wire is broken; or it has no word for a stop in a jog."""
+    line = Line(monkeypatch, "invt-goodrive")
+    line.sim.jog_needs_own_stop = True
+    line.drive.jog()
+    assert line.sim.motor.goal
+
+    def refuse(request: Message) -> bytes | None:
+        if not is_write(request) or request.data[-1] != InvtControl.STOP or not line.sim.motor.goal:
+            return None
+        return build_reply(Framing.RTU, Message(1, request.function, request.start, exception=4))
+
+    if is_refused:
+        line.bus.answers = refuse
+        line.drive.stop()
+    else:
+        line.bus.loses = lambda request: True
+        with pytest.raises(Unconfirmed):
+            line.drive.stop(seconds=20)
+    line.sim.pass_time(line.bus.seconds + 5)
+    assert not line.sim.motor.energised
+
+
+def test_no_stop_of_a_jog_is_sent_where_another_drive_is_there(monkeypatch: pytest.MonkeyPatch) -> None:
+    line = Line(monkeypatch, "invt-goodrive")
+    checked: list[Drive] = []
+
+    def withhold(drive: Drive) -> None:
+        checked.append(drive)
+        raise Refused("another family is there")
+
+    monkeypatch.setattr(line.bus.bus._writer.identity_check, "check_before_stop", withhold)
+    with pytest.raises(Refused, match="another family"):
+        line.drive.stop()
+    assert checked == [line.drive]
+    assert line.writes == []
 
 
 def test_a_cia402_drive_without_mains_is_not_started(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from enum import IntEnum
 from typing import Any, Unpack
 
-from multidrop.drive import Advice, Drive, DriveRefused, NotDone, Refused
+from multidrop.drive import Advice, BusError, Drive, DriveRefused, NotDone, Refused
 from multidrop.drive.declare import Details, command, declaration, reading, setting
 from multidrop.drive.number_format import NumberFormat
 from multidrop.drive.options import Option
@@ -138,9 +139,9 @@ class InvtCHE(Drive):
     - Newer INVT families have the control word at 2000H: see `identify`.
     - GD200L and GD300L print the DC bus voltage with and without a decimal: its scale is left open.
     - The example that writes 5000 to 0008H does not say what that is, and is not to be repeated.
-    - STOP may not end a jog: where the motor still turns after it, STOP_JOG follows at once. Nor may a
-      start: one that was jogged is to be stopped before a start. Whether a run ends in a jog is not
-      stated either: `jog` is refused while the motor turns.
+    - STOP may not end a jog: where the motor still turns after it, or nobody says that it stands, STOP_JOG
+      follows at once. Nor may a start: one that was jogged is to be stopped before a start. Whether a run
+      ends in a jog is not stated either: `jog` is refused while the motor turns.
     - A state word other than 1 to 4 is not explained: `start` and `jog` are refused then.
     - Exception 03 is a malformed frame; a value out of range is 12H.
 
@@ -285,16 +286,28 @@ class InvtCHE(Drive):
     def stop(self) -> Script[None]:
         """Stop along the ramp, and a jog too where the motor turns after it: that it jogs cannot be read."""
         refusals: list[DriveRefused] = []
-        for word in (CHEControl.STOP, CHEControl.STOP_JOG):
-            try:
-                yield from insist(self.control, word)
-            except DriveRefused as refusal:  # as it may in a fault, or where there is no jog to stop
-                refusals.append(refusal)
-            if (yield from self._stands()):
+        try:
+            if (yield from self._stands_by(CHEControl.STOP, refusals)):
                 return
+        except Refused:  # another drive is there
+            raise
+        except BusError:  # one that is not heard may hear, and jog
+            with suppress(BusError):
+                yield from insist(self.control, CHEControl.STOP_JOG, attempts=1)
+            raise
+        if (yield from self._stands_by(CHEControl.STOP_JOG, refusals)):
+            return
         if len(refusals) > 1:
             raise refusals[0]
         yield from self._stopped(self._stands, self.option.get("stop_time", STOP_TIME))
+
+    def _stands_by(self, word: CHEControl, refusals: list[DriveRefused]) -> Script[bool]:
+        """Write a stop, and return True where the motor stands then; note its refusal."""
+        try:
+            yield from insist(self.control, word)
+        except DriveRefused as refusal:  # as it may in a fault, or where there is no jog to stop
+            refusals.append(refusal)
+        return (yield from self._stands())
 
     @verb
     def coast(self) -> Script[None]:

@@ -7,7 +7,7 @@ from contextlib import suppress
 from enum import IntEnum
 from typing import ClassVar
 
-from multidrop.drive import DriveRefused
+from multidrop.drive import BusError, DriveRefused, Refused
 from multidrop.drive.register import Access
 from multidrop.drive.script import Script, insist, write
 from multidrop.drive.state import Condition, Direction
@@ -50,8 +50,9 @@ class Invt(Profile):
 
     - Other makes have copied the words with 5 and 6 the other way round (both stop), and some with 5 for
       reverse: compare the manual's list with `InvtControl`, word by word, before a family is declared.
-    - A stop may not end a jog, nor may a start: where the motor still turns after it, STOP_JOG follows at
-      once; one that was jogged is to be stopped before a start.
+    - A stop may not end a jog, nor may a start: where the motor still turns after it, or the stop is refused,
+      or nobody says that it stands, STOP_JOG follows at once; one that was jogged is to be stopped before a
+      start.
     """
 
     stop_word: ClassVar[int] = InvtControl.STOP
@@ -110,11 +111,20 @@ class Invt(Profile):
         yield from write(self.control, self._word(word))
         yield from self._started()
 
-    def _watch_stop(self) -> Script[None]:
-        if self._turns((yield from self._status())):
+    def _stop_by(self, word: int) -> Script[None]:
+        try:
+            yield from self._send_stop(word)
+            may_jog = self._turns((yield from self._status()))
+        except Refused:  # another drive is there
+            raise
+        except BusError:  # one that is not heard may hear, and jog
+            with suppress(BusError):
+                yield from insist(self.control, self._word(InvtControl.STOP_JOG), attempts=1)
+            raise
+        if may_jog:
             with suppress(DriveRefused):  # there may be no jog to stop
                 yield from insist(self.control, self._word(InvtControl.STOP_JOG))
-        yield from super()._watch_stop()
+        yield from self._watch_stop()
 
     def _take_reset_back(self) -> Script[None]:
         """Do nothing: a word is carried out when it comes, and is not held."""

@@ -221,12 +221,15 @@ class Profile(Drive):
         yield from self._stop_by(self.coast_word)
 
     def _stop_by(self, word: int) -> Script[None]:
+        yield from self._send_stop(word)
+        yield from self._watch_stop()
+
+    def _send_stop(self, word: int) -> Script[None]:
         try:
             yield from insist(self.control, self._word(word))
         except DriveRefused:  # as some do in a fault, in which they stand already
             if not (yield from self._stands()):
                 raise
-        yield from self._watch_stop()
 
     def _watch_stop(self) -> Script[None]:
         yield from self._stopped(self._stands, self._stop_limit())
