@@ -9,7 +9,7 @@ from typing import Any
 
 from multidrop.control.outcome import Seen, Stopped
 from multidrop.drive.family import Drive
-from multidrop.drive.script import Pulse, Script, Step, Wait, Write
+from multidrop.drive.script import Pulse, Read, Script, Step, Wait, Write
 from multidrop.errors import (
     BadReply,
     BusError,
@@ -109,17 +109,15 @@ class StopAttempt:
         script = self._script
         if isinstance(step, Pulse) and (step.register.name, step.value) in self._pulses:
             reason = "it is a pulse, and was sent once already"
-            again = Unconfirmed(self.drive.name, step.register.name, reason)
-            self._resume = lambda: script.throw(again)
+            self._raise_in_script(Unconfirmed(self.drive.name, step.register.name, reason))
             return
         try:
             result = do(self, step)
         except CheckAgain:
             self._resume = lambda: step
         except (BusError, ValueError) as failure:
-            error = failure  # outlives the except clause
-            self._note(step, error)
-            self._resume = lambda: script.throw(error)
+            self._note(step, failure)
+            self._raise_in_script(failure)
         except (KeyboardInterrupt, SystemExit, *NO_ROOM):
             self._times_in_doubt += isinstance(step, Write)
             raise
@@ -157,14 +155,26 @@ class StopAttempt:
             log_aside(_log, logging.CRITICAL, "%s", failure.of_a_stop())
 
     def once_more(self, do: Do) -> None:
-        """Send the stop again without looking at anything: its caller was interrupted."""
+        """Send the stop again, and wait for nothing: its caller was interrupted.
+
+        What is looked at before it is sent is read; a look after it fails, as one that nobody answers.
+        """
         self._begin()
+        is_written = False
         with suppress(Exception):  # its end, too
             for _ in range(MOST_STEPS):
                 step = self._resume()
-                if not isinstance(step, Write):
+                if isinstance(step, Wait):
                     return
-                self._carry_out(step, do)
+                if isinstance(step, Read) and is_written:
+                    self._raise_in_script(NoReply(self.drive.name))
+                else:
+                    is_written |= isinstance(step, Write)
+                    self._carry_out(step, do)
+
+    def _raise_in_script(self, failure: Exception) -> None:
+        script = self._script
+        self._resume = lambda: script.throw(failure)
 
     @property
     def known(self) -> Exception | None:
