@@ -7,9 +7,10 @@ import threading
 from decimal import Decimal
 from errno import EMFILE
 from fractions import Fraction
+from itertools import count
 from linecache import getline
 from pathlib import Path
-from types import FrameType, SimpleNamespace
+from types import CodeType, FrameType, SimpleNamespace
 from typing import Any
 
 import pytest
@@ -21,6 +22,7 @@ from multidrop.control import eeprom_ledger, ramp, stop_all
 from multidrop.control.eeprom_ledger import Ledger
 from multidrop.control.outcome import Seen
 from multidrop.control.ramp import start_staggered
+from multidrop.control.stop_all import Stopper
 from multidrop.core import Completion, Exchange
 from multidrop.drives import InvtCHE
 from multidrop.errors import Refused, Unconfirmed
@@ -71,6 +73,40 @@ def test_wherever_a_stop_of_all_is_interrupted_each_is_sent_once_more_and_told_o
             sim.pass_time(line.seconds + 60)
             assert not sim.motor.energised, nth
         assert not line.bus.stops_under_way()
+
+
+def first_line(code: CodeType, text: str) -> int:
+    """Return the number of the first line of this code that begins so."""
+    numbers = (number for _, _, number in code.co_lines() if number is not None)
+    return min(number for number in numbers if getline(code.co_filename, number).strip().startswith(text))
+
+
+@pytest.mark.parametrize("all_of_them", [False, True])
+def test_a_stop_that_is_interrupted_as_it_begins_is_sent(
+    monkeypatch: pytest.MonkeyPatch, all_of_them: bool
+) -> None:
+    """Also between its making and its beginning."""
+    making, beginning = Stopper._carry_out.__code__, Stopper._carry_out_known.__code__
+    since = first_line(making, "with self._under_way")
+
+    def counts(frame: FrameType) -> bool:
+        is_before = making.co_firstlineno < frame.f_lineno < since
+        return frame.f_code is beginning or (frame.f_code is making and not is_before)
+
+    for nth in count(1):
+        line, drives, sims = running(monkeypatch, 2 if all_of_them else 1)
+        begun_before = [drive.begin_call("start") for drive in drives]
+        try:
+            with interrupted_at(nth, counts):
+                line.bus.stop_all() if all_of_them else drives[0].stop()
+        except KeyboardInterrupt:
+            for sim in sims:
+                sim.pass_time(line.seconds + 60)
+            assert not any(sim.motor.energised for sim in sims), nth
+            assert not any(call.permit.is_good for call in begun_before), nth
+        else:
+            break
+    assert nth > 8
 
 
 def fails_to_start_the_last(line: SimulatedBus, drives: list[Any], sims: list[Any]) -> None:

@@ -103,19 +103,22 @@ class Stopper:
         too late for nobody: each is sent once.
         """
         stops: list[StopAttempt] = []
+        under_way: list[StopAttempt] = []
         for left in reversed(range(BEGINNINGS)):
             try:
                 with self._under_way(drives):
-                    stops = attempts()
-                    self._carry_out_known(stops, [*stops], broadcast, end)
+                    under_way = attempts()
+                    stops = [*under_way]
+                    self._carry_out_known(stops, under_way, broadcast, end)
                 break
             except NO_ROOM:
                 if stops or not left:
                     raise
                 clock.sleep(PAUSE_S)
             except (KeyboardInterrupt, SystemExit) as interruption:
-                if not stops:
-                    send_once_more(attempts(), self._do, interruption)
+                if under_way or not stops:  # none has begun
+                    with self._under_way(drives):
+                        send_once_more(attempts(), self._do, interruption)
                 raise
         return stops
 
@@ -126,7 +129,7 @@ class Stopper:
         broadcast: Callable[[], bool],
         end: Callable[[StopAttempt], object],
     ) -> None:
-        """Carry these out, all of which are `under_way`.
+        """Carry these out, all of which are `under_way`, and take each from there.
 
         At an interruption each stop that is not over is sent once more, unless a second one comes.
         """
@@ -137,7 +140,9 @@ class Stopper:
                     stop.note_broadcast()
             stop_together(under_way, self._do, partial(self._over, end))
         except BaseException as interruption:
-            send_once_more(under_way, self._do, interruption)
+            not_over = [*under_way]
+            under_way.clear()
+            send_once_more(not_over, self._do, interruption)
             raise
         finally:
             self._stops.difference_update(stops)
