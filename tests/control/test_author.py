@@ -153,6 +153,7 @@ def test_under_a_name_that_would_spoil_the_log_a_stop_alone_is_sent(
             drive.start,
             lambda: bus.raw(drive, 6, 0x1000, b"\0\5"),
             lambda: bus.write(drive, drive.setpoint, 20.0),
+            lambda: bus.broadcast(drive.setpoint, 0.0),
             lambda: start_staggered([drive], gap=1.0),
         ):
             before = len(audited.noted())

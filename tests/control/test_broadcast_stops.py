@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from contextlib import suppress
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -11,9 +12,10 @@ from motors import MAKE, STARTS
 from simulated_bus import SimulatedBus, is_write
 
 from multidrop.control.outcome import Seen
-from multidrop.core import Message
+from multidrop.control.time_limit import written_before
+from multidrop.core import Completion, Exchange, Message
 from multidrop.drives import MODELS, InvtCHE
-from multidrop.errors import BusError, PortLost, Refused
+from multidrop.errors import BusError, Expired, Overtaken, PortLost, Refused
 from multidrop.sim import simulated
 
 BROADCASTING = [model for model, family in MODELS.items() if family.broadcasts]
@@ -103,6 +105,85 @@ def test_nothing_that_was_called_before_it_starts_a_motor_after_it(
     after = [at for at, request in enumerate(asked) if request.address == 0]
     for request in asked[after[0] if after else len(asked) :]:
         assert request.address == 0 or not (is_write(request) and STARTS[model](request))
+
+
+SETTING = [model for model in BROADCASTING if model.startswith(("inn", "invt", "yd"))]
+
+
+def setpoint_of(drive: Any) -> Any:
+    return drive.register(drive.setpoint_name)
+
+
+@pytest.mark.parametrize("model", SETTING)
+def test_a_setpoint_is_broadcast_to_nobody_once_the_bus_was_left(
+    monkeypatch: pytest.MonkeyPatch, model: str
+) -> None:
+    line, drives, _ = line_of(monkeypatch, model, model)
+    assert 0 in setpoint_of(drives[0]).broadcast
+    line.bus.leave()
+    with pytest.raises(Overtaken, match="the bus was left"):
+        line.bus.broadcast(setpoint_of(drives[0]), 0.0)
+    line.bus.broadcast(drives[0].control, stop_of(drives[0]))  # unlike a stop
+    (sent,) = broadcasts(line)
+    assert sent.start == drives[0].control.address
+
+
+@pytest.mark.parametrize("moment", ["before it is sent", "while it waits for its turn"])
+def test_a_setpoint_that_was_called_before_a_stop_is_not_broadcast_after_it(
+    monkeypatch: pytest.MonkeyPatch, moment: str
+) -> None:
+    line, drives, _ = line_of(monkeypatch, "invt-che", "invt-che")
+    line.sleep(60)  # who is there is asked again
+    carry_out, begun = line.carry_out, len(line.frames)
+
+    def stop_meanwhile(exchange: Exchange, **details: Any) -> Completion:
+        waits = exchange.request.address == 0
+        if waits if moment == "while it waits for its turn" else len(line.frames) == begun + 1:
+            line.bus._latches.rise([drives[0]])
+        return carry_out(exchange, **details)
+
+    monkeypatch.setattr(line, "carry_out", stop_meanwhile)
+    with pytest.raises(Overtaken, match=r"setpoint = 0\.00 %.*a stop was called"):
+        line.bus.broadcast(drives[0].setpoint, 0.0)
+    assert [request.address for request, _ in line.frames[begun:]] == [1, 2]
+    assert line.written == []
+
+
+def test_a_setpoint_that_is_late_is_not_broadcast(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Nor is it noted as one that may have been sent."""
+    audit = tmp_path / "audit"
+    sims = [simulated(InvtCHE(address, maximum_frequency=50)) for address in (1, 2)]
+    line = SimulatedBus(monkeypatch, *sims, audit=audit)
+    drives = [line.attach(sim.drive) for sim in sims]
+    with written_before(lambda: 0.0), pytest.raises(Expired):
+        line.bus.broadcast(drives[0].setpoint, 0.0)
+    line.queue_time = 2.0
+    with pytest.raises(Expired):
+        line.bus.broadcast(drives[0].setpoint, 0.0)
+    line.bus.close()
+    assert line.written == []
+    assert audit.read_text(encoding="utf-8") == ""
+
+
+def test_looks_at_many_drives_make_no_setpoint_late(monkeypatch: pytest.MonkeyPatch) -> None:
+    """They take longer than the time in which a write's turn must come."""
+    line, drives, _ = line_of(monkeypatch, *["invt-che"] * 20)
+    line.sleep(60)
+    line.queue_time = 0.1
+    line.bus.broadcast(drives[0].setpoint, 0.0)
+    assert len(broadcasts(line)) == 1
+
+
+def test_a_setpoint_is_broadcast_to_nobody_where_another_drive_may_be_there_by_now(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The last one's place was taken while nobody asked it; what is at the others was asked just now."""
+    line, drives, sims = line_of(monkeypatch, "invt-che", "invt-che")
+    line.sleep(60)
+    sims[1]["device"] = 0x010A
+    with pytest.raises(Refused, match="010AH"):
+        line.bus.broadcast(drives[0].setpoint, 0.0)
+    assert line.written == []
 
 
 def test_a_broadcast_is_told_as_sent(monkeypatch: pytest.MonkeyPatch) -> None:

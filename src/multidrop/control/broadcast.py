@@ -11,6 +11,7 @@ from contextlib import suppress
 from typing import Any, cast
 
 from multidrop.control.author import check_author
+from multidrop.control.call import Call
 from multidrop.control.latches import Latches
 from multidrop.control.performer import Performer
 from multidrop.control.rules import check_broadcast, is_harmless, is_stop, raw_count
@@ -55,20 +56,31 @@ class Broadcaster:
             raise Refused(f"{first.title} has no harmless broadcast of {register.name} = {value}")
         for drive in drives:
             check_broadcast(drive, register, raw)
-        for drive in drives:
-            self._performer.check_identity(drive)
         if is_harmless(register, raw):
+            for drive in drives:
+                self._performer.check_identity(drive)
             self._latches.rise(drives)
+            call = None
         else:
-            check_author()
+            call = self._checked_call(drives, f"{register.name} = {register.format(register.decode(raw))}")
         if register.name == first.setpoint_name:
             for drive in drives:
                 drive.commanded = None
         try:
-            self._writer.broadcast(first, register, raw)
+            self._writer.broadcast(first, register, raw, call)
         finally:
             self._writer.records.catch_up()
         return {drive.name: self._state(drive) for drive in drives}
+
+    def _checked_call(self, drives: Sequence[Drive], what: str) -> Call:
+        """Check each drive as before a write to it alone; return the first one's call, made now."""
+        check_author()
+        calls = [self._performer.call(drive) for drive in drives]
+        for call in calls:
+            self._writer.identity_check.check(call.drive, call.look)
+        for call in calls:
+            call.check(what)
+        return calls[0].anew()
 
     def _state(self, drive: Drive) -> State | BusError:
         try:

@@ -128,12 +128,17 @@ class Writer:
         log(drive, request, what, Effect.DONE)
         return reply.data
 
-    def broadcast(self, drive: Drive, register: Register[Any], raw: float) -> None:
-        """Write to all drives at once, by the table of one of them."""
+    def broadcast(self, drive: Drive, register: Register[Any], raw: float, call: Call | None = None) -> None:
+        """Write to all drives at once, by the table of one of them; without a call it is a stop."""
         request = write_request(drive, register, raw, address=0)
         what = _in_words(register, register.decode(raw))
+        expires_ns, permit = (call.expires_ns, call.permit) if call else (0, None)
         with self._logged(drive, request, what, self.records.log_later):
-            self._exchanges.carry_out(drive, request, insists=True, timeout=0.0)
+            completion = self._exchanges.carry_out(
+                drive, request, expires_ns, insists=True, timeout=0.0, permit=permit
+            )
+            if call and completion.result == Failure.EXPIRED:
+                raise call.unsent(what)
         self.records.log_later(drive, request, what, Effect.UNCONFIRMED, "nobody answers a broadcast")
 
     # ---- sending, and what came of it ----
