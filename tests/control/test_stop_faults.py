@@ -23,6 +23,7 @@ from multidrop.control.eeprom_ledger import Ledger
 from multidrop.control.outcome import Seen
 from multidrop.control.ramp import start_staggered
 from multidrop.control.stop_all import Stopper
+from multidrop.control.stop_attempt import LEAST_S, StopAttempt
 from multidrop.core import Completion, Exchange
 from multidrop.drives import InvtCHE
 from multidrop.errors import Refused, Unconfirmed
@@ -190,6 +191,46 @@ def test_a_stop_is_repeated_where_the_system_had_no_room_for_it(
     assert not sims[1].motor.energised
 
 
+class NoRoom:
+    """Stands in for the class of stops: the system has no room for the first of them."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, times: int, fault: Exception) -> None:
+        self.left = times
+        self._fault = fault
+        self._make = stop_all.StopAttempt
+        monkeypatch.setattr(stop_all, "StopAttempt", self.make)
+
+    def make(self, *details: Any) -> StopAttempt:
+        self.left -= 1
+        if self.left >= 0:
+            raise self._fault
+        return self._make(*details)
+
+
+@pytest.mark.parametrize("fault", [NO_MEMORY, NO_DESCRIPTORS], ids=["memory", "descriptors"])
+@pytest.mark.parametrize("all_of_them", [False, True])
+def test_a_stop_is_made_once_the_system_has_room_for_it(
+    monkeypatch: pytest.MonkeyPatch, fault: Exception, all_of_them: bool
+) -> None:
+    line, drives, sims = running(monkeypatch)
+    begun = line.seconds
+    room = NoRoom(monkeypatch, 149, fault)
+    line.bus.stop_all() if all_of_them else drives[0].stop()
+    assert room.left == -1
+    assert line.seconds - begun > 149 * 0.2
+    assert not sims[0].motor.energised
+
+
+def test_a_stop_that_can_never_be_made_raises_why(monkeypatch: pytest.MonkeyPatch) -> None:
+    line, drives, _ = running(monkeypatch)
+    begun, before = line.seconds, len(line.written)
+    NoRoom(monkeypatch, 1000, NO_MEMORY)
+    with pytest.raises(MemoryError):
+        drives[0].stop()
+    assert LEAST_S - 1 < line.seconds - begun < LEAST_S + 1
+    assert len(line.written) == before
+
+
 def test_a_stop_for_which_there_is_never_room_ends_and_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
     line, _, _ = running(monkeypatch)
 
@@ -210,7 +251,7 @@ def test_a_stop_for_which_there_is_never_room_ends_and_says_so(monkeypatch: pyte
 @pytest.mark.parametrize("seconds", [Decimal(12), Fraction(12), 10**400], ids=["decimal", "fraction", "huge"])
 def test_a_stop_takes_any_number_as_its_time(monkeypatch: pytest.MonkeyPatch, seconds: Any) -> None:
     line, drives, sims = running(monkeypatch)
-    deaf_until = line.seconds + 20
+    deaf_until = line.seconds + (20 if seconds == 12 else 2 * LEAST_S)
     line.deafens = lambda request: clock.now_ns() < deaf_until * 1e9
     if seconds == 12:
         with pytest.raises(Unconfirmed, match="never confirmed"):

@@ -28,6 +28,7 @@ from multidrop.drive.declare import reading, setting
 from multidrop.drive.table import Kept
 from multidrop.drive.verbs import verb
 from multidrop.drives import YD1000, DelixiModbus, ErmanERG220, InnovertIBD, InvtCHE
+from multidrop.drives.invt_che import CHEControl
 from multidrop.errors import (
     BusError,
     Expired,
@@ -441,8 +442,9 @@ def test_a_stop_gives_up_when_its_caller_says_so_and_tells_what_is_known(
     assert 2 <= line.seconds - begun < 2.2
     line.deafens = lambda request: True
     begun = line.seconds
-    with pytest.raises(Unconfirmed, match=r"sent \d+ times, it was never confirmed: .*no reply"):
+    with pytest.raises(Unconfirmed, match=r"sent \d+ times, it was never confirmed: .*no reply") as failure:
         drive.stop()
+    assert "control = STOP took effect" in str(failure.value.__cause__)
     assert LEAST_S <= line.seconds - begun < LEAST_S + 2
     begun = line.seconds
     with pytest.raises(Unconfirmed):
@@ -560,6 +562,95 @@ def test_no_stop_waits_for_a_second_look_at_another_drive(monkeypatch: pytest.Mo
     assert addresses[:before].count(1) == 1
     assert found["invt-che@1"].seen is Seen.FAILED
     assert all(write.address != 1 for write in writes(line, begun))
+
+
+def test_a_stop_whose_drive_must_rest_holds_up_no_other_and_is_sent_as_it_may(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The motor of the other one runs out meanwhile, and is looked at."""
+    sims: list[Any] = [simulated(InvtCHE(address, maximum_frequency=50)) for address in (1, 2)]
+    line = SimulatedBus(monkeypatch, *sims)
+    for sim in sims:
+        drive = line.attach(sim.drive)
+        drive.set_frequency(50)
+        drive.start()
+    line.sleep(20)
+    ready_at = line.seconds + 3
+    line.bus.peer(sims[0].drive).c.ready_ns = round(ready_at * 1e9)
+    asked: list[tuple[int, float]] = []
+
+    def note(request: Message) -> bytes | None:
+        asked.append((request.address, line.seconds))
+        return None
+
+    line.answers = note
+    line.bus.stop_all()
+    of_others = [seconds for address, seconds in asked if address == 2]
+    rested = [seconds for address, seconds in asked if address == 1]
+    assert of_others[0] < ready_at - 2 < ready_at <= rested[0] < ready_at + 0.5 < of_others[-1]
+
+
+def test_a_look_that_is_lost_is_not_repeated_before_the_stop_is_sent_again(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    line, drive, _ = one(monkeypatch, YD1000(1))
+    line.bus.check_identity(drive)
+    begun = len(line.frames)
+    line.loses = lambda request: not is_write(request) and len(line.frames) == begun + 2
+    drive.stop()
+    assert [is_write(request) for request, _ in line.frames[begun : begun + 3]] == [True, False, True]
+
+
+def test_a_stop_s_first_write_waits_for_no_late_answer_and_its_later_ones_do(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Where answers are known to be late, it is confirmed thus; the stops of others wait for no first one."""
+    line, drive, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
+    line.bus.check_identity(drive)
+    carry_out, waits = line.carry_out, list[float]()
+
+    def note(exchange: Exchange, **times: Any) -> Completion:
+        if is_write(exchange.request):
+            waits.append(exchange.c.timeout_ns / 1e9)
+        return carry_out(exchange, **times)
+
+    monkeypatch.setattr(line, "carry_out", note)
+    line.loses = lambda request: is_write(request) and len(waits) < 3
+    drive.stop()
+    assert waits[:3] == [0.0, 1.0, 1.0]
+
+
+@pytest.mark.slow
+def test_that_a_stop_is_repeated_is_told_once_and_so_is_its_end(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.INFO, "multidrop.control")
+    line, drive, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
+    deaf_until = line.seconds + 20
+    line.deafens = lambda request: line.seconds < deaf_until
+    drive.stop()
+    flush(60)
+    told = [record.getMessage() for record in caplog.records if record.levelno == logging.WARNING]
+    assert len(told) == 1
+    assert told[0].startswith("the stop is repeated for 30 s at least: invt-che@1: it is not known whether")
+    ends = [record.getMessage() for record in caplog.records if "stopped after" in record.getMessage()]
+    assert len(ends) == 1
+    assert ends[0].startswith("invt-che@1: stopped after 2")
+
+
+@pytest.mark.parametrize("suspicions", [1, 2])
+def test_a_plain_stop_is_withheld_where_another_family_answers_twice(
+    monkeypatch: pytest.MonkeyPatch, suspicions: int
+) -> None:
+    line, drive, _ = one(monkeypatch, InvtCHE(1))
+    odd = build_reply(Framing.RTU, Message(1, 3, data=b"\0\3"))
+    line.answers = lambda request: odd if len(line.frames) <= suspicions else None
+    if suspicions == 1:
+        line.bus.write(drive, drive.control, CHEControl.STOP)
+    else:
+        with pytest.raises(Refused, match="no stop was sent"):
+            line.bus.write(drive, drive.control, CHEControl.STOP)
+    assert len(line.written) == 2 - suspicions
 
 
 def test_an_emergency_stop_that_is_a_pulse_is_sent_once_however_long_it_takes(

@@ -58,7 +58,6 @@ class Stopper:
         """
 
         def attempt() -> list[StopAttempt]:
-            self._latches.latch(drive)  # raises for one that is not on this bus
             return [StopAttempt(drive, make, _now(), _limit(seconds))]
 
         (stop,) = self._carry_out([drive], attempt, lambda: False, lambda stop: None)
