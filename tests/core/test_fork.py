@@ -25,7 +25,7 @@ from multidrop.bus import Bus
 from multidrop.core import Field, NumberFormat, RowLayout, RowQueue, Status
 from multidrop.core.fork import only_here
 from multidrop.drives import InvtCHE
-from multidrop.errors import LineError, NoReply
+from multidrop.errors import LineError, NoReply, Overtaken
 from multidrop.poller import Poller
 from multidrop.sim import MotorDrive, Simulator, Wire, simulated
 
@@ -161,6 +161,8 @@ def test_an_inherited_bus_says_that_it_is_its_parent_s(any_port: str) -> None:
             stopped = [each.why for each in bus.stop_all().values()]
             with pytest.raises(LineError) as failure:
                 current(bus)
+            with pytest.raises(Overtaken, match="the start was not sent: the bus was left"):
+                bus.drives[0].start()
         return [*stopped, str(failure.value)]
 
     with Bus(any_port) as bus:
@@ -210,7 +212,8 @@ def test_a_lock_that_was_held_does_not_hold_a_child_up(port: str) -> None:
 
     with Bus(port) as bus:
         assert current(bus) == 3.25
-        with held(bus.line._lock, bus._attached.lock, bus._latches._over):
+        stop = bus._latches.stopping(bus.drives)  # of another thread, for which the child would wait
+        with stop, held(bus.line._lock, bus._attached.lock, bus._latches._over):
             assert in_child(use) is None
         assert current(bus) == 3.25
 
