@@ -18,17 +18,20 @@ class Latch:
 
     def __init__(self) -> None:
         self.c: Any = ffi.new("uint32_t *")
-        self.why = ""  # of the last rise
+        self.why = ""  # of the last rise, or of its shutting
         self._is_shut = False
         self._holds: set[object] = set()  # stops under way
 
     def rise(self, why: str) -> None:
         """End every permit that there is."""
-        self.why = why
+        if not self._is_shut:
+            self.why = why
         lib.md_count_stop(self.c)
 
     def shut(self, why: str) -> None:
         """Rise for good: no permit is good any more."""
+        if not self._is_shut:
+            self.why = why
         self._is_shut = True
         self.rise(why)
 
