@@ -360,6 +360,16 @@ MISTAKES: dict[str, tuple[Callable[[Bus, Rig], Any], type[Exception], str]] = {
         TypeError,
         "pump is made already: what it is to be goes into Toy(…)",
     ),
+    "a script for a name": (
+        lambda bus, rig: bus.perform(cast(Any, "pump"), rig.stop.script()),
+        TypeError,
+        "'pump' is no drive: it is what attach returns",
+    ),
+    "a name is detached": (
+        lambda bus, rig: bus.detach(cast(Any, "pump")),
+        TypeError,
+        "'pump' is no drive: it is what attach returns",
+    ),
     "a class is attached that is no family": (
         lambda bus, rig: bus.attach(dict, 2),
         TypeError,
