@@ -17,7 +17,7 @@ from kills import BoundProcess
 from lines import PATIENCE, until
 from motors import ReceivedRequests
 
-from multidrop.control.exit_hook import CUT_SHORT, ExitHook
+from multidrop.control.exit_hook import CUT_SHORT, ExitHook, LastAct
 from multidrop.drives import InvtCHE
 from multidrop.sim import MotorDrive, Simulator, Wire, simulated
 
@@ -197,6 +197,88 @@ def test_it_may_be_finished_on_any_thread(caught: list[int]) -> None:
     assert made.is_over
     signal.raise_signal(signal.SIGTERM)
     assert caught == [signal.SIGTERM]
+
+
+def test_a_bus_that_comes_as_the_last_one_goes_has_the_signals(
+    caught: list[int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Else SIGTERM would end the process, and leave its motors running."""
+    hook, acts = ExitHook(), [Act(), Act()]
+    first, let_go = hook.add(acts[0].begin, acts[0].work), hook._let_go
+
+    def come_meanwhile() -> None:
+        monkeypatch.setattr(hook, "_let_go", let_go)
+        thread = threading.Thread(target=hook.add, args=[acts[1].begin, acts[1].work])
+        thread.start()
+        thread.join(PATIENCE)
+        let_go()
+
+    monkeypatch.setattr(hook, "_let_go", come_meanwhile)
+    acts[0].go_on.set()
+    hook.finish(first)
+    signal.raise_signal(signal.SIGTERM)
+    assert acts[1].is_begun
+    acts[1].go_on.set()
+    until(lambda: caught == [signal.SIGTERM])
+
+
+def test_a_bus_that_comes_too_late_for_the_signals_is_told_so(
+    caught: list[int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    hook, acts = ExitHook(), [Act(), Act()]
+    first = hook.add(acts[0].begin, acts[0].work)
+    has_taken, goes_on, told = threading.Event(), threading.Event(), list[ValueError]()
+
+    def make(*details: Any) -> LastAct:
+        has_taken.set()
+        assert goes_on.wait(PATIENCE)
+        return LastAct(*details)
+
+    def add() -> None:
+        try:
+            hook.add(acts[1].begin, acts[1].work)
+        except ValueError as mistake:
+            told.append(mistake)
+
+    monkeypatch.setattr("multidrop.control.exit_hook.LastAct", make)
+    thread = threading.Thread(target=add)
+    thread.start()
+    assert has_taken.wait(PATIENCE)
+    acts[0].go_on.set()
+    hook.finish(first)
+    goes_on.set()
+    thread.join(PATIENCE)
+    assert len(told) == 1
+    hook._at_exit()
+    assert not acts[1].is_begun
+
+
+def test_a_signal_that_was_put_back_after_the_end_has_the_effect_it_had(caught: list[int]) -> None:
+    """By code that had it for a while, during which the bus was left."""
+    hook = ExitHook()
+    for comes_again in (False, True):
+        made = hook.add(lambda: None, lambda: None)
+        ours = signal.signal(signal.SIGTERM, signal.SIG_IGN)
+        hook.finish(made)
+        assert signal.getsignal(signal.SIGTERM) == signal.SIG_IGN
+        signal.signal(signal.SIGTERM, ours)
+        if comes_again:
+            hook.finish(hook.add(lambda: None, lambda: None))
+        signal.raise_signal(signal.SIGTERM)
+        assert caught == [signal.SIGTERM]
+        caught.clear()
+
+
+def test_a_child_begins_its_own_last_acts_though_its_parent_was_ending(caught: list[int]) -> None:
+    hook, acts = ExitHook(), [Act(), Act()]
+    hook.add(acts[0].begin, acts[0].work)
+    signal.raise_signal(signal.SIGTERM)
+    hook.forked()
+    made = hook.add(acts[1].begin, acts[1].work)
+    assert not acts[1].is_begun
+    for act in acts:
+        act.go_on.set()
+    hook.finish(made)
 
 
 # ---- in processes ----

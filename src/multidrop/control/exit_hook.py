@@ -98,7 +98,8 @@ class ExitHook:
 
     def __init__(self) -> None:
         self._acts: list[LastAct] = []  # changed in one step: lines come and go on any thread
-        self._before: dict[signal.Signals, Any] = {}
+        self._before: dict[signal.Signals, Any] = {}  # their effect, when they were taken last
+        self._has_taken = False
         self._held: int | None = None  # the first signal that came
         self._came: list[float] = []  # when it and others did
         self._passing = threading.Lock()
@@ -108,6 +109,7 @@ class ExitHook:
 
     def forked(self) -> None:
         self._passing = threading.Lock()
+        self._held, self._came = None, []
         for act in self._acts:
             act.forget()
         self._acts = []
@@ -120,15 +122,24 @@ class ExitHook:
         self.take_signals()
         act = LastAct(begin, work, self._one_is_over)
         self._acts.append(act)
+        try:
+            self.take_signals()  # the end of another one may have let them go
+        except ValueError:
+            self._acts.remove(act)
+            raise
         if self._held is not None:  # the end has begun without it
             act.begin()
         return act
 
     def take_signals(self) -> None:
         """Take these signals. Raises ValueError outside the main thread, the only one that may."""
-        if not self._before:
-            for number in _ending():
-                self._before[number] = signal.signal(number, self._on_signal)
+        if self._has_taken:
+            return
+        for number in _ending():
+            had = signal.signal(number, self._on_signal)
+            if had != self._on_signal:  # else whoever had it for a while has put it back
+                self._before[number] = had
+        self._has_taken = True
 
     def finish(self, act: LastAct) -> None:
         """Do it now, and forget it."""
@@ -137,6 +148,8 @@ class ExitHook:
             self._acts.remove(act)
         if not self._acts and self._held is None and threading.current_thread() is threading.main_thread():
             self._let_go()
+            if self._acts:  # another one came meanwhile
+                self.take_signals()
 
     def _at_exit(self) -> None:
         acts = [*self._acts]
@@ -181,8 +194,8 @@ class ExitHook:
         signal.raise_signal(number)
 
     def _let_go(self) -> None:
-        before, self._before = self._before, {}
-        for number, handler in before.items():
+        self._has_taken = False
+        for number, handler in self._before.items():
             if signal.getsignal(number) == self._on_signal:
                 signal.signal(number, signal.SIG_DFL if handler is None else handler)
 
