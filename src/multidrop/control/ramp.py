@@ -98,7 +98,7 @@ def _ramp(drive: Drive, hz: float, rate: float | None, every: float) -> Script[N
     yield from _check(drive, hz)
     while at != hz:
         at = min(at + step, hz) if hz > at else max(at - step, hz)
-        yield from drive.set_frequency.script(round(at, 2) if at != hz else hz)
+        yield from drive.set_frequency.script(at)
         if at != hz:
             yield from wait(every)
 
@@ -112,8 +112,6 @@ def _check(drive: Drive, hz: float) -> Script[None]:
             step = script.send((yield step))
     except StopIteration:  # it would write nothing
         return
-    finally:
-        script.close()
     raw = raw_count(drive, step.register, step.value)
     yield from conditions(drive, step.register, step.register.decode(raw))
 

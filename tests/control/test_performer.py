@@ -1,0 +1,160 @@
+"""Verbs and plain writes by their steps: what ends them, what is taken back, and what is told and noted."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+from typing import Any
+
+import pytest
+from simulated_bus import SimulatedBus, is_write, one
+
+from multidrop.control.audit_log import read_audit
+from multidrop.control.ramp import ramp
+from multidrop.control.time_limit import written_before
+from multidrop.core import Message
+from multidrop.drive import Direction, Drive, Script, read, write
+from multidrop.drive.declare import reading, setting
+from multidrop.drive.table import Kept
+from multidrop.drive.verbs import verb
+from multidrop.drives import YD1000, ErmanERG220, InvtCHE
+from multidrop.drives.invt_che import CHEControl
+from multidrop.errors import BusError, Expired, Overtaken, Unconfirmed
+from multidrop.sim import simulated
+
+
+class Stubborn(Drive):
+    """A drive of a user's own, whose start tries again whatever it is told."""
+
+    model = "stubborn"
+    title = "OWN 4"
+    speed = reading(0x10, "rpm")
+    run = setting(0x20, kept=Kept.RAM)
+
+    @verb
+    def start(self, direction: Direction | None = None) -> Script[Any]:
+        """Start the motor, and return its speed."""
+        for _ in range(5):
+            try:
+                yield from read(self.speed)
+                yield from write(self.run, 1)
+            except BusError:
+                continue
+            return (yield from read(self.speed)) + 7
+        return None
+
+    @verb
+    def stop(self) -> Script[None]:
+        """Stop the motor."""
+        yield from write(self.run, 0)
+
+
+def stubborn(monkeypatch: pytest.MonkeyPatch) -> tuple[SimulatedBus, Any]:
+    line = SimulatedBus(monkeypatch, simulated(Stubborn(1)))
+    drive = line.attach(Stubborn(1, name="fan", confirmed=1))
+    line.bus.check_identity(drive)
+    return line, drive
+
+
+def call_stop_at(line: SimulatedBus, drive: Any, nth: int) -> None:
+    """Have another one's stop called as the nth request from now on leaves."""
+    begun = len(line.frames)
+
+    def note(request: Message) -> bytes | None:
+        if len(line.frames) == begun + nth:
+            line.bus._latches.rise([drive])
+        return None
+
+    line.answers = note
+
+
+def test_what_a_verb_returns_is_returned(monkeypatch: pytest.MonkeyPatch) -> None:
+    _, drive = stubborn(monkeypatch)
+    assert drive.start() == 7
+
+
+def test_a_start_that_goes_on_after_its_stop_ends_all_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    line, drive = stubborn(monkeypatch)
+    call_stop_at(line, drive, 1)
+    with pytest.raises(
+        Overtaken, match=r"^fan: the start was not sent: a stop was called; nothing more was sent$"
+    ):
+        drive.start()
+    assert line.written == []
+
+
+def test_a_write_that_a_script_goes_on_to_after_a_stop_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    line, drive, _ = one(monkeypatch, YD1000(1))
+    drive.set_frequency(10)
+    before = len(line.written)
+    call_stop_at(line, drive, 3)
+    with pytest.raises(Overtaken, match=r"^yd1000@1: frequency was not sent: a stop was called"):
+        ramp(drive, 20.0)
+    assert len(line.written) == before
+
+
+def test_what_a_reset_wrote_is_taken_back_after_a_stop_and_noted(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Else the reset would stay on, and reset the next fault by itself."""
+    audit = tmp_path / "audit"
+    line, drive, _ = one(monkeypatch, ErmanERG220(1), audit=audit)
+    line.bus.check_identity(drive)
+
+    def note(request: Message) -> bytes | None:
+        if is_write(request) and request.start == 9 and request.data != b"\0\0":
+            line.bus._latches.rise([drive])
+        return None
+
+    line.answers = note
+    with pytest.raises(Unconfirmed, match="it was sent, and then a stop was called"):
+        drive.reset_fault()
+    noted = [entry["write"] for entry in read_audit(audit)]
+    assert noted == ["start_coil = OFF", "fault_reset_coil = ON", "fault_reset_coil = OFF"]
+    line.bus.close()
+
+
+def test_what_a_plain_write_stopped_is_noted_at_once(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    line, drive, _ = one(monkeypatch, InvtCHE(1), audit=tmp_path / "audit")
+    line.bus.write(drive, drive.control, CHEControl.STOP)
+    (entry,) = read_audit(tmp_path / "audit")
+    assert (entry["write"], entry["outcome"]) == ("control = STOP", "done")
+    line.bus.close()
+
+
+def test_nothing_is_even_read_for_a_write_that_is_too_late(monkeypatch: pytest.MonkeyPatch) -> None:
+    line, drive, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
+    with written_before(lambda: 0.0), pytest.raises(Expired, match=r"setpoint = 10\.00 %"):
+        line.bus.write(drive, drive.setpoint, 10.0)
+    assert line.frames == []
+
+
+def test_the_watchdog_of_a_drive_is_told_when_it_is_first_known(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.INFO, "multidrop.control")
+    line, drive, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
+    drive.stop()
+    caplog.clear()
+    line.queue = object()  # the port was opened again
+    drive.set_frequency(20)
+    drive.start()
+    drive.stop()
+    drive.start()
+    told = [record.getMessage() for record in caplog.records if "PC.04" in record.getMessage()]
+    assert told == [f"invt-che@1: {InvtCHE.watchdog}"]
+
+
+def test_an_effect_that_was_neither_confirmed_nor_seen_is_told_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The reset cuts its own reply off, and then the drive does not say what its record of faults is."""
+    line, drive, sim = one(monkeypatch, YD1000(1))
+    sim.trip(4)
+    line.bus.check_identity(drive)
+
+    def loses(request: Message) -> bool:
+        is_reset = is_write(request) and bool(request.data[0] & 0x20)
+        return is_reset or (request.start == drive.fault_record_1.address and not is_write(request))
+
+    line.loses = loses
+    with pytest.raises(Unconfirmed, match="it was sent, and its effect could not be seen: yd1000@1 does not"):
+        drive.reset_fault()
