@@ -10,12 +10,18 @@ from typing import Any
 import pytest
 from motors import MAKE, STARTS
 from simulated_bus import SimulatedBus, is_write
+from toy import Status, Toy
 
+from multidrop.control.audit_log import read_audit
 from multidrop.control.outcome import Seen
 from multidrop.control.time_limit import written_before
 from multidrop.core import Completion, Exchange, Message
+from multidrop.drive import Condition, Drive, Script, State
+from multidrop.drive.declare import command, setting
+from multidrop.drive.table import Kept
+from multidrop.drive.verbs import verb
 from multidrop.drives import MODELS, InvtCHE
-from multidrop.errors import BusError, Expired, Overtaken, PortLost, Refused
+from multidrop.errors import BusError, Expired, Overtaken, PortLost, Refused, Unconfirmed
 from multidrop.sim import simulated
 
 BROADCASTING = [model for model, family in MODELS.items() if family.broadcasts]
@@ -64,9 +70,94 @@ def test_a_stop_of_all_is_no_broadcast_where_families_differ(
 def test_a_stop_of_all_is_a_broadcast_where_all_are_alike(
     monkeypatch: pytest.MonkeyPatch, model: str
 ) -> None:
-    line, _, _ = line_of(monkeypatch, model, model)
+    line, drives, _ = line_of(monkeypatch, model, model)
     line.bus.stop_all()
-    assert len(broadcasts(line)) == 1
+    (sent,) = broadcasts(line)
+    line.bus.write(drives[0], drives[0].control, stop_of(drives[0]))
+    assert (sent.start, sent.data) == (line.frames[-2][0].start, line.frames[-2][0].data)
+
+
+def test_a_stop_of_all_where_the_family_has_no_broadcast(monkeypatch: pytest.MonkeyPatch) -> None:
+    line, drives, sims = line_of(monkeypatch, "erman-er-g-220", "erman-er-g-220")
+    for drive in drives:
+        drive.set_frequency(20)
+        drive.start()
+    assert {each.seen for each in line.bus.stop_all().values()} == {Seen.STOPPED}
+    assert broadcasts(line) == []
+    assert not any(sim.motor.energised for sim in sims)
+
+
+@pytest.mark.parametrize("models", [("erman-er-g-220", "erman-er-g-220"), ("invt-che", "yd1000")])
+def test_where_nothing_was_broadcast_and_nothing_else_is_sent_all_failed(
+    monkeypatch: pytest.MonkeyPatch, models: tuple[str, str]
+) -> None:
+    line, _, _ = line_of(monkeypatch, *models)
+
+    def lose(request: Message) -> bytes | None:
+        raise PortLost("hall", "there is no such port")
+
+    line.answers = lose
+    assert {told.seen for told in line.bus.stop_all(seconds=1.0).values()} == {Seen.FAILED}
+
+
+class Quiet(Toy):
+    """Its word of all drives stops none of them."""
+
+    model = "quiet"
+    broadcasts = True
+    identify = Drive.identify
+    control = command(0x14, Status, broadcast=(0,), kept=Kept.RAM)
+    frequency = setting(0x15, "Hz", step=0.01, span=(0, 50), broadcast=(0,), kept=Kept.RAM)
+
+    @verb
+    def state(self) -> Script[State]:
+        """Report nothing."""
+        yield from ()
+        return State(Condition.STOPPED)
+
+
+@pytest.mark.parametrize("confirmed", [0, 1])
+def test_a_word_that_is_no_stop_is_broadcast_by_no_stop(
+    monkeypatch: pytest.MonkeyPatch, confirmed: int
+) -> None:
+    drives = [Quiet(address, confirmed=confirmed) for address in (1, 2)]
+    line = SimulatedBus(monkeypatch, *(simulated(drive) for drive in drives))
+    for drive in drives:
+        line.bus.check_identity(line.attach(drive))
+    line.bus.stop_all(seconds=1)
+    assert broadcasts(line) == []
+    if confirmed:
+        line.bus.broadcast(drives[0].frequency, 0.0)
+        assert len(broadcasts(line)) == 1
+    else:
+        with pytest.raises(Refused, match="confirmed = 1"):
+            line.bus.broadcast(drives[0].frequency, 0.0)
+        assert broadcasts(line) == []
+
+
+@pytest.mark.parametrize("is_sent", [False, True])
+def test_a_broadcast_that_failed_is_told_as_sent_only_where_it_may_have_left(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, is_sent: bool
+) -> None:
+    audit = tmp_path / "audit"
+    sims = [simulated(InvtCHE(address, maximum_frequency=50)) for address in (1, 2)]
+    line = SimulatedBus(monkeypatch, *sims, audit=audit)
+    drives = [line.attach(sim.drive) for sim in sims]
+    for drive in drives:
+        line.bus.check_identity(drive)
+
+    def lose(request: Message) -> bytes | None:
+        lost = PortLost("hall", "the port was lost (hung up)")
+        lost.is_sent = is_sent and request.address == 0
+        raise lost
+
+    line.answers = lose
+    with pytest.raises(Unconfirmed if is_sent else PortLost):
+        line.bus.broadcast(drives[0].control, stop_of(drives[0]))
+    assert [entry["outcome"] for entry in read_audit(audit)] == ["unconfirmed"] * is_sent
+    (seen,) = {told.seen for told in line.bus.stop_all(seconds=1.0).values()}
+    assert seen is (Seen.SENT if is_sent else Seen.FAILED)
+    line.bus.close()
 
 
 @pytest.mark.parametrize("address", [1, 2])

@@ -7,7 +7,6 @@ so all drives must be of one family, share settings and framing, and be known to
 from __future__ import annotations
 
 from collections.abc import Sequence
-from contextlib import suppress
 from typing import Any, cast
 
 from multidrop.control.author import check_author
@@ -20,7 +19,7 @@ from multidrop.core import Framing
 from multidrop.drive.family import Drive
 from multidrop.drive.register import Register
 from multidrop.drive.state import State
-from multidrop.errors import BusError, Refused
+from multidrop.errors import BusError, Refused, Unconfirmed
 
 
 class Broadcaster:
@@ -89,17 +88,18 @@ class Broadcaster:
             return failure
 
     def stop(self, drives: Sequence[Drive]) -> bool:
-        """Broadcast a stop where all drives are known and have one; True where it was sent."""
+        """Broadcast a stop where all drives are known and have one; True where it may have been sent."""
         known = all(self._writer.identity_check.is_known(drive) for drive in drives)
         control = drives[0].registers.get("control") if drives else None
         if len(drives) < 2 or not _are_alike(drives) or not known or drives[0].framing is Framing.TCP:
             return False
         if control is None or not control.broadcast or not is_stop(drives[0], control, control.broadcast[0]):
             return False
-        with suppress(Exception):
+        try:
             self._writer.broadcast(drives[0], control, control.broadcast[0])
-            return True
-        return False
+        except Exception as failure:  # each drive has its own stop still
+            return isinstance(failure, Unconfirmed)
+        return True
 
 
 def _are_alike(drives: Sequence[Drive]) -> bool:
