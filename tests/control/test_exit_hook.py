@@ -281,6 +281,28 @@ def test_a_child_begins_its_own_last_acts_though_its_parent_was_ending(caught: l
     hook.finish(made)
 
 
+def test_a_signal_that_is_held_is_sent_on_once(caught: list[int], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two acts may end at once, before the main thread comes to it."""
+    sent: list[int] = []
+    hook, act = ExitHook(), Act()
+    monkeypatch.setattr("multidrop.control.exit_hook._send", lambda number, ident: sent.append(number))
+    hook.add(act.begin, act.work)
+    for count in (1, 2):  # the next one is held and sent on too
+        signal.raise_signal(signal.SIGTERM)
+        act.go_on.set()
+        until(lambda count=count: len(sent) == count)
+        hook._one_is_over()
+        assert len(sent) == count
+        signal.raise_signal(sent[-1])
+        assert len(caught) == count
+        act = Act()
+        hook.add(act.begin, act.work)
+    signal.raise_signal(signal.SIGTERM)
+    act.go_on.set()
+    until(lambda: len(sent) == 3)
+    signal.raise_signal(sent[-1])
+
+
 # ---- in processes ----
 
 CLIENT = """

@@ -8,9 +8,10 @@ from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any, NamedTuple
 
+from controlled_loop import run_controlled
 from lines import PATIENCE
 
-from multidrop.control.repeated_stops import EndedStops, RepeatedStops, StopWork
+from multidrop.control.repeated_stops import BEGINNING_S, REPEATED_S, EndedStops, RepeatedStops, StopWork
 
 
 class Ended(NamedTuple):
@@ -91,3 +92,89 @@ def test_a_stop_is_repeated_on_where_the_one_beside_it_is_given_up() -> None:
         assert (await called)["pump"].is_done is False
 
     asyncio.run(live())
+
+
+def test_a_stop_counts_as_repeated_from_its_call_until_its_drive_stands() -> None:
+    async def live() -> None:
+        pump, stops = NotedStops(), RepeatedStops(stop_noted)
+        drive: Any = pump
+        assert stops.of(drive) is None
+        repeated = asyncio.get_running_loop().create_future()
+        pump.under_way = {}
+        stops.note([drive], repeated)
+        assert stops.of(drive) is repeated  # its thread need not have begun
+        await asyncio.sleep(0.9 * BEGINNING_S)
+        assert stops.of(drive) is repeated
+        await asyncio.sleep(0.2 * BEGINNING_S)
+        assert stops.of(drive) is None  # it is over, and others of its line are not
+        pump.under_way = {"pump": "no stop was sent yet"}
+        await asyncio.sleep(20.0)
+        assert stops.of(drive) is repeated
+        bus, drive.bus = pump.bus, None
+        assert stops.of(drive) is None  # it was taken off
+        drive.bus = bus
+        repeated.set_result({"pump": Ended(True, "stopped")})
+        assert stops.of(drive) is None
+
+    run_controlled(live())
+
+
+def test_drives_are_divided_into_those_that_are_begun_and_those_that_are_sent_once_more() -> None:
+    async def live() -> None:
+        stops = RepeatedStops(stop_noted)
+        drives: list[Any] = [NotedStops(), NotedStops(), NotedStops()]
+        repeated = asyncio.get_running_loop().create_future()
+        stops.note(drives[:2], repeated)
+        assert stops.divided(iter(drives)) == ([drives[2]], drives[:2])
+        repeated.set_result({})
+        assert stops.divided(drives) == (drives, [])
+        stops.note([drives[2]], asyncio.get_running_loop().create_future())
+        assert set(stops._repeated) == {drives[2]}  # a plant is read anew for years
+
+    run_controlled(live())
+
+
+class TimedStops:
+    """Stops of a drive that take some seconds of the loop's; the first that are repeated are given up."""
+
+    def __init__(self, drive: Any, given_up: int) -> None:
+        self.stops = RepeatedStops(self._stop)
+        self.calls: list[float | None] = []
+        self._drive = drive
+        self._given_up = given_up
+
+    def _stop(self, drive: Any, seconds: float | None) -> dict[str, Ended]:
+        self.calls.append(seconds)
+        is_done = seconds is None and self.calls.count(None) > self._given_up
+        return {drive.name: Ended(is_done, "stopped" if is_done else "no reply")}
+
+    def begin(self, work: StopWork[Ended]) -> EndedStops[Ended]:
+        ended = asyncio.get_running_loop().create_future()
+        told = work(None)
+        asyncio.get_running_loop().call_later(1.0, ended.set_result, told)
+        return ended
+
+    async def called_beside(self, seconds: float) -> Ended:
+        """Return the end of one that is called beside another, which is given up after so long."""
+        repeated = asyncio.get_running_loop().create_future()
+        self.stops.note([self._drive], repeated)
+        called = self.stops.send_once(self._drive, self.begin)
+        assert len(self.stops._tasks) == 1  # nothing else holds it
+        asyncio.get_running_loop().call_later(
+            seconds, repeated.set_result, {"pump": Ended(False, "no reply")}
+        )
+        told = (await called)["pump"]
+        assert not self.stops._tasks
+        return told
+
+
+def test_the_end_of_the_stop_that_took_another_s_place_is_told() -> None:
+    timed = TimedStops(NotedStops(), 0)
+    assert run_controlled(timed.called_beside(10.0)) == Ended(True, "stopped")
+    assert timed.calls == [0.0, None]
+
+
+def test_a_stop_that_was_repeated_for_its_time_by_another_is_not_repeated_again() -> None:
+    timed = TimedStops(NotedStops(), 0)
+    assert run_controlled(timed.called_beside(REPEATED_S + 1)) == Ended(False, "no reply")
+    assert timed.calls == [0.0]
