@@ -10,10 +10,12 @@ import pytest
 from examples import usually
 from lines import line, plant, polled, until
 from motors import MAKE, ReceivedRequests
+from simulated_bus import one
 
 from multidrop import Bus, InvtCHE, NoReply, Poller, Refused
 from multidrop.control import records
-from multidrop.core import PAUSE_NS
+from multidrop.core import PAUSE_NS, Framing, Message, build_reply
+from multidrop.errors import CheckAgain
 from multidrop.sim import MotorDrive, Simulator, Wire, simulated
 from multidrop.transport import clock
 
@@ -163,3 +165,45 @@ def test_what_polling_missed_counts_too() -> None:
             with pytest.raises(Refused, match="010AH"):
                 drive.start()
     assert received.writes == []
+
+
+# ---- drives that were taken off, and attached again ----
+
+
+def test_a_drive_that_was_taken_off_is_asked_again_before_it_is_moved(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    bus, drive, sim = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
+    drive.set_frequency(10)
+    bus.bus.detach(drive)
+    bus.attach(drive)
+    sim["device"] = GOODRIVE
+    with pytest.raises(Refused, match="010AH"):
+        drive.start()
+    assert len(bus.written) == 1
+
+
+def test_a_drive_that_was_taken_off_is_asked_again_before_its_stop(monkeypatch: pytest.MonkeyPatch) -> None:
+    """That nothing was found against a stop says nothing of what is there now."""
+    bus, drive, sim = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
+    odd = [build_reply(Framing.RTU, Message(1, 3, data=bytes([0, device]))) for device in (3, 4)]
+    bus.answers = lambda request: odd.pop(0) if odd else None
+    drive.stop()  # no two answers were the same
+    begun = len(bus.written)
+    bus.bus.detach(drive)
+    bus.attach(drive)
+    sim["device"] = GOODRIVE
+    with pytest.raises(Refused, match="no stop was sent"):
+        drive.stop()
+    assert len(bus.written) == begun
+
+
+def test_a_suspicion_of_a_drive_that_was_taken_off_is_forgotten(monkeypatch: pytest.MonkeyPatch) -> None:
+    bus, drive, sim = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
+    sim["device"] = GOODRIVE
+    check = bus.bus._writer.identity_check
+    for _ in range(2):  # the second one would be proof
+        with pytest.raises(CheckAgain):
+            check.check_before_stop(drive)
+        bus.bus.detach(drive)
+        bus.attach(drive)
