@@ -11,7 +11,7 @@ import pytest
 from commands import Run
 from declared_families import FAMILIES, NAMES, class_of, document_of
 from lines import ANY_PORT
-from simulated_bus import one
+from simulated_bus import is_write, one
 from tables import table
 
 from multidrop import Bus, Condition, Direction, FamilyError, Refused, load_family, load_plant
@@ -173,3 +173,33 @@ def test_a_frequency_that_says_nothing_is_no_standstill(monkeypatch: pytest.Monk
     with pytest.raises(Unconfirmed):
         drive.stop(seconds=5)
     assert len(line.written) > 1  # it was repeated
+
+
+STEPS = """[verb.stop]
+steps = [
+    { insist = "control", value = "stop" },
+    { insist = "control", value = "jog_stop" },
+    { insist = "control", value = "coast", when = "turns" },
+    { insist = "control", value = "coast" },
+    { await = "stands", limit = "60 s" },
+]
+"""
+
+
+@pytest.mark.parametrize("lost", ["stop", "all"])
+def test_what_follows_a_stop_at_once_is_sent_though_nobody_confirms_it(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, lost: str
+) -> None:
+    """The drive may hear, and heed another word alone; what hangs on a look is not sent unseen."""
+    text = (FAMILIES / "enum.toml").read_text(encoding="utf-8")
+    begin, end = text.index("[verb.stop]"), text.index("[verb.coast]")
+    (tmp_path / "own.toml").write_text(text[:begin] + STEPS + "\n" + text[end:], encoding="utf-8")
+    family = load_family(tmp_path / "own.toml")
+    line, drive, _ = one(monkeypatch, family(1, confirmed=1))
+    line.bus.check_identity(drive)
+    begun = len(line.written)
+    line.loses = lambda request: lost == "all" or request.data[-1:] == b"\5"
+    with pytest.raises(Unconfirmed, match="control = stop took effect"):
+        drive.stop(seconds=5)
+    words = [request.data[-1] for request, _ in line.frames if is_write(request)][begun:]
+    assert words[:8] == [5, 5, 5, 8, 5, 5, 5, 8]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from typing import Any
 
 from multidrop.drive.family import Drive
@@ -225,11 +226,15 @@ def _stop(declared: DeclaredVerbs, name: str, steps: Sequence[VerbStep]) -> Call
 
 
 def _stop_steps(drive: Any, standing: Sequence[Look], steps: Sequence[VerbStep]) -> Script[None]:
-    for step in steps:
+    for at, step in enumerate(steps):
         if step.when is not None and not (yield from step.when.seen(drive)):
             continue
         if isinstance(step, Insists):
-            yield from _insist_on_stop(drive, standing, step)
+            try:
+                yield from _insist_on_stop(drive, standing, step)
+            except Unconfirmed:  # a drive that is not heard may hear
+                yield from _send_what_follows(drive, steps[at + 1 :])
+                raise
         elif isinstance(step, Waits):
             yield from wait(step.seconds)
         elif isinstance(step, Awaits):
@@ -243,6 +248,16 @@ def _insist_on_stop(drive: Any, standing: Sequence[Look], step: Insists) -> Scri
     except DriveRefused:  # as it may in a fault, in which it stands already
         if not (yield from first_seen(drive, standing)):
             raise
+
+
+def _send_what_follows(drive: Any, steps: Sequence[VerbStep]) -> Script[None]:
+    """Write once each what these steps write before anything is looked at or waited for."""
+    for step in steps:
+        if not isinstance(step, Insists) or step.when is not None:
+            return
+        register = drive.register(step.register)
+        with suppress(Unconfirmed, DriveRefused):
+            yield from insist(register, register.decode(step.words.all[0]), attempts=1)
 
 
 def _await_standstill(drive: Any, standing: Sequence[Look], step: Awaits) -> Script[None]:
