@@ -10,11 +10,16 @@ import pytest
 from examples import usually
 from lines import line, plant, polled, until
 from motors import MAKE, ReceivedRequests
-from simulated_bus import one
+from simulated_bus import SimulatedBus, is_write, one
 
-from multidrop import Bus, InvtCHE, NoReply, Poller, Refused
+from multidrop import YD1000, Bus, Drive, InnovertIBD, InvtCHE, NoReply, Poller, Refused, Script
 from multidrop.control import records
-from multidrop.core import PAUSE_NS, Framing, Message, build_reply
+from multidrop.control.outcome import Seen
+from multidrop.core import PAUSE_NS, Completion, Exchange, Framing, Message, build_reply
+from multidrop.drive import write
+from multidrop.drive.declare import reading, setting
+from multidrop.drive.table import Kept
+from multidrop.drive.verbs import verb
 from multidrop.errors import CheckAgain
 from multidrop.sim import MotorDrive, Simulator, Wire, simulated
 from multidrop.transport import clock
@@ -207,3 +212,87 @@ def test_a_suspicion_of_a_drive_that_was_taken_off_is_forgotten(monkeypatch: pyt
             check.check_before_stop(drive)
         bus.bus.detach(drive)
         bus.attach(drive)
+
+
+# ---- the looks themselves ----
+
+
+class Mute(Drive):
+    """A drive of a user's own, whose class cannot tell what it is."""
+
+    model = "mute"
+    title = "OWN 5"
+    speed = reading(0x10, "rpm")
+    run = setting(0x20, kept=Kept.RAM)
+
+    @verb
+    def stop(self) -> Script[None]:
+        """Stop the motor."""
+        yield from write(self.run, 0)
+
+
+@pytest.mark.parametrize("is_lost", [False, True])
+def test_something_is_read_once_before_the_first_stop_and_waits_for_nothing(
+    monkeypatch: pytest.MonkeyPatch, is_lost: bool
+) -> None:
+    """So that an adapter's echo is known before it could pass for the drive's confirmation."""
+    bus = SimulatedBus(monkeypatch, simulated(Mute(1)))
+    drive, carry_out = bus.attach(Mute(1)), bus.carry_out
+    asked: list[tuple[bool, bool]] = []
+
+    def note(exchange: Exchange, **times: Any) -> Completion:
+        asked.append((is_write(exchange.request), bool(exchange.c.insists)))
+        return carry_out(exchange, **times)
+
+    monkeypatch.setattr(bus, "carry_out", note)
+    bus.loses = lambda request: is_lost and len(asked) == 1
+    drive.stop()
+    assert asked[:2] == [(False, True), (True, True)]
+    asked.clear()
+    if not is_lost:
+        drive.stop()
+        assert asked[0] == (True, True)
+    bus.queue = object()  # the port was opened again
+    bus.bus.read(drive, drive.speed)
+    asked.clear()
+    drive.stop()
+    assert asked[0] == (True, True)  # it has answered since
+
+
+@pytest.mark.parametrize("is_in_step", [True, False])
+def test_the_look_before_a_stop_counts_where_it_can_be_no_other_request_s_answer(
+    monkeypatch: pytest.MonkeyPatch, is_in_step: bool
+) -> None:
+    bus, drive, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
+
+    def fall_out_of_step(request: Message) -> bytes | None:
+        if not is_in_step:
+            bus.bus.peer(drive).c.history.ended[10] = 1
+        return None
+
+    bus.answers = fall_out_of_step
+    drive.stop()
+    assert [is_write(request) for request, _ in bus.frames[:2]] == [False, True]
+    assert bus.bus.knows_identity(drive) is is_in_step
+
+
+def test_a_family_that_little_proves_is_no_reason_to_withhold_a_stop(monkeypatch: pytest.MonkeyPatch) -> None:
+    """An IBD is recognised by places that its manual does not name."""
+    bus = SimulatedBus(monkeypatch, simulated(InnovertIBD(1)))
+    bus.attach(YD1000(1, stop_time=1.0))
+    (stopped,) = bus.bus.stop_all(seconds=1).values()
+    assert stopped.seen is not Seen.FAILED
+    assert bus.written[0].startswith("01 06 10 00 C0 00")
+
+
+@pytest.mark.parametrize(("share", "looks"), [(0.6, 0), (1.1, 1)])
+def test_a_drive_that_was_asked_just_now_is_not_looked_at_again(
+    monkeypatch: pytest.MonkeyPatch, share: float, looks: int
+) -> None:
+    bus, drive, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
+    drive.set_frequency(10)
+    bus.sleep(share * PAUSE_NS / 1e9)
+    begun = len(bus.frames)
+    drive.set_frequency(20)
+    asked = [is_write(request) for request, _ in bus.frames[begun:]]
+    assert asked[: looks + 1] == [False] * looks + [True]
