@@ -12,7 +12,7 @@ from lines import line, plant, polled, until
 from motors import MAKE, ReceivedRequests
 from simulated_bus import SimulatedBus, is_write, one
 
-from multidrop import YD1000, Bus, Drive, InnovertIBD, InvtCHE, NoReply, Poller, Refused, Script
+from multidrop import Bus, Drive, InnovertIBD, InvtCHE, NoReply, Poller, Refused, Script
 from multidrop.control import records
 from multidrop.control.outcome import Seen
 from multidrop.core import PAUSE_NS, Completion, Exchange, Framing, Message, build_reply
@@ -279,10 +279,17 @@ def test_the_look_before_a_stop_counts_where_it_can_be_no_other_request_s_answer
 def test_a_family_that_little_proves_is_no_reason_to_withhold_a_stop(monkeypatch: pytest.MonkeyPatch) -> None:
     """An IBD is recognised by places that its manual does not name."""
     bus = SimulatedBus(monkeypatch, simulated(InnovertIBD(1)))
-    bus.attach(YD1000(1, stop_time=1.0))
+    bus.attach(InvtCHE(1))
+
+    def refuse(request: Message) -> bytes | None:
+        is_look = request.start == InvtCHE.device.address
+        refusal = Message(1, request.function, request.start, exception=2)
+        return build_reply(Framing.RTU, refusal) if is_look else None
+
+    bus.answers = refuse
     (stopped,) = bus.bus.stop_all(seconds=1).values()
     assert stopped.seen is not Seen.FAILED
-    assert bus.written[0].startswith("01 06 10 00 C0 00")
+    assert bus.written[0].startswith("01 06 10 00 00 05")
 
 
 @pytest.mark.parametrize(("share", "looks"), [(0.6, 0), (1.1, 1)])
