@@ -604,7 +604,7 @@ def test_a_look_that_is_lost_is_not_repeated_before_the_stop_is_sent_again(
 def test_a_stop_s_first_write_waits_for_no_late_answer_and_its_later_ones_do(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Where answers are known to be late, it is confirmed thus; the stops of others wait for no first one."""
+    """It is confirmed thus on a line with late answers; the stops of others wait for no first write."""
     line, drive, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
     line.bus.check_identity(drive)
     carry_out, waits = line.carry_out, list[float]()
