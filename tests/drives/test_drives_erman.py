@@ -123,6 +123,14 @@ def test_start_is_refused_while_a_fault_may_stand() -> None:
         wire.drive.start()
 
 
+@pytest.mark.parametrize("fault", ErmanFault)
+def test_no_fault_counts_as_dealt_with_by_itself(fault: ErmanFault) -> None:
+    wire = Wire(ErmanERG220(1), {**STOPPED, "last_fault": fault}, turns=TURNS)
+    with pytest.raises(Refused, match=f"acknowledged_fault = {int(fault)}"):
+        wire.drive.start()
+    assert wire.sent == []
+
+
 def test_a_fault_that_its_owner_has_dealt_with() -> None:
     wire = Wire(
         ErmanERG220(1, acknowledged_fault=64), {**STOPPED, "last_fault": ErmanFault.OVERHEAT}, turns=TURNS
@@ -175,6 +183,10 @@ def test_start_is_written_off_though_nobody_confirms_the_stop() -> None:
         with pytest.raises(Unconfirmed, match="no reply"):  # so that it is repeated as a whole
             (wire.drive.stop if stop == STOP_ON else wire.drive.emergency_stop)()
         assert wire.sent == [*[stop] * 3, START_OFF]
+        wire = Wire(ErmanERG220(1), STOPPED, {stop: lost, START_OFF: lost})
+        with pytest.raises(Unconfirmed, match="no reply"):  # once: the whole is repeated, the stop first
+            (wire.drive.stop if stop == STOP_ON else wire.drive.emergency_stop)()
+        assert wire.sent == [*[stop] * 3, START_OFF]
 
 
 def test_a_drive_that_refuses_its_stop_is_stopped_by_the_emergency_stop() -> None:
@@ -183,6 +195,7 @@ def test_a_drive_that_refuses_its_stop_is_stopped_by_the_emergency_stop() -> Non
         wire = Wire(ErmanERG220(1), STOPPED, {refused: [refusal] * 3})
         wire.drive.stop()
         assert wire.sent == [*begun, EMERGENCY_ON, START_OFF]
+        assert wire.reads == ["deceleration_time", "status", "output_frequency"]  # it is watched once
 
 
 def test_stop_is_sent_again_when_its_answer_is_lost() -> None:
