@@ -6,6 +6,7 @@ import json
 import sqlite3
 import threading
 from contextlib import AbstractContextManager, closing
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
@@ -170,6 +171,25 @@ def test_a_clock_that_is_set_back_an_hour_frees_one_write_and_no_more(tmp_path: 
         assert "was written" in ledger.enter(CELL, set_back + second, 60.0)
     assert ledger.enter(CELL, set_back + 60, 60.0) == ""
     assert writes(ledger) == 3
+
+
+def test_a_clock_that_is_set_back_by_little_frees_a_write_too(tmp_path: Path) -> None:
+    """How long ago the last one was cannot be known then."""
+    ledger = Ledger(tmp_path / "wear")
+    assert ledger.enter(CELL, 1000.0, 60.0) == ""
+    assert ledger.enter(CELL, 999.75, 60.0) == ""
+    assert "was written 0 s ago" in ledger.enter(CELL, 999.75, 60.0)
+
+
+def test_stops_are_counted_together_or_not_at_all(tmp_path: Path) -> None:
+    """In one transaction: each of its own would wait for a disk, or for who holds the file."""
+    ledger = Ledger(tmp_path / "wear")
+    wrong = replace(CELL, register="no text: \udcff")
+    with pytest.raises(ValueError, match="surrogates not allowed"):
+        ledger.note([CELL, CELL, wrong], 1000.0)
+    assert ledger.wear(1000.0) == []
+    ledger.note([CELL, CELL], 1000.0)
+    assert [wear.writes for wear in ledger.wear(1000.0)] == [2]
 
 
 def test_a_clock_that_is_set_back_gives_no_budget_back(tmp_path: Path) -> None:
