@@ -352,6 +352,9 @@ def test_stop_keeps_bit_15_until_the_motor_stands_twice() -> None:
     wire.drive.stop()
     assert wire.sent == [STOP]
     assert wire.reads.count("output_frequency") == 5
+    wire = Wire(YD1000(1), {**STANDING, "output_frequency": [20.0, 0.01, 0.0, 0.0]})
+    wire.drive.stop()
+    assert wire.reads.count("output_frequency") == 4
     wire = Wire(YD1000(1), {**STANDING, "output_frequency": 3.0})
     with pytest.raises(Unconfirmed, match="15 s"):
         wire.drive.stop()
@@ -411,6 +414,35 @@ def test_reset_is_sent_once_and_followed_by_a_stop() -> None:
         wire.drive.reset_fault()
     with pytest.raises(Refused, match="runs"):
         Wire(YD1000(1), {"output_frequency": 5.0}).drive.reset_fault()
+    turning = Wire(YD1000(1), {**STANDING, "output_frequency": 0.01})
+    with pytest.raises(Refused, match="runs"):
+        turning.drive.reset_fault()
+    assert turning.sent == []
+
+
+def test_a_start_after_a_reset_is_at_the_setpoint_that_was_written(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The restart loses it: at another one, which the drive has by itself, nobody asked for a start."""
+    wire = Wire(YD1000(1), AT_30_HZ, turns=TURNS)
+    wire.drive.set_frequency(30)
+    wire.drive.reset_fault()
+    wire.sent.clear()
+    wire.say({"frequency": 20.0})
+    with pytest.raises(
+        Refused, match=r"holds 20\.00 Hz and not 30\.00 Hz .* call set_frequency before start"
+    ):
+        wire.drive.start()
+    assert wire.sent == []
+    line, drive, sim = one(monkeypatch, YD1000(1))
+    drive.set_frequency(30)
+    sim.trip(4)
+    drive.reset_fault()
+    with pytest.raises(Refused, match="call set_frequency before start"):
+        drive.start()
+    assert not sim.motor.energised
+    line.sleep(1)
+    drive.set_frequency(30)
+    drive.start()
+    assert sim.motor.energised
 
 
 FUNCTIONS = {f"input_{at}_function": factory for at, factory in enumerate((2.0, 3.0, 10.0, 6.0, 7.0), 1)}

@@ -504,7 +504,6 @@ class YD1000(Drive):
         yield from wait(RESET_TIME)
         yield from insist(self.control, STOP)
         self._record = yield from read(self.fault_record_1)
-        self.commanded = None
 
     def _no_terminal_runs(self) -> Script[None]:
         """Raise Refused where a terminal could start the motor: bit 15 does not outlast the restart."""
