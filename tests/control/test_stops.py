@@ -882,6 +882,56 @@ def test_looks_that_take_their_time_are_no_delay(monkeypatch: pytest.MonkeyPatch
     assert len(writes(line)) == 1
 
 
+class Looking(Own):
+    """One whose start looks at it twenty times."""
+
+    @verb
+    def start(self, direction: Direction | None = None) -> Script[None]:
+        """Start the motor."""
+        for _ in range(20):
+            yield from read(self.speed)
+        yield from write(self.ratio, 1)
+
+
+@pytest.mark.parametrize(("more", "is_sent"), [(0.25, True), (0.35, False)])
+def test_looks_may_take_as_long_as_their_silences_and_their_characters_do(
+    monkeypatch: pytest.MonkeyPatch, more: float, is_sent: bool
+) -> None:
+    """Twice the silence of 100 ms, and 64 characters, beside the time-out: twenty that take more are late."""
+    line = SimulatedBus(monkeypatch, simulated(Looking(1)))
+    drive = line.attach(Looking(1, confirmed=1, silence=0.1))
+    line.bus.check_identity(drive)
+    line.queue_time = drive.response_timeout + more - EXCHANGE_TIME
+    if is_sent:
+        drive.start()
+    else:
+        with pytest.raises(Expired):
+            drive.start()
+    assert len(line.written) == is_sent
+
+
+class Resting(Own):
+    """One that is given rests of five seconds."""
+
+    least_interval = 5.0
+
+
+@pytest.mark.parametrize(("waits", "is_sent"), [(5.9, True), (6.1, False)])
+def test_the_rest_of_a_drive_makes_no_write_late(
+    monkeypatch: pytest.MonkeyPatch, waits: float, is_sent: bool
+) -> None:
+    line = SimulatedBus(monkeypatch, simulated(Resting(1)))
+    drive = line.attach(Resting(1, confirmed=1))
+    line.bus.check_identity(drive)
+    line.queue_time = waits
+    if is_sent:
+        line.bus.write(drive, drive.ratio, 3.0)
+    else:
+        with pytest.raises(Expired):
+            line.bus.write(drive, drive.ratio, 3.0)
+    assert len(line.written) == is_sent
+
+
 def test_writes_that_take_their_time_are_no_delay(monkeypatch: pytest.MonkeyPatch) -> None:
     """A ramp has more of them than one after another take in the time of one call."""
     line, drive, _ = one(monkeypatch, YD1000(1))
