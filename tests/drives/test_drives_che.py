@@ -294,6 +294,16 @@ def test_the_setpoint_is_a_percentage_of_the_maximum_frequency() -> None:
         Wire(InvtCHE(1)).drive.set_frequency(40)
 
 
+@table(("most", "hz", "count"), [(50, 20.03, 4006), (30, 10, 3333), (60, 40, 6667), (60, 60, 10000)])
+def test_the_setpoint_is_the_nearest_hundredth_of_a_percent(
+    monkeypatch: pytest.MonkeyPatch, most: float, hz: float, count: int
+) -> None:
+    line, drive, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=most))
+    drive.set_frequency(hz)
+    (written,) = line.written
+    assert int(written[12:17].replace(" ", ""), 16) == count
+
+
 def test_a_negative_setpoint_cannot_be_written_at_all() -> None:
     with pytest.raises(ValueError, match="0 to 100 %"):
         InvtCHE.setpoint.encode(-1)

@@ -340,7 +340,7 @@ class InvtCHE(Drive):
             )
         if not 0 <= hz <= most:
             raise ValueError(f"{hz:g} Hz is outside 0 to {most:g} Hz, the maximum frequency of {self.name}")
-        yield from self._hold(self.setpoint, round(hz / most * 100, 2))
+        yield from self._hold(self.setpoint, hz / most * 100)
 
     @verb
     def state(self) -> Script[State]:
