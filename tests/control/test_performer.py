@@ -19,7 +19,7 @@ from multidrop.drive.table import Kept
 from multidrop.drive.verbs import verb
 from multidrop.drives import YD1000, ErmanERG220, InvtCHE
 from multidrop.drives.invt_che import CHEControl
-from multidrop.errors import BusError, Expired, Overtaken, Unconfirmed
+from multidrop.errors import BusError, Expired, Overtaken, Refused, Unconfirmed
 from multidrop.sim import simulated
 
 
@@ -143,6 +143,17 @@ def test_the_watchdog_of_a_drive_is_told_when_it_is_first_known(
     drive.start()
     told = [record.getMessage() for record in caplog.records if "PC.04" in record.getMessage()]
     assert told == [f"invt-che@1: {InvtCHE.watchdog}"]
+
+
+def test_what_is_refused_is_told_to_the_log(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.INFO, "multidrop.control")
+    line, drive, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
+    with pytest.raises(Refused) as refusal:
+        drive.start()
+    assert f"refused: {refusal.value}" in [record.getMessage() for record in caplog.records]
+    assert line.written == []
 
 
 def test_an_effect_that_was_neither_confirmed_nor_seen_is_told_so(monkeypatch: pytest.MonkeyPatch) -> None:

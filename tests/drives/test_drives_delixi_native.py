@@ -286,3 +286,18 @@ def test_a_fault_that_stands_after_its_reset_is_told(status: DelixiNativeStatus)
     with pytest.raises(NotDone, match=r"the fault reset.*the fault stands: OC_OVERCURRENT"):
         wire.drive.reset_fault()
     assert wire.sent == [RESET]  # once
+
+
+@table(
+    ("status", "hz"),
+    [
+        (DelixiNativeStatus.FORWARD, 12.0),
+        (DelixiNativeStatus.REVERSE, 12.0),
+        (DelixiNativeStatus.STOPPED, 0.01),
+    ],
+)
+def test_a_motor_that_turns_has_no_fault_to_reset(status: DelixiNativeStatus, hz: float) -> None:
+    wire = Wire(DelixiNative(1), {**STANDING, "status": status, "output_frequency": hz})
+    with pytest.raises(Refused, match="runs: it has no fault to reset"):
+        wire.drive.reset_fault()
+    assert wire.sent == []
