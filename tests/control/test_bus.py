@@ -355,6 +355,11 @@ MISTAKES: dict[str, tuple[Callable[[Bus, Rig], Any], type[Exception], str]] = {
         TypeError,
         "attach takes a family such as InnovertIBD, or a drive of one, not 'innovert-ibd'",
     ),
+    "a drive that is made is attached by another name": (
+        lambda bus, rig: bus.attach(Toy(3, name="pump"), name="fan"),
+        TypeError,
+        "pump is made already: what it is to be goes into Toy(…)",
+    ),
     "a drive that is made is attached at another address": (
         lambda bus, rig: bus.attach(Toy(3, name="pump"), 2),
         TypeError,

@@ -122,6 +122,15 @@ def test_what_a_plain_write_stopped_is_noted_at_once(monkeypatch: pytest.MonkeyP
     line.bus.close()
 
 
+def test_a_raw_request_is_noted_at_once(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    line, drive, _ = one(monkeypatch, InvtCHE(1), audit=tmp_path / "audit")
+    assert line.bus.audit_trouble == ""
+    line.bus.raw(drive, 6, 0x1000, b"\0\5")
+    (entry,) = read_audit(tmp_path / "audit")
+    assert (entry["sent"], entry["outcome"]) == ("01 06 10 00 00 05 4D 09", "done")
+    line.bus.close()
+
+
 def test_nothing_is_even_read_for_a_write_that_is_too_late(monkeypatch: pytest.MonkeyPatch) -> None:
     line, drive, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
     with written_before(lambda: 0.0), pytest.raises(Expired, match=r"setpoint = 10\.00 %"):

@@ -34,6 +34,7 @@ from multidrop.errors import (
     Expired,
     LineError,
     NoReply,
+    NotAttached,
     Overtaken,
     PortLost,
     Refused,
@@ -1136,6 +1137,49 @@ def test_a_drive_is_on_one_bus_at_a_time(monkeypatch: pytest.MonkeyPatch) -> Non
     other.attach(drive)
     other.bus.close()
     line.attach(drive)  # the other one is closed
+
+
+def test_a_drive_is_attached_to_the_next_bus_while_its_last_one_closes(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """That one lets go of it afterwards: it stays on the next."""
+    line, drive, sim = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
+    before = line.bus
+    free = before._attached.free
+    monkeypatch.setattr(before._attached, "free", lambda: None)
+    before.close()
+    after = SimulatedBus(monkeypatch, sim)
+    after.attach(drive)
+    free()
+    assert drive.bus is after.bus
+    with pytest.raises(ValueError, match="is on the bus at hall: detach it there first"):
+        SimulatedBus(monkeypatch).attach(drive)
+    drive.stop()
+    assert line.written == []
+    assert len(after.written) == 1
+
+
+def test_a_drive_that_another_thread_takes_off_meanwhile_is_not_taken_off_twice(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    line, drive, _ = one(monkeypatch, InvtCHE(1))
+    latches = line.bus._latches
+    await_stops = latches.await_stops
+
+    def detach_meanwhile(drives: Any = None) -> None:
+        monkeypatch.setattr(latches, "await_stops", await_stops)
+        line.bus.detach(drive)
+
+    monkeypatch.setattr(latches, "await_stops", detach_meanwhile)
+    with pytest.raises(NotAttached, match="is not attached"):
+        line.bus.detach(drive)
+    line.attach(drive)
+
+
+def test_drives_of_a_bus_that_was_closed_are_on_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    line, drive, _ = one(monkeypatch, InvtCHE(1))
+    line.bus.close()
+    assert drive.bus is None
 
 
 def test_many_threads_attach_at_once(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -99,7 +99,7 @@ def test_the_class_of_all_families_is_none() -> None:
 def test_a_direction_is_never_guessed(family: type[Drive], name: str, given: object) -> None:
     """A word that is no Direction must not turn the motor the other way; nothing is sent."""
     drive = family(family.addresses[0], name="pump")
-    drive.perform = drive.check_identity = pytest.fail
+    drive.perform = pytest.fail
     sentence = rf"^{name} of pump takes Direction\.FORWARD or Direction\.REVERSE, not "
     for words, named in (((given,), {}), ((), {"direction": given})):
         with pytest.raises(TypeError, match=sentence):
@@ -112,7 +112,7 @@ def test_a_direction_is_never_guessed(family: type[Drive], name: str, given: obj
 @table("given", ["25", None, True, Direction.FORWARD])
 def test_a_frequency_is_a_number(family: type[Drive], given: object) -> None:
     drive = family(family.addresses[0], name="pump")
-    drive.perform = drive.check_identity = pytest.fail
+    drive.perform = pytest.fail
     with pytest.raises(TypeError, match=r"^set_frequency of pump takes a number in Hz, not "):
         drive.set_frequency(given)  # type: ignore[arg-type]
 

@@ -71,7 +71,6 @@ class Attached:
         bus, performer, stopper = self._bus, self._performer, self._stopper
         drive.bus = bus
         drive.perform = lambda script: bus.perform(drive, script)
-        drive.check_identity = lambda: bus.check_identity(drive)
         drive.begin_call = lambda verb: performer.call(drive, verb)
         drive.carry_out_move = performer.move
         drive.carry_out_stop = lambda verb, script, seconds: stopper.stop(drive, script, seconds)

@@ -112,7 +112,6 @@ class Drive(ManualFacts):
         self.ram = frozenset(self._in_ram(name) for name in ram)
         self._known_setpoint = KnownSetpoint()
         self.perform: Callable[[Script[Any]], Any] = self._perform_nowhere
-        self.check_identity: Callable[[], None] = lambda: None  # until a bus has its own
         self.begin_call: Callable[[str], Any] = lambda verb: None  # its permit, which a stop ends
         self.carry_out_move: Callable[[Script[Any], Any], Any] = self._move_nowhere
         self.carry_out_stop: Callable[[str, Callable[[], Script[Any]], float | None], Any] = (
@@ -138,7 +137,6 @@ class Drive(ManualFacts):
         return self._known_setpoint.begin_write()
 
     def _move_nowhere(self, script: Script[Any], call: Any) -> Any:
-        self.check_identity()
         return self.perform(script)
 
     def _perform_nowhere(self, script: Script[Any]) -> Any:
@@ -261,5 +259,5 @@ class Drive(ManualFacts):
 # Names that a register cannot have.
 TAKEN_NAMES = frozenset(
     {*dir(Drive), *("address", "framing", "settings", "agreed_silence", "response_delay", "name")}
-    | {"option", "ram", "perform", "check_identity"}
+    | {"option", "ram", "perform"}
 )
