@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,8 @@ import pytest
 from simulated_bus import SimulatedBus, is_write, one
 
 from multidrop.control.audit_log import read_audit
+from multidrop.control.author import written_by
+from multidrop.control.outcome import Seen, Stopped
 from multidrop.control.ramp import ramp
 from multidrop.control.time_limit import written_before
 from multidrop.core import Message
@@ -17,7 +20,7 @@ from multidrop.drive import Direction, Drive, Script, read, write
 from multidrop.drive.declare import reading, setting
 from multidrop.drive.table import Kept
 from multidrop.drive.verbs import verb
-from multidrop.drives import YD1000, ErmanERG220, InvtCHE
+from multidrop.drives import YD1000, DelixiModbus, ErmanERG220, InvtCHE
 from multidrop.drives.invt_che import CHEControl
 from multidrop.errors import BusError, Expired, Overtaken, Refused, Unconfirmed
 from multidrop.sim import simulated
@@ -154,6 +157,19 @@ def test_the_watchdog_of_a_drive_is_told_when_it_is_first_known(
     assert told == [f"invt-che@1: {InvtCHE.watchdog}"]
 
 
+def test_a_write_is_told_to_the_log_with_who_asked_for_it(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.INFO, "multidrop.control")
+    line, drive, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
+    for who in ((), ("anna",), ("anna", "web")):
+        with written_by(*who) if who else nullcontext():
+            line.bus.write(drive, drive.setpoint, 10.0)
+    told = [record.getMessage() for record in caplog.records if "setpoint" in record.getMessage()]
+    sentence = "invt-che@1: setpoint = 10.00 %: done"
+    assert told == [sentence, f"{sentence} (by anna)", f"{sentence} (by anna, web)"]
+
+
 def test_what_is_refused_is_told_to_the_log(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -178,3 +194,23 @@ def test_an_effect_that_was_neither_confirmed_nor_seen_is_told_so(monkeypatch: p
     line.loses = loses
     with pytest.raises(Unconfirmed, match="it was sent, and its effect could not be seen: yd1000@1 does not"):
         drive.reset_fault()
+
+
+def test_a_write_that_its_budget_holds_back_says_that_it_may_be_sent_later(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    line, drive, _ = one(monkeypatch, DelixiModbus(1), ledger=tmp_path / "wear")
+    line.bus.write(drive, drive.frequency, 12.0)
+    with pytest.raises(Refused, match="was written 0 s ago") as refusal:
+        line.bus.write(drive, drive.frequency, 13.0)
+    assert refusal.value.is_budget
+    line.sleep(61)
+    line.bus.write(drive, drive.frequency, 13.0)
+    with pytest.raises(Refused, match="does not fit") as refusal:
+        line.bus.write(drive, drive.frequency, 1e9)
+    assert not refusal.value.is_budget
+
+
+def test_the_end_of_a_stop_is_told_with_its_reason() -> None:
+    assert str(Stopped("fan", Seen.STOPPED, 2.04)) == "fan: stopped after 2.0 s"
+    assert str(Stopped("fan", Seen.SENT, 30.0, "no reply")) == "fan: sent but unknown after 30.0 s: no reply"
