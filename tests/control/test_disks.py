@@ -88,6 +88,15 @@ def test_closing_waits_for_a_record_that_another_thread_writes(
     assert [record["write"] for record in read_audit(path)] == ["control = STOP"]
 
 
+def test_what_is_queued_is_noted_before_the_log_is_closed(tmp_path: Path) -> None:
+    path = tmp_path / "audit.jsonl"
+    line: Any = SimpleNamespace(port="/dev/ttyUSB0", identity="usb-1")
+    records = write_records.WriteRecords(line, Ledger(tmp_path / "ledger"), AuditLog(path))
+    records.log_later(InvtCHE(1), Message(1, 6, 0x1000, data=b"\0\5"), "control = STOP", Effect.DONE)
+    records.close()
+    assert [record["write"] for record in read_audit(path)] == ["control = STOP"]
+
+
 def _is_record(line: bytes) -> bool:
     try:
         json.loads(line)
@@ -107,7 +116,9 @@ def test_a_full_disk_hinders_no_stop_and_what_comes_after_is_noted(
         drive.stop()
     assert not sim.motor.energised
     assert "the audit log cannot be written: " in caplog.text
+    assert line.bus.audit_trouble == "File too large"  # what `full_at` has a full disk say
     drive.set_frequency(30)
+    assert line.bus.audit_trouble == ""
     line.bus.close()
     assert [each["write"] for each in read_audit(path)] == [
         "setpoint = 40.00 %",
