@@ -185,7 +185,7 @@ def test_a_clock_that_is_set_back_an_hour_frees_one_write_and_no_more(tmp_path: 
 
 
 def test_a_clock_that_is_set_back_by_little_frees_a_write_too(tmp_path: Path) -> None:
-    """How long ago the last one was cannot be known then."""
+    """The time since the last one cannot be known then."""
     ledger = Ledger(tmp_path / "wear")
     assert ledger.enter(CELL, 1000.0, 60.0) == ""
     assert ledger.enter(CELL, 999.75, 60.0) == ""
