@@ -198,6 +198,7 @@ def test_a_look_finds_its_drive_by_another_spelling(tmp_path: Path) -> None:
     gateway: Any = SimpleNamespace(
         plant=plant_of(("hall", InvtCHE(1, name="L\u00fcfter"))),
         ledger=Ledger(tmp_path / "wear.sqlite"),
+        poller=None,
         side_reads=SimpleNamespace(look=lambda plant, name: {"of": name}),
         lately=SimpleNamespace(drive=lambda line, name: None),
     )

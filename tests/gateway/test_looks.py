@@ -14,6 +14,7 @@ from gateways import Served, served
 from lines import line, plant, polled, until
 
 from multidrop import NoReply
+from multidrop.control.eeprom_ledger import LedgerCell
 from multidrop.drives import ErmanERG220, InvtCHE
 from multidrop.gateway import side_reads
 from multidrop.gateway.describe import describe
@@ -191,6 +192,22 @@ def test_a_silent_drives_misses_are_a_share_of_its_values(gateway: Served) -> No
     assert line["asked"] >= line["missed"] + before
     drive = gateway.get("/api/drive/pump-2").json
     assert drive["asked"] >= sum(drive["misses"].values()) + before
+
+
+def test_a_drive_shows_no_eeprom_writes_of_another_line_s_or_family_s(gateway: Served) -> None:
+    """Another drive may have its address on another port, and may have had it on this one."""
+    drive = gateway.gateway.plant.find_drive("pump-1")[1]
+    assert gateway.gateway.poller
+    port = gateway.gateway.poller.bus("hall").line.identity
+    cells = [
+        LedgerCell(port, 1, drive.ledger_name, "acceleration_time"),
+        LedgerCell(port, 1, "yd1000", "foreign_family"),
+        LedgerCell(port, 2, drive.ledger_name, "foreign_address"),
+        LedgerCell("/dev/elsewhere", 1, drive.ledger_name, "foreign_line"),
+    ]
+    gateway.gateway.ledger.at(port).note(cells, time.time())
+    ledger = gateway.get("/api/drive/pump-1").json["ledger"]
+    assert ledger == [{"register": "acceleration_time", "year": 1, "budget": 1000, "total": 1}]
 
 
 @pytest.mark.slow

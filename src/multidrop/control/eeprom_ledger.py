@@ -121,6 +121,11 @@ class Ledger:
             found = [_wear(ledger, cell, ports, now) for cell, ports in names.items()]
         return sorted(found, key=_by_wear)
 
+    def wear_of(self, port: str, address: int, model: str, now: float) -> list[Wear]:
+        """Return the cells of one drive: `port` is a port's name or its identity, `model` the ledger's name."""
+        place = (of_name(port), address, model)
+        return [one for one in self.wear(now) if (one.cell.port, one.cell.address, one.cell.model) == place]
+
     @contextmanager
     def _opened(self) -> Iterator[sqlite3.Connection]:
         try:

@@ -7,7 +7,7 @@ import contextlib
 import time
 from typing import TYPE_CHECKING, Any
 
-from multidrop import Ledger, MetricFamily, Statistics, drive_meant
+from multidrop import Drive, Ledger, MetricFamily, Statistics, drive_meant
 from multidrop.gateway.frames import lost_of
 from multidrop.gateway.lately import asked_of, misses_of
 from multidrop.gateway.metrics import Figures
@@ -21,7 +21,9 @@ async def look_at(gateway: Gateway, name: str) -> dict[str, Any]:
     """Return what the page shows of one drive alone. Raises ValueError for an unknown one."""
     name = drive_meant(name, drives_of(gateway.plant))
     line, drive = gateway.plant.find_drive(name)
-    wear = await asyncio.to_thread(_wear, gateway.ledger, line.port, drive.address)  # it may wait for a lock
+    bus = gateway.poller.buses.get(line.name) if gateway.poller else None
+    port = bus.line.identity if bus else line.port
+    wear = await asyncio.to_thread(_wear, gateway.ledger, port, drive)  # it may wait for a lock
     found = gateway.side_reads.look(gateway.plant, name)
     statistics = gateway.lately.drive(line.name, name)
     return {
@@ -54,7 +56,7 @@ def _usual_delays(statistics: Statistics) -> dict[str, float | None]:
     return {name: round(s * 1e3, 3) if delays.replies else None for name, s in quantiles.items()}
 
 
-def _wear(ledger: Ledger, port: str, address: int) -> list[dict[str, Any]]:
+def _wear(ledger: Ledger, port: str, drive: Drive) -> list[dict[str, Any]]:
     """Return the writes of a year to each cell of a drive's EEPROM, and how many it may have."""
     with contextlib.suppress(OSError):
         book = ledger.at(port)
@@ -65,8 +67,7 @@ def _wear(ledger: Ledger, port: str, address: int) -> list[dict[str, Any]]:
                 "budget": book.budget,
                 "total": wear.writes,
             }
-            for wear in book.wear(time.time())
-            if wear.cell.address == address
+            for wear in book.wear_of(port, drive.address, drive.ledger_name, time.time())
         ]
     return []
 
