@@ -408,7 +408,11 @@ def test_a_port_in_use_is_a_sentence(run: Run, port: str) -> None:
     with BoundProcess(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as other:
         assert other.stdout is not None
         assert other.stdout.readline() == b"held\n"
-        assert run("read", port, TOY, 1) == (1, "", f"multidrop: {port}: it is in use by another program\n")
+        reason = f"{port}: it is in use by another program"
+        assert run("read", port, TOY, 1) == (1, "", f"multidrop: {reason}\n")
+        status, out, err = run("stop", port, "invt-che", 1)
+        assert (status, out) == (1, "")
+        assert err.startswith(f"multidrop: the stop was NOT sent: {reason}; use the hard-wired stop")
         other.communicate()
 
 

@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
+from multidrop.bus import Bus
 from multidrop.cli import DONE, MISTAKE, STOPS
 from multidrop.cli.support.arguments import add_json_argument, add_writing_arguments, duration
 from multidrop.cli.support.confirm import confirm
@@ -20,8 +21,9 @@ from multidrop.control.stop_attempt import LEAST_S
 from multidrop.drive.family import Drive
 from multidrop.drive.script import Script, Write
 from multidrop.drive.state import Direction, State
-from multidrop.errors import Unsupported
+from multidrop.errors import LineError, Unsupported
 
+HARD_WIRED = "use the hard-wired stop"
 _DIRECTED = ("start", "jog")
 _FURTHER = {"set-frequency": ("HZ",)}  # arguments of commands behind the drive
 _SHOWING_WATCHDOG = ("state", *_DIRECTED)  # they print what the motor does when the client dies
@@ -79,7 +81,7 @@ def run(arguments: argparse.Namespace) -> int:
         drive.check_confirmed(arguments.command)
         confirm(f"{_QUESTIONS[arguments.command]} {drive.name} on {target.port}?", arguments)
     limit = {"seconds": arguments.seconds} if arguments.command in STOPS else {}
-    with _annotating(arguments.command, target) as known, target.open_bus(_audit_file(arguments)) as bus:
+    with _annotating(arguments.command, target) as known, _opened(target, arguments) as bus:
         known.clear()
         if hz is not None and arguments.command != "set-frequency":
             drive.set_frequency(hz)
@@ -114,6 +116,17 @@ def _target(arguments: argparse.Namespace) -> tuple[Target, list[str]]:
     if words:
         warn(f"left out, for {command} takes one drive, and that is {target.drive.name}: {' '.join(words)}")
     return target, words
+
+
+def _opened(target: Target, arguments: argparse.Namespace) -> Bus:
+    """Open the drive's line; where a stop's port cannot be had, say that it was not sent, and what is left."""
+    audit = _audit_file(arguments)
+    try:
+        return target.open_bus(audit)
+    except LineError as failure:
+        if arguments.command not in STOPS:
+            raise
+        raise OSError(f"the {arguments.command} was NOT sent: {failure}; {HARD_WIRED}") from failure
 
 
 def _audit_file(arguments: argparse.Namespace) -> str | None:
