@@ -5,11 +5,14 @@ from __future__ import annotations
 import asyncio
 import http.client
 import json
+import re
+import shlex
 import socket
 import threading
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
+from importlib.resources import files
 from pathlib import Path
 from time import monotonic
 from types import SimpleNamespace
@@ -75,6 +78,23 @@ def test_all_drives_are_stopped_and_seen_to_stand(tmp_path: Path) -> None:
         assert stands(gateway, "pump-1")
         assert stands(gateway, "pump-2")
         gateway.await_state("pump-1", "stands")
+
+
+@pytest.mark.slow
+def test_what_the_page_says_where_there_is_no_javascript_stops_all_drives(tmp_path: Path) -> None:
+    page = (files("multidrop.gateway") / "page" / "index.html").read_text("utf-8")
+    without = page[page.index("<noscript") : page.index("</noscript")]
+    said, token = (shlex.split(command) for command in re.findall("<code>(.+)</code>", without))
+    with served(tmp_path, "") as gateway:  # a stop needs a token
+        assert said[:2] == ["curl", "-H"]
+        name, value = said[2].split(": ")
+        assert said[3] == "-d"
+        address, path = said[-1].split("/", 1)
+        assert (address, token[0]) == ("ADDRESS", "-H")
+        key, bearer = token[1].replace("TOKEN", gateway.secrets[Right.STOP]).split(": ")
+        headers = {name.replace("-", "_"): value, key: bearer}
+        told = gateway.request("POST", f"/{path}", said[4].encode(), **headers).json
+        assert {name: one["done"] for name, one in told.items()} == {"pump-1": True, "pump-2": True}
 
 
 UNREADABLE = {
