@@ -20,9 +20,12 @@ MOST_PARTS = 100  # of a dotted key
 def read_document(path: Path, what: str) -> dict[str, Any]:
     """Return a TOML file's tables; ValueError, without the path, where it cannot be read.
 
-    A byte order mark before the text is skipped: some editors write one.
+    A byte order mark before the text is skipped: some editors write one. A device is not read: a serial port
+    would be waited for without an end, and what its drives say be lost.
     """
     try:
+        if path.is_char_device():
+            raise ValueError(f"is a device, and no {what}")
         data = path.read_bytes()
     except OSError as failure:
         raise ValueError(f"the {what} cannot be read: {failure.strerror}") from failure

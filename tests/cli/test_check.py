@@ -67,6 +67,12 @@ def test_check_tells_what_it_understood_and_what_it_does_not_know(run: Run, fan:
         assert told in refused
 
 
+def test_an_address_in_place_of_a_file_is_told_as_one(run: Run) -> None:
+    told = "http://10.0.0.7:8750 is an address, and no plant file; a gateway's page is for a browser: "
+    for command in ("check", "plan", "poll", "simulate"):
+        assert run(command, "http://10.0.0.7:8750") == (2, "", f"multidrop: {told}open it there\n")
+
+
 def test_check_tells_verbs_in_words(run: Run) -> None:
     status, out, _ = run("check", DATA / "abb.toml")
     assert status == 0

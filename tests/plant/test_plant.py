@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -427,6 +428,33 @@ def test_a_file_that_cannot_be_read_is_a_sentence(tmp_path: Path) -> None:
     (tmp_path / "latin.toml").write_bytes(b'name = "S\xfcd"')
     with pytest.raises(PlantError, match=r"latin.toml: is not text in UTF-8, from byte 9 on"):
         load_plant(tmp_path / "latin.toml")
+
+
+SCANNED = "is a port, and no plant file; `multidrop scan {} --out plant.toml` writes one"
+
+
+@pytest.mark.parametrize(
+    ("name", "told"),
+    [
+        ("http://10.0.0.7:8750", "a gateway's page is for a browser"),
+        ("HTTPS://plant.example/", "a gateway's page is for a browser"),
+        ("nats://10.0.0.7:4222", "name a file such as plant.toml"),
+        ("tcp://10.0.0.7", SCANNED.format("tcp://10.0.0.7")),
+        ("/dev/ttyUSB0", SCANNED.format("/dev/ttyUSB0")),
+    ],
+)
+def test_an_address_or_a_port_is_told_from_a_plant_file(name: str, told: str) -> None:
+    for given in (name, Path(name)):  # which has lost one of two slashes
+        with pytest.raises(PlantError) as raised:
+            load_plant(given)
+        assert str(raised.value).lower().startswith(name.lower().rstrip("/"))
+        assert told in str(raised.value)
+
+
+def test_a_device_is_not_read_for_a_plant_file() -> None:
+    """A serial port would be waited for, and what is said on its line be lost."""
+    with pytest.raises(PlantError, match=r": is a device, and no plant file$"):
+        load_plant(os.devnull)
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
@@ -33,6 +34,8 @@ class PlantError(ValueError):
 
 def load_plant(path: Path | str) -> Plant:
     """Return the plant that the file describes; PlantError when anything in it is wrong."""
+    if why := port_or_address(path):
+        raise PlantError((why,))
     path = Path(path)
     place = TomlPlace(path)
     document = place.attempt(read_document, path, "plant file")
@@ -43,6 +46,22 @@ def load_plant(path: Path | str) -> Plant:
         raise PlantError(tuple(place.config_errors), None if document is None else replace(plant, lines=()))
     return plant
 
+
+def port_or_address(name: Path | str) -> str:
+    """Return a sentence for a URL or a device where a plant file is wanted; "" for what may be a file."""
+    url = _URL.match(str(name))
+    if url is None and not str(name).startswith("/dev/tty"):
+        return ""
+    shown = f"{url[1]}://{url[2]}" if url else str(name)
+    if url and url[1].lower() in ("http", "https"):
+        return f"{shown} is an address, and no plant file; a gateway's page is for a browser: open it there"
+    if url and url[1].lower() not in _PORTS:
+        return f"{shown} is an address, and no plant file; name a file such as plant.toml"
+    return f"{shown} is a port, and no plant file; `multidrop scan {shown} --out plant.toml` writes one"
+
+
+_URL = re.compile(r"([a-z][a-z0-9+.-]+):/{1,2}(.*)", re.IGNORECASE)  # a Path has one slash of two
+_PORTS = ("tcp", "socket", "rfc2217")
 
 _PLANT = {
     "line": Key(list, "[[line]], in two brackets, with its name, port and drives", needed=True),

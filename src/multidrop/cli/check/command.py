@@ -22,7 +22,7 @@ from multidrop.drives.registry import find_model
 from multidrop.family_file.errors import FamilyError
 from multidrop.family_file.loader import load_family
 from multidrop.family_file.step_words import declared_in_words
-from multidrop.plant.loader import PlantError, load_plant
+from multidrop.plant.loader import PlantError, load_plant, port_or_address
 from multidrop.toml_check import read_document
 
 
@@ -37,6 +37,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
+    if why := port_or_address(arguments.file):
+        raise ValueError(why)
     if _is_plant(arguments.file):
         return _check_plant(arguments)
     try:
