@@ -418,8 +418,13 @@ def test_no_permission_is_told_in_a_sentence(run: Run, monkeypatch: pytest.Monke
     )
 
 
-def test_mistaken_calls_are_told_in_a_sentence(run: Run, tmp_path: Path, capture: Path) -> None:
+def test_mistaken_calls_are_told_in_a_sentence(
+    run: Run, tmp_path: Path, capture: Path, request: pytest.FixtureRequest
+) -> None:
     none, text = tmp_path / "none.pcapng", tmp_path / "text"
+    ends = os.pipe()
+    request.addfinalizer(lambda: [os.close(end) for end in ends])
+    pipe = f"/dev/fd/{ends[0]}"
     text.write_text("hello, world")
     cut = tmp_path / "cut.pcapng"
     cut.write_bytes(capture.read_bytes()[:-5])
@@ -428,6 +433,8 @@ def test_mistaken_calls_are_told_in_a_sentence(run: Run, tmp_path: Path, capture
         (["sniff", "--replay", capture, "--out", "a.csv"], 2, "a.csv: a capture's name ends in .pcapng"),
         (["decode", none], 2, f"{none}: No such file or directory"),
         (["decode", text], 2, f"{text} is not a capture: it does not begin like pcap or pcapng"),
+        (["decode", pipe], 2, f"{pipe} is not a capture: it is no file"),
+        (["sniff", "--replay", pipe], 2, f"{pipe} is not a capture: it is no file"),
         (
             ["decode", capture, "--out", capture],
             2,

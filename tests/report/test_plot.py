@@ -760,6 +760,23 @@ def test_mistakes_are_one_sentence(
     assert len(err.splitlines()) == 1
 
 
+@pytest.mark.parametrize("command", ["plot", "report", "convert"])
+def test_a_folder_of_a_history_is_told_as_one(run: Run, tmp_path: Path, command: str) -> None:
+    out = () if command != "convert" else (tmp_path / "all.csv",)
+    folder = f"multidrop: {tmp_path} is the folder of a history: name one of its segments, such as"
+    by_program = "or read all of them from Python by `multidrop.History`\n"
+    (tmp_path / "rows").mkdir()
+    for name in ("rows.00000003.arrows", "rows/00000001.parquet", "rows/00000002.parquet"):
+        (tmp_path / name).touch()
+    assert run(command, tmp_path, *out) == (2, "", f"{folder} {tmp_path}/rows.00000003.arrows, {by_program}")
+    (tmp_path / "rows.00000003.arrows").unlink()
+    assert run(command, tmp_path, *out) == (
+        2,
+        "",
+        f"{folder} {tmp_path}/rows/00000002.parquet, {by_program}",
+    )
+
+
 @pytest.mark.parametrize("command", ["plot", "report"])
 def test_what_is_no_recording_or_has_no_rows_is_one_sentence(run: Run, tmp_path: Path, command: str) -> None:
     assert run(command, ".")[::2] == (2, "multidrop: . is a folder: name the recording in it\n")

@@ -57,6 +57,8 @@ class Capture:
         self._order = "<"
         self._unpacker: Unpacker | None = None
         try:
+            if not self._file.seekable():  # a serial port, or a pipe
+                raise CaptureError(f"{path} is not a capture: it is no file")
             self._size = self._file.seek(0, SEEK_END)  # what is appended later is not read
             self._begin()
         except BaseException:

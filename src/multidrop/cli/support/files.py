@@ -47,15 +47,27 @@ def warn_truncated(path: Path, rows: int, left_out: int) -> None:
 
 
 def check_no_segments(path: Path) -> None:
-    """Raise ValueError where there is no recording at this path, but segments of one."""
+    """Raise ValueError where there is no recording at this path, but segments of one, or a folder."""
+    if path.is_dir():
+        kept = [*sorted(path.glob("rows/*.parquet")), *sorted(path.glob("rows.*.arrows"))]
+        if not kept:
+            raise _is_folder(path)
+        raise ValueError(
+            f"{path} is the folder of a history: name one of its segments, such as {kept[-1]}, or read all of "
+            "them from Python by `multidrop.History`"
+        )
     if not path.exists() and path.parent.is_dir() and (segments := segments_of(path)):
         raise ValueError(f"{path} was recorded in segments: name one of them, such as {segments[-1][1]}")
+
+
+def _is_folder(path: Path) -> ValueError:
+    return ValueError(f"{path} is a folder: name the recording in it")
 
 
 def beside(recording: Path, suffix: str) -> Path:
     """Return a recording's path with another suffix. Raises ValueError for a path that names no file."""
     if not recording.name:
-        raise ValueError(f"{recording} is a folder: name the recording in it")
+        raise _is_folder(recording)
     return recording.with_suffix(suffix)
 
 
