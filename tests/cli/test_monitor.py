@@ -19,6 +19,7 @@ from commands import Run, plant_file
 from lines import PATIENCE
 from rich.cells import cell_len
 from rich.console import Console
+from rich.text import Text
 from tables import table
 from terminals import Terminal, on_terminal
 
@@ -36,8 +37,10 @@ from multidrop.cli.monitor.screen import (
     page,
     sparkline,
 )
+from multidrop.cli.monitor.side_reads import SideRead
 from multidrop.cli.support.live_plant import LivePlant
 from multidrop.cli.support.polling import PollingSession
+from multidrop.cli.support.screen_text import joined
 from multidrop.cli.support.signals import Interruption
 from multidrop.control.outcome import Seen, Stopped
 from multidrop.core import Counters, Status
@@ -184,11 +187,46 @@ def test_the_overview_says_it_in_words(watched: LivePlant) -> None:
     assert lines[0].endswith("09:30:00 UTC ")
     assert lines[1].startswith(" hall-1   90% of the wire used  50.0 exchanges/s  12 missed: bad checksum")
     assert lines[3].split() == [">drive-1", "forward", "42.50", "Hz", "2.5", "A", "0.5", "s", "12", "██"]
-    assert lines[4].startswith("!drive-2 fault")
-    assert "oc1_overc" in lines[4]
+    assert lines[4].startswith("!drive-2 ?fault")
+    assert lines[4].split()[2:5] == ["?0.00", "Hz", "?oc1_overcu~"]
+    assert lines[-2] == " ? is old"
     assert lines[5].split()[:5] == ["drive-3", "silent", "no", "reply", "never"]
     assert lines[-1].startswith(" up/down choose")
     assert "start" not in " ".join(lines).lower()
+
+
+def test_one_old_value_among_new_ones_is_marked(watched: LivePlant) -> None:
+    watched.add(from_rows([row("drive-1", "output_frequency", None, "exception 02", ago=0)]))
+    at = Position()
+    shown = [texts(overview(watched, at, (80, 24), NOW + wait, BLOCKS))[3] for wait in (0, SECOND)]
+    assert [" 42.50 Hz " in line for line in shown] == [True, False]  # one miss is none yet
+    assert shown[1].split()[1:8] == ["forward", "?42.50", "Hz", "2.5", "A", "1.5", "s"]
+
+
+def test_what_is_asked_seldom_is_not_old_before_it_is_due_again(tmp_path: Path) -> None:
+    path = tmp_path / "hall.toml"
+    a_plant(tmp_path, 1)
+    path.write_text(path.read_text().replace("address = 1\n", 'address = 1\nevery = "1 min"\n'))
+    plant = load_plant(path)
+    (drive,) = LivePlant(plant).drives
+    drive.add(row("drive-1", "output_frequency", 42.5))
+    ages = [drive.is_old("output_frequency", NOW + seconds * SECOND) for seconds in (100, 170, 190)]
+    assert ages == [False, False, True]
+    planned = plant.metadata()["planned"] | {"hall-1": {"cycle_ms": 100_000.0}}  # of a line full of drives
+    (drive,) = LivePlant(plant, planned).drives
+    drive.add(row("drive-1", "output_frequency", 42.5))
+    assert [drive.is_old("output_frequency", NOW + seconds * SECOND) for seconds in (290, 310)] == [
+        False,
+        True,
+    ]
+
+
+def test_what_a_terminal_cannot_show_takes_the_same_columns() -> None:
+    lines = [Text("pump"), Text("Июль 主 26 °C", style="reverse")]
+    picture = joined(lines, "ascii")
+    assert picture.plain == "pump\n???? ?? 26 ?C"
+    assert cell_len(picture.plain.splitlines()[1]) == cell_len(lines[1].plain)
+    assert joined(lines, "utf-8").plain == "pump\nИюль 主 26 °C"
 
 
 @pytest.mark.parametrize("size", [(60, 12), (80, 24), (200, 50), (500, 100)])
@@ -244,7 +282,7 @@ def test_a_wide_overview_has_long_names_whole(tmp_path: Path) -> None:
 
 def test_the_page_has_every_register(watched: LivePlant) -> None:
     live = watched.drives[1]
-    others = {"motor_speed": "0 rpm"}
+    others = {"motor_speed": SideRead("0 rpm", NOW - 14 * SECOND)}
     lines = texts(page(live, others, Position(1, page=True), (80, 40), NOW))
     assert lines[0].startswith(" drive-2  INVT CHE  address 2  9600 8N1 rtu")
     rows = {line.split()[0]: line for line in lines[3:-2] if line.strip()}
@@ -252,8 +290,15 @@ def test_the_page_has_every_register(watched: LivePlant) -> None:
     assert set(rows) == readable
     assert rows["output_frequency"].split()[1:] == ["0.00", "Hz", "9.0", "s", "bad", "checksum"]
     assert rows["status"].split()[1:3] == ["not", "yet"]
-    assert rows["motor_speed"].split()[1:] == ["0", "rpm", "not", "polled"]
+    assert rows["motor_speed"].split()[1:] == ["0", "rpm", "14", "s", "not", "polled"]
     assert rows["device"].split()[1] == "..."
+
+
+def test_a_page_has_whole_reasons_beside_short_values(watched: LivePlant) -> None:
+    why = "not asked: drive is silent"
+    watched.add(from_rows([row("drive-1", name, None, why) for name in CHE]))
+    lines = texts(page(watched.drives[0], {}, Position(page=True), (80, 24), NOW))
+    assert [line.endswith(why) for line in lines[3:7]] == [True] * 4
 
 
 @pytest.mark.parametrize(
@@ -433,7 +478,7 @@ def test_all_lines_are_sent_their_stops_before_one_is_waited_for_without_threads
         monitor._obey(key)
     names = [line.name for line in lines]
     assert asked == [(name, 0.0) for name in names] + [(name, None) for name in names]
-    assert "; ".join(f"1 of 1 drives on {name} have stopped" for name in names) == monitor._at.message
+    assert monitor._at.message == "3 of 3 drives stopped"
     assert monitor._at.failures == []
 
 
@@ -449,7 +494,7 @@ def test_a_failure_stays_until_it_is_acknowledged(tmp_path: Path, monkeypatch: p
         monitor._obey(key)
     failure = "drive-2: failed after 0.2 s: no reply"
     assert failure in seen(monitor)
-    assert "1 of 2 drives on hall-1 have stopped" in seen(monitor)
+    assert "1 of 2 drives stopped" in seen(monitor)
     assert "a acknowledges what FAILED" in seen(monitor)
     stopped = {"drive-2": Stopped("drive-2", Seen.STOPPED, 0.1)}
     poller.stop_all = lambda: stopped  # type: ignore[method-assign]
@@ -467,11 +512,11 @@ def test_all_lines_stand_in_what_a_stop_of_all_came_to(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monitor, _ = a_monitor(tmp_path, monkeypatch)
-    monitor._stop_results = {}
-    message = ""
-    for line in ("hall-1", "hall-2"):
-        message, _ = monitor._stop_all(line)
-    assert message == "1 of 2 drives on hall-1 have stopped; 1 of 2 drives on hall-2 have stopped"
+    (line,) = monitor._plant.plant.lines
+    both = (line, replace(line, name="hall-2"))
+    monitor._plant.plant = replace(monitor._plant.plant, lines=both)
+    messages = [monitor._stop_all(line.name)[0] for line in both]
+    assert messages == ["1 of 2 drives stopped, on 1 of 2 lines so far", "2 of 4 drives stopped"]
 
 
 def test_what_had_no_room_is_shown_once_the_first_are_acknowledged(watched: LivePlant) -> None:
@@ -632,7 +677,7 @@ def test_the_page_says_why_what_is_not_polled_is_not_known(plant: Path) -> None:
         await_both(terminal)
         terminal.press(b"\x1b[B\r")
         terminal.wait_for("TOY T1  address 9")
-        terminal.wait_for("NoReply")
+        terminal.wait_for("  no reply  ")
         terminal.press(b"q")
         assert terminal.process.wait(timeout=60) == 0
 

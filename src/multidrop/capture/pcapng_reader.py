@@ -57,9 +57,6 @@ class Capture:
         self._order = "<"
         self._unpacker: Unpacker | None = None
         try:
-            if not self._file.seekable():  # a serial port, or a pipe
-                raise CaptureError(f"{path} is not a capture: it is no file")
-            self._size = self._file.seek(0, SEEK_END)  # what is appended later is not read
             self._begin()
         except BaseException:
             self.close()
@@ -79,6 +76,9 @@ class Capture:
         self.close()
 
     def _begin(self) -> None:
+        if not self._file.seekable():  # a serial port, or a pipe
+            raise CaptureError(f"{self.path} is not a capture: it is no file")
+        self._size = self._file.seek(0, SEEK_END)  # what is appended later is not read
         if not self._size:
             raise CaptureError(f"{self.path} is not a capture: it is empty")
         magic = self._piece(0, 4)

@@ -119,7 +119,7 @@ def _target(arguments: argparse.Namespace) -> tuple[Target, list[str]]:
 
 
 def _opened(target: Target, arguments: argparse.Namespace) -> Bus:
-    """Open the drive's line; where a stop's port cannot be had, say that it was not sent, and what is left."""
+    """Open the drive's line; of a stop whose port cannot be had, say that it was not sent."""
     audit = _audit_file(arguments)
     try:
         return target.open_bus(audit)

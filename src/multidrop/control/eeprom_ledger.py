@@ -122,7 +122,7 @@ class Ledger:
         return sorted(found, key=_by_wear)
 
     def wear_of(self, port: str, address: int, model: str, now: float) -> list[Wear]:
-        """Return the cells of one drive: `port` is a port's name or its identity, `model` the ledger's name."""
+        """Return the cells of one drive, at a port of this name or identity; `model` is its `ledger_name`."""
         place = (of_name(port), address, model)
         return [one for one in self.wear(now) if (one.cell.port, one.cell.address, one.cell.model) == place]
 

@@ -63,7 +63,7 @@ def watch(plant: Plant, *, out: Path | None = None, seconds: float | None = None
     A terminal that is closed ends it too. Stops that are under way are waited for in any case.
     """
     console = open_console()
-    live = LivePlant(plant)
+    live = LivePlant(plant, plant.metadata()["planned"])
     with polling_session(plant, out, live.add) as session:
         monitor = Monitor(live, session, console)
         with session.poller:
@@ -88,7 +88,7 @@ class Monitor:
         self._at = Position()
         self._on_yes: Callable[[], None] | None = None  # done when the question is answered with y
         self._stops: list[threading.Thread] = []  # under way, or done
-        self._stop_results: dict[str, str] = {}  # of the last stop of all drives, by line
+        self._stop_results: dict[str, tuple[int, int]] = {}  # of all drives: stopped, asked, by line
         self._has_left = False
         self._side_reader = SideReader(session.poller)
         self._blocks = BLOCKS if "utf" in console.encoding else PLAIN_BLOCKS
@@ -155,9 +155,8 @@ class Monitor:
             yield draw, DRAW_S
 
     def _picture(self) -> Any:
-        from rich.text import Text
-
         from multidrop.cli.monitor.screen import overview, page
+        from multidrop.cli.support.screen_text import joined
 
         size = self._console.width, self._console.height
         now_ns = time.time_ns()
@@ -166,7 +165,7 @@ class Monitor:
             lines = page(self._chosen, others, self._at, size, now_ns)
         else:
             lines = overview(self._plant, self._at, size, now_ns, self._blocks)
-        return Text("\n", no_wrap=True, end="").join(lines)
+        return joined(lines, self._console.encoding)
 
     @property
     def _chosen(self) -> LiveDrive:
@@ -292,7 +291,8 @@ class Monitor:
     def _stop_all(self, line: str) -> tuple[str, list[str]]:
         stopped = self._session.poller.bus(line).stop_all().values()
         doubtful = [str(stop) for stop in stopped if stop.seen is not Seen.STOPPED]
-        self._stop_results[line] = (
-            f"{len(stopped) - len(doubtful)} of {len(stopped)} drives on {line} have stopped"
-        )
-        return "; ".join(self._stop_results.values()), doubtful
+        self._stop_results[line] = len(stopped) - len(doubtful), len(stopped)
+        have, asked = map(sum, zip(*[*self._stop_results.values()], strict=True))
+        lines, done = len(self._plant.plant.lines), len(self._stop_results)
+        so_far = f", on {done} of {lines} lines so far" if done < lines else ""
+        return f"{have} of {asked} drives stopped{so_far}", doubtful

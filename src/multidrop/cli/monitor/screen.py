@@ -9,19 +9,22 @@ import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
-from typing import Any
 
 from rich.cells import cell_len, set_cell_size
 from rich.text import Text
 
-from multidrop.cli.support.live_plant import CURRENT, FREQUENCY, LiveDrive, LivePlant
+from multidrop.cli.monitor.side_reads import SideRead
+from multidrop.cli.support.live_plant import CURRENT, FAULT, FREQUENCY, STATE, LiveDrive, LivePlant
+from multidrop.cli.support.screen_text import cut
 from multidrop.cli.support.values import counted
-from multidrop.drive.register import Register
 from multidrop.printable import printable
 
 LEAST_WIDTH, LEAST_HEIGHT = 60, 12
 WIDE = 100  # has room for more columns
-OLD = 5.0  # s: an older value is marked
+OLD_NOTE, NOT_POLLED = "old", "not polled"  # of registers
+NEVER = "never"
+LEAST_VALUE, AROUND = 12, 13  # columns of a register's value; of its age, and of blanks
+OLD = "?"  # before a value that is not the present one any more
 BLOCKS, PLAIN_BLOCKS = "▁▂▃▄▅▆▇█", "_.-=+*#@"
 STOPS = "s stop   S stop all   q quit"
 ACKNOWLEDGE = (f"a acknowledges what FAILED   {STOPS}",)
@@ -56,12 +59,13 @@ def overview(plant: LivePlant, at: Position, size: tuple[int, int], now_ns: int,
         for number, drive in enumerate(plant.drives[first : first + room], first)
     ]
     hidden = len(plant.drives) - len(rows)
-    note = f"{hidden} more drives: scroll" if hidden else ""
+    notes = [f"{OLD} is old"] if any(OLD in row.plain for row in rows) else []
+    note = "   ".join([*notes, *([f"{hidden} more drives: scroll"] if hidden else [])])
     return [*top, *rows, *[Text()] * (room - len(rows)), *alarms, *_foot(at, width, HELP, note)]
 
 
 def page(
-    shown: LiveDrive, others: Mapping[str, str], at: Position, size: tuple[int, int], now_ns: int
+    shown: LiveDrive, others: Mapping[str, SideRead], at: Position, size: tuple[int, int], now_ns: int
 ) -> list[Text]:
     """Draw every register of one drive; `others` has the side reads of those that are not polled."""
     width, height = size
@@ -71,14 +75,21 @@ def page(
     state = f" {shown.state or 'state not polled'}   {shown.fault}   {_misses(shown.so_far.misses)}"
     top = [
         Text(set_cell_size(head, width), style="reverse"),
-        Text(_cut(state, width)),
-        Text(_cut(f" {_pace(shown)}", width)),
+        Text(cut(state, width)),
+        Text(cut(f" {_pace(shown)}", width)),
     ]
     names = [name for name, register in drive.registers.items() if register.readable]
     polled = [poll.register.name for poll in shown.polled.polls]
     names = [*polled, *(name for name in names if name not in polled)]
     longest = max(map(len, names), default=0)
-    rows = [_register(shown, drive.register(name), others, longest, width, now_ns) for name in names]
+    cells = [_register(shown, name, others, now_ns) for name in names]
+    notes = max((len(note) for *_, note in cells), default=0)
+    room = max(LEAST_VALUE, width - longest - notes - AROUND)  # for values, beside whole notes
+    values = max(LEAST_VALUE, min(room, max((cell_len(value) for value, *_ in cells), default=0)))
+    rows = [
+        _register_row(f"{name:<{longest}}", *cell, values, width)
+        for name, cell in zip(names, cells, strict=True)
+    ]
     alarms = _alarms(at, size)
     room = height - len(top) - len(alarms) - 2
     at.scrolled = max(0, min(at.scrolled, len(rows) - room))
@@ -102,7 +113,7 @@ def _line_states(plant: LivePlant, width: int) -> list[Text]:
         lately = plant.lately[line.name]
         text = f" {line.name}  {lately.utilisation:4.0%} of the wire used  "
         text += f"{lately.exchanges_per_second:.1f} exchanges/s  {_misses(plant.so_far[line.name].misses)}"
-        lines.append(Text(_cut(text, width)))
+        lines.append(Text(cut(text, width)))
     return lines
 
 
@@ -133,7 +144,7 @@ def _ms(seconds: float) -> str:
 
 def _columns(plant: LivePlant, width: int) -> dict[str, int]:
     """Return widths by heading; the rest of the line goes to the fault and the history."""
-    columns = {"DRIVE": 5, "STATE": 10, "FREQUENCY": 9, "CURRENT": 9, "FAULT": 10, "AGE": 7}
+    columns = {"DRIVE": 5, "STATE": 10, "FREQUENCY": 10, "CURRENT": 10, "FAULT": 8, "AGE": 7}
     longest = max(cell_len(drive.name) for drive in plant.drives)
     most = 11 + max(0, width - WIDE) // 3
     columns["DRIVE"] += max(0, min(longest - 5, most, width - len(columns) - sum(columns.values())))
@@ -155,7 +166,7 @@ _RIGHT = {"FREQUENCY", "CURRENT", "AGE", "MISSED", "DELAY"}
 def _row(columns: Mapping[str, int], cells: Mapping[str, str], mark: str) -> str:
     parts = []
     for head, width in columns.items():
-        text = _cut(cells.get(head, ""), width)
+        text = cut(cells.get(head, ""), width)
         blank = " " * (width - cell_len(text))
         parts.append(blank + text if head in _RIGHT else text + blank)
     return f"{mark:1}" + " ".join(parts)
@@ -164,43 +175,44 @@ def _row(columns: Mapping[str, int], cells: Mapping[str, str], mark: str) -> str
 def _drive(
     drive: LiveDrive, chosen: bool, columns: Mapping[str, int], width: int, now_ns: int, blocks: str
 ) -> Text:
-    age = drive.age(now_ns)
+    old = {name for name in (STATE, FREQUENCY, CURRENT, FAULT) if drive.is_old(name, now_ns)}
+
+    def marked(text: str, register: str) -> str:
+        return OLD + text if text and register in old else text
+
     cells = {
         "DRIVE": drive.name,
-        "STATE": drive.state,
-        "FREQUENCY": drive.shown(FREQUENCY),
-        "CURRENT": drive.shown(CURRENT),
-        "FAULT": drive.fault or drive.why_silent,
-        "AGE": _age(age),
+        "STATE": marked(drive.state, drive.told_by),
+        "FREQUENCY": marked(drive.shown(FREQUENCY), FREQUENCY),
+        "CURRENT": marked(drive.shown(CURRENT), CURRENT),
+        "FAULT": marked(drive.fault, FAULT) or drive.why_silent,
+        "AGE": _age(drive.age(now_ns)),
         "DELAY": f"{_ms(drive.so_far.delays.p50)} ms" if drive.so_far.delays.replies else "",
         "MISSED": str(drive.so_far.misses.total() or ""),
         "HISTORY": sparkline(list(drive.history), columns.get("HISTORY", 0), blocks),
     }
-    style = "red" if drive.fault else "yellow" if drive.why_silent or (age is not None and age > OLD) else ""
+    style = "red" if drive.fault else "yellow" if drive.why_silent or old else ""
     text = _row(columns, cells, ">" if chosen else "!" if drive.fault else "")
     return Text(set_cell_size(text, width), style=f"{style} reverse" if chosen else style)
 
 
 def _register(
-    drive: LiveDrive,
-    register: Register[Any],
-    others: Mapping[str, str],
-    longest: int,
-    width: int,
-    now_ns: int,
-) -> Text:
-    name = register.name
-    miss = drive.missed.get(name)
-    row = drive.newest.get(name)
+    drive: LiveDrive, name: str, others: Mapping[str, SideRead], now_ns: int
+) -> tuple[str, str, str]:
+    """Return a register's value, its age, and a note."""
     if any(poll.register.name == name for poll in drive.polled.polls):
+        miss = drive.missed.get(name)
+        row = drive.newest.get(name)
         value = drive.shown(name) or (miss.status if miss else "not yet")
-        age = _age(None if row is None else (now_ns - row.time) / 1e9)
-        note = miss.status if miss and row else ""
-    else:
-        value, age, note = others.get(name, "..."), "", "not polled"
-    value_width = max(12, min(40, width - longest - 30))
-    text = f" {name:<{longest}}  {_cut(value, value_width):>{value_width}}  {age:>6}  {note}"
-    return Text(_cut(text, width), style="yellow" if miss else "dim" if note == "not polled" else "")
+        note = miss.status if miss and row else OLD_NOTE if drive.is_old(name, now_ns) else ""
+        return value, _age(None if row is None else (now_ns - row.time) / 1e9), note
+    other = others.get(name)
+    return (other.text, _age((now_ns - other.time) / 1e9), NOT_POLLED) if other else ("...", "", NOT_POLLED)
+
+
+def _register_row(name: str, value: str, age: str, note: str, value_width: int, width: int) -> Text:
+    text = f" {name}  {cut(value, value_width):>{value_width}}  {age:>6}  {note}"
+    return Text(cut(text, width), style="dim" if note == NOT_POLLED else "yellow" if note or age == NEVER else "")
 
 
 def _alarms(at: Position, size: tuple[int, int]) -> list[Text]:
@@ -223,26 +235,20 @@ def _alarms(at: Position, size: tuple[int, int]) -> list[Text]:
 
 def _foot(at: Position, width: int, helps: Sequence[str], note: str) -> list[Text]:
     if at.question:
-        return [Text(), Text(set_cell_size(_cut(f" {at.question}", width), width), style="bold reverse")]
+        return [Text(), Text(set_cell_size(cut(f" {at.question}", width), width), style="bold reverse")]
     text = f" {at.message}" if at.message else f" {note}"
     helps = ACKNOWLEDGE if at.failures else helps
     help_text = next((help_text for help_text in helps if len(help_text) < width), helps[-1])
-    return [Text(_cut(text, width), style="bold"), Text(_cut(f" {help_text}", width), style="dim")]
+    return [Text(cut(text, width), style="bold"), Text(cut(f" {help_text}", width), style="dim")]
 
 
 def _first_seen(chosen: int, count: int, room: int) -> int:
     return max(0, min(chosen - room // 2, count - room))
 
 
-def _cut(text: str, width: int) -> str:
-    """Cut to so many columns of a terminal, of which some characters take two and some none."""
-    text = printable(text)
-    return text if cell_len(text) <= width else set_cell_size(text, max(0, width - 1)) + "~"
-
-
 def _age(seconds: float | None) -> str:
     if seconds is None:
-        return "never"
+        return NEVER
     if seconds < 10:
         return f"{seconds:.1f} s"
     if seconds < 120:

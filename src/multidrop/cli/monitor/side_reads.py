@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import re
 import threading
 import time
+from typing import NamedTuple
 
 from multidrop.cli.support.live_plant import LiveDrive
 from multidrop.cli.support.values import value_text
@@ -13,17 +15,24 @@ from multidrop.poller import Poller
 SIDE_S = 0.1  # between two reads: the polling keeps nearly all of the line
 
 
+class SideRead(NamedTuple):
+    """What was read of a register, or why nothing was."""
+
+    text: str
+    time: int  # UTC, ns: the read was over
+
+
 class SideReader:
     """Reads one drive's other registers, one after another, in a thread of its own."""
 
     def __init__(self, poller: Poller) -> None:
         self._poller = poller
         self._drive: LiveDrive | None = None
-        self._found: dict[str, str] = {}
+        self._found: dict[str, SideRead] = {}
         self._thread: threading.Thread | None = None
 
-    def read(self, drive: LiveDrive) -> dict[str, str]:
-        """Return the values found so far, as text by register; go on reading."""
+    def read(self, drive: LiveDrive) -> dict[str, SideRead]:
+        """Return what was found so far, by register; go on reading."""
         if self._drive is not drive:
             self._drive, self._found = drive, {}
         if self._thread is None or not self._thread.is_alive():
@@ -35,7 +44,7 @@ class SideReader:
         """Read no further."""
         self._drive = None
 
-    def _read_all(self, chosen: LiveDrive, found: dict[str, str]) -> None:
+    def _read_all(self, chosen: LiveDrive, found: dict[str, SideRead]) -> None:
         drive = chosen.polled.drive
         polled = {poll.register.name for poll in chosen.polled.polls}
         bus = self._poller.bus(chosen.line.name)
@@ -45,7 +54,13 @@ class SideReader:
             if self._drive is not chosen:
                 return
             try:
-                found[name] = value_text(register, bus.read(drive, register))
+                text = value_text(register, bus.read(drive, register))
             except BusError as failure:
-                found[name] = type(failure).__name__
+                text = _in_words(failure)
+            found[name] = SideRead(text, time.time_ns())
             time.sleep(SIDE_S)
+
+
+def _in_words(failure: BusError) -> str:
+    """Return the kind of a failure in a few words, such as "no reply"."""
+    return re.sub(r"(?<=[a-z])(?=[A-Z])", " ", type(failure).__name__).lower()

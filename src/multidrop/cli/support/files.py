@@ -53,8 +53,8 @@ def check_no_segments(path: Path) -> None:
         if not kept:
             raise _is_folder(path)
         raise ValueError(
-            f"{path} is the folder of a history: name one of its segments, such as {kept[-1]}, or read all of "
-            "them from Python by `multidrop.History`"
+            f"{path} is the folder of a history: name one of its segments, such as {kept[-1]}, or read all "
+            "of them from Python by `multidrop.History`"
         )
     if not path.exists() and path.parent.is_dir() and (segments := segments_of(path)):
         raise ValueError(f"{path} was recorded in segments: name one of them, such as {segments[-1][1]}")

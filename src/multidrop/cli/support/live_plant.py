@@ -9,6 +9,7 @@ from collections import deque
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from enum import Flag
+from typing import Any
 
 from multidrop.cli.support.values import value_text
 from multidrop.core import UNASKED, Counters
@@ -18,6 +19,9 @@ from multidrop.transport.statistics import LineStatistics, Statistics, line_stat
 
 HISTORY = 240  # points, one a second
 LATELY = 5.0  # s over which rates are taken
+OLD = 5.0  # s, or so many periods of a register, or bus cycles of its line, if they are longer:
+PERIODS = 3  # a value is old then,
+MISSED = 1.0  # s: and where it was missed since, after so long
 FREQUENCY, CURRENT, FAULT, STATE = "output_frequency", "output_current", "fault", "status"
 
 _NOTHING = Statistics(1.0, Counters())
@@ -29,6 +33,7 @@ class LiveDrive:
 
     line: PlantLine
     polled: PolledDrive
+    cycle: float = 0.0  # s, of its line, as planned
     newest: dict[str, Row] = field(default_factory=dict)  # samples, by register
     missed: dict[str, Row] = field(default_factory=dict)  # misses newer than the register's sample
     last_miss: str = ""  # status of the last miss of a request that was sent
@@ -61,6 +66,17 @@ class LiveDrive:
         newest = max((row.time for row in self.newest.values()), default=None)
         return None if newest is None else max(0.0, (now_ns - newest) / 1e9)
 
+    def is_old(self, name: str, now_ns: int) -> bool:
+        """Return True where a register's newest value is not the present one any more."""
+        row = self.newest.get(name)
+        age = 0.0 if row is None else (now_ns - row.time) / 1e9
+        return age > (MISSED if name in self.missed else self._holds(name))
+
+    def _holds(self, name: str) -> float:
+        """Return for how long a value of this register is the present one."""
+        every = next((poll.every for poll in self.polled.polls if poll.register.name == name), None)
+        return max(OLD, PERIODS * max(every or 0.0, self.cycle))
+
     @property
     def why_silent(self) -> str:
         """Return the reason for the misses, where every polled register is missed."""
@@ -74,18 +90,25 @@ class LiveDrive:
         return self.shown(FAULT).lower() if row and row.value else ""
 
     @property
+    def told_by(self) -> str:
+        """Return the register that tells the state; "" where the drive is silent."""
+        if self.why_silent:
+            return ""
+        if self.fault:
+            return FAULT
+        is_named = STATE in self.newest and not self._is_bare(self.newest[STATE])
+        return STATE if is_named else FREQUENCY
+
+    @property
     def state(self) -> str:
         """Return the state as far as the polled registers show it."""
-        if self.why_silent:
-            return "silent"
-        if self.fault:
-            return "fault"
-        if STATE in self.newest and not self._is_bare(self.newest[STATE]):
+        told_by = self.told_by
+        if told_by == STATE:
             return self.shown(STATE).lower()
+        if told_by != FREQUENCY:
+            return "fault" if told_by else "silent"
         row = self.newest.get(FREQUENCY)
-        if row is None or not row.value:
-            return ""  # 0 Hz may be a stop, or a run at a setpoint of 0
-        return "turns"
+        return "turns" if row and row.value else ""  # 0 Hz may be a stop, or a run at a setpoint of 0
 
     def _is_bare(self, row: Row) -> bool:
         """Return True for flags of which none is set: they are no name of a state."""
@@ -101,11 +124,17 @@ class LiveDrive:
 
 
 class LivePlant:
-    """All drives of a plant, and the statistics of its lines: so far, and of the last LATELY seconds."""
+    """All drives of a plant, and the statistics of its lines: so far, and of the last LATELY seconds.
 
-    def __init__(self, plant: Plant) -> None:
+    `planned` is `plant.metadata()["planned"]`, for a screen that tells old values from new ones.
+    """
+
+    def __init__(self, plant: Plant, planned: Mapping[str, Any] | None = None) -> None:
         self.plant = plant
-        self.drives = [LiveDrive(line, polled) for line in plant.lines for polled in line.drives]
+        self.drives = []
+        for line in plant.lines:
+            cycle = planned[line.name]["cycle_ms"] / 1e3 if planned else 0.0
+            self.drives += [LiveDrive(line, polled, cycle) for polled in line.drives]
         self.so_far = {line.name: line_statistics(1.0, {}, None) for line in plant.lines}
         self.lately = self.so_far
         self._by_name = {drive.name: drive for drive in self.drives}
