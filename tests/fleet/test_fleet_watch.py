@@ -9,6 +9,7 @@ import re
 import signal
 import subprocess
 import sys
+from argparse import Namespace
 from itertools import pairwise
 from typing import Any
 
@@ -23,6 +24,7 @@ from terminals import on_terminal
 require_module("nats")
 require_module("rich")
 
+from multidrop.cli.fleet import look  # noqa: E402
 from multidrop.cli.fleet import watch as fleet_watch  # noqa: E402
 from multidrop.cli.support.fleet_screen import picture  # noqa: E402
 from multidrop.cli.support.fleet_tables import moment, move_table, size  # noqa: E402
@@ -82,12 +84,36 @@ def test_lines_that_do_not_fit_are_counted_and_the_masterless_come_first() -> No
 
 
 def test_a_narrow_terminal_has_the_columns_that_matter_whole() -> None:
-    head = [drawn(told(), width).splitlines()[2] for width in (200, 80, 72, 64)]
+    head = [drawn(told(), width).splitlines()[2] for width in (200, 80, 72, 64, 56, 48, 40)]
     assert [re.sub(" +", " ", one) for one in head] == [
         "GATEWAY HOST SESSION SINCE STATE LINES MARGIN SPOOL BEHIND LAG LOST",
         "GATEWAY HOST SESSION STATE LINES MARGIN SPOOL BEHIND LAG LOST",
         "GATEWAY SESSION STATE LINES MARGIN SPOOL BEHIND LAG LOST",
         "GATEWAY STATE LINES MARGIN SPOOL BEHIND LAG LOST",
+        "GATEWAY STATE LINES MARGIN BEHIND LAG LOST",
+        "GATEWAY STATE LINES MARGIN BEHIND LOST",
+        "GATEWAY STATE LINES BEHIND LOST",
+    ]
+
+
+def test_a_narrow_terminal_says_who_is_master_and_to_whom_a_line_went() -> None:
+    shown = drawn(told(), 40).splitlines()
+    assert [re.sub(" +", " ", row) for row in shown if re.match("LINE|line-1 ", row)] == [
+        "LINE MASTER SINCE",
+        "line-1 gw-1 1970-01-01 00:00:00",
+    ]
+    assert "1970-01-01 01:02:03  line-1  to gw-2" in shown
+    assert "LINE    MASTER" in drawn(told(), 30).splitlines()
+
+
+def test_what_does_not_fit_is_wrapped_or_seen_to_be_cut() -> None:
+    found = told(12.0, "no server is reached at nats://a:4222") | {"notes": ["a note of some words " * 3]}
+    shown = drawn(found, 40).splitlines()
+    assert shown[1] == "this is 12 s old: no server is reached~"
+    assert shown[-3:] == [
+        "a note of some words a note of some",
+        "words a note of some words",
+        "Ctrl-C ends it",
     ]
 
 
@@ -97,6 +123,31 @@ def test_no_head_stands_without_a_row(height: int) -> None:
     for row, next_row in pairwise(rows):
         if row.startswith(("LINE ", "last moves")):
             assert re.match(r"line-|1970-", next_row), (row, next_row)
+
+
+def test_lines_of_a_master_that_does_not_answer_are_told() -> None:
+    """Where all gateways are dead nobody ends their sessions, and each line has a master in the records."""
+    found = told(lines=12)
+    assert "1 without a master\n" in drawn(found)
+    found["lines"]["line-7"]["master"] = "gw-2"
+    rows = drawn(found).splitlines()
+    assert "12 lines, 1 without a master, 1 whose master does not answer" in rows
+    first = [row.split()[0] for row in rows if row.startswith("line-")][:3]
+    assert first == ["line-0", "line-7", "line-1"]
+    (one,) = (line for line in picture(found, (120, 40), "") if line.plain.startswith("line-7"))
+    assert "  gw-2, no answer  " in one.plain
+    assert str(one.style) == "bold red"
+
+
+@pytest.mark.parametrize(("master", "status"), [("gw-1", 0), ("gw-2", 1), (None, 1)])
+def test_the_exit_status_says_that_a_master_is_missing(
+    monkeypatch: pytest.MonkeyPatch, master: str | None, status: int
+) -> None:
+    async def seen(paths: object) -> dict[str, Any]:
+        return told() | {"lines": {"line-1": line(master)}}
+
+    monkeypatch.setattr(look, "_seen", seen)
+    assert asyncio.run(look._status(Namespace(json=False), [])) == status
 
 
 def test_lines_are_in_the_order_of_their_numbers() -> None:

@@ -9,7 +9,7 @@ ACTIONS = {  # name: module in this package, and help
     "init": ("init", "make what is missing in the NATS servers, and store the plant"),
     "serve": ("serve", "run the gateway of this name"),
     "drain": ("drain", "let a gateway give all its lines away"),
-    "status": ("look", "say how the gateways are; status 1 while a line has no master"),
+    "status": ("look", "say how the gateways are; status 1 where a master is missing"),
     "lines": ("look", "list the lines, and who is master of each since when"),
     "watch": ("watch", "show the fleet live on a terminal"),
     "stop": ("commands", "stop drives, or all of them; asks nobody"),

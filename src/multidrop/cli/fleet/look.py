@@ -16,6 +16,7 @@ from multidrop.cli.support.fleet_tables import (
     move_table,
     natural,
     trouble_sentences,
+    unsure_lines,
 )
 from multidrop.cli.support.output import print_text
 
@@ -47,7 +48,7 @@ async def _status(arguments: argparse.Namespace, paths: list[ServerPath]) -> int
         print_text(json.dumps(found, indent=2))
     else:
         print_text("\n".join(_table(found)))
-    return 1 if free_lines(found) else 0
+    return 1 if free_lines(found) or unsure_lines(found) else 0
 
 
 def _table(found: dict[str, Any]) -> list[str]:
@@ -56,9 +57,10 @@ def _table(found: dict[str, Any]) -> list[str]:
 
 
 async def _lines(arguments: argparse.Namespace, paths: list[ServerPath]) -> int:
-    lines = (await _seen(paths))["lines"]
-    ordered = {name: lines[name] for name in sorted(lines, key=natural)}
-    print_text(json.dumps(ordered, indent=2) if arguments.json else "\n".join(line_table(ordered)))
+    found = await _seen(paths)
+    names = sorted(found["lines"], key=natural)
+    ordered = {name: found["lines"][name] for name in names}
+    print_text(json.dumps(ordered, indent=2) if arguments.json else "\n".join(line_table(found, names)))
     return 0
 
 

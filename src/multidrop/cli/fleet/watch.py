@@ -81,15 +81,15 @@ def drawing(head: str = "multidrop fleet watch") -> Iterator[Callable[[dict[str,
     """
     from rich.console import Console
     from rich.control import Control
-    from rich.text import Text
 
     from multidrop.cli.support.fleet_screen import picture
+    from multidrop.cli.support.screen_text import joined
 
     console = Console()
 
     def drawn(told: dict[str, Any]) -> Any:
         lines = picture(told, (console.width, console.height), head)
-        return Text("\n", no_wrap=True, end="").join(lines)
+        return joined(lines, console.encoding)
 
     if console.is_dumb_terminal:
         yield lambda told: console.print(drawn(told))

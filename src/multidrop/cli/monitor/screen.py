@@ -212,7 +212,8 @@ def _register(
 
 def _register_row(name: str, value: str, age: str, note: str, value_width: int, width: int) -> Text:
     text = f" {name}  {cut(value, value_width):>{value_width}}  {age:>6}  {note}"
-    return Text(cut(text, width), style="dim" if note == NOT_POLLED else "yellow" if note or age == NEVER else "")
+    style = "dim" if note == NOT_POLLED else "yellow" if note or age == NEVER else ""
+    return Text(cut(text, width), style=style)
 
 
 def _alarms(at: Position, size: tuple[int, int]) -> list[Text]:

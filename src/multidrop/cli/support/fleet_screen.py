@@ -5,6 +5,7 @@ Everything that matters is in words as well as in colours. What is old is dim, a
 
 from __future__ import annotations
 
+import textwrap
 import time
 from typing import Any
 
@@ -17,9 +18,10 @@ from multidrop.cli.support.fleet_tables import (
     line_table,
     move_table,
     natural,
+    silent_gateways,
     trouble_sentences,
 )
-from multidrop.printable import printable
+from multidrop.cli.support.screen_text import cut
 
 OLD_S = 3.0  # an older look is not shown as the present
 NOTES = 4  # lines of what happened, and of troubles
@@ -31,7 +33,7 @@ def picture(told: Told, size: tuple[int, int], head: str) -> list[Text]:
     width, height = size
     is_old = told["age_s"] is None or told["age_s"] > OLD_S
     top = [_title(told, head, width), _warning(told, width)]
-    foot = [Text(_cut(note, width)) for note in (*told.get("notes", ())[-NOTES:], "Ctrl-C ends it")]
+    foot = [Text(_cut(note, width)) for note in (*_notes(told, width), "Ctrl-C ends it")]
     room = max(0, height - len(top) - len(foot))
     body = [_row(text, width, is_old) for text in _body(told, width, room)[:room]]
     return [*top, *body, *[Text()] * (room - len(body)), *foot][:height]
@@ -41,13 +43,21 @@ def _body(told: Told, width: int, room: int) -> list[str]:
     """Return gateways whole, and of moves and lines as many as there is room for."""
     begin = [*gateway_table(told, width - 1), "", count_sentence(told), *trouble_sentences(told)[:NOTES], ""]
     room = max(0, room - len(begin))
-    lines = line_table(dict(sorted(told["lines"].items(), key=_urgency)))
-    moves = _moves(told, max(min(MOVES, room // 2), room - len(lines)))
+    silent = silent_gateways(told)
+    names = sorted(told["lines"], key=lambda name: _urgency(name, told["lines"][name]["master"], silent))
+    lines = line_table(told, names, width - 1)
+    moves = _moves(told, width, max(min(MOVES, room // 2), room - len(lines)))
     return [*begin, *_fitting(lines, room - len(moves)), *moves]
 
 
-def _moves(told: Told, room: int) -> list[str]:
-    rows = move_table(told["moves"])[: max(0, room - 2)]
+def _notes(told: Told, width: int) -> list[str]:
+    """Return the last notes of what happened, each wrapped: as many as there is room for."""
+    wrapped = [line for note in told.get("notes", ()) for line in textwrap.wrap(note, width - 1)]
+    return wrapped[-NOTES:]
+
+
+def _moves(told: Told, width: int, room: int) -> list[str]:
+    rows = move_table(told["moves"][: max(0, room - 2)], width - 1)
     return ["", "last moves:", *rows] if rows else []
 
 
@@ -60,9 +70,9 @@ def _fitting(lines: list[str], room: int) -> list[str]:
     return [*lines[:kept], f"and {len(lines) - kept} more lines"]
 
 
-def _urgency(line: tuple[str, Told]) -> tuple[bool, list[str | int]]:
-    """Order the lines without a master before the others."""
-    return line[1]["master"] is not None, natural(line[0])
+def _urgency(name: str, master: str | None, silent: set[str]) -> tuple[int, list[str | int]]:
+    """Order the lines without a master before those whose master does not answer, and both before others."""
+    return 0 if master is None else 1 if master in silent else 2, natural(name)
 
 
 def _title(told: Told, head: str, width: int) -> Text:
@@ -88,4 +98,4 @@ def _row(text: str, width: int, is_old: bool) -> Text:
 
 
 def _cut(text: str, width: int) -> str:
-    return printable(text)[: width - 1]
+    return cut(text, width - 1)

@@ -25,7 +25,9 @@ GATEWAYS = (
     "LOST",
 )
 LINES = ("LINE", "PORT", "MASTER", "SINCE")
-LEFT_OUT = ("SINCE", "HOST", "SESSION")  # in this order, where a terminal is too narrow for all
+# Columns that are left out, in this order, where a terminal is too narrow for all.
+LEFT_OUT = ("SINCE", "HOST", "SESSION", "SPOOL", "LAG", "MARGIN")
+LINES_LEFT_OUT = ("PORT", "SINCE")
 UNITS = ("B", "kB", "MB", "GB", "TB")
 
 
@@ -39,9 +41,13 @@ def moment(ms: int) -> str:
 
 def gateway_table(fleet: Told, width: float = inf) -> list[str]:
     """Return the table of gateways, without some columns where it would be wider than `width`."""
-    table = [GATEWAYS, *(_gateway_row(name, gateway) for name, gateway in fleet["gateways"].items())]
-    sides = "<<><<>>>>>>"
-    for column in LEFT_OUT:
+    rows = [_gateway_row(name, gateway) for name, gateway in fleet["gateways"].items()]
+    return _fitting([GATEWAYS, *rows], "<<><<>>>>>>", LEFT_OUT, width)
+
+
+def _fitting(table: list[Row], sides: str, left_out: Iterable[str], width: float) -> list[str]:
+    """Return the lines of a table, whose first row is its head, without as many columns as need be."""
+    for column in left_out:
         found = aligned(table, sides)
         if max(map(len, found)) <= width:
             return found
@@ -83,12 +89,22 @@ def natural(name: str) -> list[str | int]:
     return [int(part) if at % 2 else part for at, part in enumerate(re.split(r"([0-9]+)", name))]
 
 
-def line_table(lines: Mapping[str, Told]) -> list[str]:
-    return aligned([LINES, *(_line_row(name, line) for name, line in lines.items())], "<<<<")
+def line_table(fleet: Told, names: Iterable[str], width: float = inf) -> list[str]:
+    """Return the table of these lines, without some columns where it would be wider than `width`."""
+    silent = silent_gateways(fleet)
+    rows = [_line_row(name, fleet["lines"][name], silent) for name in names]
+    return _fitting([LINES, *rows], "<<<<", LINES_LEFT_OUT, width)
 
 
-def _line_row(name: str, line: Told) -> Row:
-    return name, line["port"], line["master"] or "none", moment(line["since_ms"]) if line["master"] else ""
+def _line_row(name: str, line: Told, silent: set[str]) -> Row:
+    master, since = line["master"], line["since_ms"]
+    answer = ", no answer" if master in silent else ""
+    return name, line["port"], f"{master}{answer}" if master else "none", moment(since) if master else ""
+
+
+def silent_gateways(fleet: Told) -> set[str]:
+    """Return the gateways that do not answer: nobody may poll their lines."""
+    return {name for name, gateway in fleet["gateways"].items() if gateway["says"] is None}
 
 
 def free_lines(fleet: Told) -> list[str]:
@@ -96,14 +112,25 @@ def free_lines(fleet: Told) -> list[str]:
     return [name for name, line in fleet["lines"].items() if not line["master"]]
 
 
+def unsure_lines(fleet: Told) -> list[str]:
+    """Return the lines whose master does not answer."""
+    silent = silent_gateways(fleet)
+    return [name for name, line in fleet["lines"].items() if line["master"] in silent]
+
+
 def count_sentence(fleet: Told) -> str:
-    return f"{counted(len(fleet['lines']), 'line')}, {len(free_lines(fleet))} without a master"
+    unsure = len(unsure_lines(fleet))
+    more = f", {unsure} whose master does not answer" if unsure else ""
+    return f"{counted(len(fleet['lines']), 'line')}, {len(free_lines(fleet))} without a master{more}"
 
 
-def move_table(moves: Iterable[Told]) -> list[str]:
-    """Return a line for each move: when, which line, from whom, to whom."""
+def move_table(moves: Iterable[Told], width: float = inf) -> list[str]:
+    """Return a line for each move: when, which line, from whom, to whom; from whom only where it fits."""
     rows = [(moment(move["at_ms"]), move["line"], *_from_to(move)) for move in moves]
-    return aligned(rows, "<<<<")
+    found = aligned(rows, "<<<<")
+    if max(map(len, found), default=0) <= width:
+        return found
+    return aligned([(at, line, to) for at, line, _, to in rows], "<<<")
 
 
 def _from_to(move: Told) -> tuple[str, str]:
