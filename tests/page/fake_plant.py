@@ -200,7 +200,7 @@ def fleet(began: float) -> dict[str, Any]:
             "port": f"socket://10.0.0.{n}:4001", "revision": n, "session": 5,
             "master": f"gw-{n % 3 + 1}" if n > 1 else None, "since_ms": at - 60_000 * n if n > 1 else None,
         }
-        for n in range(1, 13)
+        for n in sorted(range(1, 13), key=str)  # as the gateway sorts names
     }  # fmt: skip
     moves = [
         {"line": f"hall-{n}", "revision": n, "at_ms": at - 60_000 * n, "from": before, "to": "gw-1"}

@@ -32,8 +32,11 @@ def test_gateways_lines_and_moves(opened: Opener) -> None:
     assert third[0] == "gw-3"
     lines = cells(page, "lines")
     assert lines[0] == ["hall-1", "socket://10.0.0.1:4001", "none", NONE]
-    assert [line[0] for line in lines] == [f"hall-{n}" for n in range(1, 13)]
-    assert page.locator("#fleet-lines-note.bad").inner_text() == "12 lines, 1 without a master"
+    assert [line[0] for line in lines] == [f"hall-{n}" for n in (1, 4, 7, 10, 2, 3, 5, 6, 8, 9, 11, 12)]
+    assert {line[2] for line in lines[1:4]} == {"gw-2, no answer"}
+    assert {line[2] for line in lines[4:]} == {"gw-1", "gw-3"}
+    note = "12 lines, 1 without a master, 3 whose master does not answer"
+    assert page.locator("#fleet-lines-note.bad").inner_text() == note
     assert [[row[0], *row[2:]] for row in cells(page, "moves")] == [
         ["hall-3", "gw-2", "gw-1"],
         ["hall-6", "nobody", "gw-1"],
@@ -59,7 +62,8 @@ def test_what_is_old_is_marked_with_its_age_and_why(opened: Opener, gateway: Fak
     await_note(page, "Looked at once a second")
     gateway.fleet = {"age_s": 40.0, "trouble": "no connection to nats://a:4222"}
     await_note(page, "Seen ")
-    assert page.locator("#fleet-age.bad").inner_text().endswith(" s ago: no connection to nats://a:4222")
+    told = page.locator("#fleet-age.bad").inner_text()
+    assert told.endswith(" s ago: no connection to nats://a:4222. Times are UTC.")
     style = "getComputedStyle(document.querySelector('#fleet-gateways td')).fontStyle"
     assert page.evaluate(style) == "italic"
     gateway.fleet = {}

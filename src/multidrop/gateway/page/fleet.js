@@ -8,7 +8,8 @@ import { onPlant, store } from "./store.js";
 import { UNKNOWN } from "./values.js";
 
 const OLD_S = 3;
-const MOST_LINES = 200; // are drawn, those without a master first
+const MOST_LINES = 200; // are drawn, those without a master that answers first
+const NAMES = new Intl.Collator("en", { numeric: true }); // line-2 before line-10
 const UNITS = ["B", "kB", "MB", "GB", "TB"];
 const TABLES = {
   gateways: [
@@ -23,6 +24,8 @@ const TABLES = {
 };
 
 let newest = null,
+  silent = new Set(), // gateways that do not answer: nobody may poll their lines
+  ordered = [], // lines
   cameAt = 0, // by this device's own clock
   why = "",
   isAsking = false;
@@ -35,7 +38,7 @@ export function begin() {
   );
   onPlant(() => {
     find('nav a[href="#/fleet"]').hidden = !store.plant.fleet;
-    if (!store.plant.fleet) newest = null;
+    if (!store.plant.fleet) [newest, ordered] = [null, []];
   });
 }
 
@@ -69,6 +72,7 @@ async function ask() {
   try {
     [newest, why] = [await get("api/fleet"), ""];
     cameAt = performance.now();
+    order(newest.gateways, Object.entries(newest.lines));
   } catch (problem) {
     why = problem.message;
   }
@@ -76,20 +80,26 @@ async function ask() {
   draw();
 }
 
+function order(gateways, lines) {
+  silent = new Set(Object.keys(gateways).filter(name => !gateways[name].says));
+  const urgency = ([, { master }]) => (master === null ? 0 : silent.has(master) ? 1 : 2);
+  ordered = lines.sort((a, b) => urgency(a) - urgency(b) || NAMES.compare(a[0], b[0]));
+}
+
 function draw() {
   const age = newest?.age_s == null ? null : newest.age_s + (performance.now() - cameAt) / 1000,
-    { gateways = {}, lines = {}, moves = [] } = newest ?? {};
+    { gateways = {}, moves = [] } = newest ?? {};
   drawAge(age, age === null || age > OLD_S);
   const members = Object.entries(gateways),
-    all = Object.entries(lines),
-    free = all.filter(([, line]) => line.master === null),
-    sorted = [...free, ...all.filter(([, line]) => line.master !== null)].slice(0, MOST_LINES),
-    more = all.length > sorted.length ? `; the first ${sorted.length} are shown` : "";
+    free = ordered.filter(([, { master }]) => master === null).length,
+    unsure = ordered.filter(([, { master }]) => silent.has(master)).length,
+    others = unsure ? `, ${unsure} whose master does not answer` : "",
+    more = ordered.length > MOST_LINES ? `; the first ${MOST_LINES} are shown` : "";
   note("gateways", members.flatMap(troubles).join("; "), true);
-  note("lines", `${all.length} lines, ${free.length} without a master${more}`, free.length > 0);
-  note("moves", `Times are ${clock.zoneName()}; a dash stands for a master that nobody saw.`, false);
+  note("lines", `${ordered.length} lines, ${free} without a master${others}${more}`, free + unsure > 0);
+  note("moves", "A dash stands for a master that nobody saw.", false);
   drawTable("gateways", members.map(gateway));
-  drawTable("lines", sorted.map(line));
+  drawTable("lines", ordered.slice(0, MOST_LINES).map(line));
   drawTable("moves", moves.map(move));
 }
 
@@ -109,7 +119,8 @@ function drawAge(age, isOld) {
   const seen = age === null ? "Nothing of the fleet was seen yet" : `Seen ${clock.lasting(age * 1000)} ago`,
     reason = why || newest?.trouble,
     place = find("#fleet-age");
-  put(place, isOld ? `${seen}${reason ? `: ${reason}` : ""}` : "Looked at once a second.");
+  const said = isOld ? `${seen}${reason ? `: ${reason}` : ""}` : "Looked at once a second.";
+  put(place, `${said}${said.endsWith(".") ? "" : "."} Times are ${clock.zoneName()}.`);
   setClass(place, "bad", isOld);
   setClass(find("#fleet"), "stale", isOld);
 }
@@ -151,7 +162,11 @@ function gateway([name, { host, session, began_ms: began, lines, says }]) {
 const line = ([name, { port, master, since_ms: from }]) => [
   named(name),
   named(port),
-  master === null ? wrong("port", "none") : named(master),
+  master === null
+    ? wrong("port", "none")
+    : silent.has(master)
+      ? make("span", { class: "bad" }, glyph("silent"), " ", named(master), ", no answer")
+      : named(master),
   from === null ? UNKNOWN : clock.when(from),
 ];
 
