@@ -210,6 +210,32 @@ def test_trends_zoom_and_move_by_keyboard_and_have_markers(opened: Opener) -> No
     assert page.locator("#span").inner_text().count(":45:00") == 1
 
 
+def test_on_a_phone_several_drives_are_chosen_at_once_and_told_apart(opened: Opener) -> None:
+    page = opened("#/trends?drive=pump-2&from=1764075600000&to=1764079200000", size="phone")
+    until(page, DRAWN)
+    heads = page.locator("#trend-plots .plothead output")
+    assert heads.all_inner_texts() == ["", ""]  # one drive needs no legend
+    page.get_by_text("What is shown").click()
+    for name in ("pump-1", "filler-1"):
+        page.get_by_label(name, exact=True).check()  # which the list is not folded up by
+    page.get_by_text("What is shown").click()
+    until_met(page, lambda: heads.first.locator("canvas").count() == 3)
+    assert heads.first.inner_text().split() == ["pump-2", "pump-1", "filler-1"]
+    marks = "marks => new Set(marks.map(mark => mark.toDataURL())).size"
+    assert heads.first.locator("canvas").evaluate_all(marks) == 3  # each line looks otherwise
+    assert page.evaluate("document.documentElement.scrollWidth") <= 390
+
+
+def test_no_more_drives_are_chosen_than_there_are_lines_to_tell_apart(opened: Opener) -> None:
+    page = opened("#/trends?drive=pump-1&from=1764075600000&to=1764079200000")
+    until(page, DRAWN)
+    boxes = page.locator("#picker [aria-label=Drives] input")
+    for at in range(1, 25):
+        boxes.nth(at).click()
+    until_met(page, lambda: page.locator("#picker [aria-label=Drives] input:checked").count() == 24)
+    assert not boxes.nth(24).is_checked()
+
+
 def test_another_unit_is_another_plot_and_what_is_left_out_is_told(
     opened: Opener, gateway: FakeGateway
 ) -> None:

@@ -1,7 +1,7 @@
 // The choice of drives and quantities for trends.
 
-import { colour, fill, find, make, named } from "./dom.js";
-import { COLOURS, DASHES } from "./plots.js";
+import { fill, find, make, named } from "./dom.js";
+import { COLOURS, DASHES, swatch } from "./plots.js";
 import { key, state, store } from "./store.js";
 import { unit, words } from "./values.js";
 
@@ -63,6 +63,7 @@ function numbers() {
 }
 
 export function draw() {
+  const isOpen = find("details", place)?.open ?? innerWidth > 1000;
   const filter = make("input", {
     type: "search",
     placeholder: "Find a drive",
@@ -83,7 +84,7 @@ export function draw() {
     place,
     make(
       "details",
-      { open: innerWidth > 1000 },
+      { open: isOpen },
       make("summary", {}, "What is shown"),
       make("h2", {}, "Drives"),
       names.length > 8 ? filter : null,
@@ -117,8 +118,7 @@ function choice(name) {
     named(name),
     at >= 0,
     is => {
-      if (is && chosen.length >= MOST_DRIVES) return;
-      chosen = toggled(chosen, name, is);
+      if (!is || chosen.length < MOST_DRIVES) chosen = toggled(chosen, name, is);
       draw();
       find(`input[data-name="${CSS.escape(name)}"]`, place)?.focus();
       changed();
@@ -135,16 +135,5 @@ function check(title, is, what, name = null, at = -1) {
     onchange: event => what(event.target.checked),
   });
   box.checked = is;
-  const mark =
-    at >= 0 ? make("canvas", { class: "swatch", width: 28, height: 6, "aria-hidden": "true" }) : null;
-  if (mark) {
-    const pen = mark.getContext("2d");
-    [pen.strokeStyle, pen.lineWidth] = [colour(COLOURS[at % COLOURS.length]), 3];
-    pen.setLineDash(DASHES[Math.floor(at / COLOURS.length) % DASHES.length]);
-    pen.beginPath();
-    pen.moveTo(0, 3);
-    pen.lineTo(28, 3);
-    pen.stroke();
-  }
-  return make("label", {}, box, mark, make("span", {}, title));
+  return make("label", {}, box, at >= 0 ? swatch(at) : null, make("span", {}, title));
 }

@@ -1,7 +1,7 @@
 // Plots made by uPlot: its theme, its axes, and series of different times on one.
 
 import * as clock from "./clock.js";
-import { colour } from "./dom.js";
+import { colour, make } from "./dom.js";
 import { number } from "./values.js";
 
 export const COLOURS = ["c1", "c2", "c3", "c4", "c5", "c6"];
@@ -73,6 +73,19 @@ export const line = (index, label) => ({
   dash: DASHES[Math.floor(index / COLOURS.length) % DASHES.length],
   points: { show: false, filter: alone, size: 4, fill: (u, k) => u.series[k].stroke(u, k) },
 });
+
+// Return a short piece of the line of this index, to stand beside its name.
+export function swatch(index) {
+  const mark = make("canvas", { class: "swatch", width: 28, height: 6, "aria-hidden": "true" }),
+    pen = mark.getContext("2d");
+  [pen.strokeStyle, pen.lineWidth] = [colour(COLOURS[index % COLOURS.length]), 3];
+  pen.setLineDash(DASHES[Math.floor(index / COLOURS.length) % DASHES.length]);
+  pen.beginPath();
+  pen.moveTo(0, 3);
+  pen.lineTo(28, 3);
+  pen.stroke();
+  return mark;
+}
 
 // Return one table of times (s) and columns from several [times in ms, column, column …].
 export function join(tables) {

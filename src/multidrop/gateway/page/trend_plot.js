@@ -5,7 +5,7 @@ import { colour, fill, make, named } from "./dom.js";
 import { label } from "./history.js";
 import * as markers from "./markers.js";
 import * as picker from "./picker.js";
-import { COLOURS, join, line, makePlot, summary, wide } from "./plots.js";
+import { COLOURS, join, line, makePlot, summary, swatch, wide } from "./plots.js";
 import { store } from "./store.js";
 import { number, words } from "./values.js";
 
@@ -46,6 +46,7 @@ export function makeTrend(place, { register, unit, drives }, told, { view, set, 
     tables.push([time, most, least, mean]);
     said.push(summary(name, mean, unit, spec.digits));
   }
+  const marks = drives.map(name => (drives.length > 1 ? swatch(picker.index(name)) : null));
   const height = Math.max(150, Math.min(300, (innerHeight - 300) / count));
   const plot = makePlot(box, join(tables), {
     series,
@@ -56,7 +57,7 @@ export function makeTrend(place, { register, unit, drives }, told, { view, set, 
     cursor: { drag: { x: true, y: false, setScale: false } },
     window: () => [view.from / 1000, view.to / 1000],
     hooks: {
-      setCursor: [u => fill(out, under(u, drives, spec))],
+      setCursor: [u => fill(out, under(u, drives, marks, spec))],
       setSelect: [
         u => {
           if (u.select.width > 4)
@@ -70,18 +71,23 @@ export function makeTrend(place, { register, unit, drives }, told, { view, set, 
       draw: [u => markers.mark(u)],
     },
   });
+  fill(out, under(plot, drives, marks, spec));
   box.setAttribute("aria-label", `${words(register)}. ${said.join(". ")}`);
   return { plot, drives, spec, register, unit };
 }
 
-function under(u, drives, spec) {
-  const i = u.cursor.idx;
-  if (i === null || i === undefined || u.data[0][i] === undefined) return [];
+// Return the drives with what they had at the cursor; without a cursor, which line is whose, where they are
+// several.
+function under(u, drives, marks, spec) {
+  const i = u.cursor.idx ?? null,
+    at = i === null ? undefined : u.data[0][i];
+  if (at === undefined && drives.length < 2) return [];
   return [
-    make("span", {}, clock.time(u.data[0][i] * 1000)),
+    at === undefined ? null : make("span", {}, clock.time(at * 1000)),
     ...drives.map((name, k) => {
-      const value = u.data[3 + 3 * k][i] ?? null;
-      return make("span", {}, named(name), ` ${value === null ? "–" : number(value, spec.digits)}`);
+      const value = at === undefined ? undefined : (u.data[3 + 3 * k][i] ?? null);
+      const told = value === undefined ? null : ` ${value === null ? "–" : number(value, spec.digits)}`;
+      return make("span", {}, marks[k], named(name), told);
     }),
   ];
 }
