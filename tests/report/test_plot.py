@@ -366,6 +366,30 @@ def test_drives_without_a_fault_take_no_room(tmp_path: Path) -> None:
     assert titles(["fault"]) == ["faults: none"]
 
 
+def test_a_fault_is_shaded_where_its_drive_is_drawn_alone(tmp_path: Path) -> None:
+    units = {"output_frequency": "Hz", "output_current": "A", "output_torque": "%"}
+    meanings = {name: {"unit": unit} for name, unit in units.items()}
+    status = {"status": {"unit": "", "values": {"RUN": 1}, "bits": False}}
+    about = {"drives": {name: {"registers": {**meanings, **status}} for name in ("pump", "fan")}}
+    rows = [row(at, "pump", "fault", float(at > 5)) for at in range(10)]
+    drawn = {"pump": ("output_frequency", "output_current", "status"), "fan": ("output_current", "status")}
+    rows += [row(at, name, one, 1.0) for at in range(10) for name in drawn for one in drawn[name]]
+    rows += [row(at, "fan", "output_torque", 1.0) for at in range(10)]
+    figure, _ = plot(load(record(tmp_path / "it.arrows", sorted(rows, key=lambda row: row.time), about)))
+    shaded = {
+        axes.get_title(loc="left"): [patch.get_y() for patch in axes.patches if patch.get_alpha() == 0.08]
+        for axes in figure.axes
+    }
+    names = [text.get_text() for text in figure.axes[-1].get_yticklabels()]
+    assert shaded == {
+        "faults": [],
+        "output_frequency, Hz": [0],
+        "output_current, A": [0],
+        "output_torque, %": [],
+        "status": [names.index("pump") - 0.5],
+    }
+
+
 def test_no_line_and_no_state_leads_across_a_pause(tmp_path: Path) -> None:
     """A process that stood still recorded nothing, not even a miss. A rate that changes is no pause."""
     times = [0.0, 0.1, 0.2, 10.2, 10.3, 10.4, 30.4, 50.4, 70.4]

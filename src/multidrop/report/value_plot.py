@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -94,11 +94,9 @@ def plot(
     figure, axes = new_figure([*strip, *(content.inches for content in contents)], sharex=True)
     if faults:
         _draw_faults(axes[0], faults)
-    spans = [span for series in faults for span in series.faults()]
     for content, one in zip(contents, axes[len(strip) :], strict=True):
         _draw(one, content, recording)
-        for span in spans:
-            one.axvspan(day(span.begin), day(span.end), color=FAULT, alpha=0.08, lw=0)
+        _shade(one, content, faults)
     label_time(axes[-1])
     axes[-1].set_xlim(day(recording.begin), day(max(recording.end, recording.begin + 1_000_000)))
     _add_drives(figure, contents, recording, has_misses=any(series.missed.any() for series in chosen))
@@ -229,6 +227,19 @@ def _draw_faults(axes: Axes, series: Sequence[Series]) -> None:
     axes.set_yticks(range(len(series)), [label(one.drive) for one in series], fontsize=8)
     axes.set_ylim(len(series) - 0.5, -0.5)
     axes.grid(visible=True, axis="x", color=GRID, linewidth=0.6)
+
+
+def _shade(axes: Axes, content: Content, faults: Sequence[Series]) -> None:
+    """Shade the time of faults where their drives are drawn: of lanes, those of the drive alone."""
+    shade: dict[str, Any] = {"color": FAULT, "alpha": 0.08, "lw": 0}
+    for one in faults:
+        rows = [row for row, lane in enumerate(content.lanes) if lane.drive == one.drive]
+        is_curve = not content.lanes and any(series.drive == one.drive for series in content.series)
+        for span in one.faults():
+            begin, end = day(span.begin), day(span.end)
+            if is_curve:
+                axes.axvspan(begin, end, **shade)
+            axes.barh(rows, end - begin, left=begin, height=1.0, **shade)
 
 
 def with_pauses(time: Array, value: Array, begins: Array) -> tuple[Array, Array]:
