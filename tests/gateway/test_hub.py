@@ -311,10 +311,13 @@ def test_a_fault_that_gets_its_name_goes_on() -> None:
 
 
 def test_ended_alarms_are_bounded() -> None:
-    events = Events()
+    events = Events(since=7)
     for time in range(4000):
         events.look(time, "pump-1", Shown("fault", "a") if time % 2 else Shown("runs", None))
+        assert time > 100 or events.since == 7
     assert len(events.between(0, 9999)) <= 1001
+    oldest = events.between(0, 9999)[-1]
+    assert events.since == oldest.time - 1  # when the one before it, which is forgotten, ended
     assert events.begun == 2000
     assert len(events.shown()) <= 21
 

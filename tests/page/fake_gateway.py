@@ -50,6 +50,7 @@ class FakeGateway:
         self.token: str | None = None  # POST wants it where it is set
         self.has_history = True
         self.recorded: dict[str, dict[str, object]] = {}  # by series, what else its history says of it
+        self.knows_since = 0  # UTC, ms: it has no alarms of before
         self.fleet: dict[str, Any] = {}  # keys of /api/fleet with other values
         self.reloaded: dict[str, Any] = {
             "done": True,
@@ -277,7 +278,8 @@ def history(handler: Any, gateway: FakeGateway, asked: dict[str, list[str]]) -> 
 def alarms(handler: Any, gateway: FakeGateway, asked: dict[str, list[str]]) -> None:
     start, end = float(asked["from"][0]), float(asked["to"][0])
     found = fake_plant.alarms(gateway.renamed, gateway.began)
-    handler.tell({"alarms": [a for a in found if a["time"] < end and (a["ended"] or math.inf) > start]})
+    told = [a for a in found if a["time"] < end and (a["ended"] or math.inf) > start]
+    handler.tell({"alarms": told, "since": gateway.knows_since})
 
 
 def audit(handler: Any, gateway: FakeGateway, _: object) -> None:

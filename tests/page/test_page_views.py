@@ -236,6 +236,22 @@ def test_no_more_drives_are_chosen_than_there_are_lines_to_tell_apart(opened: Op
     assert not boxes.nth(24).is_checked()
 
 
+def test_a_time_of_which_the_gateway_knows_nothing_is_not_shown_as_one_without_faults(
+    opened: Opener, gateway: FakeGateway
+) -> None:
+    """It began in the middle of the hour that is shown."""
+    page = opened("#/trends?drive=pump-2&from=1764075600000&to=1764079200000")
+    lanes = page.locator("#lane .bars")
+    until_met(page, lambda: lanes.all_inner_texts() == ["none known"] * 2)
+    gateway.knows_since = 1764077400000
+    page.get_by_role("button", name="Later").click()
+    page.get_by_role("button", name="Back to the span before").click()
+    unknown = "not known: the daemon began later"
+    until_met(page, lambda: lanes.all_inner_texts() == [unknown] * 2)
+    part = "bars => bars.map(bar => bar.firstChild.offsetWidth / bar.clientWidth)"
+    assert all(abs(part - 0.5) < 0.02 for part in lanes.evaluate_all(part))
+
+
 def test_another_unit_is_another_plot_and_what_is_left_out_is_told(
     opened: Opener, gateway: FakeGateway
 ) -> None:

@@ -22,9 +22,14 @@ class Alarm(NamedTuple):
 
 
 class Events:
-    """Alarms that last, and the latest of those that are over."""
+    """Alarms that last, and the latest of those that are over.
 
-    def __init__(self) -> None:
+    `since` is the time (UTC, ms) from which all are known: none is of before it, and of later ones those that
+    ended first are forgotten.
+    """
+
+    def __init__(self, since: int = 0) -> None:
+        self.since = since
         self._lasting: dict[tuple[str, str], Alarm] = {}  # by drive and kind, the oldest first
         self._ended: deque[Alarm] = deque(maxlen=MOST_ENDED)
         self.begun = 0  # so far
@@ -78,4 +83,6 @@ class Events:
     def _end(self, time: int, drive: str, kind: str) -> None:
         before = self._lasting.pop((drive, kind), None)
         if before is not None:
+            if len(self._ended) == MOST_ENDED:
+                self.since = max(self.since, self._ended[0].ended or 0)
             self._ended.append(before._replace(ended=time))

@@ -83,7 +83,7 @@ class Gateway:
         self.tokens = Tokens(settings.tokens)
         self.hub = Hub(plant, now_and_slept_ns)
         self.newcomers = Newcomers()
-        self.events = Events()
+        self.events = Events(utc_ms())
         self.lately = Lately(plant)
         self.notifier = Notifier()
         self.reload = Reload(self, read)

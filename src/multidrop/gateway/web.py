@@ -185,8 +185,9 @@ class _Pages:
     async def alarms(self, request: Request) -> Response:
         query = request.query_params
         begin, end = (number_in(query.get(key, ""), key) for key in ("from", "to"))
-        found = self._gateway.events.between(begin, end)
-        return JsonResponse({"alarms": [alarm._asdict() for alarm in found]})
+        events = self._gateway.events
+        found = [alarm._asdict() for alarm in events.between(begin, end)]
+        return JsonResponse({"alarms": found, "since": events.since})
 
     # ---- history ----
 

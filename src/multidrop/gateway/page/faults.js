@@ -13,14 +13,15 @@ const AROUND_MS = 15 * 60e3;
 let shown = "",
   shownAt = 0;
 
-// Return what was wrong between two times, newest first: as the gateway remembers it, or as the frame has it.
+// Return what was wrong between two times, newest first: as the gateway remembers it, or as the frame has it;
+// and since when the gateway knows of all, null where it does not say.
 export async function read(from, to) {
   const known = alarms();
   try {
     const told = await get(`api/alarms?${query({ from: Math.floor(from), to: Math.ceil(to) })}`);
-    return known.filter(alarm => alarm.kind === "port").concat(told.alarms);
+    return [known.filter(alarm => alarm.kind === "port").concat(told.alarms), told.since];
   } catch {
-    return known.filter(alarm => (alarm.ended ?? Infinity) > from && alarm.time < to);
+    return [known.filter(alarm => (alarm.ended ?? Infinity) > from && alarm.time < to), null];
   }
 }
 
@@ -43,7 +44,7 @@ export function begin() {
 
 // Draw the list anew, where it is another one.
 export async function show() {
-  const found = await read(now() - SPAN_MS, now()),
+  const [found] = await read(now() - SPAN_MS, now()),
     sign = JSON.stringify([found, clock.zoneName()]),
     list = find("#fault-list");
   if (sign === shown && (now() - shownAt < 5000 || list.contains(document.activeElement))) return;

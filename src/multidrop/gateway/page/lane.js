@@ -17,7 +17,8 @@ export async function draw(place, from, to, drives) {
     fill(place);
     return;
   }
-  const alarms = (await read(from, to)).filter(alarm => drives.includes(alarm.drive));
+  const [all, since] = await read(from, to),
+    alarms = all.filter(alarm => drives.includes(alarm.drive));
   if (mine !== serial) return;
   fill(
     place,
@@ -32,13 +33,22 @@ export async function draw(place, from, to, drives) {
         make(
           "div",
           { class: "bars" },
-          there.length
-            ? there.map(alarm => bar(alarm, from, to))
-            : make("span", { class: "none" }, "none known"),
+          since > from ? unknown(since, from, to) : null,
+          there.map(alarm => bar(alarm, from, to)),
+          there.length || since > from ? null : make("span", { class: "none" }, "none known"),
         ),
       );
     }),
   );
+}
+
+// Return a bar over the time of which the gateway, which began later, knows nothing.
+function unknown(since, from, to) {
+  const text = "not known: the daemon began later",
+    shown = make("span", { class: "unknown", title: text }, text);
+  shown.style.left = 0;
+  shown.style.width = `${Math.min(1, (since - from) / (to - from)) * 100}%`;
+  return shown;
 }
 
 function bar(alarm, from, to) {
