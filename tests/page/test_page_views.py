@@ -224,6 +224,11 @@ def test_on_a_phone_several_drives_are_chosen_at_once_and_told_apart(opened: Ope
     marks = "marks => new Set(marks.map(mark => mark.toDataURL())).size"
     assert heads.first.locator("canvas").evaluate_all(marks) == 3  # each line looks otherwise
     assert page.evaluate("document.documentElement.scrollWidth") <= 390
+    plot = page.locator("#trend-plots .plotbox").first
+    before = plot.bounding_box()
+    plot.hover(position={"x": 200, "y": 40})
+    until_met(page, lambda: ":" in heads.first.inner_text())  # the time at the cursor
+    assert plot.bounding_box() == before  # which the plot does not flee from
 
 
 def test_no_more_drives_are_chosen_than_there_are_lines_to_tell_apart(opened: Opener) -> None:

@@ -46,7 +46,9 @@ export function makeTrend(place, { register, unit, drives }, told, { view, set, 
     tables.push([time, most, least, mean]);
     said.push(summary(name, mean, unit, spec.digits));
   }
-  const marks = drives.map(name => (drives.length > 1 ? swatch(picker.index(name)) : null));
+  const marks = drives.map(name => (drives.length > 1 ? swatch(picker.index(name)) : null)),
+    widths = tables.map(([, most, least]) => widest([...most, ...least], spec.digits)),
+    legend = u => fill(out, under(u, drives, marks, widths, spec));
   const height = Math.max(150, Math.min(300, (innerHeight - 300) / count));
   const plot = makePlot(box, join(tables), {
     series,
@@ -57,7 +59,7 @@ export function makeTrend(place, { register, unit, drives }, told, { view, set, 
     cursor: { drag: { x: true, y: false, setScale: false } },
     window: () => [view.from / 1000, view.to / 1000],
     hooks: {
-      setCursor: [u => fill(out, under(u, drives, marks, spec))],
+      setCursor: [legend],
       setSelect: [
         u => {
           if (u.select.width > 4)
@@ -71,23 +73,36 @@ export function makeTrend(place, { register, unit, drives }, told, { view, set, 
       draw: [u => markers.mark(u)],
     },
   });
-  fill(out, under(plot, drives, marks, spec));
+  legend(plot);
   box.setAttribute("aria-label", `${words(register)}. ${said.join(". ")}`);
   return { plot, drives, spec, register, unit };
 }
 
+// Return the characters of the longest value.
+function widest(values, digits) {
+  const there = values.filter(value => value !== null && value !== undefined),
+    ends = [there.reduce((a, b) => Math.min(a, b), 0), there.reduce((a, b) => Math.max(a, b), 0)];
+  return Math.max(...ends.map(value => number(value, digits).length));
+}
+
 // Return the drives with what they had at the cursor; without a cursor, which line is whose, where they are
-// several.
-function under(u, drives, marks, spec) {
+// several. It takes the same room then: else the plot would move under the cursor that comes.
+function under(u, drives, marks, widths, spec) {
   const i = u.cursor.idx ?? null,
     at = i === null ? undefined : u.data[0][i];
   if (at === undefined && drives.length < 2) return [];
   return [
-    at === undefined ? null : make("span", {}, clock.time(at * 1000)),
     ...drives.map((name, k) => {
       const value = at === undefined ? undefined : (u.data[3 + 3 * k][i] ?? null);
-      const told = value === undefined ? null : ` ${value === null ? "–" : number(value, spec.digits)}`;
-      return make("span", {}, marks[k], named(name), told);
+      const told = value === undefined ? "" : value === null ? "–" : number(value, spec.digits);
+      return make("span", {}, marks[k], named(name), " ", wideText(told, widths[k]));
     }),
+    wideText(at === undefined ? "" : clock.time(at * 1000), 8),
   ];
+}
+
+function wideText(text, width) {
+  const found = make("span", { class: "wide" }, text);
+  found.style.minWidth = `${width}ch`;
+  return found;
 }
