@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Sequence
+from io import StringIO
 from pathlib import Path
 
 import pytest
@@ -22,6 +23,7 @@ from multidrop.drives.innovert_ibd import InnovertIBD
 from multidrop.drives.invt_che import InvtCHE
 from multidrop.plant.loader import load_plant
 from multidrop.scan import Crowd, Finding, Found, Noise, Untried, plant_text
+from multidrop.scan.results import Progress
 from multidrop.scan.sweep import Sweep
 from multidrop.sim import SimulatedDrive, Simulator, Wire, simulated
 
@@ -250,3 +252,22 @@ def test_on_a_terminal_progress_is_one_line(port: str) -> None:
         lines = terminal.text.splitlines()
     assert next(line for line in lines if "innovert-ibd" in line).startswith("address 2: ")
     assert terminal.written.count(b"\r\x1b[K") > 3
+
+
+class TerminalText(StringIO):
+    """What is written to a terminal."""
+
+    def isatty(self) -> bool:
+        return True
+
+
+def test_an_interruption_leaves_no_progress_before_what_is_said_next(monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted() -> Iterator[Finding]:
+        yield Progress(USUAL, Framing.RTU, 3, 12.0)
+        raise KeyboardInterrupt
+
+    terminal = TerminalText()
+    monkeypatch.setattr(multidrop.cli.scan.sys, "stderr", terminal)  # type: ignore[attr-defined]
+    with pytest.raises(KeyboardInterrupt):
+        list(multidrop.cli.scan._shown(interrupted(), silent=True))
+    assert terminal.getvalue() == "\r\x1b[K9600 8N1 rtu, address 3; 12 s left\r\x1b[K"

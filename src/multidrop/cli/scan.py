@@ -147,22 +147,24 @@ def _shown(findings: Iterator[Finding], silent: bool) -> Iterator[Finding]:
     """
     redraws = sys.stderr.isatty()
     shown = ""  # the setting of the progress line
-    for finding in findings:
-        if isinstance(finding, Progress):
-            setting, left = f"{finding.settings} {finding.framing}", _duration(finding.left)
-            if redraws:
-                _redraw(f"{setting}, address {finding.address}; {left} left")
-            elif setting != shown:
-                print_text(f"{setting}; {left} left", file=sys.stderr, flush=True)
-            shown = setting
-            continue
+    try:
+        for finding in findings:
+            if isinstance(finding, Progress):
+                setting, left = f"{finding.settings} {finding.framing}", _duration(finding.left)
+                if redraws:
+                    _redraw(f"{setting}, address {finding.address}; {left} left")
+                elif setting != shown:
+                    print_text(f"{setting}; {left} left", file=sys.stderr, flush=True)
+                shown = setting
+                continue
+            if shown and redraws:
+                _redraw("")
+            if not silent:
+                print_text(sentence(finding), flush=True)
+            yield finding
+    finally:  # by Ctrl-C too
         if shown and redraws:
             _redraw("")
-        if not silent:
-            print_text(sentence(finding), flush=True)
-        yield finding
-    if shown and redraws:
-        _redraw("")
 
 
 def _redraw(text: str) -> None:

@@ -10,12 +10,14 @@ import shutil
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import suppress
+from math import ceil
 from typing import TextIO
 
 from multidrop.cli.support.live_plant import LiveDrive, LivePlant
-from multidrop.cli.support.values import counted
+from multidrop.cli.support.values import aligned, columns_of, counted, cut_to
 from multidrop.plant.model import Plant
 from multidrop.polling.batch import Rows
+from multidrop.printable import printable
 
 EVERY = 0.5  # s, between two drawings
 _UP_AND_CLEAR = "\x1b[{}F\x1b[J"
@@ -29,7 +31,7 @@ class LiveTable:
         self._terminal = terminal
         self._samples: Counter[str] = Counter()
         self._misses: Counter[str] = Counter()
-        self._height = 0  # lines of the last drawing
+        self._drawn: list[str] = []  # lines of the last drawing
         self._next_draw = 0.0
 
     def add(self, rows: Rows) -> None:
@@ -46,20 +48,24 @@ class LiveTable:
 
     def draw(self) -> None:
         columns, height = shutil.get_terminal_size()
-        lines = [line[: columns - 1] for line in self._lines()]
+        encoding = self._terminal.encoding or "utf-8"  # an escape for what it lacks would be longer
+        shown = (printable(line).encode(encoding, "replace").decode(encoding) for line in self._lines())
+        lines = [cut_to(line, columns - 1) for line in shown]
         if len(lines) > height - 1:
             lines = [*lines[: height - 2], f"... and {counted(len(lines) - height + 2, 'more drive')}"]
-        back = _UP_AND_CLEAR.format(self._height) if self._height else ""
+        # A terminal that has become narrower has wrapped what was drawn.
+        rows = sum(max(1, ceil(columns_of(line) / columns)) for line in self._drawn)
+        back = _UP_AND_CLEAR.format(min(rows, height - 1)) if self._drawn else ""
         with suppress(OSError):  # of a terminal that is closed: the recording goes on to its end
             print(back + "\n".join(lines), file=self._terminal, flush=True)
-        self._height = len(lines)
+        self._drawn = lines
 
     def _lines(self) -> Iterator[str]:
-        width = max(len(drive.name) for drive in self._plant.drives)
-        yield f"{'DRIVE':<{width}}  SAMPLES  MISSES  NEWEST VALUES"
+        rows = [("DRIVE", "SAMPLES", "MISSES", "NEWEST VALUES")]
         for drive in self._plant.drives:
-            counts = f"{self._samples[drive.name]:>7}  {self._misses[drive.name]:>6}"
-            yield f"{drive.name:<{width}}  {counts}  {', '.join(_values(drive))}"
+            counts = str(self._samples[drive.name]), str(self._misses[drive.name])
+            rows.append((drive.name, *counts, ", ".join(_values(drive))))
+        yield from aligned(rows, "<>><")
 
 
 def _values(drive: LiveDrive) -> Iterator[str]:

@@ -21,17 +21,17 @@ LONGEST_NAME = 24  # columns; keeps tables within a terminal
 def aligned(rows: Iterable[Row], alignment: str) -> list[str]:
     """Return one line per row with aligned columns; `alignment` has < or > for each column."""
     rows = list(rows)
-    widths = [max(map(_columns_of, column), default=0) for column in zip(*rows, strict=True)]
+    widths = [max(map(columns_of, column), default=0) for column in zip(*rows, strict=True)]
     return ["  ".join(map(_padded, row, alignment, widths)).rstrip() for row in rows]
 
 
-def _columns_of(text: str) -> int:
+def columns_of(text: str) -> int:
     """Return how many columns of a terminal a text takes: some characters take two, and some none."""
     return sum((not combining(mark)) + (east_asian_width(mark) in "WF") for mark in text)
 
 
 def _padded(text: str, side: str, width: int) -> str:
-    blank = " " * (width - _columns_of(text))
+    blank = " " * (width - columns_of(text))
     return text + blank if side == "<" else blank + text
 
 
@@ -54,14 +54,19 @@ def counted(count: int, one: str, many: str = "") -> str:
 
 def shortened(name: str) -> str:
     """Return a name without its middle where it is long: two may differ at their ends."""
-    if _columns_of(name) <= LONGEST_NAME:
+    if columns_of(name) <= LONGEST_NAME:
         return name
     return f"{_first(name, 12)}...{_first(name[::-1], LONGEST_NAME - 15)[::-1]}"
 
 
+def cut_to(text: str, columns: int) -> str:
+    """Return a text as far as it fits; a ~ ends what was cut."""
+    return text if columns_of(text) <= columns else f"{_first(text, columns - 1)}~"
+
+
 def _first(text: str, columns: int) -> str:
     """Return as much of a text's beginning as fits."""
-    return next(text[:n] for n in range(len(text), -1, -1) if _columns_of(text[:n]) <= columns)
+    return next(text[:n] for n in range(len(text), -1, -1) if columns_of(text[:n]) <= columns)
 
 
 def nearest_value(register: Register[T], value: T) -> T:

@@ -1,0 +1,65 @@
+"""The table of `poll` on a terminal: cut where it does not fit, and redrawn over itself at any width."""
+
+from __future__ import annotations
+
+import os
+from io import BytesIO, TextIOWrapper
+from pathlib import Path
+
+import pytest
+
+import multidrop.cli.poll.live_table
+from multidrop.cli.poll.live_table import LiveTable
+from multidrop.plant.loader import load_plant
+from multidrop.polling.batch import Row
+from multidrop.recording.rows import from_rows
+
+WIDE_NAME = "\u4e3b\u6cf5-1"  # two columns for each of its first two characters
+
+
+@pytest.fixture
+def size(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """The terminal's columns and lines, which a test may change."""
+    found = [80, 24]
+    monkeypatch.setattr(
+        multidrop.cli.poll.live_table.shutil, "get_terminal_size", lambda: os.terminal_size(found)
+    )
+    return found
+
+
+def drawings(tmp_path: Path, encoding: str, size: list[int], *widths: int) -> list[str]:
+    """Return what is written at each width in turn."""
+    path = tmp_path / "plant.toml"
+    drive = f'[[line.drive]]\nname = "{WIDE_NAME}"\nmodel = "invt-che"\naddress = 1\n'
+    path.write_text(f'[[line]]\nname = "hall"\nport = "x"\n{drive}poll = ["output_frequency"]\n', "utf-8")
+    terminal = TextIOWrapper(BytesIO(), encoding, errors="backslashreplace")
+    table = LiveTable(load_plant(path), terminal)
+    table.add(from_rows([Row(0, 0, 1000, WIDE_NAME, "output_frequency", 42.5, "ok")]))
+    found, before = [], 0
+    for size[0] in widths:
+        table.draw()
+        written = terminal.buffer.getvalue().decode(encoding)  # type: ignore[attr-defined]
+        found.append(written[before:])
+        before = len(written)
+    return found
+
+
+def test_what_does_not_fit_is_seen_to_be_cut(tmp_path: Path, size: list[int]) -> None:
+    whole, narrow = drawings(tmp_path, "utf-8", size, 80, 40)
+    head = "DRIVE   SAMPLES  MISSES  NEWEST VALUES\n"
+    assert whole == f"{head}{WIDE_NAME}        1       0  output_frequency 42.50 Hz\n"
+    assert narrow.endswith(f"{WIDE_NAME}        1       0  output_freque~\n")
+
+
+def test_a_table_that_a_narrower_terminal_wrapped_is_drawn_over_whole(
+    tmp_path: Path, size: list[int]
+) -> None:
+    """51 columns of values are two rows where there are 40, and 38 of the head one."""
+    again = [text[: text.index("J") + 1] for text in drawings(tmp_path, "utf-8", size, 80, 80, 40)[1:]]
+    assert again == ["\x1b[2F\x1b[J", "\x1b[3F\x1b[J"]
+
+
+def test_a_name_that_the_terminal_lacks_moves_no_column(tmp_path: Path, size: list[int]) -> None:
+    (text,) = drawings(tmp_path, "ascii", size, 80)
+    assert "\\u" not in text
+    assert text.endswith("\n??-1        1       0  output_frequency 42.50 Hz\n")
