@@ -21,6 +21,7 @@ from gateways import certificate, get, served, serving, simulated_plant, written
 from kills import BoundProcess
 from lines import PATIENCE, until
 
+import multidrop.cli.serve
 from multidrop.gateway.listener import listen
 from multidrop.gateway.rights import Right, digest, read_tokens
 
@@ -222,6 +223,7 @@ def test_a_new_token_is_shown_once(run: Run) -> None:
     [
         ((), "name a plant file, or try `multidrop serve --demo`"),
         (("--demo", "plant.toml"), "--demo has a plant of its own: leave the plant file out"),
+        (("--demo", "--port", "hall=x"), "--demo has a plant of its own: leave --port out"),
         (
             ("--new-token", "stop"),
             "a new token needs a role and a name: multidrop serve --new-token stop --for anna",
@@ -234,6 +236,16 @@ def test_a_new_token_is_shown_once(run: Run) -> None:
 )
 def test_mistaken_calls(run: Run, words: tuple[str, ...], sentence: str) -> None:
     assert run("serve", *words) == (2, "", f"multidrop: {sentence}\n")
+
+
+def test_a_demo_for_browsers_leaves_nothing_out_without_a_word(
+    run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(multidrop.cli.serve, "serve_demo", lambda **_: 0)
+    assert run("demo", "--web") == (0, "", "")
+    why = "multidrop: --web serves until Ctrl-C and records nothing: leave"
+    assert run("demo", "--web", "--out", "run.csv") == (2, "", f"{why} --out out\n")
+    assert run("demo", "--web", "--seconds", 3, "--json") == (2, "", f"{why} --seconds and --json out\n")
 
 
 @pytest.mark.long

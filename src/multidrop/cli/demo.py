@@ -15,17 +15,19 @@ from multidrop.cli.support.files import refuse_overwriting
 from multidrop.plant.loader import load_plant
 from multidrop.recording import open_reader
 
+OUT, SECONDS = "demo.arrows", 10.0
 POLLED = ("output_frequency", "motor_speed", "output_current", "dc_bus_voltage")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    add_polling_arguments(parser, out="demo.arrows", seconds=10.0)
+    add_polling_arguments(parser, out=OUT, seconds=SECONDS)
     parser.add_argument("--web", action="store_true", help="show it in a browser, as `serve --demo` does")
     parser.add_argument("--no-browser", action="store_true", help="open no page, with --web")
 
 
 def run(arguments: argparse.Namespace) -> int:
     if arguments.web:
+        _check_web(arguments)
         from multidrop.cli.serve import serve_demo
 
         return serve_demo(is_shown=not arguments.no_browser)
@@ -39,6 +41,19 @@ def run(arguments: argparse.Namespace) -> int:
             if _can_be_watched(arguments):
                 return conclude(plant, watch(plant, out=arguments.out, seconds=arguments.seconds), arguments)
             return follow(plant, arguments)
+
+
+def _check_web(arguments: argparse.Namespace) -> None:
+    """Raise ValueError for what --web, which serves until Ctrl-C and records nothing, would leave out."""
+    given = {
+        "--seconds": arguments.seconds != SECONDS,
+        "--out": str(arguments.out) != OUT,
+        "--capture": arguments.capture,
+        "--flight-recorder": arguments.flight_recorder,
+        "--json": arguments.json,
+    }
+    if names := [name for name, is_given in given.items() if is_given]:
+        raise ValueError(f"--web serves until Ctrl-C and records nothing: leave {' and '.join(names)} out")
 
 
 def _make_room(out: Path) -> None:

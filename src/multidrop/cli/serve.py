@@ -60,6 +60,8 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.demo:
         if arguments.plant:
             raise ValueError("--demo has a plant of its own: leave the plant file out")
+        if arguments.ports:
+            raise ValueError("--demo has a plant of its own: leave --port out")
         return serve_demo(is_shown=not arguments.no_browser, log=arguments.log)
     if not arguments.plant:
         raise ValueError("name a plant file, or try `multidrop serve --demo`")
