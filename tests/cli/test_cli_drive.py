@@ -122,7 +122,7 @@ def test_a_number_that_the_document_does_not_name_is_shown_as_such(
 
 def test_what_a_drive_refuses_to_tell_does_not_hide_the_rest(run: Run, port: str) -> None:
     status, out, err = run("read", port, TOY, 2, "status", "fault")
-    assert (status, out) == (1, "status  none\nfault         refused: illegal address\n")
+    assert (status, out) == (1, "status  none\nfault         refused: code 02H, illegal address\n")
     assert err == ""
 
 

@@ -80,14 +80,18 @@ def _read_text(bus: Bus, drive: Drive, text: Text) -> str | DriveRefused:
 
 def _row(register: Register[Any], value: Any) -> Row:
     if isinstance(value, DriveRefused):
-        return register.name, "", f"refused: {value.meaning}"
+        return register.name, "", _refusal(value)
     if value is None:
         return register.name, "", str(Status.NO_VALUE)
     return as_row(register, value)
 
 
 def _text_row(text: Text, answer: str | DriveRefused) -> Row:
-    return text.name, f"refused: {answer.meaning}" if isinstance(answer, DriveRefused) else answer
+    return text.name, _refusal(answer) if isinstance(answer, DriveRefused) else answer
+
+
+def _refusal(refusal: DriveRefused) -> str:
+    return f"refused: code {refusal.code:02X}H, {refusal.meaning}"
 
 
 def _text_as_json(answer: str | DriveRefused) -> dict[str, Any]:
