@@ -255,7 +255,7 @@ def test_on_a_terminal_progress_is_one_line(port: str) -> None:
 
 
 class TerminalText(StringIO):
-    """What is written to a terminal."""
+    """Text that is written to a terminal."""
 
     def isatty(self) -> bool:
         return True

@@ -126,7 +126,7 @@ def test_no_head_stands_without_a_row(height: int) -> None:
 
 
 def test_lines_of_a_master_that_does_not_answer_are_told() -> None:
-    """Where all gateways are dead nobody ends their sessions, and each line has a master in the records."""
+    """Nobody ends the sessions where all gateways are dead, and each line has a master in the records."""
     found = told(lines=12)
     assert "1 without a master\n" in drawn(found)
     found["lines"]["line-7"]["master"] = "gw-2"

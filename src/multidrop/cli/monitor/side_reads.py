@@ -16,7 +16,7 @@ SIDE_S = 0.1  # between two reads: the polling keeps nearly all of the line
 
 
 class SideRead(NamedTuple):
-    """What was read of a register, or why nothing was."""
+    """One read of a register: its value as text, or why there is none."""
 
     text: str
     time: int  # UTC, ns: the read was over
