@@ -15,7 +15,7 @@ from multidrop import load_plant
 from multidrop.core import Columns, Field, Names, NumberFormat, RowLayout, Status
 from multidrop.gateway.events import Events
 from multidrop.gateway.frames import frame_of, lost_of
-from multidrop.gateway.hub import LEAST_SLEEP_NS, NOT_ASKED, Hub, Newest, Shown
+from multidrop.gateway.hub import INCOMPLETE, LEAST_SLEEP_NS, NOT_ASKED, Hub, Newest, Shown
 from multidrop.gateway.lately import Lately
 from multidrop.gateway.mqtt_settings import fresh_values
 from multidrop.polling.batch import Batch
@@ -278,6 +278,7 @@ SHOWN = st.sampled_from(
         Shown("silent", "x"),
         Shown("unknown", None),
         Shown("unknown", NOT_ASKED),
+        Shown("unknown", INCOMPLETE),
     ]
 )
 
@@ -294,13 +295,36 @@ def test_alarms_begin_and_end_once(shown: list[Shown]) -> None:
             silent = True
         elif one.words != NOT_ASKED:
             silent = False
-            fault = one.words if one.state == "fault" else None
+            if one.words != INCOMPLETE:
+                fault = one.words if one.state == "fault" else None
         lasting = {alarm.text for alarm in events.lasting}
         assert lasting == ({fault} - {None}) | ({"x"} if silent else set())
     found = events.between(0, len(shown))
     assert [alarm.time for alarm in found] == sorted((alarm.time for alarm in found), reverse=True)
     assert all(alarm.ended is None or alarm.ended > alarm.time for alarm in found)
     assert len([alarm for alarm in found if alarm.ended is None]) == len(events.lasting)
+
+
+@pytest.mark.parametrize(("status", "is_over"), [(STANDBY, True), (9, True), (TRIPPED, False)])
+def test_a_fault_lasts_while_only_some_of_its_drive_is_known(
+    hub: Hub, clock: HubClock, status: int, is_over: bool
+) -> None:
+    """A busy line misses its status for a second, and reads its current: nobody saw the fault go."""
+    events = Events()
+
+    def look() -> list[tuple[int, int | None]]:
+        events.look(clock.now_ns // PERIOD, "pump-1", hub.seen("pump-1"))
+        return [(one.time, one.ended) for one in events.between(0, 999)]
+
+    hub.take(all_of(10, TRIPPED, fault=4))
+    assert look() == [(10, None)]
+    clock.now_ns = 30 * PERIOD
+    hub.take(rows((30, STATUS, Status.NO_REPLY), (30, FREQUENCY, 0), (30, CURRENT, 0), (30, FAULT, 4)))
+    assert hub.seen("pump-1") == Shown("unknown", INCOMPLETE)
+    assert look() == [(10, None)]
+    clock.now_ns = 31 * PERIOD
+    hub.take(all_of(31, status, fault=4))
+    assert look() == [(10, 31 if is_over else None)]
 
 
 def test_a_fault_that_gets_its_name_goes_on() -> None:

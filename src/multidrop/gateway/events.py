@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import deque
 from typing import NamedTuple
 
-from multidrop.gateway.hub import FAULT, NOT_ASKED, SILENT, UNNAMED, Shown
+from multidrop.gateway.hub import FAULT, INCOMPLETE, NOT_ASKED, SILENT, UNNAMED, Shown
 
 MOST_ENDED = 1000  # that are remembered
 MOST_SHOWN = 20  # of them beside those that last
@@ -35,7 +35,7 @@ class Events:
         self.begun = 0  # so far
 
     def look(self, time: int, drive: str, shown: Shown) -> None:
-        """Note what a drive shows. A fault lasts while the drive is silent: nobody saw it go."""
+        """Note what a drive shows. A fault lasts until somebody sees it go, so while its drive is silent."""
         state, words = shown
         if state == SILENT:
             self._begin(time, drive, SILENT, words or "no reply")
@@ -45,7 +45,7 @@ class Events:
         self._end(time, drive, SILENT)
         if state == FAULT:
             self._begin(time, drive, FAULT, words or UNNAMED)
-        else:
+        elif words != INCOMPLETE:
             self._end(time, drive, FAULT)
 
     def forget(self, drive: str, time: int) -> None:

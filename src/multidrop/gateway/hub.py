@@ -15,7 +15,8 @@ from multidrop.gateway.kept_rows import FreshValues, Known, RegisterRows
 RUNS, STANDS, FAULT, SILENT, UNKNOWN = "runs", "stands", "fault", "silent", "unknown"
 UNNAMED = "it shows a fault"  # whose code is not known
 
-NOT_ASKED = "not asked lately"  # words of an unknown state: nothing is known of it at present
+NOT_ASKED = "not asked lately"  # words of an unknown state: nothing is known of it at present,
+INCOMPLETE = "not all of it is known"  # or not all of what is polled is: a fault may be there all the same
 
 _STATES = {
     Condition.STOPPED: STANDS,
@@ -259,7 +260,9 @@ class Hub:
             register = watched.polled.drive.registers["fault"]
             return Shown(FAULT, _words(register, fresh["fault"]))
         is_turning = any(fresh.get(name) for name in _TURNING)  # 0 Hz may be a run at a setpoint of 0
-        return Shown(RUNS if is_turning else UNKNOWN, None)
+        if is_turning:
+            return Shown(RUNS, None)
+        return Shown(UNKNOWN, INCOMPLETE if any(name not in fresh for name in watched.names) else None)
 
     def _unseen(self, watched: _Watched) -> Shown:
         """Tell a silent drive from one that refuses, and from one that was not asked lately."""
@@ -272,7 +275,7 @@ class Hub:
             return Shown(UNKNOWN, NOT_ASKED)
         reasons = [self._statuses[status] for _, _, _, status in sorted(misses, key=lambda row: -row[1])]
         if any(reason.startswith(_ANSWERED) for reason in reasons):
-            return Shown(UNKNOWN, None)
+            return Shown(UNKNOWN, INCOMPLETE)
         asked = next((reason for reason in reasons if not reason.startswith("not ")), reasons[0])
         return Shown(SILENT, asked)
 
