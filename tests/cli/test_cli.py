@@ -255,6 +255,16 @@ def test_a_sheet_says_what_its_class_says_of_moving_the_motor(run: Run, tmp_path
             ["start", "/dev/ttyX", TOY, "1"],
             "Start the motor of toy@1 on /dev/ttyX? There is no terminal to ask on: add --yes if it is meant",
         ),
+        (
+            ["start", "/dev/ttyX", TOY, "1", "--frequency", "20.5", "--direction", "reverse"],
+            "Start the motor of toy@1 on /dev/ttyX at 20.5 Hz, reverse? There is no terminal to ask on: "
+            "add --yes if it is meant",
+        ),
+        (
+            ["set-frequency", "/dev/ttyX", TOY, "1", "20"],
+            "Change the frequency setpoint of toy@1 on /dev/ttyX to 20 Hz? There is no terminal to ask on: "
+            "add --yes if it is meant",
+        ),
     ],
 )
 def test_what_a_rule_forbids_is_a_sentence_and_status_1(run: Run, words: list[str], sentence: str) -> None:

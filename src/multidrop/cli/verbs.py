@@ -79,7 +79,8 @@ def run(arguments: argparse.Namespace) -> int:
     setpoint = None if hz is None else _setpoint(drive, hz)
     if arguments.command in _QUESTIONS:
         drive.check_confirmed(arguments.command)
-        confirm(f"{_QUESTIONS[arguments.command]} {drive.name} on {target.port}?", arguments)
+        how = _details(arguments)
+        confirm(f"{_QUESTIONS[arguments.command]} {drive.name} on {target.port}{how}?", arguments)
     limit = {"seconds": arguments.seconds} if arguments.command in STOPS else {}
     with _annotating(arguments.command, target) as known, _opened(target, arguments) as bus:
         known.clear()
@@ -169,6 +170,13 @@ def _rehearse(script: Script[Any]) -> None:
     step = next(script)
     if isinstance(step, Write):
         step.register.encode(step.value)
+
+
+def _details(arguments: argparse.Namespace) -> str:
+    """Return what a question says of the setpoint and the direction that were asked for."""
+    hz, direction = (getattr(arguments, name, None) for name in ("frequency", "direction"))
+    at = "to" if arguments.command == "set-frequency" else "at"
+    return ("" if hz is None else f" {at} {hz:g} Hz") + (f", {direction}" if direction else "")
 
 
 def _parameters(arguments: argparse.Namespace) -> list[Any]:
