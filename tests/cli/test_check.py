@@ -98,6 +98,7 @@ def test_a_family_that_ships_as_a_file_is_checked_by_its_name(run: Run) -> None:
     status, out, _ = run("check", "abb-acs355")
     assert status == 0
     assert "No mistake found in abb-acs355" in words(out)
+    assert max(map(len, out.splitlines())) <= 80
 
 
 def test_a_name_that_is_no_file_is_told_what_to_do(run: Run, tmp_path: Path) -> None:

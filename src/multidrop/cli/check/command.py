@@ -65,7 +65,7 @@ def run(arguments: argparse.Namespace) -> int:
         lines += ["", "verbs", *_lines(verbs)]
     for heading, remarks in (("not known", not_known), ("will be refused", will_be_refused)):
         lines += ["", heading, *_lines(remarks)]
-    print_text("\n".join([*lines, "", _verdict(family, arguments.file)]))
+    print_text("\n".join([*lines, "", *wrapped(_verdict(family, arguments.file), breaks_words=False)]))
     return 0
 
 
@@ -117,7 +117,7 @@ def _verdict(family: type[Drive], file: Path) -> str:
         return f"No mistake found in {file}. Compare the addresses, as they are sent, with the manual."
     return (
         f"No mistake found in {file}. It can move a motor, and nobody has tested it: compare every line with "
-        "the\nmanual, and only then give its drives confirmed = 1 in the plant file, or --option confirmed=1."
+        "the manual, and only then give its drives confirmed = 1 in the plant file, or --option confirmed=1."
     )
 
 
