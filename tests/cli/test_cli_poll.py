@@ -373,6 +373,7 @@ def test_a_demo_that_is_killed_leaves_no_simulator(tmp_path: Path) -> None:
 def test_on_a_terminal_a_demo_is_watched_until_its_time_is_over(tmp_path: Path) -> None:
     out = tmp_path / "demo.arrows"
     with on_terminal("demo", "--out", out, "--seconds", 2, size=(120, 24)) as terminal:
+        terminal.wait_for("starting the motors of 8 simulated drives ...")
         terminal.wait_for(">erman")
         terminal.wait_for("utilisation")
         assert terminal.process.wait(timeout=60) == 0

@@ -15,6 +15,8 @@ from typing import Any
 
 from multidrop.bus import Bus
 from multidrop.cli import main
+from multidrop.cli.support.output import print_text
+from multidrop.cli.support.values import counted
 from multidrop.drives import MODELS
 from multidrop.errors import BadReply, Expired, NoReply, NotDone, Unconfirmed
 from multidrop.plant.model import PlantLine
@@ -55,7 +57,9 @@ def plant_file(port: str, registers: Sequence[str]) -> str:
 
 
 def start_motors(line: PlantLine, ledger: Path) -> None:
-    """Start every simulated motor, each at another frequency."""
+    """Start every simulated motor, each at another frequency; on a terminal, say what takes some seconds."""
+    if sys.stdout.isatty():
+        print_text(f"starting the motors of {counted(len(line.drives), 'simulated drive')} ...", flush=True)
     with Bus(line.port, ledger=ledger) as bus:
         for number, polled in enumerate(line.drives):
             drive = bus.attach(polled.drive)
