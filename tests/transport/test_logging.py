@@ -39,6 +39,19 @@ def test_a_port_that_is_opened_and_closed(caplog: pytest.LogCaptureFixture) -> N
     assert told == [("INFO", f"{port}: opened ({port})"), ("INFO", f"{port}: closed")]
 
 
+def test_a_port_that_never_was_there_is_not_missed_again(
+    caplog: pytest.LogCaptureFixture, tmp_path: Path
+) -> None:
+    with caplog.at_level(logging.INFO, "multidrop"):
+        bus = Bus.awaiting(str(tmp_path / "port"))
+        with pytest.raises(LineError):
+            bus.line.regain()
+        flush(PATIENCE)
+        bus.close()
+    first = messages(caplog, "multidrop.line")[0]
+    assert first == ("WARNING", f"{tmp_path}/port: not opened: there is no such port")
+
+
 def test_a_port_that_is_lost_and_regained(caplog: pytest.LogCaptureFixture, tmp_path: Path) -> None:
     """Its loss is told once, however often it is asked."""
     link = tmp_path / "port"

@@ -45,10 +45,11 @@ class LineLog:
             log_aside(_log, logging.WARNING, "%s: lost (%s)", self._port, why)
 
     def unopened(self, why: str) -> None:
-        """Log why a lost port is not opened again, unless that is the last thing in the log."""
+        """Log why a port is not opened, or not again, unless that is the last thing in the log."""
         if why != self._why_unopened:
             self._why_unopened = why
-            log_aside(_log, logging.WARNING, "%s: not opened again: %s", self._port, why)
+            again = " again" if self._is_lost else ""
+            log_aside(_log, logging.WARNING, "%s: not opened%s: %s", self._port, again, why)
 
     def closed(self) -> None:
         log_aside(_log, logging.INFO, "%s: closed", self._port)
