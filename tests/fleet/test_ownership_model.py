@@ -48,7 +48,7 @@ Records = tuple[Stored, ...]
 
 
 class Session(NamedTuple):
-    """What one gateway's session knows; `given` has the buckets and revisions that it gave away."""
+    """The knowledge of one gateway's session; `given` has the buckets and revisions that it gave away."""
 
     known: Records = (Stored(),) * BUCKETS
     given: frozenset[tuple[int, int]] = frozenset()

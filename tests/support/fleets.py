@@ -6,7 +6,7 @@ import asyncio
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from multidrop.fleet.buckets import Record, Written
+from multidrop.fleet.buckets import Record, WriteAnswers
 from multidrop.fleet.errors import Conflict, Unsure
 from multidrop.fleet.lease_rules import SECOND
 
@@ -47,8 +47,8 @@ class MemoryBucket:
             raise Unsure("no answer")
         return self.last
 
-    async def put_all(self, records: Sequence[Record]) -> Written:
-        written = Written([], set())
+    async def put_all(self, records: Sequence[Record]) -> WriteAnswers:
+        written = WriteAnswers([], set())
         for record in records:
             try:
                 revision = await self.put(record.key, record.value, record.revision)

@@ -38,7 +38,7 @@ class Record(NamedTuple):
     value: Any
 
 
-class Written(NamedTuple):
+class WriteAnswers(NamedTuple):
     """The records that were replaced, at their new revisions, and the keys of those that had another one.
 
     Any other may have been replaced or not: read it.
@@ -138,13 +138,13 @@ class Bucket:
             raise Conflict(f"{self.name}.{key} has another revision than {revision}")
         raise Unsure(f"NATS did not store {self.name}.{key}: {error.get('description')}")
 
-    async def put_all(self, records: Sequence[Record]) -> Written:
+    async def put_all(self, records: Sequence[Record]) -> WriteAnswers:
         """Replace records, each at the revision given with it.
 
         All are sent one behind the other, and the server decides each by itself.
         """
         answers = await self.path().request_all([self._put(record) for record in records])
-        written = Written([], set())
+        written = WriteAnswers([], set())
         for record, answer in zip(records, answers, strict=True):
             with suppress(Unsure):
                 said = _table(answer or b"")

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 
 from multidrop.fleet import names
-from multidrop.fleet.buckets import Record, Written
+from multidrop.fleet.buckets import Record, WriteAnswers
 from multidrop.fleet.errors import FleetError
 from multidrop.fleet.lease import Lease
 from multidrop.fleet.ownership import (
@@ -138,7 +138,7 @@ class OwnerRecords:
         async with self._writing[bucket]:
             if not self._may_write():
                 return set()
-            written = Written([], set())
+            written = WriteAnswers([], set())
             with suppress(FleetError):
                 written = await follower.bucket.put_all(records)
         for record in written.stored:

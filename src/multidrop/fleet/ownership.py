@@ -38,7 +38,7 @@ class Claim(NamedTuple):
 
 
 class Step(NamedTuple):
-    """What a gateway is to claim and to give away."""
+    """The lines that a gateway is to claim, and those that it is to give away."""
 
     claims: dict[str, Claim]  # by line
     releases: set[str]
