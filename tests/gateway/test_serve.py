@@ -21,7 +21,7 @@ from gateways import certificate, get, served, serving, simulated_plant, written
 from kills import BoundProcess
 from lines import PATIENCE, until
 
-import multidrop.cli.serve
+from multidrop.cli import serve as serve_command
 from multidrop.gateway.listener import listen
 from multidrop.gateway.rights import Right, digest, read_tokens
 
@@ -241,7 +241,7 @@ def test_mistaken_calls(run: Run, words: tuple[str, ...], sentence: str) -> None
 def test_a_demo_for_browsers_leaves_nothing_out_without_a_word(
     run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(multidrop.cli.serve, "serve_demo", lambda **_: 0)
+    monkeypatch.setattr(serve_command, "serve_demo", lambda **_: 0)
     assert run("demo", "--web") == (0, "", "")
     why = "multidrop: --web serves until Ctrl-C and records nothing: leave"
     assert run("demo", "--web", "--out", "run.csv") == (2, "", f"{why} --out out\n")
