@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 from clocked_lines import ClockedLines, ClockedWire
@@ -68,14 +69,13 @@ class Moody(SimulatedDrive):
 @pytest.mark.parametrize(
     ("says", "is_set_aside"), [(Reason.BUSY, False), (Reason.READ_ADDRESS, True)], ids=["busy", "refused"]
 )
+@pytest.mark.parametrize("registers", [[Toy.output_current, Toy.fault], [Toy.fault]], ids=["two", "one"])
 def test_what_is_read_after_all_is_polled_as_before(
-    says: Reason, is_set_aside: bool, monkeypatch: pytest.MonkeyPatch
+    says: Reason, is_set_aside: bool, registers: list[Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(refusals, "SET_ASIDE_NS", 1_000_000_000)
     drive, moody = Toy(1, name="pump-1"), Moody(Toy(1))
-    with ClockedLines(
-        ClockedWire([moody], Faults()), [polled(drive, [Toy.output_current, Toy.fault])]
-    ) as clocked:
+    with ClockedLines(ClockedWire([moody], Faults()), [polled(drive, registers)]) as clocked:
         before = len(clocked.run(1.0))
         moody.says = says
         clocked.run(2.0)

@@ -48,8 +48,10 @@ class Refusals:
         """Ask for refused registers in another way, and for those that are answered again as before."""
         for trial in [trial for trial in self._trials if trial.rows.is_answered]:
             self._make_whole(trial, now_ns)
-        for job in [job for job in self._set_aside if not job.rows.refusals]:
-            self._schedule.replace([job], [self._set_aside.pop(job)], now_ns)
+        for rare in [rare for rare in self._set_aside if not rare.rows.refusals]:
+            job = self._set_aside.pop(rare)
+            job.rows.refusals = 0  # not before: as it was set aside the core may have had it under way
+            self._schedule.replace([rare], [job], now_ns)
         for job in [job for job in self._schedule.jobs if self._is_refused(job)]:
             if parts := halves(job.owner, job.block):
                 self._split(job, parts, now_ns)
@@ -73,7 +75,7 @@ class Refusals:
         if job not in self._rare:
             self._rare[job] = self._maker.make(job.owner, job.block, SET_ASIDE_NS)
         rare = self._rare[job]
-        rare.rows.refusals, job.rows.refusals = job.rows.refusals, 0
+        rare.rows.refusals = job.rows.refusals
         self._set_aside[rare] = job
         self._schedule.replace([job], [rare], now_ns)
         said = "%s is refused (code %02XH), and asked rarely from now on"
