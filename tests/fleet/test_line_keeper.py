@@ -99,6 +99,13 @@ class DeadTrial(Trial):
         for bucket in self.buckets[:2]:
             bucket.store("hall", owner_value(("", 0), 1, 0))
 
+    async def claim_without_the_first(self) -> None:
+        """Claim the line while its first bucket holds what it is told up."""
+        await self.read_and_begin()
+        self.buckets[0].shut()
+        self.claim_now()
+        await asyncio.wait_for(self.is_polled(), 10)
+
 
 def test_a_claimed_line_takes_stops_at_once_and_commands_when_the_guard_is_over() -> None:
     async def main() -> None:
@@ -299,10 +306,7 @@ def test_a_bucket_that_answers_late_holds_no_claim_up(monkeypatch: pytest.Monkey
 
     async def main() -> None:
         trial = DeadTrial()
-        await trial.read_and_begin()
-        trial.buckets[0].shut()
-        trial.claim_now()
-        await asyncio.wait_for(trial.is_polled(), 10)
+        await trial.claim_without_the_first()
         assert owners(trial) == [NOBODY, ME, ME]
         trial.buckets[0].open()
         await until(lambda: not trial.keeper._tasks)
@@ -331,10 +335,7 @@ def test_a_late_answer_makes_no_line_ours_that_is_being_given_away(monkeypatch: 
 
     async def main() -> None:
         trial = DeadTrial()
-        await trial.read_and_begin()
-        trial.buckets[0].shut()
-        trial.claim_now()
-        await asyncio.wait_for(trial.is_polled(), 10)
+        await trial.claim_without_the_first()
         trial.keeper.releasing = {"hall"}
         trial.keeper.reconcile()
         await until(lambda: not trial.keeper.polled and not trial.keeper._at_work)

@@ -60,7 +60,7 @@ class FleetRecords:
         return self._of.get(line, _UNREAD)
 
     def owner(self, line: str) -> Record | None:
-        """Return a record with the line's master; None where no two records agree."""
+        """Return a record with the line's master, who may be nobody; None where nobody has enough votes."""
         return owner_by(self.of(line))
 
     def lines(self) -> tuple[str, ...]:

@@ -1,6 +1,6 @@
 """Line keeper: the work on a gateway's lines, one thing at a time on each: claim, poll, let go, give away.
 
-A line is polled only while two of its records name us and our present session, and while the lease is valid.
+A line is polled only while our present session has enough votes by its records, and while the lease is valid.
 Half a second before it runs out all lines are let go.
 """
 

@@ -89,7 +89,7 @@ class OwnerRecords:
 
     async def claim(self, claims: Mapping[str, Claim]) -> None:
         """Write the first records of claims, and spare ones where a bucket takes much longer than another."""
-        now_ms, begun = utc_ms(), time.monotonic()
+        now_ms, begun = time.time_ns() // 1_000_000, time.monotonic()
         values = {
             line: owner_value(self._me, claim.turn, now_ms, claim.votes) for line, claim in claims.items()
         }
@@ -114,7 +114,7 @@ class OwnerRecords:
 
         All of them are given away before one is sent: an answer to a late claim makes none ours meanwhile.
         """
-        now_ms, nobody = utc_ms(), (NOBODY, 0)
+        now_ms, nobody = time.time_ns() // 1_000_000, (NOBODY, 0)
         given: list[tuple[str, Record]] = []
         for line in lines:
             ours = self._naming_us(line)
@@ -150,7 +150,3 @@ class OwnerRecords:
         stored = {record.key for record in written.stored}
         self._records.doubt(bucket, {record.key for record in records} - stored)
         return written.refused
-
-
-def utc_ms() -> int:
-    return time.time_ns() // 1_000_000

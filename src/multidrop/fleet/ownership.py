@@ -87,12 +87,11 @@ def claim_of(
 
     `doubted` are the buckets where ours was given away, and nobody knows whether that was stored.
     """
-    home = next(iter(records), "")
-    first = records.get(home)
+    first_bucket, first = next(iter(records.items()), ("", None))
     if not first:
-        return None
+        return None  # it may have two votes
     if first.revision == NONE_YET:
-        return Claim({home: NONE_YET}, {}, 1, NEEDED)
+        return Claim({first_bucket: NONE_YET}, {}, 1, NEEDED)
     free: dict[str, int] = {}
     needed = NEEDED
     for bucket, record in records.items():
