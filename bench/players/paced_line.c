@@ -44,7 +44,7 @@ struct samples {
 static struct samples lateness, excess;
 static int64_t settled_ns, first_ns, last_ns; /* of requests: counted from, first, last */
 static int64_t pending_ideal_ns, ideal_ns;
-static long answered, unanswered, early, given_up, refused, per_drive[MOST_DRIVES + 1];
+static long answered, unanswered, early, given_up, refused, registers, per_drive[MOST_DRIVES + 1];
 static int is_crossed; /* a request came before the reply to the one before was over */
 
 static void add(struct samples *samples, int64_t sample)
@@ -92,8 +92,9 @@ static void print_report(void)
         }
     double span = (double)(last_ns - first_ns), ideal = (double)ideal_ns;
     double cycles = drives ? (double)counted / (double)drives : 1;
-    printf("}, \"seconds\": %.3f, \"answered\": %ld, \"unanswered\": %ld, \"early\": %ld, \"given_up\": %ld, \"refused\": %ld, ",
-           span / 1e9, answered, unanswered, early, given_up, refused);
+    printf("}, \"seconds\": %.3f, \"answered\": %ld, \"unanswered\": %ld, ", span / 1e9, answered, unanswered);
+    printf("\"early\": %ld, \"given_up\": %ld, \"refused\": %ld, \"registers\": %ld, ", early, given_up, refused,
+           registers);
     printf("\"ideal_cycle_ms\": %.4f, \"cycle_ms\": %.4f, \"utilisation\": %.5f, ", ideal / cycles / 1e6,
            span / cycles / 1e6, span > 0 ? ideal / span : 0);
     print_percentiles("lateness_us", &lateness);
@@ -154,6 +155,7 @@ static size_t make_reply(const uint8_t *request, uint8_t *out)
         out[len++] = (uint8_t)(request[1] | 0x80);
         out[len++] = request[1] == 3 ? 2 : 1;
     } else {
+        registers += count;
         out[len++] = 3;
         out[len++] = (uint8_t)(2 * count);
         for (unsigned i = start; i < start + count; i++) {
