@@ -7,6 +7,7 @@ import math
 import time
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager, suppress
+from functools import partial
 from itertools import count
 
 import pytest
@@ -17,14 +18,14 @@ from peers import require_module
 require_module("nats")
 
 from multidrop.fleet import member as member_module  # noqa: E402
-from multidrop.fleet import names, releases  # noqa: E402
+from multidrop.fleet import names, releases, weak_session  # noqa: E402
 from multidrop.fleet.buckets import Bucket  # noqa: E402
 from multidrop.fleet.cluster import Cluster as Servers  # noqa: E402
 from multidrop.fleet.cluster import Replica  # noqa: E402
 from multidrop.fleet.errors import Conflict  # noqa: E402
 from multidrop.fleet.lease import Lease, boottime_ns  # noqa: E402
 from multidrop.fleet.lease_bucket import LeaseBucket  # noqa: E402
-from multidrop.fleet.lease_rules import SECOND, USUAL, Terms  # noqa: E402
+from multidrop.fleet.lease_rules import RULES, SECOND, USUAL, Terms  # noqa: E402
 from multidrop.fleet.member import Member, MemberState  # noqa: E402
 from multidrop.fleet.plant_store import store  # noqa: E402
 from multidrop.fleet.servers import paths_of  # noqa: E402
@@ -131,11 +132,31 @@ async def gateways(cluster: Cluster, *members: str, terms: Terms = USUAL) -> Asy
     running = Gateways(cluster, terms)
     try:
         await asyncio.gather(*(running.join(name) for name in members))
-        await until(running.all_are_polled, "cold start")
+        await until(lambda: not members or running.all_are_polled(), "cold start")
         yield running
         assert running.hall.overlaps == []
     finally:
         await asyncio.gather(*(running.leave(name) for name in list(running.members)))
+        for path in paths:
+            await path.close()
+
+
+@asynccontextmanager
+async def other_version(cluster: Cluster, monkeypatch: pytest.MonkeyPatch) -> AsyncIterator[Lease]:
+    """Yield the lease of a gateway that says by other rules whose a line is."""
+    paths = paths_of(cluster.urls)
+    await open_all(paths)
+    buckets = [
+        LeaseBucket(bucket, partial(paths.__getitem__, at), "other") for at, bucket in enumerate(names.LEASES)
+    ]
+    mastership = NotedMastership(boottime_ns)
+    lease = Lease("other", buckets, mastership, terms=LONG, note=lambda: {"draining": False})
+    value = lease._value
+    monkeypatch.setattr(lease, "_value", lambda **ended: {**value(**ended), "rules": RULES + 1})
+    try:
+        yield lease
+    finally:
+        await lease.end()
         for path in paths:
             await path.close()
 
@@ -230,6 +251,35 @@ def test_lines_come_change_and_go_with_the_plant(fleet: Cluster) -> None:
     asyncio.run(main())
 
 
+def test_beside_gateways_with_other_rules_no_line_is_taken(
+    fleet: Cluster, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Neither when a gateway begins, nor where one with other rules comes to those that poll."""
+
+    async def main() -> None:
+        async with gateways(fleet, terms=LONG) as running, other_version(fleet, monkeypatch) as other:
+            await other.begin()
+            member = await running.join("a")
+            await until(lambda: "until other is stopped" in member.trouble, "a word about it")
+            await until(lambda: member.records.is_complete, "all records")
+            await asyncio.sleep(0.5)
+            assert member.lease.session == 0
+            await other.end()
+            await until(running.all_are_polled, "start")
+            await other.begin()
+            await until(lambda: "until other is stopped" in member.trouble, "a word about it")
+            bucket = Bucket(names.PLANT, member.best)
+            more = [*LINES, "line-new"]
+            await store(bucket, {line: {"line": {"name": line}, "files": {}} for line in more})
+            await until(lambda: "line-new" in member.wanted, "its share")
+            await asyncio.sleep(0.5)
+            assert running.all_are_polled()
+            await other.end()
+            await until(lambda: "line-new" in member.polled, "the new line")
+
+    asyncio.run(main())
+
+
 @pytest.mark.long
 def test_a_node_that_dies_costs_nothing(fleet: Cluster) -> None:
     """Two of three paths are renewed as before while the third waits for another leader: 4 to 9 s."""
@@ -270,7 +320,7 @@ def test_who_lost_a_path_gives_the_session_up_one_after_another(
     fleet: Cluster, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Else it would fall silent with the next server that dies."""
-    monkeypatch.setattr(member_module, "WEAK_NS", 3600 * SECOND)
+    monkeypatch.setattr(weak_session, "WEAK_NS", 3600 * SECOND)
 
     async def lose_a_path(member: Member) -> None:
         other = LeaseBucket(names.LEASES[1], member.best, "other")
@@ -286,7 +336,7 @@ def test_who_lost_a_path_gives_the_session_up_one_after_another(
             for member in members.values():
                 await lose_a_path(member)
                 assert "a new session begins soon" in member.trouble
-            monkeypatch.setattr(member_module, "WEAK_NS", 0)
+            monkeypatch.setattr(weak_session, "WEAK_NS", 0)
             began = {name: member.lease.session for name, member in members.items()}
             await until(lambda: members["a"].lease.session > began["a"], "a's new session")
             assert members["b"].lease.session == began["b"]

@@ -12,11 +12,11 @@ from peers import require_module
 require_module("nats")
 
 
-from multidrop.fleet.lease_rules import SECOND  # noqa: E402
+from multidrop.fleet.lease_rules import RULES, SECOND  # noqa: E402
 from multidrop.fleet.member import SETTLE_S, Member  # noqa: E402
 from multidrop.fleet.shares import QUIET_NS  # noqa: E402
 
-VALUE: dict[str, Any] = {"session": 1, "draining": False}
+VALUE: dict[str, Any] = {"session": 1, "draining": False, "rules": RULES}
 LINES = tuple(f"line-{at}" for at in range(40))
 
 

@@ -186,6 +186,7 @@ class Lease:
     def _value(self, *, ended: bool = False) -> dict[str, Any]:
         return {
             **self._note(),
+            "rules": lease_rules.RULES,
             "session": self.session,
             "nonce": self._nonce,
             "ended": ended,

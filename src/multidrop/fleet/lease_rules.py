@@ -19,6 +19,7 @@ from typing import NamedTuple
 SECOND = 1_000_000_000  # ns
 PATHS = 3
 RENEW_S = 0.5  # between renewals of a path
+RULES = 2  # the number of those by which a line is owned (ownership.py): a change of them counts it up
 
 
 class Terms(NamedTuple):

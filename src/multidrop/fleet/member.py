@@ -25,19 +25,21 @@ from typing import Any
 from multidrop.fleet import names
 from multidrop.fleet.buckets import Record
 from multidrop.fleet.errors import FleetError
-from multidrop.fleet.leaders import bring_leaders_home, have_leaders
+from multidrop.fleet.leaders import bring_leaders_home
 from multidrop.fleet.lease import Lease, MayPoll
 from multidrop.fleet.lease_bucket import LeaseBucket
 from multidrop.fleet.lease_rules import SECOND, USUAL, Terms
 from multidrop.fleet.lease_terms import LeaseTerms
 from multidrop.fleet.life_lock import LifeLock
 from multidrop.fleet.line_keeper import LineKeeper, Lines, TakenLine
+from multidrop.fleet.other_rules import OtherRules
 from multidrop.fleet.ownership import decide, owner_of
 from multidrop.fleet.releases import WAIT_S, Releases
 from multidrop.fleet.servers import ServerPath
 from multidrop.fleet.share_records import ShareRecords
 from multidrop.fleet.shares import Sharers, Shares
 from multidrop.fleet.task_end import end_tasks
+from multidrop.fleet.weak_session import WeakSession
 
 _log = logging.getLogger("multidrop.fleet")
 
@@ -48,7 +50,6 @@ TIDY_NS = SECOND // 2  # between looks at all lines of the share, where nothing 
 SETTLE_S = 3.0
 SOUND_S = 1.0  # of our lease, to end others': where less is left the servers may fail all of us alike
 HOME_S = 1.0
-WEAK_NS = 10 * SECOND  # from the end of settling on, before a session that lost a path is given up
 
 
 class MemberState(StrEnum):
@@ -88,7 +89,9 @@ class Member:
         self._settled_at = 0
         self._is_dirty = True
         self._woken = asyncio.Event()
-        self._was_valid = self._is_too_weak = False
+        self._was_valid = False
+        self._weak = WeakSession(self.lease, self.records.observer, self.best)
+        self._other_rules = OtherRules(name, self.records.observer)
         self._stepped: tuple[Any, ...] = ()
 
     # ---- what others ask ----
@@ -103,9 +106,9 @@ class Member:
 
     @property
     def trouble(self) -> str:
-        """Return what is not well with the lease; "" for nothing."""
+        """Return what is not well with the lease, or hinders it; "" for nothing."""
         weak = "others have ended one path of its lease; a new session begins soon"
-        return self.lease.trouble or (weak if self.lease.is_weak else "")
+        return self._other_rules.trouble or self.lease.trouble or (weak if self.lease.is_weak else "")
 
     @property
     def polled(self) -> Mapping[str, TakenLine]:
@@ -158,7 +161,7 @@ class Member:
             *self.records.works(),
             self._guard(),
             self._home(),
-            self._watch_strength(),
+            self._weak.watch(lambda: self._settled_at),
             self._releases.watch(),
             self._live(),
             self.keeper.fail(),
@@ -181,27 +184,32 @@ class Member:
     async def _live(self) -> None:
         while True:
             if not self.lease.session:
-                await self._read_all()
+                await self._prepare()
                 await self.lease.begin()
                 self._settled_at = self.lease.clock() + int(SETTLE_S * SECOND)
                 self._shares.begin_anew()
                 self._is_dirty = True
                 _log.info("%s: session %d began", self.name, self.lease.session)
-            elif self.lease.is_over or self._is_too_weak:
+            elif self.lease.is_over or self._weak.is_too_weak:
                 what = "is over" if self.lease.is_over else "lost a path; a new one begins"
                 _log.warning("%s: session %d %s", self.name, self.lease.session, what)
                 await self._leave()
-                self._is_dirty, self._is_too_weak = True, False
+                self._is_dirty, self._weak.is_too_weak = True, False
             self._woken.clear()
             await self.step()
             await asyncio.sleep(LEAST_STEP_S)
             with suppress(TimeoutError):
                 await asyncio.wait_for(self._woken.wait(), STEP_S - LEAST_STEP_S)
 
-    async def _read_all(self) -> None:
-        """Wait until all was read: a large plant takes seconds, in which no lease could be renewed."""
-        while not self.records.is_complete:
+    async def _prepare(self) -> None:
+        """Wait until all was read: a large plant takes seconds, in which no lease could be renewed.
+
+        Wait for the end of gateways with other rules too.
+        """
+        while True:
             self._see(self.records.observer.sessions())
+            if self.records.is_complete and not self._other_rules.gateways:
+                break
             await asyncio.sleep(STEP_S)
 
     async def _guard(self) -> None:
@@ -230,20 +238,6 @@ class Member:
                     await terms.keep_ahead(self.best())
                     await bring_leaders_home(self.best())
 
-    async def _watch_strength(self) -> None:
-        """Give a session up that lost a path to others: the next server that dies would end it.
-
-        Its lines are others' for a moment, so one gateway at a time does it, once all paths answer and lines
-        can be claimed.
-        """
-        while True:
-            await asyncio.sleep(HOME_S)
-            now = self.lease.clock()
-            if not (self.lease.is_weak and self.lease.is_valid) or now < self._settled_at + WEAK_NS:
-                continue
-            if self.records.observer.weak()[:1] == [self.name]:
-                self._is_too_weak = await have_leaders(self.best()) and await self.lease.could_be_whole()
-
     # ---- one step ----
 
     async def step(self) -> None:
@@ -268,7 +262,9 @@ class Member:
 
     def _see(self, present: Mapping[str, Mapping[str, Any]]) -> set[str]:
         """Return the other gateways that take lines; since when they are the same is noted."""
-        others = {name for name, value in present.items() if not value["draining"]} - {self.name}
+        self._other_rules.look(present)
+        others = {name for name, value in present.items() if not value["draining"]}
+        others -= {self.name} | self._other_rules.gateways
         self._shares.see(frozenset(others), self.lease.clock())
         return others
 
@@ -297,4 +293,5 @@ class Member:
         )
         gone = {line for line in owned if not self.records.is_in_plant(line)}
         self.keeper.releasing = gone | self._releases.due(step.releases, 0 if self.is_draining else WAIT_S)
-        self.keeper.claim(step.claims)
+        if not self._other_rules.gateways:
+            self.keeper.claim(step.claims)
