@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
@@ -126,20 +126,56 @@ def test_a_stop_of_a_drive_that_was_silent_asks_nothing_first(model: str) -> Non
         assert received.requests[0] == received.writes[0]
 
 
-@pytest.mark.slow
+def _asleep(bus: Bus, drive: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    at_ns = clock.boottime_ns
+    monkeypatch.setattr(clock, "boottime_ns", lambda: at_ns() + 2 * PAUSE_NS)
+
+
+def _idle(bus: Bus, drive: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    bus.peer(drive).c.answered_ns -= 2 * PAUSE_NS
+    at_ns = clock.now_ns
+    monkeypatch.setattr(clock, "now_ns", lambda: at_ns() + 2 * PAUSE_NS)
+    _asleep(bus, drive, monkeypatch)  # both clocks go on
+
+
+def _read_since(bus: Bus, drive: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    bus.peer(drive).c.answered_ns -= 2 * PAUSE_NS
+    bus.read(drive, next(register for register in drive.registers.values() if register.readable))
+
+
+def _on_another_port(bus: Bus, drive: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    bus.line.reopen()
+
+
+@pytest.mark.usefixtures("_patient")
 @pytest.mark.parametrize("model", ["innovert-ibd", "delixi-native"])
+@pytest.mark.parametrize("lose", [_asleep, _idle, _read_since, _on_another_port])
 def test_a_setpoint_that_cannot_be_read_is_forgotten_once_the_drive_may_have_lost_its_power(
-    model: str,
+    model: str, lose: Callable[[Bus, Any, pytest.MonkeyPatch], None], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """Asked or not: nobody has seen then whether it was there all the time."""
     with known(model) as (bus, drive, received):
         drive.set_frequency(10)
-        be_silent(bus, drive, received)
-        bus.peer(drive).c.answered_ns -= 2 * PAUSE_NS
+        received.requests.clear()
+        lose(bus, drive, monkeypatch)
         with pytest.raises(Refused, match="cannot say its setpoint: call set_frequency before start"):
             drive.start()
         assert received.writes == []
         drive.set_frequency(10)
         drive.start()
+
+
+@pytest.mark.usefixtures("_patient")
+@pytest.mark.parametrize("model", ["innovert-ibd", "delixi-native"])
+def test_a_setpoint_that_was_written_through_another_bus_is_not_known(model: str) -> None:
+    with known(model) as (bus, drive, received):
+        drive.set_frequency(10)
+        bus.detach(drive)
+        bus.attach(drive)
+        received.requests.clear()
+        with pytest.raises(Refused, match="cannot say its setpoint"):
+            drive.start()
+        assert received.writes == []
 
 
 @pytest.mark.slow

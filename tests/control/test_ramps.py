@@ -18,7 +18,7 @@ from multidrop.drive import Drive, Script, read
 from multidrop.drive.declare import setting
 from multidrop.drive.table import Kept
 from multidrop.drive.verbs import verb
-from multidrop.drives import YD1000, InvtCHE
+from multidrop.drives import YD1000, InnovertIBD, InvtCHE
 from multidrop.errors import NoReply, Refused
 from multidrop.sim import simulated
 
@@ -164,6 +164,22 @@ def test_starts_may_follow_at_once(monkeypatch: pytest.MonkeyPatch, gap: float) 
     start_staggered(drives, gap)
     assert all(sim.motor.energised for sim in sims)
     assert gap <= line.seconds - begun < gap + 1
+
+
+@pytest.mark.parametrize("gap", [4.0, 25.0])
+def test_those_that_wait_for_their_start_are_heard_meanwhile(
+    monkeypatch: pytest.MonkeyPatch, gap: float
+) -> None:
+    """Else those that cannot say their setpoint would be refused: they may have lost it with their power."""
+    sims: list[Any] = [simulated(InnovertIBD(address, maximum_frequency=50)) for address in range(1, 6)]
+    line = SimulatedBus(monkeypatch, *sims)
+    drives = [line.attach(sim.drive) for sim in sims]
+    for drive in drives:
+        drive.set_frequency(20)
+    begun = line.seconds
+    start_staggered(drives, gap)
+    assert all(sim.motor.energised for sim in sims)
+    assert 4 * gap <= line.seconds - begun < 4 * gap + 10
 
 
 def test_what_a_staggered_start_did_not_come_to_is_not_stopped(monkeypatch: pytest.MonkeyPatch) -> None:

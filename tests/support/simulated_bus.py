@@ -10,6 +10,7 @@ from completions import completed
 
 from multidrop import bus
 from multidrop.core import (
+    PAUSE_NS,
     Completion,
     Exchange,
     Failure,
@@ -117,8 +118,16 @@ class SimulatedBus:
         if reply is None or self.loses(request):
             self.seconds += TIMEOUT
             return self._completion(int(Failure.NO_REPLY))
+        self._note_answer(exchange)
         used, message = parse_reply(exchange.framing, reply, request)
         return self._completion(used or int(Failure.CUT_SHORT), message, reply, exchange.values)
+
+    def _note_answer(self, exchange: Exchange) -> None:
+        """Note when the drive was heard, as the core does."""
+        drive, at_ns = exchange.c.drive, round(self.seconds * 1e9)
+        if drive.answered_ns and at_ns - drive.answered_ns >= PAUSE_NS:
+            drive.history.pauses += 1
+        drive.answered_ns = at_ns
 
     def _completion(
         self, result: int, reply: Message | None = None, raw: bytes = b"", values: RowLayout | None = None

@@ -95,10 +95,11 @@ class IdentityCheck:
         self._know(drive, port, silences)
 
     def _know(self, drive: Drive, port: object, silences: int) -> None:
-        pauses, before = self._exchanges.peer(drive).pauses, self._known.get(drive)
-        if before and before.silences != silences and before.pauses != pauses:
+        pauses = self._exchanges.peer(drive).pauses
+        look = _Look(port, silences, pauses, clock.now_ns(), _slept_ns())
+        if not _was_heard_since(self._known.get(drive), look):
             _forget_setpoint(drive)
-        self._known[drive] = _Look(port, silences, pauses, clock.now_ns(), _slept_ns())
+        self._known[drive] = look
 
     def _read(self, drive: Drive, step: Step, attempts: int, *, insists: bool = False) -> object:
         if not isinstance(step, Read):
@@ -195,8 +196,19 @@ class IdentityCheck:
         return True
 
 
+def _was_heard_since(before: _Look | None, look: _Look) -> bool:
+    """Return True where the drive answered on this port in any PAUSE_NS since that look.
+
+    A reply or two may have been lost. Where nothing was heard for longer, asked or not, it may have lost its
+    power meanwhile, and come back.
+    """
+    if before is None or before.port is not look.port:
+        return False
+    return before.pauses == look.pauses and look.slept_ns - before.slept_ns < PAUSE_NS
+
+
 def _forget_setpoint(drive: Drive) -> None:
-    """Forget what a drive cannot say: silent for so long, it may have lost it with its power."""
+    """Forget what a drive cannot say, and may have lost with its power."""
     if drive.setpoint_name in drive.registers and not drive.register(drive.setpoint_name).readable:
         drive.commanded = None
 

@@ -16,26 +16,44 @@ from multidrop.drive.state import Direction
 from multidrop.drive.table import Kept
 from multidrop.errors import Refused
 
+HEARD_S = 5.0  # after ten nobody knows whether a drive has lost its power (identity.py)
+
 
 def start_staggered(drives: Sequence[Drive], gap: float, direction: Direction | None = None) -> None:
     """Start drives one after another, `gap` seconds apart.
 
     When one fails, it and all that were started before are stopped, and its failure is raised. None is
-    started whose stop was called, on any thread, after this call began.
+    started whose stop was called, on any thread, after this call began. Those that wait for their turn are
+    looked at meanwhile: the setpoint of one that cannot say it counts as lost where nothing is heard of it.
     """
     if not 0 <= gap < inf:
         raise ValueError(f"gap = {gap:g} s is no time between two starts")
     for drive in drives:
         drive.check_confirmed("start")
     calls = [drive.begin_call("start") for drive in drives]
+    unheard_s = 0.0
     for number, (drive, call) in enumerate(zip(drives, calls, strict=True)):
         try:
             if number:
-                drive.perform(wait(gap))
+                unheard_s = _await_turn(drives[number:], gap, unheard_s)
             drive.carry_out_move(drive.start.script(direction), call and call.anew())
         except BaseException:
             _stop(drives[: number + 1])
             raise
+
+
+def _await_turn(waiting: Sequence[Drive], gap: float, unheard_s: float) -> float:
+    """Wait, and look at those that wait before they are unheard for too long; return how long they are."""
+    while gap > 0:
+        rest = min(gap, HEARD_S - unheard_s)
+        waiting[0].perform(wait(rest))
+        gap, unheard_s = gap - rest, unheard_s + rest
+        if unheard_s >= HEARD_S:
+            unheard_s = 0.0
+            for drive in waiting:
+                with suppress(Exception):  # its start tells
+                    drive.identify()
+    return unheard_s
 
 
 def _stop(drives: Sequence[Drive]) -> None:
