@@ -137,7 +137,7 @@ def frame_sizes(url: str) -> str:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seconds", type=float, default=20.0, help="for which each row is looked at")
-    parser.add_argument("--kills", type=int, default=5, help="of the daemon")
+    parser.add_argument("--kills", type=int, default=5, help="of the gateway")
     arguments = parser.parse_args()
     from playwright.sync_api import sync_playwright
 
@@ -184,13 +184,13 @@ def main() -> None:
             print()
             found = []
             for _ in range(arguments.kills):
-                with program("serve", str(plant)) as (daemon, ready):
+                with program("serve", str(plant)) as (served, ready):
                     context = browser.new_context()
                     page = opened(context, re.sub("127.0.0.1", "localhost", ready.split()[-1]))
-                    daemon.send_signal(signal.SIGKILL)
+                    served.send_signal(signal.SIGKILL)
                     found.append(until(page, STALE))
                     context.close()
-            columns = ["daemons killed", "s until the page says so: median", "longest"]
+            columns = ["gateways killed", "s until the page says so: median", "longest"]
             tables.show(columns, [[len(found), f"{statistics.median(found):.2f}", f"{max(found):.2f}"]])
         browser.close()
 

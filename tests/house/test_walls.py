@@ -170,7 +170,7 @@ def test_imports_between_files_run_one_way() -> None:
 
 @pytest.mark.parametrize("client", CLIENTS)
 def test_clients_use_public_names_alone(client: str) -> None:
-    """So a daemon of one's own can do all that these do."""
+    """So a gateway of one's own can do all that these do."""
     found = {
         str(path.relative_to(PACKAGE)): {
             name for name in _imported(path) if name.startswith("multidrop.") and not _is_public(name, client)

@@ -79,7 +79,7 @@ def test_axe_finds_nothing(
 def test_axe_finds_nothing_in_rare_states(
     opened: Opener, gateway: FakeGateway, axe: str, size: str, theme: str, few_drives: int
 ) -> None:
-    """Dialogs that send, what a write became, nothing known of a drive, one drive, no daemon."""
+    """Dialogs that send, what a write became, nothing known of a drive, one drive, no gateway."""
     gateway.token = "right"
     page = opened("#/drives/pump-1", size=size, color_scheme=theme)
     page.evaluate(axe)

@@ -76,7 +76,7 @@ def test_it_grows_old_by_itself_where_the_gateway_is_gone(opened: Opener, gatewa
     await_note(page, "Looked at once a second")
     gateway.kill()
     await_note(page, "Seen")
-    assert "The daemon cannot be reached" in page.locator("#fleet-age").inner_text()
+    assert "The gateway cannot be reached" in page.locator("#fleet-age").inner_text()
 
 
 def test_before_the_first_look_nothing_is_shown(opened: Opener, gateway: FakeGateway) -> None:

@@ -36,7 +36,7 @@ def test_all_drives_are_live(opened: Opener, gateway: FakeGateway) -> None:
     until_met(page, lambda: old.count() == 2)  # frequency and current of the silent drive
 
 
-def test_a_killed_daemon_is_told(opened: Opener, gateway: FakeGateway) -> None:
+def test_a_killed_gateway_is_told(opened: Opener, gateway: FakeGateway) -> None:
     page = opened("#/drives/pump-1")
     gateway.kill()
     until(page, STALE)
@@ -51,7 +51,7 @@ def test_a_killed_daemon_is_told(opened: Opener, gateway: FakeGateway) -> None:
     assert page.locator("#said").inner_text() == "Values are old: no new ones come."
 
 
-def test_a_daemon_that_hangs_is_told_of(opened: Opener, gateway: FakeGateway) -> None:
+def test_a_gateway_that_hangs_is_told_of(opened: Opener, gateway: FakeGateway) -> None:
     page = opened()
     gateway.is_silent = True
     until(page, STALE)
@@ -65,7 +65,7 @@ def test_a_daemon_that_hangs_is_told_of(opened: Opener, gateway: FakeGateway) ->
 def test_a_viewer_s_clock_that_is_set_back_makes_nothing_live(
     opened: Opener, gateway: FakeGateway, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(fake_gateway, "HOLD_S", 120)  # no answer tells of the daemon's clock
+    monkeypatch.setattr(fake_gateway, "HOLD_S", 120)  # no answer tells of the gateway's clock
     page = opened()
     gateway.is_silent = True
     page.evaluate("(now => { Date.now = () => now() - 3600e3; })(Date.now)")
@@ -75,7 +75,7 @@ def test_a_viewer_s_clock_that_is_set_back_makes_nothing_live(
     until_met(page, lambda: float(age.inner_text().removesuffix(" s")) >= 2)
 
 
-def test_the_page_lives_again_when_the_daemon_does(opened: Opener, gateway: FakeGateway) -> None:
+def test_the_page_lives_again_when_the_gateway_does(opened: Opener, gateway: FakeGateway) -> None:
     page = opened()
     gateway.kill()
     until(page, "document.body.classList.contains('dead')")
@@ -118,7 +118,7 @@ SET_BACK = """([name, register, known]) => import('/page/store.js').then(s => {
 })"""
 
 
-def test_nothing_gets_young_where_the_daemon_s_clock_is_set_back(opened: Opener) -> None:
+def test_nothing_gets_young_where_the_gateway_s_clock_is_set_back(opened: Opener) -> None:
     page = opened()
     until(page, LIVE)
     value, age, is_old = page.evaluate(SET_BACK, ["labeller", "output_frequency", True])

@@ -251,7 +251,7 @@ def test_a_time_of_which_the_gateway_knows_nothing_is_not_shown_as_one_without_f
     gateway.knows_since = 1764077400000
     page.get_by_role("button", name="Later").click()
     page.get_by_role("button", name="Back to the span before").click()
-    unknown = "not known: the daemon began later"
+    unknown = "not known: the gateway began later"
     until_met(page, lambda: lanes.all_inner_texts() == [unknown] * 2)
     part = "bars => bars.map(bar => bar.firstChild.offsetWidth / bar.clientWidth)"
     assert all(abs(part - 0.5) < 0.02 for part in lanes.evaluate_all(part))

@@ -1,4 +1,4 @@
-"""Words, counts and marks say what is so: of one drive, a plant that has just begun, a daemon that died."""
+"""Words, counts and marks say what is so: of one drive, a plant that has just begun, a gateway that died."""
 
 from __future__ import annotations
 
@@ -64,16 +64,16 @@ def test_plots_and_markers_tell_floats_too(opened: Opener, gateway: FakeGateway)
     until_met(page, lambda: re.fullmatch(fraction, cell.inner_text()) is not None)
 
 
-def test_a_daemon_that_stays_away_is_told_of_in_one_sentence(opened: Opener, gateway: FakeGateway) -> None:
+def test_a_gateway_that_stays_away_is_told_of_in_one_sentence(opened: Opener, gateway: FakeGateway) -> None:
     page = opened()
     with page.expect_event("requestfailed", lambda request: request.url.endswith("/api/plant")):
         gateway.kill()
-    told = r"The daemon cannot be reached\. What is shown is of \d\d:\d\d:\d\d UTC\."
+    told = r"The gateway cannot be reached\. What is shown is of \d\d:\d\d:\d\d UTC\."
     page.wait_for_timeout(1000)
     assert re.fullmatch(told, page.locator("#notice").inner_text())
 
 
-def test_figures_of_a_dead_daemon_look_old_and_nothing_is_said_of_misses(
+def test_figures_of_a_dead_gateway_look_old_and_nothing_is_said_of_misses(
     opened: Opener, gateway: FakeGateway
 ) -> None:
     page = opened()
@@ -84,7 +84,7 @@ def test_figures_of_a_dead_daemon_look_old_and_nothing_is_said_of_misses(
     until(page, "document.body.classList.contains('dead')")
     assert [figure.evaluate(style) for figure in figures] == ["italic"] * 3
     page.evaluate("location.hash = '#/lines'")
-    page.locator("#lines").get_by_text("The daemon cannot be reached.", exact=True).wait_for()
+    page.locator("#lines").get_by_text("The gateway cannot be reached.", exact=True).wait_for()
     assert "counted yet" not in page.locator("#lines").inner_text()
 
 
@@ -98,7 +98,7 @@ def test_faults_that_come_before_the_first_frame_last_for_as_long_as_they_do(
     assert lasted.inner_text() == "87 min so far"
 
 
-def test_what_lasted_when_the_daemon_died_is_not_known_to_last_on(
+def test_what_lasted_when_the_gateway_died_is_not_known_to_last_on(
     opened: Opener, gateway: FakeGateway
 ) -> None:
     page = opened("#/faults")

@@ -78,9 +78,9 @@ def test_an_answer_that_breaks_off_is_no_answer(opened: Opener, gateway: FakeGat
     page.get_by_role("button", name="start").click()
     page.get_by_role("button", name="start pump-1").click()
     outcome = page.locator("#outcomes li").inner_text()
-    assert "The daemon's answer broke off." in outcome
+    assert "The gateway's answer broke off." in outcome
     assert "not known whether it was carried out" in outcome
-    page.locator("#writes").get_by_text("The daemon's answer broke off.").wait_for()
+    page.locator("#writes").get_by_text("The gateway's answer broke off.").wait_for()
 
 
 def test_a_start_warns_and_enter_alone_sends_nothing(opened: Opener, gateway: FakeGateway) -> None:

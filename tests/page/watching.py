@@ -75,5 +75,5 @@ def cell(page: Any, drive: str, part: str) -> Any:
 
 
 def link(page: Any) -> str:
-    """Return what the head says of the way to the daemon."""
+    """Return what the head says of the way to the gateway."""
     return str(page.locator("#link").inner_text().strip())

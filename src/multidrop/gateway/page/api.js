@@ -17,14 +17,14 @@ async function ask(path, options, patience) {
     throw new Refused(
       0,
       error.name === "TimeoutError"
-        ? `The daemon has not answered for ${Math.round(patience / 1000)} s.`
-        : "The daemon cannot be reached.",
+        ? `The gateway has not answered for ${Math.round(patience / 1000)} s.`
+        : "The gateway cannot be reached.",
     );
   }
   const body = await response.json().catch(() => null);
   if (!response.ok)
-    throw new Refused(response.status, body?.error ?? `The daemon answers ${response.status}.`);
-  if (body === null) throw new Refused(0, "The daemon's answer broke off.");
+    throw new Refused(response.status, body?.error ?? `The gateway answers ${response.status}.`);
+  if (body === null) throw new Refused(0, "The gateway's answer broke off.");
   return body;
 }
 

@@ -35,7 +35,7 @@ export function begin() {
       make(
         "p",
         { class: "note" },
-        "What lasts, and what ended in the last 30 days since the daemon began.",
+        "What lasts, and what ended in the last 30 days since the gateway began.",
       ),
       make("div", { id: "fault-list", class: "scroll" }),
     ),
@@ -78,8 +78,8 @@ function row(alarm) {
     to = Math.ceil((alarm.ended ?? now()) + AROUND_MS);
   const where = alarm.drive ? `#/drives/${encodeURIComponent(alarm.drive)}` : "#/lines";
   const t = now(),
-    isNew = isLive(t) || store.frame === null, // before the first frame the daemon has just told the list
-    seen = alarm.ended ?? (isNew ? t : store.time), // of a dead daemon nothing lasts on
+    isNew = isLive(t) || store.frame === null, // before the first frame the gateway has just told the list
+    seen = alarm.ended ?? (isNew ? t : store.time), // of a dead gateway nothing lasts on
     lasted = `${clock.lasting(seen - alarm.time)}${isLasting ? " so far" : ""}`;
   return make(
     "tr",

@@ -44,7 +44,7 @@ export async function draw(place, from, to, drives) {
 
 // Return a bar over the time of which the gateway, which began later, knows nothing.
 function unknown(since, from, to) {
-  const text = "not known: the daemon began later",
+  const text = "not known: the gateway began later",
     shown = make("span", { class: "unknown", title: text }, text);
   shown.style.left = 0;
   shown.style.width = `${Math.min(1, (since - from) / (to - from)) * 100}%`;

@@ -1,9 +1,9 @@
-// The way to the daemon: one request for a frame under way, and how old what it brought is.
+// The way to the gateway: one request for a frame under way, and how old what it brought is.
 
 import { get } from "./api.js";
 import { store, takeFrame, takePlant } from "./store.js";
 
-const PATIENCE_MS = 25000; // the daemon answers after 20 s where there is nothing new
+const PATIENCE_MS = 25000; // the gateway answers after 20 s where there is nothing new
 const AGAIN_MS = 500;
 const NONE = -1; // the number of no frame
 const HIDDEN_MS = 1000; // a tab that nobody sees asks once a second, and holds no connection
@@ -11,8 +11,8 @@ const HIDDEN_MS = 1000; // a tab that nobody sees asks once a second, and holds 
 export const link = { why: "" };
 let under = null; // what cancels the request under way
 
-// The daemon's clock less ours, in ms, as far as its answers' Date headers prove a difference. Date is cut to
-// whole seconds: the truth lies between `least` and `most`, and no correction is made where 0 does too.
+// The gateway's clock less ours, in ms, as far as its answers' Date headers prove a difference. Date is cut
+// to whole seconds: the truth lies between `least` and `most`, and no correction is made where 0 does too.
 const skew = { least: -Infinity, most: Infinity };
 
 function learnSkew(date, sent, received) {
@@ -27,7 +27,7 @@ function learnSkew(date, sent, received) {
 
 export const correction = () => (skew.least > 0 ? skew.least : skew.most < 0 ? skew.most : 0);
 
-// Return the daemon's time in ms; the later one by two clocks, for this device's may be set back.
+// Return the gateway's time in ms; the later one by two clocks, for this device's may be set back.
 export const now = () =>
   Math.max(Date.now() + correction(), store.time + performance.now() - store.came);
 
@@ -89,9 +89,9 @@ async function newer(n) {
   } catch (error) {
     if (error.name === "AbortError") throw error;
     throw new Error(
-      error.name === "TimeoutError" ? "The daemon does not answer." : "The daemon cannot be reached.",
+      error.name === "TimeoutError" ? "The gateway does not answer." : "The gateway cannot be reached.",
     );
   }
   const body = await response.json().catch(() => null);
-  throw new Error(body?.error ?? `The daemon answers ${response.status}.`);
+  throw new Error(body?.error ?? `The gateway answers ${response.status}.`);
 }

@@ -9,7 +9,7 @@ const FAILED_LIMIT_MS = 1000; // and one whose newest request failed
 const UNSEEN_MS = 5000; // between two frames: what was then is not known
 export const LIVE_MS = 1500; // a frame comes each second at least
 
-// `time` of the frame is in ms of the daemon's clock, and `came` in ms of one that nobody sets.
+// `time` of the frame is in ms of the gateway's clock, and `came` in ms of one that nobody sets.
 export const store = { plant: null, frame: null, time: 0, came: 0, isLost: false, drives: new Map() };
 store.lines = new Map();
 const watchers = [];
@@ -107,9 +107,9 @@ function most() {
 }
 
 // Return what is known of a register now, or null where nothing ever was:
-// {value, ms, status, age (ms), isOld}. `now` is the daemon's time; a value is old when the gateway says so,
+// {value, ms, status, age (ms), isOld}. `now` is the gateway's time; a value is old when the gateway says so,
 // a second after it where the newest request failed, or when the frame itself is old. A time to come is one
-// of before the daemon's clock was set back.
+// of before the gateway's clock was set back.
 export function reading(name, register, now) {
   const drive = store.drives.get(name),
     newest = drive?.newest.get(register);

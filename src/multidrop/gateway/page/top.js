@@ -50,7 +50,7 @@ export function drawTop() {
 function drawNotice(isNow, age) {
   const parts = [];
   if (store.isLost) parts.push(link.why.replace(/\.?$/, "."));
-  else if (store.frame && age > LIVE_MS) parts.push("The daemon sends no new values.");
+  else if (store.frame && age > LIVE_MS) parts.push("The gateway sends no new values.");
   if (store.frame && !isNow)
     parts.push(`What is shown is of ${clock.when(store.time)} ${clock.zoneName()}.`);
   const wrong = store.plant?.mistakes?.length ?? 0;
@@ -61,7 +61,7 @@ function drawNotice(isNow, age) {
   if (Math.abs(off) > SKEW_MS) {
     parts.push(
       `This device's clock is ${clock.lasting(Math.abs(off))} ${off > 0 ? "slow" : "fast"}; ` +
-        "times here are the daemon's.",
+        "times here are the gateway's.",
     );
   }
   const notice = find("#notice");
