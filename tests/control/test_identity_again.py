@@ -131,6 +131,13 @@ def _asleep(bus: Bus, drive: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(clock, "boottime_ns", lambda: at_ns() + 2 * PAUSE_NS)
 
 
+def _idle_and_asleep(bus: Bus, drive: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """For six seconds each."""
+    now_ns, boottime_ns = clock.now_ns, clock.boottime_ns
+    monkeypatch.setattr(clock, "now_ns", lambda: now_ns() + 6 * PAUSE_NS // 10)
+    monkeypatch.setattr(clock, "boottime_ns", lambda: boottime_ns() + 12 * PAUSE_NS // 10)
+
+
 def _idle(bus: Bus, drive: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     bus.peer(drive).c.answered_ns -= 2 * PAUSE_NS
     at_ns = clock.now_ns
@@ -149,7 +156,7 @@ def _on_another_port(bus: Bus, drive: Any, monkeypatch: pytest.MonkeyPatch) -> N
 
 @pytest.mark.usefixtures("_patient")
 @pytest.mark.parametrize("model", ["innovert-ibd", "delixi-native"])
-@pytest.mark.parametrize("lose", [_asleep, _idle, _read_since, _on_another_port])
+@pytest.mark.parametrize("lose", [_asleep, _idle, _idle_and_asleep, _read_since, _on_another_port])
 def test_a_setpoint_that_cannot_be_read_is_forgotten_once_the_drive_may_have_lost_its_power(
     model: str, lose: Callable[[Bus, Any, pytest.MonkeyPatch], None], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -45,16 +45,19 @@ class IdentityCheck:
         look = self._known.get(drive)
         return look is not None and look.port is self._exchanges.line.queue
 
-    def _is_the_same(self, drive: Drive) -> bool:
-        """Return True where it answered all since it was known, without a pause: so nobody has changed it."""
+    def _was_heard(self, drive: Drive) -> bool:
+        """Return True where it was known on this port, and PAUSE_NS without an answer never passed since."""
         look = self._known.get(drive)
         if look is None or look.port is not self._exchanges.line.queue:
             return False
         peer = self._exchanges.peer(drive)
-        if (look.silences, look.pauses) != (peer.silences, peer.pauses):
-            return False
         idle_ns = clock.now_ns() - max(look.at_ns, peer.answered_ns)
-        return idle_ns + _slept_ns() - look.slept_ns < PAUSE_NS
+        return look.pauses == peer.pauses and idle_ns + _slept_ns() - look.slept_ns < PAUSE_NS
+
+    def _has_answered_all(self, drive: Drive) -> bool:
+        """Return True where it answered all that it was asked since it was known."""
+        look = self._known.get(drive)
+        return look is not None and look.silences == self._exchanges.peer(drive).silences
 
     def forget(self, drive: Drive) -> None:
         self._known.pop(drive, None)
@@ -71,8 +74,9 @@ class IdentityCheck:
         did not answer, and after PAUSE_NS without an answer: something else may be there. Each read is
         within `timed`.
         """
-        if self._is_the_same(drive):
-            return
+        was_heard = self._was_heard(drive)
+        if was_heard and self._has_answered_all(drive):
+            return  # nobody has changed it
 
         def do(step: Step) -> object:
             if isinstance(step, Wait):
@@ -92,14 +96,14 @@ class IdentityCheck:
         if not self._exchanges.has_answered(drive):
             with timed():
                 self._echo.read_any(drive, READ_ATTEMPTS)
-        self._know(drive, port, silences)
+        self._know(drive, port, silences, was_heard=was_heard)
 
-    def _know(self, drive: Drive, port: object, silences: int) -> None:
-        pauses = self._exchanges.peer(drive).pauses
-        look = _Look(port, silences, pauses, clock.now_ns(), _slept_ns())
-        if not _was_heard_since(self._known.get(drive), look):
+    def _know(self, drive: Drive, port: object, silences: int, *, was_heard: bool) -> None:
+        """Know it by what it has just answered; it `was_heard` all the time until then."""
+        before, pauses = self._known.get(drive), self._exchanges.peer(drive).pauses
+        if not was_heard or before is None or before.pauses != pauses:
             _forget_setpoint(drive)
-        self._known[drive] = look
+        self._known[drive] = _Look(port, silences, pauses, clock.now_ns(), _slept_ns())
 
     def _read(self, drive: Drive, step: Step, attempts: int, *, insists: bool = False) -> object:
         if not isinstance(step, Read):
@@ -164,7 +168,7 @@ class IdentityCheck:
         except Exception:  # no answer; or the family's own code failed, which must not keep a stop back
             return None
         if self._is_in_step(drive):
-            self._know(drive, port, silences)
+            self._know(drive, port, silences, was_heard=False)  # else it was known
         return None
 
     def _lookalike(self, drive: Drive) -> Drive | None:
@@ -196,19 +200,8 @@ class IdentityCheck:
         return True
 
 
-def _was_heard_since(before: _Look | None, look: _Look) -> bool:
-    """Return True where the drive answered on this port in any PAUSE_NS since that look.
-
-    A reply or two may have been lost. Where nothing was heard for longer, asked or not, it may have lost its
-    power meanwhile, and come back.
-    """
-    if before is None or before.port is not look.port:
-        return False
-    return before.pauses == look.pauses and look.slept_ns - before.slept_ns < PAUSE_NS
-
-
 def _forget_setpoint(drive: Drive) -> None:
-    """Forget what a drive cannot say, and may have lost with its power."""
+    """Forget what a drive cannot say: unheard for so long, asked or not, it may have lost its power."""
     if drive.setpoint_name in drive.registers and not drive.register(drive.setpoint_name).readable:
         drive.commanded = None
 
