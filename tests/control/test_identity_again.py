@@ -172,6 +172,18 @@ def test_a_setpoint_that_cannot_be_read_is_forgotten_once_the_drive_may_have_los
         drive.start()
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("model", ["innovert-ibd", "delixi-native"])
+def test_a_setpoint_is_forgotten_where_the_look_before_start_ends_a_long_silence(model: str) -> None:
+    with known(model) as (bus, drive, received):
+        drive.set_frequency(10)
+        be_silent(bus, drive, received)
+        bus.peer(drive).c.answered_ns -= 2 * PAUSE_NS
+        with pytest.raises(Refused, match="cannot say its setpoint: call set_frequency before start"):
+            drive.start()
+        assert received.writes == []
+
+
 @pytest.mark.usefixtures("_patient")
 @pytest.mark.parametrize("model", ["innovert-ibd", "delixi-native"])
 def test_a_setpoint_that_was_written_through_another_bus_is_not_known(model: str) -> None:

@@ -9,6 +9,7 @@ from contextvars import copy_context
 from math import inf
 
 from multidrop.control.rules import conditions, raw_count, wears
+from multidrop.core import PAUSE_NS
 from multidrop.drive.family import Drive
 from multidrop.drive.register import Register
 from multidrop.drive.script import Script, Write, read, wait
@@ -16,7 +17,7 @@ from multidrop.drive.state import Direction
 from multidrop.drive.table import Kept
 from multidrop.errors import Refused
 
-HEARD_S = 5.0  # after ten nobody knows whether a drive has lost its power (identity.py)
+HEARD_S = PAUSE_NS / 2e9  # after PAUSE_NS nobody knows whether a drive has lost its power (identity.py)
 
 
 def start_staggered(drives: Sequence[Drive], gap: float, direction: Direction | None = None) -> None:
