@@ -72,6 +72,11 @@ class Trial:
         while "hall" not in self.keeper.polled or self.keeper._at_work:
             await asyncio.sleep(0.001)
 
+    async def is_at_rest(self) -> None:
+        """Wait until nothing is under way on the line, while time passes."""
+        while self.keeper._at_work:
+            await asyncio.sleep(0.001)
+
     def claim_now(self) -> None:
         claim = self.keeper.claim_of("hall")
         assert claim
@@ -312,6 +317,27 @@ def test_a_bucket_that_answers_late_holds_no_claim_up(monkeypatch: pytest.Monkey
         await until(lambda: not trial.keeper._tasks)
         assert owners(trial) == [ME, ME, ME]
         assert trial.keeper.moves == 1
+
+    asyncio.run(main())
+
+
+def test_a_refused_claim_waits_for_no_late_answer(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It is tried again at once, by newer records: a server that is cut off answers nothing for long."""
+    monkeypatch.setattr(owner_records, "SPARE_S", 0.0)
+
+    async def main() -> None:
+        trial = DeadTrial()
+        await trial.read_and_begin()
+        trial.buckets[1].store("hall", owner_value(("", 0), 2, 0))
+        trial.buckets[0].shut()
+        trial.claim_now()
+        await asyncio.wait_for(trial.is_at_rest(), 10)
+        assert owners(trial) == [NOBODY, NOBODY, NOBODY]
+        assert all(trial.records.owners[bucket.name]._doubted for bucket in trial.buckets[:2])
+        await trial.read()
+        trial.claim_now()
+        await asyncio.wait_for(trial.is_polled(), 10)
+        assert owners(trial) == [ME, ME, NOBODY]
 
     asyncio.run(main())
 

@@ -26,6 +26,7 @@ from multidrop.fleet.ownership import (
     turn_of,
 )
 from multidrop.fleet.share_records import ShareRecords
+from multidrop.fleet.task_end import end_tasks
 
 WRITERS = 2  # batches at a time in each bucket
 SPARE_S = 0.15  # after one bucket has answered, before records are written in the spare one
@@ -88,7 +89,11 @@ class OwnerRecords:
         return claim_of(self._me, self._records.of(line), is_over, self.doubted(line))
 
     async def claim(self, claims: Mapping[str, Claim]) -> None:
-        """Write the first records of claims, and spare ones where a bucket takes much longer than another."""
+        """Write the first records of claims, and spare ones where a bucket takes much longer than another.
+
+        Answers that nothing is decided by any more are not waited for where a claim was refused: it is to be
+        tried again, by newer records.
+        """
         now_ms, begun = time.time_ns() // 1_000_000, time.monotonic()
         values = {
             line: owner_value(self._me, claim.turn, now_ms, claim.votes) for line, claim in claims.items()
@@ -107,7 +112,11 @@ class OwnerRecords:
             if not self.is_mine(line)
             for bucket, revision in claims[line].spare.items()
         )
-        await asyncio.gather(*late, *spare)
+        refused = refused.union(*await asyncio.gather(*spare))
+        if refused and all(map(self.is_mine, claims.keys() - refused)):
+            await end_tasks(*late)  # what was sent may still be stored, and is read then
+        else:
+            await asyncio.gather(*late)
 
     async def give_away(self, lines: Sequence[str]) -> None:
         """Name nobody in each record of these lines that names us.
@@ -139,14 +148,16 @@ class OwnerRecords:
             if not self._may_write():
                 return set()
             written = WriteAnswers([], set())
-            with suppress(FleetError):
-                written = await follower.bucket.put_all(records)
+            try:
+                with suppress(FleetError):
+                    written = await follower.bucket.put_all(records)
+            finally:
+                stored = {record.key for record in written.stored}
+                self._records.doubt(bucket, {record.key for record in records} - stored)
         for record in written.stored:
             was_mine = self.is_mine(record.key)
             follower.take(record)
             if self.is_mine(record.key) and not was_mine:
                 self.moves += 1
                 self._on_mine(record.key)
-        stored = {record.key for record in written.stored}
-        self._records.doubt(bucket, {record.key for record in records} - stored)
         return written.refused
