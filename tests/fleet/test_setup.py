@@ -123,6 +123,27 @@ def test_servers_that_do_not_look_at_all_writers_records_are_refused(
         asyncio.run(_init(nats.urls))
 
 
+@table(("is_carried_out",), [(True,), (False,)])
+def test_a_removal_that_nobody_answers_is_looked_after(
+    is_carried_out: bool, nats: Cluster, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A busy leader may be late with its answer to the end of the contest."""
+    removals = []
+
+    async def ask_in_vain(path: ServerPath, subject: str, data: Any = None) -> dict[str, Any]:
+        if subject.startswith("STREAM.DELETE"):
+            removals.append(subject)
+            if len(removals) == 1:
+                if is_carried_out:
+                    await ask(path, subject, data)
+                raise Unsure("no answer")
+        return await ask(path, subject, data)
+
+    monkeypatch.setattr(setup, "ask", ask_in_vain)
+    asyncio.run(_init(nats.urls))
+    assert removals == ["STREAM.DELETE.KV_contest"] * (1 if is_carried_out else 2)
+
+
 @pytest.mark.long
 @pytest.mark.slow
 def test_a_server_that_is_down_is_waited_for_at_first_and_not_later(tmp_path: Path) -> None:

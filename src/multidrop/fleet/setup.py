@@ -155,10 +155,21 @@ async def _info(path: ServerPath, stream: str) -> dict[str, Any] | None:
 
 
 async def _create(path: ServerPath, settings: Mapping[str, Any]) -> None:
+    await _ask_until(path, "CREATE", settings["name"], settings)
+
+
+async def _remove(path: ServerPath, stream: str) -> None:
+    await _ask_until(path, "DELETE", stream)
+
+
+async def _ask_until(
+    path: ServerPath, deed: str, stream: str, settings: Mapping[str, Any] | None = None
+) -> None:
+    """Ask for a stream to be created or deleted until it is."""
     ends = asyncio.get_running_loop().time() + WAIT_S
-    while await _info(path, settings["name"]) is None:
+    while (await _info(path, stream) is None) == (deed == "CREATE"):
         try:
-            await ask(path, f"STREAM.CREATE.{settings['name']}", settings)
+            await ask(path, f"STREAM.{deed}.{stream}", settings)
         except ServerError:
             if asyncio.get_running_loop().time() > ends:
                 raise
@@ -210,7 +221,7 @@ async def _contest(paths: Sequence[ServerPath], replicas: int) -> None:
             if unsure > 2 * ROUNDS:
                 raise no_quorum(paths[0], Unsure("a key was never granted"))
     finally:
-        await ask(paths[0], f"STREAM.DELETE.{settings['name']}")
+        await _remove(paths[0], settings["name"])
 
 
 def _itself(path: ServerPath) -> ServerPath:
