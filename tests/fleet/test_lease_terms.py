@@ -12,18 +12,22 @@ from peers import require_module
 
 require_module("nats")
 
-from multidrop.fleet import leaders, lease_terms, names  # noqa: E402
+from multidrop.fleet import leaders, names  # noqa: E402
 from multidrop.fleet.errors import Unsure  # noqa: E402
+from multidrop.fleet.leader_keeper import keep_leaders  # noqa: E402
+from multidrop.fleet.leaders import SOON_S, bring_leaders_home, led_clusters  # noqa: E402
 from multidrop.fleet.lease_terms import EVERY_S, FOR_S, LeaseTerms  # noqa: E402
 
 SERVERS = ("n1", "n2", "n3")
+PATH: Any = None
+ASKS_S = 4.0  # after so long a server that hears nobody may ask for votes
 
 
 class Servers:
     """Three servers; each bucket has a leader and a term."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        self.leaders = dict(zip(names.LEASES, SERVERS, strict=True))
+        self.leaders = dict(zip((*names.LEASES, *names.OWNERS), 2 * SERVERS, strict=True))
         self.terms = dict.fromkeys(names.LEASES, 1)
         self.silent: set[str] = set()
         self.unheard_ns = 0  # never, by this leader
@@ -32,8 +36,7 @@ class Servers:
         self.under_way = 0
         self.now = 0.0
         self.found = LeaseTerms(lambda: self.now)
-        for module in (leaders, lease_terms):
-            monkeypatch.setattr(module, "ask", self.ask)
+        monkeypatch.setattr(leaders, "ask", self.ask)
 
     async def ask(self, path: Any, subject: str, data: Mapping[str, Any] | None = None) -> dict[str, Any]:
         bucket = subject.rpartition("KV_")[2]
@@ -47,7 +50,8 @@ class Servers:
             await asyncio.sleep(0.05)
             self.under_way -= 1
             self.leaders[bucket] = "" if bucket in self.stuck else data["placement"]["preferred"]
-            self.terms[bucket] += 1
+            if bucket in self.terms:
+                self.terms[bucket] += 1
             return {}
         peers = [
             {
@@ -65,7 +69,8 @@ class Servers:
 
         async def main() -> None:
             for _ in range(seconds):
-                await self.found.keep_ahead(None)  # type: ignore[arg-type]
+                clusters = await led_clusters(PATH)
+                await self.found.keep_ahead(PATH, clusters)
                 self.now += 1
 
         run_controlled(main())
@@ -104,7 +109,7 @@ def test_terms_grow_faster_than_a_silent_server_can_ask_for_votes(servers: Serve
             assert servers.terms[bucket] > 1 + second // 4
             assert servers.leaders[bucket] in ("n1", "n2")
     assert servers.terms[names.LEASES[2]] == 1  # it has no leader that could hand it over
-    assert EVERY_S < 4.0
+    assert EVERY_S < ASKS_S
 
 
 def test_a_bucket_whose_leader_was_silent_is_kept_ahead_once_it_has_another(servers: Servers) -> None:
@@ -140,3 +145,52 @@ def test_one_server_alone_hands_nothing_over(servers: Servers) -> None:
     servers.silent = {"n2", "n3"}
     servers.pass_s(10)
     assert set(servers.terms.values()) == {1}
+
+
+def test_a_leader_that_answers_nothing_holds_no_look_up(servers: Servers) -> None:
+    servers.silent = {"n2"}
+
+    async def main() -> None:
+        begun = asyncio.get_running_loop().time()
+        clusters = await led_clusters(PATH)
+        assert asyncio.get_running_loop().time() - begun == pytest.approx(SOON_S)
+        assert [cluster.leader for cluster in clusters.values()] == ["n1", "n3", "n1", "n3"]
+        assert await bring_leaders_home(PATH, clusters) == 0
+
+    run_controlled(main())
+
+
+@pytest.mark.parametrize("cut_after_s", [0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7])
+def test_terms_are_ahead_before_a_server_that_was_cut_off_asks_for_votes(
+    cut_after_s: float, servers: Servers
+) -> None:
+    """Its leaders answer nothing, and the others tell after 2 s that it is silent."""
+
+    async def main() -> None:
+        keeping = asyncio.create_task(
+            keep_leaders(lambda: PATH, lambda: True, asyncio.get_running_loop().time)
+        )
+        await asyncio.sleep(10 + cut_after_s)
+        servers.silent, servers.unheard_ns = {"n2"}, 1
+        await asyncio.sleep(2.0)
+        servers.unheard_ns = 2_000_000_000
+        await asyncio.sleep(ASKS_S - 2.0)
+        assert min(servers.terms["lease_0"], servers.terms["lease_2"]) > 1
+        keeping.cancel()
+
+    run_controlled(main())
+
+
+def test_leaders_come_home_once_they_can(servers: Servers) -> None:
+    """One that was handed over for a silent server is brought back when it is looked at again."""
+    servers.leaders |= {"lease_0": "n2", "own_2": "n1"}
+    servers.lagging = {"n1"}
+
+    async def main() -> None:
+        assert await bring_leaders_home(PATH, await led_clusters(PATH)) == 1
+        servers.lagging = set()
+        assert await bring_leaders_home(PATH, await led_clusters(PATH)) == 1
+        assert await bring_leaders_home(PATH, await led_clusters(PATH)) == 0
+
+    run_controlled(main())
+    assert list(servers.leaders.values()) == list(2 * SERVERS)

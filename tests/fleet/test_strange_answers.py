@@ -15,8 +15,7 @@ require_module("nats")
 from multidrop.fleet import names, samples_stream, setup  # noqa: E402
 from multidrop.fleet.buckets import Bucket, Record, ask  # noqa: E402
 from multidrop.fleet.errors import FleetError, Unsure  # noqa: E402
-from multidrop.fleet.leaders import bring_leaders_home, cluster_at, has_leader  # noqa: E402
-from multidrop.fleet.lease_terms import LeaseTerms  # noqa: E402
+from multidrop.fleet.leaders import cluster_at, has_leader, led_clusters  # noqa: E402
 from multidrop.fleet.samples_stream import StreamError  # noqa: E402
 from multidrop.fleet.setup import check_buckets  # noqa: E402
 
@@ -131,8 +130,7 @@ def test_a_bucket_s_servers_that_are_none_are_one_sentence_and_nothing_is_moved(
     with pytest.raises(FleetError, match="what NATS answers of a bucket's servers is none of JetStream's: "):
         asyncio.run(check_buckets(path))
     assert not asyncio.run(has_leader(path, names.OWNERS[0]))
-    assert asyncio.run(bring_leaders_home(path)) == 0
-    asyncio.run(LeaseTerms().keep_ahead(path))
+    assert asyncio.run(led_clusters(path)) == {}
     assert {subject.split(".KV_")[0] for subject in path.asked} == {"$JS.API.STREAM.INFO"}
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Mapping
 from contextlib import suppress
 
 from multidrop.fleet import names
@@ -11,6 +12,9 @@ from multidrop.fleet.cluster import Cluster, cluster_of
 from multidrop.fleet.errors import FleetError
 from multidrop.fleet.ownership import NEEDED
 from multidrop.fleet.servers import ServerPath
+from multidrop.fleet.task_end import end_tasks
+
+SOON_S = 0.4  # at rest it takes some milliseconds
 
 
 async def cluster_at(path: ServerPath, bucket: str) -> Cluster | None:
@@ -36,18 +40,39 @@ async def have_leaders(path: ServerPath) -> bool:
     return sum(led) >= NEEDED
 
 
-async def bring_leaders_home(path: ServerPath) -> int:
+async def led_clusters(path: ServerPath) -> dict[str, Cluster]:
+    """Return the servers of those buckets of leases and of lines' masters whose leader answers soon.
+
+    One whose server is cut off answers nothing, and holds the others up no longer than that.
+    """
+    buckets = (*names.LEASES, *names.OWNERS)
+    looks = [asyncio.create_task(known_cluster(path, bucket)) for bucket in buckets]
+    try:
+        await asyncio.wait(looks, timeout=SOON_S)
+    finally:
+        found = await end_tasks(*looks)
+    return {
+        bucket: one
+        for bucket, one in zip(buckets, found, strict=True)
+        if isinstance(one, Cluster) and one.leader
+    }
+
+
+async def bring_leaders_home(path: ServerPath, clusters: Mapping[str, Cluster]) -> int:
     """Ask leaders elsewhere to step down in favour of their home; return how many were asked."""
     moved = 0
     for group in (names.LEASES, names.OWNERS):
         for place, bucket in enumerate(group):
-            with suppress(FleetError):
-                cluster = await cluster_at(path, bucket)
-                if cluster is None or not cluster.leader:
-                    continue
-                home = cluster.home_of(place)
-                if home in cluster.ready:
-                    wanted = {"placement": {"preferred": home}}
-                    await ask(path, f"STREAM.LEADER.STEPDOWN.KV_{bucket}", wanted)
+            if bucket in clusters:
+                home = clusters[bucket].home_of(place)
+                if home in clusters[bucket].ready:
+                    await hand_over(path, bucket, home)
                     moved += 1
     return moved
+
+
+async def hand_over(path: ServerPath, bucket: str, server: str) -> None:
+    """Ask the leader of a bucket to step down in favour of this server."""
+    with suppress(FleetError):
+        wanted = {"placement": {"preferred": server}}
+        await ask(path, f"STREAM.LEADER.STEPDOWN.KV_{bucket}", wanted)

@@ -11,16 +11,13 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 
 from multidrop.fleet import names
-from multidrop.fleet.buckets import ask
 from multidrop.fleet.cluster import Cluster
-from multidrop.fleet.errors import FleetError
-from multidrop.fleet.leaders import known_cluster
+from multidrop.fleet.leaders import hand_over, known_cluster
 from multidrop.fleet.servers import ServerPath
-from multidrop.fleet.task_end import end_tasks
 
 EVERY_S = 3.0  # less than the shortest time between two requests for votes
 FOR_S = 60.0  # a server that is silent for longer is not waited for
@@ -36,22 +33,22 @@ class LeaseTerms:
         self._silent_since: float | None = None
         self._handed_at: dict[str, float] = {}  # by bucket
 
-    async def keep_ahead(self, path: ServerPath) -> None:
-        """Hand over what is due, one bucket after the other: through us at most one waits for an election."""
-        looks = [asyncio.create_task(_named(path, bucket)) for bucket in names.LEASES]
-        has_silent, found = False, 0
-        try:
-            for look in asyncio.as_completed(looks):
-                bucket, cluster = await look
-                found += bool(cluster.leader)
-                if cluster.leader and cluster.has_silent:
-                    has_silent, ready = True, cluster.ready
-                    if ready and self._is_due(bucket) and not await _hand_over(path, bucket, ready[0]):
-                        return
-        finally:
-            await end_tasks(*looks)
-        if found == len(looks) and not has_silent:
+    async def keep_ahead(self, path: ServerPath, clusters: Mapping[str, Cluster]) -> bool:
+        """Hand over what is due, and return True where anything was.
+
+        It is done one bucket after the other: through us at most one waits for an election.
+        """
+        led = {bucket: clusters[bucket] for bucket in names.LEASES if bucket in clusters}
+        silent = {bucket: cluster for bucket, cluster in led.items() if cluster.has_silent}
+        if len(led) == len(names.LEASES) and not silent:
             self._silent_since = None
+        any_due = False
+        for bucket, cluster in silent.items():
+            if cluster.ready and self._is_due(bucket):
+                any_due = True
+                if not await _leads_now(path, bucket, cluster.ready[0]):
+                    break
+        return any_due
 
     def _is_due(self, bucket: str) -> bool:
         now = self._clock()
@@ -63,15 +60,9 @@ class LeaseTerms:
         return True
 
 
-async def _named(path: ServerPath, bucket: str) -> tuple[str, Cluster]:
-    return bucket, await known_cluster(path, bucket)
-
-
-async def _hand_over(path: ServerPath, bucket: str, server: str) -> bool:
+async def _leads_now(path: ServerPath, bucket: str, server: str) -> bool:
     """Hand a bucket over, and return True once this server leads it."""
-    wanted = {"placement": {"preferred": server}}
-    with suppress(FleetError):
-        await ask(path, f"STREAM.LEADER.STEPDOWN.KV_{bucket}", wanted)
+    await hand_over(path, bucket, server)
     with suppress(TimeoutError):
         async with asyncio.timeout(DONE_S):
             while (await known_cluster(path, bucket)).leader != server:

@@ -24,12 +24,10 @@ from typing import Any
 
 from multidrop.fleet import names
 from multidrop.fleet.buckets import Record
-from multidrop.fleet.errors import FleetError
-from multidrop.fleet.leaders import bring_leaders_home
+from multidrop.fleet.leader_keeper import keep_leaders
 from multidrop.fleet.lease import Lease, MayPoll
 from multidrop.fleet.lease_bucket import LeaseBucket
 from multidrop.fleet.lease_rules import SECOND, USUAL, Terms
-from multidrop.fleet.lease_terms import LeaseTerms
 from multidrop.fleet.life_lock import LifeLock
 from multidrop.fleet.line_keeper import LineKeeper, Lines, TakenLine
 from multidrop.fleet.other_rules import OtherRules
@@ -49,7 +47,6 @@ LEAST_STEP_S = 0.01  # between any two
 TIDY_NS = SECOND // 2  # between looks at all lines of the share, where nothing is known to have changed
 SETTLE_S = 3.0
 SOUND_S = 1.0  # of our lease, to end others': where less is left the servers may fail all of us alike
-HOME_S = 1.0
 
 
 class MemberState(StrEnum):
@@ -160,7 +157,7 @@ class Member:
             *(self.lease.renew(path) for path in range(len(self.paths))),
             *self.records.works(),
             self._guard(),
-            self._home(),
+            keep_leaders(self.best, self._keeps_leaders),
             self._weak.watch(lambda: self._settled_at),
             self._releases.watch(),
             self._live(),
@@ -228,15 +225,9 @@ class Member:
                     _log.warning("%s: the lease was not renewed in time; no line is polled", self.name)
             await asyncio.sleep(GUARD_LOOK_S)
 
-    async def _home(self) -> None:
-        """Keep leaders ahead, and bring them home; one gateway does it, the first by name."""
-        terms = LeaseTerms()
-        while True:
-            await asyncio.sleep(HOME_S)
-            if self.lease.is_valid and min(self.records.observer.sessions(), default="") == self.name:
-                with suppress(FleetError):
-                    await terms.keep_ahead(self.best())
-                    await bring_leaders_home(self.best())
+    def _keeps_leaders(self) -> bool:
+        """Say whether leaders are ours to keep: one gateway does it, the first by name."""
+        return self.lease.is_valid and min(self.records.observer.sessions(), default="") == self.name
 
     # ---- one step ----
 

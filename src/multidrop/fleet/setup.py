@@ -14,7 +14,7 @@ from multidrop.fleet import names
 from multidrop.fleet.buckets import NONE_YET, Bucket, ServerError, ask, bucket_settings
 from multidrop.fleet.cluster import Cluster, cluster_of
 from multidrop.fleet.errors import Conflict, FleetError, NobodyThere, NoRight, TooOld, Unsure
-from multidrop.fleet.leaders import bring_leaders_home
+from multidrop.fleet.leaders import bring_leaders_home, led_clusters
 from multidrop.fleet.lease_bucket import LeaseBucket
 from multidrop.fleet.servers import ServerPath
 
@@ -47,7 +47,7 @@ async def set_up(paths: Sequence[ServerPath]) -> dict[str, Any]:
     for bucket in names.BUCKETS:
         await _create(paths[0], bucket_settings(bucket, replicas))
     await _wait_for_plant(paths[0])
-    await bring_leaders_home(paths[0])
+    await bring_leaders_home(paths[0], await led_clusters(paths[0]))
     servers = {path.server_name: ".".join(map(str, path.version)) for path in paths}
     return {"servers": servers, "replicas": replicas, "buckets": list(names.BUCKETS)}
 
