@@ -323,7 +323,7 @@ def test_a_bucket_that_answers_late_holds_no_claim_up(monkeypatch: pytest.Monkey
 
 def test_a_refused_claim_waits_for_no_late_answer(monkeypatch: pytest.MonkeyPatch) -> None:
     """It is tried again at once, by newer records: a server that is cut off answers nothing for long."""
-    monkeypatch.setattr(owner_records, "SPARE_S", 0.0)
+    monkeypatch.setattr(owner_records, "SPARE_S", 100.0)
 
     async def main() -> None:
         trial = DeadTrial()
@@ -335,9 +335,25 @@ def test_a_refused_claim_waits_for_no_late_answer(monkeypatch: pytest.MonkeyPatc
         assert owners(trial) == [NOBODY, NOBODY, NOBODY]
         assert all(trial.records.owners[bucket.name]._doubted for bucket in trial.buckets[:2])
         await trial.read()
+        trial.buckets[0].open()
         trial.claim_now()
         await asyncio.wait_for(trial.is_polled(), 10)
         assert owners(trial) == [ME, ME, NOBODY]
+
+    asyncio.run(main())
+
+
+def test_a_bucket_whose_home_may_be_gone_is_written_last() -> None:
+    async def main() -> None:
+        trial = DeadTrial()
+        await trial.read_and_begin()
+        trial.clock.pass_s(1.001)
+        for path, name in enumerate(names.OWNERS):
+            if name != trial.buckets[0].name:
+                await trial.lease.renew_once(path)
+        trial.claim_now()
+        await until(lambda: "hall" in trial.keeper.polled and not trial.keeper._at_work)
+        assert owners(trial) == [NOBODY, ME, ME]
 
     asyncio.run(main())
 

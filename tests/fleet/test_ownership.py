@@ -178,6 +178,16 @@ def test_a_record_that_was_not_read_is_not_written() -> None:
     assert claim_of(ME, records, is_over) is None
 
 
+def test_a_bucket_that_may_have_no_leader_is_written_last() -> None:
+    records = records_of(DEAD, DEAD, DEAD)
+    assert claim_of(ME, records, is_over) == Claim({"first": 11, "second": 12}, {"third": 13}, 6)
+    claim = claim_of(ME, records, is_over, leaderless=["first"])
+    assert claim == Claim({"second": 12, "third": 13}, {"first": 11}, 6)
+    records = records_of(DEAD, DEAD, LIVING)
+    claim = claim_of(ME, records, is_over, leaderless=["first"])
+    assert claim == Claim({"second": 12, "first": 11}, {}, 6)
+
+
 def test_what_was_given_away_in_doubt_is_claimed_at_that_revision() -> None:
     records = records_of(ME, ME, LIVING)
     assert claim_of(ME, records, is_over) is None

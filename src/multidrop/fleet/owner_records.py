@@ -15,6 +15,7 @@ from multidrop.fleet import names
 from multidrop.fleet.buckets import Record, WriteAnswers
 from multidrop.fleet.errors import FleetError
 from multidrop.fleet.lease import Lease
+from multidrop.fleet.lease_rules import SECOND
 from multidrop.fleet.ownership import (
     NEEDED,
     NOBODY,
@@ -29,6 +30,7 @@ from multidrop.fleet.share_records import ShareRecords
 from multidrop.fleet.task_end import end_tasks
 
 WRITERS = 2  # batches at a time in each bucket
+LATE_NS = SECOND  # two renewals
 SPARE_S = 0.15  # after one bucket has answered, before records are written in the spare one
 
 
@@ -86,13 +88,19 @@ class OwnerRecords:
     def claim_of(self, line: str) -> Claim | None:
         """Return what is to be written for a line to be ours; None where nothing can be."""
         is_over = self._records.observer.is_over
-        return claim_of(self._me, self._records.of(line), is_over, self.doubted(line))
+        return claim_of(self._me, self._records.of(line), is_over, self.doubted(line), self._leaderless())
+
+    def _leaderless(self) -> set[str]:
+        """Return the buckets that may have no leader: a lease with the same home was not renewed for long."""
+        since = self._lease.clock() - LATE_NS
+        held = zip(names.OWNERS, self._lease.held, strict=True)
+        return {bucket for bucket, path in held if path is None or path.sent < since}
 
     async def claim(self, claims: Mapping[str, Claim]) -> None:
         """Write the first records of claims, and spare ones where a bucket takes much longer than another.
 
-        Answers that nothing is decided by any more are not waited for where a claim was refused: it is to be
-        tried again, by newer records.
+        Where a claim was refused, answers that decide nothing any more are not waited for: it is to be tried
+        again, by newer records.
         """
         now_ms, begun = time.time_ns() // 1_000_000, time.monotonic()
         values = {
@@ -103,20 +111,36 @@ class OwnerRecords:
             for line, claim in claims.items()
             for bucket, revision in claim.first.items()
         )
+        refused: set[str] = set()
         await asyncio.wait(writes, return_when=asyncio.FIRST_COMPLETED)
-        done, late = await asyncio.wait(writes, timeout=max(SPARE_S, time.monotonic() - begun))
-        refused = set[str]().union(*(write.result() for write in done))
+        late = await self._decide(claims, writes, refused, max(SPARE_S, time.monotonic() - begun))
         spare = self._write(
             (bucket, Record(line, revision, values[line]))
             for line in claims.keys() - refused
             if not self.is_mine(line)
             for bucket, revision in claims[line].spare.items()
         )
-        refused = refused.union(*await asyncio.gather(*spare))
-        if refused and all(map(self.is_mine, claims.keys() - refused)):
+        late = await self._decide(claims, [*late, *spare], refused)
+        if refused:
             await end_tasks(*late)  # what was sent may still be stored, and is read then
         else:
             await asyncio.gather(*late)
+
+    async def _decide(
+        self,
+        lines: Iterable[str],
+        writes: Iterable[asyncio.Task[set[str]]],
+        refused: set[str],
+        within_s: float | None = None,
+    ) -> set[asyncio.Task[set[str]]]:
+        """Wait until each of the lines is ours or one of the refused; return the writes not answered yet."""
+        late = set(writes)
+        with suppress(TimeoutError):
+            async with asyncio.timeout(within_s):
+                while late and not all(line in refused or self.is_mine(line) for line in lines):
+                    done, late = await asyncio.wait(late, return_when=asyncio.FIRST_COMPLETED)
+                    refused.update(*(write.result() for write in done))
+        return late
 
     async def give_away(self, lines: Sequence[str]) -> None:
         """Name nobody in each record of these lines that names us.

@@ -81,11 +81,16 @@ def turn_of(records: LineRecords) -> int:
 
 
 def claim_of(
-    me: Owner, records: LineRecords, is_over: Callable[[str, int], bool], doubted: Collection[str] = ()
+    me: Owner,
+    records: LineRecords,
+    is_over: Callable[[str, int], bool],
+    doubted: Collection[str] = (),
+    leaderless: Collection[str] = (),
 ) -> Claim | None:
     """Return which records to write for us to have enough votes; None where that cannot be, or is so.
 
-    `doubted` are the buckets where ours was given away, and nobody knows whether that was stored.
+    `doubted` are the buckets where ours was given away, and nobody knows whether that was stored; those that
+    are `leaderless`, perhaps, are written last.
     """
     first_bucket, first = next(iter(records.items()), ("", None))
     if not first:
@@ -104,7 +109,7 @@ def claim_of(
             return None  # its master lives, and needs no other
     if not 0 < needed <= len(free):
         return None
-    wanted = dict(list(free.items())[:needed])
+    wanted = {bucket: free[bucket] for bucket in sorted(free, key=leaderless.__contains__)[:needed]}
     spare = {bucket: revision for bucket, revision in free.items() if bucket not in wanted}
     return Claim(wanted, spare, turn_of(records) + 1)
 
