@@ -358,6 +358,27 @@ def test_a_bucket_whose_home_may_be_gone_is_written_last() -> None:
     asyncio.run(main())
 
 
+def test_a_bucket_whose_home_may_be_gone_is_not_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It was the only one left to be written as long as another was not read."""
+    monkeypatch.setattr(owner_records, "SPARE_S", 0.0)
+
+    async def main() -> None:
+        trial = Trial()
+        await trial.read_and_begin()
+        trial.clock.pass_s(1.001)
+        for path, name in enumerate(names.OWNERS):
+            if name != trial.buckets[0].name:
+                await trial.lease.renew_once(path)
+        trial.buckets[0].shut()
+        trial.claim_now()
+        await asyncio.wait_for(trial.is_at_rest(), 10)
+        trial.buckets[0].open()
+        trial.claim_now()
+        await asyncio.wait_for(trial.is_polled(), 10)
+
+    asyncio.run(main())
+
+
 def test_where_another_was_first_nothing_more_is_written() -> None:
     async def main() -> None:
         trial = DeadTrial()

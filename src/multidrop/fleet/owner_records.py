@@ -99,8 +99,8 @@ class OwnerRecords:
     async def claim(self, claims: Mapping[str, Claim]) -> None:
         """Write the first records of claims, and spare ones where a bucket takes much longer than another.
 
-        Where a claim was refused, answers that decide nothing any more are not waited for: it is to be tried
-        again, by newer records.
+        Where a claim was refused, answers that decide nothing any more are not waited for, and those of a
+        bucket that may have no leader never for long: it is to be tried again, by newer records.
         """
         now_ms, begun = time.time_ns() // 1_000_000, time.monotonic()
         values = {
@@ -112,19 +112,22 @@ class OwnerRecords:
             for bucket, revision in claim.first.items()
         )
         refused: set[str] = set()
-        await asyncio.wait(writes, return_when=asyncio.FIRST_COMPLETED)
-        late = await self._decide(claims, writes, refused, max(SPARE_S, time.monotonic() - begun))
+        late = set(writes.values())
+        vain = {writes[bucket] for bucket in self._leaderless() & writes.keys()}
+        if hopeful := late - vain:
+            await asyncio.wait(hopeful, return_when=asyncio.FIRST_COMPLETED)
+        late = await self._decide(claims, late, refused, max(SPARE_S, time.monotonic() - begun))
         spare = self._write(
             (bucket, Record(line, revision, values[line]))
             for line in claims.keys() - refused
             if not self.is_mine(line)
             for bucket, revision in claims[line].spare.items()
         )
-        late = await self._decide(claims, [*late, *spare], refused)
+        late = await self._decide(claims, (late - vain).union(spare.values()), refused)
         if refused:
-            await end_tasks(*late)  # what was sent may still be stored, and is read then
-        else:
-            await asyncio.gather(*late)
+            late, vain = set(), late | vain
+        await end_tasks(*vain)  # what was sent may still be stored, and is read then
+        await asyncio.gather(*late)
 
     async def _decide(
         self,
@@ -155,15 +158,17 @@ class OwnerRecords:
                 self._offered[line, bucket] = record.revision
                 value = owner_value(nobody, turn_of(ours) + 1, now_ms, record.value["votes"])
                 given.append((bucket, record._replace(value=value)))
-        await asyncio.gather(*self._write(given))
+        await asyncio.gather(*self._write(given).values())
         self.moves += sum(not self._naming_us(line) for line in lines)
 
-    def _write(self, records: Iterable[tuple[str, Record]]) -> list[asyncio.Task[set[str]]]:
-        """Begin to replace records, each in this bucket; each task returns the lines that were refused."""
+    def _write(self, records: Iterable[tuple[str, Record]]) -> dict[str, asyncio.Task[set[str]]]:
+        """Begin to replace records, each in this bucket; a bucket's task returns the lines refused there."""
         by_bucket: dict[str, list[Record]] = {}
         for bucket, record in records:
             by_bucket.setdefault(bucket, []).append(record)
-        return [asyncio.create_task(self._write_in(bucket, some)) for bucket, some in by_bucket.items()]
+        return {
+            bucket: asyncio.create_task(self._write_in(bucket, some)) for bucket, some in by_bucket.items()
+        }
 
     async def _write_in(self, bucket: str, records: Sequence[Record]) -> set[str]:
         """Replace records: the server decides, by the revision of each. Lines that are ours now are taken."""
