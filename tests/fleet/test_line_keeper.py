@@ -445,6 +445,30 @@ def test_an_answer_that_is_late_does_not_undo_the_giving_away() -> None:
     asyncio.run(main())
 
 
+def test_what_was_given_away_in_doubt_is_claimed_anew_where_any_line_may_be() -> None:
+    async def main() -> None:
+        trial = Trial()
+        await trial.claim()
+        for bucket in trial.buckets:
+            bucket.is_down = True
+        trial.keeper.releasing = {"hall"}
+        for _ in range(2):  # it is let go first
+            trial.keeper.reconcile()
+            await until(lambda: not trial.keeper._tasks)
+        assert not trial.keeper.is_mine("hall")
+        for bucket in trial.buckets:
+            bucket.is_down = False
+        trial.keeper.releasing, trial.keeper.may_claim = set(), False
+        trial.keeper.reconcile()
+        await until(lambda: not trial.keeper._tasks)
+        assert not trial.keeper.is_mine("hall")
+        trial.keeper.may_claim = True
+        trial.keeper.reconcile()
+        await until(lambda: "hall" in trial.keeper.polled)
+
+    asyncio.run(main())
+
+
 def test_a_line_that_is_not_closed_for_certain_ends_the_gateway() -> None:
     """Its session is not ended: the others wait for as long as if it had died."""
 

@@ -56,6 +56,7 @@ class LineKeeper:
         self.polled: dict[str, TakenLine] = {}
         self.troubles: dict[str, str] = {}  # lines that could not be taken, and why
         self.releasing: set[str] = set()  # ours, and to be given away
+        self.may_claim = True  # beside gateways with other rules nothing is
         self._lease = lease
         self._records = records
         self._owners = OwnerRecords(lease, records, lambda: self.may_poll, self._take_new)
@@ -110,8 +111,9 @@ class LineKeeper:
     # ---- all lines ----
 
     def claim(self, claims: Mapping[str, Claim]) -> None:
-        """Claim lines, each at the revisions of its records that were judged."""
-        for lines in _some_at_once(claims.keys() - self._at_work.keys()):
+        """Claim lines where any may be, each at the revisions of its records that were judged."""
+        free = claims.keys() - self._at_work.keys() if self.may_claim else ()
+        for lines in _some_at_once(free):
             self._start(lines, self._owners.claim({line: claims[line] for line in lines}))
 
     def reconcile(self) -> None:

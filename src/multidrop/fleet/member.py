@@ -254,6 +254,7 @@ class Member:
     def _see(self, present: Mapping[str, Mapping[str, Any]]) -> set[str]:
         """Return the other gateways that take lines; since when they are the same is noted."""
         self._other_rules.look(present)
+        self.keeper.may_claim = not self._other_rules.gateways
         others = {name for name, value in present.items() if not value["draining"]}
         others -= {self.name} | self._other_rules.gateways
         self._shares.see(frozenset(others), self.lease.clock())
@@ -284,5 +285,4 @@ class Member:
         )
         gone = {line for line in owned if not self.records.is_in_plant(line)}
         self.keeper.releasing = gone | self._releases.due(step.releases, 0 if self.is_draining else WAIT_S)
-        if not self._other_rules.gateways:
-            self.keeper.claim(step.claims)
+        self.keeper.claim(step.claims)
