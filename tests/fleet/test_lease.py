@@ -210,6 +210,36 @@ def test_a_late_answer_of_an_earlier_session_is_not_counted() -> None:
     asyncio.run(main())
 
 
+def test_renewals_that_are_stored_while_a_session_ends_hide_no_end() -> None:
+    """Else the next gateway would wait until the lease has run out, though this one left in order."""
+
+    async def main() -> None:
+        trial = Trial()
+        lease = trial.lease()
+        assert await lease.try_to_begin()
+        for bucket, value in zip(trial.buckets, trial.values(), strict=True):
+            bucket.store("a", value)
+        await lease.end()
+        assert [value["ended"] for value in trial.values()] == [True, True, True]
+        assert await trial.lease().try_to_begin()
+
+    asyncio.run(main())
+
+
+@pytest.mark.parametrize("later", [{"nonce": "another's"}, {"ended": True, "by": "b"}])
+def test_the_end_of_a_session_is_written_over_its_own_renewals_alone(later: dict[str, Any]) -> None:
+    async def main() -> None:
+        trial = Trial()
+        lease = trial.lease()
+        assert await lease.try_to_begin()
+        trial.buckets[0].store("a", {**trial.values()[0], **later})
+        await lease.end()
+        assert [value["ended"] for value in trial.values()] == [later.get("ended", False), True, True]
+        assert trial.buckets[0].records["a"].value.get("by") == later.get("by")
+
+    asyncio.run(main())
+
+
 def test_renewals_that_are_stored_but_not_answered_when_a_session_ends_begin_nothing() -> None:
     """Else the engine might send again, and the kernel's timer would run for a gateway without a session."""
 

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple, Protocol
 from multidrop.fleet import lease_rules, life_lock
 from multidrop.fleet.buckets import NONE_YET, Bucket, Record
 from multidrop.fleet.errors import Conflict, FleetError, Unsure
+from multidrop.fleet.lease_bucket import put_end
 from multidrop.fleet.lease_rules import RENEW_S, SECOND, SeenRevision, Terms
 from multidrop.fleet.life_lock import LifeLock
 
@@ -288,7 +289,7 @@ class Lease:
 
         async def write(path: int, revision: int) -> None:
             with suppress(Conflict, FleetError):
-                await self._buckets[path].put(self.name, value, revision)
+                await put_end(self._buckets[path], Record(self.name, revision, value))
 
         await asyncio.gather(*(write(path, mine.revision) for path, mine in enumerate(held) if mine))
 

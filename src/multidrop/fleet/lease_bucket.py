@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from multidrop.fleet.buckets import Bucket, Record
+from multidrop.fleet.errors import Conflict
 from multidrop.fleet.servers import ServerPath
 
 
@@ -34,3 +35,17 @@ class LeaseBucket(Bucket):
             if writer != key:
                 value |= {"ended": True, "by": writer}
         return Record(key, revision, value)
+
+
+async def put_end(bucket: Bucket, end: Record) -> None:
+    """Replace our own record by this end of its session. Raises Conflict and FleetError as `put` does.
+
+    A renewal whose answer nobody waited for any more may have been stored meanwhile. It is replaced too.
+    """
+    try:
+        await bucket.put(end.key, end.value, end.revision)
+    except Conflict:
+        newest = await bucket.get(end.key)
+        if not newest.value or newest.value["ended"] or newest.value["nonce"] != end.value["nonce"]:
+            raise
+        await bucket.put(end.key, end.value, newest.revision)
