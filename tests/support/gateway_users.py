@@ -286,6 +286,7 @@ async def _live(place: Place) -> None:
         await asyncio.gather(users.run(), listen())
     finally:
         listener.kill()
+        await listener.wait()
 
 
 def main(place: list[Any]) -> None:
