@@ -358,6 +358,21 @@ def test_a_bucket_whose_home_may_be_gone_is_written_last() -> None:
     asyncio.run(main())
 
 
+def test_where_all_leases_are_late_no_bucket_is_written_last() -> None:
+    """Servers that are busy are slow in all buckets."""
+
+    async def main() -> None:
+        trial = DeadTrial()
+        await trial.read_and_begin()
+        trial.clock.pass_s(1.5)
+        await trial.lease.renew_once(names.OWNERS.index(trial.buckets[2].name))
+        trial.claim_now()
+        await until(lambda: "hall" in trial.keeper.polled and not trial.keeper._at_work)
+        assert owners(trial) == [ME, ME, NOBODY]
+
+    asyncio.run(main())
+
+
 def test_a_bucket_whose_home_may_be_gone_is_not_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
     """It was the only one left to be written as long as another was not read."""
     monkeypatch.setattr(owner_records, "SPARE_S", 0.0)

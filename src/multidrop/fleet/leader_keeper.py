@@ -16,7 +16,7 @@ LOOK_S = 0.4  # between looks: leaders tell after 2 s that a server is silent, w
 async def keep_leaders(
     path: Callable[[], ServerPath], is_ours: Callable[[], bool], clock: Callable[[], float] = time.monotonic
 ) -> None:
-    """Do it for ever, as long as it is ours to do."""
+    """Keep leaders for ever, whenever that is ours to do."""
     terms = LeaseTerms(clock)
     while True:
         await asyncio.sleep(LOOK_S)

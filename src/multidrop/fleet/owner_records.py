@@ -30,7 +30,7 @@ from multidrop.fleet.share_records import ShareRecords
 from multidrop.fleet.task_end import end_tasks
 
 WRITERS = 2  # batches at a time in each bucket
-LATE_NS = SECOND  # two renewals
+LAG_NS = SECOND  # two renewals
 SPARE_S = 0.15  # after one bucket has answered, before records are written in the spare one
 
 
@@ -91,10 +91,10 @@ class OwnerRecords:
         return claim_of(self._me, self._records.of(line), is_over, self.doubted(line), self._leaderless())
 
     def _leaderless(self) -> set[str]:
-        """Return the buckets that may have no leader: a lease with the same home was not renewed for long."""
-        since = self._lease.clock() - LATE_NS
-        held = zip(names.OWNERS, self._lease.held, strict=True)
-        return {bucket for bucket, path in held if path is None or path.sent < since}
+        """Return the bucket, if any, that may have no leader: its home's lease lags behind the two others."""
+        sent = [path.sent if path else 0 for path in self._lease.held]
+        since = sorted(sent)[1] - LAG_NS
+        return {bucket for bucket, moment in zip(names.OWNERS, sent, strict=True) if moment < since}
 
     async def claim(self, claims: Mapping[str, Claim]) -> None:
         """Write the first records of claims, and spare ones where a bucket takes much longer than another.
