@@ -155,30 +155,32 @@ async def _info(path: ServerPath, stream: str) -> dict[str, Any] | None:
 
 
 async def _create(path: ServerPath, settings: Mapping[str, Any]) -> None:
-    await _ask_until(path, "CREATE", settings["name"], settings)
+    ends = asyncio.get_running_loop().time() + WAIT_S
+    while await _info(path, settings["name"]) is None:
+        await _try(path, f"STREAM.CREATE.{settings['name']}", ends, settings)
 
 
 async def _remove(path: ServerPath, stream: str) -> None:
-    await _ask_until(path, "DELETE", stream)
-
-
-async def _ask_until(
-    path: ServerPath, deed: str, stream: str, settings: Mapping[str, Any] | None = None
-) -> None:
-    """Ask for a stream to be created or deleted until it is."""
     ends = asyncio.get_running_loop().time() + WAIT_S
-    while (await _info(path, stream) is None) == (deed == "CREATE"):
-        try:
-            await ask(path, f"STREAM.{deed}.{stream}", settings)
-        except ServerError:
-            if asyncio.get_running_loop().time() > ends:
-                raise
-            await asyncio.sleep(0.2)  # no leader yet, or it is under way
-        except NoRight:
+    while await _info(path, stream) is not None:
+        await _try(path, f"STREAM.DELETE.{stream}", ends)
+
+
+async def _try(
+    path: ServerPath, subject: str, ends: float, settings: Mapping[str, Any] | None = None
+) -> None:
+    """Ask for a stream to be changed; before the end of the time a failure is no matter, but for rights."""
+    try:
+        await ask(path, subject, settings)
+    except ServerError:
+        if asyncio.get_running_loop().time() > ends:
             raise
-        except FleetError as failure:
-            if asyncio.get_running_loop().time() > ends:
-                raise no_quorum(path, failure) from None
+        await asyncio.sleep(0.2)  # no leader yet, or it is under way
+    except NoRight:
+        raise
+    except FleetError as failure:
+        if asyncio.get_running_loop().time() > ends:
+            raise no_quorum(path, failure) from None
 
 
 async def _wait_for_plant(path: ServerPath) -> None:
