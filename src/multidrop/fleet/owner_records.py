@@ -136,7 +136,7 @@ class OwnerRecords:
         refused: set[str],
         within_s: float | None = None,
     ) -> set[asyncio.Task[set[str]]]:
-        """Wait until each of the lines is ours or one of the refused; return the writes not answered yet."""
+        """Wait until each line is ours or refused, and add the refused; return the writes not answered."""
         late = set(writes)
         with suppress(TimeoutError):
             async with asyncio.timeout(within_s):
