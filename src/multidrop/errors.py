@@ -184,6 +184,9 @@ class Advice(NamedTuple):
         )
 
 
+ANOTHER_FAMILY = "another family is at its address"  # the rule of a Refused that withholds a stop too
+
+
 class Refused(BusError, ValueError):
     """The library itself did not send it; with the register, the rule, and its place in the manual.
 

@@ -413,6 +413,71 @@ def test_the_stop_of_the_family_that_it_looks_like_is_offered(
     assert line.written != []
 
 
+OUT_OF_DATE = [  # a register of `identify`, and a count that the family's own drive may hold for a while
+    ("delixi-modbus", "baudrate_setting", 4),
+    ("delixi-modbus", "address_setting", 7),
+    ("delixi-modbus", "fault", 99),
+    ("delixi-native", "baudrate_setting", 4),
+    ("delixi-native", "address_setting", 7),
+    ("innovert-ibd", "baudrate_setting", 3),
+    ("innovert-ibd", "address_setting", 7),
+    ("invt-che", "device", 0x0103),
+    ("invt-che", "device", 0x0001),
+    ("yd1000", "address_setting", 7),
+    ("yd1000", "maximum_frequency", 800),
+]
+
+
+def shows(line: SimulatedBus, drive: Drive, name: str, count: int) -> None:
+    """Let each read of this register return `count`, whatever the simulated drive holds."""
+    register = drive.register(name)
+    data = count.to_bytes(4 if drive.framing is Framing.DELIXI else 2, "big")
+    start = register.address if drive.framing is Framing.DELIXI else 0
+    reply = build_reply(drive.framing, Message(1, register.table.read, start, data=data))
+    line.answers = lambda request: reply if request.start == register.address else None
+
+
+@pytest.mark.parametrize(("model", "name", "count"), OUT_OF_DATE)
+@pytest.mark.parametrize("how", ["stop", "stop_all", "write"])
+def test_one_value_that_does_not_fit_its_family_withholds_a_start_and_no_stop(
+    monkeypatch: pytest.MonkeyPatch, model: str, name: str, count: int, how: str
+) -> None:
+    line, drive, _ = one(monkeypatch, MAKE[model](1))
+    shows(line, drive, name, count)
+    with pytest.raises(Refused):
+        drive.set_frequency(20)
+    assert line.written == []
+    if how == "stop":
+        drive.stop()
+    elif how == "stop_all":
+        line.bus.detach(drive)
+        line.bus.attach(drive)
+        (stopped,) = line.bus.stop_all().values()
+        assert stopped.seen is Seen.STOPPED
+    else:
+        line.bus.write(drive, drive.control, drive.control.decode(drive.control.broadcast[0]))
+    assert STOPS[model](writes(line)[0])
+
+
+@every_family
+def test_a_stop_is_sent_to_a_drive_that_refuses_what_its_family_answers(
+    monkeypatch: pytest.MonkeyPatch, model: str
+) -> None:
+    """Some other makes answer function 04 too, which is all that an ERMAN's identity check asks."""
+    line, drive, _ = one(monkeypatch, MAKE[model](1))
+
+    def refuse(request: Message) -> bytes | None:
+        if is_write(request) or request.function == 4:
+            return None
+        return build_reply(drive.framing, Message(1, request.function, request.start, exception=2))
+
+    if drive.framing is Framing.RTU:
+        line.answers = refuse
+    with suppress(BusError):
+        drive.stop(seconds=1)
+    assert STOPS[model](writes(line)[0])
+
+
 # ---- until it stands ----
 
 
@@ -644,7 +709,7 @@ def test_a_plain_stop_is_withheld_where_another_family_answers_twice(
     monkeypatch: pytest.MonkeyPatch, suspicions: int
 ) -> None:
     line, drive, _ = one(monkeypatch, InvtCHE(1))
-    odd = build_reply(Framing.RTU, Message(1, 3, data=b"\0\3"))
+    odd = build_reply(Framing.RTU, Message(1, 3, data=b"\x01\x0a"))  # a Goodrive300L
     line.answers = lambda request: odd if len(line.frames) <= suspicions else None
     if suspicions == 1:
         line.bus.write(drive, drive.control, CHEControl.STOP)

@@ -452,19 +452,36 @@ def test_an_optidrive_of_the_first_guide_is_never_started(monkeypatch: pytest.Mo
     assert line.starts == []
 
 
-def test_a_stop_is_kept_from_a_drive_that_says_twice_that_it_is_another(
-    monkeypatch: pytest.MonkeyPatch,
+OF_ANOTHER = {  # what a drive of the family shows only while a setting is not in force yet, if at all
+    "status": 0x0241,  # of no state of PROFIdrive
+    "station": 7,
+    "signature": 1,
+}
+
+
+@pytest.mark.parametrize("first", OF_ANOTHER)
+@pytest.mark.parametrize("second", OF_ANOTHER)
+def test_a_stop_is_withheld_only_if_the_status_and_another_value_are_another_drive_s(
+    monkeypatch: pytest.MonkeyPatch, first: str, second: str
 ) -> None:
-    """One make's stop is another's run; but a stop goes to a drive that cannot say who it is."""
-    line = Line(monkeypatch, "invt-goodrive")
-    line.sim["signature"] = 0x0101
-    with pytest.raises(Refused, match="no stop was sent"):
-        line.drive.stop(seconds=1)
-    assert line.writes == []
-    line = Line(monkeypatch, "siemens-v20")
-    line.sim["status"] = 0x0241  # no state of its profile
-    line.drive.stop()
-    assert line.writes
+    """One make's stop is another's run, but one value alone proves nothing, nor do two stale settings."""
+    line = Line(monkeypatch, "abb-acs355")
+    shown = {line.drive.register(name).address: OF_ANOTHER[name] for name in (first, second)}
+
+    def show(request: Message) -> bytes | None:
+        if request.function != 3 or request.start not in shown:
+            return None
+        return build_reply(Framing.RTU, Message(1, 3, data=shown[request.start].to_bytes(2, "big")))
+
+    line.bus.answers = show
+    if first == second or "status" not in (first, second):
+        with suppress(Unconfirmed):
+            line.drive.stop(seconds=1)
+        assert line.writes
+    else:
+        with pytest.raises(Refused, match="no stop was sent"):
+            line.drive.stop(seconds=1)
+        assert line.writes == []
 
 
 def test_a_stop_of_a_drive_that_was_known_is_never_kept_back(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -6,7 +6,7 @@ from enum import IntEnum, IntFlag
 from typing import Any
 
 import pytest
-from profile_families import MAKE, V20, Acs355, Atv320, Fc51, Goodrive, VfdEl
+from profile_families import MAKE, Acs355, Atv320, Fc51, Goodrive, VfdEl
 from scripts import Wire
 from tables import table
 
@@ -45,8 +45,6 @@ def test_the_profile_says_what_the_family_does_not() -> None:
     assert control.place == "40001"
     assert control.commands
     assert not Acs355.reference.commands
-    assert not Acs355.identity_is_inferred
-    assert V20.identity_is_inferred  # so that only a recognised other family keeps a stop back
 
 
 def test_a_family_may_add_the_bit_for_reverse_where_makes_differ() -> None:

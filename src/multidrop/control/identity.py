@@ -11,14 +11,14 @@ from multidrop.core import PAUSE_NS
 from multidrop.drive.family import Drive
 from multidrop.drive.script import Read, Step, Wait, carry_out
 from multidrop.drives import MODELS
-from multidrop.errors import BusError, CheckAgain, DriveRefused, Refused
+from multidrop.errors import ANOTHER_FAMILY, BusError, CheckAgain, DriveRefused, Refused
 from multidrop.transport import clock
 from multidrop.transport.exchange import READ_ATTEMPTS, Exchanges
 
 SURE = 2  # times that a drive must answer as another would, before a stop is withheld from it
 
 Timed = Callable[[], AbstractContextManager[None]]
-Suspicion = tuple[str, bool]  # why it is not of its family, and whether it answered every read
+Suspicion = tuple[str, bool]  # why it may be of another family, and whether that is certain
 
 
 class _Look(NamedTuple):
@@ -117,11 +117,11 @@ class IdentityCheck:
 
         Raises CheckAgain after the first suspicion: call this again, after the stops of other drives.
 
-        The stop of one family may be another's run. But a check that fails proves nothing, nor does one
-        whose read may have got the answer to an earlier request: the stop is sent then. It is withheld from
-        a drive that answered all that it was ever asked, and SURE times in a row as another would. Where it
-        refuses the reads, or its family's own answers prove little, it is withheld only if another built-in
-        family is recognised.
+        The stop of one family may be another's run. But a failed check proves nothing: a parameter such as
+        an address or a baud rate may hold a value that is not in force, and a reply may be the answer to an
+        earlier request. The stop is sent then. It is withheld only if `identify` fails SURE times in a row,
+        every request was answered so far, and either the drive is recognised as one of another built-in
+        family, or `identify` itself is certain: it raised Refused by the rule ANOTHER_FAMILY.
         """
         port = self._exchanges.line.queue
         if self.is_known(drive) or self._stoppable.get(drive, self) is port:
@@ -132,8 +132,8 @@ class IdentityCheck:
             self._suspected[drive] = port, suspicion
             raise CheckAgain
         if suspicion is not None and suspicion == before:
-            (why, is_answered), other = suspicion, self._lookalike(drive)
-            if other is not None or (is_answered and not drive.identity_is_inferred):
+            (why, is_certain), other = suspicion, self._lookalike(drive)
+            if other is not None or is_certain:
                 raise _withheld(drive, why, other)  # it is checked again before the next stop
         self._stoppable[drive] = port
 
@@ -164,7 +164,7 @@ class IdentityCheck:
         except (Refused, DriveRefused) as refusal:
             if refused and drive.is_passing(refused.code):
                 return None
-            return str(refusal), refused is None
+            return str(refusal), isinstance(refusal, Refused) and refusal.rule == ANOTHER_FAMILY
         except Exception:  # no answer; or the family's own code failed, which must not keep a stop back
             return None
         if self._is_in_step(drive):
@@ -172,10 +172,10 @@ class IdentityCheck:
         return None
 
     def _lookalike(self, drive: Drive) -> Drive | None:
-        """Return a drive of the built-in family that would answer as this one does."""
+        """Return a drive of the built-in family whose identity check this drive passes SURE times."""
         settings = drive.settings
         for family in MODELS.values():
-            if isinstance(drive, family) or family.identity_is_inferred:
+            if isinstance(drive, family) or not family.identify_recognises:
                 continue
             with suppress(ValueError):  # it could not be on this line
                 other = family(
@@ -222,5 +222,5 @@ def _withheld(drive: Drive, why: str, other: Drive | None) -> Refused:
     return Refused(
         f"no stop was sent to {drive.name}: at its address is another drive, as it said twice ({why}), "
         f"which may run at this family's stop. {way}",
-        rule="another family is at its address",
+        rule=ANOTHER_FAMILY,
     )

@@ -6,9 +6,19 @@ from multidrop.drive.options import Option
 from multidrop.drive.script import Read, Script, Wait, carry_out, insist, read, until, wait, write
 from multidrop.drive.state import Condition, Direction, State
 from multidrop.drive.verbs import verb
-from multidrop.errors import Advice, BusError, DriveRefused, NotDone, Refused, Unconfirmed, Unsupported
+from multidrop.errors import (
+    ANOTHER_FAMILY,
+    Advice,
+    BusError,
+    DriveRefused,
+    NotDone,
+    Refused,
+    Unconfirmed,
+    Unsupported,
+)
 
 __all__ = [
+    "ANOTHER_FAMILY",
     "Advice",
     "BusError",
     "Condition",

@@ -25,7 +25,7 @@ _SPANS = {
     "answering_time": (LONGEST_TIME, "s"),
     "turnaround_delay": (LONGEST_TIME, "s"),
 }
-_TRUTHS = ("answers_every_read", "broadcasts", "identity_is_inferred")
+_TRUTHS = ("answers_every_read", "broadcasts", "identify_recognises")
 _TEXTS = ("model", "title", "manual", "remote", "line_parameters", "no_broadcasts", "watchdog")
 
 Error = tuple[str, str]  # the name of the fact, and the rest of the sentence

@@ -36,7 +36,7 @@ class ManualFacts(LineFacts):
     damaged: ClassVar[frozenset[int]] = frozenset()  # those of a request that came damaged
     later: ClassVar[frozenset[int]] = frozenset({5, 6})  # those of a drive that will answer later
     broadcasts: ClassVar[bool] = False  # the document has broadcasts, which nobody answers
-    identity_is_inferred: ClassVar[bool] = False  # a drive that `identify` refuses may be of the family
+    identify_recognises: ClassVar[bool] = False  # a drive of another make does not pass `identify` by chance
     options: ClassVar[Mapping[str, Option]] = {}
     setpoint_name: ClassVar[str] = "frequency"  # the register that set_frequency writes
     remote: ClassVar[str] = "the drive must take its commands from the line"  # to be set on its keypad

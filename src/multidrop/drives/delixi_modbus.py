@@ -73,6 +73,7 @@ class DelixiModbus(DelixiParameters, table=HOLDING):
     most_registers = {HOLDING: 1}  # in none of its examples more
     exceptions = {}
     broadcasts = True
+    identify_recognises = True
     remote = "P00.00 must be 2 (RS-485), and P00.01 1 (digital setting)"
 
     control = command(
@@ -106,7 +107,10 @@ class DelixiModbus(DelixiParameters, table=HOLDING):
         yield from self._shows_its_line()
         fault = yield from read(self.fault)
         if not isinstance(fault, type(self.fault.decode(0))):
-            raise Refused(f"{self.name} has {int(fault):04X}H as its present fault: it is not a Delixi")
+            raise Refused(
+                f"{self.name} has {int(fault):04X}H as its present fault (P05.31), which no list explains: "
+                "it may be another make; look at its name plate"
+            )
 
     @verb
     def start(self, direction: Direction | None = None) -> Script[None]:

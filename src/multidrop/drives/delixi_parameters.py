@@ -138,13 +138,21 @@ class DelixiParameters(Drive):
         super().__init_subclass__()
 
     def _shows_its_line(self) -> Script[None]:
-        """Raise Refused unless P04.30 and P04.28 are the address and baud rate at which it answers."""
+        """Raise Refused unless P04.30 and P04.28 are the declared address and baud rate."""
         address = yield from read(self.address_setting)
         if address != self.address:
-            raise Refused(f"{self.name} has {address:g} as P04.30, not its address: it is not a Delixi")
-        baudrate = yield from read(self.baudrate_setting)
-        if baudrate != DelixiBaudrate[f"B{self.settings.baudrate}"]:
-            raise Refused(f"{self.name} has {int(baudrate)} as P04.28, not its baud rate: it is not a Delixi")
+            raise Refused(
+                f"{self.name} has {address:g} as P04.30, not its address {self.address}: it may be another "
+                "make; look at its name plate, and at P04.30 on its keypad"
+            )
+        held, declared = (yield from read(self.baudrate_setting)), self.settings.baudrate
+        if held == DelixiBaudrate[f"B{declared}"]:
+            return
+        named = f", {held.name[1:]} bit/s" if isinstance(held, DelixiBaudrate) else ""
+        raise Refused(
+            f"{self.name} has {int(held)} as P04.28{named}, and is declared with {declared} bit/s: declare "
+            "its baud rate, behind a converter too; if its keypad shows another P04.28, it is another make"
+        )
 
     def _may_start(self) -> Script[None]:
         """Raise Refused with a fault, without a setpoint, and where the line does not command it."""

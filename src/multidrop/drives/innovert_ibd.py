@@ -136,7 +136,6 @@ class InnovertIBD(Drive):
     most_registers = {HOLDING: 4}
     exceptions = {}
     broadcasts = True
-    identity_is_inferred = True
     remote = "set Prb.01 to 5 and Prb.02 to 2 on the keypad"
     line_parameters = (
         "PrH.00 baud rate (1 is 9600), PrH.01 format (0 to 2: ASCII, 3 to 5: RTU; each 8N1, 8E1, 8O1), "

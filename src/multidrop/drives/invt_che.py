@@ -6,7 +6,7 @@ from contextlib import suppress
 from enum import IntEnum
 from typing import Any, Unpack
 
-from multidrop.drive import Advice, BusError, Drive, DriveRefused, NotDone, Refused
+from multidrop.drive import ANOTHER_FAMILY, Advice, BusError, Drive, DriveRefused, NotDone, Refused
 from multidrop.drive.declare import Details, command, declaration, reading, setting
 from multidrop.drive.number_format import NumberFormat
 from multidrop.drive.options import Option
@@ -46,6 +46,9 @@ class CHEStatus(IntEnum):
 class Device(IntEnum):
     CHE_UNIVERSAL = 0x0101
     CHE_1500_HZ = 0x0102
+
+
+OTHER_SERIES = {0x010A: "Goodrive300L", 0x010C: "Goodrive200L"}  # what their manuals have at 3016H
 
 
 class CHEFault(IntEnum):
@@ -172,6 +175,7 @@ class InvtCHE(Drive):
     }
     damaged = frozenset({0x11})
     broadcasts = True
+    identify_recognises = True
     setpoint_name = "setpoint"
     remote = "P0.01 must be 2, and P0.03 take the frequency from the line"
     line_parameters = (
@@ -245,10 +249,16 @@ class InvtCHE(Drive):
 
     @verb
     def identify(self) -> Script[None]:
-        """Check that 3016H is 0101H or 0102H."""
+        """Check that 3016H is 0101H or 0102H; a stop is withheld only from another series of INVT's."""
         device = yield from read(self.device)
-        if not isinstance(device, Device):
-            raise Refused(f"{self.name} says that it is device {int(device):04X}H; a CHE is 0101H or 0102H")
+        if isinstance(device, Device):
+            return
+        series = OTHER_SERIES.get(int(device))
+        known = f", a {series}" if series else ""
+        raise Refused(
+            f"{self.name} says that it is device {int(device):04X}H{known}; a CHE is 0101H or 0102H",
+            rule=ANOTHER_FAMILY if series else "",
+        )
 
     @verb
     def start(self, direction: Direction | None = None) -> Script[None]:

@@ -205,6 +205,7 @@ class YD1000(Drive):
         4: "cannot be done now (after VF-S15)",
     }
     broadcasts = True
+    identify_recognises = True
     remote = (
         "nothing is to be set for it: bits 15 and 14 of a start go before CNOD and FNOD; after a trip or an "
         "emergency stop the drive needs reset_fault()"
@@ -368,10 +369,16 @@ class YD1000(Drive):
         """Check that 0802H is the drive's own address, and 0011H a maximum frequency."""
         address = yield from read(self.address_setting)
         if address != self.address:
-            raise Refused(f"{self.name} has {address:g} at 0802H, not its address: it is not a YD1000")
+            raise Refused(
+                f"{self.name} has {address:g} at 0802H (F802), not its address {self.address}: it may be "
+                "another make; look at its name plate"
+            )
         most = yield from read(self.maximum_frequency)
         if not 30 <= most <= 320:
-            raise Refused(f"{self.name} has {most:g} Hz at 0011H, not 30 to 320: it is not a YD1000")
+            raise Refused(
+                f"{self.name} has {most:g} Hz at 0011H (FH), not 30 to 320: it may be another make; look at "
+                "its name plate"
+            )
 
     @verb
     def start(self, direction: Direction | None = None) -> Script[None]:

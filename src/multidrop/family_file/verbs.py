@@ -51,7 +51,6 @@ def add_verbs(
         return
     namespace.update(verbs_of(declared))
     namespace["declared_verbs"] = declared
-    namespace["identity_is_inferred"] = True  # a file's `identify` is too weak to keep a stop back
     if declared.setpoint is not None:
         namespace["setpoint_name"] = declared.setpoint.register
 

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from itertools import chain
 from typing import Any, ClassVar
 
-from multidrop.drive import Advice, Drive, DriveRefused, NotDone, Refused, Unconfirmed
+from multidrop.drive import ANOTHER_FAMILY, Advice, Drive, DriveRefused, NotDone, Refused, Unconfirmed
 from multidrop.drive.declaration_check import DeclarationError
 from multidrop.drive.options import Option
 from multidrop.drive.register import Register
@@ -35,8 +35,9 @@ class Profile(Drive):
     The verbs guarantee what the built-in families' verbs do. A stop is sent always, repeated until it is
     confirmed, and watched until the drive stands. A start or a reset is written once. A start is refused in a
     fault, in local control, and without a setpoint in force; a reset is refused while the motor turns, never
-    has a bit that runs it, and comes after a stop. `identify` only reads; without `station` and `signature`
-    it proves little, and no stop is kept back because of it alone.
+    has a bit that runs it, and comes after a stop. `identify` only reads. A stop is withheld because of it
+    only if the status is another profile's, and `station` or `signature` another drive's: these two are
+    settings, and may not be in force yet.
     """
 
     roles: ClassVar[Mapping[str, Role]] = {}
@@ -45,7 +46,6 @@ class Profile(Drive):
     reset_word: ClassVar[int]
     reset_role: ClassVar[str] = "control"
 
-    identity_is_inferred = True
     setpoint_name = "reference"
     options = {
         "maximum_frequency": Option("Hz", (1, 3000), "the frequency that is 100 % of the reference"),
@@ -69,7 +69,6 @@ class Profile(Drive):
                 setattr(cls, name, whole)
         cls.options = {**Profile.options, **cls.options}
         super().__init_subclass__()
-        cls.identity_is_inferred = not cls.registers.keys() & {*PROOFS}
 
     @classmethod
     def role_mistakes(cls, own: Mapping[str, Register[Any]]) -> list[str]:
@@ -162,22 +161,24 @@ class Profile(Drive):
     @verb
     def identify(self) -> Script[None]:
         """Check that the status word is one of this profile, and `station` and `signature` if declared."""
-        kind = self.title or type(self).__name__
+        wrong: list[str] = []
         status = yield from self._status()
-        if wrong := self._impossible(status):
-            raise Refused(f"{self.name} is not known as {kind}: its status is {status:04X}H, and {wrong}")
+        if impossible := self._impossible(status):
+            wrong.append(f"its status is {status:04X}H, and {impossible}")
         station = self.registers.get("station")
         if station is not None and (address := int((yield from read(station)))) != self.address:
-            raise Refused(f"{self.name} is not known as {kind}: it says that its address is {address}")
+            wrong.append(f"it says that its address is {address}")
         signature = self.registers.get("signature")
         if signature is not None:
             assert signature.values is not None
             held = yield from read(signature)
             if not isinstance(held, signature.values):
                 names = ", ".join(value.name for value in signature.values)
-                raise Refused(
-                    f"{self.name} is not known as {kind}: {signature.name} is {held:g}, and none of {names}"
-                )
+                wrong.append(f"{signature.name} is {held:g}, and none of {names}")
+        if wrong:
+            kind = self.title or type(self).__name__
+            rule = ANOTHER_FAMILY if impossible and len(wrong) > 1 else ""
+            raise Refused(f"{self.name} is not known as {kind}: {'; '.join(wrong)}", rule=rule)
 
     @verb
     def start(self, direction: Direction | None = None) -> Script[None]:
