@@ -218,7 +218,7 @@ def test_a_stop_is_sent_to_a_drive_that_cannot_be_heard_and_nothing_else_is(
     with pytest.raises(Unconfirmed, match=r"never confirmed: .*control = STOP took effect"):
         drive.stop()
     assert set(line.written) == {"01 06 10 00 00 05 4D 09", "01 06 10 00 00 08 8C CC"}  # a run's and a jog's
-    assert len(line.written) > 50  # for 30 s
+    assert len(line.written) > 35  # for 30 s, of which more than half is left to polling
     assert 30 <= line.seconds - begun < 32
 
 

@@ -14,14 +14,14 @@ from typing import Any
 
 import pytest
 from motors import MAKE, STARTS
-from simulated_bus import EXCHANGE_TIME, SimulatedBus, is_write, one
+from simulated_bus import EXCHANGE_TIME, TIMEOUT, SimulatedBus, is_write, one
 from tables import table
 
 from multidrop.bus import Bus
 from multidrop.control.eeprom_ledger import Ledger
 from multidrop.control.outcome import Effect, Seen
 from multidrop.control.ramp import ramp, start_staggered
-from multidrop.control.stop_attempt import LEAST_S
+from multidrop.control.stop_attempt import AT_ONCE, LEAST_S, PAUSE_S
 from multidrop.core import Completion, Exchange, Framing, Message, build_reply
 from multidrop.drive import Condition, Direction, Drive, Script, State, read, wait, write
 from multidrop.drive.declare import reading, setting
@@ -490,6 +490,32 @@ def test_a_stop_is_repeated_as_long_as_the_line_is_deaf(monkeypatch: pytest.Monk
     line.deafens = lambda request: line.seconds < hears_at
     drive.stop()
     assert not sim.motor.energised
+
+
+@every_family
+@pytest.mark.parametrize("seconds", [None, 12.0])
+def test_the_stop_of_a_silent_drive_leaves_its_neighbours_more_than_half_of_the_line(
+    monkeypatch: pytest.MonkeyPatch, model: str, seconds: float | None
+) -> None:
+    """But for its first frames, which nothing delays; and its time is no longer for that."""
+    line, drive, _ = one(monkeypatch, MAKE[model](1))
+    line.bus.check_identity(drive)
+    sent: list[float] = []
+
+    def note(request: Message) -> bool:
+        sent.append(line.seconds)  # its reply is waited for from now on
+        return True
+
+    line.deafens = note
+    begun = line.seconds
+    with pytest.raises(Unconfirmed):
+        drive.stop(seconds=seconds)
+    limit = LEAST_S if seconds is None else seconds
+    assert limit <= line.seconds - begun + 1e-6 < limit + 2
+    assert sent[AT_ONCE] - begun < (AT_ONCE + 1) * (TIMEOUT + EXCHANGE_TIME) + 3 * PAUSE_S
+    shared = [at for at in sent if sent[AT_ONCE] <= at < begun + limit - 1]
+    assert len(shared) * (TIMEOUT + EXCHANGE_TIME) < 0.45 * (shared[-1] - shared[0])
+    assert all(later - earlier < 1.2 for earlier, later in pairwise(shared))
 
 
 @pytest.mark.slow

@@ -28,9 +28,12 @@ from multidrop.transport.aside_log import log_aside
 
 LEAST_S = 30.0  # for which a stop is repeated where its caller gives no time
 PAUSE_S = 0.2  # before it is repeated
+AT_ONCE = 8  # steps without a good answer, after which the line is shared with polling
+SHARE = 1.5  # time left to polling after such a step, in units of the step's own time
 MOST_STEPS = 8  # that are sent once more after an interruption
 UNSENT = (Refused, LineError, NotMaster, ValueError)
 WORTH_REPEATING = (Unconfirmed, NotDone, NoReply, BadReply, DriveRefused, PortLost, NotMaster)
+UNANSWERED = (Unconfirmed, NoReply, BadReply)
 NO_ROOM = (MemoryError, OSError)  # what the system may have again soon, such as memory and descriptors
 
 _log = logging.getLogger("multidrop.control")
@@ -42,7 +45,8 @@ class StopAttempt:
     """One drive's stop under way; its `failure`, None while all is well.
 
     It is repeated for `seconds`; without that for LEAST_S at least, and an attempt that has begun by then
-    may take its time, which is the ramp's. `ready` returns the time before which nothing is sent to it.
+    may take its time, which is the ramp's. After AT_ONCE steps without a good answer it leaves more than
+    half of its line's time to others. `ready` returns the time before which nothing is sent to it.
     """
 
     def __init__(
@@ -62,6 +66,7 @@ class StopAttempt:
         self._seconds = seconds
         self._make = script
         self.times_sent = 0  # those that the drive refused too
+        self._unanswered = 0  # steps without a good answer
         self._times_in_doubt = 0  # those that an interruption, or the system, may have kept back
         self._is_confirmed = False
         self._pulses: set[tuple[str, Any]] = set()
@@ -89,7 +94,9 @@ class StopAttempt:
             if isinstance(step, Wait):
                 self._wait(step.seconds, now())
             else:
-                self._carry_out(step, do)
+                begun = now()
+                if not self._carry_out(step, do):
+                    self._share_line(begun, now())
         except StopIteration:
             self.failure = None
             return True
@@ -105,12 +112,21 @@ class StopAttempt:
         script = self._script
         self._resume = lambda: script.send(None)
 
-    def _carry_out(self, step: Step, do: Do) -> None:
+    def _share_line(self, begun: float, now: float) -> None:
+        """Delay the next step after one without a good answer, unless that ends the stop's own time."""
+        self._unanswered += 1
+        limit = LEAST_S if self._seconds is None else self._seconds
+        due = now + SHARE * (now - begun)
+        if self._unanswered > AT_ONCE and due < self._begun + limit:
+            self.due = due
+
+    def _carry_out(self, step: Step, do: Do) -> bool:
+        """Carry out a step, and resume the script with its result; False if no good answer came."""
         script = self._script
         if isinstance(step, Pulse) and (step.register.name, step.value) in self._pulses:
             reason = "it is a pulse, and was sent once already"
             self._raise_in_script(Unconfirmed(self.drive.name, step.register.name, reason))
-            return
+            return True
         try:
             result = do(self, step)
         except CheckAgain:
@@ -118,12 +134,14 @@ class StopAttempt:
         except (BusError, ValueError) as failure:
             self._note(step, failure)
             self._raise_in_script(failure)
+            return not isinstance(failure, UNANSWERED)
         except (KeyboardInterrupt, SystemExit, *NO_ROOM):
             self._times_in_doubt += isinstance(step, Write)
             raise
         else:
             self._note(step, None)
             self._resume = lambda: script.send(result)
+        return True
 
     def _note(self, step: Step, failure: Exception | None) -> None:
         if not isinstance(step, Write):
