@@ -8,6 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from motors import MAKE
+from profile_families import MAKE as PROFILES
 from simulated_bus import SimulatedBus, is_write, one
 
 from multidrop.control.audit_log import read_audit
@@ -22,8 +24,8 @@ from multidrop.drive.table import Kept
 from multidrop.drive.verbs import verb
 from multidrop.drives import YD1000, DelixiModbus, ErmanERG220, InvtCHE
 from multidrop.drives.invt_che import CHEControl
-from multidrop.errors import BusError, Expired, Overtaken, Refused, Unconfirmed
-from multidrop.sim import simulated
+from multidrop.errors import BusError, Expired, NotDone, Overtaken, Refused, Unconfirmed
+from multidrop.sim import MotorDrive, simulated
 
 
 class Stubborn(Drive):
@@ -155,6 +157,66 @@ def test_the_watchdog_of_a_drive_is_told_when_it_is_first_known(
     drive.start()
     told = [record.getMessage() for record in caplog.records if "PC.04" in record.getMessage()]
     assert told == [f"invt-che@1: {InvtCHE.watchdog}"]
+
+
+DIRECTED = {  # the families whose state shows a direction
+    name: (MAKE | PROFILES)[name]
+    for name in ("invt-che", "delixi-native", "yd1000", "delta-vfd-el", "invt-goodrive")
+}
+every_directed = pytest.mark.parametrize("model", DIRECTED)
+
+
+def turning(monkeypatch: pytest.MonkeyPatch, model: str) -> tuple[SimulatedBus, Any, MotorDrive]:
+    """A motor that turns forward at 20 Hz; from there its ramp down takes 4 s."""
+    line, drive, sim = one(monkeypatch, DIRECTED[model](1))
+    drive.set_frequency(20)
+    drive.start(Direction.FORWARD)
+    line.sleep(6)
+    sim.pass_time(line.seconds)
+    return line, drive, sim
+
+
+@every_directed
+def test_a_start_the_other_way_is_done_once_the_motor_is_seen_to_turn_so(
+    monkeypatch: pytest.MonkeyPatch, model: str
+) -> None:
+    line, drive, sim = turning(monkeypatch, model)
+    drive.start(Direction.REVERSE)
+    assert drive.state().direction is Direction.REVERSE
+    if model not in ("yd1000", "delta-vfd-el"):  # simulated ones, which show the direction commanded
+        assert sim.motor.frequency < 0
+    begun = line.seconds
+    drive.start(Direction.REVERSE)  # in which it turns already
+    assert line.seconds - begun < 1
+
+
+@every_directed
+@pytest.mark.parametrize("options", [{}, {"stop_time": 5}])
+def test_a_start_the_other_way_that_the_drive_ignores_is_unconfirmed(
+    monkeypatch: pytest.MonkeyPatch, model: str, options: dict[str, float]
+) -> None:
+    line, drive, sim = turning(monkeypatch, model)
+    drive.option.update(options)
+    monkeypatch.setattr(sim.motor, "run", lambda direction=None: None)
+    begun, sent = line.seconds, len(line.written)
+    with pytest.raises(Unconfirmed, match="is not seen to turn in reverse; stop it"):
+        drive.start(Direction.REVERSE)
+    assert len(line.written) == sent + 1
+    assert line.seconds - begun < (25 if options else 250)
+
+
+def test_a_trip_while_the_motor_changes_its_direction_ends_the_start(monkeypatch: pytest.MonkeyPatch) -> None:
+    line, drive, sim = turning(monkeypatch, "invt-che")
+    begun = line.seconds
+
+    def trip(request: Message) -> bool:
+        if line.seconds > begun + 1 and not sim.motor.fault:
+            sim.trip(4)
+        return False
+
+    line.loses = trip
+    with pytest.raises(NotDone, match="it tripped: OC1"):
+        drive.start(Direction.REVERSE)
 
 
 def test_a_write_is_told_to_the_log_with_who_asked_for_it(

@@ -91,7 +91,7 @@ def test_commands() -> None:
 
 
 def test_start_without_a_direction_does_not_turn_a_running_motor_round() -> None:
-    wire = Wire(DelixiNative(1), {**STANDING, **TURNS[REVERSE]})
+    wire = Wire(DelixiNative(1), {**STANDING, **TURNS[REVERSE]}, turns=TURNS)
     wire.drive.set_frequency(50)
     wire.drive.start()
     wire.drive.start(Direction.FORWARD)

@@ -279,7 +279,8 @@ def yd_word(word: int) -> str:
 )
 def test_options_of_start(options: dict[str, float], forward: int, reverse: int) -> None:
     words = [yd_word(forward), yd_word(reverse)]
-    wire = Wire(YD1000(1, **options), AT_30_HZ, turns=dict.fromkeys(words, TURNS[FORWARD]))
+    turns = dict(zip(words, (TURNS[FORWARD], TURNS[REVERSE]), strict=True))
+    wire = Wire(YD1000(1, **options), AT_30_HZ, turns=turns)
     wire.drive.start(Direction.FORWARD)
     wire.drive.start(Direction.REVERSE)
     assert wire.sent == words
@@ -341,7 +342,8 @@ def test_a_preset_speed_that_is_not_seen_starts_nothing(
 
 def test_jog_leaves_the_run_bit_off() -> None:
     jogs = [frame(YD1000(1), YD1000.control, YD1000Control(word)) for word in (0xC100, 0xC300)]
-    wire = Wire(YD1000(1), STANDING, turns=dict.fromkeys(jogs, TURNS[FORWARD]))
+    turns = dict(zip(jogs, (TURNS[FORWARD], TURNS[REVERSE]), strict=True))
+    wire = Wire(YD1000(1), STANDING, turns=turns)
     wire.drive.jog()
     wire.drive.jog(Direction.REVERSE)
     assert [each[:17] for each in wire.sent] == ["01 06 10 00 C1 00", "01 06 10 00 C3 00"]

@@ -34,6 +34,7 @@ ABB_OFF, ABB_READY, ABB_ON, ABB_RUNS = 0x0270, 0x0231, 0x0233, 0x0237  # ACS355 
 ABB_FAULT = 0x0238
 FC_READY, FC_RUNS, FC_TRIP, FC_LOCK = 0x0607, 0x0E07, 0x0604 | 8, 0x0604 | 0x48
 DELTA_STOP, DELTA_RUNS, DELTA_REVERSE = 0x0500, 0x0503, 0x051B
+DELTA_TO_REVERSE = 0x0513  # it still turns forward
 GD_STANDBY, GD_RUNS, GD_FAULT = 3, 1, 4
 E3_READY, E3_RUNS, E3_TRIP = 0x0040, 0x0041, 0x0302
 ATV_OFF, ATV_READY, ATV_ON, ATV_RUNS, ATV_FAULT = 0x0250, 0x0231, 0x0233, 0x0237, 0x0218
@@ -179,10 +180,10 @@ def test_a_jog_has_its_direction() -> None:
     found = wire("delta-vfd-el", [DELTA_STOP, DELTA_RUNS])
     found.drive.jog()
     assert sent(found) == [DELTA + "00 13"]
-    found = wire("delta-vfd-el", [DELTA_STOP, DELTA_RUNS])
+    found = wire("delta-vfd-el", [DELTA_STOP, DELTA_TO_REVERSE, DELTA_REVERSE])
     found.drive.jog(Direction.REVERSE)
     assert sent(found) == [DELTA + "00 23"]
-    found = wire("invt-goodrive", [GD_STANDBY, GD_RUNS])
+    found = wire("invt-goodrive", [GD_STANDBY, GD_RUNS, GD_RUNS, 2])
     found.drive.jog(Direction.REVERSE)
     assert sent(found) == [DELTA + "00 04"]
 

@@ -25,6 +25,7 @@ from multidrop.drive.verbs import MOVING, verb, verb_errors
 from multidrop.errors import Advice, NotAttached, NotDone, Refused, Unconfirmed, Unsupported
 
 START_TIME = 5.0  # s, after which a motor that was started must be seen to run
+REVERSAL_TIME = 60.0  # s, for the ramps of a motor that turned the other way, without the option `stop_time`
 _SETPOINT_FIRST = Advice("call set_frequency before start", "add --frequency HZ")
 
 _TURNING = (Condition.RUNNING, Condition.ACCELERATING, Condition.DECELERATING)
@@ -182,17 +183,39 @@ class Drive(ManualFacts):
         why = f"{self.name} has {shown}: see to it, then call reset_fault()"
         return Refused(why, advice=Advice.call("reset_fault"))
 
-    def _started(self) -> Script[None]:
-        """Wait until the motor is seen to run; NotDone when the drive trips, Unconfirmed when it does not."""
+    def _started(self, direction: Direction | None = None) -> Script[None]:
+        """Wait until the motor is seen to run, and in `direction` if the drive shows one.
+
+        A motor that turned the other way has the time of its ramps for that. Raises NotDone if the drive
+        trips, Unconfirmed if it is not seen to run so.
+        """
         if not (yield from until(self._runs, limit=START_TIME)):
             seen = f"after {START_TIME:g} s it is not seen to run; stop it, or it may start later"
             raise Unconfirmed(self.name, "the start", f"{seen}; {self.remote}")
+        if direction is None:
+            return
+        limit = self.option.get("stop_time", REVERSAL_TIME) + START_TIME
+        if not (yield from until(lambda: self._turns_in(direction), limit=limit)):
+            way = "in reverse" if direction is Direction.REVERSE else "forward"
+            seen = f"after {limit:g} s it is not seen to turn {way}; stop it, or it may later"
+            raise Unconfirmed(self.name, f"the start {way}", seen)
 
     def _runs(self) -> Script[bool]:
+        state = yield from self._without_trip()
+        return state.condition in _TURNING
+
+    def _turns_in(self, direction: Direction) -> Script[bool]:
+        """Return True if the motor is seen to turn in this direction, or if the drive shows none."""
+        state = yield from self._without_trip()
+        if state.direction is None:
+            return (yield from self._runs())
+        return state.condition in _TURNING and state.direction is direction
+
+    def _without_trip(self) -> Script[State]:
         state = yield from self.state.script()
         if state.condition is Condition.FAULT:
             raise NotDone(self.name, "the start", f"it tripped: {state.fault or 'it shows a fault'}")
-        return state.condition in _TURNING
+        return state
 
     @verb
     def identify(self) -> Script[None]:

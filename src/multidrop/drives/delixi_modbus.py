@@ -125,7 +125,7 @@ class DelixiModbus(DelixiParameters, table=HOLDING):
         yield from write(
             self.control, DelixiModbusControl.FORWARD if forward else DelixiModbusControl.REVERSE
         )
-        yield from self._started()
+        yield from self._started(direction)
 
     @verb
     def jog(self, direction: Direction | None = None) -> Script[None]:
@@ -137,7 +137,7 @@ class DelixiModbus(DelixiParameters, table=HOLDING):
         yield from write(
             self.control, DelixiModbusControl.JOG_FORWARD if forward else DelixiModbusControl.JOG_REVERSE
         )
-        yield from self._started()
+        yield from self._started(direction)
 
     def _forward(self, direction: Direction | None) -> Script[bool]:
         yield from self._may_start()

@@ -130,7 +130,7 @@ class DelixiNative(DelixiParameters, table=PARAMETER):
             direction = Direction.REVERSE
         word = DelixiNativeControl.REVERSE if direction is Direction.REVERSE else DelixiNativeControl.FORWARD
         yield from write(self.control, word)
-        yield from self._started()
+        yield from self._started(direction)
 
     @verb
     def stop(self) -> Script[None]:

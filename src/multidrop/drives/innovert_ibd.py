@@ -264,7 +264,7 @@ class InnovertIBD(Drive):
         if (yield from self._runs()):
             raise self._stop_first("turns, and a jog would go on through this:")
         yield from write(self.control, sent)
-        yield from self._started()
+        yield from self._started(direction)
 
     def _bit(self, direction: Direction) -> int:
         forward = self.option.get("forward_bit")

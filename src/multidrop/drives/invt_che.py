@@ -269,7 +269,7 @@ class InvtCHE(Drive):
         yield from self._setpoint_in_force()
         self._jogged = False
         yield from write(self.control, CHEControl.FORWARD if forward else CHEControl.REVERSE)
-        yield from self._started()
+        yield from self._started(direction)
 
     @verb
     def jog(self, direction: Direction | None = None) -> Script[None]:
@@ -279,7 +279,7 @@ class InvtCHE(Drive):
             raise self._stop_first("turns, and may go on through a jog:")
         self._jogged = True
         yield from write(self.control, CHEControl.JOG_FORWARD if forward else CHEControl.JOG_REVERSE)
-        yield from self._started()
+        yield from self._started(direction)
 
     def _forward(self, direction: Direction | None) -> Script[bool]:
         status = yield from read(self.status)

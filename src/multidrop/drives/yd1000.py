@@ -440,7 +440,7 @@ class YD1000(Drive):
             direction = state.direction
         reverse = YD1000Control.REVERSE if direction is Direction.REVERSE else YD1000Control(0)
         yield from write(self.control, self._valid() | how | reverse)
-        yield from self._started()
+        yield from self._started(direction)
 
     def _valid(self) -> YD1000Control:
         """Return bit 15, and bit 14 unless FNOD selects the setpoint."""

@@ -198,7 +198,7 @@ def _needs_setpoint(call: _Call, step: NeedsSetpoint) -> Script[None]:
 
 
 def _started(call: _Call, step: AwaitsRunning) -> Script[None]:
-    yield from call.drive._started()
+    yield from call.drive._started(call.direction)
 
 
 _DO: Mapping[type[VerbStep], Callable[[_Call, Any], Script[None]]] = {

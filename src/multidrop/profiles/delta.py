@@ -108,6 +108,11 @@ class Delta(Profile):
         shown = status >> 3 & 3
         return Direction.REVERSE if shown in (TO_REVERSE, REVERSE) else Direction.FORWARD
 
+    def _turns_in(self, direction: Direction) -> Script[bool]:
+        """Return True if it turns so, and is not still about to: both lamps of the direction are alike."""
+        shown = (yield from self._status()) >> 3 & 3
+        return shown in (FORWARD, REVERSE) and (yield from super()._turns_in(direction))
+
     def _reverse(self, direction: Direction | None, status: int) -> bool:
         if direction is None:
             return self._turns(status) and self._direction(status) is Direction.REVERSE
@@ -124,7 +129,7 @@ class Delta(Profile):
         reverse = self._reverse(direction, status)
         word = DeltaControl.JOG_REVERSE if reverse else DeltaControl.JOG_FORWARD
         yield from write(self.control, self._word(word))
-        yield from self._started()
+        yield from self._started(direction)
 
     def _take_reset_back(self) -> Script[None]:
         yield from write(self.register("reset"), DeltaReset.NOTHING)

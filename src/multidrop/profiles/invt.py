@@ -109,7 +109,7 @@ class Invt(Profile):
         self._jogged = True
         word = InvtControl.JOG_REVERSE if reverse else InvtControl.JOG_FORWARD
         yield from write(self.control, self._word(word))
-        yield from self._started()
+        yield from self._started(direction)
 
     def _stop_by(self, word: int) -> Script[None]:
         try:

@@ -190,7 +190,7 @@ class Profile(Drive):
         if not self._turns(status):
             yield from self._prepare(status)
         yield from write(self.control, self._word(word))
-        yield from self._started()
+        yield from self._started(direction)
 
     def _may_start(self, status: int) -> Script[None]:
         """Raise Refused in a fault, in local control, and where the status shows another hindrance."""
