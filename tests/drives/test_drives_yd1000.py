@@ -8,9 +8,21 @@ from scripts import Wire, frame, rows, typed
 from simulated_bus import one
 from tables import table
 
-from multidrop.drive import Condition, Direction, DriveRefused, NotDone, Refused, State, Unconfirmed
+from multidrop.drive import (
+    Condition,
+    Direction,
+    DriveRefused,
+    NotDone,
+    Refused,
+    State,
+    Unconfirmed,
+    Unsupported,
+)
 from multidrop.drive.table import HOLDING, Kept
+from multidrop.drives import DelixiModbus
 from multidrop.drives.yd1000 import YD1000, Inputs, Outputs, YD1000Control, YD1000Status, extended
+from multidrop.errors import Expired, NoReply
+from multidrop.sim.yd1000 import SimulatedYD1000
 
 FORWARD = "01 06 10 00 C4 00 DF CA"
 REVERSE = "01 06 10 00 C6 00 DE AA"
@@ -474,6 +486,75 @@ def test_other_terminals_keep_no_reset_back(closed: Inputs) -> None:
     wire = Wire(YD1000(1), {**STANDING, **FUNCTIONS, "inputs": closed})
     wire.drive.reset_fault()
     assert wire.sent == [frame(YD1000(1), YD1000.control, YD1000Control(0xE000)), STOP]
+
+
+RELEASE = checksums.rtu("01 06 10 00 00 00").hex(" ").upper()  # section 8.1: bits 15 and 14 off
+
+
+def test_the_command_is_given_back_at_rest_alone() -> None:
+    wire = Wire(YD1000(1), {**STANDING, **FUNCTIONS})
+    wire.drive.release_control()
+    assert wire.sent == [RELEASE]
+    for frequencies in (12.0, [0.0, 12.0]):  # 1100H must be 0 twice
+        wire = Wire(YD1000(1), {**STANDING, **FUNCTIONS, "output_frequency": frequencies})
+        with pytest.raises(Refused, match=r"turns: call stop\(\) first"):
+            wire.drive.release_control()
+        assert wire.sent == []
+
+
+@table(
+    ("says", "terminal"),
+    [
+        ({"inputs": Inputs.F}, "terminal F"),
+        ({"inputs": Inputs.R}, "terminal R"),
+        ({"always_on_function": 3.0}, "F110"),
+    ],
+)
+def test_the_command_is_not_given_to_a_terminal_that_says_run(says: dict[str, object], terminal: str) -> None:
+    wire = Wire(YD1000(1), {**STANDING, **FUNCTIONS, **says})
+    with pytest.raises(Refused, match=f"^{terminal}.* says run, .* once the line no longer commands it"):
+        wire.drive.release_control()
+    assert wire.sent == []
+
+
+def test_a_motor_that_turns_once_its_command_is_given_back_is_stopped_again() -> None:
+    turns = {RELEASE: {"output_frequency": [0.0, 0.0, 1.5]}}
+    wire = Wire(YD1000(1), {**STANDING, **FUNCTIONS}, turns=TURNS | turns)
+    with pytest.raises(NotDone, match="its panel or a terminal started the motor, so the stop was written"):
+        wire.drive.release_control()
+    assert wire.sent == [RELEASE, STOP]
+
+
+@pytest.mark.parametrize("is_sent", [True, False])
+def test_the_line_keeps_the_command_if_its_release_is_in_doubt(is_sent: bool) -> None:
+    lost = Unconfirmed("drive", "control", "no reply") if is_sent else Expired("drive", "control", 1.0)
+    wire = Wire(YD1000(1), {**STANDING, **FUNCTIONS}, loses={RELEASE: [lost]})
+    with pytest.raises(type(lost)):
+        wire.drive.release_control()
+    assert wire.sent == [RELEASE, *([STOP] if is_sent else [])]
+    wire = Wire(YD1000(1), {**STANDING, **FUNCTIONS}, turns={RELEASE: {"output_frequency": NoReply("drive")}})
+    with pytest.raises(NoReply):
+        wire.drive.release_control()
+    assert wire.sent == [RELEASE, STOP]
+
+
+def test_the_panel_commands_the_motor_again_once_it_has_the_command(monkeypatch: pytest.MonkeyPatch) -> None:
+    line, drive, sim = one(monkeypatch, YD1000(1))
+    assert isinstance(sim, SimulatedYD1000)
+    line.bus.write(drive, drive.panel_frequency, 20.0)
+    drive.stop()  # which takes the command
+    sim.panel_runs = True
+    assert not sim.motor.energised
+    with pytest.raises(NotDone, match="started the motor"):
+        drive.release_control()
+    assert drive.state().condition is not Condition.RUNNING
+    sim.panel_runs = False
+    drive.release_control()
+    assert not sim.motor.energised
+    sim.panel_runs = True
+    assert sim.motor.energised
+    with pytest.raises(Unsupported, match="no way to give the command back"):
+        one(monkeypatch, DelixiModbus(1))[1].release_control()
 
 
 def test_the_setpoint() -> None:

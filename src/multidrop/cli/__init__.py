@@ -37,6 +37,7 @@ COMMANDS = {  # name: module in this package, and help
     "jog": ("verbs", "turn a drive's motor slowly until it is stopped"),
     "reset-fault": ("verbs", "reset a drive's fault; never starts the motor"),
     "set-frequency": ("verbs", "write a drive's frequency setpoint"),
+    "release-control": ("verbs", "give a motor at rest back to its panel and terminals"),
     "scan": ("scan", "find the drives on a line, by reading only"),
     "plan": ("plan", "predict what a plant file's lines will reach; opens no port"),
     "wear": ("wear", "list what was written to EEPROMs, and what is left"),

@@ -32,6 +32,7 @@ _QUESTIONS = {  # asked before anything is sent; a stop needs no confirmation
     "jog": "Turn the motor of",
     "reset-fault": "Reset the fault of",
     "set-frequency": "Change the frequency setpoint of",
+    "release-control": "Give the command over the motor back to panel and terminals of",
 }
 
 

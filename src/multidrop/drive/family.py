@@ -273,6 +273,12 @@ class Drive(ManualFacts):
         yield
 
     @verb
+    def release_control(self) -> Script[None]:
+        """Give the command over the motor back to the drive's panel or terminals; at rest only."""
+        raise self._unsupported("way to give the command back")
+        yield
+
+    @verb
     def state(self) -> Script[State]:
         """Report condition, direction and fault."""
         raise self._unsupported("state")

@@ -18,12 +18,15 @@ P = ParamSpec("P")
 
 
 # Sent only to a drive that is known to be of its family, and not after a stop was called.
-MOVING = ("start", "jog", "reset_fault", "set_frequency")
+MOVING = ("start", "jog", "reset_fault", "set_frequency", "release_control")
 
 # Sent to a silent drive too, again and again.
 STOPPING = ("stop", "coast", "emergency_stop")
 
-VERBS = ("start", "stop", "coast", "emergency_stop", "jog", "reset_fault", "set_frequency", "state")
+VERBS = (
+    *("start", "stop", "coast", "emergency_stop", "jog", "reset_fault", "set_frequency"),
+    *("release_control", "state"),
+)
 
 # Each verb's argument, its types, and these in words: "reverse", a string, would go forward.
 _TAKES: Mapping[str, tuple[str, tuple[type, ...], str]] = {

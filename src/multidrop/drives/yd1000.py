@@ -8,7 +8,7 @@ from contextlib import suppress
 from enum import IntEnum, IntFlag
 from typing import Any, Unpack
 
-from multidrop.drive import BusError, Drive, DriveRefused, Refused, Unconfirmed
+from multidrop.drive import BusError, Drive, DriveRefused, NotDone, Refused, Unconfirmed
 from multidrop.drive.declare import Details, command, reading, setting
 from multidrop.drive.options import Option
 from multidrop.drive.register import Register
@@ -19,6 +19,7 @@ from multidrop.drive.verbs import verb
 
 STOP_MARGIN = 5.0  # s, on top of the deceleration time
 SELECTION_TIME = 1.0  # s in which a preset speed becomes the frequency command
+RELEASE_TIME = 2.0  # s in which a motor that panel or terminals start is seen to turn
 RESET_TIME = 3.0  # s in which the drive restarts and may be deaf
 
 PANEL = "it is effective from the panel only"
@@ -154,6 +155,9 @@ class YD1000(Drive):
     - Other functions than 03 (one register) and 06 are spoken of, but not in the function table.
     - 0000H in the control word is no stop: without bit 15 the panel or the terminals are in command,
       and may say run. A stop keeps bit 15, and so does everything else.
+    - Bits 15 and 14 latch until they are written 0 or the power goes: until then panel and terminals command
+      nothing. `release_control` writes 0000H, at rest alone, while no terminal says run. What the panel says
+      cannot be read: if the motor turns after it, the stop is written again.
     - Bit 14 should stay as it was, and what it is cannot be told for sure: every command has it set.
       So the setpoint is 1001H from the first verb on, which is 0 Hz until set_frequency is called.
       With the option `setpoint_by_fnod` a start has it off, as the document's 8400H and 8600H.
@@ -505,15 +509,15 @@ class YD1000(Drive):
         """
         if (yield from read(self.output_frequency)) > 0:
             raise Refused(f"{self.name} runs: it has no fault to reset")
-        yield from self._no_terminal_runs()
+        yield from self._no_terminal_runs("once a reset has restarted the drive")
         with suppress(Unconfirmed):  # the restart cuts the reply off
             yield from write(self.control, STOP | YD1000Control.RESET)
         yield from wait(RESET_TIME)
         yield from insist(self.control, STOP)
         self._record = yield from read(self.fault_record_1)
 
-    def _no_terminal_runs(self) -> Script[None]:
-        """Raise Refused where a terminal could start the motor: bit 15 does not outlast the restart."""
+    def _no_terminal_runs(self, when: str) -> Script[None]:
+        """Raise Refused if a terminal could start the motor once bit 15 is off, which a restart takes too."""
         closed = yield from read(self.inputs)
         functions = {"F110, which is always on,": self.always_on_function}
         for number, terminal in enumerate(Inputs, 1):  # F111 is the function of F, and so on
@@ -522,9 +526,35 @@ class YD1000(Drive):
         for what, function in functions.items():
             if (yield from read(function)) in RUN_FUNCTIONS:
                 raise Refused(
-                    f"{what} of {self.name} says run, and may start its motor once a reset has restarted the "
-                    "drive: take that back first"
+                    f"{what} of {self.name} says run, and may start its motor {when}: take that back first"
                 )
+
+    @verb
+    def release_control(self) -> Script[None]:
+        """Give command and setpoint back to panel and terminals: bits 15 and 14 off; at rest only.
+
+        If the motor is seen to turn then, or is not heard, the stop is written again.
+        """
+        if not (yield from self._stands()):
+            raise self._stop_first("turns:")
+        yield from self._no_terminal_runs("once the line no longer commands it")
+        try:
+            yield from write(self.control, YD1000Control(0))
+        except Unconfirmed:  # it may have happened
+            yield from insist(self.control, STOP)
+            raise
+        try:
+            turns = yield from until(self._turns, limit=RELEASE_TIME)
+        except BusError:
+            yield from insist(self.control, STOP)
+            raise
+        if turns:
+            yield from self.stop.script()
+            reason = "its panel or a terminal started the motor, so the stop was written again"
+            raise NotDone(self.name, "the release of its control", reason)
+
+    def _turns(self) -> Script[bool]:
+        return (yield from read(self.output_frequency)) > 0
 
     @verb
     def set_frequency(self, hz: float) -> Script[None]:

@@ -25,7 +25,7 @@ HELD = (0x1200, 0x1201)  # frozen at a trip until the reset
 
 
 class SimulatedYD1000(MotorDrive):
-    """YD1000. Without bit 15 the panel is in command: it runs the motor if `panel_runs` is set.
+    """YD1000. Without bit 15 the panel is in command: it runs the motor while `panel_runs` is set.
 
     A value outside its limits in section 6 is refused, also where such a limit is another parameter. A
     parameter that works from the panel only is confirmed and not kept (6.1; section 8.1 has 0007H
@@ -42,10 +42,21 @@ class SimulatedYD1000(MotorDrive):
     needs_silence = True  # 4.3
 
     def prepare(self) -> None:
-        self.panel_runs = False
+        self._panel_runs = False
         self._in_force = 0  # the control word in force
         self._message_at = math.inf  # the time-out begins with the first message
         self.memory.make_readable(HOLDING, [CONTROL])
+
+    @property
+    def panel_runs(self) -> bool:
+        """True while its panel says run, which has an effect only while the line is not in command."""
+        return self._panel_runs
+
+    @panel_runs.setter
+    def panel_runs(self, runs: bool) -> None:
+        self._panel_runs = runs
+        if not self._in_force:
+            self._control(0)
 
     @property
     def most_gap(self) -> float:
