@@ -120,6 +120,17 @@ def test_a_number_that_the_document_does_not_name_is_shown_as_such(
     }
 
 
+def test_a_bit_that_the_document_does_not_name_is_shown_by_its_number(
+    run: Run, port: str, toy: SimulatedDrive
+) -> None:
+    for cell in toy.memory.of(Toy.status):
+        cell.raw = 0x1101
+    assert run("read", port, TOY, 1, "status")[1] == "status  RUNNING, bit 8, bit 12\n"
+    assert json.loads(run("read", port, TOY, 1, "status", "--json")[1])["values"] == {
+        "status": {"value": ["RUNNING", "bit 8", "bit 12"], "raw": 0x1101}
+    }
+
+
 def test_what_a_drive_refuses_to_tell_does_not_hide_the_rest(run: Run, port: str) -> None:
     status, out, err = run("read", port, TOY, 2, "status", "fault")
     assert (status, out) == (1, "status  none\nfault         refused: code 02H, illegal address\n")

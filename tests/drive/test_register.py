@@ -100,6 +100,8 @@ def test_encoding_takes_the_nearest_count(value: float) -> None:
         (Example.unknown, 311, "311 (scale not stated)"),
         (Example.bits, Bits.RUN | Bits.FAULT, "RUN|FAULT"),
         (Example.bits, Bits(0), "none"),
+        (Example.bits, Bits(0x1100), "bit 8, bit 12"),
+        (Example.bits, Bits(0x8009), "RUN|FAULT, bit 15"),
         (Example.run, Run.STOP, "STOP"),
         (Example.coarse, 15.0, "15 V"),
     ],

@@ -295,6 +295,15 @@ def test_state(status: int, fault: int, condition: Condition, note: str) -> None
     assert (state.condition, state.note, state.fault) == (condition, note, None)
 
 
+def test_a_last_fault_of_unnamed_bits_is_a_fault() -> None:
+    """Bits 8, 9 and 12 to 31 are reserved (section 10, state: 1026-1027)."""
+    wire = Wire(ErmanERG220(1), {**STOPPED, "last_fault": ErmanERG220.last_fault.decode(0x1100)}, turns=TURNS)
+    assert "last fault bit 8, bit 12" in wire.drive.state().note
+    with pytest.raises(Refused, match="may have a fault, bit 8, bit 12"):
+        wire.drive.start()
+    assert wire.sent == []
+
+
 def test_identify_refuses_the_models_03_and_04() -> None:
     Wire(ErmanERG220(1), STOPPED).drive.identify()
     with pytest.raises(Refused, match="0400H"):

@@ -90,6 +90,8 @@ def test_the_words_have_no_toggle_and_no_reserved_bit() -> None:
 
 def test_terminals() -> None:
     assert [bit.value for bit in Terminals] == [1 << at for at in (*range(11), 13)]
+    printed = InnovertIBD.terminals.decode(0x1800)  # in the example, where bits 11 and 12 have no name
+    assert InnovertIBD.terminals.format(printed) == "bit 11, bit 12"
 
 
 @pytest.mark.parametrize("framing", InnovertIBD.framings)

@@ -269,7 +269,8 @@ class Register(Generic[T]):
     def format(self, value: T) -> str:
         """Return the value as a person reads it, with its unit."""
         if isinstance(value, Flag):
-            return "|".join(str(member.name) for member in value) or "none"
+            named = "|".join(str(member.name) for member in value)
+            return ", ".join(filter(None, (named, *unnamed_bits(value)))) or "none"
         if isinstance(value, IntEnum):
             return value.name
         unit = self.unit if self.step is not None else "(scale not stated)"
@@ -283,6 +284,14 @@ class Register(Generic[T]):
         if self.scale_register:
             return f"{value:.12g}"
         return repr(value).removesuffix(".0") if self.is_float else f"{value:.{self.decimals}f}"
+
+
+def unnamed_bits(value: Flag) -> list[str]:
+    """Return a word for each bit of flags that has no name, such as "bit 8"."""
+    rest = int(value.value)
+    for member in value:
+        rest &= ~int(member.value)
+    return [f"bit {bit}" for bit in range(rest.bit_length()) if rest >> bit & 1]
 
 
 def _number_in(text: str) -> float:

@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 from unicodedata import combining, east_asian_width
 
 from multidrop.cli.support.output import warn
-from multidrop.drive.register import Register
+from multidrop.drive.register import Register, unnamed_bits
 
 Row = Sequence[str]
 T = TypeVar("T", bound=float)
@@ -111,7 +111,7 @@ def as_row(register: Register[Any], value: Any) -> Row:
 def as_json(register: Register[Any], value: Any) -> dict[str, Any]:
     """Return value and unit, or a name and its raw count. Without a scale, `value` is None."""
     if isinstance(value, Flag):
-        return {"value": [member.name for member in value], "raw": value.value}
+        return {"value": [*(member.name for member in value), *unnamed_bits(value)], "raw": value.value}
     if isinstance(value, IntEnum):
         return {"value": value.name, "raw": value.value}
     if register.values is not None or register.step is None:
