@@ -60,7 +60,7 @@ TABLE = """
 03/06 3003 output_voltage         1 V
 03/06 3004 output_current       0.1 A
 03/06 3005 motor_speed            1 rpm
-03/06 3006 output_power         0.1 %
+03/06 3006 output_power           ?
 03/06 3007 output_torque        0.1 %
 03/06 3008 pid_setpoint         0.1 %
 03/06 3009 pid_feedback         0.1 %
@@ -83,6 +83,14 @@ def test_the_registers_are_those_of_the_che100() -> None:
     assert all(register.outside for register in InvtCHE.registers.values())
     signed = {name for name, each in InvtCHE.registers.items() if each.number_format is NumberFormat.I16}
     assert signed == {"setpoint", "output_power", "output_torque"}
+
+
+def test_scales_of_which_sources_differ_are_open() -> None:
+    """3006H: 0.01 kW on a CHF100A, by its owner's log of 26 rows; 0.1 % in the Goodrive300L manual."""
+    for register, raw in ((InvtCHE.output_power, 262), (InvtCHE.dc_bus_voltage, 5370)):
+        assert register.value_unit == "raw count"
+        assert register.decode(raw) == raw
+        assert "CHF100A" in register.note
 
 
 def test_numbers() -> None:

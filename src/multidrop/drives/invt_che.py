@@ -140,7 +140,9 @@ class InvtCHE(Drive):
     - 2000H is a percentage of the maximum frequency (P0.04), so `set_frequency` needs that as the
       option `maximum_frequency`. It may be negative, which likely reverses: 0 to 100 % is written.
     - Newer INVT families have the control word at 2000H: see `identify`.
-    - GD200L and GD300L print the DC bus voltage with and without a decimal: its scale is left open.
+    - Two scales are left open, because sources differ: GD200L and GD300L print the DC bus voltage (3002H)
+      with and without a decimal; the output power (3006H) is 0.1 % in the Goodrive300L manual, and 0.01 kW
+      on a CHF100A, as its owner compared it with the keypad.
     - The example that writes 5000 to 0008H does not say what that is, and is not to be repeated.
     - STOP may not end a jog: where the motor still turns after it, or nobody says that it stands, STOP_JOG
       follows at once. Nor may a start: one that was jogged is to be stopped before a start. Whether a run
@@ -217,12 +219,22 @@ class InvtCHE(Drive):
     output_frequency = reading(0x3000, "Hz", step=0.01, outside=SCALE)
     reference_frequency = reading(0x3001, "Hz", step=0.01, outside=SCALE)
     dc_bus_voltage = reading(
-        0x3002, "V", step=None, outside=CHE100, note="0.1 V or 1 V: 1.41 times the mains tells which."
+        0x3002,
+        "V",
+        step=None,
+        outside=CHE100,
+        note="0.1 V (seen on a CHF100A) or 1 V: 1.41 times the mains tells which.",
     )
     output_voltage = reading(0x3003, "V", step=1, outside=SCALE)
     output_current = reading(0x3004, "A", step=0.1, outside=SCALE)
     motor_speed = reading(0x3005, "rpm", step=1, outside=SCALE)
-    output_power = reading(0x3006, "%", step=0.1, number_format=NumberFormat.I16, outside=SCALE)
+    output_power = reading(
+        0x3006,
+        step=None,
+        number_format=NumberFormat.I16,
+        outside=CHE100,
+        note="0.01 kW (seen on a CHF100A) or 0.1 % (Goodrive300L manual): the keypad tells which.",
+    )
     output_torque = reading(0x3007, "%", step=0.1, number_format=NumberFormat.I16, outside=SCALE)
     pid_setpoint = reading(0x3008, "%", step=0.1, outside=SCALE)
     pid_feedback = reading(0x3009, "%", step=0.1, outside=SCALE)

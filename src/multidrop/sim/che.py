@@ -22,6 +22,8 @@ def _signed(raw: int) -> int:
 class SimulatedCHE(MotorDrive):
     """INVT CHE. The setpoint is a percentage of P0.04, the drive's option `maximum_frequency`.
 
+    Output power is 0.01 kW, as a CHF100A has it; no manual of a CHE says so.
+
     For `storing` s after a write to the EEPROM the drive is busy. No manual says what a stop, a start or
     the jog's own stop do to a jog and to a run: here both stops end both, and a start ends a jog.
     """
@@ -90,6 +92,7 @@ class SimulatedCHE(MotorDrive):
     obeys = {(0x03, CONTROL): _control}
     shows = {
         (0x03, 0x1001): _state,
+        (0x03, 0x3006): lambda self: round(self.motor.power * 100),
         (0x03, 0x3016): lambda self: DEVICE_CODE,
         (0x03, 0x5000): lambda self: self.motor.fault,
         (0x03, 0x5001): lambda self: self._modbus_fault,
