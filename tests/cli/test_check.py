@@ -168,6 +168,30 @@ def test_a_model_s_file_with_mistakes_is_a_mistaken_call(run: Run, tmp_path: Pat
     assert "'manual' is missing" in err
 
 
+def test_a_line_with_more_drives_than_a_manual_allows_is_told(run: Run, tmp_path: Path) -> None:
+    """ERMAN, section 1: at most 31 devices, the drive included."""
+    plant = tmp_path / "plant.toml"
+
+    def check(drives: int, *options: str) -> tuple[int, str, str]:
+        text = '[[line]]\nname = "L"\nport = "/dev/ttyUSB0"\nbaudrate = 38400\nformat = "8N1"\n'
+        for number in range(1, drives + 1):
+            model = "erman-er-g-220" if number == 1 else "invt-che"
+            text += f'[[line.drive]]\nname = "d{number}"\nmodel = "{model}"\naddress = {number}\n'
+            text += 'poll = [{ register = "output_frequency" }]\n'
+        plant.write_text(text)
+        return run("check", plant, *options)
+
+    assert check(31)[2] == ""
+    status, out, err = check(32)
+    assert status == 0
+    assert (
+        "line L: it has 32 drives, and the manual of ERMAN ER-G-220-01(02) allows 31 devices: split it" in err
+    )
+    assert out.startswith("No mistake found")
+    remarks = json.loads(check(32, "--json")[1])["remarks"]
+    assert [name for name, _ in remarks] == ["line L"]
+
+
 def test_a_plant_file_tells_its_family_s_mistakes_once(run: Run, tmp_path: Path) -> None:
     (tmp_path / "fan.toml").write_text(FAN.replace("0x0010", '"8192"').replace("0x0020", "-1"))
     drives = "".join(f'[[line.drive]]\nname = "f{at}"\nmodel = "fan.toml"\naddress = {at}\n' for at in (1, 2))

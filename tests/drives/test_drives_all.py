@@ -34,7 +34,7 @@ from multidrop.drive.register import Access, Register
 from multidrop.drive.request import write_request
 from multidrop.drive.table import Carrier
 from multidrop.drive.verbs import VERBS
-from multidrop.drives import MODELS
+from multidrop.drives import MODELS, DelixiModbus, DelixiNative
 from multidrop.drives.invt_che import CHEStatus
 from multidrop.planning.blocks import blocks
 
@@ -80,6 +80,35 @@ def test_a_family_says_what_it_is(family: type[Drive]) -> None:
 def test_an_address_is_a_whole_number_that_the_family_has(family: type[Drive], given: object) -> None:
     with pytest.raises(ValueError, match=rf"^address {given!r} is not one of "):
         family(given)  # type: ignore[arg-type]
+
+
+TERMINALS = {  # as each document names them; CHE's does not
+    "erman-er-g-220": "485A and 485B",
+    "innovert-ibd": "RS+ and RS-",
+    "delixi-modbus": "SG+ and SG-",
+    "delixi-native": "SG+ and SG-",
+    "yd1000": "A and B",
+    "invt-che": "",
+}
+
+
+@family
+def test_a_family_names_its_terminals(family: type[Drive]) -> None:
+    assert family.line_terminals == TERMINALS[family.model]
+
+
+def test_a_framing_that_a_family_lacks_is_told_with_the_one_to_write() -> None:
+    with pytest.raises(
+        ValueError, match=r"^framing 'ascii' is not one of .*: delixi; write delixi, or leave"
+    ):
+        DelixiNative(1, framing="ascii")
+
+
+@pytest.mark.parametrize("family", [DelixiModbus, DelixiNative])
+def test_units_that_a_delixi_s_manual_does_not_print_are_said_to_be_inferred(family: type[Drive]) -> None:
+    of_p05 = [each for each in family.registers.values() if 501 <= each.address <= 510 and each.unit]
+    assert len(of_p05) == 7
+    assert all("unit is inferred" in each.note for each in of_p05)
 
 
 @family

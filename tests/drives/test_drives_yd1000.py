@@ -17,6 +17,7 @@ from multidrop.drive import (
     State,
     Unconfirmed,
     Unsupported,
+    write,
 )
 from multidrop.drive.table import HOLDING, Kept
 from multidrop.drives import DelixiModbus
@@ -486,6 +487,14 @@ def test_other_terminals_keep_no_reset_back(closed: Inputs) -> None:
     wire = Wire(YD1000(1), {**STANDING, **FUNCTIONS, "inputs": closed})
     wire.drive.reset_fault()
     assert wire.sent == [frame(YD1000(1), YD1000.control, YD1000Control(0xE000)), STOP]
+
+
+def test_a_limit_that_the_manual_does_not_print_is_not_said_to_be_its_own() -> None:
+    """It has 0.5 to FH for UL, and of FH only 30.0 to 320.0."""
+    wire = Wire(YD1000(1), {**STANDING, "upper_limit_frequency": 60.0})
+    with pytest.raises(Refused, match=r"50\.00 Hz is below upper_limit_frequency, which is 60 Hz") as refusal:
+        wire.run(write(wire.drive.maximum_frequency, 50.0))
+    assert str(refusal.value).endswith("(in the manual, maximum_frequency is 6.1, FH)")
 
 
 RELEASE = checksums.rtu("01 06 10 00 00 00").hex(" ").upper()  # section 8.1: bits 15 and 14 off

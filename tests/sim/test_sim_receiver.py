@@ -68,6 +68,21 @@ def test_two_frames_at_once() -> None:
     assert functions(receiver_rtu().feed(READ + WRITE, 0.0)) == [3, 16]
 
 
+@table("extra", [b"\x00", b"\x01", b"\x00\x00", b"\x01\x03", b"\xff" * 5, READ[:-1], READ[:-1] + b"\x00"])
+def test_a_good_frame_with_more_bytes_behind_it_is_no_request(extra: bytes) -> None:
+    """ERMAN, section 5 (wrong length); YD1000, section 5 (nothing may follow the checksum); CHE, 11.5."""
+    receiver = receiver_rtu()
+    assert receiver.feed(READ + extra, 0.0) == []
+    assert functions(receiver.silence(1.0)) == []
+    assert functions(receiver.feed(READ, 2.0)) == [3]
+
+
+def test_a_request_that_comes_in_pieces_behind_another_spoils_neither() -> None:
+    receiver = receiver_rtu()
+    assert receiver.feed(READ + WRITE[:5], 0.0) == []
+    assert functions(receiver.feed(WRITE[5:], 0.013)) == [3, 16]
+
+
 def test_a_frame_that_only_looks_like_one_within_another_does_not_count() -> None:
     """A write of twelve registers that hold a whole good request, cut after it."""
     whole = checksums.rtu(bytes.fromhex("01 10 00 00 00 0C 18") + READ + bytes(16))

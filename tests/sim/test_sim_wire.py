@@ -51,6 +51,19 @@ def test_no_byte_comes_before_its_last_bit_and_none_much_later(baudrate: int) ->
     assert passed == 9
 
 
+@table("family", [ErmanERG220, InvtCHE, InnovertIBD, DelixiModbus, YD1000])
+@table("extra", [b"\0", b"\x01\x03", b"\xff\xff\xff"])
+def test_a_drive_is_silent_to_a_good_frame_with_more_bytes_behind_it(
+    family: type[Drive], extra: bytes
+) -> None:
+    """ERMAN, section 5: wrong length; CHE, 11.5; YD1000, section 5: nothing may follow the checksum."""
+    wire = Wire([simulated(family(1))])
+    register = next(each for each in wire.drives[0].drive.readings() if each.step is not None)
+    good = checksums.rtu(f"01 {register.table.read:02X} {register.address:04X} 00 01")
+    assert exchange(wire, good + extra, 10.0) == b""
+    assert exchange(wire, good, 20.0) != b""
+
+
 def test_an_rtu_drive_keeps_t3_5_even_if_it_is_quicker() -> None:
     wire = Wire([SimulatedDrive(Own(1, baudrate=9600), response_delay=0.0)])
     wire.receive(READ, 0.0)

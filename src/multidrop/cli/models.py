@@ -105,6 +105,8 @@ def facts(family: type[Drive]) -> dict[str, Any]:
             for name, option in family.options.items()
         },
         "verbs": verbs_of(family),
+        "line_terminals": family.line_terminals,
+        "most_devices": family.most_devices or None,
         "line_parameters": family.line_parameters,
         "remote": family.remote,
         "watchdog": family.watchdog,

@@ -107,7 +107,7 @@ def conditions(drive: Drive, register: Register[T], value: T) -> Script[None]:
         bound = (yield from _bound(drive, name)) if name else None
         if bound is not None and (value - bound) * sign < 0:
             given, limit = register.format(value), f"{bound:g} {register.unit}".strip()
-            raise refused(drive, register, f"{given} is {word} {name}, which is {limit}")
+            raise _not_now(drive, register, f"{given} is {word} {name}, which is {limit}")
     if register.while_running is False:
         yield from _must_stand(drive, register)
 
@@ -124,11 +124,18 @@ def _must_stand(drive: Drive, register: Register[Any]) -> Script[None]:
     try:
         state = yield from drive.state.script()
     except Unsupported:
-        raise refused(
+        raise _not_now(
             drive, register, "it changes only while the motor stands, which the family cannot say"
         ) from None
     if state.condition not in (Condition.STOPPED, Condition.FAULT):
-        raise refused(drive, register, f"it changes only while the motor stands; state: {state}")
+        raise _not_now(drive, register, f"it changes only while the motor stands; state: {state}")
+
+
+def _not_now(drive: Drive, register: Register[Any], rule: str) -> Refused:
+    """Return the refusal by a rule that a manual need not print: its place is said to be the register's."""
+    where = f" (in the manual, {register.name} is {register.place})" if register.place else ""
+    sentence = f"{register.name} of {drive.name} is not written: {rule}{where}"
+    return Refused(sentence, register=register.name, rule=rule, place=register.place)
 
 
 def wears(drive: Drive, register: Register[Any]) -> Kept:

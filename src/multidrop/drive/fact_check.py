@@ -26,7 +26,16 @@ _SPANS = {
     "turnaround_delay": (LONGEST_TIME, "s"),
 }
 _TRUTHS = ("answers_every_read", "broadcasts", "identify_recognises")
-_TEXTS = ("model", "title", "manual", "remote", "line_parameters", "no_broadcasts", "watchdog")
+_TEXTS = (
+    "model",
+    "title",
+    "manual",
+    "remote",
+    "line_terminals",
+    "line_parameters",
+    "no_broadcasts",
+    "watchdog",
+)
 
 Error = tuple[str, str]  # the name of the fact, and the rest of the sentence
 

@@ -23,6 +23,8 @@ class LineFacts:
     formats: ClassVar[Mapping[Framing, tuple[str, ...]]] = {}  # the first is the default
     baudrates: ClassVar[tuple[int, ...]] = (9600, 1200, 2400, 4800, 19200, 38400, 57600, 115200)
     addresses: ClassVar[range] = range(1, 248)
+    line_terminals: ClassVar[str] = ""  # the drive's two terminals for the line
+    most_devices: ClassVar[int] = 0  # on a line with such a drive; 0: not stated
 
     silence: ClassVar[float] = 0.0  # s, before and after a frame; t3.5 is the least for RTU
     silence_characters: ClassVar[float] = 0.0  # the same, in characters
@@ -77,7 +79,12 @@ class LineFacts:
             framing = {str(known): known for known in Framing}.get(framing.lower(), framing)
         if framing is Framing.TCP and cls.speaks(framing):
             return framing
-        return Framing(cls._checked("framing", framing, cls.framings))
+        if framing not in cls.framings:
+            known = ", ".join(str(one) for one in cls.framings)
+            hint = f"; write {known}, or leave it out" if len(cls.framings) == 1 else ""
+            family = cls.title or cls.__name__
+            raise ValueError(f"framing {str(framing)!r} is not one of {family}: {known}{hint}")
+        return Framing(framing)
 
     @classmethod
     def speaks(cls, framing: Framing) -> bool:

@@ -16,6 +16,8 @@ STOP_TIME = 60.0  # s; the deceleration time's number is not known
 
 KEYPAD = "it belongs to the line or to the command over the motor; set it on the keypad"
 
+UNIT_INFERRED = "Its unit is inferred: the manual has the name alone."
+
 
 def parameter(group: int, index: int) -> int:
     """Return the number of a parameter: 500 for P05.00."""
@@ -68,10 +70,12 @@ class DelixiParameters(Drive):
     P04.29, the format, has other codes in each protocol, and is the subclass's.
 
     Values come without their decimal point, and the list that says where it belongs is lost: only the
-    scale of the output frequency is known, from an example.
+    scale of the output frequency is known, from an example. The units of P05.01 to P05.10 are inferred from
+    the quantities' names.
     """
 
     baudrates = (9600, 1200, 2400, 4800, 19200, 38400)  # P04.28
+    line_terminals = "SG+ and SG-"
     addresses = range(1, 32)  # P04.30
     response_timeout = 0.15
     answers_every_read = True
@@ -91,18 +95,18 @@ class DelixiParameters(Drive):
     address_setting = setting(parameter(4, 30), never=KEYPAD, place="P04.30")
 
     output_frequency = reading(parameter(5, 0), "Hz", step=0.01, place="P05.00")
-    reference_frequency = reading(parameter(5, 1), "Hz", step=None, place="P05.01")
-    output_current = reading(parameter(5, 2), "A", step=None, place="P05.02")
-    output_voltage = reading(parameter(5, 3), "V", step=None, place="P05.03")
-    dc_bus_voltage = reading(parameter(5, 4), "V", step=None, place="P05.04")
+    reference_frequency = reading(parameter(5, 1), "Hz", step=None, place="P05.01", note=UNIT_INFERRED)
+    output_current = reading(parameter(5, 2), "A", step=None, place="P05.02", note=UNIT_INFERRED)
+    output_voltage = reading(parameter(5, 3), "V", step=None, place="P05.03", note=UNIT_INFERRED)
+    dc_bus_voltage = reading(parameter(5, 4), "V", step=None, place="P05.04", note=UNIT_INFERRED)
     io_signals = reading(parameter(5, 5), place="P05.05", note="Its bits are not described.")
     closed_loop_setpoint = reading(parameter(5, 6), step=None, place="P05.06")
     closed_loop_feedback = reading(parameter(5, 7), step=None, place="P05.07")
     heatsink_temperature = reading(
-        parameter(5, 8), "°C", step=None, place="P05.08", note="Of the power module."
+        parameter(5, 8), "°C", step=None, place="P05.08", note=f"Of the power module. {UNIT_INFERRED}"
     )
-    synchronous_speed = reading(parameter(5, 9), "rpm", step=None, place="P05.09")
-    motor_speed = reading(parameter(5, 10), "rpm", step=None, place="P05.10")
+    synchronous_speed = reading(parameter(5, 9), "rpm", step=None, place="P05.09", note=UNIT_INFERRED)
+    motor_speed = reading(parameter(5, 10), "rpm", step=None, place="P05.10", note=UNIT_INFERRED)
     counter = reading(parameter(5, 11), place="P05.11")
     length = reading(parameter(5, 12), step=None, place="P05.12")
     set_length = reading(parameter(5, 13), step=None, place="P05.13")

@@ -128,6 +128,8 @@ class ErmanERG220(Drive):
 
     formats = dict.fromkeys(Drive.framings, ("8N1",))
     baudrates = (38400,)
+    line_terminals = "485A and 485B"
+    most_devices = 31  # section 1
     remote = "b.001 must be 2 and b.002 5 (RS-485)"
     line_parameters = (
         "b.010 address (1 from the factory), set while the motor stands, in effect when the mains come back; "
@@ -141,8 +143,8 @@ class ErmanERG220(Drive):
     exceptions = {
         1: "unknown command",
         2: "bad register address",
-        3: "bad addresses on read",
-        4: "bad addresses on write",
+        3: 'bad addresses (printed as "on read", and as the answer to writes too)',
+        4: 'bad addresses (printed as "on write")',
     }
     options = {
         "acknowledged_fault": Option(

@@ -130,6 +130,7 @@ class InnovertIBD(Drive):
     framings = (Framing.RTU, Framing.ASCII)
     formats = dict.fromkeys(framings, ("8N1", "8E1", "8O1"))
     baudrates = (9600, 4800, 19200, 38400)
+    line_terminals = "RS+ and RS-"
     addresses = range(1, 241)
     answers_every_read = True
     silence = 10e-3  # before and after an RTU frame (table "message in RTU mode")

@@ -196,6 +196,8 @@ class YD1000(Drive):
 
     formats = dict.fromkeys(Drive.framings, ("8E1", "8N1", "8O1"))  # F801
     baudrates = (9600, 4800, 2400, 1200)  # F800
+    line_terminals = "A and B"
+    most_devices = 63  # section 1
     addresses = range(1, 64)
     silence_characters = 24  # section 4.3
     response_delay_characters = 24

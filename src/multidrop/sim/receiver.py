@@ -1,6 +1,7 @@
 """Cut received bytes into requests, as a drive does: bytes and times in, frames out.
 
-Garbage costs the frames that it damages and no others, and buffers are bounded.
+Garbage costs the frames that it damages and no others, and buffers are bounded. An RTU frame ends by silence:
+a request that other bytes follow at once, which begin no request, is damaged too.
 """
 
 from __future__ import annotations
@@ -78,6 +79,8 @@ class Receiver:
         self._buffer.clear()
         if self.framing is not Framing.RTU or not LEAST_RTU <= len(rest) <= MOST_RTU:
             return []
+        if _first_request(rest) is not None:  # with more behind it
+            return []
         intact = crc16(rest[:-2], len(rest) - 2) == int.from_bytes(rest[-2:], "little")
         return [self._frame(rest[:-2], None, intact, 0, len(rest))]
 
@@ -90,22 +93,18 @@ class Receiver:
         return Frame(body, message, intact, end - length * self.character, end)
 
     def _cut_rtu(self) -> Frame | None:
-        """Return the next request: the first byte at which a good one begins wins.
-
-        While one may still be incomplete, a later one counts only if it ends with the last byte.
-        """
-        pending = False
+        """Return the next request, unless bytes follow it of which it is not known yet what they are."""
         data = bytes(self._buffer[-MOST_RTU:])
-        for at, code in enumerate(data[1:]):
-            if code not in _REQUESTS:
-                continue
-            used, message = parse_request(Framing.RTU, data[at:])
-            after = len(data) - at - used
-            if message is not None and not (pending and after):
-                frame = self._frame(data[at : at + used - 2], message, True, after, used)
-                self._buffer = bytearray(data[at + used :])
-                return frame
-            pending = pending or used == 0
+        while (found := _first_request(data)) is not None:
+            at, used, message = found
+            rest = data[at + used :]
+            more = parse_request(Framing.RTU, rest)[0] if rest else 1
+            if more > 0:
+                self._buffer = bytearray(rest)
+                return self._frame(data[at : at + used - 2], message, True, len(rest), used)
+            if more == 0:
+                break
+            data = rest
         self._buffer = bytearray(data)
         return None
 
@@ -152,3 +151,19 @@ class Receiver:
         checksum = lrc if self.framing is Framing.ASCII else sum8
         intact = checksum(body, len(body)) == octets[-1]
         return self._frame(body, message if used == len(text) else None, intact, after, len(text))
+
+
+def _first_request(data: bytes) -> tuple[int, int, Message] | None:
+    """Return place, length and content of the first good request.
+
+    While one may still be incomplete, a later one counts only if it ends with the last byte.
+    """
+    pending = False
+    for at, code in enumerate(data[1:]):
+        if code not in _REQUESTS:
+            continue
+        used, message = parse_request(Framing.RTU, data[at:])
+        if message is not None and not (pending and at + used < len(data)):
+            return at, used, message
+        pending = pending or used == 0
+    return None

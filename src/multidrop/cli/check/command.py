@@ -10,7 +10,7 @@ import json
 from collections.abc import Iterator
 from pathlib import Path
 
-from multidrop.cli.check.remarks import Remark, refused, unknown
+from multidrop.cli.check.remarks import Remark, crowded, refused, unknown
 from multidrop.cli.models import facts
 from multidrop.cli.support.arguments import add_json_argument
 from multidrop.cli.support.family_sheet import INDENT, sheet
@@ -79,18 +79,22 @@ def _is_plant(file: Path) -> bool:
 
 def _check_plant(arguments: argparse.Namespace) -> int:
     mistakes: tuple[str, ...] = ()
+    remarks: list[Remark] = []
     try:
         plant = load_plant(arguments.file)
+        remarks += crowded(plant)
     except PlantError as wrong:
         mistakes = wrong.mistakes
     if arguments.json:
-        print_text(json.dumps({"mistakes": mistakes}, indent=2))
+        print_text(json.dumps({"mistakes": mistakes, "remarks": remarks}, indent=2))
     elif mistakes:
         warn("\n".join(mistakes))
     else:
         drives = sum(len(line.drives) for line in plant.lines)
         holds = f"{counted(len(plant.lines), 'line')}, {counted(drives, 'drive')}"
         served = "; `multidrop serve --check` checks its [serve]" if plant.serve else ""
+        for name, sentence in remarks:
+            warn(f"{plant.path}: {name}: {sentence}")
         print_text(f"No mistake found in {plant.path}: {holds}{served}.")
     return 1 if mistakes else 0
 

@@ -11,6 +11,7 @@ from multidrop.drive.family import Drive
 from multidrop.drive.register import Access, Register
 from multidrop.drive.table import Kept
 from multidrop.drive.verbs import MOVING
+from multidrop.plant.model import Plant
 
 Remark = tuple[str, str]  # a register or a key, and the sentence about it
 
@@ -49,6 +50,17 @@ def _unknown_of(drive: Drive, register: Register[Any]) -> Iterator[str]:
         yield "its span: all that fits is written; span = [0, 50]"
     if register.access is not Access.READING and not register.place:
         yield 'its place in the manual, to be compared; place = "table 3"'
+
+
+def crowded(plant: Plant) -> Iterator[Remark]:
+    """Yield each line with more drives than one of their documents allows there."""
+    for line in plant.lines:
+        stated = [polled.drive for polled in line.drives if polled.drive.most_devices]
+        strictest = min(stated, key=lambda drive: drive.most_devices, default=None)
+        if strictest is not None and len(line.drives) > strictest.most_devices:
+            kind, most = strictest.title or type(strictest).__name__, strictest.most_devices
+            has = f"it has {len(line.drives)} drives"
+            yield f"line {line.name}", f"{has}, and the manual of {kind} allows {most} devices: split it"
 
 
 def _some(names: list[str]) -> str:

@@ -70,6 +70,10 @@ def _lines_of(family: type[Drive]) -> Iterator[tuple[str, str]]:
     if gain := gain_of(family):
         yield "reading", f"all readings in {gain} (at {gain.drive.settings})"
     yield "verbs", ", ".join(verbs_of(family)) or "none"
+    if family.line_terminals:
+        yield "terminals", family.line_terminals
+    if family.most_devices:
+        yield "devices", f"at most {family.most_devices} on a line"
     if family.line_parameters:
         yield "line", family.line_parameters
     if family.remote != Drive.remote:
