@@ -71,7 +71,7 @@ def test_the_line_and_its_limits() -> None:
     assert ErmanERG220.most_registers == {HOLDING: 88, INPUT: 17, COIL: 12}
     assert ErmanERG220.readable_gaps == {HOLDING: range(0x59), INPUT: range(0x1000)}
     assert set(ErmanERG220.exceptions) == {1, 2, 3, 4}
-    assert "writes too" in ErmanERG220.exceptions[3]  # 01 86 03 02 61, the printed error of function 06
+    assert "read or write" in ErmanERG220.exceptions[3]  # 01 86 03 02 61, the printed error of function 06
     assert "write" in drive.exception(4)
     assert not ErmanERG220.broadcasts
     for wrong in ({"baudrate": 9600}, {"format": "8E1"}):

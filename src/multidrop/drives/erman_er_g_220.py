@@ -143,8 +143,8 @@ class ErmanERG220(Drive):
     exceptions = {
         1: "unknown command",
         2: "bad register address",
-        3: 'bad addresses (printed as "on read", and as the answer to writes too)',
-        4: 'bad addresses (printed as "on write")',
+        3: "bad addresses on read or write (the table has it for reads, the examples for writes too)",
+        4: "bad addresses on write",
     }
     options = {
         "acknowledged_fault": Option(
