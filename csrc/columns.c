@@ -13,7 +13,7 @@ enum {
 static const uint8_t words_of[FORMAT + 1] = { /* 0: none, or a bit */
     [MD_U16] = 1, [MD_I16] = 1, [MD_U32] = 2, [MD_I32] = 2, [MD_U32_EITHER] = 2,
     [MD_F32] = 2, [MD_BIT] = 0, [MD_I8] = 1, [MD_U64] = 4, [MD_I64] = 4,
-    [MD_F64] = 4, [MD_BCD16] = 1, [MD_BCD32] = 2,
+    [MD_F64] = 4, [MD_BCD16] = 1, [MD_BCD32] = 2, [MD_F16] = 1,
 };
 
 static const double power_of_ten[] = {1e0,  1e1,  1e2,  1e3,  1e4,  1e5,  1e6,  1e7,  1e8,  1e9,  1e10, 1e11,
@@ -51,6 +51,16 @@ static double of_float(uint32_t bits)
     return (double)value;
 }
 
+/* A half float has 5 bits of exponent and 10 of fraction. */
+static double of_half(uint32_t bits)
+{
+    uint32_t sign = (bits & 0x8000) << 16, exponent = bits >> 10 & 0x1F, fraction = bits & 0x3FF;
+    if (exponent == 0) /* subnormal: multiples of 2^-24 */
+        return (sign ? -1.0 : 1.0) * fraction / 16777216;
+    exponent = exponent == 0x1F ? 0xFF : exponent + 127 - 15;
+    return of_float(sign | exponent << 23 | fraction << 13);
+}
+
 static double of_double(uint64_t bits)
 {
     double value;
@@ -80,6 +90,7 @@ static double number_of(uint64_t bits, int format)
     case MD_U32_EITHER: return (double)((bits >> 16 | bits) & 0xFFFF); /* order not stated; one word is 0 */
     case MD_F32: return of_float((uint32_t)bits);
     case MD_F64: return of_double(bits);
+    case MD_F16: return of_half((uint32_t)bits);
     case MD_BCD16:
     case MD_BCD32: return of_decimal(bits);
     default: return (double)bits;

@@ -17,7 +17,7 @@ enum {
 enum md_number_format {
     MD_U16, MD_I16, MD_U32, MD_I32, MD_U32_EITHER, MD_F32, MD_BIT,
     MD_I8, /* the low byte of a word */
-    MD_U64, MD_I64, MD_F64, MD_BCD16, MD_BCD32,
+    MD_U64, MD_I64, MD_F64, MD_BCD16, MD_BCD32, MD_F16,
     MD_LOW_WORD_FIRST = 0x40, /* added to a format of several words */
     MD_LOW_BYTE_FIRST = 0x80  /* added to any but MD_BIT: within each word */
 };

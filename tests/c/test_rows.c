@@ -20,6 +20,7 @@ static const struct {
     {"signed, low word first", {0xFF, 0xFE, 0xFF, 0xFF}, 4, 0, MD_I32 | MD_LOW_WORD_FIRST, -2},
     {"either word", {0x00, 0x00, 0x00, 0x02}, 4, 0, MD_U32_EITHER, 2},
     {"the other word", {0x00, 0x02, 0x00, 0x00}, 4, 0, MD_U32_EITHER, 2},
+    {"half float", {0x52, 0x40}, 2, 0, MD_F16, 50},
     {"float", {0x42, 0x48, 0x00, 0x00}, 4, 0, MD_F32, 50},
     {"float, low word first", {0x00, 0x00, 0x42, 0x48}, 4, 0, MD_F32 | MD_LOW_WORD_FIRST, 50},
     {"float, low byte first", {0x48, 0x42, 0x00, 0x00}, 4, 0, MD_F32 | MD_LOW_BYTE_FIRST, 50},

@@ -58,6 +58,11 @@ NUMBERS = [
     (NumberFormat.I64, "FF FF FF FF FF FF FF FE", -2),
     (NumberFormat.I64 | LOW_WORD_FIRST, "FF FE FF FF FF FF FF FF", -2),
     (NumberFormat.F64, "40 48 E0 00 00 00 00 00", 49.75),
+    (NumberFormat.F16, "52 38", 49.75),
+    (NumberFormat.F16 | LOW_BYTE_FIRST, "38 52", 49.75),
+    (NumberFormat.F16, "83 FF", -1023 / 2**24),  # subnormal
+    (NumberFormat.F16, "FB FF", -65504),
+    (NumberFormat.F16, "FC 00", -math.inf),
     (NumberFormat.BCD16, "12 34", 1234),
     (NumberFormat.BCD32, "98 76 54 32", 98765432),
     (NumberFormat.BIT, "01", 1),

@@ -39,11 +39,12 @@ PACKED = {
     NumberFormat.I32: ">i",
     NumberFormat.U64: ">Q",
     NumberFormat.I64: ">q",
+    NumberFormat.F16: ">e",
     NumberFormat.F32: ">f",
     NumberFormat.F64: ">d",
 }
 DIGITS = {NumberFormat.BCD16: 4, NumberFormat.BCD32: 8}
-FLOATS = (NumberFormat.F32, NumberFormat.F64)
+FLOATS = (NumberFormat.F16, NumberFormat.F32, NumberFormat.F64)
 WRITTEN = [*PACKED, *DIGITS]
 SPELT = {  # the letters of the bytes on the wire, A the most significant
     2: {"ABCD": "AB", "CDAB": "AB", "BADC": "BA", "DCBA": "BA", "AB": "AB", "BA": "BA"},
@@ -77,8 +78,9 @@ def counts(number_format: NumberFormat) -> st.SearchStrategy[Any]:
     """Return the raw counts of a format, the ends more often."""
     if number_format is NumberFormat.F64:
         return st.floats(allow_nan=False, allow_infinity=False)
-    if number_format is NumberFormat.F32:
-        return st.floats(width=32, allow_nan=False, allow_infinity=False)
+    if number_format in (NumberFormat.F16, NumberFormat.F32):
+        width = 32 if number_format is NumberFormat.F32 else 16
+        return st.floats(width=width, allow_nan=False, allow_infinity=False)
     if number_format in DIGITS:
         return st.integers(0, 10 ** DIGITS[number_format] - 1)
     if number_format is NumberFormat.I8:
@@ -313,6 +315,9 @@ def test_an_invalid_count_is_no_value_and_its_neighbour_is_one(
         (NumberFormat.U64, None, -1, "FF FF FF FF FF FF FF FF"),
         (NumberFormat.I64, None, 0x8000000000000000, "80 00 00 00 00 00 00 00"),
         (NumberFormat.I8, None, 0x80, "12 80"),
+        (NumberFormat.F16, None, (), "7E 00"),
+        (NumberFormat.F16, None, math.inf, "7C 00"),
+        (NumberFormat.F16, None, 0, "80 00"),
         (NumberFormat.F32, None, (), "7F C0 00 00"),  # NaN
         (NumberFormat.F32, None, (), "FF A0 00 01"),  # and another
         (NumberFormat.F64, None, (), "7F F8 00 00 00 00 00 00"),

@@ -31,6 +31,7 @@ PACKED = {  # what a document calls them
     NumberFormat.I16: ">h",
     NumberFormat.U32: ">I",
     NumberFormat.I32: ">i",
+    NumberFormat.F16: ">e",
     NumberFormat.F32: ">f",
 }
 
@@ -53,6 +54,7 @@ class Meter(Drive):
     downwards = setting(20, "V", step=-0.1, kept=Kept.RAM)
     alone = setting(22, "V", table=SEVERAL, kept=Kept.RAM)
     lamp = setting(3, table=RELAYS)
+    f16 = setting(32, "V", number_format=NumberFormat.F16, kept=Kept.RAM)
     total = reading(24, "kWh", number_format=NumberFormat.U32)
     status = reading(30)
     control = command(30, span=(0, 7), moves=False)
@@ -68,7 +70,8 @@ formats = pytest.mark.parametrize("register", FORMATS, ids=lambda each: each.nam
 def numbers(register: Register[Any]) -> st.SearchStrategy[float]:
     """Return the numbers that it can hold."""
     if register.is_float:
-        return st.floats(width=32, allow_nan=False, allow_infinity=False)
+        width = 16 if register.number_format is NumberFormat.F16 else 32
+        return st.floats(width=width, allow_nan=False, allow_infinity=False)
     low, high = {"H": (0, 0xFFFF), "h": (-0x8000, 0x7FFF), "I": (0, 0xFFFFFFFF), "i": (-(2**31), 2**31 - 1)}[
         PACKED[register.number_format][1]
     ]
@@ -153,6 +156,17 @@ def test_floats_read_well(value: float, text: str) -> None:
     assert Meter.f32.format(value) == text
     if math.isfinite(value):
         assert Meter.f32.format(Meter.f32.decode(Meter.f32.encode(value))) == text
+
+
+def test_a_half_float_is_shown_as_short_as_it_reads_back(capsys: pytest.CaptureFixture[str]) -> None:
+    assert Meter.f16.format(nearest_value(Meter.f16, 12.1)) == "12.1 V"
+    assert capsys.readouterr().err == ""
+    assert nearest_value(Meter.f16, 2049.0) == 2048
+    assert capsys.readouterr().err == (
+        "multidrop: f16 holds half-precision numbers: 2049.0 is taken as 2048 V\n"
+    )
+    with pytest.raises(ValueError, match=r"f16 = 65520 does not fit: -65504 to 65504 V"):
+        Meter.f16.encode(65520)
 
 
 def test_an_end_of_a_span_that_no_float32_is_can_be_written(attached: Any) -> None:

@@ -14,7 +14,7 @@ static const struct {
     [MD_U16] = {2, 0, 0, 0}, [MD_I16] = {2, 1, 0, 0}, [MD_U32] = {4, 0, 0, 0}, [MD_I32] = {4, 1, 0, 0},
     [MD_U32_EITHER] = {4, 0, 0, 0}, [MD_F32] = {4, 0, 1, 0}, [MD_BIT] = {0, 0, 0, 0}, [MD_I8] = {2, 1, 0, 0},
     [MD_U64] = {8, 0, 0, 0}, [MD_I64] = {8, 1, 0, 0}, [MD_F64] = {8, 0, 1, 0}, [MD_BCD16] = {2, 0, 0, 1},
-    [MD_BCD32] = {4, 0, 0, 1},
+    [MD_BCD32] = {4, 0, 0, 1}, [MD_F16] = {2, 0, 1, 0},
 };
 
 /* What a value is, by the book: byte by byte and digit by digit, in another way than the core's. */
@@ -23,7 +23,7 @@ static double expected(const uint8_t *data, size_t len, size_t at, int wire)
     if (wire == MD_BIT)
         return at < 8 * len ? data[at / 8] / (1 << at % 8) % 2 : (double)NAN;
     int format = wire & 0x3F, swap = wire & MD_LOW_BYTE_FIRST ? 1 : 0;
-    if (wire < 0 || format > MD_BCD32 || format == MD_BIT)
+    if (wire < 0 || format > MD_F16 || format == MD_BIT)
         return (double)NAN;
     size_t bytes = known[format].bytes;
     if (at > len || 2 * at + bytes > len)
@@ -52,6 +52,15 @@ static double expected(const uint8_t *data, size_t len, size_t at, int wire)
         memcpy(&number, &bits, sizeof number);
         return (double)number;
     }
+    if (format == MD_F16) {
+        int exponent = big[0] / 4 % 32, fraction = big[0] % 4 * 256 + big[1];
+        if (exponent == 31 && fraction)
+            return (double)NAN;
+        double size = exponent == 31 ? (double)INFINITY
+                      : exponent    ? ldexp(1024 + fraction, exponent - 25)
+                                    : ldexp(fraction, -24);
+        return big[0] > 127 ? -size : size;
+    }
     if (format == MD_F64) {
         double number;
         memcpy(&number, &value, sizeof number);
@@ -73,7 +82,7 @@ static double expected_with(const uint8_t *data, size_t len, const struct md_fie
     double value = expected(data, len, field->at, field->format);
     uint64_t bits = 0;
     int format = field->format & 0x3F;
-    size_t bytes = format <= MD_BCD32 && format != MD_BIT ? known[format].bytes : 0;
+    size_t bytes = format <= MD_F16 && format != MD_BIT ? known[format].bytes : 0;
     if (field->format == MD_BIT) {
         if (isnan(value))
             return value;

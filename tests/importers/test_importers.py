@@ -126,10 +126,8 @@ def test_telegraf(tmp_path: Path) -> None:
     assert found["firmware"] == {"at": 10, "table": "input", "length": 8}
     assert found["wide"] == {"at": 30, "number_format": "F64", "order": "CDAB"}
     assert found["narrow"] == {"at": 34}
-    assert told(other) == [
-        "skipped: it is marked omit, and was left out",
-        "half: its type FLOAT16 has no number format",
-    ]
+    assert found["half"] == {"at": 3, "table": "input", "number_format": "F16"}
+    assert told(other) == ["skipped: it is marked omit, and was left out"]
     registers = loaded(tmp_path, meter, "relay", "power", "energy")
     assert registers["relay"].table.name == "coil"
     assert (registers["power"].number_format.name, registers["energy"].words) == ("I16", 2)

@@ -33,6 +33,7 @@ BYTES = {
     NumberFormat.I16: 2,
     NumberFormat.BCD16: 2,
     NumberFormat.I8: 2,
+    NumberFormat.F16: 2,
     NumberFormat.U32: 4,
     NumberFormat.I32: 4,
     NumberFormat.U32_EITHER: 4,

@@ -29,13 +29,19 @@ class NumberFormat(IntEnum):
     F64 = lib.MD_F64
     BCD16 = lib.MD_BCD16
     BCD32 = lib.MD_BCD32
+    F16 = lib.MD_F16
 
 
 LOW_WORD_FIRST: int = lib.MD_LOW_WORD_FIRST  # added to a format
 LOW_BYTE_FIRST: int = lib.MD_LOW_BYTE_FIRST  # within each word
 MOST_INVALID: int = lib.MD_MOST_INVALID
 
-_MAY_LACK = frozenset({NumberFormat.F32, NumberFormat.F64, NumberFormat.BCD16, NumberFormat.BCD32})
+_MAY_LACK = frozenset(
+    {
+        *(NumberFormat.F16, NumberFormat.F32, NumberFormat.F64),
+        *(NumberFormat.BCD16, NumberFormat.BCD32),
+    }
+)
 
 
 def raw_value(data: bytes, at: int, number_format: int) -> float:

@@ -124,9 +124,7 @@ class Coding:
         Raises OverflowError beyond the largest float.
         """
         count = self.exact_count(value)
-        if self.number_format is NumberFormat.F32:
-            return nearest(count)
-        return float(count) if self.number_format is NumberFormat.F64 else round(count)
+        return nearest(count, self.number_format) if self.number_format in FLOATS else round(count)
 
     def exact_count(self, value: float) -> Fraction:
         """Return the raw count that the value would need.

@@ -14,6 +14,7 @@ WORDS = {  # of 16 bits
     NumberFormat.I16: 1,
     NumberFormat.I8: 1,
     NumberFormat.BCD16: 1,
+    NumberFormat.F16: 1,
     NumberFormat.U32: 2,
     NumberFormat.I32: 2,
     NumberFormat.U32_EITHER: 2,
@@ -23,7 +24,8 @@ WORDS = {  # of 16 bits
     NumberFormat.I64: 4,
     NumberFormat.F64: 4,
 }
-FLOATS = {NumberFormat.F32: ">f", NumberFormat.F64: ">d"}
+FLOATS = {NumberFormat.F16: ">e", NumberFormat.F32: ">f", NumberFormat.F64: ">d"}
+SHORT_FLOATS = frozenset({NumberFormat.F16, NumberFormat.F32})  # a float64 holds each exactly
 WHOLE = frozenset({NumberFormat.U64, NumberFormat.I64})  # numbers that a float does not hold exactly
 # The bytes as they come on the wire, A the most significant; in a single word only their swap counts.
 ORDERS = {
@@ -38,6 +40,7 @@ MOST_DIGITS = 9  # enough to tell any two float32 apart
 SIGNED = frozenset({NumberFormat.I8, NumberFormat.I16, NumberFormat.I32, NumberFormat.I64})
 DECIMAL = frozenset({NumberFormat.BCD16, NumberFormat.BCD32})
 _LARGEST = {
+    NumberFormat.F16: 65504.0,
     NumberFormat.F32: float.fromhex("0x1.fffffep127"),
     NumberFormat.F64: float.fromhex("0x1.fffffffffffffp1023"),
 }
@@ -106,8 +109,7 @@ def signed(bits: int, count: int) -> int:
 def bits_of(number: float, number_format: NumberFormat) -> int:
     """Return the bits of this number; a whole number loses those that do not fit."""
     if number_format in FLOATS:
-        if number_format is NumberFormat.F32:
-            number = nearest_or_infinite(number)
+        number = nearest_or_infinite(number, number_format)
         return int.from_bytes(struct.pack(FLOATS[number_format], number))
     bits = width(number_format)
     if number_format in DECIMAL:
@@ -115,33 +117,34 @@ def bits_of(number: float, number_format: NumberFormat) -> int:
     return int(number) & ((1 << bits) - 1)
 
 
-# ---- float32 ----
+# ---- floats ----
 
 
-def nearest(value: float | Fraction) -> float:
-    """Return the nearest float32; raises OverflowError beyond the largest."""
-    (found,) = struct.unpack(">f", struct.pack(">f", value))
+def nearest(value: float | Fraction, number_format: NumberFormat) -> float:
+    """Return the nearest float of this format. Raises OverflowError beyond the largest."""
+    code = FLOATS[number_format]
+    (found,) = struct.unpack(code, struct.pack(code, value))
     return float(found)
 
 
-def nearest_or_infinite(value: float) -> float:
-    """Return the nearest float32, or an infinity beyond the largest."""
+def nearest_or_infinite(value: float, number_format: NumberFormat) -> float:
+    """Return the nearest float of this format, or an infinity beyond the largest."""
     try:
-        return nearest(value)
+        return nearest(value, number_format)
     except OverflowError:
         return math.copysign(math.inf, value)
 
 
-def shortest(value: float, scale: Fraction) -> str:
-    """Return the shortest decimal that means the float32 nearest to `value`, in units of `scale`."""
+def shortest(value: float, scale: Fraction, number_format: NumberFormat) -> str:
+    """Return the shortest decimal that means the F16 or F32 nearest to `value`, in units of `scale`."""
     if not math.isfinite(value):
         return str(value)
-    held = nearest_or_infinite(value / scale)
+    held = nearest_or_infinite(value / scale, number_format)
     if math.isfinite(held):
         value = held * scale.numerator / scale.denominator
     for digits in range(1, MOST_DIGITS):
         found = float(f"{value:.{digits}g}")
-        if nearest_or_infinite(found / scale) == held:
+        if nearest_or_infinite(found / scale, number_format) == held:
             break
     else:
         found = float(f"{value:.{MOST_DIGITS}g}")

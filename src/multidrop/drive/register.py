@@ -17,7 +17,7 @@ from typing import Any, Generic, TypeVar, cast
 
 from multidrop.core import NumberFormat
 from multidrop.drive.coding import MOST_POWER, Coding
-from multidrop.drive.number_format import FLOATS, WHOLE, WORDS, bits_of, shortest
+from multidrop.drive.number_format import FLOATS, SHORT_FLOATS, WHOLE, WORDS, bits_of, shortest
 from multidrop.drive.table import HOLDING, Carrier, Kept, Table
 
 T = TypeVar("T", bound=float)
@@ -172,7 +172,7 @@ class Register(Generic[T]):
         return cast(T, self.coding.value_of(raw))
 
     def encode(self, value: T) -> float:
-        """Return the raw count of a value: a whole number, or in a float register the nearest float32.
+        """Return the raw count of a value: a whole number, or in a float register the nearest float.
 
         Raises ValueError outside the span, TypeError for what is no number.
         """
@@ -279,8 +279,8 @@ class Register(Generic[T]):
     def _number(self, value: float) -> str:
         if self.number_format in WHOLE and isinstance(value, int) and not self.decimals:
             return str(value)
-        if self.number_format is NumberFormat.F32 and not self.offset:
-            return shortest(value, self.scale)
+        if self.number_format in SHORT_FLOATS and not self.offset:
+            return shortest(value, self.scale, self.number_format)
         if self.scale_register:
             return f"{value:.12g}"
         return repr(value).removesuffix(".0") if self.is_float else f"{value:.{self.decimals}f}"

@@ -18,7 +18,11 @@ from typing import Any, Protocol
 
 from multidrop import Carrier, NumberFormat, PolledDrive, Register, Table
 
-_FLOATS = {NumberFormat.F32: (">f", ">I"), NumberFormat.F64: (">d", ">Q")}
+_FLOATS = {
+    NumberFormat.F16: (">e", ">H"),
+    NumberFormat.F32: (">f", ">I"),
+    NumberFormat.F64: (">d", ">Q"),
+}
 _OPEN = frozenset({NumberFormat.I8, NumberFormat.U32_EITHER})
 MOST_KNOWN = 8192  # values whose data are remembered: drives of a family share their registers
 _MOST_EXACT = 1 << 53  # beyond it a float64 does not hold every whole number

@@ -10,7 +10,7 @@ from typing import Any
 TABLES = ("holding", "input", "coil", "discrete")
 _SIGNED = {"16": "I16", "32": "I32", "64": "I64"}
 _UNSIGNED = {"16": "U16", "32": "U32", "64": "U64"}
-_FLOATS = {"": "F32", "32": "F32", "64": "F64"}
+_FLOATS = {"": "F32", "16": "F16", "32": "F32", "64": "F64"}
 _KINDS: Mapping[str, Mapping[str, str]] = {
     **dict.fromkeys(("int", "s", "i", "acc_s"), _SIGNED),
     **dict.fromkeys(("uint", "u", "acc", "enum", "bitfield"), _UNSIGNED),

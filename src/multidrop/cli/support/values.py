@@ -10,12 +10,14 @@ from typing import Any, TypeVar
 from unicodedata import combining, east_asian_width
 
 from multidrop.cli.support.output import warn
+from multidrop.core import NumberFormat
 from multidrop.drive.register import Register, unnamed_bits
 
 Row = Sequence[str]
 T = TypeVar("T", bound=float)
 WIDTH = 80  # characters of a line
 LONGEST_NAME = 24  # columns; keeps tables within a terminal
+_PRECISIONS = {NumberFormat.F16: "half", NumberFormat.F32: "single", NumberFormat.F64: "double"}
 
 
 def aligned(rows: Iterable[Row], alignment: str) -> list[str]:
@@ -78,7 +80,7 @@ def nearest_value(register: Register[T], value: T) -> T:
     if nearest != value and not (register.is_float and register.parse(_number(register, nearest)) == value):
         why = f"has steps of {register.step:g} {register.unit}".rstrip()
         if register.is_float:
-            why = "holds single-precision numbers"
+            why = f"holds {_PRECISIONS[register.number_format]}-precision numbers"
         shown = register.format(nearest)
         warn(f"{register.name} {why}: {value!r} is taken as {shown}")
     return nearest
