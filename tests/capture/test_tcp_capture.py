@@ -9,7 +9,8 @@ import pytest
 from lines import PATIENCE, until
 from peers import require_program
 
-from multidrop.capture import Capture, CaptureWriter, Decoding, Tapped
+from multidrop.capture import Capture, CaptureWriter, Decoding, Pairing, SniffedExchange, Tapped
+from multidrop.core import FrameSpan, Framing, Kind, Message
 from multidrop.drives import InnovertIBD
 from multidrop.plant.loader import load_plant
 from multidrop.poller import Poller
@@ -18,6 +19,23 @@ from multidrop.sim import EncodedDrive, Simulator, Wire, proof
 
 FIELDS = ("mbtcp.trans_id", "mbtcp.unit_id", "modbus.func_code", "modbus.reference_num")
 POLLED = ("output_current", "motor_speed")
+
+
+
+def test_unit_id_0_of_modbus_tcp_is_no_broadcast() -> None:
+    request, reply = Message(0, 0x03, 1, 1), Message(0, 0x03, data=b"\0\7")
+    spans = {
+        framing: [
+            FrameSpan(Kind.REQUEST, framing, 1, request, b"?"),
+            FrameSpan(Kind.REPLY, framing, 2, reply, b"!"),
+        ]
+        for framing in (Framing.TCP, Framing.RTU)
+    }
+    (exchange,) = Pairing().pair(spans[Framing.TCP])
+    assert isinstance(exchange, SniffedExchange)
+    assert (exchange.request, exchange.reply, exchange.is_broadcast) == (request, reply, False)
+    serial = list(Pairing().pair(spans[Framing.RTU]))
+    assert [isinstance(each, SniffedExchange) and each.is_broadcast for each in serial] == [True, False]
 
 
 @pytest.fixture

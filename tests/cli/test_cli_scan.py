@@ -21,6 +21,7 @@ from multidrop.drive.timing import Settings
 from multidrop.drives.delixi_modbus import DelixiModbus
 from multidrop.drives.innovert_ibd import InnovertIBD
 from multidrop.drives.invt_che import InvtCHE
+from multidrop.drives.registry import find_model
 from multidrop.plant.loader import load_plant
 from multidrop.scan import Crowd, Finding, Found, Noise, Untried, plant_text
 from multidrop.scan.results import Progress
@@ -124,10 +125,27 @@ def test_a_serial_server_is_asked_at_its_own_baud_rate(run: Run, port: str) -> N
     assert "address 2: innovert-ibd" in out
 
 
+def test_unit_ids_beyond_a_serial_line_s_addresses_are_scanned_on_tcp(run: Run, tmp_path: Path) -> None:
+    model = tmp_path / "meter.toml"
+    model.write_text(
+        '[family]\ntitle = "T"\nmanual = "M"\ncounts_from = 0\naddresses = [0, 255]\n'
+        "[reading]\nlevel = { at = 1 }\n"
+    )
+    meter = find_model(str(model))
+    drives = [simulated(meter(unit, framing=Framing.TCP)) for unit in (0, 255)]
+    with Simulator([Wire(drives, port="tcp://127.0.0.1:0", unpaced=True)]) as line:
+        status, out, _ = run(
+            "scan", line.wires[0].path, "--model", str(model), "--addresses", "0,255", "--quick"
+        )
+    assert status == 0
+    assert all(f"address {unit}: " in out for unit in (0, 255))
+
+
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
-        (("--addresses", "0-5"), "'0-5' is not addresses from 1 to 247"),
+        (("--addresses", "0-5"), "--addresses: 0 is a unit id of Modbus TCP; on /dev/nowhere write 1 to 247"),
+        (("--addresses", "1-256"), "'1-256' is not addresses from 1 to 247 (0 to 255 on a tcp:// port)"),
         (("--addresses", "1-" + "9" * 400), "is not addresses from 1 to 247"),
         (("--addresses", "1-99999999999"), "'1-99999999999' is not addresses from 1 to 247"),
         (("--addresses", "one"), "'one' is not addresses from 1 to 247"),

@@ -127,6 +127,17 @@ def test_what_must_be_written_by_10h(tmp_path: Path) -> None:
     assert [loaded.register(name).table.write for name in "ab"] == [0x10, 0x06]
 
 
+def test_addresses_of_a_file_may_be_unit_ids_of_modbus_tcp(tmp_path: Path) -> None:
+    head = HEAD + "addresses = [0, 255]\n[reading]\nlevel = { at = 1 }\n"
+    loaded = family(tmp_path, head)
+    assert loaded.addresses == range(256)
+    for unit in (0, 248, 255):
+        loaded(unit).take_framing_of("tcp://10.0.0.7")
+        with pytest.raises(ValueError, match=rf"address {unit} is a unit id of Modbus TCP; on /dev/ttyUSB0"):
+            loaded(unit).take_framing_of("/dev/ttyUSB0")
+    assert any("addresses = [0, 256]" in one for one in mistakes(tmp_path, head.replace("255", "256")))
+
+
 # ---- mistakes ----
 
 TWENTY = """\
@@ -164,8 +175,8 @@ TOLD = [
     "twenty.toml: [family]: unknown key 'manuel'; did you mean 'manual'?",
     "twenty.toml: [family]: silence = 'soon' is not a duration from 100 us to 24 h, such as \"50 ms\", "
     '"2 s" or "1 min"',
-    "twenty.toml: [family]: addresses = [1, 300]: not the first and the last address, from 1 to 247; "
-    "write addresses = [1, 247]",
+    "twenty.toml: [family]: addresses = [1, 300]: not the first and the last address, from 1 to 247 "
+    "(0 to 255 on Modbus TCP); write addresses = [1, 247]",
     "twenty.toml: [family]: baudrates = [9600, 'fast']: 'fast' is no baud rate; "
     "write baudrates = [9600, 19200]",
     "twenty.toml: [family]: together: holding = 200 is not 1 to 125 registers in one read",

@@ -11,6 +11,11 @@ _MOST_JUNK = 4096  # bytes in one Junk
 _COUNTED = ("exchanges", "broadcasts", "unanswered", "strays", "unknown_bytes")
 
 
+def _is_broadcast(framing: Framing, request: Message) -> bool:
+    """Return True for address 0, which over Modbus TCP is a unit id like any other."""
+    return request.address == 0 and framing is not Framing.TCP
+
+
 @dataclass(frozen=True)
 class SniffedExchange:
     """A request and its reply; one of the two is None where it was not sniffed or never came.
@@ -28,7 +33,7 @@ class SniffedExchange:
 
     @property
     def is_broadcast(self) -> bool:
-        return self.request is not None and self.request.address == 0
+        return self.request is not None and _is_broadcast(self.framing, self.request)
 
 
 @dataclass(frozen=True)
@@ -66,7 +71,7 @@ class Pairing:
             if span.kind in (Kind.REPLY, Kind.STRAY):
                 self._counts["strays"] += 1
                 yield _exchange(None, span)
-            elif span.message.address == 0:
+            elif _is_broadcast(span.framing, span.message):
                 self._counts["broadcasts"] += 1
                 yield _exchange(span, None)
             else:

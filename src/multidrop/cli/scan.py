@@ -16,7 +16,9 @@ from multidrop.cli.support.output import print_text
 from multidrop.cli.support.plants import add_line_arguments, add_rs485_argument, line_of, plant_at, rs485_at
 from multidrop.cli.support.values import counted
 from multidrop.core import RS485
+from multidrop.drive.fact_check import UNIT_IDS
 from multidrop.drive.family import Drive
+from multidrop.drive.line_facts import SERIAL_ADDRESSES
 from multidrop.drive.network import speaks_tcp
 from multidrop.drives import MODELS
 from multidrop.drives.registry import find_model
@@ -121,6 +123,11 @@ def _families(models: Sequence[str]) -> dict[str, type[Drive]]:
 
 
 def _planned(arguments: argparse.Namespace, families: Sequence[type[Drive]]) -> list[Sweep]:
+    unknown = [one for one in arguments.addresses if one not in SERIAL_ADDRESSES]
+    if unknown and not speaks_tcp(arguments.port):
+        raise ValueError(
+            f"--addresses: {unknown[0]} is a unit id of Modbus TCP; on {arguments.port} write 1 to 247"
+        )
     fixed = arguments.port.startswith("socket://")
     if fixed and len(arguments.baudrates) != 1:
         raise ValueError(
@@ -259,8 +266,10 @@ def _addresses(text: str) -> list[int]:
             spans.append((int(first), int(last or first)))
     except ValueError:
         spans = []
-    if not spans or not all(1 <= first <= last <= 247 for first, last in spans):
-        raise argparse.ArgumentTypeError(f"{text!r} is not addresses from 1 to 247, such as 1-31 or 1,5,9")
+    if not spans or not all(0 <= first <= last <= UNIT_IDS[-1] for first, last in spans):
+        raise argparse.ArgumentTypeError(
+            f"{text!r} is not addresses from 1 to 247 (0 to 255 on a tcp:// port), such as 1-31 or 1,5,9"
+        )
     return list(dict.fromkeys(address for first, last in spans for address in range(first, last + 1)))
 
 

@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from multidrop.core import Framing
+from multidrop.drive.fact_check import UNIT_IDS
 from multidrop.drive.line_facts import LONGEST_SILENCE
 from multidrop.drive.read_limits import LONGEST_INTERVAL, STANDARD_LIMITS
 from multidrop.drive.table import Table
@@ -80,8 +81,11 @@ def _is_whole(value: Any) -> bool:
 
 
 def _unit_addresses(value: list[Any]) -> range:
-    if len(value) != 2 or not all(map(_is_whole, value)) or not 1 <= value[0] <= value[1] <= 247:
-        raise ValueError("not the first and the last address, from 1 to 247")
+    least, most = UNIT_IDS[0], UNIT_IDS[-1]
+    if len(value) != 2 or not all(map(_is_whole, value)) or not least <= value[0] <= value[1] <= most:
+        raise ValueError(
+            f"not the first and the last address, from 1 to 247 ({least} to {most} on Modbus TCP)"
+        )
     return range(value[0], value[1] + 1)
 
 
