@@ -26,7 +26,7 @@ HELD = [  # as they are
     {"name": "limit", "reg_type": "holding", "address": 30, "format": "float", "byte_order": "little_endian"},
     {"name": "cold", "reg_type": "input", "address": 40, "format": "s16", "error_value": "0x7FFF"},
     {"name": "mode", "reg_type": "input", "address": "50:4:2", "enum": [0, 1], "enum_titles": ["a", "b"]},
-    {"name": "flag", "reg_type": "holding", "address": "50:0", "readonly": True},
+    {"name": "flag", "reg_type": "holding", "address": "50:0:1", "readonly": True},
     {"name": "small", "reg_type": "input", "address": 51, "format": "u8", "sporadic": True},
     {"name": "frost", "reg_type": "input", "address": 52, "format": "s8", "offset": -40},
     {"name": "count", "reg_type": "input", "address": 53, "format": "bcd32", "scale": -1},
@@ -38,7 +38,7 @@ HELD = [  # as they are
 READ_ONLY = [{"name": "bit", "reg_type": "holding", "address": "55:1:1"}]
 LACKING = [
     {"name": "presses", "reg_type": "press_counter", "address": 0},
-    {"name": "odd", "reg_type": "input", "address": 90, "format": "s24"},
+    {"name": "odd", "reg_type": "input", "address": 90, "format": "s48"},
     {"name": "far", "reg_type": "input", "address": 70000},
 ]
 
@@ -107,7 +107,7 @@ def test_what_lacks_is_counted_with_its_reason(bench: Any, tmp_path: Path) -> No
     assert lacking.pop(part) == (1, 1)
     assert lacking == {
         "its register type press_counter has no table": (3, 2),
-        "its format s24 has no number format": (2, 1),
+        "its format s48 has no number format": (2, 1),
         "its address is none from N to N": (2, 1),
     }
 
@@ -115,7 +115,8 @@ def test_what_lacks_is_counted_with_its_reason(bench: Any, tmp_path: Path) -> No
 def test_parameters_devices_within_and_comments_are_read(bench: Any, tmp_path: Path) -> None:
     parameters = {"p": {"title": "p", "address": 5, "condition": "q==1"}}
     within = [{"device_type": "y", "device": {"channels": [HELD[0]], "parameters": [{"address": 6}]}}]
-    text = wb(HELD[:1], parameters=parameters, subdevices=within, setup=[{"address": 1, "value": 2}])
+    used = {"name": "inner", "device_type": "y", "shift": 100}
+    text = wb([HELD[0], used], parameters=parameters, subdevices=within, setup=[{"address": 1, "value": 2}])
     (tmp_path / "a.json").write_text(
         "// http://x\n" + text.replace("}", "} /* so */ // too\n", 1).replace("]", ",\n]", 1)
     )
@@ -125,7 +126,6 @@ def test_parameters_devices_within_and_comments_are_read(bench: Any, tmp_path: P
         "it is written there; what a write does is not known here": 2,
         "condition was not carried over": 1,
         "setup (devices)": 1,
-        "subdevices (devices)": 1,
     }
 
 

@@ -154,7 +154,7 @@ def test_home_assistant(tmp_path: Path) -> None:
     assert told(device) == [
         "Odd: its type custom has no number format",
         "Far_1: its address is none from 0 to 65535",
-        "Many: it cannot be read: ValueError virtual_count = 5000 is not 0 to 1000",
+        "Many: it cannot be read: virtual_count = 5000 is not 0 to 1000",
         "Zone: a climate has no counterpart",
     ]
     text = family_text(device, "x")
@@ -231,7 +231,7 @@ def test_esphome(tmp_path: Path) -> None:
     assert "# gap: shown: not all of its filters were carried over: lambda" in text
     assert "# gap: computed: only its count is read: its lambda is a program" in text
     assert told(device) == [
-        "Raw: its value type RAW has no number format",
+        "Raw: its value_type RAW has no number format",
         "speed: is only written: a command is never imported",
     ]
     assert loaded(tmp_path, device, "level", "part", "running")["part"].part == (4, 11)
@@ -295,11 +295,13 @@ def test_no_more_is_declared_than_a_family_holds(tmp_path: Path, monkeypatch: py
     [
         ("a.csv", "", "is empty"),
         ("a.csv", "x,y\n1,2\n", "no column is called address"),
-        ("a.csv", "name,address\n", "has no register that can be imported"),
-        ("a.json", "[]", "is not laid out as its kind of file is"),
+        ("a.csv", "name,address\n", "has no row with an address"),
+        ("a.json", "[]", "is no wb-mqtt-serial template and no SunSpec model: it is a list"),
+        ("a.json", '{"a": {}}', "has no `device` with channels or parameters (wb-mqtt-serial)"),
         ("a.json", "{", "a.json: "),
         ("a.json", '{"device": {"channels": 5}}', "is not laid out"),
-        ("a.toml", "a = 1", "has no register that can be imported"),
+        ("a.toml", "a = 1", "has no [[inputs.modbus]] (Telegraf): it has a"),
+        ("a.toml", "[[inputs.modbus]]", "[[inputs.modbus]] has no field"),
         ("a.toml", "a = ", "is not TOML"),
         ("a.xls", "a", "its suffix is none of .csv"),
     ],

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections import Counter
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -23,6 +24,7 @@ from multidrop.toml_check import parse_document
 __all__ = ["SUFFIXES", "ImportedDevice", "all_devices", "family_text", "plant_text", "read_devices"]
 
 MOST_BYTES = 5_000_000
+MOST_REASONS = 3  # that a refusal gives
 
 
 def read_devices(path: Path) -> list[ImportedDevice]:
@@ -34,10 +36,26 @@ def read_devices(path: Path) -> list[ImportedDevice]:
     devices = all_devices(path)
     found = [device for device in devices if device.registers or device.texts]
     if not found:
-        lost = [printable(str(lost))[:200] for device in devices for lost in device.lost]
-        reasons = "; ".join(lost[:3])
-        raise ValueError(f"{path} has no register that can be imported{reasons and f': {reasons}'}")
+        lost = sorted((lost for device in devices for lost in device.lost), key=lambda one: not one.is_entry)
+        reasons = "; ".join(printable(str(one))[:200] for one in lost[:MOST_REASONS])
+        more = f"; and {len(lost) - MOST_REASONS} more" if len(lost) > MOST_REASONS else ""
+        raise ValueError(f"{path} has no register that can be imported: {reasons or 'it is empty'}{more}")
+    _tell_apart(found, path.stem)
     return found
+
+
+def _tell_apart(devices: list[ImportedDevice], stem: str) -> None:
+    """Give devices titles by which, with their addresses, each can be chosen."""
+    for device in devices:
+        device.title = device.title or stem
+    addresses = Counter(device.address for device in devices)
+    titles = Counter(device.title for device in devices)
+    given = Counter[str]()
+    for device in devices:
+        spelt = device.title
+        if titles[spelt] > 1 and (addresses[device.address] > 1 or device.address is None):
+            given[spelt] += 1
+            device.title = f"{spelt} {given[spelt]}" if given[spelt] > 1 else spelt
 
 
 def all_devices(path: Path) -> list[ImportedDevice]:

@@ -1,4 +1,7 @@
-"""CSV and TSV tables: ioBroker's, modpoll's and Neuron's layouts, and any with columns of known names."""
+"""CSV and TSV tables: ioBroker's, modpoll's and Neuron's layouts, and any with columns of known names.
+
+A column whose name has several conventions is read by the most frequent one, with a gap that says which.
+"""
 
 from __future__ import annotations
 
@@ -6,40 +9,99 @@ import csv
 import io
 import re
 from collections.abc import Mapping
+from fractions import Fraction
 
 from multidrop.family_file.addresses import Counting
 from multidrop.importers import neuron
 from multidrop.importers.device import ImportedDevice, ImportedRegister, unit_address
 from multidrop.importers.modpoll import read_modpoll
-from multidrop.importers.numbers import number_format, put_number, scaled, words_of
+from multidrop.importers.numbers import format_of_width, number, number_format, put_number, words_of
 
-_ALIASES = {  # of columns, in lower case
-    "name": ("name", "register", "description", "parameter", "tag", "signal"),
-    "at": ("address", "_address", "at", "register address", "addr", "modbus address"),
-    "type": ("type", "data type", "datatype", "dtype", "format"),
+CARRIED = {  # names of columns, in lower case and without _, the most telling first
+    "name": (
+        *("name", "register name", "signal name", "parameter name", "register", "description", "parameter"),
+        *("tag", "signal", "variable", "point", "title"),
+    ),
+    "at": (
+        *("address", "at", "register address", "addr", "modbus address", "start address", "reg address"),
+        *("protocol address", "register number", "reg"),
+    ),
+    "type": (
+        *("type", "data type", "datatype", "dtype", "format", "data format", "value type", "variable type"),
+    ),
     "unit": ("unit", "units"),
-    "step": ("scale", "factor", "step", "multiplier", "gain", "decimal"),
-    "offset": ("offset",),
-    "table": ("table", "register type", "function", "area"),
-    "slave": ("deviceid", "slave", "unit id"),
-    "note": ("note", "comment"),
+    "factor": ("factor", "multiplier", "step", "resolution"),
+    "scale": ("scale", "scaling", "scale factor", "scaling factor", "coefficient", "ratio"),
+    "divisor": ("divisor", "divider"),
+    "gain": ("gain",),
+    "decimal": ("decimal", "decimals", "decimal places", "decimal point", "dp", "precision"),
+    "offset": ("offset", "bias"),
+    "table": ("table", "register type", "reg type", "area", "object type", "register table", "memory area"),
+    "function": ("function", "function code", "fc", "modbus function", "read function", "func"),
+    "slave": ("deviceid", "device id", "slave", "slave id", "unit id", "node id", "station"),
+    "note": ("note", "comment", "notes", "comments", "remark", "remarks"),
     "formula": ("formula",),
-    "is_scale": ("isscale",),
-    "length": ("len", "length", "count"),
-    "access": ("attribute", "access"),
+    "is scale": ("isscale", "is scale"),
+    "length": (
+        *("len", "length", "count", "quantity", "registers", "number of registers", "register count"),
+        *("words", "num registers", "size"),
+    ),
+    "access": (
+        *("attribute", "access", "rw", "r/w", "read/write", "mode", "permission", "access type"),
+        *("access mode", "access right", "access rights"),
+    ),
+    "order": ("order", "byte order", "word order", "endian", "endianness", "endianess", "swap", "byteorder"),
+    "bit": ("bit", "bits", "bit position", "bit number", "bit offset"),
+    "signed": ("signed", "sign"),
 }
-_TYPE = re.compile(r"(u?int(?:16|32|64)|float|double)(be|le|sw|sb)")  # ioBroker's
+IRRELEVANT = frozenset(
+    {
+        *("group", "interval", "role", "room", "poll", "wp", "cw", "no", "no.", "#", "nr", "index", "id"),
+        *("category", "min", "minimum", "max", "maximum", "range", "default", "default value", "value"),
+        *("description", "label", "device class", "state class", "icon", "example", "version", "section"),
+    }
+)
+GAPS = frozenset(
+    {
+        *("values", "enum", "enumeration", "options", "value map", "mapping", "states", "mask", "bitmask"),
+        *("invalid", "invalid value", "nan", "error value", "exponent", "sf", "condition", "length in bytes"),
+        *("bytes", "byte count", "digits", "encoding"),
+    }
+)
+_ORDERED = re.compile(r"(u?int(?:16|32|64)|float|double)(be|le|sw|sb)")  # ioBroker's
 _BYTES = {"uint8be": "0-7", "uint8le": "8-15", "int8be": "0-7", "int8le": "8-15"}
 _TEXT_ORDERS = {"string": "", "stringle": "BA", "string16": "B"}
 _SUFFIXES = {"be": "", "le": "DCBA", "sw": "CDAB", "sb": "BADC"}
-_TABLE_WORDS = {
-    **{"holding": "holding", "input": "input", "coil": "coil", "discrete": "discrete"},
-    **{"3": "holding", "4": "input", "03": "holding", "04": "input", "1": "coil", "2": "discrete"},
+_ORDERS = {
+    **dict.fromkeys(("abcd", "ab", "big", "be"), ""),
+    **{"cdab": "CDAB", "badc": "BADC", "dcba": "DCBA", "ba": "DCBA"},
 }
+_STEP_COLUMNS = ("factor", "scale", "divisor", "gain", "decimal")
+_WHOLE = re.compile(r"(?:(u|unsigned)|signed)?int(?:eger)?(\d*)(?:t|bits?)?")
+_BIT_TYPES = frozenset({"bit", "bool", "boolean", "binary", "coil", "flag"})
+_NAMED_TABLES = (  # the first that a cell begins with
+    *(("holding", "holding"), ("hr", "holding"), ("4x", "holding")),
+    *(("discrete", "discrete"), ("input status", "discrete"), ("input contact", "discrete")),
+    *(("input coil", "discrete"), ("di", "discrete"), ("1x", "discrete"), ("contact", "discrete")),
+    *(("input", "input"), ("ir", "input"), ("3x", "input")),
+    *(("coil", "coil"), ("do", "coil"), ("0x", "coil"), ("output coil", "coil")),
+)
+_FUNCTIONS = {1: "coil", 2: "discrete", 3: "holding", 4: "input"}
+_WRITES = {5: "coil", 6: "holding", 15: "coil", 16: "holding"}
+_REFERENCE = re.compile(r"[0134]\d{4,5}")  # 40001 or 400001: a table's digit, and a number from 1
+_ACCESS = {  # is it read, is it written
+    **dict.fromkeys(("r", "ro", "read", "readonly", "rd"), (True, False)),
+    **dict.fromkeys(("w", "wo", "write", "writeonly", "wr"), (False, True)),
+    **dict.fromkeys(("rw", "readwrite", "writeread", "rwro", "readandwrite", "readwritable"), (True, True)),
+}
+_SIGNED = {"signed": True, "yes": True, "y": True, "true": True, "s": True}
+_SIGNED |= {"unsigned": False, "no": False, "n": False, "false": False, "u": False}
+
+Cells = Mapping[str, str]
 
 
 def read_table(text: str, stem: str) -> list[ImportedDevice]:
-    """Return the devices of a table. Raises ValueError where no column is an address."""
+    """Return the devices of a table. Raises ValueError if no column is an address, or if it has no row."""
     if "\0" in text:
         raise ValueError("has zero bytes; save it as CSV UTF-8")
     lines = [line for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
@@ -55,65 +117,200 @@ def read_table(text: str, stem: str) -> list[ImportedDevice]:
     return _columns(rows, stem)
 
 
+# ---- columns ----
+
+
 def _columns(rows: list[list[str]], stem: str) -> list[ImportedDevice]:
-    header = [cell.strip().lower() for cell in rows[0]]
-    at = {
-        key: next((header.index(alias) for alias in aliases if alias in header), None)
-        for key, aliases in _ALIASES.items()
-    }
-    if at["at"] is None:
-        raise ValueError("no column is called address; the first line names the columns")
+    header = [_plain_name(cell) for cell in rows[0]]
+    at = _places([name for name, _ in header])
+    if "at" not in at:
+        shown = ", ".join(cell.strip()[:20] for cell in rows[0][:8])
+        raise ValueError(f"no column is called address; the first line names the columns, and it is {shown}")
+    is_hex = header[at["at"]][1] == "hex"
+    others = {place: name for place, (name, _) in enumerate(header) if name and place not in at.values()}
     devices: dict[int | None, ImportedDevice] = {}
-    whole = ImportedDevice(stem)  # counts the entries
+    table = ImportedDevice(stem)  # counts the entries
+    unknown: set[str] = set()
     for row in rows[1:]:
-        cells = {
-            key: row[place].strip() for key, place in at.items() if place is not None and place < len(row)
-        }
-        if cells.get("at"):
-            with whole.entry(cells.get("name", "")):
-                _row(devices, cells, stem)
-    return [*devices.values(), *([whole] if whole.lost else [])]
+        cells = {key: row[place].strip() for key, place in at.items() if place < len(row)}
+        further = {name: row[place].strip() for place, name in others.items() if place < len(row)}
+        if not cells.get("at"):
+            if cells.get("name"):
+                table.lose(cells["name"], "its row has no address")
+            continue
+        if is_hex and re.fullmatch(r"[0-9a-fA-F]{1,8}", cells["at"]):
+            cells["at"] = f"0x{cells['at']}"
+        unknown |= {name for name, cell in further.items() if cell and _is_unknown(name)}
+        with table.entry(cells.get("name", "")):
+            _row(devices, cells, [name for name, cell in further.items() if cell and name in GAPS], stem)
+    if not devices and not table.lost:
+        raise ValueError("has no row with an address, below the line that names the columns")
+    first = next(iter(devices.values()), table)
+    for name in sorted(unknown)[:20]:
+        first.lose(f"the column {name[:40]}", "is not known here, and was not carried over", is_entry=False)
+    return [*devices.values(), *([table] if table.lost else [])]
 
 
-def _row(devices: dict[int | None, ImportedDevice], cells: Mapping[str, str], stem: str) -> None:
+def _plain_name(cell: str) -> tuple[str, str]:
+    """Return a column's name, and what its brackets say: `Address (hex)` is the address in hex."""
+    name = re.sub(r"[_\s]+", " ", cell).strip().lower()
+    match = re.fullmatch(r"([^(\[]*[^(\[ ])\s*[(\[]([^)\]]*)[)\]].*", name)
+    return (match[1], match[2].strip()) if match else (name, "")
+
+
+def _places(header: list[str]) -> dict[str, int]:
+    """Return the places of the columns that are carried, by key; one that two keys name is the first's."""
+    found: dict[str, int] = {}
+    for key, aliases in CARRIED.items():
+        for alias in aliases:
+            if alias in header and header.index(alias) not in found.values():
+                found[key] = header.index(alias)
+                break
+    if "at" not in found and "register" in header:
+        found["at"] = header.index("register")
+        found = {key: place for key, place in found.items() if key == "at" or place != found["at"]}
+    return found
+
+
+def _is_unknown(name: str) -> bool:
+    """Return True for a column that may change a value and that no importer knows."""
+    spare = {alias for key in ("name", "note", "at") for alias in CARRIED[key]}
+    return name not in IRRELEVANT | GAPS | spare
+
+
+# ---- rows ----
+
+
+def _row(devices: dict[int | None, ImportedDevice], cells: Cells, gaps: list[str], stem: str) -> None:
     tag = neuron.parse_tag(cells["at"])
-    slave = unit_address(tag.slave if tag else cells.get("slave"))
+    slave = unit_address(tag.slave if tag else cells.get("slave") or None)
     device = devices.setdefault(slave, ImportedDevice(stem, slave))
-    given = tag.address if tag else cells["at"]
-    name = cells.get("name") or f"register_{given}"
+    name = cells.get("name") or f"register_{tag.address if tag else cells['at']}"
     with device.entry(name):
-        stated = _TABLE_WORDS.get(cells.get("table", "").lower().split(" ")[0].split("_")[0])
-        counting = Counting(None)
-        address, table = counting.address_in_cell(given, None, stated or "holding")
-        register = ImportedRegister(name, address, table)
-        if counting.assumed:
-            register.gaps.append("whether its address counts from 0 or 1; 0 was assumed")
-            if stated is None:
-                register.gaps.append("its table; holding was assumed")
+        register = _placed(name, cells, tag)
+        register.gaps += [f"the column {each} was not carried over" for each in gaps]
         _fill(device, register, cells, tag)
 
 
-def _fill(
-    device: ImportedDevice, register: ImportedRegister, cells: Mapping[str, str], tag: neuron.Tag | None
-) -> None:
+def _placed(name: str, cells: Cells, tag: neuron.Tag | None) -> ImportedRegister:
+    """Return the register at its address, with the gaps of its table and its numbering."""
+    register = ImportedRegister(name, 0)
+    stated = _table(register, cells)
+    given = tag.address if tag else cells["at"]
+    counting = Counting(None)
+    if _REFERENCE.fullmatch(given) and not tag:
+        address, table = _referred(register, given, stated, cells)
+    else:
+        address, table = counting.address_in_cell(given, None, stated or "holding")
+    register.address, register.table = address, table
+    if counting.assumed:
+        _assume_number(register, stated)
+    return register
+
+
+def _assume_number(register: ImportedRegister, stated: str | None) -> None:
+    register.gaps.append("whether its address counts from 0 or 1; 0 was assumed")
+    if stated is None:
+        register.gaps.append("its table; holding was assumed")
+
+
+def _referred(register: ImportedRegister, given: str, stated: str | None, cells: Cells) -> tuple[int, str]:
+    """Return the address and table of 40001's kind, or of the number itself if other cells contradict it."""
+    address, table = Counting(None).address_in_cell(given, None, "holding")
+    is_bit = table in ("coil", "discrete")
+    if (stated not in (None, table)) or (is_bit and stated is None and _is_number(cells)):
+        if is_bit and stated is None:
+            register.gaps.append(f"{given} names a {table}, and its row a number: {int(given)} was assumed")
+        _assume_number(register, stated)
+        return int(given), stated or "holding"
+    if int(given) <= 0xFFFF:
+        register.gaps.append(
+            f"{given} may be the number that is sent, or register {int(given[1:])} of table {given[0]}; "
+            "the latter was assumed"
+        )
+    return address, table
+
+
+def _is_number(cells: Cells) -> bool:
+    """Return True if a row describes a number, and no bit."""
+    kind = cells.get("type", "").lower()
+    if kind:
+        return kind not in _BIT_TYPES
+    return bool(cells.get("unit") or _steps(cells))
+
+
+def _steps(cells: Cells) -> list[tuple[str, str]]:
+    """Return the cells that state what one count is, by their columns, as far as they say something."""
+    stated = [(key, cells.get(key, "")) for key in _STEP_COLUMNS]
+    return [(key, cell) for key, cell in stated if cell and (cell != "1" or key == "decimal")]
+
+
+def _table(register: ImportedRegister, cells: Cells) -> str | None:
+    """Return the table that a row states. What has two meanings, or none that is known, is a gap."""
+    if function := cells.get("function"):
+        codes = {int(code, 0) for code in re.findall(r"0x[0-9a-f]{1,4}|(?!0\d)\d{1,5}", function.lower())}
+        tables = {(_FUNCTIONS | _WRITES).get(code) for code in codes}
+        if len(tables) == 1 and None not in tables:
+            register.is_read = bool(codes - _WRITES.keys())
+            register.note_write(is_written=bool(codes & _WRITES.keys()))
+            return tables.pop()
+        if named := _named_table(function):
+            return named
+        register.gaps.append(f"its function {function[:40]!r} names no table")
+    given = cells.get("table", "")
+    if not given:
+        return None
+    if named := _named_table(given):
+        return named
+    if re.fullmatch(r"0?[1-4]|[0]", given):
+        code = int(given)
+        if code in _FUNCTIONS:
+            meant = f"{given} was taken for function {code:02}, {_FUNCTIONS[code]}"
+            register.gaps.append(f"its table: {meant}; it may be the digit of a table, 0, 1, 3 or 4")
+            return _FUNCTIONS[code]
+    register.gaps.append(f"its table {given[:40]!r} is not known")
+    return None
+
+
+def _named_table(given: str) -> str | None:
+    words = re.sub(r"[\s_-]+", " ", given.strip().lower())
+    return next((table for beginning, table in _NAMED_TABLES if words.startswith(beginning)), None)
+
+
+def _fill(device: ImportedDevice, register: ImportedRegister, cells: Cells, tag: neuron.Tag | None) -> None:
     """Add the register, a text or a number, as its cells say."""
-    kind = (cells.get("type") or "uint16").lower()
+    kind = cells.get("type", "").lower()
     if note := cells.get("note"):
         register.details["note"] = note
     if cells.get("formula"):
         register.lacks = "its formula is a program"
-    elif cells.get("is_scale", "").lower() == "true":
+    elif cells.get("is scale", "").lower() == "true":
         register.gaps.append("it scales other registers, which are not named: `scale_register`")
-    if "write" in cells.get("access", "").lower():
-        register.note_write()
+    _access(register, cells.get("access", ""))
     if tag and kind == "string":
         neuron.add_text(device, register, tag)
-    elif kind.startswith("string"):
+    elif kind.startswith(("string", "str", "ascii", "char", "text")):
         _text(device, register, cells.get("length", ""), kind)
     elif register.table in ("coil", "discrete"):
+        if _is_number(cells):
+            register.gaps.append(f"its type, unit and scale were left out: a {register.table} is a bit")
         device.add(register)
     else:
-        _number(device, register, kind, cells, tag)
+        _number(device, register, cells, tag)
+
+
+def _access(register: ImportedRegister, given: str) -> None:
+    """Note whether it is read and written; a word that is not known is a gap."""
+    words = re.sub(r"subscribe|static|only|[^a-z]", "", given.lower())
+    if not given:
+        return
+    if words not in _ACCESS:
+        register.gaps.append(f"its access {given[:40]!r} is not known; it is read here")
+        return
+    is_read, is_written = _ACCESS[words]
+    register.is_read = is_read
+    if is_written and not register.is_written:
+        register.note_write()
 
 
 def _text(device: ImportedDevice, register: ImportedRegister, length: str, kind: str) -> None:
@@ -130,37 +327,134 @@ def _text(device: ImportedDevice, register: ImportedRegister, length: str, kind:
     device.add(register, is_text=True)
 
 
-def _number(
-    device: ImportedDevice,
-    register: ImportedRegister,
-    kind: str,
-    cells: Mapping[str, str],
-    tag: neuron.Tag | None,
-) -> None:
+# ---- numbers ----
+
+
+def _number(device: ImportedDevice, register: ImportedRegister, cells: Cells, tag: neuron.Tag | None) -> None:
+    kind = re.sub(r"[\s_-]+", "", cells.get("type", "").lower())
     order: str | None = None
-    if (tag and tag.part) or kind in ("bit", "bool"):
-        kind, register.details["part"] = "uint16", (tag.part if tag else "") or "0"
+    if part := _part(register, kind, cells, tag):
+        register.details["part"], kind = part, "uint16"
     if kind in _BYTES:
         register.details["part"] = _BYTES[kind]
         kind = "int16" if kind.startswith("int") else "uint16"
-    if match := _TYPE.fullmatch(kind):
+    if match := _ORDERED.fullmatch(kind):
         kind, order = match[1], _SUFFIXES[match[2]]
-    found = number_format(kind)
+    found = _format(register, kind, cells)
     if found is None:
-        device.lose(register.name, f"its type {kind[:40]} has no number format")
+        given = cells.get("type") or f"of {cells['length'][:9]} registers"
+        device.lose(register.name, f"its type {given[:40]} has no number format")
         return
     if tag:
         order = neuron.order_of(register, tag, found)
     elif order is None and words_of(found) > 1:
-        register.gaps.append("the order of its words is not stated")
+        order = _order(register, cells.get("order", ""))
+    elif order is None and cells.get("order") and _ORDERS.get(cells["order"].lower()) != "":
+        register.gaps.append(f"the order of its bytes {cells['order'][:40]!r} was not carried over")
     put_number(register.details, found, order or "")
     if unit := cells.get("unit"):
         register.details["unit"] = unit
-    step, offset = cells.get("step", ""), cells.get("offset", "")
-    try:
-        scaled(register.details, step, offset)
-    except ValueError:
-        register.lacks = f"its scale {step[:40]!r} or offset {offset[:40]!r} is no number"
-    if "," in step + offset and not register.lacks:
-        register.gaps.append(f"the comma of {step or offset} was taken for a decimal point")
+    _scale(register, cells, is_neuron=tag is not None)
     device.add(register)
+
+
+def _part(register: ImportedRegister, kind: str, cells: Cells, tag: neuron.Tag | None) -> str:
+    """Return the bits of the word that it is; "" for all. A bit that is not stated is a gap."""
+    if tag and tag.part:
+        return tag.part
+    stated = re.fullmatch(r"(\d{1,2})(?:\s*(?:-|\.\.|:|to)\s*(\d{1,2}))?", cells.get("bit", ""))
+    if stated:
+        low, high = sorted((int(stated[1]), int(stated[2] or stated[1])))
+        return str(low) if low == high else f"{low}-{high}"
+    if cells.get("bit"):
+        register.gaps.append(f"its bit {cells['bit'][:40]!r} was not carried over")
+    if kind not in _BIT_TYPES:
+        return ""
+    if not tag:
+        register.gaps.append("which bit of its word it is; bit 0 was assumed")
+    return "0"
+
+
+def _format(register: ImportedRegister, kind: str, cells: Cells) -> str | None:
+    """Return the number format of a row; a type or a width that is not stated is a gap."""
+    length = cells.get("length", "")
+    words = int(length[:6]) if length.isdecimal() else 0
+    signed = _SIGNED.get(cells.get("signed", "").lower())
+    if cells.get("signed") and signed is None:
+        register.gaps.append(f"its sign {cells['signed'][:40]!r} was not carried over")
+    if not kind:
+        assumed = "int" if signed else "uint"
+        what = "type and sign are" if signed is None else "type is"
+        register.gaps.append(f"its {what} not stated; {assumed}{16 * (words or 1)} was assumed")
+        return format_of_width(assumed, words or 1)
+    kind = re.sub(r"^(\d+)bits?(.*)$", r"\2\1", kind)  # 16 bit unsigned
+    if match := _WHOLE.fullmatch(kind):
+        kind = f"{'uint' if match[1] else 'int'}{match[2]}"
+    if found := format_of_width(kind, words or 1):
+        if not words:
+            register.gaps.append(f"the width of its type {kind} is not stated; 16 bits were assumed")
+    else:
+        found = number_format(kind)
+    if found and signed and found.startswith("U"):
+        found = f"I{found[1:]}"
+    if found == "I8":
+        register.gaps.append("which byte of its word it is; the low one was assumed")
+    if found and words and words != words_of(found):
+        takes = words_of(found)
+        register.gaps.append(f"its length {words} is not that of its type, which takes {takes} registers")
+    return found
+
+
+def _order(register: ImportedRegister, given: str) -> str:
+    """Return the order that a cell states; notes a gap if it states none."""
+    word = re.sub(r"[^a-z]|endian|first", "", given.lower())
+    if not given:
+        register.gaps.append("the order of its words is not stated")
+    elif word not in _ORDERS:
+        register.lacks = f"its order of words {given[:40]!r}"
+    return _ORDERS.get(word, "")
+
+
+def _scale(register: ImportedRegister, cells: Cells, *, is_neuron: bool) -> None:
+    """Add step and offset of a row; a column with several conventions is a gap that says which was taken."""
+    found = _steps(cells)
+    key, given = found[0] if found else ("scale", "")
+    offset = cells.get("offset", "")
+    try:
+        step = _step(register, key, given, is_neuron=is_neuron)
+        shift = number(offset, 0)
+    except ValueError:
+        register.lacks = f"its {key} {given[:40]!r} or offset {offset[:40]!r} is no number"
+        return
+    if step not in (0, 1):
+        register.details["step"] = step
+    if shift:
+        register.details["offset"] = shift
+        if not is_neuron and step not in (0, 1) and not cells.get("factor"):
+            register.gaps.append(f"its offset {offset} was taken as added after the step")
+    beside = f"was not carried over beside its {key}"
+    register.gaps += [f"its {other} {text[:40]} {beside}" for other, text in found[1:]]
+    if "," in given + offset:
+        register.gaps.append(f"the comma of {given or offset} was taken for a decimal point")
+
+
+def _step(register: ImportedRegister, key: str, given: str, *, is_neuron: bool) -> float:
+    """Return the value of one count. Raises ValueError for what is no number."""
+    amount = number(given, 1)
+    exact = Fraction(str(amount))
+    if amount == 0 and key != "decimal":
+        return 1
+    if key == "divisor" or (key == "gain" and abs(amount) > 1):
+        if key == "gain":
+            register.gaps.append(f"its gain {given} was taken as a divisor: a step of {float(1 / exact):g}")
+        return float(1 / exact)
+    if key == "decimal" and not is_neuron:
+        if isinstance(amount, int) and 0 <= amount <= 10:
+            step = float(f"1e-{amount}")
+            digits = "was taken as digits after the point"
+            register.gaps.append(f"its decimal {given} {digits}: a step of {step:g}")
+            return step
+        register.gaps.append(f"its decimal {given} was taken as a factor")
+    elif key == "gain" or (key == "scale" and abs(amount) > 1):
+        register.gaps.append(f"its {key} {given} was taken as a factor; in some tables it is a divisor")
+    return amount

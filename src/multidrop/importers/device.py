@@ -7,8 +7,10 @@ from collections import Counter
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from enum import Enum
 from typing import Any
 
+from multidrop.drive.fact_check import UNIT_IDS
 from multidrop.drive.family import TAKEN_NAMES
 from multidrop.family_file.names import OF_ENUMERATIONS, unusable
 from multidrop.importers.line_settings import UNKNOWN_LINE, LineSettings
@@ -18,6 +20,46 @@ ONLY_WRITTEN = "is only written: a command is never imported"
 MOST_ENTRIES = 20_000  # of one file
 _LONGEST_NAME = 50
 _TAKEN = TAKEN_NAMES | {"declared_verbs", "is_jogged"}
+_DECIMAL = re.compile(r"-?[0-9]{1,19}")
+_ANY_BASE = re.compile(r"0[xX][0-9a-fA-F]{1,8}|0|[1-9][0-9]{0,5}")
+
+
+class Treatment(Enum):
+    """What an importer does with a key of its source's schema."""
+
+    CARRIED = "the importer reads it"
+    IRRELEVANT = "it changes no value"
+    GAP = "it may change the value: a gap is marked"
+
+
+KeyTable = Mapping[str, Treatment]
+
+
+def key_table(*, carried: str = "", irrelevant: str = "", gap: str = "") -> KeyTable:
+    """Return the treatment of each of these keys, which are separated by spaces."""
+    return {
+        **dict.fromkeys(carried.split(), Treatment.CARRIED),
+        **dict.fromkeys(irrelevant.split(), Treatment.IRRELEVANT),
+        **dict.fromkeys(gap.split(), Treatment.GAP),
+    }
+
+
+def uncarried(entry: Mapping[Any, Any], table: KeyTable) -> list[str]:
+    """Return a sentence for each key of an entry that may change its value and is not carried over.
+
+    A key that the table does not have may change the value too. Empty and false values say nothing.
+    """
+    known = {
+        Treatment.GAP: "{} was not carried over",
+        None: "{} is not known here, and was not carried over",
+    }
+    found = ((str(key)[:40], table.get(key)) for key, value in entry.items() if not is_empty(value))
+    return [known[treatment].format(key) for key, treatment in found if treatment in known]
+
+
+def is_empty(value: Any) -> bool:
+    """Return True for a value that leaves its key unset; 0 sets it."""
+    return value is None or value is False or value in ("", [], {})
 
 
 @dataclass
@@ -43,6 +85,23 @@ class ImportedRegister:
         self.is_written = is_written
         if is_written:
             self.gaps.append(WRITTEN)
+
+    def put_names(self, key: str, pairs: Mapping[Any, Any]) -> None:
+        """Add names of its values or bits; mark a gap for those that it cannot have.
+
+        Of several names of one number the first stands.
+        """
+        names, found = UniqueNames(OF_ENUMERATIONS), dict[str, int]()
+        for spelt, given in pairs.items():
+            number = int(given) if isinstance(given, str) and _DECIMAL.fullmatch(given) else given
+            if isinstance(number, bool) or not isinstance(number, int) or number in found.values():
+                continue
+            found[names.free(str(spelt))] = number
+        if len(found) < len(pairs):
+            self.gaps.append(f"{len(pairs) - len(found)} of the names of its {key} were not carried over")
+        if found:
+            self.details[key] = found
+            self.details.pop("unit", None)
 
 
 @dataclass(frozen=True)
@@ -100,8 +159,17 @@ class ImportedDevice:
             raise ValueError(f"has more than {MOST_ENTRIES} entries, which no device has")
         try:
             yield
-        except (KeyError, AttributeError, TypeError, ValueError, OverflowError, IndexError) as failure:
-            self.lose(name, f"it cannot be read: {type(failure).__name__} {str(failure)[:100]}")
+        except KeyError as failure:
+            self.lose(name, f"it has no {str(failure.args[0])[:40]}")
+        except (ValueError, OverflowError) as failure:
+            self.lose(name, f"it cannot be read: {str(failure)[:200]}")
+        except (AttributeError, TypeError, IndexError) as failure:
+            self.lose(name, f"it is not laid out as an entry: {type(failure).__name__} {str(failure)[:100]}")
+
+    def lose_keys(self, place: str, given: Mapping[Any, Any], table: KeyTable) -> None:
+        """Note the keys of a device or line that are not carried over."""
+        for sentence in uncarried(given, table):
+            self.lose(place, sentence, is_entry=False)
 
 
 class UniqueNames:
@@ -124,21 +192,10 @@ class UniqueNames:
 
 
 def unit_address(given: Any) -> int | None:
-    """Return a device's address on the line; None where it is none."""
-    if isinstance(given, str) and given.strip().isdecimal():
-        given = int(given.strip()[:6])
-    is_one = isinstance(given, int) and not isinstance(given, bool) and 1 <= given <= 247
-    return given if is_one else None
-
-
-def names_of(pairs: Mapping[str, Any]) -> dict[str, int]:
-    """Return the numbers of named values, or of bits, under names that an enumeration can have.
-
-    Two of one number are one: the first name stands.
-    """
-    names, found = UniqueNames(OF_ENUMERATIONS), dict[str, int]()
-    for spelt, number in pairs.items():
-        if isinstance(number, bool) or not isinstance(number, int) or number in found.values():
-            continue
-        found[names.free(str(spelt))] = number
-    return found
+    """Return a device's unit id, 0 to 255; None if it is not stated. Raises ValueError for no unit id."""
+    if given is None:
+        return None
+    number = int(given.strip(), 0) if isinstance(given, str) and _ANY_BASE.fullmatch(given.strip()) else given
+    if isinstance(number, bool) or not isinstance(number, int) or number not in UNIT_IDS:
+        raise ValueError(f"{str(given)[:40]!r} is no unit id from {UNIT_IDS[0]} to {UNIT_IDS[-1]}")
+    return number

@@ -1,136 +1,332 @@
-"""ESPHome's `modbus_controller`: entities of that platform in a node's YAML (its documentation)."""
+"""ESPHome's `modbus_controller`: entities of that platform in a node's YAML, or in a package of one.
+
+The tables of keys are those of its documentation and of its components' schemas.
+"""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Mapping
+from fractions import Fraction
 from typing import Any
 
-from multidrop.importers.device import ImportedDevice, ImportedRegister, names_of, unit_address
+from multidrop.importers.device import ImportedDevice, ImportedRegister, key_table, uncarried, unit_address
 from multidrop.importers.line_settings import UNKNOWN_LINE, LineSettings, serial_settings
-from multidrop.importers.numbers import put_number, scaled
+from multidrop.importers.numbers import number, put_number, scaled, whole, words_of
+from multidrop.importers.yaml_text import Tag
 
-_KINDS = ("sensor", "binary_sensor", "text_sensor", "switch", "number", "select", "output")
-_WRITTEN = ("switch", "number", "select", "output")
+PLATFORM = "modbus_controller"
 _TABLES = {"coil": "coil", "discrete_input": "discrete", "holding": "holding", "read": "input"}
 _DEFAULT_TABLES = {"output": "holding", "number": "holding", "select": "holding"}
 _FORMATS = {
     **{"U_WORD": "U16", "U_DWORD": "U32", "U_QWORD": "U64", "S_WORD": "I16", "S_DWORD": "I32"},
     **{"S_QWORD": "I64", "FP32": "F32"},
 }
-_LOST = ("skip_updates", "write_lambda", "custom_command", "multiply")
+_ITEM = "platform modbus_controller_id id name address register_type offset byte_offset bitmask lambda"
+_SHOWN = (
+    "internal disabled_by_default icon entity_category device_class web_server web_server_id "
+    "web_server_sorting_weight mqtt_id setup_priority update_interval device_id force_new_range "
+    "response_size "
+    "on_value on_state qos retain discovery availability state_topic command_topic"
+)
+_TIMES = "skip_updates custom_command"  # custom_command has bytes of its own; the entry is lost
+_WRITES = "write_lambda"
+KEYS = {  # by kind of entity
+    "sensor": key_table(
+        carried=f"{_ITEM} value_type unit_of_measurement filters",
+        irrelevant=f"{_SHOWN} register_count accuracy_decimals state_class force_update expire_after "
+        "on_raw_value on_value_range last_reset_type",
+        gap=_TIMES,
+    ),
+    "binary_sensor": key_table(
+        carried=f"{_ITEM} filters",
+        irrelevant=f"{_SHOWN} register_count publish_initial_state trigger_on_initial_state on_press "
+        "on_release on_click on_double_click on_multi_click on_state_change",
+        gap=f"{_TIMES} inverted",
+    ),
+    "text_sensor": key_table(
+        carried=f"{_ITEM} register_count response_size raw_encode filters",
+        irrelevant=f"{_SHOWN} on_raw_value",
+        gap=_TIMES,
+    ),
+    "switch": key_table(
+        carried=f"{_ITEM} use_write_multiple",
+        irrelevant=f"{_SHOWN} register_count restore_mode assumed_state on_turn_on on_turn_off",
+        gap=f"{_TIMES} {_WRITES} inverted",
+    ),
+    "number": key_table(
+        carried=f"{_ITEM} value_type unit_of_measurement multiply use_write_multiple",
+        irrelevant=f"{_SHOWN} register_count min_value max_value step mode on_value_range",
+        gap=f"{_TIMES} {_WRITES}",
+    ),
+    "select": key_table(
+        carried=f"{_ITEM} value_type optionsmap use_write_multiple",
+        irrelevant=f"{_SHOWN} register_count optimistic",
+        gap=f"{_TIMES} {_WRITES}",
+    ),
+    "output": key_table(
+        carried=f"{_ITEM} value_type use_write_multiple",
+        irrelevant=f"{_SHOWN} power_supply min_power max_power zero_means_zero",
+        gap=f"{_TIMES} {_WRITES} multiply inverted",
+    ),
+}
+CONTROLLER_KEYS = key_table(
+    carried="id address modbus_id",
+    irrelevant="update_interval setup_priority allow_duplicate_commands max_cmd_retries on_command_sent "
+    "on_online on_offline offline_skip_updates",
+    gap="command_throttle server_registers server_courtesy_response",
+)
+_WRITTEN = ("switch", "number", "select", "output")
 
 
 def is_esphome(document: Any) -> bool:
-    return isinstance(document, dict) and "modbus_controller" in document
+    """Return True for a document with a controller, or with an entity of its platform."""
+    return any(PLATFORM in part or any(_entries(part)) for part in _parts(document))
 
 
-def read_esphome(document: Mapping[str, Any]) -> list[ImportedDevice]:
-    """Return a device for each controller of a document."""
-    title = str((document.get("esphome") or {}).get("name", ""))
-    listed = document["modbus_controller"]
-    addresses = {
-        str(controller.get("id")): unit_address(controller.get("address"))
-        for controller in (listed if isinstance(listed, list) else [listed])
-    }
-    line = _line(document.get("uart"))
-    only = next(iter(addresses.values())) if len(addresses) == 1 else None
-    found: dict[str, ImportedDevice] = {}
-    for kind, entry in _entries(document):
-        controller = str(entry.get("modbus_controller_id"))
-        address = addresses.get(controller, only)
-        device = found.setdefault(controller, ImportedDevice(title, address, line=line))
-        name = str(entry.get("name") or entry.get("id") or "register")
-        with device.entry(name):
-            _add(device, kind, name, entry)
-    return list(found.values())
+def read_esphome(document: Any) -> list[ImportedDevice]:
+    """Return a device for each address on each bus. Raises ValueError if it has no entity."""
+    parts = [_substituted(part, _substitutions(document), 0) for part in _parts(document)]
+    nodes = [part["esphome"] for part in parts if isinstance(part.get("esphome"), dict)]
+    devices = _Devices(str(nodes[0].get("name") or "") if nodes else "", parts)
+    for part in parts:
+        for kind, entry in _entries(part):
+            devices.add(kind, entry)
+    if not (found := devices.found):
+        raise ValueError(f"`{PLATFORM}:` has no entity: none of {', '.join(KEYS)} has that platform")
+    return found
 
 
-def _line(uart: Any) -> LineSettings:
-    """Return the settings of the node's only UART; where it has several, they are not known."""
-    ports = [uart] if isinstance(uart, dict) else uart
-    if not isinstance(ports, list) or len(ports) != 1 or not isinstance(ports[0], dict):
-        return UNKNOWN_LINE
-    keys = {"baudrate": "baud_rate", "bits": "data_bits", "parity": "parity", "stop": "stop_bits"}
-    return serial_settings({key: ports[0][theirs] for key, theirs in keys.items() if theirs in ports[0]})
+def _parts(document: Any) -> Iterator[dict[str, Any]]:
+    """Yield the document and the packages that stand in it; a list is one of entities."""
+    if isinstance(document, list):
+        entities = [each for each in document if isinstance(each, dict) and each.get("platform") == PLATFORM]
+        yield from ({_kind_of(entity): entity} for entity in entities)
+    elif isinstance(document, dict):
+        yield document
+        packages = document.get("packages")
+        for package in packages.values() if isinstance(packages, dict) else packages or ():
+            if isinstance(package, dict):
+                yield package
 
 
-def _entries(document: Mapping[str, Any]) -> Iterator[tuple[str, Mapping[str, Any]]]:
-    for kind in _KINDS:
-        listed = document.get(kind) or []
-        for entry in listed if isinstance(listed, list) else [listed]:
-            if isinstance(entry, dict) and entry.get("platform") == "modbus_controller":
+def _kind_of(entity: Mapping[str, Any]) -> str:
+    """Return the kind of an entity in a bare list: the first whose keys are all of it."""
+    return next((kind for kind, table in KEYS.items() if entity.keys() <= table.keys()), "sensor")
+
+
+def _substitutions(document: Any) -> dict[str, str]:
+    found: dict[str, str] = {}
+    for part in _parts(document):
+        given = part.get("substitutions")
+        for key, value in given.items() if isinstance(given, dict) else ():
+            if isinstance(value, (str, int, float)):
+                found.setdefault(str(key), str(value)[:200])
+    return found
+
+
+def _substituted(value: Any, known: Mapping[str, str], depth: int) -> Any:
+    """Return a value with each ${name} that the document itself substitutes."""
+    if isinstance(value, str) and "$" in value and not isinstance(value, Tag):
+        return re.sub(r"\$(?:\{(\w+)\}|(\w+))", lambda name: known.get(name[1] or name[2], name[0]), value)
+    if depth < 5 and known:
+        if isinstance(value, dict):
+            return {key: _substituted(each, known, depth + 1) for key, each in value.items()}
+        if isinstance(value, list):
+            return [_substituted(each, known, depth + 1) for each in value]
+    return value
+
+
+def _listed(given: Any) -> list[Any]:
+    return given if isinstance(given, list) else [] if given is None else [given]
+
+
+def _entries(part: Mapping[str, Any]) -> Iterator[tuple[str, Mapping[str, Any]]]:
+    for kind in KEYS:
+        for entry in _listed(part.get(kind)):
+            if isinstance(entry, dict) and entry.get("platform") == PLATFORM:
                 yield kind, entry
 
 
+class _Devices:
+    """The devices of a node: controllers of one address on one bus are one."""
+
+    def __init__(self, title: str, parts: list[dict[str, Any]]) -> None:
+        self._title = title
+        self._parts = parts
+        self._by_place: dict[Any, ImportedDevice] = {}
+        self._by_controller: dict[str, ImportedDevice] = {}
+        for part in parts:
+            for controller in _listed(part.get(PLATFORM)):
+                if isinstance(controller, dict):
+                    self._add_controller(controller)
+
+    def _add_controller(self, controller: Mapping[str, Any]) -> None:
+        given, name = controller.get("address", 1), str(controller.get("id"))
+        try:
+            address = None if isinstance(given, Tag) or "$" in str(given) else unit_address(given)
+        except ValueError as mistake:
+            raise ValueError(f"{PLATFORM}: address: {mistake}") from mistake
+        bus = str(controller.get("modbus_id"))
+        place = (bus, name if address is None else address)
+        line = _line(self._parts, bus)
+        device = self._by_place.setdefault(place, ImportedDevice(self._title, address, line=line))
+        label = PLATFORM if name == "None" else f"the controller {name}"
+        device.lose_keys(label, controller, CONTROLLER_KEYS)
+        self._by_controller[name] = device
+
+    @property
+    def found(self) -> list[ImportedDevice]:
+        return [
+            device
+            for device in {id(each): each for each in self._by_controller.values()}.values()
+            if device.registers or device.texts or device.commands or any(one.is_entry for one in device.lost)
+        ]
+
+    def add(self, kind: str, entry: Mapping[str, Any]) -> None:
+        name = str(entry.get("name") or entry.get("id") or "register")
+        device = self._device_of(entry.get("modbus_controller_id"))
+        with device.entry(name):
+            if len(self._by_place) > 1 and "modbus_controller_id" not in entry:
+                raise ValueError("modbus_controller_id is missing, and there are several controllers")
+            _add(device, kind, name, entry)
+
+    def _device_of(self, given: Any) -> ImportedDevice:
+        """Return the device of a controller's id; one that another file declares has no known address."""
+        if given is None and self._by_controller:
+            return next(iter(self._by_controller.values()))
+        return self._by_controller.setdefault(
+            str(given), ImportedDevice(self._title or (str(given) if given else ""))
+        )
+
+
+def _line(parts: list[dict[str, Any]], bus: str) -> LineSettings:
+    """Return the settings of a bus's UART: the one that it names, or the only one."""
+    uarts = [each for part in parts for each in _listed(part.get("uart")) if isinstance(each, dict)]
+    buses = [each for part in parts for each in _listed(part.get("modbus")) if isinstance(each, dict)]
+    named = [each.get("uart_id") for each in buses if len(buses) == 1 or str(each.get("id")) == bus]
+    chosen = [uart for uart in uarts if len(uarts) == 1 or (named and uart.get("id") == named[0])]
+    if len(chosen) != 1:
+        return UNKNOWN_LINE
+    keys = {"baudrate": "baud_rate", "bits": "data_bits", "parity": "parity", "stop": "stop_bits"}
+    return serial_settings({key: chosen[0][theirs] for key, theirs in keys.items() if theirs in chosen[0]})
+
+
+# ---- entities ----
+
+
 def _add(device: ImportedDevice, kind: str, name: str, entry: Mapping[str, Any]) -> None:
-    table = _TABLES.get(str(entry.get("register_type", _DEFAULT_TABLES.get(kind))))
-    if table is None:
-        device.lose(name, "its register type is not known")
+    if "custom_command" in entry:
+        device.lose(name, "it is read by a custom_command, which is no read of registers")
         return
+    given = str(entry.get("register_type", _DEFAULT_TABLES.get(kind)))
+    if given not in _TABLES:
+        device.lose(name, f"its register_type {given[:40]} is not known")
+        return
+    table = _TABLES[given]
     is_words = table in ("holding", "input")
-    address = _whole(entry["address"]) + _whole(entry.get("offset", 0)) // (2 if is_words else 1)
+    offset = whole(entry, "byte_offset" if "byte_offset" in entry else "offset", 0)
+    address = whole(entry, "address") + offset // (2 if is_words else 1)
     register = ImportedRegister(name, address, table, is_read=kind != "output")
     register.note_write(is_written=kind in _WRITTEN)
     if entry.get("use_write_multiple"):
         register.of_writes["write"] = "multiple"
-    register.gaps += [f"{key} was not carried over" for key in _LOST if entry.get(key)]
+    register.gaps += uncarried(entry, KEYS[kind])
     if kind == "text_sensor":
-        _text(device, register, entry)
+        _text(device, register, entry, offset)
         return
-    if unit := entry.get("unit_of_measurement"):
+    if (unit := entry.get("unit_of_measurement")) and (isinstance(unit, Tag) or "${" in str(unit)):
+        register.gaps.append(f"its unit is {unit}")
+    elif unit:
         register.details["unit"] = str(unit)
     if is_words and not _number(device, register, kind, entry):
         return
-    if entry.get("lambda"):
+    if is_words and offset % 2:
+        register.lacks = "its offset is half a register"
+    if "lambda" in entry:
         register.lacks = "its lambda is a program"
-    if entry.get("filters"):
+    if entry.get("filters") is not None:
         _filters(register, entry["filters"])
     device.add(register)
 
 
 def _filters(register: ImportedRegister, filters: Any) -> None:
-    """Make a factor among the filters a step; what the others do is not carried over."""
-    listed = [each for each in filters if isinstance(each, dict)] if isinstance(filters, list) else []
-    factors = [each["multiply"] for each in listed if "multiply" in each]
-    if len(factors) == 1 and register.table in ("holding", "input"):
-        scaled(register.details, factors[0])
-    others = sorted({str(key)[:40] for each in listed for key in each if key != "multiply"})
-    if others or len(factors) > 1 or len(listed) != len(filters):
-        register.gaps.append(f"not all of its filters were carried over: {', '.join(others)}")
+    """Make factors and offsets, in their order, a step and an offset; what others do is not carried over."""
+    step, offset = Fraction(1), Fraction(0)
+    others: list[str] = []
+    for each in _listed(filters):
+        pairs = list(each.items()) if isinstance(each, dict) and each else [(each, None)]
+        key, given = pairs[0]
+        if key in ("multiply", "offset") and not others and register.table in ("holding", "input"):
+            try:
+                amount = Fraction(str(number(_required(given), 0)))
+            except ValueError:
+                others.append(str(key))
+                continue
+            step, offset = (step * amount, offset * amount) if key == "multiply" else (step, offset + amount)
+        else:
+            others.append(str(key)[:40])
+    scaled(register.details, float(step), float(offset))
+    if others:
+        listed = ", ".join(sorted(set(others)))
+        register.gaps.append(f"not all of its filters were carried over: {listed}")
 
 
-def _text(device: ImportedDevice, register: ImportedRegister, entry: Mapping[str, Any]) -> None:
-    if entry.get("raw_encode", "NONE") != "NONE" or entry.get("lambda"):
-        register.gaps.append("raw_encode and lambda were not carried over: the characters are shown")
-    size = _whole(entry.get("response_size", 2 * _whole(entry.get("register_count", 1))))
-    register.details["length"] = (size + 1) // 2
+def _required(given: Any) -> Any:
+    if given is None:
+        raise ValueError("it is empty")
+    return given
+
+
+def _text(device: ImportedDevice, register: ImportedRegister, entry: Mapping[str, Any], offset: int) -> None:
+    if offset % 2:
+        device.lose(register.name, "a text whose offset is half a register")
+        return
+    if str(entry.get("raw_encode", "ANSI")) not in ("NONE", "ANSI"):
+        register.gaps.append("raw_encode was not carried over: the characters are shown")
+    register.gaps += [f"{key} was not carried over" for key in ("lambda", "filters") if key in entry]
+    registers = whole(entry, "register_count", 0)
+    if "response_size" not in entry:
+        register.gaps.append(f"its response_size is not stated; {2 * registers or 2} bytes were assumed")
+    size = whole(entry, "response_size", 2 * registers or 2)
+    register.details["length"] = (min(size, 2 * registers or size) + 1) // 2
     device.add(register, is_text=True)
 
 
 def _number(device: ImportedDevice, register: ImportedRegister, kind: str, entry: Mapping[str, Any]) -> bool:
-    """Give the register its number; False where it is lost."""
-    given = str(entry.get("value_type", "U_WORD"))
+    """Give the register its number; False if it is lost."""
+    is_flag = kind in ("binary_sensor", "switch")  # of one word, whatever else it says
+    given = "U_WORD" if is_flag else str(entry.get("value_type", "U_WORD"))
     found = _FORMATS.get(given.removesuffix("_R"))
     if found is None:
-        device.lose(register.name, f"its value type {given[:40]} has no number format")
+        device.lose(register.name, f"its value_type {given[:40]} has no number format")
         return False
-    put_number(register.details, found, "CDAB" if given.endswith("_R") else "")
-    if _whole(entry.get("offset", 0)) % 2:
-        register.lacks = "its offset is half a register"
-    mask = _whole(entry.get("bitmask", 0xFFFFFFFF))
-    bits = [bit for bit in range(32) if mask >> bit & 1]
-    if mask not in (0xFFFF, 0xFFFFFFFF) and "bitmask" in entry:
-        if not bits or bits[-1] - bits[0] + 1 != len(bits):
-            register.lacks = f"bits that are not side by side: {mask:#x}"
-        else:
-            register.details["part"] = f"{bits[0]}-{bits[-1]}"
-    elif kind in ("binary_sensor", "switch"):
+    every = (1 << 16 * words_of(found)) - 1
+    mask = whole(entry, "bitmask", every) & every
+    if words_of(found) < 4 and mask != every:  # the mask of 64 bits is ignored there
+        found = found.replace("I", "U")  # what is masked has no sign there
+        _part(register, found, mask)
+    elif is_flag:
         register.gaps.append("it is true where its count is not 0")
-    if isinstance(options := entry.get("optionsmap"), dict) and (named := names_of(options)):
-        register.details["values"] = named
-        register.details.pop("unit", None)
+    put_number(register.details, found, "CDAB" if given.endswith("_R") else "")
+    if is_flag and mask.bit_count() > 1 and mask != every:
+        register.gaps.append("it is true where one of its bits is")
+    if entry.get("multiply") is not None:
+        factor = Fraction(str(number(entry["multiply"], 1, "multiply"))) or Fraction(1)
+        scaled(register.details, float(1 / factor))  # what is read is divided there
+    if (options := entry.get("optionsmap")) is not None:
+        if isinstance(options, dict):
+            register.put_names("values", options)
+        else:
+            register.gaps.append("optionsmap was not carried over")
     return True
 
 
-def _whole(given: Any) -> int:
-    return int(given, 0) if isinstance(given, str) else int(given)
+def _part(register: ImportedRegister, found: str, mask: int) -> None:
+    bits = [bit for bit in range(32) if mask >> bit & 1]
+    if found == "F32":
+        register.lacks = f"its bitmask {mask:#x} is of a float"
+    elif not bits or bits[-1] - bits[0] + 1 != len(bits):
+        register.lacks = f"bits that are not side by side: {mask:#x}"
+    else:
+        register.details["part"] = f"{bits[0]}-{bits[-1]}"

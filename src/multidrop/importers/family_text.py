@@ -6,9 +6,11 @@ import json
 from collections.abc import Iterator
 from typing import Any
 
+from multidrop.drive.line_facts import SERIAL_ADDRESSES
 from multidrop.family_file.addresses import sent_as
 from multidrop.family_file.csv_table import MOST_BYTES
 from multidrop.importers.device import ImportedDevice, ImportedRegister
+from multidrop.importers.line_settings import UNKNOWN_HOST
 from multidrop.printable import printable
 
 MOST_LOST = 500  # that the file tells
@@ -36,6 +38,8 @@ def family_text(device: ImportedDevice, source: str) -> str:
         "counts_from = 0  # the addresses below are those that are sent",
         _line_gap(device),
     ]
+    if device.address is not None and device.address not in SERIAL_ADDRESSES:
+        lines.append("addresses = [0, 255]  # unit ids of Modbus TCP")
     if device.together:
         lines.append(f"together = {{ holding = {device.together}, input = {device.together} }}")
     if device.readable:
@@ -74,11 +78,18 @@ def plant_text(device: ImportedDevice, family_file: str) -> str:
         )
     if device.address is None:
         raise ValueError("the file does not say the device's address: no plant file can be made of it")
+    is_serial = device.address in SERIAL_ADDRESSES
+    if not is_serial and device.line.port and not device.line.is_network:
+        raise ValueError(
+            f"the address {device.address} is a unit id of Modbus TCP, and the port {device.line.port} is a "
+            "serial one: no plant file can be made of it"
+        )
+    port = device.line.port or ("/dev/ttyUSB0" if is_serial else f"tcp://{UNKNOWN_HOST}:502")
     return "\n".join(
         [
             "[[line]]",
             'name = "line-1"',
-            f"port = {_value(device.line.port or '/dev/ttyUSB0')}  # gap: the port",
+            f"port = {_value(port)}  # gap: the port",
             "",
             "[[line.drive]]",
             f"name = {_value(f'device-{device.address}')}",

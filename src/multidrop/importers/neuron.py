@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from multidrop.importers.device import ImportedDevice, ImportedRegister
 from multidrop.importers.numbers import words_of
 
-_TAG = re.compile(r"(\d{1,6})!(\d{1,9})(?:[.](\d{1,6})([HLDE]?))?(?:#([A-Z]{1,2}))?")
+_TAG = re.compile(r"([0-9]{1,6})!([0-9]{1,9})(?:[.](\d{1,6})([HLDE]?))?(?:#([A-Z]{1,2}))?")
 _ORDERS = {  # Neuron's Modbus TCP page, #ENDIAN: LL is 1,2,3,4
     **{"L": "", "LL": "", "LB": "BADC", "BL": "CDAB", "BB": "DCBA", "B": "DCBA"},
 }

@@ -4,30 +4,41 @@ from __future__ import annotations
 
 import math
 import re
+import struct
 from collections.abc import Mapping
 from typing import Any
 
 TABLES = ("holding", "input", "coil", "discrete")
-_SIGNED = {"16": "I16", "32": "I32", "64": "I64"}
+_SIGNED = {"8": "I8", "16": "I16", "32": "I32", "64": "I64"}
 _UNSIGNED = {"16": "U16", "32": "U32", "64": "U64"}
 _FLOATS = {"": "F32", "16": "F16", "32": "F32", "64": "F64"}
 _KINDS: Mapping[str, Mapping[str, str]] = {
-    **dict.fromkeys(("int", "s", "i", "acc_s"), _SIGNED),
-    **dict.fromkeys(("uint", "u", "acc", "enum", "bitfield"), _UNSIGNED),
-    "float": _FLOATS,
+    **dict.fromkeys(("int", "s", "i", "sint", "signed", "acc_s"), _SIGNED),
+    **dict.fromkeys(("uint", "u", "unsigned", "acc", "enum", "bitfield", "bitmap"), _UNSIGNED),
+    **dict.fromkeys(("float", "f", "fp", "real"), _FLOATS),
+    "bcd": {"16": "BCD16", "32": "BCD32"},
 }
-_NAMED = {"word": "U16", "dword": "U32", "double": "F64", "float": "F32", "s8": "I8", "int8": "I8"}
-_NAMED |= {"int": "I16", "uint": "U16", "sunssf": "I16", "count": "U16", "pad": "U16", "raw16": "U16"}
-_COUNT = re.compile(r"0[xX][0-9a-fA-F]{1,16}|-?[0-9]{1,20}")
+_NAMED = {"word": "U16", "dword": "U32", "lword": "U64", "double": "F64", "lreal": "F64", "short": "I16"}
+_NAMED |= {"ushort": "U16", "dint": "I32", "udint": "U32", "lint": "I64", "ulint": "U64"}  # IEC 61131
+_NAMED |= {"sunssf": "I16", "count": "U16", "pad": "U16", "raw16": "U16"}
+_ANY_WIDTH = {"int": "I", "signed": "I", "uint": "U", "unsigned": "U", "bcd": "BCD"}
+_ANY_WIDTH |= dict.fromkeys(("enum", "bitfield", "bitmap", "hex"), "U")
+_WHOLE = re.compile(r"0[xX][0-9a-fA-F]{1,16}|-?[0-9]{1,20}")
 
 
 def number_format(kind: str) -> str | None:
-    """Return the number format of a type such as uint16, s32 or float; None where it is not known."""
+    """Return the number format of a type such as uint16, s32 or float; None if it is not known."""
     kind = kind.strip().lower()
     if kind in _NAMED:
         return _NAMED[kind]
     match = re.fullmatch(r"([a-z_]+?)(\d*)", kind)
     return _KINDS.get(match[1], {}).get(match[2]) if match else None
+
+
+def format_of_width(kind: str, words: int) -> str | None:
+    """Return the format that a type without a width has in so many words; None if it has a width."""
+    letter = _ANY_WIDTH.get(kind.strip().lower())
+    return f"{letter}{16 * words}" if letter and words in (1, 2, *((4,) if letter != "BCD" else ())) else None
 
 
 def words_of(number: str) -> int:
@@ -44,33 +55,59 @@ def put_number(details: dict[str, Any], number: str, order: str = "") -> None:
         details["order"] = order
 
 
-def scaled(details: dict[str, Any], step: Any, offset: Any = 0) -> None:
-    """Add step and offset where they say something; a step of 0 says nothing. Raises as `number` does."""
-    found = number(step, 1), number(offset, 0)
+def scaled(
+    details: dict[str, Any], step: Any, offset: Any = 0, keys: tuple[str, str] = ("scale", "offset")
+) -> None:
+    """Add step and offset if they say something; a step of 0 says nothing. Raises as `number` does."""
+    found = number(step, 1, keys[0]), number(offset, 0, keys[1])
     if found[0] not in (0, 1):
         details["step"] = found[0]
     if found[1] != 0:
         details["offset"] = found[1]
 
 
-def number(given: Any, default: float) -> float:
-    """Return a number that may be text; `default` where there is none. Raises ValueError for other text."""
+def number(given: Any, default: float, key: str = "number") -> float:
+    """Return a number that may be text; `default` if it is empty. Raises ValueError for what is none."""
     if given in (None, ""):
         return default
-    text = str(given)
+    text = str(given).strip()
     if re.fullmatch(r"-?\d+,\d+", text):  # a decimal comma
         text = text.replace(",", ".")
-    found = float(text)
+    try:
+        found = float(text)
+    except ValueError:
+        found = math.nan
     if not math.isfinite(found):
-        raise ValueError(f"{str(given)[:40]!r} is no number")
+        raise ValueError(f"{key} = {str(given)[:40]!r} is no number")
     return int(found) if found == int(found) and abs(found) < 1e15 else found
 
 
-def count(given: Any) -> int | str:
-    """Return a raw count: a number, also as text and in hex, or NaN. Raises ValueError for what is none."""
+def whole(entry: Mapping[str, Any], key: str, default: int | None = None) -> int:
+    """Return the whole number of a key, which may be text and hex.
+
+    Raises KeyError if the entry has none and there is no default, ValueError for what is no whole number.
+    """
+    given = entry.get(key)
+    if given is None:
+        if default is None:
+            raise KeyError(key)
+        return default
     text = str(given).strip()
-    if text.lower() == "nan":
-        return "NaN"
-    if not _COUNT.fullmatch(text):
-        raise ValueError(f"{text[:40]!r} is no count")
-    return int(text, 0 if text[:2].lower() == "0x" else 10)
+    if isinstance(given, bool) or not isinstance(given, (int, str)) or not _WHOLE.fullmatch(text):
+        raise ValueError(f"{key} = {str(given)[:40]!r} is no whole number")
+    return int(text, 16) if text[:2].lower() == "0x" else int(text)
+
+
+def count(given: Any, key: str = "count") -> int | str:
+    """Return a raw count: a number, also as text and in hex, or NaN. Raises ValueError for what is none."""
+    return "NaN" if str(given).strip().lower() in ("nan", ".nan") else whole({key: given}, key)
+
+
+def float_of_bits(bits: int, number: str) -> float | str:
+    """Return the float that these bits of a float format mean, or NaN. Raises ValueError for more bits."""
+    code, size = {"F16": (">e", 2), "F32": (">f", 4), "F64": (">d", 8)}[number]
+    try:
+        (found,) = struct.unpack(code, bits.to_bytes(size))
+    except OverflowError:
+        raise ValueError(f"{bits:#x} has more bits than {number}") from None
+    return "NaN" if math.isnan(found) else float(found)

@@ -6,9 +6,18 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-from multidrop.importers.device import ImportedDevice, ImportedRegister, names_of
-from multidrop.importers.numbers import number_format, put_number
+from multidrop.importers.device import ImportedDevice, ImportedRegister, key_table, uncarried
+from multidrop.importers.numbers import number_format, put_number, whole, words_of
 
+POINT_KEYS = key_table(
+    carried="name type size count sf units access symbols label",
+    irrelevant="value mandatory static desc detail notes comments standards",
+)
+GROUP_KEYS = key_table(
+    carried="name label points groups", irrelevant="type count desc detail notes comments standards"
+)
+MODEL_KEYS = key_table(carried="id group", irrelevant="label desc detail notes comments standards")
+MOST_REPEATED = 1000  # of a point
 FIRST = 40000  # assumed: a model's place is not in its file
 # Counts that mean "not implemented" (SunSpec information model specification, data types).
 _INVALID = {
@@ -29,7 +38,7 @@ def is_sunspec(document: Any) -> bool:
 
 
 def read_sunspec(document: Mapping[str, Any]) -> list[ImportedDevice]:
-    """Return the model as a device whose block begins at the address 40000, which is to be mended."""
+    """Return the model as a device whose block begins at the address 40000, which is to be corrected."""
     group = document["group"]
     title = f"SunSpec model {document.get('id', '')} {group.get('label', group.get('name', ''))}".strip()
     device = ImportedDevice(title)
@@ -38,16 +47,29 @@ def read_sunspec(document: Mapping[str, Any]) -> list[ImportedDevice]:
     names: dict[str, str] = {}  # of scale registers, by their points
     address = FIRST
     for point in group["points"]:
-        with device.entry(str(point["name"])):
-            _add(device, point, address, names)
-        address += int(point["size"])
+        size, count = _size(point), whole(point, "count", 1)
+        for at in range(min(count, MOST_REPEATED)):
+            name = f"{point['name']}_{at}" if at else str(point["name"])
+            with device.entry(name):
+                _add(device, point, name, address + at * size, names)
+        address += size * count
     if FIRST < address <= 0x10000:
         device.readable = range(FIRST, address)  # a model is one block without holes
     for register in device.registers:
         _tie(register, names)
+    device.lose_keys("the model", document, MODEL_KEYS)
+    device.lose_keys("the group", group, GROUP_KEYS)
     for repeated in group.get("groups", []):
         _lose_group(device, repeated)
     return [device]
+
+
+def _size(point: Mapping[str, Any]) -> int:
+    """Return a point's registers. Raises ValueError if it has none: the next ones have no place then."""
+    try:
+        return whole(point, "size")
+    except KeyError:
+        raise ValueError(f"the point {str(point.get('name'))[:40]!r} has no size") from None
 
 
 def _lose_group(device: ImportedDevice, group: Mapping[str, Any]) -> None:
@@ -61,11 +83,14 @@ def _lose_group(device: ImportedDevice, group: Mapping[str, Any]) -> None:
         _lose_group(device, inner)
 
 
-def _add(device: ImportedDevice, point: Mapping[str, Any], address: int, names: dict[str, str]) -> None:
-    kind, name = str(point["type"]), str(point["name"])
+def _add(
+    device: ImportedDevice, point: Mapping[str, Any], name: str, address: int, names: dict[str, str]
+) -> None:
+    kind = str(point["type"])
     register = ImportedRegister(name, address)
+    register.gaps += uncarried(point, POINT_KEYS)
     if kind == "string":
-        register.details["length"] = int(point["size"])
+        register.details["length"] = whole(point, "size")
         device.add(register, is_text=True)
         return
     if kind == "pad":
@@ -73,6 +98,9 @@ def _add(device: ImportedDevice, point: Mapping[str, Any], address: int, names: 
     found = number_format(kind)
     if found is None:
         device.lose(name, f"its type {kind} has no number format")
+        return
+    if words_of(found) != whole(point, "size"):
+        device.lose(name, f"its size {point['size']} is not that of {kind}, which takes {words_of(found)}")
         return
     if label := point.get("label"):
         register.details["note"] = str(label)
@@ -85,9 +113,8 @@ def _add(device: ImportedDevice, point: Mapping[str, Any], address: int, names: 
     if point.get("sf"):
         register.details["scale_register"] = point["sf"]
     symbols = {str(symbol["name"]): symbol["value"] for symbol in point.get("symbols") or ()}
-    if named := names_of(symbols):
-        register.details["bits" if kind.startswith("bitfield") else "values"] = named
-        register.details.pop("unit", None)
+    if symbols:
+        register.put_names("bits" if kind.startswith("bitfield") else "values", symbols)
     register.note_write(is_written=point.get("access") == "RW")
     device.add(register)
     if kind == "sunssf":

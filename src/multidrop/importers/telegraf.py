@@ -1,16 +1,19 @@
-"""Telegraf's inputs.modbus in its three styles: register, request and metric (plugin's README)."""
+"""Telegraf's inputs.modbus in its three styles: register, request and metric.
+
+The tables of keys are those of the plugin's README and of its configuration's structures.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from typing import Any
+from typing import Any, NamedTuple
 from urllib.parse import urlsplit
 
-from multidrop.importers.device import ImportedDevice, ImportedRegister, unit_address
+from multidrop.importers.device import ImportedDevice, ImportedRegister, key_table, uncarried, unit_address
 from multidrop.importers.line_settings import LineSettings, network_settings, serial_settings
-from multidrop.importers.numbers import TABLES, number_format, put_number, scaled, words_of
+from multidrop.importers.numbers import TABLES, number_format, put_number, scaled, whole, words_of
 
-_STYLE = {
+_REGISTER_STYLE = {
     "holding_registers": "holding",
     "input_registers": "input",
     "coils": "coil",
@@ -22,19 +25,84 @@ _ORDERS = {  # for any width: the plugin takes ABCD's four for 16 and 64 bits as
     **dict.fromkeys(("CDAB", "GHEFCDAB", "LSW-BE"), "CDAB"),
     **dict.fromkeys(("DCBA", "BA", "HGFEDCBA", "LSW", "LSW-LE"), "DCBA"),
 }
+FIELD_KEYS = {  # by style
+    "register": key_table(carried="name byte_order data_type scale address bit", irrelevant="measurement"),
+    "request": key_table(
+        carried="address name type length scale omit bit", irrelevant="measurement", gap="output"
+    ),
+    "metric": key_table(carried="register address length name type scale bit", gap="output"),
+}
+_PLACE = "slave_id byte_order fields"
+BLOCK_KEYS = {
+    "request": key_table(
+        carried=f"{_PLACE} register",
+        irrelevant="measurement optimization optimization_max_register_fill tags",
+    ),
+    "metric": key_table(carried=_PLACE, irrelevant="measurement tags"),
+}
+WORKAROUND_KEYS = key_table(
+    carried="string_register_location",
+    irrelevant="close_connection_after_gather read_coils_starting_at_zero",
+    gap="pause_after_connect pause_between_requests one_request_per_field max_bit_registers_per_request "
+    "max_word_registers_per_request",
+)
+PLUGIN_KEYS = key_table(
+    carried="name controller transmission_mode baud_rate data_bits parity stop_bits configuration_type "
+    f"slave_id workarounds request metric {' '.join(_REGISTER_STYLE)}",
+    irrelevant="timeout busy_retries busy_retries_wait debug_connection log_level exclude_register_type_tag "
+    "optimization optimization_max_register_fill alias interval precision collection_jitter "
+    "collection_offset name_override name_prefix name_suffix tags namepass namedrop fieldpass fielddrop "
+    "fieldinclude fieldexclude tagpass tagdrop taginclude tagexclude metricpass startup_error_behavior "
+    "always_include_local_tags always_include_global_tags skip_processors_after_aggregators",
+    gap="rs485",
+)
+
+
+class _Field(NamedTuple):
+    """A field of a plugin, and what its place says of it."""
+
+    given: Mapping[str, Any]
+    style: str
+    slave: Any
+    table: Any
+    order: str
+    text_bytes: str
 
 
 def read_telegraf(document: Mapping[str, Any]) -> list[ImportedDevice]:
-    """Return a device for each slave id of each line."""
+    """Return a device for each slave id of each line. Raises ValueError if there is no field."""
+    inputs = document.get("inputs")
+    plugins = inputs.get("modbus") if isinstance(inputs, dict) else None
+    if plugins is None:
+        tables = ", ".join(str(key)[:40] for key in list(document)[:8]) or "nothing"
+        raise ValueError(f"has no [[inputs.modbus]] (Telegraf): it has {tables}")
     found: dict[tuple[LineSettings, int | None], ImportedDevice] = {}
-    for plugin in document.get("inputs", {}).get("modbus", []):
+    for plugin in plugins if isinstance(plugins, list) else [plugins]:
         line, title = _line(plugin), str(plugin.get("name", ""))
-        for slave, table, order, field in _fields(plugin):
-            address = unit_address(slave)
+        here: ImportedDevice | None = None
+        for field in _fields(plugin):
+            address = unit_address(field.slave)
             device = found.setdefault((line, address), ImportedDevice(title, address, line=line))
-            with device.entry(str(field.get("name", "register"))):
-                _add(device, table, order, field)
+            here = here or device
+            with device.entry(str(field.given.get("name", "register"))):
+                _add(device, field)
+        if here is not None:
+            _lose_settings(here, plugin)
+    if not found:
+        lists = ", ".join((*_REGISTER_STYLE, *BLOCK_KEYS))
+        raise ValueError(f"[[inputs.modbus]] has no field: none of {lists} has one")
     return list(found.values())
+
+
+def _lose_settings(device: ImportedDevice, plugin: Mapping[str, Any]) -> None:
+    device.lose_keys("inputs.modbus", plugin, PLUGIN_KEYS)
+    device.lose_keys("workarounds", plugin.get("workarounds") or {}, WORKAROUND_KEYS)
+    for style, table in BLOCK_KEYS.items():
+        for block in plugin.get(style) or ():
+            device.lose_keys(style, block, table)
+            if "slave_id" not in block and "slave_id" in plugin:
+                reason = "it has no slave_id, for which Telegraf asks unit 0; the plugin's was taken"
+                device.lose(style, reason, is_entry=False)
 
 
 def _line(plugin: Mapping[str, Any]) -> LineSettings:
@@ -45,63 +113,79 @@ def _line(plugin: Mapping[str, Any]) -> LineSettings:
             parts = urlsplit(controller)
             host, port = parts.hostname, parts.port or 502
         except ValueError as mistake:
+            if "$" in controller:  # a variable of its environment
+                return network_settings(None, 502)
             raise ValueError(f"controller = {controller[:200]!r} is no address: {mistake}") from mistake
-        return network_settings(host, port, is_rtu=mode.lower() == "rtuovertcp")
+        framing = mode.lower().removesuffix("overtcp")
+        is_serial = framing in ("rtu", "ascii")
+        return network_settings(
+            host, port, is_serial_frames=is_serial, framing=framing if is_serial else "rtu"
+        )
     keys = {"baudrate": "baud_rate", "bits": "data_bits", "parity": "parity", "stop": "stop_bits"}
     given = {key: plugin[theirs] for key, theirs in keys.items() if theirs in plugin}
     return serial_settings(given, port=controller.removeprefix("file://"), framing=mode)
 
 
-def _fields(plugin: Mapping[str, Any]) -> Iterator[tuple[Any, str, str, Mapping[str, Any]]]:
-    slave = plugin.get("slave_id", 0)
-    for key, table in _STYLE.items():
-        for field in plugin.get(key, []):
-            yield slave, table, field.get("byte_order", ""), field
-    for request in [*plugin.get("request", []), *plugin.get("metric", [])]:
-        for field in request.get("fields", []):
-            table = field.get("register", request.get("register", "holding"))
-            order = request.get("byte_order") or "ABCD"  # the plugin's default in these styles
-            yield request.get("slave_id", slave), table, order, field
+def _fields(plugin: Mapping[str, Any]) -> Iterator[_Field]:
+    """Yield the fields of the plugin's style, or of all styles if it states none."""
+    style, slave = str(plugin.get("configuration_type", "")), plugin.get("slave_id")
+    text = str((plugin.get("workarounds") or {}).get("string_register_location") or "both")
+    if style in ("", "register"):
+        for key, table in _REGISTER_STYLE.items():
+            for field in plugin.get(key) or ():
+                yield _Field(field, "register", slave, table, str(field.get("byte_order", "")), text)
+    for kind in ("request", "metric"):
+        for block in plugin.get(kind) or () if style in ("", kind) else ():
+            for field in block.get("fields") or ():
+                table = block.get("register", "holding") if kind == "request" else field.get("register")
+                order = str(block.get("byte_order") or "ABCD")  # the plugin's default in these styles
+                yield _Field(field, kind, block.get("slave_id", slave), table or "holding", order, text)
 
 
-def _add(device: ImportedDevice, table: str, order: str, field: Mapping[str, Any]) -> None:
-    name = str(field.get("name", "register"))
-    given = field.get("address", 0)
-    addresses = given if isinstance(given, list) else [given]
-    if table not in TABLES:
-        device.lose(name, f"its table {str(table)[:40]!r} is not known")
+def _add(device: ImportedDevice, field: _Field) -> None:
+    given = field.given
+    name, is_bit = str(given.get("name", "register")), field.table in ("coil", "discrete")
+    if field.table not in TABLES:
+        device.lose(name, f"its table {str(field.table)[:40]!r} is not known")
         return
-    register = ImportedRegister(name, addresses[0], table)
-    if field.get("omit"):
+    listed = given["address"]
+    addresses = listed if isinstance(listed, list) and listed else [whole(given, "address")]
+    register = ImportedRegister(name, addresses[0], field.table)
+    if given.get("omit"):
         device.lose(name, "it is marked omit, and was left out", is_entry=False)
         return
-    if "measurement" in field or "output" in field:
-        register.gaps.append("measurement and output were not carried over")
-    if table in ("coil", "discrete"):
+    register.gaps += [] if is_bit else uncarried(given, FIELD_KEYS[field.style])
+    kind = given.get("data_type" if field.style == "register" else "type")
+    if is_bit:
         device.add(register)
-    elif str(field.get("data_type", field.get("type"))).upper() == "STRING":
-        register.details["length"] = int(field.get("length", len(addresses)))
-        if _ORDERS.get(str(order).upper()) in ("BADC", "DCBA"):
-            register.details["order"] = "BA"
-        device.add(register, is_text=True)
-    elif _number(device, register, str(order).upper(), field, addresses):
+    elif str(kind).upper() == "STRING":
+        _text(device, register, field, len(addresses))
+    elif _number(device, register, field, addresses, kind):
         device.add(register)
+
+
+def _text(device: ImportedDevice, register: ImportedRegister, field: _Field, words: int) -> None:
+    register.details["length"] = whole(field.given, "length", words)
+    if field.text_bytes == "lower":
+        register.details["order"] = "B"
+    elif field.text_bytes != "both":
+        device.lose(register.name, f"a text whose string_register_location is {field.text_bytes[:40]}")
+        return
+    elif _ORDERS.get(field.order.upper()) in ("BADC", "DCBA"):
+        register.details["order"] = "BA"
+    device.add(register, is_text=True)
 
 
 def _number(
-    device: ImportedDevice,
-    register: ImportedRegister,
-    order: str,
-    field: Mapping[str, Any],
-    addresses: list[Any],
+    device: ImportedDevice, register: ImportedRegister, field: _Field, addresses: list[Any], kind: Any
 ) -> bool:
-    kind = str(field.get("data_type", field.get("type", "UINT16"))).upper().removesuffix("-IEEE")
-    if kind in ("FIXED", "UFIXED"):  # of as many registers as there are addresses
-        kind = f"{'INT' if kind == 'FIXED' else 'UINT'}{16 * len(addresses)}"
-    part, kind = _part(kind, field)
-    found = number_format(kind)
+    order, spelt = field.order.upper(), str(kind or "UINT16").upper()
+    if kind is None:
+        register.gaps.append("its type is not stated; UINT16 was assumed")
+    part, plain = _part(_plain_type(field.style, spelt, len(addresses)), field.given)
+    found = number_format(plain)
     if found is None:
-        device.lose(register.name, f"its type {kind[:40]} has no number format")
+        device.lose(register.name, f"its type {spelt[:40]} has no number format")
         return False
     if part:
         register.details["part"] = part
@@ -111,17 +195,30 @@ def _number(
         register.gaps.append("the order of its words is not stated")
     if len(addresses) > 1 and addresses != list(range(addresses[0], addresses[0] + words_of(found))):
         listed = ", ".join(str(each)[:10] for each in addresses[:5])
-        device.lose(register.name, f"its addresses {listed} are not those of a {kind[:40]}, side by side")
+        device.lose(register.name, f"its addresses {listed} are not those of a {spelt[:40]}, side by side")
         return False
     put_number(register.details, found, _ORDERS.get(order, ""))
-    scaled(register.details, field.get("scale", 1))
+    scaled(register.details, field.given.get("scale", 1))
     return True
+
+
+def _plain_type(style: str, kind: str, words: int) -> str:
+    """Return a type that means the same in every style.
+
+    In the register style, FLOAT32 is a whole number of as many registers as there are addresses; IEEE's
+    floats end in -IEEE there.
+    """
+    if style != "register":
+        return kind.removesuffix("-IEEE")
+    if kind in ("FIXED", "UFIXED", "FLOAT32"):
+        return f"{'INT' if kind == 'FIXED' else 'UINT'}{16 * words}"
+    return f"{kind} of this style" if kind in ("FLOAT16", "FLOAT64") else kind.removesuffix("-IEEE")
 
 
 def _part(kind: str, field: Mapping[str, Any]) -> tuple[str, str]:
     """Return the bits of a word that a type of less than 16 bits is, and the number's type."""
     if kind == "BIT":
-        return str(int(field.get("bit", 0))), "UINT16"
+        return str(whole(field, "bit", 0)), "UINT16"
     if kind in ("INT8L", "UINT8L", "INT8H", "UINT8H"):
         return ("0-7" if kind.endswith("L") else "8-15"), f"{kind[:-2]}16"
     return "", kind

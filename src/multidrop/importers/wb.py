@@ -1,4 +1,8 @@
-"""Templates of wb-mqtt-serial as JSON: of one's own, since most published ones are not free to copy."""
+"""wb-mqtt-serial: its device templates and its configuration, as JSON.
+
+Use templates of your own, since most published ones are not free to copy. The tables of keys are those of its
+JSON schemas and of its README.
+"""
 
 from __future__ import annotations
 
@@ -6,28 +10,56 @@ import re
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from multidrop.importers.device import ImportedDevice, ImportedRegister, names_of
-from multidrop.importers.numbers import count, put_number, scaled
+from multidrop.importers.device import ImportedDevice, ImportedRegister, key_table, uncarried, unit_address
+from multidrop.importers.line_settings import UNKNOWN_LINE, LineSettings, network_settings, serial_settings
+from multidrop.importers.numbers import count, float_of_bits, put_number, scaled, whole, words_of
 
 # Comments, and a comma before the end of a list: what JSON does not have. Strings are left as they are; what
 # has no end goes to the text's end, so that each character is looked at once.
 _NOT_JSON = re.compile(r'("(?:\\.|[^"\\])*+(?:"|\\?\Z))|//[^\n]*|/\*.*?(?:\*/|\Z)|,(?=\s*[\]}])', re.DOTALL)
 MOST_READ = 125
+_DEEPEST = 8  # subdevices in subdevices
 _TABLES = {
     **{"holding": "holding", "holding_single": "holding", "holding_multi": "holding"},
     **{"input": "input", "coil": "coil", "discrete": "discrete"},
 }
 _FORMATS = {
     **{"u8": "U16", "u16": "U16", "u24": "U32", "u32": "U32", "u64": "U64"},
-    **{"s8": "I8", "s16": "I16", "s32": "I32", "s64": "I64"},
+    **{"s8": "I8", "s16": "I16", "s24": "I32", "s32": "I32", "s64": "I64"},
     **{"float": "F32", "double": "F64"},
     **{"bcd8": "BCD16", "bcd16": "BCD16", "bcd24": "BCD32", "bcd32": "BCD32"},
 }
-_WIDTHS = {"u8": 8, "u24": 24}  # bits of a format that is the lowest part of a larger one
+_WIDTHS = {"u8": 8, "s8": 8, "u24": 24, "s24": 24}  # bits of a format that is the lowest part of a larger one
 _TEXTS = {"string": "B", "char8": "B", "string8": ""}  # B: one character a register, in its low byte
-_ORDERS = {(False, False): "", (True, False): "CDAB", (False, True): "BADC", (True, True): "DCBA"}
-_LOST = ("condition", "fw", "sporadic", "semi-sporadic", "round_to", "on_value", "consists_of")
-_LOST_OF_DEVICES = ("subdevices", "min_request_interval", "guard_interval_us", "frame_timeout_ms")
+_ORDERS = {"big_endian": False, "little_endian": True}
+_ORDER_OF = {(False, False): "", (True, False): "CDAB", (False, True): "BADC", (True, True): "DCBA"}
+_ENTRY = "name id title address write_address reg_type format units scale offset word_order byte_order"
+_SHOWN = (
+    "enabled type control_type max min default order required group description dependencies hidden "
+    "read_period_ms read_rate_limit_ms poll_interval mode precision unit ui_options original_name"
+)
+CHANNEL_KEYS = key_table(
+    carried=f"{_ENTRY} error_value unsupported_value string_data_size readonly enum enum_titles consists_of "
+    "device_type oneOf shift stride",
+    irrelevant=_SHOWN,
+    gap="condition fw sporadic semi-sporadic round_to on_value off_value",
+)
+PARAMETER_KEYS = CHANNEL_KEYS
+DEVICE_KEYS = key_table(
+    carried="name protocol channels parameters subdevices setup max_read_registers title shift stride slave_id",
+    irrelevant="id response_timeout enabled groups translations device_type deprecated hw read_rate_limit_ms max_reg_hole "
+    "max_bit_hole min_read_registers max_write_registers response_timeout_ms device_timeout_ms password "
+    "device_max_fail_cycles max_write_fail_time_s preserve_setup_order enable_wb_continuous_read "
+    "continue_polling_on_illegal_modbus_exception force_frame_timeout",
+    gap="min_request_interval guard_interval_us frame_timeout_ms access_level standard_channels",
+)
+TEMPLATE_KEYS = key_table(carried="title device", irrelevant="device_type group deprecated hw")
+PORT_KEYS = key_table(
+    carried="port_type path baud_rate parity data_bits stop_bits address port devices",
+    irrelevant="enabled response_timeout_ms read_rate_limit_ms connection_timeout_ms "
+    "connection_max_fail_cycles connected_to_mge",
+    gap="guard_interval_us",
+)
 
 
 def json_without_comments(text: str) -> str:
@@ -36,35 +68,117 @@ def json_without_comments(text: str) -> str:
 
 
 def read_wb(document: Any) -> list[ImportedDevice]:
-    """Return the template's device, with its channels and parameters, also those of devices within it."""
+    """Return the device of a template, or all devices of a configuration. Raises ValueError for neither."""
+    if not isinstance(document, dict):
+        kind = type(document).__name__
+        raise ValueError(f"is no wb-mqtt-serial template and no SunSpec model: it is a {kind}")
+    if isinstance(ports := document.get("ports"), list):
+        return [device for port in ports for device in _of_port(port)]
     template = document.get("device", document)
-    if not str(template.get("protocol", "modbus")).startswith("modbus"):
-        raise ValueError(f"is a template of another protocol than Modbus: {template['protocol']!r}")
-    device = ImportedDevice(str(document.get("title", template.get("name", ""))))
+    if not isinstance(template, dict) or not {"channels", "parameters", "subdevices"} & template.keys():
+        keys = ", ".join(str(key)[:40] for key in list(document)[:8])
+        raise ValueError(
+            "has no `device` with channels or parameters (wb-mqtt-serial) and no `group` with points "
+            f"(SunSpec): its keys are {keys}"
+        )
+    return [_device(template, str(document.get("title") or template.get("name") or ""), None, UNKNOWN_LINE)]
+
+
+def _of_port(port: Mapping[str, Any]) -> Iterator[ImportedDevice]:
+    """Yield the devices of a port of a configuration, each with its address and line."""
+    kind = str(port.get("port_type", "serial"))
+    if "tcp" in kind:
+        line = network_settings(
+            port.get("address"), port.get("port", 502), is_serial_frames=not kind.startswith("modbus")
+        )
+    else:
+        keys = {"baudrate": "baud_rate", "bits": "data_bits", "parity": "parity", "stop": "stop_bits"}
+        given = {key: port[theirs] for key, theirs in keys.items() if theirs in port}
+        line = serial_settings(given, port=port.get("path", ""))
+    for template in port.get("devices") or ():
+        title = str(template.get("name") or template.get("device_type") or "device")
+        try:
+            # Its other keys are values of its template's parameters.
+            known = {key: value for key, value in template.items() if key in DEVICE_KEYS}
+            device = _device(known, title, unit_address(template.get("slave_id")), line)
+        except ValueError as mistake:
+            device = ImportedDevice(title, line=line)
+            device.lose(title, f"it cannot be read: {mistake}")
+        if "device_type" in template:
+            reason = "it refers to a template of that name: import that one too"
+            device.lose(f"device_type {str(template['device_type'])[:40]}", reason, is_entry=False)
+        device.lose_keys("the port", port, PORT_KEYS)
+        yield device
+
+
+def _device(
+    template: Mapping[str, Any], title: str, address: int | None, line: LineSettings
+) -> ImportedDevice:
+    protocol = str(template.get("protocol", "modbus"))
+    if not protocol.startswith("modbus"):
+        raise ValueError(f"is a template of another protocol than Modbus: {protocol[:40]!r}")
+    device = ImportedDevice(title, address, line=line)
     most = template.get("max_read_registers")
     device.together = most if isinstance(most, int) and 1 <= most <= MOST_READ else 0
-    for name, entry in _entries(template):
-        with device.entry(name):
-            _add(device, name, entry)
-    if template.get("setup"):
-        reason = "writes at every start are never sent, for they wear the EEPROM"
-        device.lose("setup", reason, is_entry=False)
-    for key in _LOST_OF_DEVICES:
-        if template.get(key):
-            device.lose(key, "was not carried over", is_entry=False)
-    return [device]
+    shift, stride = whole(template, "shift", 0), whole(template, "stride", 0)
+    _Walk(device, template, "modbus-io" in protocol).add(template, "", shift, stride, 0)
+    device.lose_keys("the device", template, DEVICE_KEYS)
+    return device
 
 
-def _entries(found: Any) -> Iterator[tuple[str, Mapping[str, Any]]]:
-    """Yield all channels and parameters that have an address, with their names."""
-    for inner in found if isinstance(found, list) else ():
-        yield from _entries(inner)
-    for key, inner in found.items() if isinstance(found, dict) else ():
-        if key in ("channels", "parameters"):
-            listed = list(inner.items()) if isinstance(inner, dict) else [("", entry) for entry in inner]
-            yield from _flat(listed)
-        elif isinstance(inner, (dict, list)):
-            yield from _entries(inner)
+class _Walk:
+    """Walks through a template's entries, and those of the subdevices that its channels use."""
+
+    def __init__(self, device: ImportedDevice, template: Mapping[str, Any], is_shifted: bool) -> None:
+        self._device = device
+        self._is_shifted = is_shifted
+        self._subdevices: dict[str, Mapping[str, Any]] = {}
+        self._unused: set[str] = set()
+        self._declare(template)
+
+    def _declare(self, template: Mapping[str, Any]) -> None:
+        for each in template.get("subdevices") or ():
+            kind = str(each["device_type"])
+            self._subdevices[kind] = each["device"]
+            self._unused.add(kind)
+
+    def add(self, template: Mapping[str, Any], prefix: str, shift: int, stride: int, depth: int) -> None:
+        for key in ("channels", "parameters"):
+            for name, entry in _flat(_listed(template.get(key))):
+                with self._device.entry(f"{prefix}{name}"):
+                    self._entry(f"{prefix}{name}", entry, shift, stride, depth)
+        if template.get("setup"):
+            reason = "writes at every start are never sent, for they wear the EEPROM"
+            self._device.lose("setup", reason, is_entry=False)
+        for kind in sorted(self._unused) if depth == 0 else ():
+            self._device.lose(f"subdevice {kind}", "no channel uses it, so its address is not known")
+
+    def _entry(self, name: str, entry: Mapping[str, Any], shift: int, stride: int, depth: int) -> None:
+        if "device_type" not in entry and "oneOf" not in entry:
+            if {"address", "write_address"} & entry.keys():
+                _add(self._device, name, entry, shift, stride, self._is_shifted)
+            elif "consists_of" not in entry:
+                self._device.lose(name, "it has no address")
+            return
+        kind = str(entry.get("device_type"))
+        self._unused -= {kind, *map(str, entry.get("oneOf") or ())}
+        if "oneOf" in entry:
+            choices = ", ".join(str(each)[:40] for each in entry["oneOf"][:5])
+            self._device.lose(name, f"the configuration chooses which subdevice it is: {choices}")
+        elif kind not in self._subdevices:
+            self._device.lose(name, f"its subdevice {kind[:40]} is not in this file")
+        elif depth >= _DEEPEST:
+            self._device.lose(name, f"more than {_DEEPEST} subdevices in each other")
+        else:
+            inner = self._subdevices[kind]
+            self._declare(inner)
+            self._unused.discard(kind)
+            further = shift + whole(entry, "shift", 0)
+            self.add(inner, f"{name} ", further, whole(entry, "stride", 0), depth + 1)
+
+
+def _listed(found: Any) -> list[tuple[str, Any]]:
+    return list(found.items()) if isinstance(found, dict) else [("", entry) for entry in found or ()]
 
 
 def _flat(listed: list[tuple[str, Any]]) -> Iterator[tuple[str, Mapping[str, Any]]]:
@@ -72,62 +186,106 @@ def _flat(listed: list[tuple[str, Any]]) -> Iterator[tuple[str, Mapping[str, Any
     for key, entry in listed:
         if isinstance(entry, dict):
             name = str(entry.get("name") or key or entry.get("id") or entry.get("title") or "channel")
-            if {"address", "write_address"} & entry.keys():
-                yield name, entry
+            yield name, entry
             parts = entry.get("consists_of")
             yield from _flat([(name, part) for part in parts] if isinstance(parts, list) else [])
 
 
-def _add(device: ImportedDevice, name: str, entry: Mapping[str, Any]) -> None:
+# ---- entries ----
+
+
+def _add(
+    device: ImportedDevice, name: str, entry: Mapping[str, Any], shift: int, stride: int, is_shifted: bool
+) -> None:
     kind, format = str(entry.get("reg_type", "holding")), str(entry.get("format", "u16"))
     table = _TABLES.get(kind)
     if table is None:
         device.lose(name, f"its register type {kind} has no table")
         return
-    elsewhere = entry.get("write_address")
-    address, part = _place(entry.get("address", elsewhere))
-    register = ImportedRegister(name, address, table, is_read="address" in entry)
     is_number = table in ("holding", "input")
+    if is_number and format not in _FORMATS and format not in _TEXTS:
+        device.lose(name, f"its format {format} has no number format")
+        return
+    elsewhere = entry.get("write_address")
+    size = words_of(_FORMATS.get(format, "U16")) if is_number else 1
+    base = shift + stride * size
+    address, bits = _place(entry.get("address", elsewhere))
+    register = ImportedRegister(name, base + address, table, is_read="address" in entry)
+    register.gaps += uncarried(entry, CHANNEL_KEYS)
+    if is_shifted:
+        register.gaps.append("its address: modbus-io adds a shift that depends on the module's place")
     if is_number and format in _TEXTS:
         _text(device, register, format, entry)
-        return
-    if is_number and format not in _FORMATS:
-        device.lose(name, f"its format {format} has no number format")
         return
     if entry.get("units"):
         register.details["unit"] = str(entry["units"])
     register.note_write(is_written=table in ("holding", "coil") and not entry.get("readonly"))
     if is_number:
-        _number(register, format, part, entry)
+        _number(register, format, bits, entry)
     if kind == "holding_multi":
         register.of_writes["write"] = "multiple"
     if elsewhere is not None and register.is_read:
-        register.of_writes["ram_address"] = _place(elsewhere)[0]
+        register.of_writes["ram_address"] = base + _place(elsewhere)[0]
         register.gaps.append(f"it is written at another address, {register.of_writes['ram_address']:04X}H")
-    register.gaps += [f"{key} was not carried over" for key in _LOST if entry.get(key) not in (None, False)]
     device.add(register)
 
 
 def _number(
-    register: ImportedRegister, format: str, part: tuple[int, int] | None, entry: Mapping[str, Any]
+    register: ImportedRegister, format: str, bits: tuple[int, int] | None, entry: Mapping[str, Any]
 ) -> None:
-    put_number(register.details, _FORMATS[format], _order(entry))
-    if part is None and format in _WIDTHS and not register.is_written:
-        part = (0, _WIDTHS[format] - 1)
-    if part is not None:
-        register.details["part"] = f"{part[0]}-{part[1]}"
+    number, part = _number_of_bits(register, format, bits)
+    put_number(register.details, number, _order(entry))
+    if part:
+        register.details["part"] = part
+    if format in ("bcd8", "bcd24"):
+        register.gaps.append(f"its format {format} has fewer digits than its registers hold")
     scaled(register.details, entry.get("scale") or 1, entry.get("offset"))
-    invalid = [count(entry[key]) for key in ("error_value", "unsupported_value") if key in entry]
-    if not register.details.get("number_format", "").startswith("F"):
-        invalid = [each for each in invalid if each != "NaN"]
-    if invalid:
-        register.details["invalid"] = invalid if len(invalid) > 1 else invalid[0]
+    _invalid(register, entry)
     values, titles = entry.get("enum"), entry.get("enum_titles")
-    if isinstance(values, list) and isinstance(titles, list) and _is_plain(register):
-        named = names_of(dict(zip(map(str, titles), values, strict=False)))
-        if named:
-            register.details["values"] = named
-            register.details.pop("unit", None)
+    if isinstance(values, list) and isinstance(titles, list):
+        if _is_plain(register):
+            named: dict[str, Any] = {}
+            for title, value in zip(map(str, titles), values, strict=False):
+                named.setdefault(f"{title} {value}" if title in named else title, value)
+            register.put_names("values", named)
+        elif titles:
+            register.gaps.append("enum was not carried over: its names are of values with a step")
+
+
+def _number_of_bits(register: ImportedRegister, format: str, bits: tuple[int, int] | None) -> tuple[str, str]:
+    """Return the number format, and the part of it that a format or an address with bits is."""
+    number = _FORMATS[format]
+    own = _WIDTHS.get(format, 16 * words_of(number))
+    if bits is None and (own == 16 * words_of(number) or number == "I8"):
+        return number, ""
+    shift, width = bits or (0, own)
+    width = width or own
+    words = -(-max(own, shift + width) // 16)  # as many registers as the bits reach
+    if number[0] not in "UI" or words not in (1, 2, 4):
+        register.lacks = f"its bits {shift} to {shift + width - 1} of the format {format}"
+        return number, ""
+    sign = number[0] if width == own else "U"  # a part has no sign there
+    part = "" if (shift, width) == (0, 16 * words) else f"{shift}-{shift + width - 1}"
+    return f"{sign}{16 * words}", part
+
+
+def _invalid(register: ImportedRegister, entry: Mapping[str, Any]) -> None:
+    """Add the counts that mean no value; those of a float are its bits."""
+    number = str(register.details.get("number_format", ""))
+    bits = 8 if number == "I8" else 16 * words_of(number)
+    found: list[float | str] = []
+    for key in ("error_value", "unsupported_value"):
+        if key not in entry:
+            continue
+        given = count(entry[key], key)
+        if number.startswith("F"):
+            found.append(float_of_bits(given, number) if isinstance(given, int) and given >= 0 else given)
+        elif isinstance(given, str) or given >> bits:
+            register.gaps.append(f"{key} {entry[key]} is no count of {bits} bits, and was not carried over")
+        else:
+            found.append(given - (1 << 64) if given >> 63 else given)  # TOML has signed numbers
+    if found:
+        register.details["invalid"] = found if len(found) > 1 else found[0]
 
 
 def _is_plain(register: ImportedRegister) -> bool:
@@ -137,23 +295,35 @@ def _is_plain(register: ImportedRegister) -> bool:
 
 
 def _text(device: ImportedDevice, register: ImportedRegister, format: str, entry: Mapping[str, Any]) -> None:
-    characters = int(entry.get("string_data_size", 1))
+    characters = whole(entry, "string_data_size", 1)
     register.details["length"] = characters if _TEXTS[format] else (characters + 1) // 2
-    order = _TEXTS[format] or ("BA" if entry.get("byte_order") == "little_endian" else "")
-    if order:
+    words_reversed, bytes_swapped = _is_little(entry, "word_order"), _is_little(entry, "byte_order")
+    if words_reversed and register.details["length"] > 1:
+        device.lose(register.name, "a text whose word_order is little_endian")
+        return
+    if bytes_swapped and _TEXTS[format]:
+        device.lose(register.name, "a text of one character a register, in its high byte")
+        return
+    if order := _TEXTS[format] or ("BA" if bytes_swapped else ""):
         register.details["order"] = order
     device.add(register, is_text=True)
 
 
 def _place(address: Any) -> tuple[int, tuple[int, int] | None]:
-    """Return the address, and the lowest and highest bit of "register:shift:width"."""
+    """Return the address, and of "register:shift:width" the shift and the width, which is 0 without one."""
     register, *bits = str(address).split(":")
-    at = int(register, 0)
+    at = whole({"address": register}, "address")
     if not bits:
         return at, None
-    shift, width = int(bits[0]), int(bits[1]) if len(bits) > 1 else 1
-    return at, (shift, shift + width - 1)
+    return at, (whole({"shift": bits[0]}, "shift"), whole({"width": bits[1]}, "width") if bits[1:] else 0)
 
 
 def _order(entry: Mapping[str, Any]) -> str:
-    return _ORDERS[entry.get("word_order") == "little_endian", entry.get("byte_order") == "little_endian"]
+    return _ORDER_OF[_is_little(entry, "word_order"), _is_little(entry, "byte_order")]
+
+
+def _is_little(entry: Mapping[str, Any], key: str) -> bool:
+    given = str(entry.get(key, "big_endian"))
+    if given not in _ORDERS:
+        raise ValueError(f"{key} = {given[:40]!r} is none of {', '.join(_ORDERS)}")
+    return _ORDERS[given]

@@ -9,8 +9,12 @@ MOST_CHARACTERS = 1_000_000
 MOST_NODES = 50_000  # where each alias counts as all that it stands for
 
 
+class Tag(str):
+    """A value that stands elsewhere or is a program, such as `!secret host`, as it is spelt."""
+
+
 def parse_yaml(text: str) -> Any:
-    """Return the document; tags such as !secret stand for nothing.
+    """Return the document; a value with a tag such as !secret is a `Tag`.
 
     Raises ImportError without PyYAML, ValueError for what is no YAML, too long, or blown up by aliases.
     """
@@ -22,7 +26,7 @@ def parse_yaml(text: str) -> Any:
         raise ValueError(f"has more than {MOST_CHARACTERS} characters of YAML")
 
     class Loader(yaml.SafeLoader):  # type: ignore[misc]
-        """Counts nodes, and takes tags for nothing."""
+        """Counts nodes, and reads no tag."""
 
         left = MOST_NODES
 
@@ -49,10 +53,14 @@ def parse_yaml(text: str) -> Any:
                         each for pair in value for each in (pair if isinstance(pair, tuple) else (pair,))
                     ]
 
-    Loader.add_multi_constructor("!", lambda loader, suffix, node: None)
+    Loader.add_multi_constructor("!", lambda loader, suffix, node: Tag(_spelt(suffix, node.value)))
     try:
         return yaml.load(text, Loader)
     except yaml.YAMLError as failure:
         raise ValueError(f"is not YAML: {' '.join(str(failure).split())[:300]}") from failure
     except RecursionError as failure:
         raise ValueError("is YAML that is nested too deeply") from failure
+
+
+def _spelt(suffix: str, value: Any) -> str:
+    return f"!{suffix} {value}"[:100] if isinstance(value, str) else f"!{suffix}"
