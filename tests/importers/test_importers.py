@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 import tomllib
 from pathlib import Path
@@ -11,36 +10,27 @@ from typing import Any
 import pytest
 from commands import Run
 from examples import usually
-from imported import ESPHOME, HOME, IOBROKER, MODPOLL, NEURON, OWN, SUNSPEC, TELEGRAF, WB
+from imported import (
+    ESPHOME,
+    HOME,
+    IOBROKER,
+    MODPOLL,
+    NEURON,
+    OWN,
+    SUNSPEC,
+    TELEGRAF,
+    WB,
+    devices,
+    entries,
+    only,
+    told,
+)
 
 from multidrop import load_family
 from multidrop.drive.register import Access, Register
 from multidrop.importers import family_text, plant_text, read_devices, settling
 from multidrop.importers.device import ImportedDevice, ImportedRegister
 from multidrop.importers.settling import declare
-
-
-def devices(folder: Path, name: str, contents: str | dict[str, Any]) -> list[ImportedDevice]:
-    path = folder / name
-    path.write_text(contents if isinstance(contents, str) else json.dumps(contents), "utf-8")
-    return read_devices(path)
-
-
-def only(folder: Path, name: str, contents: str | dict[str, Any]) -> ImportedDevice:
-    (device,) = devices(folder, name, contents)
-    return device
-
-
-def told(device: ImportedDevice) -> list[str]:
-    """Return the sentences on what was not carried over."""
-    return [str(lost) for lost in device.lost]
-
-
-def entries(device: ImportedDevice) -> dict[str, Any]:
-    """Return what the family file says, as TOML reads it; it never has a verb, nor anything that writes."""
-    document = tomllib.loads(family_text(device, "source"))
-    assert document.keys() <= {"family", "reading", "text"}
-    return {**document.get("reading", {}), **document.get("text", {})}
 
 
 def loaded(folder: Path, device: ImportedDevice, *names: str) -> dict[str, Register[Any]]:

@@ -3,6 +3,11 @@
 from __future__ import annotations
 
 import json
+import tomllib
+from pathlib import Path
+from typing import Any
+
+from multidrop.importers import ImportedDevice, family_text, read_devices
 
 IOBROKER = (
     "_address\tname\tdescription\tunit\ttype\tlen\tfactor\toffset\tformula\trole\n"
@@ -175,3 +180,33 @@ FILES = {  # by the suffix by which an importer knows them
     ".yaml": (HOME, ESPHOME),
     ".json": (json.dumps(SUNSPEC), json.dumps(WB)),
 }
+
+
+def devices(folder: Path, name: str, contents: str | dict[str, Any]) -> list[ImportedDevice]:
+    path = folder / name
+    path.write_text(contents if isinstance(contents, str) else json.dumps(contents), "utf-8")
+    return read_devices(path)
+
+
+def only(folder: Path, name: str, contents: str | dict[str, Any]) -> ImportedDevice:
+    (device,) = devices(folder, name, contents)
+    return device
+
+
+def told(device: ImportedDevice) -> list[str]:
+    """Return the sentences on what was not carried over."""
+    return [str(lost) for lost in device.lost]
+
+
+def entries(device: ImportedDevice) -> dict[str, Any]:
+    """Return what the family file says, as TOML reads it; it never has a verb, nor anything that writes."""
+    document = tomllib.loads(family_text(device, "source"))
+    assert document.keys() <= {"family", "reading", "text"}
+    return {**document.get("reading", {}), **document.get("text", {})}
+
+
+def gaps(device: ImportedDevice, name: str) -> list[str]:
+    """Return the gaps of a register or a text, as its family file marks them."""
+    mark = f"# gap: {name}: "
+    lines = family_text(device, "source").splitlines()
+    return [line.removeprefix(mark) for line in lines if line.startswith(mark)]

@@ -56,11 +56,15 @@ def _chosen(devices: list[ImportedDevice], address: int | None, title: str | Non
     if len(found) == 1:
         return found[0]
     first = devices[0]
-    if len({device.address for device in devices}) == len(devices):
+    addresses = {device.address for device in devices}
+    example = f"--address {first.address}" if first.address is not None else ""
+    if len(addresses) == len(devices) and None not in addresses:
         known = ", ".join(str(device.address) for device in devices)
-        raise ValueError(f"the file has devices at {known}: say which, such as --address {first.address}")
-    known = ", ".join(printable(f"{device.address} of {device.title!r}"[:100]) for device in devices)
-    raise ValueError(
-        f"the file has devices at {known}: say which, such as --address {first.address} "
-        f"--title {printable(first.title[:60])!r}"
-    )
+    else:
+        known = ", ".join(printable(_spelt(device)[:100]) for device in devices)
+        example = f"{example} --title {printable(first.title[:60])!r}".strip()
+    raise ValueError(f"the file has devices at {known}: say which, such as {example}")
+
+
+def _spelt(device: ImportedDevice) -> str:
+    return f"{'an unknown address' if device.address is None else device.address} of {device.title!r}"

@@ -74,7 +74,10 @@ def all_devices(path: Path) -> list[ImportedDevice]:
         devices = read(data, path)
         for device in devices:
             settle(device)
-    except (KeyError, AttributeError, TypeError, IndexError, OverflowError, RecursionError) as failure:
+    except KeyError as missing:
+        key = printable(str(missing.args[0]))[:200]
+        raise ValueError(f"{path} is not laid out as its kind of file is: a {key} is missing") from missing
+    except (AttributeError, TypeError, IndexError, OverflowError, RecursionError) as failure:
         kind = f"{type(failure).__name__} {printable(str(failure))[:200]}"
         raise ValueError(f"{path} is not laid out as its kind of file is: {kind}") from failure
     except ValueError as mistake:

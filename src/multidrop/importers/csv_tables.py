@@ -15,7 +15,14 @@ from multidrop.family_file.addresses import Counting
 from multidrop.importers import neuron
 from multidrop.importers.device import ImportedDevice, ImportedRegister, unit_address
 from multidrop.importers.modpoll import read_modpoll
-from multidrop.importers.numbers import format_of_width, number, number_format, put_number, words_of
+from multidrop.importers.numbers import (
+    bits_text,
+    format_of_width,
+    number,
+    number_format,
+    put_number,
+    words_of,
+)
 
 CARRIED = {  # names of columns, in lower case and without _, the most telling first
     "name": (
@@ -88,6 +95,7 @@ _NAMED_TABLES = (  # the first that a cell begins with
 )
 _FUNCTIONS = {1: "coil", 2: "discrete", 3: "holding", 4: "input"}
 _WRITES = {5: "coil", 6: "holding", 15: "coil", 16: "holding"}
+_BARE_HEX = re.compile(r"(?=[0-9]*[a-fA-F])[0-9a-fA-F]{1,8}")
 _REFERENCE = re.compile(r"[0134]\d{4,5}")  # 40001 or 400001: a table's digit, and a number from 1
 _ACCESS = {  # is it read, is it written
     **dict.fromkeys(("r", "ro", "read", "readonly", "rd"), (True, False)),
@@ -128,6 +136,7 @@ def _columns(rows: list[list[str]], stem: str) -> list[ImportedDevice]:
         raise ValueError(f"no column is called address; the first line names the columns, and it is {shown}")
     is_hex = header[at["at"]][1] == "hex"
     others = {place: name for place, (name, _) in enumerate(header) if name and place not in at.values()}
+    may_be_hex = any(_BARE_HEX.fullmatch(row[at["at"]].strip()) for row in rows[1:] if at["at"] < len(row))
     devices: dict[int | None, ImportedDevice] = {}
     table = ImportedDevice(stem)  # counts the entries
     unknown: set[str] = set()
@@ -141,8 +150,12 @@ def _columns(rows: list[list[str]], stem: str) -> list[ImportedDevice]:
         if is_hex and re.fullmatch(r"[0-9a-fA-F]{1,8}", cells["at"]):
             cells["at"] = f"0x{cells['at']}"
         unknown |= {name for name, cell in further.items() if cell and _is_unknown(name)}
+        columns = [name for name, cell in further.items() if cell and name in GAPS]
+        gaps = [f"the column {name} was not carried over" for name in columns]
+        if may_be_hex and cells["at"].isdecimal():
+            gaps.append(f"its address {cells['at']} may be hex, as others of its column are")
         with table.entry(cells.get("name", "")):
-            _row(devices, cells, [name for name, cell in further.items() if cell and name in GAPS], stem)
+            _row(devices, cells, gaps, stem)
     if not devices and not table.lost:
         raise ValueError("has no row with an address, below the line that names the columns")
     first = next(iter(devices.values()), table)
@@ -183,12 +196,12 @@ def _is_unknown(name: str) -> bool:
 
 def _row(devices: dict[int | None, ImportedDevice], cells: Cells, gaps: list[str], stem: str) -> None:
     tag = neuron.parse_tag(cells["at"])
-    slave = unit_address(tag.slave if tag else cells.get("slave") or None)
+    slave = unit_address(tag.slave if tag else cells.get("slave") or None, "slave")
     device = devices.setdefault(slave, ImportedDevice(stem, slave))
     name = cells.get("name") or f"register_{tag.address if tag else cells['at']}"
     with device.entry(name):
         register = _placed(name, cells, tag)
-        register.gaps += [f"the column {each} was not carried over" for each in gaps]
+        register.gaps += gaps
         _fill(device, register, cells, tag)
 
 
@@ -354,6 +367,8 @@ def _number(device: ImportedDevice, register: ImportedRegister, cells: Cells, ta
     put_number(register.details, found, order or "")
     if unit := cells.get("unit"):
         register.details["unit"] = unit
+        if re.match(r"[x*/]?\s*\d", unit):
+            register.gaps.append(f"its unit {unit[:40]!r} begins with a number, which may be its step")
     _scale(register, cells, is_neuron=tag is not None)
     device.add(register)
 
@@ -365,13 +380,12 @@ def _part(register: ImportedRegister, kind: str, cells: Cells, tag: neuron.Tag |
     stated = re.fullmatch(r"(\d{1,2})(?:\s*(?:-|\.\.|:|to)\s*(\d{1,2}))?", cells.get("bit", ""))
     if stated:
         low, high = sorted((int(stated[1]), int(stated[2] or stated[1])))
-        return str(low) if low == high else f"{low}-{high}"
+        return bits_text(low, high)
     if cells.get("bit"):
         register.gaps.append(f"its bit {cells['bit'][:40]!r} was not carried over")
     if kind not in _BIT_TYPES:
         return ""
-    if not tag:
-        register.gaps.append("which bit of its word it is; bit 0 was assumed")
+    register.gaps.append("which bit of its word it is; bit 0 was assumed")
     return "0"
 
 

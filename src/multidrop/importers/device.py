@@ -191,11 +191,11 @@ class UniqueNames:
         return free
 
 
-def unit_address(given: Any) -> int | None:
+def unit_address(given: Any, key: str) -> int | None:
     """Return a device's unit id, 0 to 255; None if it is not stated. Raises ValueError for no unit id."""
     if given is None:
         return None
     number = int(given.strip(), 0) if isinstance(given, str) and _ANY_BASE.fullmatch(given.strip()) else given
     if isinstance(number, bool) or not isinstance(number, int) or number not in UNIT_IDS:
-        raise ValueError(f"{str(given)[:40]!r} is no unit id from {UNIT_IDS[0]} to {UNIT_IDS[-1]}")
+        raise ValueError(f"{key} = {str(given)[:40]!r} is no unit id from {UNIT_IDS[0]} to {UNIT_IDS[-1]}")
     return number

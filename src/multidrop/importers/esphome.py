@@ -12,7 +12,7 @@ from typing import Any
 
 from multidrop.importers.device import ImportedDevice, ImportedRegister, key_table, uncarried, unit_address
 from multidrop.importers.line_settings import UNKNOWN_LINE, LineSettings, serial_settings
-from multidrop.importers.numbers import number, put_number, scaled, whole, words_of
+from multidrop.importers.numbers import bits_text, number, put_number, scaled, whole, words_of
 from multidrop.importers.yaml_text import Tag
 
 PLATFORM = "modbus_controller"
@@ -163,10 +163,8 @@ class _Devices:
 
     def _add_controller(self, controller: Mapping[str, Any]) -> None:
         given, name = controller.get("address", 1), str(controller.get("id"))
-        try:
-            address = None if isinstance(given, Tag) or "$" in str(given) else unit_address(given)
-        except ValueError as mistake:
-            raise ValueError(f"{PLATFORM}: address: {mistake}") from mistake
+        is_elsewhere = isinstance(given, Tag) or "$" in str(given)
+        address = None if is_elsewhere else unit_address(given, f"{PLATFORM}: address")
         bus = str(controller.get("modbus_id"))
         place = (bus, name if address is None else address)
         line = _line(self._parts, bus)
@@ -329,4 +327,4 @@ def _part(register: ImportedRegister, found: str, mask: int) -> None:
     elif not bits or bits[-1] - bits[0] + 1 != len(bits):
         register.lacks = f"bits that are not side by side: {mask:#x}"
     else:
-        register.details["part"] = f"{bits[0]}-{bits[-1]}"
+        register.details["part"] = bits_text(bits[0], bits[-1])

@@ -73,7 +73,7 @@ def read_home_assistant(document: Any) -> list[ImportedDevice]:
             name = str(entry.get("name", "register"))
             with whole_hub.entry(name):
                 slave = entry.get("slave", entry.get("device_address"))
-                address = None if isinstance(slave, Tag) else unit_address(slave)
+                address = None if isinstance(slave, Tag) else unit_address(slave, "slave")
                 device = found.setdefault((which, address), ImportedDevice(title, address, line=line))
                 with device.entry(name):
                     if kind in _NOT_READ:

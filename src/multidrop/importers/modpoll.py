@@ -26,10 +26,7 @@ def read_modpoll(rows: list[list[str]]) -> list[ImportedDevice]:
         if not any((word, *cells)):
             continue
         if word == "device":
-            try:
-                devices.append(ImportedDevice(cells[0], unit_address(cells[1] or None)))
-            except ValueError as mistake:
-                raise ValueError(f"row {number}: {mistake}") from mistake
+            devices.append(ImportedDevice(cells[0], unit_address(cells[1] or None, f"row {number}: device")))
             table = ""
         elif word == "poll" and devices:
             table, order = cells[0], cells[3].upper()

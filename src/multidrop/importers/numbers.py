@@ -45,6 +45,11 @@ def words_of(number: str) -> int:
     return {"32": 2, "64": 4}.get(number[-2:], 1)
 
 
+def bits_text(low: int, high: int) -> str:
+    """Return the bits of a part as a family file has them: 3, or 0-7."""
+    return str(low) if low == high else f"{low}-{high}"
+
+
 def put_number(details: dict[str, Any], number: str, order: str = "") -> None:
     """Add the number format and the order of its bytes, of ABCD's kind for any width."""
     if number != "U16":

@@ -81,7 +81,7 @@ def read_telegraf(document: Mapping[str, Any]) -> list[ImportedDevice]:
         line, title = _line(plugin), str(plugin.get("name", ""))
         here: ImportedDevice | None = None
         for field in _fields(plugin):
-            address = unit_address(field.slave)
+            address = unit_address(field.slave, "slave_id")
             device = found.setdefault((line, address), ImportedDevice(title, address, line=line))
             here = here or device
             with device.entry(str(field.given.get("name", "register"))):
@@ -180,7 +180,7 @@ def _number(
     device: ImportedDevice, register: ImportedRegister, field: _Field, addresses: list[Any], kind: Any
 ) -> bool:
     order, spelt = field.order.upper(), str(kind or "UINT16").upper()
-    if kind is None:
+    if not kind:
         register.gaps.append("its type is not stated; UINT16 was assumed")
     part, plain = _part(_plain_type(field.style, spelt, len(addresses)), field.given)
     found = number_format(plain)

@@ -12,7 +12,7 @@ from typing import Any
 
 from multidrop.importers.device import ImportedDevice, ImportedRegister, key_table, uncarried, unit_address
 from multidrop.importers.line_settings import UNKNOWN_LINE, LineSettings, network_settings, serial_settings
-from multidrop.importers.numbers import count, float_of_bits, put_number, scaled, whole, words_of
+from multidrop.importers.numbers import bits_text, count, float_of_bits, put_number, scaled, whole, words_of
 
 # Comments, and a comma before the end of a list: what JSON does not have. Strings are left as they are; what
 # has no end goes to the text's end, so that each character is looked at once.
@@ -44,13 +44,14 @@ CHANNEL_KEYS = key_table(
     irrelevant=_SHOWN,
     gap="condition fw sporadic semi-sporadic round_to on_value off_value",
 )
-PARAMETER_KEYS = CHANNEL_KEYS
 DEVICE_KEYS = key_table(
-    carried="name protocol channels parameters subdevices setup max_read_registers title shift stride slave_id",
-    irrelevant="id response_timeout enabled groups translations device_type deprecated hw read_rate_limit_ms max_reg_hole "
-    "max_bit_hole min_read_registers max_write_registers response_timeout_ms device_timeout_ms password "
-    "device_max_fail_cycles max_write_fail_time_s preserve_setup_order enable_wb_continuous_read "
-    "continue_polling_on_illegal_modbus_exception force_frame_timeout",
+    carried="name protocol channels parameters subdevices setup max_read_registers title shift stride "
+    "slave_id",
+    irrelevant="response_timeout id enabled groups translations device_type deprecated hw "
+    "read_rate_limit_ms max_reg_hole max_bit_hole min_read_registers max_write_registers "
+    "response_timeout_ms device_timeout_ms password device_max_fail_cycles max_write_fail_time_s "
+    "preserve_setup_order enable_wb_continuous_read force_frame_timeout "
+    "continue_polling_on_illegal_modbus_exception",
     gap="min_request_interval guard_interval_us frame_timeout_ms access_level standard_channels",
 )
 TEMPLATE_KEYS = key_table(carried="title device", irrelevant="device_type group deprecated hw")
@@ -81,7 +82,11 @@ def read_wb(document: Any) -> list[ImportedDevice]:
             "has no `device` with channels or parameters (wb-mqtt-serial) and no `group` with points "
             f"(SunSpec): its keys are {keys}"
         )
-    return [_device(template, str(document.get("title") or template.get("name") or ""), None, UNKNOWN_LINE)]
+    title = str(document.get("title") or template.get("name") or "")
+    device = _device(template, title, None, UNKNOWN_LINE)
+    if template is not document:
+        device.lose_keys("the template", document, TEMPLATE_KEYS)
+    return [device]
 
 
 def _of_port(port: Mapping[str, Any]) -> Iterator[ImportedDevice]:
@@ -100,7 +105,7 @@ def _of_port(port: Mapping[str, Any]) -> Iterator[ImportedDevice]:
         try:
             # Its other keys are values of its template's parameters.
             known = {key: value for key, value in template.items() if key in DEVICE_KEYS}
-            device = _device(known, title, unit_address(template.get("slave_id")), line)
+            device = _device(known, title, unit_address(template.get("slave_id"), "slave_id"), line)
         except ValueError as mistake:
             device = ImportedDevice(title, line=line)
             device.lose(title, f"it cannot be read: {mistake}")
@@ -265,7 +270,7 @@ def _number_of_bits(register: ImportedRegister, format: str, bits: tuple[int, in
         register.lacks = f"its bits {shift} to {shift + width - 1} of the format {format}"
         return number, ""
     sign = number[0] if width == own else "U"  # a part has no sign there
-    part = "" if (shift, width) == (0, 16 * words) else f"{shift}-{shift + width - 1}"
+    part = "" if (shift, width) == (0, 16 * words) else bits_text(shift, shift + width - 1)
     return f"{sign}{16 * words}", part
 
 
