@@ -16,6 +16,8 @@ from modbus_requests import read_requests
 
 from multidrop.capture import Capture, CaptureError, Decoding, Junk, Pairing
 from multidrop.core import Splitter
+from multidrop.drive.fact_check import UNIT_IDS
+from multidrop.drive.line_facts import SERIAL_ADDRESSES
 from multidrop.drive.register import Access
 from multidrop.family_file.errors import FamilyError
 from multidrop.family_file.loader import load_family
@@ -110,7 +112,9 @@ def read_import(path: Path) -> None:
         assert list(family.registers) == [register.name for register in device.registers]
         assert list(family.texts) == [text.name for text in device.texts]
         assert {register.access for register in family.registers.values()} <= {Access.READING}
-        if device.address is not None and device.registers:
+        is_serial = bool(device.line.port) and not device.line.is_network
+        addresses = SERIAL_ADDRESSES if is_serial else UNIT_IDS
+        if device.address in addresses and device.registers:
             plant = path.with_name("plant.toml")
             plant.write_text(plant_text(device, made.name), "utf-8")
             load_plant(plant)

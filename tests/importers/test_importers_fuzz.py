@@ -113,19 +113,27 @@ ANYTHING = st.one_of(
 
 PLAUSIBLE: dict[str, st.SearchStrategy[Any]] = {
     "address": st.sampled_from(
-        [0, 1, 2, 10_001, 30_001, 40_001, 65_532, 65_534, 65_535, "0x10", "3:4:2", "9:9:9"]
+        [0, 1, 2, 10_001, 30_001, 40_001, 65_532, 65_534, 65_535, "0x10", "3:4:2", "9:9:9", "3:30:4"]
     ),
     "name": st.sampled_from(["a", "A", "class", "address", "1st", "", "\u202e", "a.b" * 99, "sf"]),
     "reg_type": st.sampled_from(["holding", "input", "coil", "holding_multi"]),
     "register_type": st.sampled_from(["holding", "read", "coil"]),
     "input_type": st.sampled_from(["holding", "input", "coil"]),
     "format": st.sampled_from(
-        ["u8", "s8", "u16", "s16", "u32", "u64", "float", "double", "bcd8", "string", "string8"]
+        ["u8", "s8", "s24", "u16", "s16", "u32", "u64", "float", "double", "bcd8", "string", "string8"]
     ),
     "type": st.sampled_from(
         ["int16", "uint32", "sunssf", "string", "pad", "bitfield32", "enum16", "float64"]
     ),
-    "data_type": st.sampled_from(["int16", "uint32", "int64", "float32", "string"]),
+    "data_type": st.sampled_from(
+        ["int16", "uint32", "int64", "float16", "float32", "int", "float", "custom", "string"]
+    ),
+    "structure": st.sampled_from([">f", ">h", "<q", ">2h", "?"]),
+    "slave": st.sampled_from([0, 1, 247, 248, 255, "1", "!secret a", 256]),
+    "verify": st.fixed_dictionaries({}, optional={"address": st.integers(0, 70_000), "state_on": ANYTHING}),
+    "shift": st.sampled_from([0, 256, "0x100", 65_000, -1]),
+    "stride": st.integers(-1, 5),
+    "device_type": st.sampled_from(["inner", "other"]),
     "value_type": st.sampled_from(["U_WORD", "S_DWORD_R", "U_QWORD", "FP32"]),
     "size": st.integers(-1, 200),
     "sf": st.sampled_from(["a", "a_2", "sf", -2, 400]),
@@ -153,17 +161,19 @@ def entries_of(needed: str, keys: str) -> st.SearchStrategy[list[dict[str, Any]]
 CHANNELS = entries_of(
     "address format",
     "name reg_type scale offset error_value enum enum_titles readonly units word_order byte_order"
-    " write_address string_data_size consists_of",
+    " write_address string_data_size consists_of device_type shift stride oneOf",
 )
 POINTS = entries_of("name type size", "sf units access symbols label")
 SENSORS = entries_of(
     "name address",
-    "slave input_type data_type swap scale offset nan_value count virtual_count scan_interval",
+    "slave input_type data_type structure swap reverse_order scale offset nan_value count virtual_count"
+    " scan_interval verify min_value",
 )
 ENTITIES = entries_of(
     "address register_type",
-    "name value_type bitmask offset filters lambda optionsmap register_count",
+    "name value_type bitmask offset byte_offset filters lambda optionsmap register_count multiply",
 )
+INNER = [{"device_type": "inner", "device": {"channels": [{"name": "a", "address": 5, "device_type": "x"}]}}]
 ROWS = st.lists(st.lists(st.text("0123456789!#.BLWS,;xH-au\t \"'", max_size=8), max_size=7), max_size=5)
 
 
@@ -178,17 +188,24 @@ def test_what_an_importer_takes_is_a_family_that_loads(
     """YAML takes JSON, which has no tags and no aliases."""
     platform = [{"platform": "modbus_controller", **entity} for entity in entities]
     documents = {
-        ".json": ({"device": {"channels": channels}}, {"group": {"points": points}}),
+        ".json": (
+            {"device": {"channels": channels, "subdevices": INNER}},
+            {"ports": [{"path": "/dev/ttyS0", "devices": [{"slave_id": "0", "channels": channels}]}]},
+            {"group": {"points": points}},
+        ),
         ".yaml": (
-            {"modbus": [{"sensors": sensors, "binary_sensors": sensors}]},
+            {"modbus": [{"sensors": sensors, "binary_sensors": sensors, "switches": sensors}]},
+            {"modbus": [{"type": "serial", "port": "/dev/ttyS0", "sensors": sensors}]},
             {"modbus_controller": {"address": 7}, "sensor": platform, "text_sensor": platform},
+            {"number": platform, "binary_sensor": platform},
         ),
     }
     for suffix, listed in documents.items():
         for document in listed:
             read("import", f"{suffix}\n{json.dumps(document)}".encode(), tmp_path)
-    table = "\n".join(["name,address,type,unit,scale,offset,len", *map(",".join, rows)])
-    read("import", f".csv\n{table}".encode(), tmp_path)
+    for header in ("name,address,type,unit,scale,offset,len", "address,fc,gain,decimal,bit,signed,access"):
+        table = "\n".join([header, *map(",".join, rows)])
+        read("import", f".csv\n{table}".encode(), tmp_path)
 
 
 # ---- bounds of time and memory ----

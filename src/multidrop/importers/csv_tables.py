@@ -75,6 +75,8 @@ GAPS = frozenset(
         *("bytes", "byte count", "digits", "encoding"),
     }
 )
+_SPARE = frozenset(alias for key in ("name", "note", "at") for alias in CARRIED[key])
+_SECOND = frozenset(alias for aliases in CARRIED.values() for alias in aliases) - _SPARE  # beside the first
 _ORDERED = re.compile(r"(u?int(?:16|32|64)|float|double)(be|le|sw|sb)")  # ioBroker's
 _BYTES = {"uint8be": "0-7", "uint8le": "8-15", "int8be": "0-7", "int8le": "8-15"}
 _TEXT_ORDERS = {"string": "", "stringle": "BA", "string16": "B"}
@@ -99,8 +101,10 @@ _BARE_HEX = re.compile(r"(?=[0-9]*[a-fA-F])[0-9a-fA-F]{1,8}")
 _REFERENCE = re.compile(r"[0134]\d{4,5}")  # 40001 or 400001: a table's digit, and a number from 1
 _ACCESS = {  # is it read, is it written
     **dict.fromkeys(("r", "ro", "read", "readonly", "rd"), (True, False)),
-    **dict.fromkeys(("w", "wo", "write", "writeonly", "wr"), (False, True)),
-    **dict.fromkeys(("rw", "readwrite", "writeread", "rwro", "readandwrite", "readwritable"), (True, True)),
+    **dict.fromkeys(("w", "wo", "write", "writeonly"), (False, True)),
+    **dict.fromkeys(
+        ("rw", "wr", "readwrite", "writeread", "rwro", "readandwrite", "readwritable"), (True, True)
+    ),
 }
 _SIGNED = {"signed": True, "yes": True, "y": True, "true": True, "s": True}
 _SIGNED |= {"unsigned": False, "no": False, "n": False, "false": False, "u": False}
@@ -150,7 +154,9 @@ def _columns(rows: list[list[str]], stem: str) -> list[ImportedDevice]:
         if is_hex and re.fullmatch(r"[0-9a-fA-F]{1,8}", cells["at"]):
             cells["at"] = f"0x{cells['at']}"
         unknown |= {name for name, cell in further.items() if cell and _is_unknown(name)}
-        columns = [name for name, cell in further.items() if cell and name in GAPS]
+        columns = [name for name, cell in further.items() if cell and name in GAPS | _SECOND]
+        if neuron.parse_tag(cells["at"]):
+            columns = [name for name in columns if name != "precision"]  # digits that are shown there
         gaps = [f"the column {name} was not carried over" for name in columns]
         if may_be_hex and cells["at"].isdecimal():
             gaps.append(f"its address {cells['at']} may be hex, as others of its column are")
@@ -187,8 +193,7 @@ def _places(header: list[str]) -> dict[str, int]:
 
 def _is_unknown(name: str) -> bool:
     """Return True for a column that may change a value and that no importer knows."""
-    spare = {alias for key in ("name", "note", "at") for alias in CARRIED[key]}
-    return name not in IRRELEVANT | GAPS | spare
+    return name not in IRRELEVANT | GAPS | _SECOND | _SPARE
 
 
 # ---- rows ----

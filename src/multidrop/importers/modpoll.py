@@ -32,9 +32,9 @@ def read_modpoll(rows: list[list[str]]) -> list[ImportedDevice]:
             table, order = cells[0], cells[3].upper()
         elif word == "ref" and devices:
             with devices[-1].entry(cells[0]):
-                _reference(devices[-1], cells, table, order)
                 if any(cell.strip() for cell in row[_CELLS:]):
                     raise ValueError(f"row {number} has more than {_CELLS} cells")
+                _reference(devices[-1], cells, table, order)
         else:
             raise ValueError(f"is no table of modpoll: row {number} is {','.join(row)[:40]!r}")
     return devices

@@ -1,0 +1,228 @@
+"""wb-mqtt-serial: subdevices at their shifts, bits, counts that mean no value, texts, and configurations."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+from imported import devices, entries, gaps, only, told
+
+from multidrop.importers import ImportedDevice, read_devices
+
+
+def channel(folder: Path, **keys: Any) -> ImportedDevice:
+    """Return the device of an input register `a` at 5."""
+    given = {"name": "a", "reg_type": "input", "address": 5, **keys}
+    return only(folder, "w.json", {"device": {"channels": [given]}})
+
+
+VOLTAGE = {"name": "Voltage", "reg_type": "input", "address": "0x0010", "format": "u16", "scale": 0.1}
+ENERGY = {"name": "Energy", "reg_type": "input", "address": 32, "format": "u32"}
+
+
+def with_subdevice(*channels: dict[str, Any], **inner: Any) -> dict[str, Any]:
+    device = {"channels": [VOLTAGE, ENERGY], **inner}
+    return {"device": {"channels": list(channels), "subdevices": [{"device_type": "ch", "device": device}]}}
+
+
+def places(device: ImportedDevice) -> list[tuple[str, int]]:
+    return [(register.name, register.address) for register in device.registers]
+
+
+def test_a_subdevice_is_at_the_shift_of_each_channel_that_uses_it(tmp_path: Path) -> None:
+    first = {"name": "First", "device_type": "ch", "shift": 256}
+    second = {"name": "Second", "device_type": "ch", "shift": "0x200", "stride": 2}
+    device = only(tmp_path, "w.json", with_subdevice(first, second))
+    assert places(device) == [
+        ("first_voltage", 0x110),
+        ("first_energy", 0x120),
+        ("second_voltage", 0x210 + 2),  # a stride counts numbers
+        ("second_energy", 0x220 + 4),
+    ]
+    assert told(device) == []
+
+
+def test_subdevices_in_subdevices_add_their_shifts(tmp_path: Path) -> None:
+    inner = {"device_type": "in", "device": {"channels": [VOLTAGE]}}
+    used = {"name": "Inner", "device_type": "in", "shift": 3}
+    document = with_subdevice(
+        {"name": "Outer", "device_type": "ch", "shift": 100}, channels=[used], subdevices=[inner]
+    )
+    assert places(only(tmp_path, "w.json", document)) == [("outer_inner_voltage", 16 + 103)]
+
+
+def test_a_subdevice_that_contains_itself_ends(tmp_path: Path) -> None:
+    again = {"name": "Again", "device_type": "ch", "shift": 1}
+    device = only(tmp_path, "w.json", with_subdevice(again, channels=[VOLTAGE, again]))
+    assert len(device.registers) == 8
+    assert "more than 8 subdevices in each other" in told(device)[0]
+
+
+@pytest.mark.parametrize(
+    ("used", "reason"),
+    [
+        (
+            {"name": "X", "oneOf": ["ch", "other"]},
+            "X: the configuration chooses which subdevice it is: ch, other",
+        ),
+        ({"name": "X", "device_type": "none"}, "X: its subdevice none is not in this file"),
+        ({"name": "X", "address": 1}, "subdevice ch: no channel uses it, so its address is not known"),
+    ],
+)
+def test_entries_without_a_place_are_lost(tmp_path: Path, used: dict[str, Any], reason: str) -> None:
+    document = with_subdevice({"name": "Known", "address": 7}, used)
+    device = only(tmp_path, "w.json", document)
+    assert ("known", 7) in places(device)
+    assert "voltage" not in entries(device)
+    assert reason in told(device)
+
+
+@pytest.mark.parametrize(
+    ("keys", "expected"),
+    [
+        ({"address": "5:4:2"}, {"part": "4-5"}),
+        ({"address": "5:0"}, {}),  # without a width it has all bits of its format
+        ({"address": "5:8", "format": "u8"}, {"part": "8-15"}),
+        ({"address": "5:8:4", "format": "s16"}, {"part": "8-11"}),  # a part has no sign there
+        ({"address": "5:8:16", "format": "s16"}, {"number_format": "I32", "part": "8-23"}),
+        ({"format": "s24"}, {"number_format": "I32", "part": "0-23"}),
+        ({"format": "u8"}, {"part": "0-7"}),
+        ({"format": "s8"}, {"number_format": "I8"}),
+    ],
+)
+def test_bits_of_registers(tmp_path: Path, keys: dict[str, Any], expected: dict[str, Any]) -> None:
+    device = channel(tmp_path, **keys)
+    assert entries(device)["a"] == {"at": 5, "table": "input"} | expected
+    assert gaps(device, "a") == []
+
+
+def test_bits_of_three_registers_are_a_gap(tmp_path: Path) -> None:
+    device = channel(tmp_path, address="5:30:4")
+    assert gaps(device, "a") == ["only its count is read: its bits 30 to 33 of the format u16"]
+
+
+def test_the_low_byte_of_a_written_register_is_its_low_byte(tmp_path: Path) -> None:
+    assert entries(channel(tmp_path, reg_type="holding", format="u8"))["a"] == {"at": 5, "part": "0-7"}
+
+
+@pytest.mark.parametrize(
+    ("keys", "invalid"),
+    [
+        ({"format": "float", "error_value": "0x7FC00000"}, "NaN"),
+        ({"format": "float", "error_value": "0xC61C3F9A"}, -9999.900390625),
+        ({"format": "u64", "error_value": "0xFFFFFFFFFFFFFFFF"}, -1),
+        ({"format": "s16", "error_value": "0x7FFF", "unsupported_value": "0xFFFE"}, [0x7FFF, 0xFFFE]),
+    ],
+)
+def test_an_error_value_is_the_bits_of_its_format(tmp_path: Path, keys: dict[str, Any], invalid: Any) -> None:
+    device = channel(tmp_path, **keys)
+    assert (entries(device)["a"]["invalid"], gaps(device, "a")) == (invalid, [])
+
+
+@pytest.mark.parametrize(
+    ("keys", "gap"),
+    [
+        (
+            {"error_value": "0xFFFFFFFF"},
+            "error_value 0xFFFFFFFF is no count of 16 bits, and was not carried over",
+        ),
+        (
+            {"enum": [0, 1], "enum_titles": ["a", "b"], "scale": 0.1},
+            "enum was not carried over: its names are of values with a step",
+        ),
+        ({"enum": [0, "x"], "enum_titles": ["a", "b"]}, "1 of the names of its values were not carried over"),
+        ({"off_value": 0}, "off_value was not carried over"),
+        ({"round_to": 0.1}, "round_to was not carried over"),
+        ({"format": "bcd8"}, "its format bcd8 has fewer digits than its registers hold"),
+    ],
+)
+def test_what_is_not_carried_over_is_a_gap(tmp_path: Path, keys: dict[str, Any], gap: str) -> None:
+    assert gaps(channel(tmp_path, **keys), "a") == [gap]
+
+
+def test_names_of_values_given_as_text_are_carried_over(tmp_path: Path) -> None:
+    named = channel(tmp_path, enum=["0", "2"], enum_titles=["off", "on"])
+    assert entries(named)["a"]["values"] == {"off": 0, "on": 2}
+
+
+@pytest.mark.parametrize(
+    ("keys", "reason"),
+    [
+        (
+            {"format": "string", "byte_order": "little_endian"},
+            "a text of one character a register, in its high byte",
+        ),
+        ({"format": "string8", "word_order": "little_endian"}, "a text whose word_order is little_endian"),
+    ],
+)
+def test_a_text_in_an_order_that_no_family_has_is_lost(
+    tmp_path: Path, keys: dict[str, Any], reason: str
+) -> None:
+    with pytest.raises(ValueError, match=f"a: {reason}"):
+        channel(tmp_path, string_data_size=8, **keys)
+
+
+CONFIG = {
+    "ports": [
+        {
+            "port_type": "serial",
+            "path": "/dev/ttyRS485-1",
+            "baud_rate": 19200,
+            "parity": "E",
+            "devices": [
+                {"name": "Meter", "slave_id": "0x0A", "channels": [VOLTAGE]},
+                {
+                    "name": "Relay",
+                    "slave_id": 11,
+                    "channels": [{"name": "K1", "reg_type": "coil", "address": 0}],
+                },
+                {"device_type": "WB-X", "slave_id": 12, "in1_mode": 2},
+                {"name": "Other", "protocol": "energomera_iec", "channels": [VOLTAGE]},
+            ],
+        },
+        {
+            "port_type": "modbus tcp",
+            "address": "10.0.0.7",
+            "port": 502,
+            "devices": [{"name": "Net", "slave_id": "255", "channels": [VOLTAGE]}],
+        },
+    ]
+}
+
+
+def test_a_configuration_has_a_device_for_each_slave(tmp_path: Path) -> None:
+    meter, relay, net = devices(tmp_path, "wb-mqtt-serial.json", CONFIG)
+    assert [(each.title, each.address, each.line.port) for each in (meter, relay, net)] == [
+        ("Meter", 10, "/dev/ttyRS485-1"),
+        ("Relay", 11, "/dev/ttyRS485-1"),
+        ("Net", 255, "tcp://10.0.0.7:502"),
+    ]
+    assert str(meter.line) == "19200, 8E1"
+    assert places(relay) == [("k1", 0)]
+
+
+@pytest.mark.parametrize(
+    ("document", "reason"),
+    [
+        ({"device_type": "x"}, "has no `device` with channels or parameters (wb-mqtt-serial)"),
+        ({"device": {"protocol": "uniel", "channels": []}}, "another protocol than Modbus: 'uniel'"),
+        ({"ports": [CONFIG["ports"][0] | {"devices": [{"device_type": "WB-X"}]}]}, "a template of that name"),
+        (
+            {"device": {"channels": [{"name": "a", "address": "x"}]}},
+            "a: it cannot be read: address = 'x' is no",
+        ),
+        ({"device": {"channels": [{"name": "a"}]}}, "a: it has no address"),
+        ({"device": {"channels": [{"address": 1, "word_order": "x"}]}}, "word_order = 'x' is none of"),
+    ],
+)
+def test_a_refusal_says_why(tmp_path: Path, document: dict[str, Any], reason: str) -> None:
+    with pytest.raises(ValueError, match=re.escape(reason)):
+        only(tmp_path, "w.json", document)
+
+
+def test_the_file_is_named_in_a_refusal(tmp_path: Path) -> None:
+    (tmp_path / "w.json").write_text("{}")
+    with pytest.raises(ValueError, match=re.escape(str(tmp_path / "w.json"))):
+        read_devices(tmp_path / "w.json")
