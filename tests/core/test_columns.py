@@ -6,6 +6,7 @@ import math
 import sys
 from array import array
 from itertools import pairwise
+from struct import iter_unpack
 from typing import Any
 
 import pytest
@@ -72,6 +73,14 @@ NUMBERS = [
 @table(("wire", "data", "value"), NUMBERS)
 def test_number(wire: int, data: str, value: float) -> None:
     assert raw_value(bytes.fromhex(data), 0, wire) == value
+
+
+def test_every_half_float_is_what_struct_reads() -> None:
+    data = b"".join(bits.to_bytes(2) for bits in range(1 << 16))
+    for at, (number,) in enumerate(iter_unpack(">e", data)):
+        found = raw_value(data, at, NumberFormat.F16)
+        assert found == number or (math.isnan(found) and math.isnan(number))
+        assert math.copysign(1, found) == math.copysign(1, number) or math.isnan(number)
 
 
 def test_every_wire_is_tested() -> None:

@@ -230,6 +230,11 @@ def test_a_register_column_of_numbers_is_the_address(tmp_path: Path) -> None:
     assert entries(device)["volts"]["at"] == 16
 
 
+def test_lines_above_the_names_of_the_columns_are_titles(tmp_path: Path) -> None:
+    text = "Meter M-1\nInput registers;;\nName;Address;Type\nvolts;0x10;uint16\n"
+    assert entries(only(tmp_path, "t.csv", text))["volts"]["at"] == 16
+
+
 @pytest.mark.parametrize("unit", [0, 255])
 def test_a_unit_id_of_modbus_tcp_is_an_address(tmp_path: Path, unit: int) -> None:
     assert row(tmp_path, "address,type,slave", f"0x10,uint16,{unit}").address == unit

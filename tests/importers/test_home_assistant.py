@@ -75,6 +75,7 @@ def test_a_nan_value_may_be_hex_without_a_prefix(tmp_path: Path) -> None:
 
 def test_a_clamp_at_0_is_a_gap(tmp_path: Path) -> None:
     assert gaps(sensor(tmp_path, "min_value: 0"), "a") == ["min_value was not carried over"]
+    assert gaps(sensor(tmp_path, "precision: 0"), "a") == ["precision was not carried over"]
 
 
 def test_a_unit_that_stands_elsewhere_is_a_gap(tmp_path: Path) -> None:

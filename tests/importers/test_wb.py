@@ -142,6 +142,13 @@ def test_what_is_not_carried_over_is_a_gap(tmp_path: Path, keys: dict[str, Any],
     assert gaps(channel(tmp_path, **keys), "a") == [gap]
 
 
+def test_the_parts_of_a_channel_are_gaps(tmp_path: Path) -> None:
+    parts = [{"reg_type": "input", "address": at} for at in (5, 7)]
+    device = only(tmp_path, "w.json", {"device": {"channels": [{"name": "a", "consists_of": parts}]}})
+    assert places(device) == [("a", 5), ("a_2", 7)]
+    assert "its place in a channel that consists of several is not known" in gaps(device, "a")[0]
+
+
 def test_names_of_values_given_as_text_are_carried_over(tmp_path: Path) -> None:
     named = channel(tmp_path, enum=["0", "2"], enum_titles=["off", "on"])
     assert entries(named)["a"]["values"] == {"off": 0, "on": 2}

@@ -51,7 +51,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="1-31",
         type=_addresses,
         default=list(ADDRESSES),
-        help=f"such as 1-247 or 1,5,9; {ADDRESSES[0]}-{ADDRESSES[-1]} without it",
+        help=f"such as 1-247 or 1,5,9, on tcp:// 0-255; {ADDRESSES[0]}-{ADDRESSES[-1]} without it",
     )
     for name, metavar, parse in (("--baudrates", "N,N", _baudrates), ("--formats", "8N1,8E1", _formats)):
         parser.add_argument(name, metavar=metavar, type=parse, default=[], help="only these; all without it")

@@ -109,6 +109,8 @@ _ACCESS = {  # is it read, is it written
 _SIGNED = {"signed": True, "yes": True, "y": True, "true": True, "s": True}
 _SIGNED |= {"unsigned": False, "no": False, "n": False, "false": False, "u": False}
 
+MOST_TITLES = 20  # lines above the one that names the columns
+
 Cells = Mapping[str, str]
 
 
@@ -119,14 +121,16 @@ def read_table(text: str, stem: str) -> list[ImportedDevice]:
     lines = [line for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
     if not lines:
         raise ValueError("is empty: it has no line but comments")
-    delimiter = max((",", ";", "\t"), key=lines[0].count)
+    head = lines[0] if re.search("[,;\t]", lines[0]) else "\n".join(lines[:MOST_TITLES])
+    delimiter = max((",", ";", "\t"), key=head.count)
     try:
         rows = list(csv.reader(io.StringIO("\n".join(lines)), delimiter=delimiter))
     except csv.Error as failure:
         raise ValueError(f"is not CSV: {failure}") from failure
     if rows[0] and rows[0][0].strip().lower() in ("device", "poll", "ref"):
         return read_modpoll(rows)
-    return _columns(rows, stem)
+    titles = [at for at, row in enumerate(rows[:MOST_TITLES]) if "at" in _places(_names(row))]
+    return _columns(rows[titles[0] :] if titles else rows, stem)
 
 
 # ---- columns ----
@@ -134,7 +138,7 @@ def read_table(text: str, stem: str) -> list[ImportedDevice]:
 
 def _columns(rows: list[list[str]], stem: str) -> list[ImportedDevice]:
     header = [_plain_name(cell) for cell in rows[0]]
-    at = _places([name for name, _ in header])
+    at = _places(_names(rows[0]))
     if "at" not in at:
         shown = ", ".join(cell.strip()[:20] for cell in rows[0][:8])
         raise ValueError(f"no column is called address; the first line names the columns, and it is {shown}")
@@ -168,6 +172,10 @@ def _columns(rows: list[list[str]], stem: str) -> list[ImportedDevice]:
     for name in sorted(unknown)[:20]:
         first.lose(f"the column {name[:40]}", "is not known here, and was not carried over", is_entry=False)
     return [*devices.values(), *([table] if table.lost else [])]
+
+
+def _names(row: list[str]) -> list[str]:
+    return [_plain_name(cell)[0] for cell in row]
 
 
 def _plain_name(cell: str) -> tuple[str, str]:

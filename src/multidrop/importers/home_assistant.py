@@ -40,8 +40,8 @@ KEYS = {  # by kind of entity
     "sensors": key_table(
         carried=f"{_ENTITY} unit_of_measurement input_type data_type count structure scale offset swap "
         "reverse_order nan_value slave_count virtual_count",
-        irrelevant=f"{_SHOWN} state_class precision",  # digits that are shown
-        gap="zero_suppress min_value max_value",
+        irrelevant=f"{_SHOWN} state_class",
+        gap="zero_suppress min_value max_value precision",
     ),
     "binary_sensors": key_table(carried=f"{_ENTITY} input_type slave_count virtual_count", irrelevant=_SHOWN),
     "switches": _SWITCH,

@@ -19,6 +19,7 @@ from multidrop.importers.numbers import bits_text, count, float_of_bits, put_num
 _NOT_JSON = re.compile(r'("(?:\\.|[^"\\])*+(?:"|\\?\Z))|//[^\n]*|/\*.*?(?:\*/|\Z)|,(?=\s*[\]}])', re.DOTALL)
 MOST_READ = 125
 _DEEPEST = 8  # subdevices in subdevices
+PART = "its place in a channel that consists of several"  # is in no table of keys, and so is a gap
 _TABLES = {
     **{"holding": "holding", "holding_single": "holding", "holding_multi": "holding"},
     **{"input": "input", "coil": "coil", "discrete": "discrete"},
@@ -193,7 +194,9 @@ def _flat(listed: list[tuple[str, Any]]) -> Iterator[tuple[str, Mapping[str, Any
             name = str(entry.get("name") or key or entry.get("id") or entry.get("title") or "channel")
             yield name, entry
             parts = entry.get("consists_of")
-            yield from _flat([(name, part) for part in parts] if isinstance(parts, list) else [])
+            for part in parts if isinstance(parts, list) else ():
+                if isinstance(part, dict):
+                    yield name, {**part, PART: True}
 
 
 # ---- entries ----
