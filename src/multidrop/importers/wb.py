@@ -10,7 +10,14 @@ import re
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from multidrop.importers.device import ImportedDevice, ImportedRegister, key_table, uncarried, unit_address
+from multidrop.importers.device import (
+    ImportedDevice,
+    ImportedRegister,
+    Treatment,
+    key_table,
+    uncarried,
+    unit_address,
+)
 from multidrop.importers.line_settings import UNKNOWN_LINE, LineSettings, network_settings, serial_settings
 from multidrop.importers.numbers import bits_text, count, float_of_bits, put_number, scaled, whole, words_of
 
@@ -19,7 +26,7 @@ from multidrop.importers.numbers import bits_text, count, float_of_bits, put_num
 _NOT_JSON = re.compile(r'("(?:\\.|[^"\\])*+(?:"|\\?\Z))|//[^\n]*|/\*.*?(?:\*/|\Z)|,(?=\s*[\]}])', re.DOTALL)
 MOST_READ = 125
 _DEEPEST = 8  # subdevices in subdevices
-PART = "its place in a channel that consists of several"  # is in no table of keys, and so is a gap
+PART = "its place in a larger channel"  # the key of a channel's part, beside those of its own
 _TABLES = {
     **{"holding": "holding", "holding_single": "holding", "holding_multi": "holding"},
     **{"input": "input", "coil": "coil", "discrete": "discrete"},
@@ -39,12 +46,15 @@ _SHOWN = (
     "enabled type control_type max min default order required group description dependencies hidden "
     "read_period_ms read_rate_limit_ms poll_interval mode precision unit ui_options original_name"
 )
-CHANNEL_KEYS = key_table(
-    carried=f"{_ENTRY} error_value unsupported_value string_data_size readonly enum enum_titles consists_of "
-    "device_type oneOf shift stride",
-    irrelevant=_SHOWN,
-    gap="condition fw sporadic semi-sporadic round_to on_value off_value",
-)
+CHANNEL_KEYS = {
+    PART: Treatment.GAP,
+    **key_table(
+        carried=f"{_ENTRY} error_value unsupported_value string_data_size readonly enum enum_titles consists_of "
+        "device_type oneOf shift stride",
+        irrelevant=_SHOWN,
+        gap="condition fw sporadic semi-sporadic round_to on_value off_value",
+    ),
+}
 DEVICE_KEYS = key_table(
     carried="name protocol channels parameters subdevices setup max_read_registers title shift stride "
     "slave_id",
