@@ -168,6 +168,12 @@ def test_a_type_that_is_not_stated_is_a_gap(
     assert said == ([gap] if gap else [])
 
 
+def test_the_length_of_a_text_may_be_registers_or_characters(tmp_path: Path) -> None:
+    device = row(tmp_path, "address,type,length", "0x10,string,8")
+    assert found(device) == ["its length was taken for registers, and may be characters"]
+    assert found(row(tmp_path, "address,type,registers", "0x10,string,8")) == []
+
+
 def test_a_number_of_three_registers_without_a_type_is_lost(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="a: its type of 3 registers has no number format"):
         row(tmp_path, "address,count", "0x10,3")

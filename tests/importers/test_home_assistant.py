@@ -187,6 +187,7 @@ def test_platforms_of_before_2021_are_read(tmp_path: Path) -> None:
             "a: it cannot be read: address = 'x' is no whole",
         ),
         ("[]", "it is list"),
+        ("- {name: a, address: 1, data_type: string}\n", "a: it has no count"),
     ],
 )
 def test_a_refusal_says_why(tmp_path: Path, text: str, reason: str) -> None:

@@ -136,6 +136,10 @@ def test_a_unit_id_of_modbus_tcp_is_an_address(tmp_path: Path, unit: int) -> Non
         (HEAD, "[[inputs.modbus]] has no field: none of holding_registers"),
         (HEAD + 'coils = [{ name = "a" }]\n', "a: it has no address"),
         (
+            f'{HEAD}[[inputs.modbus.request]]\nfields = [{{ name = "a", address = 1, type = "STRING" }}]\n',
+            "a: it has no length",
+        ),
+        (
             HEAD + 'coils = [{ name = "a", address = "x" }]\n',
             "a: it cannot be read: address = 'x' is no whole",
         ),

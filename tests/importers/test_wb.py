@@ -142,6 +142,10 @@ def test_what_is_not_carried_over_is_a_gap(tmp_path: Path, keys: dict[str, Any],
     assert gaps(channel(tmp_path, **keys), "a") == [gap]
 
 
+def test_a_text_without_its_size_is_a_gap(tmp_path: Path) -> None:
+    assert gaps(channel(tmp_path, format="string8"), "a") == ["string_data_size is not stated; 1 was assumed"]
+
+
 def test_the_parts_of_a_channel_are_gaps(tmp_path: Path) -> None:
     parts = [{"reg_type": "input", "address": at} for at in (5, 7)]
     device = only(tmp_path, "w.json", {"device": {"channels": [{"name": "a", "consists_of": parts}]}})

@@ -162,6 +162,9 @@ def _columns(rows: list[list[str]], stem: str) -> list[ImportedDevice]:
         if neuron.parse_tag(cells["at"]):
             columns = [name for name in columns if name != "precision"]  # digits that are shown there
         gaps = [f"the column {name} was not carried over" for name in columns]
+        length = header[at["length"]][0] if cells.get("length") else ""
+        if length in ("length", "size") and cells.get("type", "").lower().startswith("str"):
+            gaps.append(f"its {length} was taken for registers, and may be characters")
         if may_be_hex and cells["at"].isdecimal():
             gaps.append(f"its address {cells['at']} may be hex, as others of its column are")
         with table.entry(cells.get("name", "")):

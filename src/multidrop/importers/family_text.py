@@ -14,6 +14,7 @@ from multidrop.importers.line_settings import UNKNOWN_HOST
 from multidrop.printable import printable
 
 MOST_LOST = 500  # that the file tells
+UNKNOWN_PORT = f"the port, which the file does not state; tcp://{UNKNOWN_HOST}:502 if it is Modbus TCP"
 _LONGEST = 200  # characters of a text
 _MOST_POINTS = 20  # of a text; TOML's reader takes a line of very many for a key
 
@@ -89,7 +90,7 @@ def plant_text(device: ImportedDevice, family_file: str) -> str:
         [
             "[[line]]",
             'name = "line-1"',
-            f"port = {_value(port)}  # gap: the port",
+            f"port = {_value(port)}  # gap: {'the port' if device.line.port else UNKNOWN_PORT}",
             "",
             "[[line.drive]]",
             f"name = {_value(f'device-{device.address}')}",

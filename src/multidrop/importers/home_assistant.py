@@ -247,7 +247,7 @@ def _sensor(device: ImportedDevice, register: ImportedRegister, entry: Mapping[s
     kind = str(entry.get("data_type", "int16"))
     swap = _swap(register, entry)
     if kind == "string":
-        register.details = {"length": whole(entry, "count", 1)}
+        register.details = {"length": whole(entry, "count")}
         if swap == "BADC":
             register.details["order"] = "BA"
         elif swap:

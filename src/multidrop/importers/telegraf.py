@@ -165,7 +165,7 @@ def _add(device: ImportedDevice, field: _Field) -> None:
 
 
 def _text(device: ImportedDevice, register: ImportedRegister, field: _Field, words: int) -> None:
-    register.details["length"] = whole(field.given, "length", words)
+    register.details["length"] = words if field.style == "register" else whole(field.given, "length")
     if field.text_bytes == "lower":
         register.details["order"] = "B"
     elif field.text_bytes != "both":

@@ -49,8 +49,8 @@ _SHOWN = (
 CHANNEL_KEYS = {
     PART: Treatment.GAP,
     **key_table(
-        carried=f"{_ENTRY} error_value unsupported_value string_data_size readonly enum enum_titles consists_of "
-        "device_type oneOf shift stride",
+        carried=f"{_ENTRY} error_value unsupported_value string_data_size readonly enum enum_titles "
+        "consists_of device_type oneOf shift stride",
         irrelevant=_SHOWN,
         gap="condition fw sporadic semi-sporadic round_to on_value off_value",
     ),
@@ -314,6 +314,8 @@ def _is_plain(register: ImportedRegister) -> bool:
 
 def _text(device: ImportedDevice, register: ImportedRegister, format: str, entry: Mapping[str, Any]) -> None:
     characters = whole(entry, "string_data_size", 1)
+    if format != "char8" and "string_data_size" not in entry:
+        register.gaps.append("string_data_size is not stated; 1 was assumed")
     register.details["length"] = characters if _TEXTS[format] else (characters + 1) // 2
     words_reversed, bytes_swapped = _is_little(entry, "word_order"), _is_little(entry, "byte_order")
     if words_reversed and register.details["length"] > 1:
