@@ -102,6 +102,8 @@ def test_a_bit_keeps_no_unit_and_says_so(tmp_path: Path) -> None:
         ("Decimal places", "1", 0.1, "its decimal 1 was taken as digits after the point: a step of 0.1"),
         ("decimal", "0.1", 0.1, "its decimal 0.1 was taken as a factor"),
         ("unit", "0.1V", None, "its unit '0.1V' begins with a number, which may be its step"),
+        ("scale", "1_0", None, "only its count is read: its scale '1_0' or offset '' is no number"),
+        ("scale", "\u0661", None, "only its count is read: its scale '\u0661' or offset '' is no number"),
         ("scale", "x/10", None, "only its count is read: its scale 'x/10' or offset '' is no number"),
     ],
 )

@@ -76,7 +76,10 @@ GAPS = frozenset(
     }
 )
 _SPARE = frozenset(alias for key in ("name", "note", "at") for alias in CARRIED[key])
-_SECOND = frozenset(alias for aliases in CARRIED.values() for alias in aliases) - _SPARE  # beside the first
+# Beside the first column of a key, a second one may contradict it.
+_VALUE_COLUMNS = GAPS | frozenset(alias for aliases in CARRIED.values() for alias in aliases) - _SPARE
+_KNOWN = IRRELEVANT | _VALUE_COLUMNS | _SPARE
+_NUMBER = re.compile(r"[0-9]{1,9}")
 _ORDERED = re.compile(r"(u?int(?:16|32|64)|float|double)(be|le|sw|sb)")  # ioBroker's
 _BYTES = {"uint8be": "0-7", "uint8le": "8-15", "int8be": "0-7", "int8le": "8-15"}
 _TEXT_ORDERS = {"string": "", "stringle": "BA", "string16": "B"}
@@ -98,7 +101,7 @@ _NAMED_TABLES = (  # the first that a cell begins with
 _FUNCTIONS = {1: "coil", 2: "discrete", 3: "holding", 4: "input"}
 _WRITES = {5: "coil", 6: "holding", 15: "coil", 16: "holding"}
 _BARE_HEX = re.compile(r"(?=[0-9]*[a-fA-F])[0-9a-fA-F]{1,8}")
-_REFERENCE = re.compile(r"[0134]\d{4,5}")  # 40001 or 400001: a table's digit, and a number from 1
+_REFERENCE = re.compile(r"[0134][0-9]{4,5}")  # 40001 or 400001: a table's digit, and a number from 1
 _ACCESS = {  # is it read, is it written
     **dict.fromkeys(("r", "ro", "read", "readonly", "rd"), (True, False)),
     **dict.fromkeys(("w", "wo", "write", "writeonly"), (False, True)),
@@ -110,6 +113,7 @@ _SIGNED = {"signed": True, "yes": True, "y": True, "true": True, "s": True}
 _SIGNED |= {"unsigned": False, "no": False, "n": False, "false": False, "u": False}
 
 MOST_TITLES = 20  # lines above the one that names the columns
+MOST_UNKNOWN = 20  # columns that are named
 
 Cells = Mapping[str, str]
 
@@ -137,44 +141,70 @@ def read_table(text: str, stem: str) -> list[ImportedDevice]:
 
 
 def _columns(rows: list[list[str]], stem: str) -> list[ImportedDevice]:
-    header = [_plain_name(cell) for cell in rows[0]]
-    at = _places(_names(rows[0]))
-    if "at" not in at:
-        shown = ", ".join(cell.strip()[:20] for cell in rows[0][:8])
-        raise ValueError(f"no column is called address; the first line names the columns, and it is {shown}")
-    is_hex = header[at["at"]][1] == "hex"
-    others = {place: name for place, (name, _) in enumerate(header) if name and place not in at.values()}
-    may_be_hex = any(_BARE_HEX.fullmatch(row[at["at"]].strip()) for row in rows[1:] if at["at"] < len(row))
+    layout = _Layout(rows)
     devices: dict[int | None, ImportedDevice] = {}
     table = ImportedDevice(stem)  # counts the entries
     unknown: set[str] = set()
     for row in rows[1:]:
-        cells = {key: row[place].strip() for key, place in at.items() if place < len(row)}
-        further = {name: row[place].strip() for place, name in others.items() if place < len(row)}
+        cells, further = layout.cells(row), layout.further(row)
         if not cells.get("at"):
             if cells.get("name"):
                 table.lose(cells["name"], "its row has no address")
             continue
-        if is_hex and re.fullmatch(r"[0-9a-fA-F]{1,8}", cells["at"]):
-            cells["at"] = f"0x{cells['at']}"
-        unknown |= {name for name, cell in further.items() if cell and _is_unknown(name)}
-        columns = [name for name, cell in further.items() if cell and name in GAPS | _SECOND]
-        if neuron.parse_tag(cells["at"]):
-            columns = [name for name in columns if name != "precision"]  # digits that are shown there
-        gaps = [f"the column {name} was not carried over" for name in columns]
-        length = header[at["length"]][0] if cells.get("length") else ""
-        if length in ("length", "size") and cells.get("type", "").lower().startswith("str"):
-            gaps.append(f"its {length} was taken for registers, and may be characters")
-        if may_be_hex and cells["at"].isdecimal():
-            gaps.append(f"its address {cells['at']} may be hex, as others of its column are")
+        unknown |= further - _KNOWN
         with table.entry(cells.get("name", "")):
-            _row(devices, cells, gaps, stem)
+            _row(devices, cells, layout.gaps(cells, further), stem)
     if not devices and not table.lost:
         raise ValueError("has no row with an address, below the line that names the columns")
     first = next(iter(devices.values()), table)
-    for name in sorted(unknown)[:20]:
+    for name in sorted(unknown)[:MOST_UNKNOWN]:
         first.lose(f"the column {name[:40]}", "is not known here, and was not carried over", is_entry=False)
     return [*devices.values(), *([table] if table.lost else [])]
+
+
+class _Layout:
+    """What the first line of a table says of its columns. Raises ValueError if none is an address."""
+
+    def __init__(self, rows: list[list[str]]) -> None:
+        header = [_plain_name(cell) for cell in rows[0]]
+        self._at = _places([name for name, _ in header])
+        if "at" not in self._at:
+            shown = ", ".join(cell.strip()[:20] for cell in rows[0][:8])
+            line = "the first line names the columns"
+            raise ValueError(f"no column is called address; {line}, and it is {shown}")
+        place = self._at["at"]
+        self._length = header[self._at["length"]][0] if "length" in self._at else ""
+        self._is_hex = header[place][1] == "hex"
+        self._may_be_hex = any(
+            _BARE_HEX.fullmatch(row[place].strip()) for row in rows[1:] if place < len(row)
+        )
+        self._others = {
+            at: name for at, (name, _) in enumerate(header) if name and at not in self._at.values()
+        }
+
+    def cells(self, row: list[str]) -> dict[str, str]:
+        """Return the cells of a row that are carried over, by key."""
+        found = {key: row[place].strip() for key, place in self._at.items() if place < len(row)}
+        if self._is_hex and re.fullmatch(r"[0-9a-fA-F]{1,8}", found.get("at", "")):
+            found["at"] = f"0x{found['at']}"
+        return found
+
+    def further(self, row: list[str]) -> set[str]:
+        """Return the names of the other columns in which a row says something."""
+        return {name for place, name in self._others.items() if place < len(row) and row[place].strip()}
+
+    def gaps(self, cells: Cells, further: set[str]) -> list[str]:
+        """Return what the columns of a row leave open."""
+        columns = further & _VALUE_COLUMNS
+        if neuron.parse_tag(cells["at"]):
+            columns -= {"precision"}  # digits that are shown there
+        found = [f"the column {name} was not carried over" for name in sorted(columns)]
+        is_text = cells.get("type", "").lower().startswith("str")
+        if cells.get("length") and is_text and self._length in ("length", "size"):
+            found.append(f"its {self._length} was taken for registers, and may be characters")
+        if self._may_be_hex and _NUMBER.fullmatch(cells["at"]):
+            found.append(f"its address {cells['at']} may be hex, as others of its column are")
+        return found
 
 
 def _names(row: list[str]) -> list[str]:
@@ -200,11 +230,6 @@ def _places(header: list[str]) -> dict[str, int]:
         found["at"] = header.index("register")
         found = {key: place for key, place in found.items() if key == "at" or place != found["at"]}
     return found
-
-
-def _is_unknown(name: str) -> bool:
-    """Return True for a column that may change a value and that no importer knows."""
-    return name not in IRRELEVANT | GAPS | _SECOND | _SPARE
 
 
 # ---- rows ----
@@ -343,11 +368,11 @@ def _access(register: ImportedRegister, given: str) -> None:
 
 
 def _text(device: ImportedDevice, register: ImportedRegister, length: str, kind: str) -> None:
-    if not length.isdecimal():
+    if not _NUMBER.fullmatch(length):
         device.lose(register.name, "a text of unknown length")
         return
     register.details.pop("note", None)
-    register.details["length"] = int(length[:6])
+    register.details["length"] = int(length)
     if kind not in _TEXT_ORDERS:
         device.lose(register.name, f"a text of the type {kind[:40]}")
         return
@@ -393,7 +418,7 @@ def _part(register: ImportedRegister, kind: str, cells: Cells, tag: neuron.Tag |
     """Return the bits of the word that it is; "" for all. A bit that is not stated is a gap."""
     if tag and tag.part:
         return tag.part
-    stated = re.fullmatch(r"(\d{1,2})(?:\s*(?:-|\.\.|:|to)\s*(\d{1,2}))?", cells.get("bit", ""))
+    stated = re.fullmatch(r"([0-9]{1,2})(?:\s*(?:-|\.\.|:|to)\s*([0-9]{1,2}))?", cells.get("bit", ""))
     if stated:
         low, high = sorted((int(stated[1]), int(stated[2] or stated[1])))
         return bits_text(low, high)
@@ -408,7 +433,7 @@ def _part(register: ImportedRegister, kind: str, cells: Cells, tag: neuron.Tag |
 def _format(register: ImportedRegister, kind: str, cells: Cells) -> str | None:
     """Return the number format of a row; a type or a width that is not stated is a gap."""
     length = cells.get("length", "")
-    words = int(length[:6]) if length.isdecimal() else 0
+    words = int(length) if _NUMBER.fullmatch(length) else 0
     signed = _SIGNED.get(cells.get("signed", "").lower())
     if cells.get("signed") and signed is None:
         register.gaps.append(f"its sign {cells['signed'][:40]!r} was not carried over")

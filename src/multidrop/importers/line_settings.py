@@ -77,6 +77,6 @@ def network_settings(
 
 def _whole(given: Any) -> int:
     """Return a whole number that may be text; 0 for what is none."""
-    if isinstance(given, str) and given.strip().isdecimal():
-        given = int(given.strip()[:9])
+    if isinstance(given, str) and re.fullmatch(r"[0-9]{1,9}", given.strip()):
+        given = int(given)
     return given if isinstance(given, int) and not isinstance(given, bool) and 0 < given < 10**9 else 0

@@ -23,6 +23,7 @@ _NAMED |= {"ushort": "U16", "dint": "I32", "udint": "U32", "lint": "I64", "ulint
 _NAMED |= {"sunssf": "I16", "count": "U16", "pad": "U16", "raw16": "U16"}
 _ANY_WIDTH = {"int": "I", "signed": "I", "uint": "U", "unsigned": "U", "bcd": "BCD"}
 _ANY_WIDTH |= dict.fromkeys(("enum", "bitfield", "bitmap", "hex"), "U")
+_REAL = re.compile(r"[+-]?(?:[0-9]{1,400}[.]?[0-9]{0,400}|[.][0-9]{1,400})(?:[eE][+-]?[0-9]{1,9})?")
 _WHOLE = re.compile(r"0[xX][0-9a-fA-F]{1,16}|-?[0-9]{1,20}")
 
 
@@ -76,12 +77,9 @@ def number(given: Any, default: float, key: str = "number") -> float:
     if given in (None, ""):
         return default
     text = str(given).strip()
-    if re.fullmatch(r"-?\d+,\d+", text):  # a decimal comma
+    if re.fullmatch(r"-?[0-9]+,[0-9]+", text):  # a decimal comma
         text = text.replace(",", ".")
-    try:
-        found = float(text)
-    except ValueError:
-        found = math.nan
+    found = float(text) if _REAL.fullmatch(text) else math.nan
     if not math.isfinite(found):
         raise ValueError(f"{key} = {str(given)[:40]!r} is no number")
     return int(found) if found == int(found) and abs(found) < 1e15 else found
