@@ -13,6 +13,7 @@ from tables import table
 from toy import Status, Toy
 
 from multidrop.bus import Bus
+from multidrop.cli import stop_plant
 from multidrop.cli.monitor import command as monitor
 from multidrop.drive import Drive
 from multidrop.drives import InvtCHE
@@ -361,3 +362,68 @@ def test_a_family_s_file_in_place_of_a_plant_file_is_told(run: Run, tmp_path: Pa
     status, out, err = run("read", tmp_path / "meter.toml", "meter-1")
     assert (status, out) == (2, "")
     assert "'line' is missing; add [[line]]" in err
+
+
+# ---- stops of a whole plant ----
+
+
+@pytest.mark.parametrize("words", [[], ["--all"], ["--line", "hall-1"]])
+def test_stop_of_a_plant_or_line_stops_all_its_drives(
+    run: Run, plant: Path, at: str, toy: SimulatedDrive, words: list[str]
+) -> None:
+    toy["control"] = Status.RUNNING
+    plant.write_text(plant.read_text().replace('"che-1"\nmodel = "invt-che"', f'"toy-4"\nmodel = "{TOY}"'))
+    status, out, _ = run("stop", plant, at, "--seconds", "0.2", *words)
+    assert toy["control"] == 0
+    assert {line.split(":")[0] for line in out.splitlines()} >= {"pump-1", "fan-1", "toy-4"}
+    assert out.count(": stopped after 0.") == 3
+    has_portless_line = "--line" not in words
+    assert ("pump-2: the stop was NOT sent: /dev/none-2: there is no such port" in out) == has_portless_line
+    assert status == has_portless_line
+
+
+def test_stop_of_a_plant_prints_json_and_exits_with_0_when_all_stand(
+    run: Run, tmp_path: Path, port: str, toy: SimulatedDrive
+) -> None:
+    plant = tmp_path / "all.toml"
+    drives = DRIVE.format("pump-1", TOY, 1) + DRIVE.format("pump-4", TOY, 4)
+    plant.write_text(LINE.format("hall-1", port) + drives)
+    toy["control"] = Status.RUNNING
+    status, out, _ = run("stop", plant, "--json")
+    assert status == 0
+    assert toy["control"] == 0
+    assert [(found["line"], found["drive"], found["seen"]) for found in json.loads(out)] == [
+        ("hall-1", "pump-1", "stopped"),
+        ("hall-1", "pump-4", "stopped"),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("words", "mistake"),
+    [
+        (["--line", "hall-2"], "has no line 'hall-2'; did you mean hall-1?"),
+        (["pump-1", "--all"], "pump-1 and --all contradict each other: give one of them"),
+        (["--all", "--line", "roof"], "--all and --line contradict each other: give one of them"),
+    ],
+)
+def test_mistaken_stop_of_a_plant_says_that_it_was_not_sent(
+    run: Run, plant: Path, at: str, toy: SimulatedDrive, words: list[str], mistake: str
+) -> None:
+    status, _, err = run("stop", plant, at, *words)
+    assert status == 2
+    assert err.startswith("multidrop: the stop was NOT sent: ")
+    assert mistake in err
+    assert not toy.counters.writes
+
+
+def test_interrupted_stop_of_a_plant_says_what_is_known_of_each_drive(
+    run: Run, plant: Path, at: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupt(*arguments: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(stop_plant, "_start", interrupt)
+    status, _, err = run("stop", plant, at)
+    assert status == 130
+    names = ("pump-1", "fan-1", "che-1", "pump-2")
+    assert err.splitlines()[1:] == [f"multidrop: {name}: the stop was NOT sent" for name in names]

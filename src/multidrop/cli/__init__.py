@@ -20,6 +20,7 @@ from multidrop.errors import BusError, Refused, Unsupported
 
 DONE, FAILED, MISTAKE, INTERRUPTED = 0, 1, 2, 130
 STOPS = ("stop", "coast", "emergency-stop")  # neither a mistake beside their drive nor SIGHUP keeps one back
+HARD_WIRED = "use the hard-wired stop"  # advice when a stop could not be sent
 _MISNAMED = (FileNotFoundError, IsADirectoryError, NotADirectoryError)
 
 COMMANDS = {  # name: module in this package, and help

@@ -9,7 +9,8 @@ from contextlib import contextmanager
 from typing import Any
 
 from multidrop.bus import Bus
-from multidrop.cli import DONE, MISTAKE, STOPS
+from multidrop.cli import DONE, HARD_WIRED, MISTAKE, STOPS
+from multidrop.cli.stop_plant import add_plant_stop_arguments, names_plant, stop_plant
 from multidrop.cli.support.arguments import add_json_argument, add_writing_arguments, duration
 from multidrop.cli.support.confirm import confirm
 from multidrop.cli.support.interruption import telling_what_was_sent
@@ -23,7 +24,6 @@ from multidrop.drive.script import Script, Write
 from multidrop.drive.state import Direction, State
 from multidrop.errors import LineError, Unsupported
 
-HARD_WIRED = "use the hard-wired stop"
 _DIRECTED = ("start", "jog")
 _FURTHER = {"set-frequency": ("HZ",)}  # arguments of commands behind the drive
 _SHOWING_WATCHDOG = ("state", *_DIRECTED)  # they print what the motor does when the client dies
@@ -39,6 +39,8 @@ _QUESTIONS = {  # asked before anything is sent; a stop needs no confirmation
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     command = parser.get_default("command")
     add_target_arguments(parser, *_FURTHER.get(command, ()))
+    if command == "stop":
+        add_plant_stop_arguments(parser)
     if command in _DIRECTED:
         parser.add_argument(
             "--direction",
@@ -69,6 +71,8 @@ def _stop_time(text: str) -> float | None:
 
 
 def run(arguments: argparse.Namespace) -> int:
+    if names_plant(arguments):
+        return stop_plant(arguments, _audit_file(arguments))
     target, words = _target(arguments)
     if words and arguments.command not in STOPS:
         arguments.frequency = number_of(arguments, "HZ", words[0])
