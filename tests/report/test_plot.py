@@ -164,6 +164,17 @@ def test_the_response_delay_is_without_the_request(look: Recording) -> None:
     assert fan.quantile(1.0) == pytest.approx(0.021)
 
 
+def test_reply_that_may_answer_a_lost_request_has_no_response_delay(tmp_path: Path) -> None:
+    rows = [row(tick / 10, "pump", "fault", 0.0, ms=10.0) for tick in range(10)]
+    rows += [row(1.0, "pump", "fault", None, "no reply"), row(1.0, "pump", "fault", 0.0, ms=488.0)]
+    rows += [
+        row(2.0, "pump", "fault", None, "not asked: drive is silent"),
+        row(2.0, "pump", "fault", 0.0, ms=30),
+    ]
+    (pump,) = delays(load(record(tmp_path / "it.arrows", rows, {})))
+    assert pump.seconds * 1e3 == pytest.approx([10.0] * 10 + [30.0])
+
+
 def test_noise_that_comes_with_speed_is_seen(look: Recording) -> None:
     shares = miss_shares(look, "pump")
     assert shares is not None

@@ -46,11 +46,14 @@ class DelaySeries:
 
 
 def delays(recording: Recording) -> list[DelaySeries]:
-    """Return the delays of every drive that answered."""
+    """Return the delays of every drive that answered.
+
+    The first reply after a loss is left out: it may answer the lost request, so its delay is unknown.
+    """
     found = []
     for drive in recording.drives:
         request = _request_seconds(recording, drive)
-        answered = [(series, ~series.missed) for series in recording.of(drive)]
+        answered = [(series, ~series.missed & ~_spans_loss(series)) for series in recording.of(drive)]
         # An exchange is one reply to several registers: its stamps count once.
         times = np.concatenate([series.time[there] for series, there in answered])
         stamps, firsts = np.unique(times, return_index=True)
@@ -59,6 +62,14 @@ def delays(recording: Recording) -> list[DelaySeries]:
             seconds = taken[firsts] / 1e9 - (request or 0.0)
             found.append(DelaySeries(drive, np.maximum(seconds, 0.0), request is not None))
     return found
+
+
+def _spans_loss(series: Series) -> Array:
+    """Return True for each value that may answer an earlier, lost request of the same register."""
+    asked = [number for number, status in enumerate(series.statuses) if not status.startswith(UNASKED)]
+    lost = np.unique(series.time[series.missed & np.isin(series.status, asked)])
+    next_lost = np.append(lost, np.iinfo(np.int64).max)[np.searchsorted(lost, series.time)]
+    return np.asarray(next_lost - series.time <= series.uncertainty)
 
 
 def _request_seconds(recording: Recording, drive: str) -> float | None:
