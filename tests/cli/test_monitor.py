@@ -37,7 +37,7 @@ from multidrop.cli.monitor.screen import (
     page,
     sparkline,
 )
-from multidrop.cli.monitor.side_reads import SideRead
+from multidrop.cli.monitor.side_reads import SideRead, pause_s
 from multidrop.cli.support.live_plant import LivePlant
 from multidrop.cli.support.polling import PollingSession
 from multidrop.cli.support.screen_text import joined
@@ -219,6 +219,15 @@ def test_what_is_asked_seldom_is_not_old_before_it_is_due_again(tmp_path: Path) 
         False,
         True,
     ]
+
+
+def test_side_reads_take_spare_time_and_hardly_any_of_a_full_line(tmp_path: Path) -> None:
+    for utilisation, share in ((0.2, 0.05), (0.97, 0.03), (1.0, 0.01), (3.0, 0.01)):
+        assert 0.03 / (0.03 + pause_s(0.03, utilisation)) == pytest.approx(share)
+    assert pause_s(0.001, 0.2) == 0.1  # a fast line
+    plant = a_plant(tmp_path, 1)
+    (drive,) = LivePlant(plant, plant.metadata()["planned"]).drives
+    assert drive.line_utilisation == 1.0  # polled as fast as the line allows
 
 
 def test_what_a_terminal_cannot_show_takes_the_same_columns() -> None:

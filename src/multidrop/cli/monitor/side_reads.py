@@ -12,7 +12,8 @@ from multidrop.cli.support.values import value_text
 from multidrop.errors import BusError
 from multidrop.poller import Poller
 
-SIDE_S = 0.1  # between two reads: the polling keeps nearly all of the line
+LEAST_PAUSE_S = 0.1  # between two reads
+MOST_SHARE, LEAST_SHARE = 0.05, 0.01  # of a line's time: with spare time, and on a full line
 
 
 class SideRead(NamedTuple):
@@ -23,7 +24,10 @@ class SideRead(NamedTuple):
 
 
 class SideReader:
-    """Reads one drive's other registers, one after another, in a thread of its own."""
+    """Reads one drive's other registers, one after another, in a thread of its own.
+
+    The reads use the time that the polls leave, at most MOST_SHARE of it; on a full line LEAST_SHARE.
+    """
 
     def __init__(self, poller: Poller) -> None:
         self._poller = poller
@@ -53,12 +57,19 @@ class SideReader:
                 continue
             if self._drive is not chosen:
                 return
+            asked = time.monotonic()
             try:
                 text = value_text(register, bus.read(drive, register))
             except BusError as failure:
                 text = _in_words(failure)
             found[name] = SideRead(text, time.time_ns())
-            time.sleep(SIDE_S)
+            time.sleep(pause_s(time.monotonic() - asked, chosen.line_utilisation))
+
+
+def pause_s(read_s: float, utilisation: float) -> float:
+    """Return how long to wait, in s, after a read that took `read_s` on a line with this utilisation."""
+    share = min(MOST_SHARE, max(LEAST_SHARE, 1.0 - utilisation))
+    return max(LEAST_PAUSE_S, read_s * (1.0 / share - 1.0))
 
 
 def _in_words(failure: BusError) -> str:

@@ -34,6 +34,7 @@ class LiveDrive:
     line: PlantLine
     polled: PolledDrive
     cycle: float = 0.0  # s, of its line, as planned
+    line_utilisation: float = 1.0  # as planned; 1 or more: the polls leave no spare time
     newest: dict[str, Row] = field(default_factory=dict)  # samples, by register
     missed: dict[str, Row] = field(default_factory=dict)  # misses newer than the register's sample
     last_miss: str = ""  # status of the last miss of a request that was sent
@@ -133,8 +134,9 @@ class LivePlant:
         self.plant = plant
         self.drives = []
         for line in plant.lines:
-            cycle = planned[line.name]["cycle_ms"] / 1e3 if planned else 0.0
-            self.drives += [LiveDrive(line, polled, cycle) for polled in line.drives]
+            facts = planned[line.name] if planned else {}
+            cycle, utilisation = facts.get("cycle_ms", 0.0) / 1e3, facts.get("utilisation", 1.0)
+            self.drives += [LiveDrive(line, polled, cycle, utilisation) for polled in line.drives]
         self.so_far = {line.name: line_statistics(1.0, {}, None) for line in plant.lines}
         self.lately = self.so_far
         self._by_name = {drive.name: drive for drive in self.drives}
