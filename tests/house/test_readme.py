@@ -8,11 +8,13 @@ from __future__ import annotations
 import re
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import patient
 import pytest
 from lines import PATIENCE
+from sources import files, run_time_imports
 
 from multidrop.drives import MODELS
 
@@ -31,6 +33,21 @@ def test_it_is_short() -> None:
 
 def test_the_benchmarks_page_is_short() -> None:
     assert len((ROOT / "bench" / "README.md").read_text("utf-8").splitlines()) <= 80
+
+
+def test_the_bench_extra_installs_all_that_benchmarks_import() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
+    extras = project["optional-dependencies"]
+    nested = [extra for name in ("test", "history", "plot") for extra in extras[name]]
+    assert any("multidrop[test,history,plot]" in wanted for wanted in extras["bench"])
+    distributions = {"pyserial": "serial", "modbus-tk": "modbus_tk", "cffi": "cffi"}
+    wanted = {
+        re.split(r"[\[><=; ]", text)[0] for text in [*project["dependencies"], *extras["bench"], *nested]
+    }
+    installed = {distributions.get(name, name) for name in wanted}
+    ours = {"multidrop", "bench", *(path.stem for path in (ROOT / "tests" / "support").rglob("*.py"))}
+    imported = {name.partition(".")[0] for path in files("bench") for name in run_time_imports(path)}
+    assert imported - ours - set(sys.stdlib_module_names) - installed == set()
 
 
 def test_setting_up_is_what_ci_does() -> None:
