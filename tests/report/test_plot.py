@@ -33,13 +33,14 @@ def _imported() -> None:
     """Import matplotlib where these tests run; each worker that only collects them needs 0.5 s for it."""
     global np, Recording, load, plot, plot_page, png, report_page, _about, _drives
     global MOST_REASONS, delays, draw_rates, miss_shares, reasons_of, line_uses
-    global MOST_LANES, MOST_PANELS, MOST_POINTS, thinned
+    global MOST_DRIVES, MOST_LANES, MOST_PANELS, MOST_POINTS, thinned
     import numpy as np
 
     from multidrop.report import Recording, load, plot, plot_page, png, report_page
     from multidrop.report.health import MOST_REASONS, delays, draw_rates, miss_shares, reasons_of
     from multidrop.report.html import _about, _drives
     from multidrop.report.lanes import MOST_LANES
+    from multidrop.report.style import MOST_DRIVES
     from multidrop.report.utilisation import line_uses
     from multidrop.report.value_plot import MOST_PANELS, MOST_POINTS, thinned
 
@@ -561,6 +562,34 @@ def test_a_panel_has_room_for_so_many_lanes_only(tmp_path: Path) -> None:
     assert "(16 more lanes: choose with --drive)" in axes.get_title(loc="left")
 
 
+def test_drives_without_room_are_counted_and_stay_in_the_tables(tmp_path: Path) -> None:
+    rows = [row(at, f"pump-{number}", "x", at) for at in range(2) for number in range(MOST_DRIVES + 2)]
+    look = load(record(tmp_path / "it.arrows", rows, {}))
+    assert plot(look)[1] == ["2 more drives"]
+    assert plot(look, [f"pump-{MOST_DRIVES + 1}"])[1] == []
+    tables = "".join(_drives(look))
+    assert f'<td class="short">pump-{MOST_DRIVES + 1}</td>' in tables
+    assert f"The pictures show the first {MOST_DRIVES} of these drives" in tables
+
+
+@pytest.mark.parametrize(
+    ("limit", "value", "mistake"),
+    [
+        ("MOST_NAMES", 9, "names more than 9 drives, registers or statuses"),
+        ("MOST_ROWS", 19, "is too large to draw: it has more than 19 rows"),
+        ("LONGEST_NAME", 5, "a name has 7 bytes: a recording's have at most 5"),
+    ],
+)
+def test_recording_too_large_to_draw_is_one_sentence(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, limit: str, value: int, mistake: str
+) -> None:
+    path = record(tmp_path / "it.arrows", [row(at, f"pump-{at:02}", "x", at) for at in range(20)], {})
+    assert len(load(path).series) == 20
+    monkeypatch.setattr("multidrop.report.load." + limit, value)
+    with pytest.raises(ValueError, match=mistake):
+        load(path)
+
+
 @pytest.mark.slow
 def test_states_that_change_faster_than_can_be_drawn_hide_none(tmp_path: Path) -> None:
     rows = [row(at / 100, "che", "status", 1 + at % 2) for at in range(20_000)]
@@ -592,7 +621,7 @@ def test_what_has_no_room_is_named(run: Run, tmp_path: Path) -> None:
     assert f"<p>Not shown: r{MOST_PANELS}; r{MOST_PANELS + 1}. <code>multidrop plot" in report_page(look)
     assert run("plot", tmp_path / "it.arrows") == (
         0,
-        f"{tmp_path}/it.png\nnot shown: r{MOST_PANELS}; r{MOST_PANELS + 1} (choose with --register)\n",
+        f"{tmp_path}/it.png\nnot shown: r{MOST_PANELS}; r{MOST_PANELS + 1} (choose with --drive and --register)\n",
         "",
     )
 

@@ -36,5 +36,5 @@ def run(arguments: argparse.Namespace) -> int:
         out.write_text(plot_page(recording, figure), "utf-8")
     print_text(out)
     if left_out:
-        print_text(f"not shown: {'; '.join(left_out)} (choose with --register)")
+        print_text(f"not shown: {'; '.join(left_out)} (choose with --drive and --register)")
     return 0

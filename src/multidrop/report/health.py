@@ -15,6 +15,7 @@ from multidrop.drive.timing import Settings
 from multidrop.report.load import Array, Recording, Series
 from multidrop.report.style import (
     COLOURS,
+    MOST_DRIVES,
     TEXT,
     TimeBins,
     add_legend,
@@ -86,7 +87,8 @@ def _request_seconds(recording: Recording, drive: str) -> float | None:
 
 
 def draw_delays(found: Sequence[DelaySeries]) -> Figure:
-    """Draw a row for each drive: a box between the quartiles, whiskers to 1 % and 99 %."""
+    """Draw a row for each of the first MOST_DRIVES: a box between the quartiles, whiskers to 1 % and 99 %."""
+    found = found[:MOST_DRIVES]
     figure, (axes,) = new_figure([0.8 + 0.32 * len(found)])
     axes.boxplot(
         [delay.seconds * 1e3 for delay in found],
@@ -111,10 +113,10 @@ def draw_delays(found: Sequence[DelaySeries]) -> Figure:
 
 
 def draw_rates(recording: Recording) -> Figure:
-    """Draw the values a second of each drive, and below them the misses a second by reason."""
+    """Draw the values a second of the first MOST_DRIVES drives, and below the misses a second by reason."""
     figure, (rates, misses) = new_figure([2.2, 1.8], sharex=True)
     bins = TimeBins(recording.begin, recording.end)
-    for number, drive in enumerate(recording.drives):
+    for number, drive in enumerate(recording.drives[:MOST_DRIVES]):
         rate = sum(bins.rates(series.time[~series.missed]) for series in recording.of(drive))
         rates.plot(bins.middles, rate, linewidth=1.3, label=label(drive), **line_style(number))
     set_title(rates, "values a second")
@@ -178,7 +180,7 @@ def miss_shares(recording: Recording, drive: str) -> tuple[Array, Array] | None:
 
 def draw_miss_shares(recording: Recording) -> Figure | None:
     """Draw misses against output frequency: noise that comes with speed shows as a slope."""
-    shares = {drive: miss_shares(recording, drive) for drive in recording.drives}
+    shares = {drive: miss_shares(recording, drive) for drive in recording.drives[:MOST_DRIVES]}
     if not any(shares.values()):
         return None
     figure, (axes,) = new_figure([2.4])

@@ -11,9 +11,16 @@ from datetime import UTC, datetime
 from matplotlib.figure import Figure
 
 from multidrop.printable import printable
-from multidrop.report.health import DelaySeries, delays, draw_delays, draw_miss_shares, draw_rates, reasons_of
+from multidrop.report.health import (
+    DelaySeries,
+    delays,
+    draw_delays,
+    draw_miss_shares,
+    draw_rates,
+    reasons_of,
+)
 from multidrop.report.load import Recording, Series
-from multidrop.report.style import png
+from multidrop.report.style import MOST_DRIVES, png
 from multidrop.report.utilisation import LineUse, draw_utilisation, line_uses
 from multidrop.report.value_plot import FAULTS, plot
 
@@ -124,6 +131,8 @@ def _drives(recording: Recording) -> Iterator[str]:
         )
     heads = ["Drive", "Line", "Model", "Address", "Settings", "Registers"]
     yield _table([*heads, "#Values/s", "#Values", "#Misses", "#Missed"], rows)
+    if len(rows) > MOST_DRIVES:
+        yield f"<p>The pictures show the first {MOST_DRIVES} of these drives; the tables have all.</p>"
 
 
 def _utilisation(uses: Sequence[LineUse], recording: Recording) -> Iterator[str]:
@@ -209,7 +218,7 @@ def _values(recording: Recording) -> Iterator[str]:
     figure, left = plot(recording)
     if left:
         names = _escape("; ".join(left))
-        yield f"<p>Not shown: {names}. <code>multidrop plot --register NAME</code> shows each.</p>"
+        yield f"<p>Not shown: {names}. <code>multidrop plot</code> with --drive or --register shows each.</p>"
     yield _image(figure, "values over time")
 
 

@@ -19,6 +19,9 @@ RAW = "raw count"  # the unit where no document states the scale
 LARGEST = 1e150  # drawable value: axes compute with differences and products
 LATEST_NS = 230 * 365 * 86400 * 10**9  # UTC: dates beyond it cannot be computed
 PAUSE_NS, PAUSE_STEPS = 2 * 10**9, 5  # longer than both: nothing was polled, as by a process that stood still
+MOST_ROWS = 100_000_000  # they take 5 GB
+MOST_NAMES = 4096  # of drives, registers or statuses
+LONGEST_NAME = 4096  # bytes
 LARGEST_COUNT = 2**53  # that a column of values can hold exactly
 Array = NDArray[Any]
 
@@ -141,7 +144,7 @@ class Recording:
     def rows(self) -> int:
         return sum(len(series.time) for series in self.series)
 
-    @property
+    @cached_property
     def drives(self) -> tuple[str, ...]:
         there = dict.fromkeys(series.drive for series in self.series)
         known = [drive for drive in self.metadata.get("drives", {}) if drive in there]
@@ -165,20 +168,35 @@ class Recording:
 
     def of(self, drive: str, register: str = "") -> tuple[Series, ...]:
         """Return a drive's series, or that of one register."""
-        of_drive = (series for series in self.series if series.drive == drive)
+        of_drive = self._by_drive.get(drive, ())
         return tuple(series for series in of_drive if register in ("", series.register))
+
+    @cached_property
+    def _by_drive(self) -> dict[str, list[Series]]:
+        found: dict[str, list[Series]] = {}
+        for series in self.series:
+            found.setdefault(series.drive, []).append(series)
+        return found
 
 
 def load(path: str | Path) -> Recording:
-    """Load a recording. Raises ValueError for a file without rows or of another kind, and OSError."""
+    """Load a recording. Raises OSError, and ValueError for a file of another kind, empty, or too large."""
     reader = open_reader(path)
-    names: dict[str, list[str]] = {"drive": [], "register": [], "status": []}
+    codes: dict[str, dict[str, int]] = {"drive": {}, "register": {}, "status": {}}
     parts: list[list[Array]] = []
-    for rows in reader:
-        children = dict(zip(Row._fields, rows.arrow().view().children, strict=True))
-        codes = [_codes(children[name], known) for name, known in names.items()]
-        parts.append(codes + [_numbers(children[name]) for name in ("time", "value", "uncertainty_ns")])
-    if not parts or not any(len(part[0]) for part in parts):
+    rows = 0
+    for batch in reader:
+        children = dict(zip(Row._fields, batch.arrow().view().children, strict=True))
+        columns = [_codes(children[name], known) for name, known in codes.items()]
+        parts.append(columns + [_numbers(children[name]) for name in ("time", "value", "uncertainty_ns")])
+        rows += len(batch)
+        if rows > MOST_ROWS:
+            raise ValueError(f"{path} is too large to draw: it has more than {MOST_ROWS} rows")
+        if max(map(len, codes.values())) > MOST_NAMES:
+            raise ValueError(
+                f"{path} cannot be drawn: it names more than {MOST_NAMES} drives, registers or statuses"
+            )
+    if not rows:
         raise ValueError(f"{path} holds no rows: nothing was polled while it was recorded")
     drive, register, status, time, value, uncertainty = (
         np.concatenate(column) for column in zip(*parts, strict=True)
@@ -186,14 +204,15 @@ def load(path: str | Path) -> Recording:
     if not 0 <= time.min() <= time.max() < LATEST_NS:
         raise ValueError(f"{path} cannot be drawn: there are rows from before 1970 or after 2200")
     metadata = {**reader.metadata, "drives": _described(reader.metadata.get("drives"))}
-    statuses = tuple(names["status"])
+    drives, registers, statuses = map(tuple, codes.values())
+    pair = drive.astype(np.int64) * len(registers) + register
+    order = np.lexsort((time, pair))
+    starts = np.flatnonzero(np.diff(pair[order], prepend=-1))
+    first_seen = np.minimum.reduceat(order, starts)  # the row in which each series first appears
     series = []
-    pair = drive.astype(np.int64) * len(names["register"]) + register
-    for key in dict.fromkeys(pair.tolist()):
-        rows_of = np.flatnonzero(pair == key)
-        rows_of = rows_of[np.argsort(time[rows_of], kind="stable")]
-        drive_name = names["drive"][key // len(names["register"])]
-        register_name = names["register"][key % len(names["register"])]
+    groups = np.split(order, starts[1:])
+    for rows_of in (groups[at] for at in np.argsort(first_seen)):
+        drive_name, register_name = drives[drive[rows_of[0]]], registers[register[rows_of[0]]]
         about = metadata["drives"].get(drive_name, {}).get("registers", {}).get(register_name, {})
         series.append(
             Series(
@@ -245,10 +264,12 @@ def _numbers(column: Any) -> Array:
     return np.where(valid[: column.length] == 1, numbers.astype(float), np.nan)
 
 
-def _codes(column: Any, known: list[str]) -> Array:
-    """Return the index of each row's text in `known`, which grows by new ones."""
+def _codes(column: Any, known: dict[str, int]) -> Array:
+    """Return the code of each row's text by `known`, to which new texts are added."""
     ends = np.array(column.buffer(1))[: column.length + 1]
     lengths = np.diff(ends)
+    if lengths.max(initial=0) > LONGEST_NAME:
+        raise ValueError(f"a name has {lengths.max()} bytes: a recording's have at most {LONGEST_NAME}")
     width = int(lengths.max(initial=1)) or 1
     padded = np.zeros((column.length, width), np.uint8)
     text = np.frombuffer(bytes(column.buffer(2)), np.uint8)[ends[0] : ends[-1]]
@@ -257,8 +278,6 @@ def _codes(column: Any, known: list[str]) -> Array:
         padded.view(f"S{width}").ravel(), return_index=True, return_inverse=True
     )
     for at in np.argsort(firsts):
-        name = found[at].decode(errors="replace")
-        if name not in known:
-            known.append(name)
-    numbers = np.array([known.index(text.decode(errors="replace")) for text in found.tolist()], np.int32)
+        known.setdefault(found[at].decode(errors="replace"), len(known))
+    numbers = np.array([known[text.decode(errors="replace")] for text in found.tolist()], np.int32)
     return numbers[places] if len(found) else np.zeros(0, np.int32)

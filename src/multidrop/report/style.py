@@ -16,6 +16,7 @@ from multidrop.printable import printable
 from multidrop.report.load import Array
 
 # Okabe and Ito's, without black and yellow; then the same once more, dashed.
+MOST_DRIVES = 100  # in a picture; tables have all
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#555555")
 DASHES = ("solid", "dashed", "dotted", "dashdot")
 TEXT = "#555555"

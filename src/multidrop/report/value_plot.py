@@ -18,6 +18,7 @@ from multidrop.report.load import RAW, Array, Recording, Series
 from multidrop.report.style import (
     FAULT,
     GRID,
+    MOST_DRIVES,
     TEXT,
     add_legend,
     day,
@@ -77,7 +78,7 @@ class Content:
 def plot(
     recording: Recording, drives: Sequence[str] = (), registers: Sequence[str] = ()
 ) -> tuple[Figure, list[str]]:
-    """Return the picture, and the registers that had no room in it.
+    """Return the picture, and the registers and drives that had no room in it.
 
     Raises ValueError for unknown names, and where there is no value to draw.
     """
@@ -100,16 +101,19 @@ def plot(
     label_time(axes[-1])
     axes[-1].set_xlim(day(recording.begin), day(max(recording.end, recording.begin + 1_000_000)))
     _add_drives(figure, contents, recording, has_misses=any(series.missed.any() for series in chosen))
-    return figure, list(dict.fromkeys(panel.title for panel in panels[len(shown) :]))
+    left_out = list(dict.fromkeys(panel.title for panel in panels[len(shown) :]))
+    hidden = 0 if drives else len(recording.drives[MOST_DRIVES:])
+    return figure, [*left_out, *([f"{hidden} more drives"] if hidden else [])]
 
 
 # ---- what is shown ----
 
 
 def _of_drives(recording: Recording, drives: Sequence[str], registers: Sequence[str]) -> list[Series]:
-    """Return the series of these drives, or of all. Raises ValueError for names that it does not have."""
+    """Return the series of these drives, or of the first MOST_DRIVES. Raises ValueError for unknown names."""
     _check("drive", drives, recording.drives)
-    chosen = [series for series in recording.series if not drives or series.drive in drives]
+    shown = set(drives or recording.drives[:MOST_DRIVES])
+    chosen = [series for series in recording.series if series.drive in shown]
     _check("register", registers, tuple(dict.fromkeys(series.register for series in chosen)))
     return chosen
 
