@@ -60,6 +60,12 @@ def test_a_record_that_had_no_room_harms_no_other(tmp_path: Path, room: int) -> 
     assert sum(not _is_record(line) for line in whole) == (1 if room else 0)
 
 
+def test_reading_the_audit_log_skips_lines_that_are_not_records(tmp_path: Path) -> None:
+    path = tmp_path / "audit.jsonl"
+    path.write_bytes(b'{"write": "a"}\n' + b"[" * 100_000 + b"\n[1]\n\xff\n" + b'{"write": "b"}\n{"write')
+    assert [record["write"] for record in read_audit(path)] == ["a", "b"]
+
+
 def test_closing_waits_for_a_record_that_another_thread_writes(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import pyarrow as pa
+import pyarrow.parquet
 import pytest
 from batches import DRIVES, METADATA, REGISTERS, SECOND, UTC_0, block, completion, counting, example
 from completions import add_rows
@@ -26,7 +27,7 @@ from tables import table
 from toy import Toy
 
 from multidrop.core import Columns, Names
-from multidrop.polling.batch import Batch, Row
+from multidrop.polling.batch import Batch, Row, schema
 from multidrop.recording import (
     FORMATS,
     RecordingError,
@@ -471,6 +472,27 @@ def test_other_columns(tmp_path: Path, suffix: str) -> None:
         pa.parquet.write_table(other, path)
     with pytest.raises(ValueError, match=r"is not a recording: it is .* with other columns"):
         open_reader(path)
+
+
+@pytest.mark.parametrize("uses_dictionary", [True, False])
+def test_parquet_file_that_unpacks_to_gigabytes_is_refused(tmp_path: Path, uses_dictionary: bool) -> None:
+    """A few kilobytes of zstd can hold gigabytes of names, by a dictionary or as they are."""
+    rows, name = (20_000, "x" * 4000) if uses_dictionary else (300, "x" * 1_000_000)
+    described = pa.schema(schema())
+    names = [name if uses_dictionary else f"{name}{at}" for at in range(rows)]
+    columns = [[0] * rows, [0] * rows, [0] * rows, names, ["x"] * rows, [1.0] * rows, ["ok"] * rows]
+    arrays = [pa.array(column, field.type) for column, field in zip(columns, described, strict=True)]
+    path = tmp_path / "a.parquet"
+    table = pa.Table.from_arrays(arrays, schema=described)
+    pa.parquet.write_table(table, path, compression="zstd", use_dictionary=uses_dictionary)
+    assert path.stat().st_size < 100_000
+    mistake = (
+        "is damaged after row 0: the texts of column drive take more than 67108864 bytes"
+        if uses_dictionary
+        else "is not a recording: its column drive takes 3000[0-9]{5} bytes unpacked, at most 268435456 are"
+    )
+    with pytest.raises(ValueError, match=mistake):
+        list(open_reader(path))
 
 
 def test_compressed_batches_are_refused(tmp_path: Path) -> None:

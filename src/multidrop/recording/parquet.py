@@ -6,7 +6,7 @@ and convert.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from io import BufferedWriter
 from pathlib import Path
@@ -27,6 +27,9 @@ from multidrop.recording.format import (
 from multidrop.recording.rows import RecordedRows
 
 GROUP_ROWS = 1 << 17  # that wait in memory
+TEXTS = ("drive", "register", "status")
+MOST_TEXT = 1 << 26  # bytes of a text column in GROUP_ROWS rows
+MOST_OF_COLUMN = 1 << 28  # unpacked bytes of a column in a group of rows
 UNREADABLE = "nothing of it can be read, because a Parquet file is readable only once it is closed"
 ENCODING = {
     "compression": "zstd",
@@ -38,6 +41,7 @@ ENCODING = {
 def _pyarrow(path: Path) -> Any:
     try:
         import pyarrow as arrow
+        import pyarrow.compute
         import pyarrow.parquet
     except ImportError as failure:
         raise RecordingError(path, "Parquet needs pyarrow: pip install 'multidrop[parquet]'") from failure
@@ -112,7 +116,7 @@ class ParquetReader(RecordingReader):
     def __iter__(self) -> Iterator[Rows]:
         c_array = nanoarrow().c_array
         rows = 0
-        with self._open() as file:
+        with self._open(read_dictionary=TEXTS) as file:
             # Not by groups: a damaged one may claim any size.
             batches = file.iter_batches(GROUP_ROWS, columns=self._columns)
             while (batch := self._next(batches, rows)) is not None:
@@ -120,13 +124,26 @@ class ParquetReader(RecordingReader):
                 rows += len(batch)
 
     @contextmanager
-    def _open(self) -> Iterator[Any]:
+    def _open(self, read_dictionary: Sequence[str] = ()) -> Iterator[Any]:
         with self.path.open("rb") as file:
             try:
-                opened = self._arrow.parquet.ParquetFile(file)
+                opened = self._arrow.parquet.ParquetFile(file, read_dictionary=read_dictionary)
             except (OSError, ValueError, self._arrow.ArrowException) as failure:
                 raise self._not_a_recording(f"it is no whole Parquet file; {UNREADABLE}") from failure
+            self._check_sizes(opened.metadata)
             yield opened
+
+    def _check_sizes(self, described: Any) -> None:
+        """Raise ValueError for a column that would take too much memory once it is unpacked."""
+        for number in range(described.num_row_groups):
+            group = described.row_group(number)
+            for column in map(group.column, range(group.num_columns)):
+                size = column.total_uncompressed_size
+                if size > MOST_OF_COLUMN:
+                    raise self._not_a_recording(
+                        f"its column {column.path_in_schema} takes {size} bytes unpacked, at most "
+                        f"{MOST_OF_COLUMN} are read"
+                    )
 
     def _next(self, batches: Iterator[Any], rows: int) -> Any:
         """Return the next batch, None after the last."""
@@ -137,10 +154,23 @@ class ParquetReader(RecordingReader):
             batch.validate(full=True)
         except (OSError, ValueError, self._arrow.ArrowException) as failure:
             raise self._damaged(rows, "what follows cannot be unpacked") from failure
+        batch = self._with_texts(batch, rows)
         for field in self._arrow.schema(schema()):
             if not field.nullable and batch[field.name].null_count:
                 raise self._damaged(rows, f"there is a row without a {field.name}")
-        return batch.replace_schema_metadata()
+        return batch
+
+    def _with_texts(self, batch: Any, rows: int) -> Any:
+        """Return the batch with texts in place of numbers into a dictionary of texts."""
+        compute, columns = self._arrow.compute, []
+        for name, column in zip(self._columns, batch.columns, strict=True):
+            if name in TEXTS:
+                lengths = compute.take(compute.binary_length(column.dictionary), column.indices)
+                if (compute.sum(lengths).as_py() or 0) > MOST_TEXT:
+                    raise self._damaged(rows, f"the texts of column {name} take more than {MOST_TEXT} bytes")
+                column = column.dictionary_decode()
+            columns.append(column)
+        return self._arrow.RecordBatch.from_arrays(columns, schema=self._arrow.schema(schema()))
 
 
 writer, reader = ParquetWriter, ParquetReader
