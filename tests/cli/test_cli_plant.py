@@ -373,10 +373,10 @@ def test_stop_of_a_plant_or_line_stops_all_its_drives(
 ) -> None:
     toy["control"] = Status.RUNNING
     plant.write_text(plant.read_text().replace('"che-1"\nmodel = "invt-che"', f'"toy-4"\nmodel = "{TOY}"'))
-    status, out, _ = run("stop", plant, at, "--seconds", "0.2", *words)
+    status, out, _ = run("stop", plant, at, *words)
     assert toy["control"] == 0
     assert {line.split(":")[0] for line in out.splitlines()} >= {"pump-1", "fan-1", "toy-4"}
-    assert out.count(": stopped after 0.") == 3
+    assert out.count(": stopped after ") == 3
     has_portless_line = "--line" not in words
     assert ("pump-2: the stop was NOT sent: /dev/none-2: there is no such port" in out) == has_portless_line
     assert status == has_portless_line

@@ -10,7 +10,6 @@ from pathlib import Path
 from types import FrameType
 
 import pytest
-from declared_families import class_of, document_of
 from examples import in_turn
 from interruptions import failing_at
 from motors import MAKE
@@ -23,18 +22,10 @@ from multidrop.control.stop_all import stop_together
 from multidrop.drive import Drive
 from multidrop.sim import MotorDrive
 
-
-@cache
-def of_file(name: str) -> type[Drive]:
-    return class_of(document_of(name))
-
-
 FAMILIES: dict[str, Callable[[int], Drive]] = {
     **MAKE,
     "a profile": ALL["abb-acs355"],
     "a shipped file": ALL["shipped delta-ms300"],
-    "a file of words": lambda address: of_file("abb")(address, confirmed=1, reference_maximum=50),
-    "a file of coils": lambda address: of_file("coil")(address, confirmed=1),
 }
 FAILURES: dict[str, Callable[[], BaseException]] = {
     "signal": KeyboardInterrupt,
@@ -42,7 +33,7 @@ FAILURES: dict[str, Callable[[], BaseException]] = {
     "no descriptors": lambda: OSError(EMFILE, "Too many open files"),
 }
 HOME = Path(multidrop.__file__).parent
-SCRIPTS = tuple(str(HOME / name) for name in ("drives", "profiles", "family_file", "drive/script.py"))
+SCRIPTS = tuple(str(HOME / name) for name in ("drives", "profiles", "drive/script.py"))
 ATTEMPT = (str(HOME / "control/stop_attempt.py"), str(HOME / "drive/family.py"))
 
 

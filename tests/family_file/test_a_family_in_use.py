@@ -194,14 +194,31 @@ def test_a_file_that_only_measures_needs_no_confirmation(plant: Path) -> None:
     assert "confirmed" not in family.options
 
 
-def test_a_file_with_an_identify_is_confirmed_all_the_same() -> None:
-    family = load_family(Path(__file__).parents[1] / "data" / "families" / "abb.toml")
-    assert family.identify is not Drive.identify
-    drive = family(1)
-    for verb in ("start", "reset_fault", "set_frequency"):
-        with pytest.raises(Refused, match="declare confirmed = 1"):
-            drive.check_confirmed(verb)
-    family(1, confirmed=1).check_confirmed("start")
+@pytest.mark.parametrize(
+    ("proof", "value", "is_one"),
+    [
+        ("is = [250, 300]", 300, True),
+        ("is = [250, 300]", 301, False),
+        ("above = 5", 6, True),
+        ("above = 5", 5, False),
+        ("above = 5\nbelow = 7", 7, False),
+    ],
+)
+def test_file_recognises_its_drives_by_the_values_of_registers(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, proof: str, value: int, is_one: bool
+) -> None:
+    path = tmp_path / "meter.toml"
+    head = '[family]\ntitle = "Meter"\nmanual = "M"\ncounts_from = 0\n[reading]\ndevice = { at = 3 }\n'
+    path.write_text(f'{head}[[identify]]\nregister = "device"\n{proof}\n')
+    drive = load_family(path)(1)
+    line = SimulatedBus(monkeypatch, sim := simulated(drive))
+    line.bus.attach(drive)
+    sim["device"] = value
+    if is_one:
+        drive.perform(drive.identify.script())
+        return
+    with pytest.raises(Refused, match=f"shows device = {value}: it is no Meter"):
+        drive.perform(drive.identify.script())
 
 
 def test_files_of_one_name_have_wear_of_their_own(plant: Path) -> None:

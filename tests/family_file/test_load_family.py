@@ -220,39 +220,49 @@ def test_more_than_twenty_mistakes_are_told_in_one_run(tmp_path: Path) -> None:
     assert len(TOLD) > 20
 
 
-BESIDE = """
-[reading]
-a = { at = 70000, bits = { run = 0 } }
-[command]
-control = { at = 14 }
-[look]
-runs = { register = "a", has = ["run"] }
-[state]
-runs = "running"
-far = "fault"
-[identify]
-register = "a"
-[shows]
-a = ["run"]
-[verb.stop]
-steps = [{ insist = "control", value = 0 }, { await = "runs", limit = "forever" }, { fly = 1 }]
-[verb.dance]
-steps = []
-"""
+DEVICE = HEAD + "[reading]\ndevice = { at = 3 }\nspeed = { at = 4, unit = 'Hz', step = 0.1 }\n"
 
 
-def test_mistakes_of_verbs_are_told_beside_those_of_a_register(tmp_path: Path) -> None:
-    """Only what follows from the register is not told: that nobody can look at it."""
-    (tmp_path / "t.toml").write_text(HEAD + BESIDE)
-    with pytest.raises(FamilyError) as wrong:
+@pytest.mark.parametrize(
+    ("section", "mistakes"),
+    [
+        ('[[identify]]\nregister = "speed"\nabove = 71.5', []),
+        ('[identify]\nregister = "device"\nis = [0x10A]', []),
+        (
+            '[[identify]]\nregister = "devise"\nis = [1]',
+            ["identify number 1: register = 'devise' is not a readable register of this file"],
+        ),
+        (
+            '[[identify]]\nregister = "device"',
+            ["identify number 1: says no value; add is = [0x010A], or above and below"],
+        ),
+        (
+            '[[identify]]\nregister = "device"\nis = ["x"]',
+            ["identify number 1: is = ['x'] is not right; write is = [0x010A]"],
+        ),
+        (
+            "[[identify]]\nis = [1]",
+            ["identify number 1: 'register' is missing; add register = \"device\""],
+        ),
+        (
+            "identify = 5",
+            ["identify number 1: 5 is not a table with register, is, above, below"],
+        ),
+        (
+            "[verb.stop]\nsteps = []",
+            ["[verb] is not supported; name a profile, or write the drive as a Python class"],
+        ),
+    ],
+)
+def test_identify_and_verb_sections_are_checked(tmp_path: Path, section: str, mistakes: list[str]) -> None:
+    first, rest = ("", DEVICE + section) if section.startswith("[") else (section + "\n", DEVICE)
+    (tmp_path / "t.toml").write_text(first + rest)
+    told: tuple[str, ...] = ()
+    try:
         load_family(tmp_path / "t.toml")
-    assert [mistake.partition("t.toml: ")[2][:60] for mistake in wrong.value.mistakes] == [
-        "[reading] a: at: 70000 is outside 0 to FFFFH",
-        "[state]: far is no look of [look]; there are none that is ri",
-        "[verb.stop], step 2: 'forever' is not a duration from 100 us",
-        "[verb.stop], step 3: {'fly': 1} is no step; each has one of ",
-        "[verb.dance]: dance is no verb that a file declares; there a",
-    ]
+    except FamilyError as wrong:
+        told = wrong.mistakes
+    assert [mistake.partition("t.toml: ")[2] for mistake in told] == mistakes
 
 
 @table(
@@ -417,7 +427,7 @@ def test_every_key_is_in_the_reference() -> None:
     page = (Path(__file__).parents[2] / "docs" / "reference" / "family-file.md").read_text("utf-8")
     missing = [key for key in (*FAMILY_KEYS, *REGISTER_KEYS) if f"`{key}`" not in page]
     assert missing == []
-    assert [section for section in SECTIONS if f"`[{section}" not in page] == []
+    assert [section for section in SECTIONS if f"[{section}]" not in page] == []
 
 
 def test_texts(tmp_path: Path) -> None:

@@ -37,6 +37,7 @@ class ManualFacts(LineFacts):
     later: ClassVar[frozenset[int]] = frozenset({5, 6})  # those of a drive that will answer later
     broadcasts: ClassVar[bool] = False  # the document has broadcasts, which nobody answers
     identify_recognises: ClassVar[bool] = False  # a drive of another make does not pass `identify` by chance
+    identity_proofs: ClassVar[tuple[Any, ...]] = ()  # of a family's file: registers with their values
     options: ClassVar[Mapping[str, Option]] = {}
     setpoint_name: ClassVar[str] = "frequency"  # the register that set_frequency writes
     remote: ClassVar[str] = "the drive must take its commands from the line"  # to be set on its keypad

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import difflib
 import re
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,15 +16,14 @@ from multidrop.family_file.addresses import Counting
 from multidrop.family_file.csv_table import MOST_BYTES, beside, declare_rows
 from multidrop.family_file.errors import FamilyError
 from multidrop.family_file.facts import FAMILY_KEYS, facts_of
+from multidrop.family_file.identity import identify_by, proofs_of
 from multidrop.family_file.options import options_of
 from multidrop.family_file.register_keys import shown
 from multidrop.family_file.registers import MOST_REGISTERS, Declared, defaults_of
 from multidrop.family_file.texts import texts_of
-from multidrop.family_file.verbs import SECTIONS as VERB_SECTIONS
-from multidrop.family_file.verbs import add_verbs
 from multidrop.toml_check import TomlPlace, parse_document
 
-SECTIONS = ("family", "default", *(access.value for access in Access), "text", "option", *VERB_SECTIONS)
+SECTIONS = ("family", "default", *(access.value for access in Access), "text", "option", "identify")
 MOST_MISTAKES = 200
 MOST_CSV_FILES = 20
 
@@ -138,13 +137,13 @@ def _family(
         **declared.registers,
         **texts,
     }
-    base = _base(given.get("profile"), document, of_family)
-    if base is Drive:
-        _add_verbs(namespace, document, declared, place)
-    return _made(base, namespace, declared, place)
+    if "identify" in document:
+        proofs = proofs_of(document["identify"], declared.registers, place)
+        namespace["identity_proofs"], namespace["identify"] = proofs, identify_by(proofs)
+    return _made(_base(given.get("profile"), of_family), namespace, declared, place)
 
 
-def _base(profile: str | None, document: Mapping[str, Any], place: TomlPlace) -> type[Drive]:
+def _base(profile: str | None, place: TomlPlace) -> type[Drive]:
     """Return the class that the family derives from: a profile's, which then has all of its verbs."""
     if profile is None:
         return Drive
@@ -154,13 +153,14 @@ def _base(profile: str | None, document: Mapping[str, Any], place: TomlPlace) ->
         near = difflib.get_close_matches(profile, PROFILES, n=1)
         hint = f"did you mean {near[0]}?" if near else f"there are {', '.join(PROFILES)}"
         place.wrong(f"profile = {shown(profile)} is not known; {hint}")
-    for section in [section for section in VERB_SECTIONS if section in document]:
-        place.wrong(f"[{section}] says what the profile says already; leave it out, or the profile")
     return PROFILES.get(profile, Drive)
 
 
 def _check_sections(document: Mapping[str, Any], place: TomlPlace) -> None:
     sections = dict.fromkeys(SECTIONS)
+    if "verb" in document:
+        place.wrong("[verb] is not supported; name a profile, or write the drive as a Python class")
+        document = {name: table for name, table in document.items() if name != "verb"}
     if unknown := {name: None for name in document if name not in SECTIONS}:
         place.unknown(unknown, sections)
     if "family" not in document:
@@ -194,29 +194,6 @@ def _named_bytes(table: Path) -> bytes:
         return _bytes(table, "table of registers")
     except ValueError as mistake:
         raise ValueError(f'registers = ["{table.name}"]: {mistake}') from None
-
-
-def _add_verbs(
-    namespace: dict[str, Any], document: Mapping[str, Any], declared: Declared, place: TomlPlace
-) -> None:
-    """Add the verbs of the document. Mistakes that follow from those of a register or a look are left out."""
-    if not document.keys() & set(VERB_SECTIONS):
-        return
-    own = TomlPlace(place.path)
-    add_verbs(namespace, document, declared.registers, own)
-    looks = document.get("look", {})
-    follows = re.compile(
-        f"{_any_of(declared.places.keys() - declared.registers.keys())} is no register of this file"
-        rf"|{_any_of(looks if isinstance(looks, dict) else ())} is no look of \[look\]"
-    )
-    place.config_errors.extend(mistake for mistake in own.config_errors if not follows.search(mistake))
-    if own.config_errors and not place.config_errors:
-        place.config_errors.extend(own.config_errors)
-
-
-def _any_of(names: Collection[str]) -> str:
-    """Return a pattern of one of these names, as a sentence shows it with or without quotes."""
-    return rf"(?<!\w)(?:{'|'.join(map(re.escape, names))})'?" if names else "(?!)"
 
 
 # ---- the class ----

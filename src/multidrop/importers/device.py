@@ -19,7 +19,6 @@ WRITTEN = "it is written there; what a write does is not known here"
 ONLY_WRITTEN = "is only written: a command is never imported"
 MOST_ENTRIES = 20_000  # of one file
 _LONGEST_NAME = 50
-_TAKEN = TAKEN_NAMES | {"declared_verbs", "is_jogged"}
 _DECIMAL = re.compile(r"-?[0-9]{1,19}")
 _ANY_BASE = re.compile(r"0[xX][0-9a-fA-F]{1,8}|0|[1-9][0-9]{0,5}")
 
@@ -175,7 +174,7 @@ class ImportedDevice:
 class UniqueNames:
     """Names for Python that are as near as can be to what was spelt, each given once."""
 
-    def __init__(self, taken: Collection[str] = _TAKEN) -> None:
+    def __init__(self, taken: Collection[str] = TAKEN_NAMES) -> None:
         self._taken = taken
         self._given = Counter[str]()
 

@@ -80,6 +80,8 @@ class SimulatedDrive:
         self.now = 0.0  # of the last request
         self.deaf_until = 0.0  # ignores all frames before; inf: a dead drive
         self.most = _most_cells(drive)
+        for proof in drive.identity_proofs:
+            self.memory.set(drive.register(proof.register), proof.example)
 
     def __repr__(self) -> str:
         return f"<{type(self).__name__} {self.drive.name}>"

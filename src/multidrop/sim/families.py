@@ -15,7 +15,6 @@ from multidrop.profiles import CiA402, DanfossFC, Delta, Invt, Optidrive, Profid
 from multidrop.sim.che import SimulatedCHE
 from multidrop.sim.cia402 import SimulatedCiA402
 from multidrop.sim.danfoss_fc import SimulatedDanfossFC
-from multidrop.sim.declared import SimulatedDeclared
 from multidrop.sim.delixi import SimulatedDelixi, SimulatedDelixiNative
 from multidrop.sim.delta import SimulatedDelta
 from multidrop.sim.drive import SimulatedDrive
@@ -45,5 +44,4 @@ FAMILIES: Mapping[type[Drive], type[SimulatedDrive]] = {
 def simulated(drive: Drive, *, response_delay: float | None = None) -> SimulatedDrive:
     """Simulate a drive as its family's document says, or as a class or file of one's own declares."""
     kinds = (kind for family, kind in FAMILIES.items() if isinstance(drive, family))
-    own = SimulatedDeclared if hasattr(type(drive), "declared_verbs") else SimulatedDrive
-    return next(kinds, own)(drive, response_delay=response_delay)
+    return next(kinds, SimulatedDrive)(drive, response_delay=response_delay)

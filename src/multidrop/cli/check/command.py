@@ -21,7 +21,6 @@ from multidrop.drives import MODELS
 from multidrop.drives.registry import find_model
 from multidrop.family_file.errors import FamilyError
 from multidrop.family_file.loader import load_family
-from multidrop.family_file.step_words import declared_in_words
 from multidrop.plant.loader import PlantError, load_plant, port_or_address
 from multidrop.toml_check import read_document
 
@@ -53,16 +52,12 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.json:
         more = {
             "mistakes": [],
-            "steps": list(_verbs(family)),
             "not_known": not_known,
             "will_be_refused": will_be_refused,
         }
         print_text(json.dumps(facts(family) | more, indent=2))
         return 0
-    verbs = list(_verbs(family))
     lines = [sheet(family)]
-    if verbs:
-        lines += ["", "verbs", *_lines(verbs)]
     for heading, remarks in (("not known", not_known), ("will be refused", will_be_refused)):
         lines += ["", heading, *_lines(remarks)]
     print_text("\n".join([*lines, "", *wrapped(_verdict(family, arguments.file), breaks_words=False)]))
@@ -123,9 +118,3 @@ def _verdict(family: type[Drive], file: Path) -> str:
         f"No mistake found in {file}. It can move a motor, and nobody has tested it: compare every line with "
         "the manual, and only then give its drives confirmed = 1 in the plant file, or --option confirmed=1."
     )
-
-
-def _verbs(family: type[Drive]) -> Iterator[Remark]:
-    declared = getattr(family, "declared_verbs", None)
-    if declared is not None:
-        yield from declared_in_words(declared, family.registers)
