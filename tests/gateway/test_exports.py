@@ -25,7 +25,7 @@ class SlowHistory:
 
     def take(self, batch: object) -> None: ...
 
-    async def export(self, names: Sequence[str], begin: int, end: int, kind: str) -> Iterator[bytes]:
+    def export(self, names: Sequence[str], begin: int, end: int, kind: str) -> Iterator[bytes]:
         if names:
             raise ValueError(f"{names[0]!r} is no series")
         return self._pieces()

@@ -17,6 +17,7 @@ from histories import NOON, SECOND, batch
 from multidrop import Buckets, History, Plant, open_reader
 from multidrop.core.columns import Names
 from multidrop.gateway import historian
+from multidrop.gateway.exports import Exports
 from multidrop.gateway.historian import MOST_BUCKETS, HistorySettings, as_json, build
 
 MS = 1_000_000
@@ -89,7 +90,7 @@ def test_no_export_is_begun_in_the_loop(tmp_path: Path, kind: str) -> None:
         part = build(HistorySettings(), inside)
         try:
             part.history = Noted(part.history.folder)
-            await part.export([], 0, 1000, kind)
+            await Exports().respond(part, [], 0, 1000, kind)
             assert readers
             assert threading.get_ident() not in readers
         finally:
@@ -134,12 +135,12 @@ def test_it_records_and_answers(tmp_path: Path) -> None:
         assert fan["mean"] == [None] * 10
         for kind in ("csv", "parquet"):
             path = tmp_path / f"got.{kind}"
-            path.write_bytes(b"".join(await part.export(["pump-1.speed"], begin, end, kind)))
+            path.write_bytes(b"".join(part.export(["pump-1.speed"], begin, end, kind)))
             assert [row for rows in open_reader(path) for row in rows] == list(taken)
         with pytest.raises(ValueError, match="is no series"):
-            await part.export(["pump"], begin, end, "csv")
+            part.export(["pump"], begin, end, "csv")
         with pytest.raises(ValueError, match="neither csv nor parquet"):
-            await part.export([], begin, end, "xlsx")
+            part.export([], begin, end, "xlsx")
         await part.close()
         await asyncio.wait_for(running, 60)
 

@@ -392,7 +392,8 @@ def test_a_stop_by_a_verb_may_name_its_drives_in_another_spelling(
         topics.outbox = SimpleNamespace(put=lambda publication: None)
         order = json.dumps({"verb": "coast", "drive": named}).encode()
         topics.received(f"multidrop/{topic}/act", order, is_retained=False)
-        await asyncio.gather(*topics._orders._tasks)
+        while len(known.commands.noted) < len(stopped):
+            await asyncio.sleep(0)
 
     asyncio.run(receive())
     assert known.commands.noted == [("act", drive, "coast", {}) for drive in stopped]

@@ -47,12 +47,23 @@ class Served:
     """A gateway that runs, the simulated drives by name, and a secret for each right."""
 
     def __init__(
-        self, gateway: Gateway, sims: Mapping[str, SimulatedDrive], secrets: Mapping[Right, str]
+        self,
+        gateway: Gateway,
+        sims: Mapping[str, SimulatedDrive],
+        secrets: Mapping[Right, str],
+        loop: asyncio.AbstractEventLoop | None = None,
     ) -> None:
         self.gateway = gateway
+        self._loop = loop
         self.sims = sims
         self.secrets = secrets
         self._seen = -1  # the newest frame that was asked for
+
+    @property
+    def loop(self) -> asyncio.AbstractEventLoop:
+        """The gateway's loop."""
+        assert self._loop is not None
+        return self._loop
 
     def request(self, method: str, path: str, body: object = None, **headers: str) -> Answer:
         """Send one request on a connection of its own; a header's _ is a -."""
@@ -150,23 +161,26 @@ def served(
             return plant, replace(found, port=0, **{"tokens": known, **settings})
 
         gateway = Gateway(*read(), read=read)
-        with running(gateway):
-            yield Served(gateway, sims, secrets)
+        with running(gateway) as loop:
+            yield Served(gateway, sims, secrets, loop)
 
 
 @contextmanager
-def running(gateway: Gateway) -> Iterator[None]:
-    """Run a gateway in a thread, with ten times the frames of a page; its failure is raised at the end."""
+def running(gateway: Gateway) -> Iterator[asyncio.AbstractEventLoop]:
+    """Run a gateway in a thread, with ten times the frames of a page; its failure is raised at the end.
+
+    Gives its loop.
+    """
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(frames, "LEAST_S", 0.02)
         patch.setattr(gateway_module, "TAKE_S", 0.01)
         patch.setattr(gateway_module, "LOOK_S", 0.02)
-        with _running(gateway):
-            yield
+        with _running(gateway) as loop:
+            yield loop
 
 
 @contextmanager
-def _running(gateway: Gateway) -> Iterator[None]:
+def _running(gateway: Gateway) -> Iterator[asyncio.AbstractEventLoop]:
     ready = threading.Event()
     failures: list[BaseException] = []
     loops: list[asyncio.AbstractEventLoop] = []
@@ -188,7 +202,7 @@ def _running(gateway: Gateway) -> Iterator[None]:
     assert ready.wait(PATIENCE)
     try:
         if not failures:
-            yield
+            yield loops[0]
     finally:
         if thread.is_alive():
             loops[0].call_soon_threadsafe(gateway.end)

@@ -9,6 +9,7 @@ import logging
 import os
 import sys
 import threading
+import time
 import webbrowser
 from collections.abc import Callable
 from contextlib import AbstractContextManager, suppress
@@ -35,6 +36,7 @@ if TYPE_CHECKING:
     from multidrop.gateway.settings import ServeSettings
 
 DEMO_PORTS = (8750, 0)  # the usual one, or any
+END_S = 4.7  # from the signal until the process is gone, whatever hangs
 ROLES = ("look", "stop", "write")
 
 
@@ -147,14 +149,24 @@ def _serve(
             raise
         gateway = Gateway(plant, replace(settings, port=DEMO_PORTS[1]))
 
+    def end() -> None:
+        threading.Thread(target=_end_by_force, name="multidrop end", daemon=True).start()
+        gateway.end()
+
     async def live() -> None:
-        on_end_signals(gateway.end)
+        on_end_signals(end)
         if read:
-            on_reload_signal(gateway.reload.begin, gateway.end)
+            on_reload_signal(gateway.reload.begin, end)
         await gateway.run(lambda: on_ready(gateway.port))
 
     asyncio.run(live())
     return 0
+
+
+def _end_by_force() -> None:
+    """End the process when its time is over: a thread may hang in a read from a disk."""
+    time.sleep(END_S)
+    os._exit(1)
 
 
 def _url(settings: ServeSettings, port: int) -> str:

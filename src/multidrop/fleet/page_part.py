@@ -49,11 +49,13 @@ class FleetPart:
         """Ignore them: they are of the gateway's own lines, and not of the fleet's."""
 
     async def run(self) -> None:
-        keeping = asyncio.create_task(self._path.keep())
+        tasks = [asyncio.create_task(work) for work in (self._path.keep(), self._watch.run())]
         try:
-            await self._watch.run()
+            ended, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+            for task in ended:
+                task.result()
         finally:
-            await end_tasks(keeping)
+            await end_tasks(*tasks)
 
     async def close(self) -> None:
         await self._path.close()

@@ -5,12 +5,14 @@ from __future__ import annotations
 import asyncio
 import logging
 import ssl
+import threading
 from collections import deque
 from collections.abc import Callable
 from typing import Any, NamedTuple, Protocol
 from urllib.parse import urlsplit
 
 from multidrop.gateway.outbox import Outbox, Publication
+from multidrop.gateway.supervisor import supervisor
 
 PORTS = {"mqtt": 1883, "mqtts": 8883}
 RETRY_S = (1, 30)  # before the first attempt to connect again, and at most
@@ -82,6 +84,8 @@ class Broker:
         from paho.mqtt.enums import CallbackAPIVersion
 
         self._address = address
+        self._name = name
+        self._thread: threading.Thread | None = None  # paho's
         self._speaker = speaker
         self._loop: asyncio.AbstractEventLoop | None = None
         self.outbox = Outbox(self._send)
@@ -108,6 +112,7 @@ class Broker:
         self._set_will()
         self._client.connect_async(self._address.host, self._address.port, KEEP_ALIVE_S)
         self._client.loop_start()
+        self._thread = next((one for one in threading.enumerate() if one.name.endswith(self._name)), None)
 
     async def close(self) -> None:
         """Send what waits, for a second at most, and disconnect."""
@@ -118,12 +123,17 @@ class Broker:
             await asyncio.sleep(0.01)
         self._loop = None
         self._client.disconnect()
-        await asyncio.get_running_loop().run_in_executor(None, self._client.loop_stop)
+        await supervisor().within("mqtt", FAREWELL_S, self._client.loop_stop)
         self.is_connected = False
         self._client = None  # with it go the sockets by which paho wakes its thread
 
     def publish(self) -> None:
-        """Let the speaker say what is new, or count what it would have said."""
+        """Let the speaker say what is new, or count what it would have said.
+
+        Raises RuntimeError if paho's thread has ended: nothing would be sent.
+        """
+        if self._thread is not None and not self._thread.is_alive():
+            raise RuntimeError("the thread of its connection has ended")
         had_failed = self.failure
         self._let(self._speaker.publish if self.is_connected else self._pass_over)
         if had_failed and not self.failure and self.is_connected:

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import logging
-import threading
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from functools import partial
@@ -12,9 +10,11 @@ from typing import TypeVar
 
 from multidrop import written_by
 from multidrop.gateway.rights import Caller
+from multidrop.gateway.supervisor import supervisor
+
+COMMAND_S = 60.0  # after which /health says that a command goes on: a stop is repeated for 30 s
 
 R = TypeVar("R")
-_log = logging.getLogger("multidrop.gateway")
 
 
 def begin_stops(works: Sequence[Callable[[float | None], R]], caller: Caller) -> list[asyncio.Future[R]]:
@@ -45,27 +45,8 @@ def begin_stop(work: Callable[[float | None], R], caller: Caller) -> asyncio.Fut
 
 def in_thread(work: Callable[[], R], caller: Caller) -> asyncio.Future[R]:
     """Do work in a thread of its own, in this caller's name; it goes on though its waiter is cancelled."""
-    loop = asyncio.get_running_loop()
-    future: asyncio.Future[R] = loop.create_future()
-
-    def finish(settle: Callable[[], None]) -> None:
-        if not future.done():
-            settle()
-
-    def run() -> None:
-        settle: partial[None]
-        try:
-            with written_by(*_author(caller)):
-                settle = partial(future.set_result, work())
-        except BaseException as failure:
-            settle = partial(future.set_exception, failure)
-        try:
-            loop.call_soon_threadsafe(finish, settle)
-        except RuntimeError:  # the loop is closed: nobody waits any more
-            _log.warning("a command ended after the gateway: %s", settle.args[0])
-
-    threading.Thread(target=run, name="multidrop command", daemon=True).start()
-    return future
+    with written_by(*_author(caller)):  # the thread has the context of its start
+        return supervisor().thread("command", COMMAND_S, work)
 
 
 def _author(caller: Caller) -> tuple[str, str]:

@@ -37,6 +37,7 @@ from multidrop.gateway.verb_rules import STOPPING, VERBS
 MOST_AGE_S = 5.0  # of a write or a verb that a network held up; a stop is never too old
 MOST_WRITES = 8  # under way on a line, without stops
 BUSY = "too many writes are under way"  # a rule
+UNAUDITED = "the audit log cannot be written"  # a rule
 WAYS_WITHOUT_VERBS = frozenset({"modbus"})
 
 # Returns until when a command may be sent (CLOCK_BOOTTIME, ns), as it is called in words, or raises Refused.
@@ -60,6 +61,7 @@ class Commands:
 
     def __init__(self, lines: PolledLines, may: May) -> None:
         self.may = may
+        self.withheld = ""  # why nothing but stops is written
         self._lines = lines
         self.called = 0  # commands that passed all rights, so far
         self._under_way: dict[str, int] = {}  # writes, by line
@@ -228,6 +230,8 @@ class Commands:
             line, known = self._lines.plant.find_drive(drive)
         except ValueError as mistake:
             return failed(mistake)
+        if self.withheld:
+            return failed(Refused(f"{what} was not sent: {self.withheld}", rule=UNAUDITED))
         if self._under_way.get(line.name, 0) >= MOST_WRITES:
             reason = f"{what} was not sent: {MOST_WRITES} others are under way on line {line.name}"
             return failed(Refused(reason, rule=BUSY))

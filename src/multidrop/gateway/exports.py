@@ -5,22 +5,27 @@ Each takes a thread while its next piece is made, and a file of Parquet takes ro
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from typing import Protocol
+from collections.abc import AsyncIterator, Callable, Generator, Iterator, Sequence
+from functools import partial
+from typing import Protocol, TypeVar
 
 from starlette.responses import Response, StreamingResponse
 from starlette.types import Receive, Scope, Send
 
 from multidrop.gateway.guard import Denied
+from multidrop.gateway.supervisor import supervisor
 
 MOST_EXPORTS = 8  # under way
+PIECE_S = 600.0  # that a piece may take: the first one of Parquet has the whole file behind it
+R = TypeVar("R")
 KINDS = {"csv": "text/csv; charset=utf-8", "parquet": "application/vnd.apache.parquet"}
 
 
 class ExportingPart(Protocol):
     """The part of the historian that is needed here."""
 
-    async def export(self, names: Sequence[str], begin: int, end: int, kind: str) -> Iterator[bytes]: ...
+    def export(self, names: Sequence[str], begin: int, end: int, kind: str) -> Iterator[bytes]:
+        """Return a file piece by piece; called, and gone through, in threads."""
 
 
 class Exports:
@@ -32,14 +37,14 @@ class Exports:
     async def respond(
         self, part: ExportingPart, names: Sequence[str], begin: int, end: int, kind: str
     ) -> Response:
-        """Return a file of these series. Raises Denied where it cannot be made, or not now."""
+        """Return a file of these series. Raises Denied if it cannot be made, or not now; Hung by the disk."""
         if kind not in KINDS:
             raise Denied(400, f"format = {kind[:20]!r} is neither csv nor parquet")
         if self.under_way >= MOST_EXPORTS:
             raise Denied(503, f"{MOST_EXPORTS} exports are under way: try again when one has ended")
         self.under_way += 1
         try:
-            pieces = await part.export(names, begin, end, kind)
+            pieces = await _in_thread(partial(part.export, names, begin, end, kind))
         except BaseException as failure:
             self.under_way -= 1
             if isinstance(failure, ValueError):
@@ -53,7 +58,7 @@ class _Export(StreamingResponse):
 
     def __init__(self, exports: Exports, pieces: Iterator[bytes], kind: str) -> None:
         name = {"content-disposition": f'attachment; filename="multidrop.{kind}"'}
-        super().__init__(pieces, media_type=KINDS[kind], headers=name)
+        super().__init__(_through(pieces), media_type=KINDS[kind], headers=name)
         self._exports = exports
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
@@ -61,3 +66,17 @@ class _Export(StreamingResponse):
             await super().__call__(scope, receive, send)
         finally:
             self._exports.under_way -= 1
+
+
+async def _through(pieces: Iterator[bytes]) -> AsyncIterator[bytes]:
+    """Yield the pieces, each made in a thread: a disk may hang."""
+    try:
+        while (piece := await _in_thread(partial(next, pieces, None))) is not None:
+            yield piece
+    finally:  # its client may be gone: what it had on the disk goes
+        if isinstance(pieces, Generator):
+            supervisor().thread("exports", PIECE_S, pieces.close)
+
+
+async def _in_thread(work: Callable[[], R]) -> R:
+    return await supervisor().within("exports", PIECE_S, work, most=MOST_EXPORTS)

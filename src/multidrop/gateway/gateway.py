@@ -7,10 +7,10 @@ import logging
 import secrets
 import struct
 import time
-from collections.abc import Callable, Mapping
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Awaitable, Callable, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import uvicorn
@@ -27,14 +27,15 @@ from multidrop.gateway.hub import SILENT, Hub
 from multidrop.gateway.identities import Identities
 from multidrop.gateway.lately import Lately
 from multidrop.gateway.listener import BACKLOG, listen
-from multidrop.gateway.live_parts import END_S, LiveParts
+from multidrop.gateway.live_parts import LiveParts
 from multidrop.gateway.newcomers import Newcomers
-from multidrop.gateway.reload import Read, Reload
+from multidrop.gateway.reload import ADOPTION_S, Read, Reload
 from multidrop.gateway.rights import OwnNames, Tokens
 from multidrop.gateway.sd_notify import Notifier
 from multidrop.gateway.seen_frames import SeenFrames
-from multidrop.gateway.settings import ServeSettings
+from multidrop.gateway.settings import AUDIT_S, ServeSettings, check_writable
 from multidrop.gateway.side_reads import SideReads
+from multidrop.gateway.supervisor import Hung, supervisor
 from multidrop.gateway.views import troubles_of
 from multidrop.gateway.web import make_app
 
@@ -43,6 +44,9 @@ LOOK_S = 0.2  # between looks for faults and silence; frames are made then, of w
 TICK_S = 1.0  # between readings of the statistics
 LOG_S = 60.0  # between log lines of a part that goes on failing
 MOST_ASKED = 16  # requests past a register table at the same time
+ASKED_S = 30.0  # that one of them may take
+END_S = 4.0  # that the end may take, stops included
+GRACE_S = 1  # of it, in which requests under way may be answered
 
 _log = logging.getLogger("multidrop.gateway")
 
@@ -64,7 +68,8 @@ class Gateway:
         self.version = multidrop.__version__
         self.revision = secrets.randbits(32)  # of the plant: no page takes another process's for ours
         self.failures: dict[str, int] = {}
-        self.dead: dict[str, str] = {}  # parts, and why they do not live any more
+        self.audit = settings.audit
+        self.unaudited = ""  # why no write is noted in the audit log
         self.parts = LiveParts(self)
         self.feeds = self.parts.feeds
         self.guard_clock: Callable[[], float] = self.clock
@@ -75,7 +80,6 @@ class Gateway:
         self.ledger = ledger or Ledger()
         self.poller: Poller | None = None
         self._end = asyncio.Event()
-        self._threads = ThreadPoolExecutor(MOST_ASKED, "multidrop ask")
         self.listener = listen(settings.host, settings.port)
         self.connections = self.listener.connections = Connections(self.clock)
         self.port: int = self.listener.getsockname()[1]
@@ -98,54 +102,82 @@ class Gateway:
     # ---- life ----
 
     async def run(self, on_ready: Callable[[], object] = lambda: None) -> None:
-        """Poll and serve until `end` is called."""
-        tasks: list[asyncio.Task[None]] = []
+        """Poll and serve until `end` is called; then return within END_S, whatever hangs.
+
+        Raises RuntimeError if the web server ends by itself.
+        """
+        nothing = replace(self.plant, lines=())
         server = _Server(self._server_config())
         try:
-            self.parts.build(self.settings.parts)
-            nothing = replace(self.plant, lines=())
-            self.poller = Poller(nothing, ledger=self.ledger, audit=self.settings.audit)
-            with self.poller:
-                self.note_unopened(self.poller.adopt(self.plant))
-                self.plant = self.poller.plant
-                tasks = [
-                    asyncio.create_task(work, name=name)
-                    for name, work in (
-                        ("take", self._take_all()),
-                        ("tick", self._tick()),
-                        ("identities", self.identities.run()),
-                    )
-                ]
-                self.parts.start()
-                serving = asyncio.create_task(server.serve([self.listener]))
-                while not server.started and not serving.done():
-                    await asyncio.sleep(0.005)
-                if not serving.done():
-                    on_ready()
-                    self.notifier.tell("READY=1", self.status)
-                end = asyncio.create_task(self._end.wait())
-                await asyncio.wait({end, serving, *tasks}, return_when=asyncio.FIRST_COMPLETED)
-                end.cancel()
-                self.notifier.tell("STOPPING=1")
-                self.frames.close()
-                server.should_exit = True
-                await serving
-                for task in tasks:
-                    if task.done():
-                        task.result()
-                await self.side_reads.close()
-                with ThreadPoolExecutor(1, "multidrop close") as own:  # others may be busy
-                    await asyncio.get_running_loop().run_in_executor(own, self.poller.close)
+            built = await self.parts.build(self.settings.parts)
+            await self._find_audit()
+            poller = Poller(nothing, ledger=self.ledger, audit=self.audit)
+            self.poller = poller.__enter__()  # it is left in a thread: that may take its time
+            adopting = supervisor().thread("adoption", ADOPTION_S, partial(poller.adopt, self.plant))
+            self.note_unopened(await adopting)
+            self.plant = poller.plant
+            self.parts.take_up(built)
+            supervisor().keep("polling", self._take_all())
+            supervisor().keep("statistics", self._tick())
+            supervisor().keep("identities", self.identities.run())
+            serving = supervisor().keep("web", server.serve([self.listener]))
+            while not server.started and not serving.done():
+                await asyncio.sleep(0.005)
+            if not serving.done():
+                on_ready()
+                self.notifier.tell("READY=1", self.status)
+            end = supervisor().start("end", self._end.wait())
+            await asyncio.wait({end, serving}, return_when=asyncio.FIRST_COMPLETED)
+            end.cancel()
+            if not self._end.is_set():
+                raise RuntimeError(f"the web server has ended: {supervisor().dead.get('web')}")
         finally:
-            for task in tasks:
-                task.cancel()
-            await asyncio.gather(*tasks, return_exceptions=True)
-            await self.reload.close()
-            if self.poller is not None:
-                self.hand_out(self.poller)  # what came while it closed
-            await self.parts.close()
-            self.listener.close()
-            self._threads.shutdown(wait=False, cancel_futures=True)
+            await self._close(server)
+
+    async def _close(self, server: _Server) -> None:
+        """End all in END_S at most; what hangs is left behind, and logged."""
+        ends = self.clock() + END_S
+
+        def left_s(kept_s: float) -> float:
+            return max(0.1, ends - self.clock() - kept_s)
+
+        self.notifier.tell("STOPPING=1")
+        self.frames.close()
+        await self._end_of("web", left_s(2.4), self._end_server(server))
+        await self._end_of("side reads", left_s(2.4), self.side_reads.close())
+        await self._end_of("reload", left_s(2.4), self.reload.close())
+        if self.poller is not None:
+            closing = supervisor().within("polling", left_s(1.2), self.poller.close)
+            await self._end_of("polling", left_s(1.0), closing)
+            await supervisor().release("polling", "statistics", "identities")
+            self.guarded("hub", self.hand_out, self.poller)  # what came while it closed
+        await self._end_of("parts", left_s(0.2), self.parts.close(left_s(0.4)))
+        self.listener.close()
+        for name in dict.fromkeys(supervisor().under_way):
+            _log.error("%s goes on at the end, and is not waited for", name)
+
+    async def _end_server(self, server: _Server) -> None:
+        server.should_exit = True
+        if (serving := supervisor().let_go("web")) is not None and server.started:
+            await serving
+
+    async def _end_of(self, name: str, seconds: float, work: Awaitable[object]) -> None:
+        try:
+            await asyncio.wait_for(work, seconds)
+        except Exception:  # the others end all the same
+            _log.exception("%s did not end in good order", name)
+
+    async def _find_audit(self) -> None:
+        """Note the audit log if it can be opened now: polling would wait for a disk that does not answer."""
+        self.audit, path = self.settings.audit, self.settings.audit
+        if path is None:
+            return
+        try:
+            await supervisor().within("audit log", AUDIT_S, partial(check_writable, path))
+        except Hung as failure:
+            self.audit, self.unaudited = None, f"{failure} A restart tries it again"
+            self.commands.withheld = self.unaudited
+            _log.error("nothing but stops is written: %s", self.unaudited)
 
     def end(self) -> None:
         """Let `run` come to its end. Call it in the loop."""
@@ -165,7 +197,7 @@ class Gateway:
             server_header=False,
             proxy_headers=False,
             timeout_keep_alive=30,
-            timeout_graceful_shutdown=int(END_S),
+            timeout_graceful_shutdown=GRACE_S,
             ssl_context_factory=None if context is None else lambda config, default: context,
         )
 
@@ -213,10 +245,13 @@ class Gateway:
 
     def note_failure(self, name: str) -> None:
         """Count what a part raised just now, and log it from time to time."""
-        self.failures[name] = self.failures.get(name, 0) + 1
+        self.count_failure(name)
         if self.clock() - self._logged.get(name, -LOG_S) >= LOG_S:
             self._logged[name] = self.clock()
             _log.exception("%s failed, %d times so far; the others go on", name, self.failures[name])
+
+    def count_failure(self, name: str) -> None:
+        self.failures[name] = self.failures.get(name, 0) + 1
 
     async def _tick(self) -> None:
         notifier = self.notifier
@@ -225,6 +260,7 @@ class Gateway:
             if self.poller is not None:
                 self.guarded("statistics", self._read_statistics, self.poller)
             self.guarded("connections", self.connections.sweep)
+            supervisor().look()
             self._has_news = True  # a frame's time is how a page knows that we live
             if notifier.watchdog_s:
                 notifier.tell("WATCHDOG=1")
@@ -273,9 +309,8 @@ class Gateway:
         """Return words, or bits, that a drive has at any addresses; see `Bus.ask`."""
         line, known = self.plant.find_drive(drive)
         bus = self.bus(line.name)
-        data = await asyncio.get_running_loop().run_in_executor(
-            self._threads, lambda: bus.ask(known, function, start, count, expiry=expiry_s)
-        )
+        work = partial(bus.ask, known, function, start, count, expiry=expiry_s)
+        data = await supervisor().within("passed requests", ASKED_S, work, most=MOST_ASKED)
         if function in (1, 2):
             return [data[bit // 8] >> bit % 8 & 1 for bit in range(count)]
         return list(struct.unpack(f">{count}H", data))

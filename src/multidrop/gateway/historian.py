@@ -7,6 +7,7 @@ import json
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from importlib import import_module
 from math import isfinite
 from pathlib import Path
@@ -26,8 +27,13 @@ from multidrop import (
     parse_size,
 )
 from multidrop.gateway.metrics import counter
+from multidrop.gateway.supervisor import supervisor
 
 MS_NS = 1_000_000
+LOOK_S = 1.0  # between looks at the thread that writes
+CLOSING_S = 3.0  # that the last rows may take
+QUERY_S = 30.0  # that an answer may take, and that one may wait for others
+MOST_QUERIES = 2  # at the same time
 PIECE = 1 << 16  # bytes of an export
 UNFINISHED = ".export-"  # begins the names of exports' own folders
 MOST_BUCKETS = 200_000  # of an answer: the page's 24 series on a screen of 8000 px, and 5 MB
@@ -95,7 +101,7 @@ class Historian:
         for left in folder.glob(f"{UNFINISHED}*"):  # by a process that was killed; nobody else records here
             rmtree(left, ignore_errors=True)
         self.history = History(folder)
-        self._over = asyncio.Event()
+        self._is_closed = False
 
     # ---- a feed ----
 
@@ -104,14 +110,20 @@ class Historian:
         self._writer.take(batch)
 
     async def run(self) -> None:
-        """Wait until it is closed: it lives on a thread of its own."""
-        await self._over.wait()
+        """Watch the thread that writes. Raises RuntimeError if that ends before it is closed."""
+        while self._writer.is_alive:
+            await asyncio.sleep(LOOK_S)
+        if not self._is_closed:
+            raise RuntimeError("the thread that writes has ended")
 
     async def close(self) -> None:
-        """Write what waits; a disk that does not answer is waited for 10 s at most."""
-        await asyncio.to_thread(self._writer.close)
+        """Write what waits. Raises Hung if the disk does not answer."""
+        self._is_closed = True
+        await supervisor().within("history", CLOSING_S, self._close)
+
+    def _close(self) -> None:
+        self._writer.close()
         self.history.close()
-        self._over.set()
 
     def adopt(self, plant: Plant) -> None:
         """Go on with another plant file: the next segment has its metadata."""
@@ -142,12 +154,13 @@ class Historian:
     async def series(self, names: Sequence[str], begin: int, end: int, points: int) -> bytes:
         """Return the buckets of each series as JSON, made beside the loop, which may have a stop to send.
 
-        Raises ValueError, OSError and ImportError.
+        Raises ValueError, OSError, which Hung is too, and ImportError.
         """
         names = list(dict.fromkeys(names))
         if len(names) * points > MOST_BUCKETS:
             raise ValueError(f"{len(names)} series of {points} points: an answer has {MOST_BUCKETS} at most")
-        return await asyncio.to_thread(self._series, names, begin * MS_NS, end * MS_NS, points)
+        work = partial(self._series, names, begin * MS_NS, end * MS_NS, points)
+        return await supervisor().within("history queries", QUERY_S, work, most=MOST_QUERIES)
 
     def _series(self, names: Sequence[str], begin: int, end: int, points: int) -> bytes:
         found = self.history.buckets(names, begin, end, points)
@@ -155,20 +168,19 @@ class Historian:
         pieces = (f"{json.dumps(name)}:{json.dumps(as_json(made))}" for name, made in found.items())
         return f'{{"step_ms":{step / MS_NS},"series":{{{",".join(pieces)}}}}}'.encode()
 
-    async def export(self, names: Sequence[str], begin: int, end: int, kind: str) -> Iterator[bytes]:
+    def export(self, names: Sequence[str], begin: int, end: int, kind: str) -> Iterator[bytes]:
         """Return a file of these series, or of all, piece by piece: "csv" or "parquet".
 
-        Raises as `series`, before the first piece where the series or the times are wrong.
+        Raises as `series`, before the first piece where the series or the times are wrong. To be called, and
+        gone through, in threads: it reads files.
         """
-        return await asyncio.to_thread(self._export, kind, names or None, begin * MS_NS, end * MS_NS)
-
-    def _export(self, kind: str, names: Sequence[str] | None, begin: int, end: int) -> Iterator[bytes]:
+        series, begin_ns, end_ns = names or None, begin * MS_NS, end * MS_NS
         if kind not in ("csv", "parquet"):
             raise ValueError(f"format = {kind!r} is neither csv nor parquet")
         if kind == "csv":
-            return self.history.csv(names, begin, end)
-        self.history.read(names, begin, end)  # a mistake is told before the first piece
-        return self._parquet(names, begin, end)
+            return self.history.csv(series, begin_ns, end_ns)
+        self.history.read(series, begin_ns, end_ns)  # a mistake is told before the first piece
+        return self._parquet(series, begin_ns, end_ns)
 
     def _parquet(self, names: Sequence[str] | None, begin: int, end: int) -> Iterator[bytes]:
         with TemporaryDirectory(prefix=UNFINISHED, dir=self.history.folder) as directory:

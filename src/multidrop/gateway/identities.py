@@ -5,11 +5,14 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections.abc import Callable
+from functools import partial
 
 from multidrop import Bus, BusError, Drive, Plant, Refused
+from multidrop.gateway.supervisor import supervisor
 
 PAUSE_S = 0.2  # between two drives that are asked: the polling keeps the line
 ROUND_S = 2.0  # between two looks for drives that are not known
+ASKED_S = 30.0  # that the answers of one drive may take
 
 _log = logging.getLogger("multidrop.gateway")
 
@@ -40,7 +43,7 @@ class Identities:
             for line, drive in drives:
                 try:
                     if self._is_there(drive.name) and not self._knows(line, drive):
-                        await asyncio.to_thread(self._ask, line, drive)
+                        await supervisor().within("identities", ASKED_S, partial(self._ask, line, drive))
                         await asyncio.sleep(PAUSE_S)
                 except Exception:  # whatever it is, polling and stops go on
                     self._fail()

@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from multidrop import Plant
 from multidrop.gateway.parts import PARTS, Feed, Inside, build
-from multidrop.gateway.reload import beside
+from multidrop.gateway.supervisor import supervisor
 
 if TYPE_CHECKING:
     from multidrop.gateway.gateway import Gateway
 
+START_S = 2.0  # for which a start waits for parts whose files do not answer
+BUILD_S = 5.0  # for which a reload waits for them
 END_S = 3.0  # that a part may take to end
 
 _log = logging.getLogger("multidrop.gateway")
@@ -23,37 +25,54 @@ _log = logging.getLogger("multidrop.gateway")
 class Replacement(NamedTuple):
     """Parts that were built and do not live yet, and the settings of those that ended for them."""
 
-    built: dict[str, Feed]
-    wanted: Mapping[str, Any]
+    built: dict[str, Building]
     before: Mapping[str, Any]
 
 
+class Building(NamedTuple):
+    """A part that a thread builds: its files may be on a disk that does not answer."""
+
+    settings: Any
+    plant: Plant
+    feed: asyncio.Future[Feed]
+
+
 class LiveParts:
-    """The parts of a gateway, by the names of their tables; `feeds` are those that are fed."""
+    """The parts of a gateway, by the names of their tables; `feeds` are those that are fed.
+
+    One whose files do not answer is not waited for: it is in `coming` until it is built.
+    """
 
     def __init__(self, gateway: Gateway) -> None:
         self.feeds: dict[str, Feed] = {}
+        self.dead: dict[str, str] = {}  # parts that do not live any more, and why
+        self.coming: dict[str, Building] = {}
         self._gateway = gateway
         self._settings: dict[str, Any] = {}
-        self._tasks: dict[str, asyncio.Task[None]] = {}
+        self._built: dict[str, Building] = {}  # that never lived
 
-    def build(self, wanted: Mapping[str, Any]) -> None:
+    async def build(self, wanted: Mapping[str, Any]) -> dict[str, Building]:
         """Build the parts that a gateway begins with. Raises ValueError with what cannot be opened."""
-        self._build(wanted, self._gateway.plant, self.feeds)
-        self._settings = dict(wanted)
+        self._built = await self._build(wanted, self._gateway.plant, START_S)
+        return self._built
 
-    def start(self) -> None:
-        """Let all that were built live."""
-        for name, feed in self.feeds.items():
-            self._start(name, feed)
+    def take_up(self, built: Mapping[str, Building]) -> None:
+        """Let these parts live: the plant is theirs now."""
+        self._built = {}
+        for name, building in built.items():
+            self._settings[name] = building.settings
+            self.dead.pop(name, None)
+            if building.feed.done():
+                self._begin(name, building.feed.result())
+            else:
+                _log.error("%s is not there yet: its files do not answer", name)
+                self.coming[name] = building
+                supervisor().start(f"{name} comes", self._come(name, building))
 
-    async def close(self) -> None:
-        """End all of them, after the last batch."""
-        for task in self._tasks.values():
-            task.cancel()
-        await asyncio.gather(*self._tasks.values(), return_exceptions=True)
-        for name, feed in self.feeds.items():
-            await _closed(name, feed)
+    async def close(self, seconds: float) -> None:
+        """End all of them at once, after the last batch, within so many seconds."""
+        await _discard(self._built)
+        await self._drop([*self._settings], seconds)
 
     # ---- a plant file that was read again ----
 
@@ -62,77 +81,108 @@ class LiveParts:
 
         Raises ValueError with what cannot be opened; the parts from before live on then.
         """
-        changed = [name for name, settings in self._settings.items() if wanted.get(name) != settings]
-        before = {name: self._settings[name] for name in changed}
-        for name in changed:
-            await self._end(name)
+        before = {name: one for name, one in self._settings.items() if wanted.get(name) != one}
+        await self._drop([*before], END_S)
         new = {name: settings for name, settings in wanted.items() if name not in self._settings}
-        replacement = Replacement({}, new, before)
         try:
-            await beside(partial(self._build, new, plant, replacement.built))  # a folder may be large
+            return Replacement(await self._build(new, plant), before)
         except Exception:
-            await self.take_back(replacement)
+            await self.take_back(Replacement({}, before))
             raise
-        return replacement
-
-    def take_up(self, replacement: Replacement) -> None:
-        """Let the parts live that were built: the plant is theirs now."""
-        for name, feed in replacement.built.items():
-            self._take_up(name, feed, replacement.wanted[name])
 
     async def take_back(self, replacement: Replacement) -> None:
         """Go on with the parts from before."""
-        for name, feed in replacement.built.items():
-            await _closed(name, feed)
+        await _discard(replacement.built)
         for name, settings in replacement.before.items():
-            again: dict[str, Feed] = {}
             try:
-                await beside(partial(self._build, {name: settings}, self._gateway.plant, again))
+                self.take_up(await self._build({name: settings}, self._gateway.plant))
             except Exception as failure:  # its port may have gone to another program meanwhile
-                self._gateway.dead[name] = str(failure)
+                self.dead[name] = str(failure)
                 _log.error("%s did not come back: %s", name, failure)
-            for feed in again.values():
-                self._take_up(name, feed, settings)
 
     # ---- one part ----
 
-    def _build(self, wanted: Mapping[str, Any], plant: Plant, built: dict[str, Feed]) -> None:
-        gateway = self._gateway
+    async def _build(
+        self, wanted: Mapping[str, Any], plant: Plant, seconds: float = BUILD_S
+    ) -> dict[str, Building]:
+        """Build parts side by side; wait so long for them. Raises ValueError with what cannot be opened."""
+        gateway, threads = self._gateway, supervisor()
         folder = gateway.settings.folder
         inside = Inside(plant, gateway.hub, gateway.commands, gateway.ask, folder, gateway.version)
-        for name, settings in wanted.items():
-            try:
-                built[name] = build(PARTS[name], settings, inside)
-            except (ValueError, OSError) as failure:
-                raise ValueError(f"[serve.{name}]: {failure}") from failure
+        built = {
+            name: Building(
+                settings, plant, threads.thread(name, BUILD_S, partial(build, PARTS[name], settings, inside))
+            )
+            for name, settings in wanted.items()
+        }
+        try:
+            if built:
+                await asyncio.wait([one.feed for one in built.values()], timeout=seconds)
+        except asyncio.CancelledError:
+            await _discard(built)
+            raise
+        for name, building in built.items():
+            failure = building.feed.exception() if building.feed.done() else None
+            if failure is not None:
+                await _discard(built)
+                if isinstance(failure, (ValueError, OSError)):
+                    raise ValueError(f"[serve.{name}]: {failure}") from failure
+                raise failure
+        return built
 
-    def _take_up(self, name: str, feed: Feed, settings: Any) -> None:
-        self._gateway.dead.pop(name, None)
-        self._settings[name] = settings
+    async def _come(self, name: str, building: Building) -> None:
+        """Begin a part when its files have answered, unless it is no longer wanted."""
+        await asyncio.wait([building.feed])
+        if self.coming.get(name) is not building:
+            return  # it was dropped
+        del self.coming[name]
+        failure = building.feed.exception()
+        if failure is None:
+            feed: Any = building.feed.result()
+            if building.plant is not self._gateway.plant and hasattr(feed, "adopt"):
+                self._gateway.guarded(name, feed.adopt, self._gateway.plant)
+            self._begin(name, feed)
+            return
+        self.dead[name] = str(failure)
+        _log.error("%s does not begin: %s", name, failure)
+
+    def _begin(self, name: str, feed: Feed) -> None:
         self.feeds[name] = feed
-        self._start(name, feed)
-
-    def _start(self, name: str, feed: Feed) -> None:
-        self._tasks[name] = asyncio.create_task(self._live(name, feed), name=name)
+        supervisor().keep(name, self._live(name, feed))
 
     async def _live(self, name: str, feed: Feed) -> None:
         try:
             await feed.run()
-        except Exception as failure:  # it dies alone
-            self._gateway.dead[name] = f"{type(failure).__name__}: {failure}"
-            self._gateway.note_failure(name)
+        except Exception:
+            self._gateway.count_failure(name)
+            raise
 
-    async def _end(self, name: str) -> None:
-        feed, task = self.feeds.pop(name), self._tasks.pop(name)
-        del self._settings[name]
-        self._gateway.dead.pop(name, None)
-        task.cancel()
-        await asyncio.gather(task, return_exceptions=True)
-        await _closed(name, feed)
+    async def _drop(self, names: Sequence[str], seconds: float) -> None:
+        """End parts side by side."""
+        for name in names:
+            del self._settings[name]
+            self.dead.pop(name, None)
+        await _discard({name: self.coming.pop(name) for name in names if name in self.coming})
+        feeds = {name: self.feeds.pop(name) for name in names if name in self.feeds}
+        await supervisor().release(*names)
+        await asyncio.gather(*(_closed(name, feed, seconds) for name, feed in feeds.items()))
 
 
-async def _closed(name: str, feed: Feed) -> None:
+async def _discard(built: Mapping[str, Building]) -> None:
+    """Close parts that do not live, each as soon as it is built."""
+    closing = [supervisor().start(f"{name} goes", _close_built(name, one)) for name, one in built.items()]
+    there = [task for task, one in zip(closing, built.values(), strict=True) if one.feed.done()]
+    await asyncio.gather(*there)
+
+
+async def _close_built(name: str, building: Building) -> None:
+    await asyncio.wait([building.feed])
+    if building.feed.exception() is None:
+        await _closed(name, building.feed.result(), END_S)
+
+
+async def _closed(name: str, feed: Feed, seconds: float) -> None:
     try:
-        await asyncio.wait_for(feed.close(), END_S)
+        await asyncio.wait_for(feed.close(), seconds)
     except Exception:  # the others are closed all the same
         _log.exception("%s did not end in good order", name)

@@ -14,6 +14,7 @@ from typing import Any, cast
 from multidrop.gateway.mbap import Garbage, MbapRequest, function_of, request_of, take_frame, take_request
 from multidrop.gateway.modbus_codes import ModbusCode
 from multidrop.gateway.pdu import WRITES
+from multidrop.gateway.supervisor import supervisor
 
 SLICE = 64  # requests of a client that are answered before others have their turn,
 SLICE_S = 0.002  # or so much time
@@ -178,7 +179,7 @@ class ModbusClient(asyncio.Protocol):
         return b""
 
     def _begin(self, request: MbapRequest, answer: Awaitable[bytes]) -> None:
-        task = asyncio.ensure_future(answer)
+        task = supervisor().start("modbus answer", _awaited(answer))
         self._under_way.add(task)
         task.add_done_callback(lambda done: self._finish(request, done))
 
@@ -219,6 +220,10 @@ class ModbusClient(asyncio.Protocol):
     def stalled_for(self, now: float) -> float:
         """Return for how many seconds it has taken none of its answers."""
         return 0.0 if self._stalled_since is None else now - self._stalled_since
+
+
+async def _awaited(answer: Awaitable[bytes]) -> bytes:
+    return await answer
 
 
 class ModbusPort:

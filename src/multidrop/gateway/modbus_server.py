@@ -26,6 +26,7 @@ from multidrop.gateway.modbus_settings import ModbusSettings
 from multidrop.gateway.passing import LineShare, PassingBusy
 from multidrop.gateway.pdu import WRITES, read_range, reply_data
 from multidrop.gateway.rights import Caller, Right
+from multidrop.gateway.supervisor import supervisor
 from multidrop.gateway.units import MAIN, StopWrite, Unit, Units
 
 if TYPE_CHECKING:
@@ -81,7 +82,6 @@ class ModbusServer:
         self._sockets: dict[str, Any] = {}  # that listen, by line
         self._listening: list[ModbusPort] = []
         self._stops: dict[str, set[asyncio.Task[int]]] = {}  # under way, by drive
-        self._writes: set[asyncio.Task[int]] = set()
 
     # ---- life ----
 
@@ -257,9 +257,7 @@ class ModbusServer:
             raise Declined(ModbusCode.ILLEGAL_VALUE)
         if client.is_full:
             raise Declined(ModbusCode.BUSY)
-        task = asyncio.ensure_future(self._write_one(unit, register, raw, self._caller(client)))
-        self._writes.add(task)
-        task.add_done_callback(self._writes.discard)
+        task = supervisor().start("modbus write", self._write_one(unit, register, raw, self._caller(client)))
         return self._later(request, task, None)
 
     async def _write_one(self, unit: Unit, register: Register[Any], raw: float, caller: Caller) -> int:
@@ -279,7 +277,7 @@ class ModbusServer:
         under_way = self._stops.setdefault(name, set())
         if len(under_way) >= MOST_STOPS:
             raise Declined(ModbusCode.ACKNOWLEDGE)
-        task = asyncio.ensure_future(self._stop_one(unit, self._caller(client)))
+        task = supervisor().start("modbus stop", self._stop_one(unit, self._caller(client)))
         under_way.add(task)
         task.add_done_callback(under_way.discard)
         return task

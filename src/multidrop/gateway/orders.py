@@ -6,7 +6,6 @@ drive and the latest reload of the plant, and did not come before; a stop by any
 
 from __future__ import annotations
 
-import asyncio
 import logging
 from collections import deque
 from collections.abc import Callable, Coroutine, Mapping, Sequence
@@ -15,6 +14,7 @@ from typing import Any
 from multidrop.gateway.clock import boottime_ns
 from multidrop.gateway.commands import MOST_AGE_S, Commands, Told
 from multidrop.gateway.rights import Caller
+from multidrop.gateway.supervisor import supervisor
 
 MOST_AGE_MS = round(MOST_AGE_S * 1e3)  # a broker that stood still delivers those of the whole time
 MOST_AHEAD_MS = 2_000  # by which the sender's clock may be fast
@@ -37,7 +37,6 @@ class Orders:
         self._utc_ms = utc_ms
         self._tell = tell
         self._came: deque[object] = deque(maxlen=REMEMBERED)
-        self._tasks: set[asyncio.Task[None]] = set()
         self._under_way = 0
 
     def stop(self, drives: Sequence[str] | None) -> None:
@@ -108,6 +107,4 @@ class Orders:
             self._under_way -= 1
 
     def _begin(self, work: Coroutine[Any, Any, None]) -> None:
-        task = asyncio.get_running_loop().create_task(work)
-        self._tasks.add(task)
-        task.add_done_callback(self._tasks.discard)
+        supervisor().start("order", work)

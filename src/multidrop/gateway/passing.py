@@ -12,6 +12,8 @@ from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 from typing import Any
 
+from multidrop.gateway.supervisor import supervisor
+
 SHARE = 0.2  # of a line's time
 BURST_S = 0.2  # of line time that may be used at once after a rest
 MOST_WAITING = 8  # requests, on a line
@@ -98,7 +100,7 @@ class LineShare:
                 self._timer = self._loop.call_at(now - self._left_s / self._share + 1e-4, self._wake)
             return
         asked = self._waiting.pop(0)
-        self._running = self._loop.create_task(self._run(asked))
+        self._running = supervisor().start("passed request", self._run(asked))
 
     def _wake(self) -> None:
         self._timer = None

@@ -5,13 +5,14 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections.abc import Callable, Iterator, Mapping
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from multidrop import Plant, PlantError, Poller
 from multidrop.gateway.parts import PARTS
+from multidrop.gateway.settings import AUDIT_S, check_writable
+from multidrop.gateway.supervisor import Hung, supervisor
 
 if TYPE_CHECKING:
     from multidrop.gateway.gateway import Gateway
@@ -19,10 +20,13 @@ if TYPE_CHECKING:
 
 Read = Callable[[], "tuple[Plant, ServeSettings]"]
 AT_ONCE = ("names", "tokens", "may", *PARTS)  # keys of [serve]; all others wait for a restart
+READ_S = 10.0  # that reading the file may take
+QUICK_S = 1.0  # of it, for which a later reload waits too
+MOST_READS = 8  # that may hang at the same time
+ADOPTION_S = 60.0  # that ports and stops may take
 RESTART = "takes effect after a restart"
 NO_FILE = "this plant has no file to be read again"
 
-R = TypeVar("R")
 _log = logging.getLogger("multidrop.gateway")
 
 
@@ -36,7 +40,10 @@ class Reloaded(NamedTuple):
 
 
 class Reload:
-    """Reads the plant file anew with `read`, which raises ValueError or OSError for what is wrong with it."""
+    """Reads the plant file anew with `read`, which raises ValueError or OSError for what is wrong with it.
+
+    `read` runs in a thread: a file system that hangs ends one reload, and nothing else.
+    """
 
     def __init__(self, gateway: Gateway, read: Read | None) -> None:
         self.mistakes: tuple[str, ...] = ()  # of the newest reload
@@ -47,6 +54,7 @@ class Reload:
         self._turn = asyncio.Lock()
         self._soon: asyncio.Task[None] | None = None
         self._is_wanted = False
+        self._is_overtaken = asyncio.Event()  # a later reload waits for the one that reads the file
         self.coming: Plant | None = None  # while drives are on their way from one plant to this one
 
     @property
@@ -57,8 +65,9 @@ class Reload:
     def begin(self) -> None:
         """Reload as soon as the one that is under way has ended. To be called in the loop."""
         self._is_wanted = True
+        self._is_overtaken.set()
         if self._soon is None or self._soon.done():
-            self._soon = asyncio.create_task(self._carry_out_wanted())
+            self._soon = supervisor().start("reload", self._carry_out_wanted())
 
     async def _carry_out_wanted(self) -> None:
         while self._is_wanted:
@@ -73,6 +82,7 @@ class Reload:
 
     async def carry_out(self, by: str) -> Reloaded:
         """Read the file, and poll what it says now, or go on as before and say why."""
+        self._is_overtaken.set()
         async with self._turn:
             _log.info("reload, asked for by %s", by)
             self._gateway.notifier.tell_reloading()
@@ -83,18 +93,40 @@ class Reload:
             self._gateway.notifier.tell("READY=1", self._gateway.status)
             return told
 
+    async def _read_within(self, read: Read) -> tuple[Plant, ServeSettings, Mapping[str, Any]]:
+        """Return what the file says, and the plan of its lines, which is long work.
+
+        Raises Hung if that takes too long, or if a later reload is to read the file that does not answer.
+        """
+
+        def work() -> tuple[Plant, ServeSettings, Mapping[str, Any]]:
+            plant, settings = read()
+            return plant, settings, plant.metadata()["planned"]
+
+        self._is_overtaken.clear()
+        reading = supervisor().start("reload", supervisor().within("reload", READ_S, work, most=MOST_READS))
+        overtaken = supervisor().start("reload", self._is_overtaken.wait())
+        await asyncio.wait({reading}, timeout=QUICK_S)
+        await asyncio.wait({reading, overtaken}, return_when=asyncio.FIRST_COMPLETED)
+        overtaken.cancel()
+        if not reading.done():
+            reading.cancel()
+            raise Hung("a later reload takes its place")
+        return reading.result()
+
     async def _carry_out(self) -> Reloaded:
         gateway, poller = self._gateway, self._gateway.poller
         if self._read is None or poller is None:
             return Reloaded(False, NO_FILE)
-        plant, settings = await beside(self._read)
-        planned = await beside(lambda: plant.metadata()["planned"])  # long work, which the loop must not do
+        plant, settings, planned = await self._read_within(self._read)
+        if gateway.audit:  # the adoption opens it
+            await supervisor().within("audit log", AUDIT_S, partial(check_writable, gateway.audit))
         replaced = await gateway.parts.replace(settings.parts, plant)
         self.coming = plant
         try:
-            unopened = await beside(partial(poller.adopt, plant))
+            unopened = await supervisor().thread("adoption", ADOPTION_S, partial(poller.adopt, plant))
             self._take_up(poller, settings, planned)
-            gateway.parts.take_up(replaced)
+            gateway.parts.take_up(replaced.built)
         except Exception:
             if poller.plant.lines != gateway.plant.lines:  # it came half way: go on with what there is
                 self._take_up(poller, gateway.settings, None)
@@ -159,15 +191,6 @@ class Reload:
             _log.error("the plant goes on as before: %s", mistake)
         self.mistakes = tuple(mistakes)
         return Reloaded(False, "the plant goes on as before: the file has mistakes", self.mistakes)
-
-
-async def beside(work: Callable[[], R]) -> R:
-    """Return what work returns, in a thread of its own: all others may be busy."""
-    own = ThreadPoolExecutor(1, "multidrop reload")
-    try:
-        return await asyncio.get_running_loop().run_in_executor(own, work)
-    finally:
-        own.shutdown(wait=False)
 
 
 def _sentence(failure: Exception) -> str:

@@ -7,15 +7,19 @@ import json
 import re
 import ssl
 from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
 from dataclasses import MISSING, Field, dataclass, field, fields
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from multidrop import MAY_LISTS, Key, Plant, PlantError, TomlPlace, check_listed
 from multidrop.gateway.parts import PARTS, Part, settings_class
 from multidrop.gateway.rights import May, Right, Token, is_loopback, read_tokens
+from multidrop.gateway.supervisor import Hung, in_time
 
 LISTEN = "127.0.0.1:8750"
+AUDIT_S = 2.0  # within which the disk of the audit log must answer
 HOST = re.compile(r"[A-Za-z0-9]([A-Za-z0-9.-]{0,251}[A-Za-z0-9])?")
 EXAMPLES = {  # of a part's values, by their type
     bool: "true",
@@ -121,7 +125,7 @@ def read_settings(plant: Plant, environment: Mapping[str, str]) -> ServeSettings
             "key, or behind_proxy = true; or listen on 127.0.0.1"
         )
     audit = folders.state / given.get("audit", "audit.jsonl")
-    place.attempt(_check_writable, audit)
+    place.attempt(_check_audit, audit)
     parts = {
         name: _part(PARTS[name], given[name], plant, place.of_file(plant.path, f"[serve.{name}]"))
         for name in PARTS
@@ -263,7 +267,15 @@ def _digest(paths: Iterable[Path]) -> str:
     return hashlib.sha256(b"".join(path.read_bytes() for path in paths)).hexdigest()
 
 
-def _check_writable(path: Path) -> bool:
+def _check_audit(path: Path) -> bool:
+    """Check that it can be written; a disk that does not answer is no mistake of the file."""
+    with suppress(Hung):
+        in_time("audit log", AUDIT_S, partial(check_writable, path))
+    return True
+
+
+def check_writable(path: Path) -> bool:
+    """Return True if this audit log can be written. Raises ValueError."""
     is_new = not path.exists()
     try:
         with path.open("ab"):

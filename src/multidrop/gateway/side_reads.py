@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable
+from functools import partial
 from math import isfinite
 from typing import Any
 
 from multidrop import Bus, BusError, Drive, NoReply, Plant
+from multidrop.gateway.supervisor import supervisor
 
 PAUSE_S = 0.2  # between two reads on a line,
 SHARE = 20  # or so many times what the last one took, if that is more: the polling keeps the line
 LOOKED_S = 3.0  # after the last look nothing more is read
 MOST_DRIVES = 4  # that are looked at, at the same time
+READ_S = 30.0  # that one read may take
 
 UNANSWERED = "no reply"
 
@@ -47,7 +50,7 @@ class SideReads:
             polled = next(one for one in line.drives if one.drive is drive)
             others = set(drive.registers) - {poll.register.name for poll in polled.polls}
             names = [one for one in drive.registers if one in others and drive.registers[one].readable]
-            self._tasks[name] = asyncio.create_task(self._read(line.name, drive, names))
+            self._tasks[name] = supervisor().start("side reads", self._read(line.name, drive, names))
         return found
 
     @property
@@ -88,8 +91,8 @@ class SideReads:
     async def _read_in_turn(self, line: str, drive: Drive, register: str) -> None:
         begun = self._clock()
         if self._is_there(drive.name):
-            reading = asyncio.to_thread(self._read_one, line, drive, register)
-            self._found[drive.name][register] = await reading
+            reading = partial(self._read_one, line, drive, register)
+            self._found[drive.name][register] = await supervisor().within("side reads", READ_S, reading)
         await asyncio.sleep(max(PAUSE_S, SHARE * (self._clock() - begun)))
 
     def _read_one(self, line: str, drive: Drive, register: str) -> list[Any]:

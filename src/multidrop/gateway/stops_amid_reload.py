@@ -7,6 +7,7 @@ from collections.abc import Awaitable, Callable, Sequence
 from typing import Protocol, TypeVar
 
 from multidrop import Drive, Plant, PlantLine, drive_meant
+from multidrop.gateway.supervisor import supervisor
 
 LOOK_S = 0.02  # between looks at what a reload changes
 
@@ -118,7 +119,7 @@ async def stop_as_changed(
             }
             if left:
                 latest |= left
-                under_way.add(asyncio.create_task(begin(plant, left)))
+                under_way.add(supervisor().start("stop", begin(plant, left)))
             elif is_settled and not under_way:
                 return told
             if under_way:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import asyncio
 import contextlib
 import time
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from multidrop import Drive, Ledger, MetricFamily, Statistics, drive_meant
@@ -12,9 +12,12 @@ from multidrop.gateway.frames import lost_of
 from multidrop.gateway.lately import asked_of, misses_of
 from multidrop.gateway.metrics import Figures
 from multidrop.gateway.stops_amid_reload import drives_of
+from multidrop.gateway.supervisor import Hung, supervisor
 
 if TYPE_CHECKING:
     from multidrop.gateway.gateway import Gateway
+
+LEDGER_S = 6.0  # that the ledger may take: it waits 5 s for a lock
 
 
 async def look_at(gateway: Gateway, name: str) -> dict[str, Any]:
@@ -23,7 +26,7 @@ async def look_at(gateway: Gateway, name: str) -> dict[str, Any]:
     line, drive = gateway.plant.find_drive(name)
     bus = gateway.poller.buses.get(line.name) if gateway.poller else None
     port = bus.line.identity if bus else line.port
-    wear = await asyncio.to_thread(_wear, gateway.ledger, port, drive)  # it may wait for a lock
+    wear = await _wear_within(gateway.ledger, port, drive)
     found = gateway.side_reads.look(gateway.plant, name)
     statistics = gateway.lately.drive(line.name, name)
     return {
@@ -54,6 +57,13 @@ def _usual_delays(statistics: Statistics) -> dict[str, float | None]:
     delays = statistics.delays
     quantiles = {"p50": delays.p50, "p99": delays.p99}
     return {name: round(s * 1e3, 3) if delays.replies else None for name, s in quantiles.items()}
+
+
+async def _wear_within(ledger: Ledger, port: str, drive: Drive) -> list[dict[str, Any]]:
+    """Return the wear, or none if the ledger's file is locked for long, or its disk does not answer."""
+    with contextlib.suppress(Hung):
+        return await supervisor().within("ledger", LEDGER_S, partial(_wear, ledger, port, drive))
+    return []
 
 
 def _wear(ledger: Ledger, port: str, drive: Drive) -> list[dict[str, Any]]:
@@ -88,19 +98,28 @@ def look_at_lines(gateway: Gateway) -> dict[str, Any]:
 
 
 def health_of(gateway: Gateway) -> dict[str, Any]:
-    """Return how all is, by line and by part: "ok", "degraded", or "failed" where nothing is polled."""
+    """Return how all is, by line and by part: "ok", "degraded", or "failed".
+
+    It has failed if nothing is polled, or if a task or a thread that must go on has ended.
+    """
+    supervisor().look()
+    dead, hung = supervisor().dead | gateway.parts.dead, supervisor().hung
     lost = {line.name: lost_of(gateway.hub, line.name) or "ok" for line in gateway.plant.lines}
     parts = parts_of(gateway)
     audit = audit_trouble_of(gateway) or "ok"
     is_well = {"ok", audit, *lost.values(), *parts.values()} == {"ok"} and not gateway.reload.mistakes
+    is_well = is_well and not hung
+    has_failed = gateway.hub.taken == 0 or bool(dead)
     return {
-        "status": "failed" if gateway.hub.taken == 0 else "ok" if is_well else "degraded",
+        "status": "failed" if has_failed else "ok" if is_well else "degraded",
         "version": gateway.version,
         "uptime_s": round(gateway.clock() - gateway.begun, 1),
         "newest_row": gateway.hub.time // 1_000_000,
         "lines": lost,
         "parts": parts,
         "audit": audit,
+        "dead": dead,
+        "hung": hung,
         "mistakes": gateway.reload.mistakes,
         "restart": gateway.reload.restart,
         "failures": gateway.failures,
@@ -109,11 +128,19 @@ def health_of(gateway: Gateway) -> dict[str, Any]:
 
 def parts_of(gateway: Gateway) -> dict[str, str]:
     """Return "ok" of each part, or what is not well with it."""
-    return {name: _health_of_part(feed) for name, feed in gateway.feeds.items()} | gateway.dead
+    parts, dead = gateway.parts, supervisor().dead
+    return (
+        {name: _health_of_part(feed) for name, feed in parts.feeds.items()}
+        | dict.fromkeys(parts.coming, "it is not there yet: its files do not answer")
+        | parts.dead
+        | {name: why for name, why in dead.items() if name in parts.feeds}
+    )
 
 
 def audit_trouble_of(gateway: Gateway) -> str:
     """Return why the newest write of a line is not in the audit log; "" is well."""
+    if gateway.unaudited:
+        return gateway.unaudited
     poller = gateway.poller
     lines = [line.name for line in gateway.plant.lines] if poller else []
     found = (poller.bus(line).audit_trouble for line in lines if poller)
@@ -122,7 +149,8 @@ def audit_trouble_of(gateway: Gateway) -> str:
 
 def troubles_of(gateway: Gateway) -> list[str]:
     """Return a sentence for each thing beside the lines that is not well, for the page."""
-    said = {name: one for name, one in parts_of(gateway).items() if one != "ok"}
+    said = supervisor().hung | supervisor().dead
+    said |= {name: one for name, one in parts_of(gateway).items() if one != "ok"}
     audit = audit_trouble_of(gateway)
     return [f"{name}: {one}" for name, one in (said | ({"audit log": audit} if audit else {})).items()]
 

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import asyncio
 import logging
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -26,6 +26,7 @@ from multidrop.gateway.json_response import JsonResponse
 from multidrop.gateway.metrics import families_of
 from multidrop.gateway.request_fields import body_of, caller_of, drives_to_stop, frame_in, number_in, text_in
 from multidrop.gateway.rights import NEVER_THIS_WAY, NOT_ALLOWED, NOT_LISTED, Right
+from multidrop.gateway.supervisor import Hung, supervisor
 from multidrop.gateway.verb_rules import STOPPING
 from multidrop.gateway.views import figures_of, health_of, look_at, look_at_lines
 
@@ -33,7 +34,8 @@ if TYPE_CHECKING:
     from multidrop.gateway.gateway import Gateway
 
 PAGE = Path(__file__).parent / "page"
-MOST_QUERIES = 2  # of the history, and of the audit log, at the same time
+MOST_QUERIES = 2  # of the audit log, at the same time
+AUDIT_S = 20.0  # that one may take
 COOKIE_S = 30 * 24 * 3600
 RIGHTS_RULES = (NOT_ALLOWED, NOT_LISTED, NEVER_THIS_WAY)
 
@@ -80,6 +82,7 @@ def make_app(gateway: Gateway) -> ASGIApp:
         routes.append(Mount("/page", StaticFiles(directory=PAGE)))  # type: ignore[arg-type]
     handlers: Any = {
         Denied: _denied,
+        Hung: lambda request, failure: _error(503, str(failure)),
         404: lambda request, failure: _error(404, "there is nothing here"),
         500: lambda request, failure: _error(500, "this went wrong in the gateway; its log says why"),
     }
@@ -124,7 +127,6 @@ class _Pages:
 
     def __init__(self, gateway: Gateway) -> None:
         self._gateway = gateway
-        self._queries = asyncio.Semaphore(MOST_QUERIES)
         self._exports = Exports()
 
     async def index(self, request: Request) -> Response:
@@ -178,9 +180,8 @@ class _Pages:
     async def audit(self, request: Request) -> Response:
         query = request.query_params
         before, count = time_asked(query), number_in(query.get("count", str(MOST_RECORDS)), "count")
-        async with self._queries:
-            found = await asyncio.to_thread(newest_records, self._gateway.settings.audit, before, count)
-        return JsonResponse(found)
+        work = partial(newest_records, self._gateway.settings.audit, before, count)
+        return JsonResponse(await supervisor().within("audit queries", AUDIT_S, work, most=MOST_QUERIES))
 
     async def alarms(self, request: Request) -> Response:
         query = request.query_params
@@ -197,8 +198,7 @@ class _Pages:
         points = number_in(query.get("points", "800"), "points")
         begin, end = (number_in(query.get(key, ""), key) for key in ("from", "to"))
         try:
-            async with self._queries:
-                found = await part.series(query.getlist("series"), begin, end, points)
+            found = await part.series(query.getlist("series"), begin, end, points)
         except ValueError as mistake:
             return _error(400, str(mistake))
         return Response(found, media_type="application/json")

@@ -24,6 +24,7 @@ from multidrop.transport import clock
 MOST_WAITING = 250_000  # rows, for a disk that is slow: 12 MB
 WRITING_S = 0.4  # between writes: each is a batch, and a question reads all batches of its time
 TENDING_S = 60.0  # between looks at what is too old
+HANGING_S = 5.0  # for which the disk may keep the thread waiting
 ENDING_S = 10.0  # for which `close` waits for the disk
 
 _log = logging.getLogger("multidrop.history")
@@ -71,6 +72,7 @@ class HistoryWriter:
         self._trouble: str | None = None
         self._again_ns = 0
         self._tended_ns: int | None = None
+        self._busy_since_ns: int | None = None  # when the thread last went to the disk; None: it waits
         self._over = threading.Event()
         self._thread = threading.Thread(target=self._run, name="multidrop history", daemon=True)
         self._thread.start()
@@ -97,7 +99,18 @@ class HistoryWriter:
 
     def state(self) -> HistoryState:
         """Return rows written and lost so far, and what is wrong now."""
-        return HistoryState(self._segments.rows, self._dropped, self._trouble)
+        return HistoryState(self._segments.rows, self._dropped, self._hang() or self._trouble)
+
+    def _hang(self) -> str:
+        """Return that the disk does not answer; "" if it does."""
+        since_ns = self._busy_since_ns
+        seconds = 0.0 if since_ns is None else (clock.now_ns() - since_ns) / 1e9
+        return f"the disk has not answered for {seconds:.0f} s" if seconds > HANGING_S else ""
+
+    @property
+    def is_alive(self) -> bool:
+        """True until the thread that writes has ended."""
+        return self._thread.is_alive()
 
     def close(self) -> None:
         """Write what waits, and end; a disk that does not answer is waited for 10 s at most."""
@@ -108,11 +121,13 @@ class HistoryWriter:
 
     def _run(self) -> None:
         while not self._over.wait(WRITING_S):
+            self._busy_since_ns = clock.now_ns()
             try:
                 self._write_waiting()
                 self._tend()
             except Exception:  # a mistake of ours must not end the recording
                 _log.exception("the history's thread goes on after a failure")
+            self._busy_since_ns = None
         self._write_waiting()
         self._compactor.end()
         with suppress(OSError):

@@ -1,0 +1,226 @@
+"""Supervisor: starts every task and every thread of the gateway; no other of its modules starts any.
+
+So it knows all of them: which of those that must go on have ended, and which work takes too long, such as a
+read from a file system that hangs. /health says both. Its threads never keep the process from ending.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import threading
+from collections.abc import Callable, Coroutine
+from concurrent.futures import Future
+from contextvars import copy_context
+from functools import partial
+from math import inf
+from time import monotonic
+from typing import Any, NamedTuple, TypeVar
+from weakref import WeakKeyDictionary
+
+R = TypeVar("R")
+
+_log = logging.getLogger("multidrop.gateway")
+
+
+class Hung(OSError):
+    """Work that did not end in its time; its thread goes on."""
+
+
+class _Work(NamedTuple):
+    name: str
+    begun: float  # by the monotonic clock
+    limit_s: float  # after which it takes too long
+
+
+class Supervisor:
+    """The tasks and threads of one loop. All but the threads' own work is called in the loop."""
+
+    def __init__(self) -> None:
+        self.dead: dict[str, str] = {}  # tasks and threads that must go on, and why they ended
+        self._kept: dict[str, asyncio.Task[Any]] = {}
+        self._watched: dict[str, Callable[[], bool]] = {}
+        self._short: set[asyncio.Task[Any]] = set()
+        self._works: dict[asyncio.Future[Any], _Work] = {}
+
+    # ---- tasks ----
+
+    @property
+    def kept(self) -> dict[str, asyncio.Task[Any]]:
+        """The tasks that must go on, by name."""
+        return dict(self._kept)
+
+    @property
+    def watched(self) -> list[str]:
+        """The names of the watched threads."""
+        return [*self._watched]
+
+    def keep(self, name: str, work: Coroutine[Any, Any, R]) -> asyncio.Task[R]:
+        """Start a task that must go on until `release`; if it ends before, `dead` says why."""
+        task = asyncio.get_running_loop().create_task(work, name=name)
+        self.dead.pop(name, None)
+        self._kept[name] = task
+        task.add_done_callback(lambda ended: self._note_end(name, ended))
+        return task
+
+    def _note_end(self, name: str, task: asyncio.Task[Any]) -> None:
+        failure = None if task.cancelled() else task.exception()
+        if self._kept.get(name) is not task:
+            return  # it was released
+        del self._kept[name]
+        self.note_dead(name, "it was cancelled" if task.cancelled() else _reason(failure), failure)
+
+    def let_go(self, name: str) -> asyncio.Task[Any] | None:
+        """Return a task that may end from now on; None if it has ended."""
+        return self._kept.pop(name, None)
+
+    async def release(self, *names: str) -> None:
+        """End these tasks, and wait for them."""
+        tasks = [task for name in names if (task := self._kept.pop(name, None))]
+        for name in names:
+            self.dead.pop(name, None)
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+
+    def start(self, name: str, work: Coroutine[Any, Any, R]) -> asyncio.Task[R]:
+        """Start a task that ends by itself. A failure that nobody awaits is logged."""
+        task = asyncio.get_running_loop().create_task(work, name=name)
+        self._short.add(task)  # the loop keeps no reference
+        task.add_done_callback(self._short.discard)
+        return task
+
+    # ---- threads of others ----
+
+    def watch(self, name: str, is_alive: Callable[[], bool]) -> None:
+        """Watch a thread that another module started; `look` calls `is_alive`."""
+        self._watched[name] = is_alive
+
+    def look(self) -> None:
+        """Note which watched threads have ended."""
+        for name in [name for name, is_alive in self._watched.items() if not is_alive()]:
+            del self._watched[name]
+            self.note_dead(name, "its thread has ended")
+
+    def note_dead(self, name: str, why: str, failure: BaseException | None = None) -> None:
+        """Note and log that something which must go on has ended."""
+        self.dead[name] = why
+        _log.error("%s has ended, and does not come back: %s", name, why, exc_info=failure)
+
+    # ---- threads ----
+
+    def thread(self, name: str, limit_s: float, work: Callable[[], R]) -> asyncio.Future[R]:
+        """Do work in a thread of its own, which goes on whether or not the future is cancelled.
+
+        After `limit_s` seconds /health is degraded until it ends. Raises RuntimeError or MemoryError if the
+        system has no thread left.
+        """
+        loop = asyncio.get_running_loop()
+        future: asyncio.Future[R] = loop.create_future()
+        future.add_done_callback(lambda done: done.cancelled() or done.exception())  # maybe nobody awaits it
+
+        def finish(settle: Callable[[], None]) -> None:
+            self._end_work(future)
+            if not future.done():
+                settle()
+
+        def run(call: Callable[[Callable[[], R]], R]) -> None:
+            settle: partial[None]
+            try:
+                settle = partial(future.set_result, call(work))
+            except BaseException as failure:
+                settle = partial(future.set_exception, _for_a_future(failure))
+            try:
+                loop.call_soon_threadsafe(finish, settle)
+            except RuntimeError:  # the loop is closed: nobody waits any more
+                _log.warning("%s ended after the gateway: %s", name, settle.args[0])
+
+        thread = threading.Thread(
+            target=run, args=[copy_context().run], name=f"multidrop {name}", daemon=True
+        )
+        self._works[future] = _Work(name, monotonic(), limit_s)
+        try:
+            thread.start()
+        except BaseException:
+            del self._works[future]
+            raise
+        return future
+
+    def _end_work(self, future: asyncio.Future[Any]) -> None:
+        """Forget work that has ended; what began before under its name is no longer told as hanging."""
+        ended = self._works.pop(future)
+        for other, one in self._works.items():
+            if one.name == ended.name and one.begun <= ended.begun:
+                self._works[other] = one._replace(limit_s=inf)
+
+    async def within(self, name: str, limit_s: float, work: Callable[[], R], *, most: int = 4) -> R:
+        """Return what work returns, which has a thread of its own.
+
+        At most `most` works of a name go on at once; others wait for them. Raises Hung if it is not done
+        within `limit_s` seconds, or has not begun within as many.
+        """
+        begin_by = monotonic() + limit_s
+        while len(going := [future for future, one in self._works.items() if one.name == name]) >= most:
+            await asyncio.wait(
+                going, timeout=max(0.0, begin_by - monotonic()), return_when=asyncio.FIRST_COMPLETED
+            )
+            if monotonic() >= begin_by:
+                raise Hung(f"{name}: {most} others are not done; does the disk answer?")
+        future = self.thread(name, limit_s, work)
+        await asyncio.wait([future], timeout=limit_s)
+        if not future.done():
+            raise Hung(f"{name}: not done within {limit_s:g} s; does the disk answer?")
+        return future.result()
+
+    @property
+    def hung(self) -> dict[str, str]:
+        """A sentence for each name of which work goes on for longer than its time."""
+        now = monotonic()
+        late = {one.name: one for one in reversed(self._works.values()) if now - one.begun > one.limit_s}
+        return {name: f"it has gone on for {now - one.begun:.0f} s" for name, one in late.items()}
+
+    @property
+    def under_way(self) -> list[str]:
+        """The names of the threads that have not ended."""
+        return [one.name for one in self._works.values()]
+
+
+_supervisors: WeakKeyDictionary[asyncio.AbstractEventLoop, Supervisor] = WeakKeyDictionary()
+
+
+def supervisor() -> Supervisor:
+    """Return the supervisor of the running loop."""
+    loop = asyncio.get_running_loop()
+    if loop not in _supervisors:
+        _supervisors[loop] = Supervisor()
+    return _supervisors[loop]
+
+
+def in_time(name: str, seconds: float, work: Callable[[], R]) -> R:
+    """Return what work returns, where there may be no loop. Raises Hung if it is not done in its time."""
+    ended: Future[R] = Future()
+
+    def run() -> None:
+        try:
+            ended.set_result(work())
+        except BaseException as failure:
+            ended.set_exception(failure)
+
+    threading.Thread(target=run, name=f"multidrop {name}", daemon=True).start()
+    try:
+        return ended.result(seconds)
+    except TimeoutError as late:
+        if ended.done():  # the work itself raised it
+            raise
+        raise Hung(f"{name}: not done within {seconds:g} s; does the disk answer?") from late
+
+
+def _for_a_future(failure: BaseException) -> Exception:
+    """Return a failure as a future takes it: SystemExit would end the loop, and StopIteration is refused."""
+    if isinstance(failure, Exception) and not isinstance(failure, StopIteration):
+        return failure
+    return RuntimeError(_reason(failure))
+
+
+def _reason(failure: BaseException | None) -> str:
+    return "it returned" if failure is None else f"{type(failure).__name__}: {failure}"

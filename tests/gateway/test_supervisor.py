@@ -1,0 +1,238 @@
+"""The supervisor, and all tasks and threads of a gateway: each that ends makes /health fail."""
+
+from __future__ import annotations
+
+import ast
+import asyncio
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from gateways import Served, running, served, simulated_plant
+from lines import until
+from peers import require_module
+
+import multidrop.gateway
+from multidrop import load_plant
+from multidrop.gateway import historian
+from multidrop.gateway.gateway import Gateway
+from multidrop.gateway.settings import ServeSettings
+from multidrop.gateway.supervisor import Hung, Supervisor, in_time, supervisor
+
+STARTERS = {
+    *("Thread", "ThreadPoolExecutor", "TaskGroup", "Timer"),
+    *("create_task", "ensure_future", "to_thread", "run_in_executor"),
+}
+PARTS = """
+[serve.may]
+stop = "anyone"
+[serve.history]
+[serve.modbus]
+listen = "127.0.0.1:0"
+[serve.mqtt]
+broker = "mqtt://127.0.0.1:9"
+[serve.fleet]
+nats = ["nats://127.0.0.1:9"]
+"""
+TASKS = {"web", "polling", "statistics", "identities", "fleet", "history", "modbus", "mqtt"}
+THREADS = {"multidrop poller", "multidrop history", "paho-mqtt-client"}
+
+
+def test_no_other_module_of_the_gateway_starts_a_task_or_a_thread() -> None:
+    found = set()
+    for path in Path(multidrop.gateway.__file__).parent.glob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text("utf-8"))):
+            if isinstance(node, ast.Call) and ast.unparse(node.func).rpartition(".")[2] in STARTERS:
+                found.add(path.name)
+    assert found == {"supervisor.py"}
+
+
+# ---- all that a gateway has ----
+
+
+@pytest.fixture
+def gateway(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Served]:
+    require_module("paho.mqtt.client")
+    require_module("nats")
+    monkeypatch.setattr(historian, "LOOK_S", 0.02)
+    with served(tmp_path, PARTS) as gateway:
+        gateway.await_state("pump-1", "stands")
+        until(lambda: gateway.get("/health").json["newest_row"])
+        yield gateway
+
+
+def in_loop(loop: asyncio.AbstractEventLoop, work: Callable[[Supervisor], Any]) -> Any:
+    """Return what a function returns that the loop of a gateway calls with its supervisor."""
+    ends: list[Any] = []
+    loop.call_soon_threadsafe(lambda: ends.append(work(supervisor())))
+    until(lambda: ends)
+    return ends[0]
+
+
+def dead(gateway: Served) -> Any:
+    """Return what /health says is dead, where it says that the gateway has failed."""
+    answer = gateway.get("/health")
+    assert (answer.status == 503) == (answer.json["status"] == "failed") == bool(answer.json["dead"])
+    return answer.json["dead"]
+
+
+def test_the_list_of_all_tasks_and_threads(gateway: Served) -> None:
+    assert in_loop(gateway.loop, lambda found: set(found.kept)) == TASKS
+    assert gateway.get("/health").json["dead"] == {}
+    names = {thread.name for thread in threading.enumerate() if "multidrop" in thread.name}
+    there = {known for known in THREADS for name in names if name.startswith(known)}
+    assert there == THREADS
+
+
+@pytest.mark.parametrize("name", sorted(TASKS - {"web"}))
+def test_a_task_that_is_killed_makes_health_fail_and_no_stop(
+    gateway: Served, name: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    assert dead(gateway) == {}
+    in_loop(gateway.loop, lambda found: found.kept[name].cancel())
+    until(lambda: dead(gateway) == {name: "it was cancelled"})
+    assert f"{name} has ended, and does not come back: it was cancelled" in caplog.text
+    assert all(one["done"] for one in gateway.post("/api/stop").json.values())
+
+
+def test_a_poller_that_fails_makes_health_fail_and_no_stop(
+    gateway: Served, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail() -> None:
+        raise ZeroDivisionError("a bug in a user's class")
+
+    monkeypatch.setattr(gateway.gateway.poller, "take", fail)
+    until(lambda: dead(gateway) == {"polling": "ZeroDivisionError: a bug in a user's class"})
+    assert all(one["done"] for one in gateway.post("/api/stop").json.values())
+    monkeypatch.undo()
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
+def test_a_thread_of_the_history_that_ends_makes_health_fail(
+    gateway: Served, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    part: Any = gateway.gateway.feeds["history"]
+
+    def leave() -> None:
+        raise SystemExit
+
+    monkeypatch.setattr(part._writer, "_write_waiting", leave)
+    until(lambda: dead(gateway) == {"history": "RuntimeError: the thread that writes has ended"})
+    assert gateway.get("/health").json["parts"]["history"] == dead(gateway)["history"]
+    monkeypatch.undo()
+    part._writer._segments.close()
+
+
+def test_a_thread_of_the_broker_s_connection_that_ends_makes_health_fail(gateway: Served) -> None:
+    part: Any = gateway.gateway.feeds["mqtt"]
+    part._brokers[0]._client.disconnect()  # nobody asked for that
+    until(lambda: dead(gateway) == {"mqtt": "RuntimeError: the thread of its connection has ended"})
+
+
+def test_a_watched_thread_that_ends_makes_health_fail(gateway: Served) -> None:
+    over = threading.Event()
+    in_loop(gateway.loop, lambda found: found.watch("log", lambda: not over.is_set()))
+    assert dead(gateway) == {}
+    over.set()
+    until(lambda: dead(gateway) == {"log": "its thread has ended"})
+
+
+def test_a_web_server_that_ends_ends_the_gateway(tmp_path: Path) -> None:
+    with simulated_plant(tmp_path, "") as path:
+        gateway = Gateway(load_plant(path), ServeSettings(port=0))
+        ended = pytest.raises(RuntimeError, match="the web server has ended: it was cancelled")
+        with ended, running(gateway) as loop:
+            in_loop(loop, lambda found: found.kept["web"].cancel())
+            until(lambda: gateway.listener.fileno() < 0)
+
+
+# ---- the supervisor alone ----
+
+
+def test_a_task_that_is_released_is_not_dead() -> None:
+    async def live() -> dict[str, str]:
+        supervisor().keep("released", asyncio.sleep(60))
+        supervisor().keep("let go of", asyncio.sleep(0))
+        await supervisor().release("released", "never there")
+        task = supervisor().let_go("let go of")
+        assert task is not None
+        await task
+        return supervisor().dead
+
+    assert asyncio.run(live()) == {}
+
+
+def test_a_task_that_is_kept_again_is_not_dead_any_more() -> None:
+    async def live() -> list[dict[str, str]]:
+        found = []
+        await asyncio.wait([supervisor().keep("part", asyncio.sleep(0))])
+        await asyncio.sleep(0)
+        found.append(dict(supervisor().dead))
+        supervisor().keep("part", asyncio.sleep(60))
+        found.append(dict(supervisor().dead))
+        await supervisor().release("part")
+        return found
+
+    assert asyncio.run(live()) == [{"part": "it returned"}, {}]
+
+
+@pytest.mark.parametrize("failure", [ValueError("no"), SystemExit("no"), StopIteration("no")])
+def test_what_work_raises_is_raised_and_ends_no_loop(failure: BaseException) -> None:
+    def work() -> None:
+        raise failure
+
+    async def live() -> None:
+        with pytest.raises(ValueError if isinstance(failure, ValueError) else RuntimeError, match="no"):
+            await supervisor().within("work", 60, work)
+
+    asyncio.run(live())
+
+
+def test_work_that_hangs_is_given_up_told_of_and_forgotten() -> None:
+    go_on = threading.Event()
+
+    async def live() -> None:
+        threads = supervisor()
+        with pytest.raises(Hung, match=r"history: not done within 0.01 s; does the disk answer\?"):
+            await threads.within("history", 0.01, go_on.wait)
+        assert await threads.within("other", 60, lambda: 3) == 3
+        assert list(threads.hung) == ["history"]
+        with pytest.raises(Hung, match="history: 1 others are not done"):
+            await threads.within("history", 0.01, go_on.wait, most=1)
+        assert threads.under_way == ["history"]
+        assert await threads.within("history", 60, lambda: 4) == 4  # the disk answers again
+        assert threads.hung == {}
+        go_on.set()
+        while threads.under_way:
+            await asyncio.sleep(0)
+
+    asyncio.run(live())
+
+
+def test_where_there_is_no_thread_left_work_raises_that(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(thread: threading.Thread) -> None:
+        raise RuntimeError("can't start new thread")
+
+    async def live() -> list[str]:
+        with pytest.raises(RuntimeError, match="can't start new thread"):
+            await supervisor().within("work", 60, lambda: 3)
+        return supervisor().under_way
+
+    monkeypatch.setattr(threading.Thread, "start", fail)
+    assert asyncio.run(live()) == []
+
+
+def test_in_time() -> None:
+    go_on = threading.Event()
+
+    def fail() -> None:
+        raise TimeoutError("its own")
+
+    assert in_time("sum", 60, lambda: 3) == 3
+    with pytest.raises(TimeoutError, match="its own"):
+        in_time("sum", 60, fail)
+    with pytest.raises(Hung, match=r"sum: not done within 0.01 s"):
+        in_time("sum", 0.01, go_on.wait)
+    go_on.set()
