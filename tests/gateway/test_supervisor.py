@@ -123,6 +123,7 @@ def test_a_thread_of_the_history_that_ends_makes_health_fail(
     assert gateway.get("/health").json["parts"]["history"] == dead(gateway)["history"]
     monkeypatch.undo()
     part._writer._segments.close()
+    part._writer._compactor.end()
 
 
 def test_a_thread_of_the_broker_s_connection_that_ends_makes_health_fail(gateway: Served) -> None:

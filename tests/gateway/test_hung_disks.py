@@ -1,0 +1,302 @@
+"""File systems that hang, such as FIFOs: polling and stops go on, /health says why, and the gateway ends."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NoReturn
+
+import pytest
+from gateways import Served, served, serving, simulated_plant
+from lines import PATIENCE, until
+
+from multidrop import History
+from multidrop.gateway import gateway as gateway_module
+from multidrop.gateway import historian, live_parts, reload, settings, views, web
+from multidrop.gateway.rights import Right
+from multidrop.history import writer as writer_module
+
+SERVE = '[serve]\nlisten = "127.0.0.1:0"\n[serve.may]\nstop = "anyone"\nwrite = ["pump-1.setpoint"]\n'
+HISTORY = '[serve.history]\nfolder = "kept"\n'
+COMING = "it is not there yet: its files do not answer"
+UNAUDITED = "audit log: not done within 0.1 s; does the disk answer? A restart tries it again"
+HANGING = """
+import sys, threading
+from multidrop.cli import main
+
+threading.Thread(target=threading.Event().wait).start()
+main(["serve", sys.argv[1]])
+"""
+SETPOINT = {"drive": "pump-1", "register": "setpoint", "value": 10.0}
+
+
+@pytest.fixture(autouse=True)
+def _soon(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Wait for no disk that hangs for longer than needed."""
+    for module, name in (
+        *((live_parts, "START_S"), (live_parts, "BUILD_S"), (reload, "READ_S"), (reload, "QUICK_S")),
+        *((settings, "AUDIT_S"), (gateway_module, "AUDIT_S"), (reload, "AUDIT_S")),
+        *((historian, "QUERY_S"), (historian, "CLOSING_S"), (views, "LEDGER_S"), (web, "AUDIT_S")),
+    ):
+        monkeypatch.setattr(module, name, 0.1)
+
+
+class Fifos:
+    """Files that hang when they are opened, until they are let go."""
+
+    def __init__(self) -> None:
+        self._made: list[Path] = []
+
+    def put(self, path: Path) -> None:
+        path.parent.mkdir(exist_ok=True)
+        path.unlink(missing_ok=True)
+        os.mkfifo(path)
+        self._made.append(path)
+
+    def let_go(self) -> None:
+        for path in self._made:
+            os.close(os.open(path, os.O_RDWR | os.O_NONBLOCK))
+            path.unlink()
+        self._made.clear()
+
+
+@pytest.fixture
+def fifos() -> Iterator[Fifos]:
+    made = Fifos()
+    yield made
+    made.let_go()
+
+
+def health(gateway: Served) -> Any:
+    return gateway.get("/health").json
+
+
+def assert_stops_and_polls(gateway: Served) -> None:
+    gateway.await_state("pump-1", "stands")
+    assert [one["done"] for one in gateway.post("/api/stop").json.values()] == [True, True]
+    newest = health(gateway)["newest_row"]
+    until(lambda: health(gateway)["newest_row"] > newest)
+
+
+def write(gateway: Served) -> Any:
+    return gateway.command("/api/write", SETPOINT, authorization=gateway.bearer(Right.WRITE)).json
+
+
+def reload_as(gateway: Served, serve: str) -> Any:
+    path = gateway.gateway.plant.path
+    path.write_text(path.read_text().partition("[serve")[0] + serve)
+    headers = {"authorization": gateway.bearer(Right.WRITE)}
+    return gateway.post("/api/reload", {"confirm": True}, **headers).json
+
+
+# ---- history ----
+
+
+def test_a_history_that_hangs_at_the_start_comes_later(tmp_path: Path, fifos: Fifos) -> None:
+    fifos.put(tmp_path / "kept" / "rows.00000001.arrows")
+    with served(tmp_path, SERVE + HISTORY) as gateway:
+        assert_stops_and_polls(gateway)
+        found = health(gateway)
+        assert (found["status"], found["parts"]) == ("degraded", {"history": COMING})
+        assert list(found["hung"]) == ["history"]
+        assert gateway.get("/api/history?series=pump-1.status&from=0&to=1").status == 404
+        fifos.let_go()
+        until(lambda: health(gateway)["status"] == "ok")
+        assert gateway.get("/api/history?series=pump-1.status&from=0&to=1").status == 200
+
+
+def test_a_history_that_hangs_amid_a_reload_comes_later(tmp_path: Path, fifos: Fifos) -> None:
+    fifos.put(tmp_path / "kept" / "rows.00000001.arrows")
+    with served(tmp_path, SERVE) as gateway:
+        assert reload_as(gateway, SERVE + HISTORY)["done"] is True
+        assert_stops_and_polls(gateway)
+        assert health(gateway)["parts"] == {"history": COMING}
+        assert reload_as(gateway, SERVE)["done"] is True
+        assert health(gateway)["parts"] == {}
+        fifos.let_go()
+        until(lambda: health(gateway)["status"] == "ok")
+        assert gateway.gateway.feeds == {}  # nobody wants it any more
+
+
+def test_a_history_that_cannot_begin_when_its_disk_answers_is_dead(tmp_path: Path, fifos: Fifos) -> None:
+    fifos.put(tmp_path / "kept" / "rows.00000001.arrows")
+    with served(tmp_path, SERVE + HISTORY) as gateway, pytest.MonkeyPatch.context() as patch:
+        patch.setattr(historian, "History", fail)
+        fifos.let_go()
+        until(lambda: health(gateway)["dead"] == {"history": "the disk is broken"})
+        assert_stops_and_polls(gateway)
+
+
+def fail(*arguments: object) -> NoReturn:
+    raise OSError("the disk is broken")
+
+
+def test_a_query_that_hangs_is_ended_and_told_of(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    go_on = threading.Event()
+    with served(tmp_path, SERVE + HISTORY) as gateway:
+        monkeypatch.setattr(History, "buckets", lambda *given: go_on.wait(PATIENCE))
+        until(lambda: health(gateway)["status"] == "ok")
+        for _ in range(3):  # which are more than hang at a time
+            answer = gateway.get("/api/history?series=pump-1.status&from=0&to=1")
+            assert (answer.status, answer.json["error"][:16]) == (503, "history queries:")
+        assert list(health(gateway)["hung"]) == ["history queries"]
+        assert_stops_and_polls(gateway)
+        go_on.set()
+        until(lambda: health(gateway)["status"] == "ok")
+
+
+def test_a_disk_that_hangs_while_rows_are_written_is_told_of(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    go_on = threading.Event()
+    with served(tmp_path, SERVE + HISTORY) as gateway:
+        until(lambda: health(gateway)["status"] == "ok")
+        part: Any = gateway.gateway.feeds["history"]
+        monkeypatch.setattr(writer_module, "HANGING_S", 0.0)
+        monkeypatch.setattr(part._writer._segments, "write", lambda rows: go_on.wait(PATIENCE))
+        until(lambda: "the disk has not answered for" in health(gateway)["parts"]["history"])
+        assert_stops_and_polls(gateway)
+        go_on.set()
+
+
+def test_an_export_that_hangs_keeps_no_gateway_from_its_end(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    go_on, begun = threading.Event(), threading.Event()
+
+    def pieces() -> Iterator[bytes]:
+        yield b"PAR1"
+        begun.set()
+        go_on.wait(PATIENCE)
+
+    with served(tmp_path, SERVE + HISTORY) as gateway:
+        monkeypatch.setattr(History, "csv", lambda *given: pieces())
+        address = "127.0.0.1", gateway.gateway.port
+        with socket.create_connection(address, PATIENCE) as client:
+            client.sendall(b"GET /api/export?from=0&to=1 HTTP/1.1\r\nhost: localhost\r\n\r\n")
+            assert begun.wait(PATIENCE)
+            assert_stops_and_polls(gateway)
+            gateway.loop.call_soon_threadsafe(gateway.gateway.end)
+            until(lambda: gateway.loop.is_closed())
+    go_on.set()
+
+
+# ---- the plant file ----
+
+
+def test_a_plant_file_that_hangs_ends_one_reload_alone(tmp_path: Path, fifos: Fifos) -> None:
+    with served(tmp_path, SERVE) as gateway:
+        path, good = gateway.gateway.plant.path, gateway.gateway.plant.path.read_text()
+        fifos.put(path)
+        headers = {"authorization": gateway.bearer(Right.WRITE)}
+        told = gateway.post("/api/reload", {"confirm": True}, **headers).json
+        assert (told["done"], told["mistakes"]) == (
+            False,
+            ["reload: not done within 0.1 s; does the disk answer?"],
+        )
+        assert health(gateway)["status"] == "degraded"
+        assert_stops_and_polls(gateway)
+        fifos.let_go()
+        path.write_text(good)
+        assert gateway.post("/api/reload", {"confirm": True}, **headers).json["done"] is True
+        until(lambda: health(gateway)["status"] == "ok")
+
+
+def test_a_later_reload_waits_for_none_that_hangs(
+    tmp_path: Path, fifos: Fifos, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(reload, "READ_S", PATIENCE)
+    with served(tmp_path, SERVE) as gateway:
+        path, good = gateway.gateway.plant.path, gateway.gateway.plant.path.read_text()
+        fifos.put(path)
+        gateway.loop.call_soon_threadsafe(gateway.gateway.reload.begin)
+        until(lambda: "multidrop reload" in {thread.name for thread in threading.enumerate()})
+        path.rename(tmp_path / "hangs")
+        path.write_text("not TOML [")
+        gateway.loop.call_soon_threadsafe(gateway.gateway.reload.begin)
+        until(lambda: "is not TOML" in str(health(gateway)["mistakes"]))
+        path.write_text(good)
+        gateway.loop.call_soon_threadsafe(gateway.gateway.reload.begin)
+        until(lambda: health(gateway)["status"] == "ok")
+        (tmp_path / "hangs").rename(path)
+
+
+# ---- audit log and ledger ----
+
+
+def test_an_audit_log_that_hangs_at_the_start_lets_stops_alone_through(tmp_path: Path, fifos: Fifos) -> None:
+    fifos.put(tmp_path / "audit.jsonl")
+    with served(tmp_path, SERVE) as gateway:
+        assert_stops_and_polls(gateway)
+        found = health(gateway)
+        assert (found["status"], found["audit"]) == ("degraded", UNAUDITED)
+        told = write(gateway)
+        assert (told["done"], told["text"]) == (False, f"pump-1.setpoint = 10.0 was not sent: {UNAUDITED}")
+        assert gateway.frame()["troubles"][0].startswith("audit log: ")
+
+
+def test_an_audit_log_that_hangs_amid_a_reload_changes_nothing(tmp_path: Path, fifos: Fifos) -> None:
+    with served(tmp_path, SERVE) as gateway:
+        until(lambda: health(gateway)["status"] == "ok")
+        (tmp_path / "audit.jsonl").rename(tmp_path / "before")
+        fifos.put(tmp_path / "audit.jsonl")
+        told = reload_as(gateway, SERVE)
+        assert told["mistakes"] == ["audit log: not done within 0.1 s; does the disk answer?"]
+        assert_stops_and_polls(gateway)
+
+
+def test_what_hangs_when_it_is_looked_at_is_told_of(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    go_on = threading.Event()
+
+    def wait(*given: object) -> list[Any]:
+        assert go_on.wait(PATIENCE)
+        return []
+
+    with served(tmp_path, SERVE) as gateway:
+        gateway.await_state("pump-1", "stands")
+        monkeypatch.setattr(views, "_wear", wait)
+        monkeypatch.setattr(web, "newest_records", wait)
+        assert gateway.get("/api/drive/pump-1").json["ledger"] == []
+        assert gateway.get("/api/audit").status == 503
+        assert set(health(gateway)["hung"]) == {"ledger", "audit queries"}
+        assert_stops_and_polls(gateway)
+        go_on.set()
+        until(lambda: health(gateway)["status"] == "ok")
+
+
+# ---- the end ----
+
+
+@pytest.mark.long
+def test_sigterm_ends_a_gateway_whose_disks_hang(tmp_path: Path, fifos: Fifos) -> None:
+    fifos.put(tmp_path / "kept" / "rows.00000001.arrows")
+    with simulated_plant(tmp_path, SERVE + HISTORY) as path, serving(path) as (process, _):
+        fifos.put(path)
+        process.send_signal(signal.SIGHUP)
+        process.send_signal(signal.SIGTERM)
+        _, errors = process.communicate(timeout=PATIENCE)
+        assert process.returncode == 0
+    assert "history goes on at the end, and is not waited for" in errors
+
+
+@pytest.mark.long
+def test_sigterm_ends_a_gateway_that_waits_for_a_thread(tmp_path: Path) -> None:
+    """Whatever keeps the interpreter from its end: here a thread of a library."""
+    script = tmp_path / "hangs.py"
+    script.write_text(HANGING)
+    with simulated_plant(tmp_path, SERVE) as path:
+        process = subprocess.Popen([sys.executable, script, path], stdout=subprocess.PIPE, text=True)
+        try:
+            assert process.stdout is not None
+            assert process.stdout.readline().startswith("ready ")
+            process.terminate()
+            assert process.wait(PATIENCE) == 1
+        finally:
+            process.kill()
+            process.communicate()
