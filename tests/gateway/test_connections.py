@@ -2,23 +2,35 @@
 
 from __future__ import annotations
 
+import asyncio
 import http.client
 import json
 import resource
 import socket
 import ssl
+import threading
+from collections import deque
 from collections.abc import Iterator
 from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
+from typing import Any
 
 import pytest
 from clocks import Clock
 from examples import usually
 from gateways import certificate, get, served, serving, simulated_plant
-from lines import PATIENCE
+from lines import PATIENCE, until
 
-from multidrop.gateway import connections, request_fields
-from multidrop.gateway.connections import AGAIN_S, FIRST_S, MOST_OPEN, Connections
+from multidrop.gateway import connections, request_fields, web
+from multidrop.gateway.connections import (
+    AGAIN_S,
+    FIRST_S,
+    FRESH_S,
+    MOST_OPEN,
+    STALLED_S,
+    Connections,
+    Turns,
+)
 from multidrop.gateway.guard import MOST_HEAD
 from multidrop.gateway.listener import BACKLOG
 from multidrop.gateway.rights import digest
@@ -183,3 +195,132 @@ def test_the_one_that_was_idle_for_longest_makes_room(
     connections.add(pairs[MOST_OPEN + 1][1], ("10.0.0.2", 2))
     assert len(connections) == MOST_OPEN
     assert not is_ended(pairs[MOST_OPEN + 1])  # the newest one is never the one that goes
+
+
+def test_a_new_connection_is_given_time_for_its_request_beside_busy_ones(
+    clock: Clock, pairs: list[tuple[socket.socket, socket.socket]]
+) -> None:
+    """It may bring a stop: the next one that comes must not end it."""
+    connections = Connections(clock)
+    for n in range(MOST_OPEN):
+        connections.add(pairs[n][1], ("10.0.0.1", n))
+        connections.begin(("10.0.0.1", n))
+    for n in (MOST_OPEN, MOST_OPEN + 1):
+        connections.add(pairs[n][1], ("10.0.0.1", n))
+    assert [n for n, pair in enumerate(pairs) if is_ended(pair)] == [0, 1]
+
+
+@pytest.mark.parametrize("is_stalled", [False, True], ids=["sends ahead", "reads nothing"])
+def test_a_greedy_client_goes_before_those_that_are_idle_and_a_stop_goes_last(
+    clock: Clock, pairs: list[tuple[socket.socket, socket.socket]], is_stalled: bool
+) -> None:
+    connections = Connections(clock)
+    for n in range(MOST_OPEN):
+        connections.add(pairs[n][1], ("10.0.0.1", n))
+    assert connections.is_stop(("10.0.0.1", 0), "/api/stop")
+    if is_stalled:
+        connections.note_stall(("10.0.0.1", 7), is_stalled=True)
+        clock.now += FRESH_S + 0.1
+    else:
+        connections.note_greed(("10.0.0.1", 7), is_greedy=True)
+    assert not connections.is_stop(("10.0.0.1", 5), "/api/plant")
+    connections.add(pairs[MOST_OPEN][1], ("10.0.0.2", 0))
+    assert [n for n, pair in enumerate(pairs) if is_ended(pair)] == [7]
+    connections.add(pairs[MOST_OPEN + 1][1], ("10.0.0.2", 1))
+    assert [n for n, pair in enumerate(pairs) if is_ended(pair)] == [1, 7]
+    assert len(connections) == MOST_OPEN
+
+
+def test_who_takes_none_of_its_answers_for_long_is_ended(
+    clock: Clock, pairs: list[tuple[socket.socket, socket.socket]]
+) -> None:
+    connections = Connections(clock)
+    for n in range(2):
+        connections.add(pairs[n][1], ("10.0.0.1", n))
+        connections.begin(("10.0.0.1", n))
+        connections.note_stall(("10.0.0.1", n), is_stalled=True)
+    connections.note_stall(("10.0.0.1", 1), is_stalled=False)
+    clock.now += STALLED_S + 0.1
+    connections.sweep()
+    assert [is_ended(pair) for pair in pairs[:2]] == [True, False]
+
+
+def test_one_request_has_its_turn_in_a_round_and_stops_come_first() -> None:
+    order: list[str] = []
+
+    async def take(turns: Turns, name: str, waiting: deque[asyncio.Future[None]]) -> None:
+        await turns.wait(waiting)
+        order.append(name)
+
+    async def live() -> None:
+        turns = Turns()
+        reads = [asyncio.create_task(take(turns, f"read {n}", turns.others)) for n in range(4)]
+        await asyncio.sleep(0)
+        assert order == ["read 0"]
+        stop = asyncio.create_task(take(turns, "stop", turns.stops))
+        reads[1].cancel()
+        await asyncio.gather(stop, *reads, return_exceptions=True)
+        assert order == ["read 0", "read 2", "stop", "read 3"]  # read 2 had its turn when it came
+        await take(turns, "later", turns.others)  # nobody else waits
+
+    asyncio.run(live())
+    assert order[-1] == "later"
+
+
+def test_a_stop_is_taken_ahead_of_reads_that_came_before(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """100 clients that send 20 requests each, all at once, and read nothing."""
+    order: list[str] = []
+    come, go_on = threading.Event(), threading.Event()
+    described = web.describe
+
+    def describe(*given: Any, **more: Any) -> Any:
+        order.append("read")
+        return described(*given, **more)
+
+    def stand_still() -> None:
+        come.set()
+        assert go_on.wait(PATIENCE)
+
+    monkeypatch.setattr(web, "describe", describe)
+    with served(tmp_path, '[serve.may]\nstop = "anyone"\n') as gateway, ExitStack() as stack:
+        carry_out, address = gateway.gateway.commands.stop, ("127.0.0.1", gateway.gateway.port)
+
+        async def stop(*given: Any) -> Any:
+            order.append("stop")
+            return await carry_out(*given)
+
+        monkeypatch.setattr(gateway.gateway.commands, "stop", stop)
+        clients = [stack.enter_context(socket.create_connection(address, PATIENCE)) for _ in range(101)]
+        until(lambda: len(gateway.gateway.connections) == 101)
+        gateway.loop.call_soon_threadsafe(stand_still)
+        assert come.wait(PATIENCE)
+        for client in clients[:100]:
+            client.sendall(b"GET /api/plant HTTP/1.1\r\nhost: localhost\r\n\r\n" * 20)
+        body = b"content-type: application/json\r\ncontent-length: 2\r\n\r\n{}"
+        clients[100].sendall(b"POST /api/stop HTTP/1.1\r\nhost: localhost\r\n" + body)
+        go_on.set()
+        assert clients[100].recv(1000).startswith(b"HTTP/1.1 200 ")
+        until(lambda: len(order) > 1000)
+    assert order.index("stop") < 10
+
+
+def test_a_client_that_sends_ahead_is_known_until_it_has_its_answers(tmp_path: Path) -> None:
+    go_on = asyncio.Event()
+
+    async def after(n: int) -> None:
+        await go_on.wait()
+
+    with served(tmp_path) as gateway:
+        gateway.gateway.frames.after = after  # type: ignore[method-assign]
+        address = "127.0.0.1", gateway.gateway.port
+        with socket.create_connection(address, PATIENCE) as client:
+            connections, ours = gateway.gateway.connections, client.getsockname()
+            client.sendall(b"GET /api/frame HTTP/1.1\r\nhost: localhost\r\n\r\n")
+            until(lambda: ours in connections._open and connections._open[ours].is_busy)
+            assert not connections._open[ours].is_greedy
+            client.sendall(b"GET /api/plant HTTP/1.1\r\nhost: localhost\r\n\r\n")
+            until(lambda: connections._open[ours].is_greedy)
+            gateway.loop.call_soon_threadsafe(go_on.set)
+            until(lambda: not connections._open[ours].is_greedy)

@@ -241,7 +241,10 @@ def test_an_audit_log_that_hangs_at_the_start_lets_stops_alone_through(tmp_path:
         assert gateway.frame()["troubles"][0].startswith("audit log: ")
 
 
-def test_an_audit_log_that_hangs_amid_a_reload_changes_nothing(tmp_path: Path, fifos: Fifos) -> None:
+def test_an_audit_log_that_hangs_amid_a_reload_changes_nothing(
+    tmp_path: Path, fifos: Fifos, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(reload, "READ_S", PATIENCE)
     with served(tmp_path, SERVE) as gateway:
         until(lambda: health(gateway)["status"] == "ok")
         (tmp_path / "audit.jsonl").rename(tmp_path / "before")

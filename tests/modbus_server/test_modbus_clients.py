@@ -130,6 +130,30 @@ def slowly(found: MbapRequest, _: ModbusClient) -> bytes:
     return found.reply(b"")
 
 
+def test_many_clients_share_the_time_that_one_of_them_had() -> None:
+    """A stop, by whichever way it comes, waits until all of them had their turn."""
+
+    async def main() -> None:
+        share = modbus_clients.RoundShare()
+        clock = cast(ControlledLoop, asyncio.get_running_loop()).passing
+        ports = [ModbusPort(slowly, lambda _: True, lambda: clock.now, share) for _ in range(2)]
+        block = b"".join(request(number, 1, 3, 0, 1) for number in range(100))
+        clients = [connected(port) for port in ports for _ in range(30)]
+        for client, _ in clients:
+            client.data_received(block)
+        begun = clock.now
+        for client, _ in clients:  # a round
+            client._drain()
+        assert clock.now - begun < 60 * 2 * modbus_clients.SLICE_S / 3
+        for client, transport in clients:
+            while client._waiting:
+                client._drain()
+            assert transactions(transport.written) == list(range(100))
+        assert share.slice_s == modbus_clients.SLICE_S
+
+    run_controlled(main())
+
+
 def test_requests_that_take_long_to_answer_let_others_have_their_turn_sooner() -> None:
     async def main() -> None:
         client, transport = connected(port_of(slowly))

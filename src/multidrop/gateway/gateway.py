@@ -19,7 +19,7 @@ import multidrop
 from multidrop import Batch, Bus, Ledger, LineError, Plant, Poller
 from multidrop.gateway.clock import boottime_ns, now_and_slept_ns, utc_ms
 from multidrop.gateway.commands import Commands
-from multidrop.gateway.connections import Connections, Watched
+from multidrop.gateway.connections import Connections, Watched, WatchedProtocol
 from multidrop.gateway.events import Events
 from multidrop.gateway.frames import Frames, frame_of, lost_of
 from multidrop.gateway.guard import MOST_HEAD
@@ -188,7 +188,7 @@ class Gateway:
         return uvicorn.Config(
             Watched(make_app(self), self.connections),
             backlog=BACKLOG,
-            http="h11",
+            http=WatchedProtocol,
             h11_max_incomplete_event_size=MOST_HEAD,  # what is longer and does not come at once is cut off
             ws="none",
             lifespan="off",

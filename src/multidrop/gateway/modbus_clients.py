@@ -17,7 +17,8 @@ from multidrop.gateway.pdu import WRITES
 from multidrop.gateway.supervisor import supervisor
 
 SLICE = 64  # requests of a client that are answered before others have their turn,
-SLICE_S = 0.002  # or so much time
+SLICE_S = 0.002  # or so much time,
+ROUND_S = 0.004  # or their share of this, if many have requests to be looked at: a stop waits for a round
 MOST_CLIENTS = 64  # beside each other, on one TCP port
 MOST_BEHIND = 1 << 18  # bytes of requests of one client that wait for their turn
 MOST_UNTAKEN = 1 << 18  # bytes of answers that a client does not take
@@ -77,6 +78,7 @@ class ModbusClient(asyncio.Protocol):
         self.transport = None
         self._came.clear()
         self._waiting.clear()
+        self._port.share.note(self, is_busy=False)
         self._port.forget(self)
         for task in self._under_way:
             asyncio.get_running_loop().call_soon(task.cancel)  # each has begun by then
@@ -108,6 +110,7 @@ class ModbusClient(asyncio.Protocol):
         """Look at what came and answer some of it; let others have their turn before the rest."""
         is_looked_at = self._look()
         self._is_draining = self._answer_some() or not is_looked_at
+        self._port.share.note(self, is_busy=self._is_draining)
         if self.transport is not None:
             if is_looked_at:
                 self.transport.resume_reading()
@@ -135,7 +138,7 @@ class ModbusClient(asyncio.Protocol):
                 self._waiting += frame
             else:
                 answers.append(request_of(frame).exception(ModbusCode.BUSY))
-            is_in_time = self._port.clock() - begun <= SLICE_S
+            is_in_time = self._port.clock() - begun <= self._port.share.slice_s
         self._write(b"".join(answers))
         return is_in_time or not self._came
 
@@ -161,7 +164,7 @@ class ModbusClient(asyncio.Protocol):
             if request is None:
                 break
             answers.append(self._answered(request))
-            if self._port.clock() - begun > SLICE_S:
+            if self._port.clock() - begun > self._port.share.slice_s:
                 break
         self._write(b"".join(answers))
         return bool(self._waiting) and self._stalled_since is None
@@ -222,6 +225,24 @@ class ModbusClient(asyncio.Protocol):
         return 0.0 if self._stalled_since is None else now - self._stalled_since
 
 
+class RoundShare:
+    """The time of one round of the loop, divided among the clients of all ports that have requests left."""
+
+    def __init__(self) -> None:
+        self._busy: set[ModbusClient] = set()
+
+    def note(self, client: ModbusClient, *, is_busy: bool) -> None:
+        if is_busy:
+            self._busy.add(client)
+        else:
+            self._busy.discard(client)
+
+    @property
+    def slice_s(self) -> float:
+        """The seconds for which one client may be served at once."""
+        return min(SLICE_S, ROUND_S / max(1, len(self._busy)))
+
+
 async def _awaited(answer: Awaitable[bytes]) -> bytes:
     return await answer
 
@@ -229,7 +250,8 @@ async def _awaited(answer: Awaitable[bytes]) -> bytes:
 class ModbusPort:
     """One TCP port and its clients.
 
-    `serve` answers a request; `may_connect` says which addresses may come; `clock` is in seconds.
+    `serve` answers a request; `may_connect` says which addresses may come; `clock` is in seconds. Ports of
+    one server have the same `share`.
     """
 
     def __init__(
@@ -237,9 +259,11 @@ class ModbusPort:
         serve: Callable[[MbapRequest, ModbusClient], Answer],
         may_connect: Callable[[str], bool],
         clock: Callable[[], float],
+        share: RoundShare | None = None,
     ) -> None:
         self.serve = serve
         self.clock = clock
+        self.share = share or RoundShare()
         self.clients: set[ModbusClient] = set()
         self.refused = 0  # connections
         self._may_connect = may_connect

@@ -20,7 +20,7 @@ from multidrop.gateway.common_block import STOP, CommonSource
 from multidrop.gateway.drive_words import Lack
 from multidrop.gateway.listener import listen
 from multidrop.gateway.mbap import MbapRequest
-from multidrop.gateway.modbus_clients import SWEEP_S, Answer, ModbusClient, ModbusPort
+from multidrop.gateway.modbus_clients import SWEEP_S, Answer, ModbusClient, ModbusPort, RoundShare
 from multidrop.gateway.modbus_codes import Declined, ModbusCode, code_of
 from multidrop.gateway.modbus_settings import ModbusSettings
 from multidrop.gateway.passing import LineShare, PassingBusy
@@ -99,9 +99,9 @@ class ModbusServer:
         """Begin to accept clients."""
         if not self._sockets:
             self.listen()
-        clock = asyncio.get_running_loop().time
+        clock, share = asyncio.get_running_loop().time, RoundShare()
         for line, listener in self._sockets.items():
-            port = ModbusPort(partial(self.serve, line), self.settings.may_connect, clock)
+            port = ModbusPort(partial(self.serve, line), self.settings.may_connect, clock, share)
             await port.open(listener)
             self._listening.append(port)
 
