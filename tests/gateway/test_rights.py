@@ -17,6 +17,9 @@ MAY = '[serve.may]\nwrite = ["pump-1.setpoint"]\nverbs = ["pump-1.start", "pump-
 LOOPBACK_STOPS = MAY.replace("[serve.may]", '[serve.may]\nstop = "anyone"')
 CLOSED = MAY.replace("[serve.may]", '[serve]\ntokens = "tokens"\n[serve.may]\nlook = "token"')
 
+TOKENS = MAY.replace("[serve.may]", '[serve]\ntokens = "tokens"\n[serve.may]')
+OPEN = TOKENS.replace("[serve.may]", '[serve.may]\nlook = "anyone"')
+
 LOOKS = ("/api/plant", "/api/frame", "/api/lines", "/api/audit", "/api/drive/pump-1", "/health", "/metrics")
 STOP = ("/api/stop", {"drives": ["pump-1"]})
 WRITE = ("/api/write", {"drive": "pump-1", "register": "setpoint", "value": 50.0})
@@ -57,6 +60,12 @@ TABLE = {
         (None, 401, (401, 401, 401, 401, 401, 401)),
         (Right.WRITE, 200, (200, 200, 403, 200, 403, 200)),
     ],
+    (TOKENS, LOCAL): [
+        (None, 401, (401, 401, 401, 401, 401, 401)),
+        (Right.LOOK, 200, (403, 403, 403, 403, 403, 403)),
+    ],
+    (TOKENS, OTHER): [(None, 401, (401, 401, 401, 401, 401, 401))],
+    (OPEN, OTHER): [(None, 200, (401, 401, 401, 401, 401, 401))],
 }
 
 
@@ -73,6 +82,39 @@ def test_each_caller_may_what_the_table_says(tmp_path: Path, serve: str, address
             assert looks == dict.fromkeys(LOOKS, look), right
             assert tuple(gateway.command(path, body, **headers).status for path, body in ACTS) == acts, right
             assert gateway.get("/", **headers).status in (200, 404)  # the page itself is nobody's secret
+
+
+@pytest.mark.parametrize("way", ["authorization", "cookie"])
+def test_a_wrong_token_is_refused_whatever_anybody_may(tmp_path: Path, way: str) -> None:
+    wrong = {way: {"authorization": "Bearer wrong", "cookie": "multidrop=wrong"}[way]}
+    with served(tmp_path, LOOPBACK_STOPS) as gateway:
+        until(lambda: gateway.gateway.hub.taken > 0)
+        for path in LOOKS:
+            assert gateway.get(path).status == 200
+            answer = gateway.get(path, **wrong)
+            assert (answer.status, answer.json["error"]) == (401, "the token is wrong")
+            assert ("multidrop=" in answer.headers.get("set-cookie", "")) == (way == "cookie")
+        for path, body in (WRITE, RESET, UNLISTED_VERB):
+            assert gateway.post(path, {**body, "seen": 1}, **wrong).status == 401
+        assert gateway.gateway.commands.called == 0
+        for path, body in (STOP, STOP_VERB):  # which anybody may send
+            assert gateway.post(path, body, **wrong).status == 200
+        assert gateway.gateway.commands.called == 2
+        for at in range(MOST_WRONG):
+            gateway.get("/health", authorization=f"Bearer wrong-{at}")
+        for path in LOOKS:  # none is looked at any more, and none is taken for none
+            assert gateway.get(path, **wrong).status == 429
+            assert gateway.get(path, authorization=gateway.bearer(Right.WRITE)).status == 429
+            assert gateway.get(path).status == 200
+
+
+def test_a_wrong_token_that_comes_again_is_logged_once(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    with served(tmp_path) as gateway:
+        for _ in range(3):
+            assert gateway.get("/api/plant", cookie="multidrop=taken-away").status == 401
+    assert caplog.text.count("wrong token from 127.0.0.1") == 1
 
 
 @pytest.fixture(scope="module")

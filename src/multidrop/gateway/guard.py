@@ -29,6 +29,9 @@ PAGE_HEADERS = HEADERS | {
     "cache-control": "no-cache",  # a page's file is asked for again, by its ETag
 }
 ANYONE = "anyone"
+WRONG = "the token is wrong"
+SHUT = "too many wrong tokens came from this address: try again in a minute"
+HAS_WRONG_TOKEN = "has_wrong_token"  # of a scope: a stop, which is sent all the same
 MOST_HEAD = 64 * 1024  # bytes before a request's body: a browser sends the cookies of all ports of a host
 
 
@@ -98,6 +101,8 @@ class Guard:
             response = JsonResponse({"error": str(denied)}, denied.status)
             if denied.status == 401:
                 response.headers["www-authenticate"] = "Bearer"
+                if COOKIE in Headers(scope=scope).get("cookie", ""):  # the next request is without it
+                    response.delete_cookie(COOKIE, httponly=True, samesite="strict")
             await response(scope, receive, send_with_headers)
             return
         await self._app(scope, receive, send_with_headers)
@@ -145,8 +150,9 @@ class Guard:
     def _admit(self, scope: Scope, headers: Headers, needed: Right) -> Caller:
         """Return the caller of a request that needs this right.
 
-        A wrong token gives the rights of no token. After several wrong ones from an address none from there
-        is looked at for a while, but for a stop, which nothing may hold back.
+        A wrong token is refused, whatever its sender may do without one: all but a stop that anybody may
+        send. After several wrong ones from an address none from there is looked at for a while, but for a
+        stop, which nothing may hold back.
         """
         address = self.address(scope, headers)
         local = is_loopback(address) and not self._behind_proxy
@@ -156,25 +162,22 @@ class Guard:
         is_shut = needed is not Right.STOP and self._tokens.is_shut(address, self._clock())
         if secret and not is_shut:
             token = self._tokens.find(secret)
-            if token is None:
-                self._tokens.note_wrong(address, secret, self._clock())
+            if token is None and self._tokens.note_wrong(address, secret, self._clock()):
                 _log.warning("wrong token from %s", address)
+        if secret and token is None:
+            if needed is not Right.STOP or free is None or free < Right.STOP:
+                raise Denied(429, SHUT) if is_shut else Denied(401, WRONG)
+            scope[HAS_WRONG_TOKEN] = True
         if token is not None and (free is None or token.right >= free):
             caller = Caller(token.name, way, address, token.right)
         elif free is not None:
             caller = Caller(ANYONE, way, address, free)
-        elif secret and is_shut:
-            raise Denied(429, "too many wrong tokens came from this address: try again in a minute")
         else:
-            raise Denied(401, "the token is wrong" if secret else "a token is needed")
+            raise Denied(401, "a token is needed")
         if caller.role >= needed:
             return caller
-        if secret and is_shut:
-            raise Denied(429, "too many wrong tokens came from this address: try again in a minute")
         if token is None:
-            raise Denied(
-                401, "the token is wrong" if secret else f"this needs a token to {needed.name.lower()}"
-            )
+            raise Denied(401, f"this needs a token to {needed.name.lower()}")
         raise Denied(
             403, f"{caller.name} may {caller.role.name.lower()}, and this needs {needed.name.lower()}"
         )

@@ -125,14 +125,19 @@ class Tokens:
             del self._wrong[address]
         return came is not None and len(came) >= MOST_WRONG
 
-    def note_wrong(self, address: str, secret: str, now: float) -> None:
-        """Count a wrong token; the addresses that came first are forgotten where there are very many."""
+    def note_wrong(self, address: str, secret: str, now: float) -> bool:
+        """Count a wrong token; return True unless it came before.
+
+        The addresses that came first are forgotten where there are very many.
+        """
         given = digest(secret)
         if address not in self._wrong and len(self._wrong) >= MOST_ADDRESSES:
             del self._wrong[next(iter(self._wrong))]
         came = self._wrong.setdefault(address, deque(maxlen=MOST_WRONG))
-        if all(given != wrong for _, wrong in came):
+        is_new = all(given != wrong for _, wrong in came)
+        if is_new:
             came.append((now, given))
+        return is_new
 
 
 class May(NamedTuple):

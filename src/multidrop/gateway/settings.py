@@ -114,7 +114,8 @@ def read_settings(plant: Plant, environment: Mapping[str, str]) -> ServeSettings
     names = tuple(filter(None, (place.attempt(_name, name) for name in given.get("names", ()))))
     tls = _tls(given, folders, place)
     tokens = _tokens(given, folders, place)
-    may = _may(given.get("may", {}), plant, place.of_file(plant.path, "[serve.may]"))
+    usual = "token" if "tokens" in given else "anyone"
+    may = _may(given.get("may", {}), usual, plant, place.of_file(plant.path, "[serve.may]"))
     behind_proxy = given.get("behind_proxy", False)
     if may.look == "token" and not tokens and "tokens" not in given:
         place.wrong('look = "token" of [serve.may] needs tokens: nobody could look; add tokens = "tokens"')
@@ -195,7 +196,8 @@ def _tokens(given: Mapping[str, Any], folders: Folders, place: TomlPlace) -> lis
     return found
 
 
-def _may(table: Any, plant: Plant, place: TomlPlace) -> May:
+def _may(table: Any, look: str, plant: Plant, place: TomlPlace) -> May:
+    """Return the rights that the table gives; `look` is who may look if it does not say so."""
     given = place.check(table, _MAY)
     for key in ("look", "stop"):
         if given.get(key, "anyone") not in ("anyone", "token"):
@@ -208,7 +210,7 @@ def _may(table: Any, plant: Plant, place: TomlPlace) -> May:
         for key in MAY_LISTS
     }
     on_loopback = Right.STOP if given.get("stop") == "anyone" else Right.LOOK
-    return May(given.get("look", "anyone"), on_loopback, listed["write"], listed["verbs"])
+    return May(given.get("look", look), on_loopback, listed["write"], listed["verbs"])
 
 
 def _part(part: Part, table: Mapping[str, Any], plant: Plant, place: TomlPlace) -> Any:

@@ -21,7 +21,7 @@ from multidrop.gateway.commands import Admit, Told
 from multidrop.gateway.describe import describe
 from multidrop.gateway.exports import Exports
 from multidrop.gateway.frame_route import FrameRoute
-from multidrop.gateway.guard import COOKIE, Denied, Guard, Needed
+from multidrop.gateway.guard import COOKIE, HAS_WRONG_TOKEN, SHUT, WRONG, Denied, Guard, Needed
 from multidrop.gateway.json_response import JsonResponse
 from multidrop.gateway.metrics import families_of
 from multidrop.gateway.request_fields import body_of, caller_of, drives_to_stop, frame_in, number_in, text_in
@@ -235,6 +235,8 @@ class _Pages:
     async def act(self, request: Request) -> Response:
         body = await body_of(request)
         drive, verb = text_in(body, "drive"), text_in(body, "verb")
+        if HAS_WRONG_TOKEN in request.scope and verb not in STOPPING:
+            raise Denied(401, WRONG)
         options = {} if verb in STOPPING else body.get("options", {})  # no wrong ones keep a stop back
         if not isinstance(options, dict):
             raise Denied(400, "options is no JSON object")
@@ -267,12 +269,12 @@ class _Pages:
         secret = text_in(body, "token")
         is_shut = gateway.tokens.is_shut(caller.address, gateway.guard_clock())
         if is_shut and body.get("to") != "stop":
-            raise Denied(429, "too many wrong tokens came from this address: try again in a minute")
+            raise Denied(429, SHUT)
         token = gateway.tokens.find(secret)
         if token is None:
             gateway.tokens.note_wrong(caller.address, secret, gateway.guard_clock())
             _log.warning("wrong token from %s", caller.address)
-            raise Denied(401, "the token is wrong")
+            raise Denied(401, WRONG)
         response = JsonResponse({"name": token.name, "role": token.right.name.lower()})
         is_secure = gateway.settings.tls is not None or gateway.settings.behind_proxy
         response.set_cookie(
