@@ -141,6 +141,7 @@ def _serve(
     from dataclasses import replace
 
     from multidrop.gateway.gateway import Gateway
+    from multidrop.gateway.supervisor import supervisor
 
     try:
         gateway = Gateway(plant, settings, read=read)
@@ -154,6 +155,9 @@ def _serve(
         gateway.end()
 
     async def live() -> None:
+        for handler in logging.getLogger("multidrop").handlers:
+            if isinstance(handler, LogThread):
+                supervisor().watch("log", handler.is_alive)
         on_end_signals(end)
         if read:
             on_reload_signal(gateway.reload.begin, end)

@@ -26,7 +26,7 @@ MOST_FRESH = 64  # such connections that are closed after all others
 STALLED_S = 10.0  # for which a client may take none of its answers
 
 BODY_HEADERS = (b"content-length", b"transfer-encoding")
-STOP_PATH, VERB_PATH = "/api/stop", "/api/act"  # by the latter a drive may be stopped, too
+STOP_PATHS, VERB_PATH = ("/api/stop", "/api/fleet/stop"), "/api/act"  # a verb may stop a drive, too
 
 
 class Rank(IntEnum):
@@ -107,7 +107,7 @@ class Connections:
         One of a verb is not while its client sends others ahead of its answers.
         """
         found = self._open.get(client) if client else None
-        is_stop = path == STOP_PATH or (path == VERB_PATH and not (found and found.is_greedy))
+        is_stop = path in STOP_PATHS or (path == VERB_PATH and not (found and found.is_greedy))
         if found:
             found.is_stop = is_stop
         return is_stop

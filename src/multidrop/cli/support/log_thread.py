@@ -29,6 +29,10 @@ class LogThread(logging.Handler):
         self._thread = threading.Thread(target=self._write, name="multidrop log", daemon=True)
         self._thread.start()
 
+    def is_alive(self) -> bool:
+        """True until the thread has ended: then nothing is logged any more."""
+        return self._thread.is_alive()
+
     def emit(self, record: logging.LogRecord) -> None:
         """Take a record, without waiting."""
         try:
@@ -57,5 +61,5 @@ class LogThread(logging.Handler):
                 self._file.close()
 
     def _put(self, line: str) -> None:
-        with suppress(OSError):  # a full disk, or a reader that is gone
+        with suppress(OSError, ValueError):  # a full disk, or a reader that is gone
             self._file.write(f"{line}\n")
