@@ -147,7 +147,7 @@ class Gateway:
         await self._end_of("side reads", left_s(2.4), self.side_reads.close())
         await self._end_of("reload", left_s(2.4), self.reload.close())
         if self.poller is not None:
-            closing = supervisor().within("polling", left_s(1.2), self.poller.close)
+            closing = supervisor().within("polling", END_S, self.poller.close)
             await self._end_of("polling", left_s(1.0), closing)
             await supervisor().release("polling", "statistics", "identities")
             self.guarded("hub", self.hand_out, self.poller)  # what came while it closed
@@ -164,6 +164,8 @@ class Gateway:
     async def _end_of(self, name: str, seconds: float, work: Awaitable[object]) -> None:
         try:
             await asyncio.wait_for(work, seconds)
+        except TimeoutError:
+            _log.error("%s has not ended in its time", name)
         except Exception:  # the others end all the same
             _log.exception("%s did not end in good order", name)
 
@@ -204,9 +206,15 @@ class Gateway:
     # ---- rows ----
 
     async def _take_all(self) -> None:
+        dead = supervisor().dead
         while True:
-            if self.poller is not None:
-                self.hand_out(self.poller)
+            try:
+                if self.poller is not None:
+                    self.hand_out(self.poller)
+                dead.pop("polling", None)
+            except Exception as failure:  # of a poller that has ended, again each time; or a want of memory
+                dead["polling"] = f"{type(failure).__name__}: {failure}"
+                self.note_failure("polling")
             await asyncio.sleep(TAKE_S)
 
     def hand_out(self, poller: Poller) -> None:
@@ -240,7 +248,7 @@ class Gateway:
     def guarded(self, name: str, work: Callable[..., object], *arguments: object) -> None:
         try:
             work(*arguments)
-        except Exception:  # whatever it is, polling and stops go on
+        except (Exception, SystemExit):  # whatever it is, also of a user's class, polling and stops go on
             self.note_failure(name)
 
     def note_failure(self, name: str) -> None:

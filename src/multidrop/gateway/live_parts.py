@@ -65,7 +65,7 @@ class LiveParts:
             if building.feed.done():
                 self._begin(name, building.feed.result())
             else:
-                _log.error("%s is not there yet: its files do not answer", name)
+                _log.warning("%s is not there yet: it begins when its files have answered", name)
                 self.coming[name] = building
                 supervisor().start(f"{name} comes", self._come(name, building))
 
