@@ -52,7 +52,9 @@ def test_all_lines_are_there_when_it_is_closed_and_a_reader_that_goes_harms_nobo
     with os.fdopen(log, "w") as stream:
         handler = LogThread(stream, FORMAT)
         handler.handle(record("last"))
+        assert handler.is_alive()
         handler.close()
+        assert not handler.is_alive()
         assert os.read(unread, 100) == b"last\n"
         handler = LogThread(stream, FORMAT)
         os.close(unread)

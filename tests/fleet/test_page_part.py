@@ -60,6 +60,24 @@ def test_its_settings_need_no_library(tmp_path: Path, monkeypatch: pytest.Monkey
         parts.build(parts.PARTS["fleet"], settings.parts["fleet"], None)  # type: ignore[arg-type]
 
 
+@pytest.mark.parametrize("dying", ["path", "watch"])
+def test_it_ends_with_either_of_its_tasks(monkeypatch: pytest.MonkeyPatch, dying: str) -> None:
+    """The gateway then says so; else the page would show an old fleet for ever."""
+
+    async def go_on() -> None:
+        await asyncio.Event().wait()
+
+    async def fail() -> None:
+        raise ZeroDivisionError
+
+    path = ServerPath([])
+    watch = FleetWatch(FleetView(path))
+    monkeypatch.setattr(path, "keep", fail if dying == "path" else go_on)
+    monkeypatch.setattr(watch, "run", fail if dying == "watch" else go_on)
+    with pytest.raises(ZeroDivisionError):
+        asyncio.run(FleetPart(path, watch).run())
+
+
 class Looks(FleetView):
     """A view whose looks succeed until they are told not to."""
 

@@ -204,9 +204,10 @@ def test_a_stop_works_while_all_parts_are_broken(tmp_path: Path) -> None:
         told = gateway.post("/api/stop").json
         assert [one["done"] for one in told.values()] == [True, True]
         health = gateway.get("/health")
-        assert health.status == 200
-        assert health.json["status"] == "degraded"
-        assert health.json["parts"] == {
+        assert health.status == 503
+        assert health.json["status"] == "failed"
+        assert health.json["parts"] == health.json["dead"]
+        assert health.json["dead"] == {
             "history": "RuntimeError: no broker",
             "mqtt": "RuntimeError: no broker",
         }
