@@ -108,13 +108,18 @@ class Gateway:
         """
         nothing = replace(self.plant, lines=())
         server = _Server(self._server_config())
+        end = supervisor().start("end", self._end.wait())
         try:
             built = await self.parts.build(self.settings.parts)
             await self._find_audit()
             poller = Poller(nothing, ledger=self.ledger, audit=self.audit)
             self.poller = poller.__enter__()  # it is left in a thread: that may take its time
             adopting = supervisor().thread("adoption", ADOPTION_S, partial(poller.adopt, self.plant))
-            self.note_unopened(await adopting)
+            either: set[asyncio.Future[Any]] = {end, adopting}
+            await asyncio.wait(either, return_when=asyncio.FIRST_COMPLETED)
+            if not adopting.done():
+                return
+            self.note_unopened(adopting.result())
             self.plant = poller.plant
             self.parts.take_up(built)
             supervisor().keep("polling", self._take_all())
@@ -126,12 +131,11 @@ class Gateway:
             if not serving.done():
                 on_ready()
                 self.notifier.tell("READY=1", self.status)
-            end = supervisor().start("end", self._end.wait())
             await asyncio.wait({end, serving}, return_when=asyncio.FIRST_COMPLETED)
-            end.cancel()
             if not self._end.is_set():
                 raise RuntimeError(f"the web server has ended: {supervisor().dead.get('web')}")
         finally:
+            end.cancel()
             await self._close(server)
 
     async def _close(self, server: _Server) -> None:

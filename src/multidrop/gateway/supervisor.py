@@ -120,7 +120,7 @@ class Supervisor:
         future.add_done_callback(lambda done: done.cancelled() or done.exception())  # maybe nobody awaits it
 
         def finish(settle: Callable[[], None]) -> None:
-            self._end_work(future)
+            del self._works[future]
             if not future.done():
                 settle()
 
@@ -146,18 +146,12 @@ class Supervisor:
             raise
         return future
 
-    def _end_work(self, future: asyncio.Future[Any]) -> None:
-        """Forget work that has ended; what began before under its name is no longer told as hanging."""
-        ended = self._works.pop(future)
-        for other, one in self._works.items():
-            if one.name == ended.name and one.begun <= ended.begun:
-                self._works[other] = one._replace(limit_s=inf)
-
     async def within(self, name: str, limit_s: float, work: Callable[[], R], *, most: int = 4) -> R:
         """Return what work returns, which has a thread of its own.
 
         At most `most` works of a name go on at once; others wait for them. Raises Hung if it is not done
-        within `limit_s` seconds, or has not begun within as many.
+        within `limit_s` seconds, or has not begun within as many. Once one is done, those that began before
+        it are no longer reported as hanging: the disk answers.
         """
         begin_by = monotonic() + limit_s
         while len(going := [future for future, one in self._works.items() if one.name == name]) >= most:
@@ -166,10 +160,14 @@ class Supervisor:
             )
             if monotonic() >= begin_by:
                 raise Hung(f"{name}: {most} others are not done; does the disk answer?")
+        before = [future for future, one in self._works.items() if one.name == name]
         future = self.thread(name, limit_s, work)
         await asyncio.wait([future], timeout=limit_s)
         if not future.done():
             raise Hung(f"{name}: not done within {limit_s:g} s; does the disk answer?")
+        for late in before:
+            if late in self._works:
+                self._works[late] = self._works[late]._replace(limit_s=inf)
         return future.result()
 
     @property
