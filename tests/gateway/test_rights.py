@@ -108,6 +108,14 @@ def test_a_wrong_token_is_refused_whatever_anybody_may(tmp_path: Path, way: str)
             assert gateway.get(path).status == 200
 
 
+def test_a_token_is_not_checked_where_there_are_none(tmp_path: Path) -> None:
+    with served(tmp_path, LOOPBACK_STOPS, tokens=()) as gateway:
+        until(lambda: gateway.gateway.hub.taken > 0)
+        for path in LOOKS:
+            assert gateway.get(path, authorization="Bearer any").status == 200
+        assert gateway.post(WRITE[0], {**WRITE[1], "seen": 1}, authorization="Bearer any").status == 401
+
+
 def test_a_wrong_token_that_comes_again_is_logged_once(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -158,6 +158,7 @@ class Guard:
         local = is_loopback(address) and not self._behind_proxy
         free = self._may().without_token(is_loopback=local)
         secret, way = _secret(headers)
+        secret = secret if self._tokens else ""  # without any there is nothing to check it against
         token: Token | None = None
         is_shut = needed is not Right.STOP and self._tokens.is_shut(address, self._clock())
         if secret and not is_shut:
