@@ -15,7 +15,7 @@ from lines import until
 from peers import require_module
 
 import multidrop.gateway
-from multidrop import load_plant
+from multidrop import Poller, load_plant
 from multidrop.gateway import historian
 from multidrop.gateway.gateway import Gateway
 from multidrop.gateway.settings import ServeSettings
@@ -108,6 +108,14 @@ def test_a_poller_that_fails_makes_health_fail_and_no_stop(
     assert all(one["done"] for one in gateway.post("/api/stop").json.values())
     monkeypatch.undo()  # it was a want of memory, say
     until(lambda: dead(gateway) == {})
+
+
+def test_a_line_whose_polling_fails_is_told_of(gateway: Served, monkeypatch: pytest.MonkeyPatch) -> None:
+    failures = {"hall": "ZeroDivisionError: a bug in a user's class"}
+    monkeypatch.setattr(Poller, "line_failures", property(lambda poller: failures), raising=False)
+    found = gateway.get("/health").json
+    assert (found["status"], found["lines"]) == ("degraded", {"hall": f"polling fails: {failures['hall']}"})
+    until(lambda: f"line hall: polling fails: {failures['hall']}" in gateway.frame()["troubles"])
 
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")

@@ -104,7 +104,11 @@ def health_of(gateway: Gateway) -> dict[str, Any]:
     """
     supervisor().look()
     dead, hung = supervisor().dead | gateway.parts.dead, supervisor().hung
-    lost = {line.name: lost_of(gateway.hub, line.name) or "ok" for line in gateway.plant.lines}
+    failing = failing_lines_of(gateway)
+    lost = {
+        line.name: failing.get(line.name) or lost_of(gateway.hub, line.name) or "ok"
+        for line in gateway.plant.lines
+    }
     parts = parts_of(gateway)
     audit = audit_trouble_of(gateway) or "ok"
     is_well = {"ok", audit, *lost.values(), *parts.values()} == {"ok"} and not gateway.reload.mistakes
@@ -137,6 +141,12 @@ def parts_of(gateway: Gateway) -> dict[str, str]:
     )
 
 
+def failing_lines_of(gateway: Gateway) -> dict[str, str]:
+    """Return by name why a line is not polled at present: an exception, such as one of a user's class."""
+    failures: dict[str, str] = getattr(gateway.poller, "line_failures", {})
+    return {line: f"polling fails: {why}" for line, why in failures.items()}
+
+
 def audit_trouble_of(gateway: Gateway) -> str:
     """Return why the newest write of a line is not in the audit log; "" is well."""
     if gateway.unaudited:
@@ -149,7 +159,8 @@ def audit_trouble_of(gateway: Gateway) -> str:
 
 def troubles_of(gateway: Gateway) -> list[str]:
     """Return a sentence for each thing beside the lines that is not well, for the page."""
-    said = supervisor().hung | supervisor().dead
+    said = {f"line {line}": why for line, why in failing_lines_of(gateway).items()}
+    said |= supervisor().hung | supervisor().dead
     said |= {name: one for name, one in parts_of(gateway).items() if one != "ok"}
     audit = audit_trouble_of(gateway)
     return [f"{name}: {one}" for name, one in (said | ({"audit log": audit} if audit else {})).items()]
