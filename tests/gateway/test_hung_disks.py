@@ -137,7 +137,7 @@ def fail(*arguments: object) -> NoReturn:
     raise OSError("the disk is broken")
 
 
-def test_a_query_that_hangs_is_ended_and_told_of(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_query_that_hangs_is_ended_and_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     go_on = threading.Event()
     with served(tmp_path, SERVE + HISTORY) as gateway:
         monkeypatch.setattr(History, "buckets", lambda *given: go_on.wait(PATIENCE))
@@ -151,7 +151,7 @@ def test_a_query_that_hangs_is_ended_and_told_of(tmp_path: Path, monkeypatch: py
         until(lambda: health(gateway)["status"] == "ok")
 
 
-def test_a_disk_that_hangs_while_rows_are_written_is_told_of(
+def test_a_disk_that_hangs_while_rows_are_written_is_reported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     go_on = threading.Event()
@@ -254,7 +254,9 @@ def test_an_audit_log_that_hangs_amid_a_reload_changes_nothing(
         assert_stops_and_polls(gateway)
 
 
-def test_what_hangs_when_it_is_looked_at_is_told_of(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_ledger_and_an_audit_log_that_hang_are_reported(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     go_on = threading.Event()
 
     def wait(*given: object) -> list[Any]:

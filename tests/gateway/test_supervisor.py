@@ -110,7 +110,7 @@ def test_a_poller_that_fails_makes_health_fail_and_no_stop(
     until(lambda: dead(gateway) == {})
 
 
-def test_a_line_whose_polling_fails_is_told_of(gateway: Served, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_line_whose_polling_fails_is_reported(gateway: Served, monkeypatch: pytest.MonkeyPatch) -> None:
     failures = {"hall": "ZeroDivisionError: a bug in a user's class"}
     monkeypatch.setattr(Poller, "line_failures", property(lambda poller: failures), raising=False)
     found = gateway.get("/health").json
@@ -137,7 +137,7 @@ def test_a_thread_of_the_history_that_ends_makes_health_fail(
 
 def test_a_thread_of_the_broker_s_connection_that_ends_makes_health_fail(gateway: Served) -> None:
     part: Any = gateway.gateway.feeds["mqtt"]
-    part._brokers[0]._client.disconnect()  # nobody asked for that
+    part._brokers[0]._client.disconnect()  # the gateway did not ask for that
     until(lambda: dead(gateway) == {"mqtt": "RuntimeError: the thread of its connection has ended"})
 
 
@@ -200,7 +200,7 @@ def test_what_work_raises_is_raised_and_ends_no_loop(failure: BaseException) -> 
     asyncio.run(live())
 
 
-def test_work_that_hangs_is_given_up_told_of_and_forgotten() -> None:
+def test_work_that_hangs_is_given_up_reported_and_forgotten() -> None:
     go_on = threading.Event()
 
     async def live() -> None:

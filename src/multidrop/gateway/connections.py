@@ -1,6 +1,6 @@
 """Connections: how many may be open, how long one may take over its request, and whose turn it is.
 
-Clients that are slow, silent or greedy cost nobody else anything. If there are too many connections, one of
+Clients that are slow, silent or greedy do not delay the others. If there are too many connections, one of
 theirs is closed, and a new one, which may bring a stop, always gets in. Requests are answered one at a time;
 those that may stop a drive come first.
 """
@@ -102,7 +102,7 @@ class Connections:
             self._open[client].is_busy = True
 
     def is_stop(self, client: tuple[str, int] | None, path: str) -> bool:
-        """Return, and note, whether the request that begins is to be taken as a stop.
+        """Return, and note, whether a new request counts as a stop.
 
         One of a verb is not while its client sends others ahead of its answers.
         """
@@ -157,7 +157,7 @@ class CountingSocket(socket.socket):
 class Turns:
     """Turns of requests: one in each round of the loop, those in `stops` first.
 
-    What the sockets have is looked at in each round, so that a stop waits for one request, and not for all.
+    The loop reads the sockets in each round, so a stop waits for one request instead of all.
     """
 
     def __init__(self) -> None:
@@ -187,7 +187,7 @@ class Turns:
 
 
 class WatchedProtocol(H11Protocol):
-    """A connection that tells whether its client sends ahead of its answers, and whether it takes them."""
+    """A connection that reports clients that send requests ahead of their answers, or do not read these."""
 
     @property
     def _connections(self) -> Connections:

@@ -23,7 +23,7 @@ _log = logging.getLogger("multidrop.gateway")
 
 
 class Replacement(NamedTuple):
-    """Parts that were built and do not live yet, and the settings of those that ended for them."""
+    """Parts that were built and not started, and the settings of the parts that they replace."""
 
     built: dict[str, Building]
     before: Mapping[str, Any]
@@ -40,16 +40,16 @@ class Building(NamedTuple):
 class LiveParts:
     """The parts of a gateway, by the names of their tables; `feeds` are those that are fed.
 
-    One whose files do not answer is not waited for: it is in `coming` until it is built.
+    A part whose files do not answer delays nothing: it is in `coming` until it is built.
     """
 
     def __init__(self, gateway: Gateway) -> None:
         self.feeds: dict[str, Feed] = {}
-        self.dead: dict[str, str] = {}  # parts that do not live any more, and why
+        self.dead: dict[str, str] = {}  # parts that could not start, and why
         self.coming: dict[str, Building] = {}
         self._gateway = gateway
         self._settings: dict[str, Any] = {}
-        self._built: dict[str, Building] = {}  # that never lived
+        self._built: dict[str, Building] = {}  # and not started
 
     async def build(self, wanted: Mapping[str, Any]) -> dict[str, Building]:
         """Build the parts that a gateway begins with. Raises ValueError with what cannot be opened."""

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 Read = Callable[[], "tuple[Plant, ServeSettings]"]
 AT_ONCE = ("names", "tokens", "may", *PARTS)  # keys of [serve]; all others wait for a restart
 READ_S = 10.0  # that reading the file may take
-QUICK_S = 1.0  # of it, for which a later reload waits too
+QUICK_S = 1.0  # that a later reload waits for the reading
 MOST_READS = 8  # that may hang at the same time
 ADOPTION_S = 60.0  # that ports and stops may take
 RESTART = "takes effect after a restart"
@@ -94,9 +94,9 @@ class Reload:
             return told
 
     async def _read_within(self, read: Read) -> tuple[Plant, ServeSettings, Mapping[str, Any]]:
-        """Return what the file says, and the plan of its lines, which is long work.
+        """Return the plant, its settings and the plan of its lines.
 
-        Raises Hung if that takes too long, or if a later reload is to read the file that does not answer.
+        Raises Hung if reading takes too long, or if a later reload is waiting to read the file.
         """
 
         def work() -> tuple[Plant, ServeSettings, Mapping[str, Any]]:

@@ -1,7 +1,8 @@
-"""Supervisor: starts every task and every thread of the gateway; no other of its modules starts any.
+"""Supervisor: starts every task and every thread of the gateway; no other module of the gateway starts any.
 
-So it knows all of them: which of those that must go on have ended, and which work takes too long, such as a
-read from a file system that hangs. /health says both. Its threads never keep the process from ending.
+It knows which of the tasks and threads that must go on have ended. It also knows which work takes too long,
+such as a read from a file system that hangs. /health reports both. Its threads are daemons: they never keep
+the process from ending.
 """
 
 from __future__ import annotations
@@ -84,7 +85,7 @@ class Supervisor:
         await asyncio.gather(*tasks, return_exceptions=True)
 
     def start(self, name: str, work: Coroutine[Any, Any, R]) -> asyncio.Task[R]:
-        """Start a task that ends by itself. A failure that nobody awaits is logged."""
+        """Start a task that ends by itself. Its failure is logged unless it is awaited."""
         task = asyncio.get_running_loop().create_task(work, name=name)
         self._short.add(task)  # the loop keeps no reference
         task.add_done_callback(self._short.discard)
@@ -117,7 +118,7 @@ class Supervisor:
         """
         loop = asyncio.get_running_loop()
         future: asyncio.Future[R] = loop.create_future()
-        future.add_done_callback(lambda done: done.cancelled() or done.exception())  # maybe nobody awaits it
+        future.add_done_callback(lambda done: done.cancelled() or done.exception())  # it may not be awaited
 
         def finish(settle: Callable[[], None]) -> None:
             del self._works[future]
@@ -132,7 +133,7 @@ class Supervisor:
                 settle = partial(future.set_exception, _for_a_future(failure))
             try:
                 loop.call_soon_threadsafe(finish, settle)
-            except RuntimeError:  # the loop is closed: nobody waits any more
+            except RuntimeError:  # the loop is closed
                 _log.warning("%s ended after the gateway: %s", name, settle.args[0])
 
         thread = threading.Thread(
@@ -150,8 +151,8 @@ class Supervisor:
         """Return what work returns, which has a thread of its own.
 
         At most `most` works of a name go on at once; others wait for them. Raises Hung if it is not done
-        within `limit_s` seconds, or has not begun within as many. Once one is done, those that began before
-        it are no longer reported as hanging: the disk answers.
+        within `limit_s` seconds, or has not started within as many. Once one is done, those that started
+        before it are no longer reported as hanging: the disk answers.
         """
         begin_by = monotonic() + limit_s
         while len(going := [future for future, one in self._works.items() if one.name == name]) >= most:
@@ -172,7 +173,7 @@ class Supervisor:
 
     @property
     def hung(self) -> dict[str, str]:
-        """A sentence for each name of which work goes on for longer than its time."""
+        """A sentence for each name whose work takes longer than its limit."""
         now = monotonic()
         late = {one.name: one for one in reversed(self._works.values()) if now - one.begun > one.limit_s}
         return {name: f"it has gone on for {now - one.begun:.0f} s" for name, one in late.items()}
@@ -195,7 +196,7 @@ def supervisor() -> Supervisor:
 
 
 def in_time(name: str, seconds: float, work: Callable[[], R]) -> R:
-    """Return what work returns, where there may be no loop. Raises Hung if it is not done in its time."""
+    """Return the result of work; no loop is needed. Raises Hung if it is not done in `seconds`."""
     ended: Future[R] = Future()
 
     def run() -> None:
