@@ -24,6 +24,7 @@ from multidrop.history import writer as writer_module
 
 SERVE = '[serve]\nlisten = "127.0.0.1:0"\n[serve.may]\nstop = "anyone"\nwrite = ["pump-1.setpoint"]\n'
 HISTORY = '[serve.history]\nfolder = "kept"\n'
+SHORT_S = 0.1
 COMING = "it is not there yet: its files do not answer"
 UNAUDITED = "audit log: not done within 0.1 s; does the disk answer? A restart tries it again"
 HANGING = """
@@ -38,13 +39,10 @@ SETPOINT = {"drive": "pump-1", "register": "setpoint", "value": 10.0}
 
 @pytest.fixture(autouse=True)
 def _soon(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Wait for no disk that hangs for longer than needed."""
-    for module, name in (
-        *((live_parts, "START_S"), (live_parts, "BUILD_S"), (reload, "READ_S"), (reload, "QUICK_S")),
-        *((settings, "AUDIT_S"), (gateway_module, "AUDIT_S"), (reload, "AUDIT_S")),
-        *((historian, "QUERY_S"), (historian, "CLOSING_S"), (views, "LEDGER_S"), (web, "AUDIT_S")),
-    ):
-        monkeypatch.setattr(module, name, 0.1)
+    """Wait for no part, and for no end, for longer than needed."""
+    for module, name in ((live_parts, "START_S"), (live_parts, "BUILD_S"), (reload, "QUICK_S")):
+        monkeypatch.setattr(module, name, SHORT_S)
+    monkeypatch.setattr(historian, "CLOSING_S", SHORT_S)
 
 
 class Fifos:
@@ -140,6 +138,7 @@ def fail(*arguments: object) -> NoReturn:
 def test_a_query_that_hangs_is_ended_and_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     go_on = threading.Event()
     with served(tmp_path, SERVE + HISTORY) as gateway:
+        monkeypatch.setattr(historian, "QUERY_S", SHORT_S)
         monkeypatch.setattr(History, "buckets", lambda *given: go_on.wait(PATIENCE))
         until(lambda: health(gateway)["status"] == "ok")
         for _ in range(3):  # which are more than hang at a time
@@ -190,12 +189,16 @@ def test_an_export_that_hangs_keeps_no_gateway_from_its_end(
 # ---- the plant file ----
 
 
-def test_a_plant_file_that_hangs_ends_one_reload_alone(tmp_path: Path, fifos: Fifos) -> None:
+def test_a_plant_file_that_hangs_ends_one_reload_alone(
+    tmp_path: Path, fifos: Fifos, monkeypatch: pytest.MonkeyPatch
+) -> None:
     with served(tmp_path, SERVE) as gateway:
         path, good = gateway.gateway.plant.path, gateway.gateway.plant.path.read_text()
         fifos.put(path)
         headers = {"authorization": gateway.bearer(Right.WRITE)}
-        told = gateway.post("/api/reload", {"confirm": True}, **headers).json
+        with monkeypatch.context() as patch:
+            patch.setattr(reload, "READ_S", SHORT_S)
+            told = gateway.post("/api/reload", {"confirm": True}, **headers).json
         assert (told["done"], told["mistakes"]) == (
             False,
             ["reload: not done within 0.1 s; does the disk answer?"],
@@ -208,10 +211,7 @@ def test_a_plant_file_that_hangs_ends_one_reload_alone(tmp_path: Path, fifos: Fi
         until(lambda: health(gateway)["status"] == "ok")
 
 
-def test_a_later_reload_waits_for_none_that_hangs(
-    tmp_path: Path, fifos: Fifos, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(reload, "READ_S", PATIENCE)
+def test_a_later_reload_waits_for_none_that_hangs(tmp_path: Path, fifos: Fifos) -> None:
     with served(tmp_path, SERVE) as gateway:
         path, good = gateway.gateway.plant.path, gateway.gateway.plant.path.read_text()
         fifos.put(path)
@@ -230,7 +230,11 @@ def test_a_later_reload_waits_for_none_that_hangs(
 # ---- audit log and ledger ----
 
 
-def test_an_audit_log_that_hangs_at_the_start_lets_stops_alone_through(tmp_path: Path, fifos: Fifos) -> None:
+def test_an_audit_log_that_hangs_at_the_start_lets_stops_alone_through(
+    tmp_path: Path, fifos: Fifos, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for module in (settings, gateway_module):
+        monkeypatch.setattr(module, "AUDIT_S", SHORT_S)
     fifos.put(tmp_path / "audit.jsonl")
     with served(tmp_path, SERVE) as gateway:
         assert_stops_and_polls(gateway)
@@ -244,11 +248,12 @@ def test_an_audit_log_that_hangs_at_the_start_lets_stops_alone_through(tmp_path:
 def test_an_audit_log_that_hangs_amid_a_reload_changes_nothing(
     tmp_path: Path, fifos: Fifos, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(reload, "READ_S", PATIENCE)
     with served(tmp_path, SERVE) as gateway:
         until(lambda: health(gateway)["status"] == "ok")
         (tmp_path / "audit.jsonl").rename(tmp_path / "before")
         fifos.put(tmp_path / "audit.jsonl")
+        for module in (settings, reload):
+            monkeypatch.setattr(module, "AUDIT_S", SHORT_S)
         told = reload_as(gateway, SERVE)
         assert told["mistakes"] == ["audit log: not done within 0.1 s; does the disk answer?"]
         assert_stops_and_polls(gateway)
@@ -265,6 +270,8 @@ def test_a_ledger_and_an_audit_log_that_hang_are_reported(
 
     with served(tmp_path, SERVE) as gateway:
         gateway.await_state("pump-1", "stands")
+        monkeypatch.setattr(views, "LEDGER_S", SHORT_S)
+        monkeypatch.setattr(web, "AUDIT_S", SHORT_S)
         monkeypatch.setattr(views, "_wear", wait)
         monkeypatch.setattr(web, "newest_records", wait)
         assert gateway.get("/api/drive/pump-1").json["ledger"] == []
