@@ -8,11 +8,12 @@ import ssl
 import threading
 from collections import deque
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Any, NamedTuple, Protocol
 from urllib.parse import urlsplit
 
 from multidrop.gateway.outbox import Outbox, Publication
-from multidrop.gateway.supervisor import supervisor
+from multidrop.gateway.supervisor import Hung, supervisor
 
 PORTS = {"mqtt": 1883, "mqtts": 8883}
 RETRY_S = (1, 30)  # before the first attempt to connect again, and at most
@@ -123,7 +124,8 @@ class Broker:
             await asyncio.sleep(0.01)
         self._loop = None
         self._client.disconnect()
-        await supervisor().within("mqtt", FAREWELL_S, self._client.loop_stop)
+        with suppress(Hung):  # its thread may wait for a name server, and does not keep the process
+            await supervisor().within("mqtt", FAREWELL_S, self._client.loop_stop)
         self.is_connected = False
         self._client = None  # with it go the sockets by which paho wakes its thread
 
