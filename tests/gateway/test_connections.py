@@ -11,6 +11,7 @@ import ssl
 import threading
 from collections import deque
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 from typing import Any
@@ -22,6 +23,7 @@ from gateways import certificate, get, served, serving, simulated_plant
 from lines import PATIENCE, until
 
 from multidrop.gateway import connections, request_fields, web
+from multidrop.gateway import gateway as gateway_module
 from multidrop.gateway.connections import (
     AGAIN_S,
     FIRST_S,
@@ -304,6 +306,28 @@ def test_a_stop_is_taken_ahead_of_reads_that_came_before(
         assert clients[100].recv(1000).startswith(b"HTTP/1.1 200 ")
         until(lambda: len(order) > 1000)
     assert order.index("stop") < 10
+
+
+def test_a_request_that_outlasts_the_gateway_is_answered(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(gateway_module, "GRACE_S", 0)
+    entered = threading.Event()
+
+    async def stop(*given: Any) -> None:
+        entered.set()
+        await asyncio.Event().wait()
+
+    with (
+        served(tmp_path, '[serve.may]\nstop = "anyone"\n') as gateway,
+        ThreadPoolExecutor(1) as client,
+    ):
+        monkeypatch.setattr(gateway.gateway.commands, "stop", stop)
+        answer = client.submit(gateway.post, "/api/stop")
+        assert entered.wait(PATIENCE)
+        gateway.loop.call_soon_threadsafe(gateway.gateway.end)
+        assert (answer.result(PATIENCE).status, answer.result().json) == (503, {"error": connections.ENDS})
+    assert "Traceback" not in caplog.text
 
 
 def test_a_client_that_sends_ahead_is_known_until_it_has_its_answers(tmp_path: Path) -> None:

@@ -18,12 +18,16 @@ from typing import Any
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
+from multidrop.gateway.json_response import JsonResponse
+
 MOST_OPEN = 256  # a process has 1024 descriptors as a rule, and lines and files need some
 FIRST_S = 10.0  # for a TLS handshake and the whole first request
 AGAIN_S = 40.0  # for a later one; the server itself closes a silent connection after 30 s
 FRESH_S = 1.0  # in which a new connection's first request should be there
 MOST_FRESH = 64  # such connections that are closed after all others
 STALLED_S = 10.0  # for which a client may take none of its answers
+
+ENDS = "the gateway ends: it is not known what became of this"
 
 BODY_HEADERS = (b"content-length", b"transfer-encoding")
 STOP_PATHS, VERB_PATH = ("/api/stop", "/api/fleet/stop"), "/api/act"  # a verb may stop a drive, too
@@ -230,11 +234,7 @@ class Watched:
         self._turns = Turns()
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        client = scope.get("client")
-        if self._connections.is_stop(client, scope.get("path", "")):
-            await self._turns.wait(self._turns.stops)
-        else:
-            await self._turns.wait(self._turns.others)
+        client, has_begun = scope.get("client"), False
 
         async def receive_and_note() -> Message:
             message = await receive()
@@ -242,9 +242,19 @@ class Watched:
                 self._connections.begin(client)
             return message
 
-        if not any(name in BODY_HEADERS for name, _ in scope.get("headers", ())):
-            self._connections.begin(client)
+        async def send_and_note(message: Message) -> None:
+            nonlocal has_begun
+            has_begun = True
+            await send(message)
+
+        is_stop = self._connections.is_stop(client, scope.get("path", ""))
         try:
-            await self._app(scope, receive_and_note, send)
+            await self._turns.wait(self._turns.stops if is_stop else self._turns.others)
+            if not any(name in BODY_HEADERS for name, _ in scope.get("headers", ())):
+                self._connections.begin(client)
+            await self._app(scope, receive_and_note, send_and_note)
+        except asyncio.CancelledError:  # the server ends, and waits for it no longer
+            if not has_begun:
+                await JsonResponse({"error": ENDS}, 503)(scope, receive, send)
         finally:
             self._connections.finish(client)
