@@ -248,10 +248,10 @@ class Watched:
             await send(message)
 
         is_stop = self._connections.is_stop(client, scope.get("path", ""))
+        if not any(name in BODY_HEADERS for name, _ in scope.get("headers", ())):
+            self._connections.begin(client)
         try:
             await self._turns.wait(self._turns.stops if is_stop else self._turns.others)
-            if not any(name in BODY_HEADERS for name, _ in scope.get("headers", ())):
-                self._connections.begin(client)
             await self._app(scope, receive_and_note, send_and_note)
         except asyncio.CancelledError:  # the server ends, and waits for it no longer
             if not has_begun:
