@@ -15,7 +15,7 @@ from multidrop.control.leaving import Leaving
 from multidrop.control.outcome import Outcome, Stopped
 from multidrop.control.performer import Performer
 from multidrop.control.records import WriteRecords
-from multidrop.control.stop_all import Stopper
+from multidrop.control.stop_all import Stopper, StopRun
 from multidrop.control.time_limit import checked_expiry
 from multidrop.control.writer import Writer
 from multidrop.core import RS485, Echo, Mastership, Message, Peer, TransactionIds
@@ -26,6 +26,7 @@ from multidrop.drive.register import Register
 from multidrop.drive.script import Script
 from multidrop.drive.state import State
 from multidrop.drive.text import Text
+from multidrop.drive.verbs import TRIES
 from multidrop.errors import BusError
 from multidrop.transport.exchange import READ_ATTEMPTS, Exchanges
 from multidrop.transport.line import Line
@@ -361,6 +362,22 @@ class Bus:
         before this or comes while it lasts.
         After an interruption each drive that does not stand yet is sent its stop once more.
         """
+        run: StopRun | None = None
+        tried = 0
+        while True:
+            try:
+                tried += 1
+                run = run or self._all_called(seconds)
+                run.carry_out()
+                break
+            except BaseException as failure:
+                if tried < TRIES and isinstance(failure, (MemoryError, OSError)):
+                    continue
+                (run or self._all_called(seconds)).interrupted(failure)
+                raise
+        return run.found()
+
+    def _all_called(self, seconds: float | None) -> StopRun:
         peers = self.peers
         is_known = self._writer.identity_check.is_known
         in_turn = sorted(peers, key=lambda drive: (not is_known(drive), peers[drive].failures))

@@ -1,50 +1,33 @@
-"""Latches of drives that come and go, and of stops at whose beginning a signal raises."""
+"""Latches of drives that come and go, and of stops that a signal's exception interrupts."""
 
 from __future__ import annotations
 
-from contextlib import AbstractContextManager
+import threading
 from gc import collect
-from itertools import count
-from types import FrameType
 from weakref import ref
 
 import pytest
-from interruptions import interrupted_at
 from simulated_bus import one
 
-from multidrop.control import latches as of_a_bus
-from multidrop.core import latch as of_a_drive
 from multidrop.drives import InvtCHE
 from multidrop.errors import Overtaken
 
-CODE = {of_a_bus.__file__, of_a_drive.__file__}
 
-
-def raises_while_it_begins(stopping: AbstractContextManager[None], nth: int) -> bool:
-    """Raise before the nth line of a stop's beginning, as a signal may; False where it has fewer lines."""
-    has_begun = False
-
-    def counts(frame: FrameType) -> bool:
-        return not has_begun and frame.f_code.co_filename in CODE
-
-    try:
-        with interrupted_at(nth, counts), stopping:
-            has_begun = True
-    except KeyboardInterrupt:
-        return True
-    return False
-
-
-def test_a_signal_while_a_stop_begins_leaves_nothing_behind(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Else no start would be sent any more, and closing would wait for ever."""
+def test_a_thread_that_was_interrupted_in_a_stop_never_waits_for_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Else a `with` block that a signal's exception leaves would wait for ever; other threads' are waited for."""
     line, drive, _ = one(monkeypatch, InvtCHE(1))
-    latches = line.bus._latches
-    for nth in count(1):
-        if not raises_while_it_begins(latches.stopping([drive]), nth):
-            break
-        assert latches.latch(drive).permit().is_good
-        assert not latches._stops
-    assert nth > 8
+    latches, stop = line.bus._latches, object()
+    latches.begin(stop, [drive])
+    latches.await_stops()
+    waiting = threading.Thread(target=latches.await_stops, args=[[drive]])
+    waiting.start()
+    waiting.join(0.05)
+    assert waiting.is_alive()
+    for _ in range(2):
+        latches.over(stop)
+    waiting.join(60)
+    assert not waiting.is_alive()
+    assert latches.latch(drive).permit().is_good
 
 
 def test_a_drive_that_is_attached_to_a_bus_that_was_left_is_not_moved(

@@ -14,6 +14,7 @@ from multidrop.core import Message
 from multidrop.drives import InvtCHE
 from multidrop.errors import Overtaken, PortLost
 from multidrop.sim import simulated
+from multidrop.transport.aside_log import flush
 
 
 class RunningPair:
@@ -65,7 +66,7 @@ def test_drives_that_are_about_to_leave_are_stopped_where_that_was_asked_for(
     pair: RunningPair, caplog: pytest.LogCaptureFixture
 ) -> None:
     first, second = pair.drives
-    begun = [drive.begin_call("start") for drive in pair.drives]
+    begun = [drive.begin_call("start", drive.stops_called[0]) for drive in pair.drives]
     pair.bus.part_with([first], [first])
     assert pair.line.frames == []
     assert [call.permit.is_good for call in begun] == [False, True]
@@ -84,6 +85,7 @@ def test_drives_that_are_about_to_leave_are_stopped_where_that_was_asked_for(
 
     pair.line.answers = lose
     pair.bus.part_with([second], [second])
+    flush(60)
     told = [record.getMessage() for record in caplog.records if record.name == "multidrop.bus"]
     assert len(told) == 1
     assert told[0].startswith("invt-che@2: failed after 30")  # nothing left for it, nor for all
@@ -97,12 +99,12 @@ def test_a_drive_that_is_about_to_leave_cannot_be_started_behind_its_stop(pair: 
     permits: list[bool] = []
 
     def note(request: Message) -> bytes | None:
-        permits.append(first.begin_call("start").permit.is_good)
+        permits.append(first.begin_call("start", first.stops_called[0]).permit.is_good)
         return None
 
     pair.line.answers = note
     pair.bus.part_with([first], [first])
-    permits.append(first.begin_call("start").permit.is_good)
+    permits.append(first.begin_call("start", first.stops_called[0]).permit.is_good)
     assert set(permits) == {False}
     assert pair.turning == [False, True]
     pair.line.answers = lambda request: None

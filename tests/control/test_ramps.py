@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
+from functools import partial
 from itertools import pairwise
 from typing import Any
 
@@ -198,15 +199,29 @@ class NotedCalls:
         self.calls: list[tuple[int, float | None]] = []
         self.acts: dict[int, Callable[[float | None], None]] = {}
         for drive in drives:
-            drive.carry_out_stop = self._of(drive)
+            drive.begin_stop = partial(NotedStop, self, drive.address)
 
-    def _of(self, drive: Any) -> Callable[..., None]:
-        def stop(verb: str, script: object, seconds: float | None) -> None:
-            self.calls.append((drive.address, seconds))
-            if act := self.acts.get(drive.address):
-                act(seconds)
 
-        return stop
+class NotedStop:
+    """One of them."""
+
+    def __init__(
+        self, noted: NotedCalls, address: int, verb: str, make: object, seconds: float | None
+    ) -> None:
+        self._noted = noted
+        self._address = address
+        self._seconds = seconds
+
+    def carry_out(self) -> None:
+        self._noted.calls.append((self._address, self._seconds))
+        if act := self._noted.acts.get(self._address):
+            act(self._seconds)
+
+    def interrupted(self, interruption: BaseException) -> None:
+        """There is nothing left to send."""
+
+    def result(self) -> None:
+        """It stands."""
 
 
 def test_started_drives_are_stopped_side_by_side(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -7,30 +7,31 @@ import threading
 from decimal import Decimal
 from errno import EMFILE
 from fractions import Fraction
-from itertools import count
+from itertools import chain, count
 from linecache import getline
 from pathlib import Path
-from types import CodeType, FrameType, SimpleNamespace
+from types import FrameType, SimpleNamespace
 from typing import Any
 
 import pytest
-from interruptions import interrupted_at
+from interruptions import calling_at, interrupted_at
 from own_fan import Fan
 from simulated_bus import SimulatedBus, is_write
 
+import multidrop
 from multidrop.control import eeprom_ledger, ramp, stop_all
 from multidrop.control.eeprom_ledger import Ledger
 from multidrop.control.outcome import Seen
 from multidrop.control.ramp import start_staggered
-from multidrop.control.stop_all import Stopper
 from multidrop.control.stop_attempt import LEAST_S, StopAttempt
 from multidrop.core import Completion, Exchange
+from multidrop.drive import Script, verb
 from multidrop.drives import InvtCHE
-from multidrop.errors import Refused, Unconfirmed
+from multidrop.errors import Overtaken, Refused, Unconfirmed
 from multidrop.sim import simulated
 from multidrop.transport import clock
+from multidrop.transport.aside_log import flush
 
-CODE = stop_all.stop_together.__code__
 STOPPING = ramp._stop.__code__
 NO_MEMORY, NO_DESCRIPTORS = MemoryError(), OSError(EMFILE, "Too many open files")
 
@@ -53,61 +54,97 @@ def writes_to(line: SimulatedBus, address: int) -> int:
 
 # ---- signals ----
 
+HOME = str(Path(multidrop.__file__).parent)
+# The interpreter handles a signal that comes in the first opcodes of a stop in one of those behind them: none
+# of these calls anything, and the `try` of the stop follows at once.
+FIRST_OPCODES = 6
 
-def counts(frame: FrameType) -> bool:
-    """Say whether a signal comes before this line: not before the stops are known, nor once one is over."""
-    line = getline(CODE.co_filename, frame.f_lineno).strip()
-    return frame.f_code is CODE and not line.startswith(("under_way = list", "try:", "end("))
+
+def is_ours(frame: FrameType) -> bool:
+    file = frame.f_code.co_filename
+    return file.startswith(HOME) and not file.startswith(f"{HOME}/sim")
 
 
-@pytest.mark.long
-def test_wherever_a_stop_of_all_is_interrupted_each_is_sent_once_more_and_told_of(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    for nth in range(1, 40):
-        line, drives, sims = running(monkeypatch, 2)
-        with pytest.raises(KeyboardInterrupt) as interruption, interrupted_at(nth, counts):
-            line.bus.stop_all()
-        told = "".join(interruption.value.__notes__)
-        for drive, sim in zip(drives, sims, strict=True):
-            assert f"{drive.name}: the stop was sent" in told, nth
+def press() -> None:
+    raise KeyboardInterrupt
+
+
+def check_interrupted(monkeypatch: pytest.MonkeyPatch, nth: int, all_of_them: bool) -> bool:
+    """Interrupt a stop at this opcode; return whether it has one. Nothing may move or be left behind."""
+    line, drives, sims = running(monkeypatch, 2 if all_of_them else 1)
+    begun_before = [drive.begin_call("start", drive.stops_called[0]) for drive in drives]
+    stop, told, place = line.bus.stop_all if all_of_them else drives[0].stop, "", []
+    try:
+        with calling_at(nth, is_ours, press) as place:
+            stop()
+    except KeyboardInterrupt as interruption:  # it lives on, and so do all frames of the stop
+        told = "".join(getattr(interruption, "__notes__", ()))
+        assert not line.bus._latches._stops, place
+        assert not line.bus.stops_under_way(), place
+        for drive, sim, call in zip(drives, sims, begun_before, strict=True):
             sim.pass_time(line.seconds + 60)
-            assert not sim.motor.energised, nth
-        assert not line.bus.stops_under_way()
-
-
-def first_line(code: CodeType, text: str) -> int:
-    """Return the number of the first line of this code that begins so."""
-    numbers = (number for _, _, number in code.co_lines() if number is not None)
-    return min(number for number in numbers if getline(code.co_filename, number).strip().startswith(text))
+            assert not sim.motor.energised, place
+            assert not call.permit.is_good, place
+            assert drive.begin_call("start", drive.stops_called[0]).permit.is_good, place
+            assert f"{drive.name}: the stop was sent" in told or not sim.motor.goal, place
+    line.bus.close()
+    return bool(place)
 
 
 @pytest.mark.parametrize("all_of_them", [False, True])
-def test_a_stop_that_is_interrupted_as_it_begins_is_sent(
-    monkeypatch: pytest.MonkeyPatch, all_of_them: bool
+@pytest.mark.parametrize("step", [331, pytest.param(1, marks=pytest.mark.long)])
+def test_a_stop_that_is_interrupted_at_any_opcode_is_sent_and_leaves_nothing_behind(
+    all_of_them: bool, step: int
 ) -> None:
-    """Also between its making and its beginning."""
-    making, beginning = Stopper._carry_out.__code__, Stopper._carry_out_known.__code__
-    since = first_line(making, "with self._under_way")
+    first = FIRST_OPCODES + 1
+    for nth in chain(range(first, first + 60), count(first + 60, step)):
+        with pytest.MonkeyPatch.context() as monkeypatch:
+            if not check_interrupted(monkeypatch, nth, all_of_them):
+                break
+    assert nth > 1000
 
-    def counts(frame: FrameType) -> bool:
-        is_before = making.co_firstlineno < frame.f_lineno < since
-        return frame.f_code is beginning or (frame.f_code is making and not is_before)
 
-    for nth in count(1):
-        line, drives, sims = running(monkeypatch, 2 if all_of_them else 1)
-        begun_before = [drive.begin_call("start") for drive in drives]
-        try:
-            with interrupted_at(nth, counts):
-                line.bus.stop_all() if all_of_them else drives[0].stop()
-        except KeyboardInterrupt:
-            for sim in sims:
-                sim.pass_time(line.seconds + 60)
-            assert not any(sim.motor.energised for sim in sims), nth
-            assert not any(call.permit.is_good for call in begun_before), nth
-        else:
-            break
-    assert nth > 8
+@pytest.mark.parametrize("verb", ["stop", "coast", "stop_all"])
+def test_a_stop_that_a_signal_s_handler_calls_ends_the_start_that_it_interrupts(
+    monkeypatch: pytest.MonkeyPatch, verb: str
+) -> None:
+    """From the first opcode at which the interpreter can handle a signal within the call."""
+    line, (drive,), (sim,) = running(monkeypatch)
+    drive.stop()
+    stop = line.bus.stop_all if verb == "stop_all" else getattr(drive, verb)
+    start, first = drive.start, 9  # the opcodes before read how many stops were called
+    for nth in chain(range(first, first + 80, 4), range(first + 80, 4000, 997)):
+        with calling_at(nth, is_ours, stop) as place, pytest.raises((Overtaken, Unconfirmed)):
+            start()
+        line.sleep(30)
+        assert not sim.motor.energised, place
+
+
+@pytest.mark.parametrize("failure", [SystemExit, KeyboardInterrupt, GeneratorExit])
+def test_a_script_that_ends_the_program_leaves_no_other_motor_running(
+    monkeypatch: pytest.MonkeyPatch, failure: type[BaseException]
+) -> None:
+    """Not even if the other one's first stops are lost: it is raised when all stops are over."""
+
+    class Ending(Fan):
+        model = "ending"
+        title = "ENDING"
+
+        @verb
+        def stop(self) -> Script[None]:
+            raise failure
+
+    sims: list[Any] = [simulated(Ending(1)), simulated(InvtCHE(2, maximum_frequency=50))]
+    line = SimulatedBus(monkeypatch, *sims)
+    _, other = (line.attach(sim.drive) for sim in sims)
+    other.set_frequency(20)
+    other.start()
+    deaf_until = line.seconds + 5
+    line.deafens = lambda request: line.seconds < deaf_until
+    with pytest.raises(failure):
+        line.bus.stop_all()
+    assert not sims[1].motor.energised
+    assert line.bus._latches.latch(other).permit().is_good
 
 
 def fails_to_start_the_last(line: SimulatedBus, drives: list[Any], sims: list[Any]) -> None:
@@ -156,7 +193,7 @@ def test_a_failed_staggered_start_stops_each_though_the_stop_of_one_raises_anyth
     line, drives, sims = running(monkeypatch, 3)
     monkeypatch.setattr(threading, "Thread", NoThread)
     line.bus.stop_all()
-    drives[0].carry_out_stop = raises
+    drives[0].begin_stop = raises
     sims[2].trip(4)
     with pytest.raises(Refused, match="OC1"):
         start_staggered(drives, 2.0)
@@ -284,10 +321,13 @@ def test_a_stop_waits_once_for_a_ledger_that_others_hold_however_often_it_was_se
     with monkeypatch.context() as held:
         held.setattr(eeprom_ledger, "sqlite3", SimpleNamespace(connect=busy, Error=sqlite3.Error))
         line.bus.stop_all()
+        line.bus._records.flush(60)
+    flush(60)
     assert asked == 1
     assert "stops were not counted: " in caplog.text
     before = len(line.written)
     line.bus.stop_all()
+    line.bus._records.flush(60)
     assert asked == 1
     assert sum(wear.writes for wear in ledger.wear(1.8e9)) == len(line.written) - before > 40
 
@@ -299,4 +339,6 @@ def test_a_port_whose_name_is_no_text_keeps_no_stop_from_being_told(
     line.identity = "/dev/tty\udcff"
     line.attach(Fan(1)).stop()
     assert len(line.written) == 1
+    line.bus._records.flush(60)
+    flush(60)
     assert "stops were not counted: " in caplog.text

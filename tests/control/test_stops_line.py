@@ -270,9 +270,13 @@ def test_a_stop_that_never_left_is_no_sent_write_in_the_audit_log(tmp_path: Path
     with Simulator([wire]), Bus(wire.path, audit=audit) as bus:
         drive = bus.attach(MAKE["invt-che"](1))
         drive.set_frequency(20)
-        sent = [record["write"] for record in read_audit(audit)]
+        before = [*read_audit(audit)]
         bus.tended(True)
         bus.line.drop()
         with pytest.raises(PortLost):
             drive.stop(seconds=0)
-        assert [record["write"] for record in read_audit(audit)] == sent != []
+    after = [*read_audit(audit)]
+    assert after[: len(before)] == before != []
+    called, ended = after[len(before) :]
+    assert (called["outcome"], ended["outcome"], ended["times"]) == ("called", "failed", 0)
+    assert not any("sent" in record for record in (called, ended))

@@ -209,7 +209,7 @@ def _held_up(
     Return what tells that one has begun, and what lets them go on.
     """
     begun, go_on = threading.Event(), threading.Event()
-    step = bus._stopper._do
+    step = bus._stopper.do
 
     def slow(stop: StopAttempt, next_step: Step) -> object:
         if of in (None, stop.drive):
@@ -217,7 +217,7 @@ def _held_up(
             assert go_on.wait(PATIENCE)
         return step(stop, next_step)
 
-    monkeypatch.setattr(bus._stopper, "_do", slow)
+    monkeypatch.setattr(bus._stopper, "do", slow)
     return begun, go_on
 
 

@@ -158,14 +158,14 @@ def test_no_drive_leaves_while_all_are_stopped(port: str, monkeypatch: pytest.Mo
     with Bus(port) as bus:
         ours = bus.attach(Toy, address=1, name="pump-1")
         begun, go_on = threading.Event(), threading.Event()
-        step = bus._stopper._do
+        step = bus._stopper.do
 
         def slow(*arguments: object) -> object:
             begun.set()
             assert go_on.wait(120)
             return step(*arguments)
 
-        monkeypatch.setattr(bus._stopper, "_do", slow)
+        monkeypatch.setattr(bus._stopper, "do", slow)
         stopping = threading.Thread(target=bus.stop_all)
         stopping.start()
         assert begun.wait(120)

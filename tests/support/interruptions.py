@@ -14,21 +14,35 @@ def interrupted_at(nth: int, counts: Callable[[FrameType], bool]) -> AbstractCon
     return failing_at(nth, counts, KeyboardInterrupt())
 
 
-@contextmanager
-def failing_at(nth: int, counts: Callable[[FrameType], bool], failure: BaseException) -> Iterator[list[str]]:
+def failing_at(
+    nth: int, counts: Callable[[FrameType], bool], failure: BaseException
+) -> AbstractContextManager[list[str]]:
     """Raise this before the nth line that counts; give a list, which then has the line."""
+
+    def fail() -> None:
+        raise failure
+
+    return calling_at(nth, counts, fail, "line")
+
+
+@contextmanager
+def calling_at(
+    nth: int, counts: Callable[[FrameType], bool], call: Callable[[], object], event: str = "opcode"
+) -> Iterator[list[str]]:
+    """Call this before the nth opcode, or line, that counts; give a list, which then has its place."""
     left, before = nth, sys.gettrace()
     found: list[str] = []
 
-    def trace(frame: FrameType, event: str, argument: object) -> Any:
+    def trace(frame: FrameType, happens: str, argument: object) -> Any:
         nonlocal left
         is_counted = counts(frame)
-        if event == "line" and is_counted:
+        frame.f_trace_opcodes = is_counted and event == "opcode"
+        if happens == event and is_counted and left:
             left -= 1
             if left == 0:
-                found.append(f"{frame.f_code.co_qualname}, line {frame.f_lineno}")
-                raise failure
-        return trace if is_counted or event != "call" else None
+                found.append(f"{frame.f_code.co_qualname}, line {frame.f_lineno}, opcode {frame.f_lasti}")
+                call()
+        return trace if is_counted or happens != "call" else None
 
     sys.settrace(trace)
     try:

@@ -113,6 +113,7 @@ def test_writes_refusals_and_stops_are_logged(
         with pytest.raises(Refused):
             bus.write(drive, drive.register("setpoint"), 1e6)
         bus.stop_all()
+        flush(PATIENCE)
     told = [text for _, text in messages(caplog, "multidrop.control")]
     assert any(text.startswith("pump-1: ") and text.endswith(": done") for text in told)
     assert any(text.startswith("pump-1: stopped after ") for text in told)
@@ -150,15 +151,15 @@ def test_a_handler_that_hangs_keeps_no_stop_from_being_repeated(
 
 
 def test_what_waits_for_a_handler_that_hangs_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
-    aside = aside_log._AsideLog()
-    monkeypatch.setattr(aside_log, "_aside", aside)
+    aside = aside_log.AsideThread("log")
+    monkeypatch.setattr(aside_log, "_log_thread", aside)
     handler, logger = Hanging(), logging.getLogger("multidrop.line")
     logger.addHandler(handler)
     try:
         for number in range(2 * aside_log.MOST_WAITING):
             aside_log.log_aside(logger, logging.WARNING, "%d", number)
         assert handler.has_begun.wait(PATIENCE)
-        assert aside._entries.qsize() <= aside_log.MOST_WAITING
+        assert aside._work.qsize() <= aside_log.MOST_WAITING
     finally:
         handler.released.set()
         logger.removeHandler(handler)

@@ -9,6 +9,7 @@ from typing import Any, TypeVar
 from multidrop.control.latches import Latches
 from multidrop.control.performer import Performer
 from multidrop.control.stop_all import Stopper
+from multidrop.core import Latch
 from multidrop.drive.family import Drive
 from multidrop.transport.exchange import Exchanges
 
@@ -62,18 +63,18 @@ class Attached:
                 raise ValueError(
                     f"{drive.name} is on the bus at {owner.line.port}: detach it there first, or make another"
                 )
-            self._give_verbs(drive)
             self._exchanges.add(drive)
-            self._latches.add(drive)
+            self._give_verbs(drive, self._latches.add(drive))
             self.drives = [*self.drives, drive]  # anew, for others may be going through them
 
-    def _give_verbs(self, drive: Drive) -> None:
+    def _give_verbs(self, drive: Drive, latch: Latch) -> None:
         bus, performer, stopper = self._bus, self._performer, self._stopper
         drive.bus = bus
         drive.perform = lambda script: bus.perform(drive, script)
-        drive.begin_call = lambda verb: performer.call(drive, verb)
+        drive.stops_called = latch.c
+        drive.begin_call = lambda verb, seen: performer.call(drive, verb, seen)
         drive.carry_out_move = performer.move
-        drive.carry_out_stop = lambda verb, script, seconds: stopper.stop(drive, script, seconds)
+        drive.begin_stop = lambda verb, script, seconds: stopper.stop(drive, verb, script, seconds)
 
     def remove(self, drive: Drive) -> None:
         """Take a drive off the bus: nothing moves it any more. NotAttached where it is not there."""

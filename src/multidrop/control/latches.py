@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Collection, Iterable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+import time
+from collections.abc import Collection, Iterable, Sequence
 
 from multidrop.core import Latch
 from multidrop.drive.family import Drive
@@ -14,6 +14,7 @@ from multidrop.transport.exchange import Exchanges
 STOPPED = "a stop was called"
 REMOVED = "the drive was taken off the bus"
 LEFT = "the bus was left"
+LOOK_S = 0.005  # between looks whether stops are over
 
 
 class Latches:
@@ -23,21 +24,22 @@ class Latches:
         self._exchanges = exchanges
         self._latches: dict[Drive, Latch] = {}
         self._is_shut = False
-        self._make_condition()
+        self._forget_stops()
 
-    def _make_condition(self) -> None:
-        self._stops: dict[object, frozenset[Drive]] = {}  # under way, with the drives of each
-        self._over = threading.Condition()  # one of them is
+    def _forget_stops(self) -> None:
+        # Under way, each with its thread's number and its drives.
+        self._stops: dict[object, tuple[int, frozenset[Drive]]] = {}
 
     def forked(self) -> None:
         """Send nothing in the child, where nothing is under way."""
-        self._make_condition()
+        self._forget_stops()
         self.shut()
 
-    def add(self, drive: Drive) -> None:
+    def add(self, drive: Drive) -> Latch:
         latch = self._latches[drive] = Latch()
         if self._is_shut:  # looked at afterwards: a thread that shuts them later sees this latch
             latch.shut(LEFT)
+        return latch
 
     def end(self, drives: Iterable[Drive]) -> None:
         """End what moves these drives, which are about to leave: from now on nothing of it begins."""
@@ -57,14 +59,13 @@ class Latches:
             latch.shut(LEFT)
 
     def await_stops(self, drives: Collection[Drive] | None = None) -> None:
-        """Wait until no stop is under way, of these drives or of any."""
-
-        def is_over() -> bool:
-            under_way = self._stops.copy().values()
-            return not under_way if drives is None else all(map(frozenset(drives).isdisjoint, under_way))
-
-        with self._over:
-            self._over.wait_for(is_over)
+        """Wait until no stop is under way, of these drives or of any; a thread waits for none of its own."""
+        own, asked = threading.get_ident(), None if drives is None else frozenset(drives)
+        while any(
+            thread != own and (asked is None or not asked.isdisjoint(stopped))
+            for thread, stopped in self._stops.copy().values()
+        ):
+            time.sleep(LOOK_S)  # no condition, whose lock a signal's exception could leave locked
 
     def latch(self, drive: Drive) -> Latch:
         """Return a drive's latch; NotAttached for one that is not on this bus."""
@@ -79,18 +80,19 @@ class Latches:
         for drive in drives:
             self.latch(drive).rise(STOPPED)
 
-    @contextmanager
-    def stopping(self, drives: Sequence[Drive]) -> Iterator[None]:
-        """Within this context nothing that moves these drives begins or goes on, and none of them leaves."""
-        stop = object()
-        try:  # a signal that raises between any two steps leaves none behind, for which a bus waited for ever
-            self._stops[stop] = frozenset(drives)
-            with ExitStack() as stack:
-                for drive in drives:
-                    if latch := self._latches.get(drive):
-                        stack.enter_context(latch.held(STOPPED))
-                yield
-        finally:
-            self._stops.pop(stop, None)
-            with self._over:
-                self._over.notify_all()
+    def begin(self, stop: object, drives: Sequence[Drive]) -> None:
+        """Until `over` nothing that moves these drives begins or goes on, and none of them leaves.
+
+        It may be called again. Neither this nor `over` takes a lock, and each step of them is one that a
+        signal's exception comes before or after.
+        """
+        self._stops[stop] = threading.get_ident(), frozenset(drives)
+        for drive in drives:
+            if latch := self._latches.get(drive):
+                latch.hold(stop, STOPPED)
+
+    def over(self, stop: object) -> None:
+        """Let the drives go. It may be called again, and without a beginning."""
+        for latch in [*self._latches.values()]:
+            latch.let_go(stop)
+        self._stops.pop(stop, None)

@@ -10,6 +10,7 @@ from multidrop.control.latches import Latches
 from multidrop.control.outcome import Seen, Stopped
 from multidrop.control.stop_all import Stopper
 from multidrop.drive.family import Drive
+from multidrop.transport.aside_log import log_aside
 
 _log = logging.getLogger("multidrop.bus")
 
@@ -56,7 +57,13 @@ class Leaving:
         """
         self._latches.end(drives)  # before the stops: a start after its drive's would not be stopped
         if to_stop and self.stops:
-            _warn_of(self._stopper.stop_all(to_stop, lambda: False, None))
+            run = self._stopper.stop_all(to_stop, lambda: False, None)
+            try:
+                run.carry_out()
+            except BaseException as interruption:
+                run.interrupted(interruption)
+                raise
+            _warn_of(run.found())
         self._latches.await_stops(drives)
 
 
@@ -64,4 +71,4 @@ def _warn_of(found: Mapping[str, Stopped]) -> None:
     """Log each drive that is not seen to stand."""
     for stopped in found.values():
         if stopped.seen is not Seen.STOPPED:
-            _log.warning("%s", stopped)
+            log_aside(_log, logging.WARNING, "%s", stopped)

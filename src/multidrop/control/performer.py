@@ -52,9 +52,12 @@ class Performer:
         self._latches = latches
         self._expiry = expiry
 
-    def call(self, drive: Drive, verb: str = "") -> Call:
-        """Begin a call: all that it writes has the permit and the time of this moment."""
-        permit = self._latches.latch(drive).permit()
+    def call(self, drive: Drive, verb: str = "", seen: int | None = None) -> Call:
+        """Begin a call: all that it writes has the permit and the time of this moment.
+
+        `seen`: how many stops of the drive had been called when the call began, if that was earlier.
+        """
+        permit = self._latches.latch(drive).permit(seen)
         return Call(drive, permit, self._expiry, verb, time_limit.present_limit_ns())
 
     def move(self, script: Script[Any], call: Call) -> Any:
@@ -85,7 +88,7 @@ class Performer:
             try:
                 return self._writer.verified(drive, self._stopper.insist(drive, step))
             finally:
-                self._writer.records.catch_up()
+                self._writer.records.catch_up_aside()
         call = self.call(drive)
         with call.noted():
             call.check(f"{register.name} = {register.format(value)}")

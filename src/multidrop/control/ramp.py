@@ -31,7 +31,7 @@ def start_staggered(drives: Sequence[Drive], gap: float, direction: Direction | 
         raise ValueError(f"gap = {gap:g} s is no time between two starts")
     for drive in drives:
         drive.check_confirmed("start")
-    calls = [drive.begin_call("start") for drive in drives]
+    calls = [drive.begin_call("start", drive.stops_called[0]) for drive in drives]
     unheard_s = 0.0
     for number, (drive, call) in enumerate(zip(drives, calls, strict=True)):
         try:

@@ -1,19 +1,22 @@
 """WriteRecords: the audit log and the EEPROM ledger of one line's writes.
 
-A write is counted before it is sent. A stop is sent first, and recorded afterwards: a disk may hang.
+A write is counted before it is sent. A stop is recorded by threads of their own, for which no stop waits: a
+disk may hang, and a ledger be locked.
 """
 
 from __future__ import annotations
 
 import logging
 from collections import deque
+from collections.abc import Callable, Sequence
 from contextlib import suppress
+from functools import partial
 from typing import Any
 
 from multidrop.control.audit_log import AuditLog
 from multidrop.control.author import present_author
 from multidrop.control.eeprom_ledger import LEAST_INTERVAL, Ledger, LedgerCell
-from multidrop.control.outcome import Effect
+from multidrop.control.outcome import Effect, Stopped
 from multidrop.control.rules import refused
 from multidrop.core import Message, build_request
 from multidrop.drive.family import Drive
@@ -21,10 +24,16 @@ from multidrop.drive.register import Register
 from multidrop.drive.table import Kept
 from multidrop.errors import Advice
 from multidrop.transport import clock
+from multidrop.transport.aside_log import AsideThread, log_aside
 from multidrop.transport.line import Line
 
+CALLED = "called"  # the outcome of a stop that is about to be sent
+CALLED_S = 0.05  # that a stop waits for its record at most
 CLOSING_NS = 1_000_000_000  # that closing waits for other threads' records
+
 _log = logging.getLogger("multidrop.control")
+_audit_thread = AsideThread("multidrop audit")
+_ledger_thread = AsideThread("multidrop ledger")
 
 
 class WriteRecords:
@@ -62,51 +71,94 @@ class WriteRecords:
         self, drive: Drive, request: Message, what: str, effect: Effect, why: str = "", held: Any = None
     ) -> None:
         """Note a write in the audit log; a failure is logged as a warning."""
-        self.log_later(drive, request, what, effect, why, held)
+        self._put(self._record(drive, request, what, effect.value, why, held), _log.log)
         self.catch_up()
 
     def log_later(
         self, drive: Drive, request: Message, what: str, effect: Effect, why: str = "", held: Any = None
     ) -> None:
-        """Queue the note, also for the logger, whose handler may write to the same disk."""
-        frame = build_request(drive.framing, request)
+        """Queue the note until `catch_up` or `catch_up_aside`, and log it aside."""
+        self._put(self._record(drive, request, what, effect.value, why, held), partial(log_aside, _log))
+
+    def note_stops_called(self, verb: str, drives: Sequence[Drive]) -> None:
+        """Note that these drives are about to be stopped. A disk that hangs delays them by CALLED_S, once."""
+        of_one = {"model": drives[0].model, "address": drives[0].address} if len(drives) == 1 else {}
+        names = ", ".join(drive.name for drive in drives)
+        self._put({"drive": names, **of_one, "write": verb, "outcome": CALLED}, partial(log_aside, _log))
+        self.catch_up_aside()
+
+    def note_stop_ended(
+        self, verb: str, drive: Drive, stopped: Stopped, times: int, frame: Message | None
+    ) -> None:
+        """Note what is known of one drive's stop at its end, and how often it was sent."""
+        record = self._record(drive, frame, verb, stopped.seen.value, stopped.why, None)
+        self._put({**record, "times": times}, partial(log_aside, _log), str(stopped))
+        self.catch_up_aside()
+
+    def _record(
+        self, drive: Drive, request: Message | None, what: str, outcome: str, why: str, held: Any
+    ) -> dict[str, Any]:
         record = {
-            "port": self._line.port,
-            "drive": drive.name if request.address else "all",
+            "drive": drive.name if request is None or request.address else "all",
             "model": drive.model,
-            "address": request.address,
+            "address": drive.address if request is None else request.address,
             "write": what,
-            "sent": frame.decode().strip() if frame.startswith(b":") else frame.hex(" ").upper(),
-            "outcome": effect.value,
         }
-        more = {"held": None if held is None else float(held), "why": why, **present_author()._asdict()}
-        record |= {key: text for key, text in more.items() if text not in (None, "")}
-        self._unlogged.append((clock.utc_ns(), record))
+        if request is not None:
+            frame = build_request(drive.framing, request)
+            record["sent"] = frame.decode().strip() if frame.startswith(b":") else frame.hex(" ").upper()
+        more = {"held": None if held is None else float(held), "why": why}
+        return record | {"outcome": outcome} | {key: it for key, it in more.items() if it not in (None, "")}
+
+    def _put(self, record: dict[str, Any], log: Callable[..., None], text: str = "") -> None:
+        """Queue a record for the audit log, and log it, or this text for it."""
+        author = {key: text for key, text in present_author()._asdict().items() if text}
+        if self.audit is not None:
+            self._unlogged.append((clock.utc_ns(), {"port": self._line.port, **record, **author}))
+        why = f": {record['why']}" if "why" in record else ""
+        by = f" (by {', '.join(author.values())})" if "by" in author else ""
+        text = text or f"{record['drive']}: {record['write']}: {record['outcome']}{why}"
+        log(logging.INFO, "%s%s", text, by)
 
     def catch_up(self) -> None:
-        """Log and count what was queued; a failure is logged as a warning."""
+        """Write and count what was queued; a failure is logged as a warning."""
+        self._write_queued()
+        self._count_queued()
+
+    def catch_up_aside(self) -> None:
+        """Do so on threads of their own, and wait for CALLED_S at most, unless they hang already."""
+        if self._uncounted:
+            _ledger_thread.put(self._count_queued)
+        if self._unlogged:
+            _audit_thread.put(self._write_queued)
+            if not _audit_thread.hangs:
+                _audit_thread.flush(CALLED_S)
+
+    def flush(self, seconds: float) -> None:
+        """Do so, and wait for each of the threads for `seconds` s at most."""
+        self.catch_up_aside()
+        for thread in (_audit_thread, _ledger_thread):
+            if not thread.flush(seconds) and not thread.hangs:  # there is no thread
+                self.catch_up()
+
+    def _write_queued(self) -> None:
         self._writers.append(None)  # before a record is taken: `close` then waits for this thread
         try:
             with suppress(IndexError):  # another thread may be at it
                 while True:
                     self._append(*self._unlogged.popleft())
-            uncounted: list[LedgerCell] = []
-            with suppress(IndexError):
-                while True:
-                    uncounted.append(self._uncounted.popleft())
-            if uncounted:
-                self._note(uncounted)
         finally:
             self._writers.pop()
 
+    def _count_queued(self) -> None:
+        uncounted: list[LedgerCell] = []
+        with suppress(IndexError):
+            while True:
+                uncounted.append(self._uncounted.popleft())
+        if uncounted:
+            self._note(uncounted)
+
     def _append(self, at_ns: int, record: dict[str, Any]) -> None:
-        why = f": {record['why']}" if "why" in record else ""
-        by = (
-            f" (by {', '.join(record[key] for key in ('by', 'way') if key in record)})"
-            if "by" in record
-            else ""
-        )
-        _log.info("%s: %s: %s%s%s", record["drive"], record["write"], record["outcome"], why, by)
         audit = self.audit
         if audit is None:
             return
@@ -115,13 +167,13 @@ class WriteRecords:
             self.audit_trouble = ""
         except (OSError, ValueError) as failure:  # it may be closed meanwhile
             self.audit_trouble = getattr(failure, "strerror", None) or str(failure)
-            _log.warning("the audit log cannot be written: %s", self.audit_trouble)
+            log_aside(_log, logging.WARNING, "the audit log cannot be written: %s", self.audit_trouble)
 
     def _note(self, cells: list[LedgerCell]) -> None:
         try:
             self._ledger.at(cells[0].port).note(cells, clock.utc_ns() / 1e9)
         except (OSError, ValueError) as failure:  # a port's name may be no text
-            _log.warning("stops were not counted: %s", failure)
+            log_aside(_log, logging.WARNING, "stops were not counted: %s", failure)
 
     def _cell(self, drive: Drive, register: Register[Any]) -> LedgerCell:
         return LedgerCell(
@@ -130,7 +182,7 @@ class WriteRecords:
 
     def close(self) -> None:
         """Close the log when what was queued is in it; a disk that hangs holds nobody up for long."""
-        self.catch_up()
+        self.flush(CLOSING_NS / 1e9)
         given_up_ns = clock.now_ns() + CLOSING_NS
         while self._writers and clock.now_ns() < given_up_ns:
             clock.sleep(0.001)

@@ -6,8 +6,8 @@ Of several the stops take turns, so none waits for another's ramp.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Sequence
+from contextlib import suppress
 from decimal import Decimal
 from functools import partial
 from math import inf
@@ -16,7 +16,7 @@ from typing import Any
 
 from multidrop.control.latches import Latches
 from multidrop.control.outcome import Outcome, Stopped
-from multidrop.control.stop_attempt import LEAST_S, NO_ROOM, PAUSE_S, Do, StopAttempt
+from multidrop.control.stop_attempt import LEAST_S, PAUSE_S, Do, StopAttempt
 from multidrop.control.writer import Writer
 from multidrop.drive.family import Drive
 from multidrop.drive.script import Read, Script, Step, Write
@@ -26,9 +26,105 @@ from multidrop.transport.aside_log import log_aside
 from multidrop.transport.exchange import WRITE_TIMEOUT, Exchanges
 
 REGAIN_NS = 500_000_000  # between attempts of stops to open a port that was lost
-BEGINNINGS = 150  # of a stop for which the system has no room
 
 _log = logging.getLogger("multidrop.control")
+
+
+class StopRun:
+    """Stops that were called together: all that is known of them, from their call until each is over.
+
+    Whoever calls `carry_out` calls it again after a want of memory, and `interrupted` after anything else.
+    """
+
+    def __init__(
+        self,
+        stopper: Stopper,
+        verb: str,
+        drives: Sequence[Drive],
+        make: Callable[[Drive], Script[Any]],
+        seconds: float | None,
+        broadcast: Callable[[], bool] = lambda: False,
+    ) -> None:
+        self._stopper = stopper
+        self._verb = verb
+        self._drives = drives
+        self._make = make
+        self._seconds = seconds
+        self._broadcast: Callable[[], bool] | None = broadcast  # None: it was called
+        self._tries = 0
+        self.attempts: list[StopAttempt] = []
+
+    def carry_out(self) -> None:
+        """Carry out what is left of them, until each motor is seen to stand or its time is over."""
+        self._tries += 1
+        if self._tries > 1:
+            clock.sleep(PAUSE_S)
+        self._begin()
+        if (broadcast := self._broadcast) is not None:
+            self._broadcast = None
+            if broadcast():
+                for attempt in self.attempts:
+                    attempt.note_broadcast()
+        stop_together(self.attempts, self._stopper.do, self._end)
+        self._release()
+
+    def _begin(self) -> None:
+        """End what moves the drives, note the call, and make the attempts: each of these once."""
+        stopper = self._stopper
+        stopper.latches.begin(self, self._drives)
+        if not self.attempts and self._drives:
+            begun, limit = _now(), _limit(self._seconds)
+            self.attempts = [
+                StopAttempt(drive, partial(self._make, drive), begun, limit, partial(stopper.ready, drive))
+                for drive in self._drives
+            ]
+            stopper.records.note_stops_called(self._verb, self._drives)
+        stopper.under_way[self] = self.attempts
+
+    def _end(self, attempt: StopAttempt) -> None:
+        attempt.ended = _now()
+        records, drive = self._stopper.records, attempt.drive
+        records.note_stop_ended(self._verb, drive, attempt.result(), attempt.times_sent, attempt.frame)
+
+    def _release(self) -> None:
+        self._stopper.under_way.pop(self, None)
+        self._stopper.latches.over(self)
+
+    def interrupted(self, interruption: BaseException) -> None:
+        """Send each stop that is not over once more, and add to the interruption what is known of it.
+
+        A second interruption ends this.
+        """
+        latest = interruption
+        try:
+            self._begin()
+            for attempt in sorted(self._left(), key=StopAttempt.is_in_doubt):  # the one interrupted is last
+                attempt.once_more(self._stopper.do)
+        except BaseException as another:
+            latest = another
+            raise
+        finally:
+            for attempt in self._left():
+                latest.add_note(attempt.interrupted())
+                self._end(attempt)
+            self._release()
+
+    def _left(self) -> list[StopAttempt]:
+        return [attempt for attempt in self.attempts if not attempt.is_over]
+
+    def found(self) -> dict[str, Stopped]:
+        """Return what is known of each, by drive's name. Raises what a script raised to end the program."""
+        for attempt in self.attempts:
+            if attempt.interruption is not None:
+                raise attempt.interruption
+        return {attempt.drive.name: attempt.result() for attempt in self.attempts}
+
+    def result(self) -> None:
+        """Raise why the motor of one drive's stop is not seen to stand, if it is not."""
+        self.found()
+        for attempt in self.attempts:
+            if attempt.known is not None:
+                raise attempt.known
 
 
 class Stopper:
@@ -39,132 +135,43 @@ class Stopper:
 
     def __init__(self, exchanges: Exchanges, writer: Writer, latches: Latches) -> None:
         self.is_tended = False
+        self.latches = latches
+        self.records = writer.records
+        self.under_way: dict[StopRun, list[StopAttempt]] = {}
         self._regain_ns = 0  # not before then
         self._exchanges = exchanges
         self._writer = writer
-        self._latches = latches
-        self._stops: set[StopAttempt] = set()  # under way
 
     def so_far(self) -> dict[str, str]:
         """Return what is known of each drive's stop under way, by name; of several, the one sent most."""
-        stops = sorted(self._stops.copy(), key=lambda stop: stop.times_sent)
-        return {stop.drive.name: stop.so_far() for stop in stops}
+        attempts = [
+            each for stops in self.under_way.copy().values() for each in stops.copy() if not each.is_over
+        ]
+        return {each.drive.name: each.so_far() for each in sorted(attempts, key=lambda each: each.times_sent)}
 
-    def stop(self, drive: Drive, make: Callable[[], Script[Any]], seconds: float | None) -> None:
-        """Carry out a stop, again and again until the motor stands, for as long as `seconds` s.
-
-        It is sent whatever `seconds` may be. Raises Unconfirmed when it is not seen to stand then, and says
-        what is known.
-        """
-
-        def attempt() -> list[StopAttempt]:
-            return [StopAttempt(drive, make, _now(), _limit(seconds))]
-
-        (stop,) = self._carry_out([drive], attempt, lambda: False, lambda stop: None)
-        _log.info("%s", stop.result(_now()))
-        if stop.known is not None:
-            raise stop.known
+    def stop(
+        self, drive: Drive, verb: str, make: Callable[[], Script[Any]], seconds: float | None
+    ) -> StopRun:
+        """Return a stop of this drive that is repeated for `seconds` s, and sent whatever these may be."""
+        return StopRun(self, verb, [drive], lambda drive: make(), seconds)
 
     def stop_all(
         self, drives: Sequence[Drive], broadcast: Callable[[], bool], seconds: float | None
-    ) -> dict[str, Stopped]:
-        """Carry out the stops of all side by side; by drive's name, what is known of each.
+    ) -> StopRun:
+        """Return the stops of all, side by side.
 
-        `broadcast` is called before, and returns True where it has sent a stop to all of them.
+        `broadcast` is called before, and returns True if it has sent a stop to all of them.
         """
-        found: dict[str, Stopped] = {}
+        return StopRun(self, "stop", drives, lambda drive: drive.stop.script(), seconds, broadcast)
 
-        def attempts() -> list[StopAttempt]:
-            begun, limit = _now(), _limit(seconds)
-            return [
-                StopAttempt(drive, drive.stop.script, begun, limit, partial(self._ready, drive))
-                for drive in drives
-            ]
-
-        def end(stop: StopAttempt) -> None:
-            found[stop.drive.name] = stop.result(_now())
-
-        self._carry_out(drives, attempts, broadcast, end)
-        for stopped in found.values():  # not before: a logger's handler may hang
-            _log.info("%s", stopped)
-        return found
-
-    def _carry_out(
-        self,
-        drives: Sequence[Drive],
-        attempts: Callable[[], list[StopAttempt]],
-        broadcast: Callable[[], bool],
-        end: Callable[[StopAttempt], object],
-    ) -> list[StopAttempt]:
-        """Make the attempts and carry them out; call `end` with each at its end, and return them.
-
-        Where the system has no room for them yet, it may have it soon. What interrupts their making comes
-        too late for nobody: each is sent once.
-        """
-        stops: list[StopAttempt] = []
-        under_way: list[StopAttempt] = []
-        for left in reversed(range(BEGINNINGS)):
-            try:
-                with self._under_way(drives):
-                    under_way = attempts()
-                    stops = [*under_way]
-                    self._carry_out_known(stops, under_way, broadcast, end)
-                break
-            except NO_ROOM:
-                if stops or not left:
-                    raise
-                clock.sleep(PAUSE_S)
-            except (KeyboardInterrupt, SystemExit) as interruption:
-                if under_way or not stops:  # none has begun
-                    with self._under_way(drives):
-                        send_once_more(attempts(), self._do, interruption)
-                raise
-        return stops
-
-    def _carry_out_known(
-        self,
-        stops: Sequence[StopAttempt],
-        under_way: list[StopAttempt],
-        broadcast: Callable[[], bool],
-        end: Callable[[StopAttempt], object],
-    ) -> None:
-        """Carry these out, all of which are `under_way`, and take each from there.
-
-        At an interruption each stop that is not over is sent once more, unless a second one comes.
-        """
-        try:
-            self._stops.update(stops)
-            if broadcast():
-                for stop in stops:
-                    stop.note_broadcast()
-            stop_together(under_way, self._do, partial(self._over, end))
-        except BaseException as interruption:
-            not_over = [*under_way]
-            under_way.clear()
-            send_once_more(not_over, self._do, interruption)
-            raise
-        finally:
-            self._stops.difference_update(stops)
-
-    def _over(self, end: Callable[[StopAttempt], object], stop: StopAttempt) -> None:
-        self._stops.discard(stop)
-        end(stop)
-
-    @contextmanager
-    def _under_way(self, drives: Sequence[Drive]) -> Iterator[None]:
-        try:
-            with self._latches.stopping(drives):
-                yield
-        finally:
-            self._writer.records.catch_up()
-
-    def _do(self, stop: StopAttempt, step: Step) -> Any:
+    def do(self, stop: StopAttempt, step: Step) -> Any:
         """Carry out a step. A stop's first write must not hold up those of others; a later one may wait."""
         self._regain()
         if isinstance(step, Read):  # once: where it is not answered the stop is sent again
             return self._exchanges.value(stop.drive, step.register, 1)
         assert isinstance(step, Write)
-        return self._writer.insist(stop.drive, step, WRITE_TIMEOUT if stop.is_sent else 0.0).value
+        timeout = WRITE_TIMEOUT if stop.is_sent else 0.0
+        return self._writer.insist(stop.drive, step, timeout, stop.note_frame).value
 
     def insist(self, drive: Drive, step: Write) -> Outcome:
         """Write what stops the motor, on a port that is opened again if it was lost."""
@@ -174,7 +181,8 @@ class Stopper:
         except CheckAgain:  # no other stop waits
             return self._writer.insist(drive, step)
 
-    def _ready(self, drive: Drive) -> float:
+    def ready(self, drive: Drive) -> float:
+        """Return the time before which nothing is sent to it."""
         peer = self._exchanges.peers.get(drive)
         return peer.ready_ns / 1e9 if peer else 0.0
 
@@ -212,29 +220,15 @@ def _limit(seconds: float | None) -> float | None:
     return None
 
 
-def stop_together(under_way: list[StopAttempt], do: Do, end: Callable[[StopAttempt], object]) -> None:
-    """Carry the stops out, a step of each in turn.
-
-    Each is taken from the list at its end, and `end` is called with it.
-    """
-    while under_way:
-        stop = min(under_way, key=_due)  # the one that is due for longest
-        under_way[:] = [*(other for other in under_way if other is not stop), stop]  # never without it
+def stop_together(stops: Sequence[StopAttempt], do: Do, end: Callable[[StopAttempt], object]) -> None:
+    """Carry the stops out, a step of each in turn; call `end` with each at its end, at least once."""
+    waiting = [stop for stop in stops if not stop.is_over]
+    while waiting:
+        stop = min(waiting, key=_due)  # the one that is due for longest
         clock.sleep(max(0.0, stop.due - _now()))
+        waiting.remove(stop)
         if stop.advance(do, _now):
-            under_way.remove(stop)
             end(stop)
-
-
-def send_once_more(stops: Sequence[StopAttempt], do: Do, interruption: BaseException) -> None:
-    """Send these again, and note in the interruption, or in another one meanwhile, what is known of them."""
-    latest = interruption
-    try:
-        for stop in stops:
-            stop.once_more(do)
-    except BaseException as another:
-        latest = another
-        raise
-    finally:
-        for stop in stops:
-            latest.add_note(stop.interrupted())
+            stop.is_over = True
+        else:
+            waiting.append(stop)

@@ -8,6 +8,7 @@ from contextlib import suppress
 from typing import Any
 
 from multidrop.control.outcome import Seen, Stopped
+from multidrop.core import Message
 from multidrop.drive.family import Drive
 from multidrop.drive.script import Pulse, Read, Script, Step, Wait, Write
 from multidrop.errors import (
@@ -67,6 +68,10 @@ class StopAttempt:
         self._make = script
         self.times_sent = 0  # those that the drive refused too
         self._unanswered = 0  # steps without a good answer
+        self.is_over = False
+        self.ended = begun  # when it was over
+        self.interruption: BaseException | None = None  # raised by the script, to end the program
+        self.frame: Message | None = None  # the latest that was sent
         self._times_in_doubt = 0  # those that an interruption, or the system, may have kept back
         self._is_confirmed = False
         self._pulses: set[tuple[str, Any]] = set()
@@ -74,8 +79,14 @@ class StopAttempt:
         self._begin()
 
     def _begin(self) -> None:
-        script = self._script = self._make()
+        returned: list[bool] = []
+        script = self._script = _noting_return(self._make, returned)
+        self._has_returned = returned
         self._resume: Callable[[], Step] = lambda: next(script)
+
+    def note_frame(self, drive: Drive, request: Message, *outcome: object) -> None:
+        """Note the newest frame of it, for its record."""
+        self.frame = request
 
     def note_broadcast(self) -> None:
         """Note that the stop was broadcast: it was sent, and nobody confirms it."""
@@ -90,12 +101,14 @@ class StopAttempt:
             self.failure = self.failure or Unconfirmed(self.drive.name, "the stop", reason)
             return True
         try:
-            step = self._resume()
+            step = self._next_step()
             if isinstance(step, Wait):
                 self._wait(step.seconds, now())
             else:
                 begun = now()
-                if not self._carry_out(step, do):
+                is_answered = self._carry_out(step, do)
+                self.due = max(self.due, now())  # behind all that have waited meanwhile
+                if not is_answered:
                     self._share_line(begun, now())
         except StopIteration:
             self.failure = None
@@ -104,6 +117,21 @@ class StopAttempt:
             self.failure = failure
             return not self._goes_on(failure, now())
         return False
+
+    def _next_step(self) -> Step:
+        """Go on with the script. What it raises to end the program is kept until all stops are over."""
+        try:
+            return self._resume()
+        except StopIteration:
+            if self._has_returned:
+                raise
+            reason = "it was broken off"
+        except Exception:
+            raise
+        except BaseException as interruption:
+            self.interruption = interruption
+            reason = f"its script raised {type(interruption).__name__}"
+        raise Unconfirmed(self.drive.name, "the stop", reason)
 
     def _wait(self, seconds: float, now: float) -> None:
         self.due = now + seconds
@@ -135,7 +163,7 @@ class StopAttempt:
             self._note(step, failure)
             self._raise_in_script(failure)
             return not isinstance(failure, UNANSWERED)
-        except (KeyboardInterrupt, SystemExit, *NO_ROOM):
+        except BaseException:
             self._times_in_doubt += isinstance(step, Write)
             raise
         else:
@@ -181,7 +209,7 @@ class StopAttempt:
         is_written = False
         with suppress(Exception):  # its end, too
             for _ in range(MOST_STEPS):
-                step = self._resume()
+                step = self._next_step()
                 if isinstance(step, Wait):
                     return
                 if isinstance(step, Read) and is_written:
@@ -210,9 +238,9 @@ class StopAttempt:
         unknown.__cause__ = failure
         return unknown
 
-    def result(self, now: float) -> Stopped:
+    def result(self) -> Stopped:
         """Return what is known of it at its end."""
-        known, seconds = self.known, now - self._begun
+        known, seconds = self.known, self.ended - self._begun
         if known is None:
             return Stopped(self.drive.name, Seen.STOPPED, seconds)
         if isinstance(known, Unsupported) or not (self.is_sent or self.times_sent):
@@ -231,12 +259,22 @@ class StopAttempt:
             return f"{self.drive.name}: the stop was sent, and is not confirmed yet{why}"
         return f"{self.drive.name}: no stop was sent yet{why}"
 
+    def is_in_doubt(self) -> bool:
+        """Return True if nobody knows of some of its frames whether they were sent."""
+        return self._times_in_doubt > 0
+
     def interrupted(self) -> str:
         """Return what is known of it when its caller no longer waits."""
         least, most = self.times_sent, self.times_sent + self._times_in_doubt
         times = f"{least}" if least == most else f"{least} to {most}"
         sent = f"the stop was sent {times} times" if most else "no stop was sent"
         return f"{self.drive.name}: {sent}; the motor is not seen to stand"
+
+
+def _noting_return(make: Callable[[], Script[Any]], returned: list[bool]) -> Script[None]:
+    """Carry out a script, and note that it returned: a signal or a want of memory may end it too."""
+    yield from make()
+    returned.append(True)
 
 
 def _is_worth_repeating(failure: Exception) -> bool:

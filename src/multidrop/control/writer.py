@@ -72,21 +72,23 @@ class Writer:
                     return Outcome(drive.name, register, asked, Effect.DONE, held=asked)
             call.check(_in_words(register, asked))  # a write that is not sent is not counted
             self.records.count(drive, register, kept)
-        return self._send(drive, register, raw, call)
+        return self._send(drive, register, raw, call, 0.0, self.records.log)
 
-    def insist(self, drive: Drive, step: Write, timeout: float = 0.0) -> Outcome:
+    def insist(
+        self, drive: Drive, step: Write, timeout: float = 0.0, log: Callable[..., None] | None = None
+    ) -> Outcome:
         """Write what stops the motor, or does no harm at any time: only the port can hold it back.
 
         Neither a rule nor the ledger is asked; the records are kept afterwards, by `catch_up`. Only proof of
         another family is Refused. Where answers are known to be late, it waits up to `timeout` seconds for
-        its own.
+        its own. `log` notes it instead of the records.
         """
         register = step.register
         raw = raw_count(drive, register, step.value)
         self.identity_check.check_before_stop(drive)
         kept = wears(drive, register)
         try:
-            return self._send(drive, register, raw, None, timeout)
+            return self._send(drive, register, raw, None, timeout, log or self.records.log_later)
         finally:
             if kept is not Kept.RAM:
                 self.records.count_later(drive, register)
@@ -144,12 +146,17 @@ class Writer:
     # ---- sending, and what came of it ----
 
     def _send(
-        self, drive: Drive, register: Register[Any], raw: float, call: Call | None, timeout: float = 0.0
+        self,
+        drive: Drive,
+        register: Register[Any],
+        raw: float,
+        call: Call | None,
+        timeout: float,
+        log: Callable[..., None],
     ) -> Outcome:
         """Send it once for its call; without one it is a stop, which insists."""
         request, asked = write_request(drive, register, raw), register.decode(raw)
         what = _in_words(register, asked)
-        log = self.records.log if call else self.records.log_later
         is_setpoint = register.name == drive.setpoint_name
         take_back = drive.begin_setpoint() if is_setpoint else lambda: None
         with self._logged(drive, request, what, log):

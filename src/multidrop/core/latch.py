@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -35,20 +33,22 @@ class Latch:
         self._is_shut = True
         self.rise(why)
 
-    @contextmanager
-    def held(self, why: str) -> Iterator[None]:
-        """Rise, and stay so while the context lasts: no permit that is asked for meanwhile is good."""
-        hold = object()
-        try:  # a signal that raises between any two steps leaves no hold behind
-            self._holds.add(hold)
-            self.rise(why)
-            yield
-        finally:
-            self._holds.discard(hold)
+    def hold(self, stop: object, why: str) -> None:
+        """Rise, and stay so until it is let go: no permit that is asked for meanwhile is good."""
+        self._holds.add(stop)
+        self.rise(why)
 
-    def permit(self) -> Permit:
-        """Return a permit that is good until the latch rises; while a stop is under way it never is."""
-        seen = int(self.c[0])
+    def let_go(self, stop: object) -> None:
+        """End this stop's hold, if there is one."""
+        self._holds.discard(stop)
+
+    def permit(self, seen: int | None = None) -> Permit:
+        """Return a permit that is good until the latch rises; while a stop is under way it never is.
+
+        `seen`: what `c[0]` was when the call began that needs it.
+        """
+        if seen is None:
+            seen = int(self.c[0])
         if self._is_shut or self._holds:  # read after `seen`: a rise between the two ends this permit
             seen = (seen - 1) & 0xFFFF_FFFF
         return Permit(self, seen)

@@ -6,7 +6,7 @@ to a bus is carried out there.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 from multidrop.core import Framing
@@ -21,7 +21,7 @@ from multidrop.drive.scale_check import scale_errors
 from multidrop.drive.script import Script, read, until, write
 from multidrop.drive.state import Condition, Direction, State
 from multidrop.drive.text import Text, text_errors
-from multidrop.drive.verbs import MOVING, verb, verb_errors
+from multidrop.drive.verbs import MOVING, StopRun, UnattachedStop, verb, verb_errors
 from multidrop.errors import Advice, NotAttached, NotDone, Refused, Unconfirmed, Unsupported
 
 START_TIME = 5.0  # s, after which a motor that was started must be seen to run
@@ -113,10 +113,12 @@ class Drive(ManualFacts):
         self.ram = frozenset(self._in_ram(name) for name in ram)
         self._known_setpoint = KnownSetpoint()
         self.perform: Callable[[Script[Any]], Any] = self._perform_nowhere
-        self.begin_call: Callable[[str], Any] = lambda verb: None  # its permit, which a stop ends
+        self.stops_called: Sequence[int] = (0,)  # its first item counts them
+        # A call's permit, which a stop ends that is called after `seen` of them.
+        self.begin_call: Callable[[str, int], Any] = lambda verb, seen: None
         self.carry_out_move: Callable[[Script[Any], Any], Any] = self._move_nowhere
-        self.carry_out_stop: Callable[[str, Callable[[], Script[Any]], float | None], Any] = (
-            lambda verb, make, seconds: self.perform(make())
+        self.begin_stop: Callable[[str, Callable[[], Script[Any]], float | None], StopRun] = (
+            lambda verb, make, seconds: UnattachedStop(self, make)
         )
 
     def __repr__(self) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from inspect import signature
 from numbers import Real
-from typing import TYPE_CHECKING, Any, Concatenate, Generic, ParamSpec, TypeVar, cast, overload
+from typing import TYPE_CHECKING, Any, Concatenate, Generic, ParamSpec, Protocol, TypeVar, cast, overload
 
 from multidrop.drive.script import Script
 from multidrop.drive.state import Direction
@@ -36,6 +36,35 @@ _TAKES: Mapping[str, tuple[str, tuple[type, ...], str]] = {
 }
 
 
+TRIES = 150  # of a stop, while the system has no memory or descriptors for it
+
+
+class StopRun(Protocol):
+    """A stop that was called, and goes on where it was left when it is carried out again."""
+
+    def carry_out(self) -> None: ...
+    def interrupted(self, interruption: BaseException) -> None: ...
+    def result(self) -> Any: ...
+
+
+class UnattachedStop:
+    """The stop of a drive that is on no bus."""
+
+    def __init__(self, drive: Drive, make: Callable[[], Script[Any]]) -> None:
+        self._drive = drive
+        self._make = make
+
+    def carry_out(self) -> None:
+        """Do nothing."""
+
+    def interrupted(self, interruption: BaseException) -> None:
+        """Do nothing."""
+
+    def result(self) -> Any:
+        """Raise NotAttached."""
+        return self._drive.perform(self._make())
+
+
 class _BoundVerb(Generic[P, R]):
     """A verb of one drive; a call carries it out.
 
@@ -54,27 +83,7 @@ class _BoundVerb(Generic[P, R]):
     @overload
     def __call__(self, *, seconds: float | None) -> R: ...
     def __call__(self, *args: Any, **kwargs: Any) -> R:
-        if self.name in STOPPING:
-            seconds = kwargs.pop("seconds", None)
-            if args or kwargs:
-                self._check_stop(seconds, args, kwargs)
-            return cast(
-                R, self.drive.carry_out_stop(self.name, lambda: self.script(*args, **kwargs), seconds)
-            )
-        script = self.script(*args, **kwargs)
-        if self.name in MOVING:
-            self.drive.check_confirmed(self.name)
-            return cast(R, self.drive.carry_out_move(script, self.drive.begin_call(self.name)))
-        return cast(R, self.drive.perform(script))
-
-    def _check_stop(self, seconds: float | None, args: tuple[Any, ...], kwargs: dict[str, Any]) -> None:
-        """Raise TypeError for arguments that the stop does not take, once it was carried out without them."""
-        try:
-            signature(self._script).bind(self.drive, *args, **kwargs)
-        except TypeError as mistake:
-            mistake.add_note(f"{self.name} of {self.drive.name} was sent all the same, without them")
-            self.drive.carry_out_stop(self.name, lambda: self._script(self.drive), seconds)
-            raise
+        return cast(R, self.drive.perform(self.script(*args, **kwargs)))
 
     def script(self, *args: P.args, **kwargs: P.kwargs) -> Script[R]:
         """Return the steps, for another verb or a test. Raises TypeError for a wrong argument."""
@@ -84,6 +93,63 @@ class _BoundVerb(Generic[P, R]):
                 if isinstance(given, bool) or not isinstance(given, types):
                     raise TypeError(f"{self.name} of {self.drive.name} takes {right}, not {given!r}")
         return self._script(self.drive, *args, **kwargs)
+
+
+class _BoundMove(_BoundVerb[P, R]):
+    """One that may move the motor: a stop that is called after its first step ends it."""
+
+    def __call__(self, *args: Any, **kwargs: Any) -> R:
+        # First, and no Python function is called for it: a signal's handler that stops the drive comes before
+        # the call of this verb, or ends it.
+        seen = self.drive.stops_called[0]
+        script = self.script(*args, **kwargs)
+        self.drive.check_confirmed(self.name)
+        return cast(R, self.drive.carry_out_move(script, self.drive.begin_call(self.name, seen)))
+
+
+class _BoundStop(_BoundVerb[P, R]):
+    """One that stops the motor, whatever interrupts it from its first step on."""
+
+    def __call__(self, *args: Any, **kwargs: Any) -> R:
+        run: StopRun | None = None
+        tried = 0
+        while True:
+            try:
+                tried += 1
+                run = run or self._called(args, **kwargs)
+                run.carry_out()
+                break
+            except BaseException as failure:
+                if tried < TRIES and isinstance(failure, (MemoryError, OSError)):
+                    continue
+                (run or self._called(args, **kwargs)).interrupted(failure)
+                raise
+        result = run.result()
+        if mistake := self._mistake(args, **kwargs):
+            mistake.add_note(f"{self.name} of {self.drive.name} was sent all the same, without them")
+            raise mistake
+        return cast(R, result)
+
+    def _called(self, args: tuple[Any, ...], seconds: float | None = None, **kwargs: Any) -> StopRun:
+        if self._mistake(args, **kwargs):
+            args, kwargs = (), {}
+        return self.drive.begin_stop(self.name, lambda: self.script(*args, **kwargs), seconds)
+
+    def _mistake(
+        self, args: tuple[Any, ...], seconds: float | None = None, **kwargs: Any
+    ) -> TypeError | None:
+        """Return what is wrong with arguments that the stop does not take."""
+        try:
+            signature(self._script).bind(self.drive, *args, **kwargs)
+        except TypeError as mistake:
+            return mistake
+        return None
+
+
+_BOUND: Mapping[str, type[_BoundVerb[Any, Any]]] = {
+    **dict.fromkeys(MOVING, _BoundMove),
+    **dict.fromkeys(STOPPING, _BoundStop),
+}
 
 
 class Verb(Generic[P, R]):
@@ -99,7 +165,7 @@ class Verb(Generic[P, R]):
     @overload
     def __get__(self, drive: Drive, owner: type) -> _BoundVerb[P, R]: ...
     def __get__(self, drive: Drive | None, owner: type) -> Verb[P, R] | _BoundVerb[P, R]:
-        return self if drive is None else _BoundVerb(self.name, drive, self._script)
+        return self if drive is None else _BOUND.get(self.name, _BoundVerb)(self.name, drive, self._script)
 
 
 verb = Verb

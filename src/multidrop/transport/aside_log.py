@@ -1,61 +1,80 @@
-"""Log from a thread of its own, so that a handler whose disk hangs holds up no stop and no port."""
+"""Threads of their own for what may hang, such as a log handler's disk: no stop and no port waits for it."""
 
 from __future__ import annotations
 
+import _thread
 import logging
 import threading
+from collections.abc import Callable
 from contextlib import suppress
-from queue import Full, Queue
+from functools import partial
+from queue import Empty, SimpleQueue
 
 from multidrop.core.fork import register_at_fork
 
-MOST_WAITING = 10_000  # entries for a handler that hangs; what comes then is dropped
-
-Entry = tuple[logging.Logger, int, str, tuple[object, ...]]
+MOST_WAITING = 10_000  # pieces of work for what hangs; what comes then is dropped
 
 
-class _AsideLog:
-    def __init__(self) -> None:
+class AsideThread:
+    """A thread that does one piece of work after another. A signal handler may call each method."""
+
+    def __init__(self, name: str) -> None:
+        self._name = name
         self.forked()
         register_at_fork(self)
 
     def forked(self) -> None:
-        self._entries: Queue[Entry | threading.Event] = Queue(MOST_WAITING)
-        self._starting = threading.Lock()
-        self.has_begun = False
+        self._work: SimpleQueue[Callable[[], object]] = SimpleQueue()
+        self._begun = threading.Lock()  # held once the thread has begun
+        self._late: SimpleQueue[None] | None = None  # the newest answer that did not come in time
 
-    def put(self, entry: Entry | threading.Event) -> None:
-        with suppress(Full):
-            self._entries.put_nowait(entry)
-        with self._starting:
-            if not self.has_begun:
-                with suppress(RuntimeError, MemoryError):  # there is none now, or at the interpreter's end
-                    threading.Thread(target=self._run, name="multidrop log", daemon=True).start()
-                    self.has_begun = True
+    def put(self, work: Callable[[], object]) -> None:
+        """Do this soon, in the order of the calls; return at once."""
+        if self._work.qsize() < MOST_WAITING:
+            self._work.put(work)
+        if self._begun.acquire(blocking=False):
+            try:
+                _thread.start_new_thread(self._run, ())  # threading would wait until it runs
+            except BaseException as failure:  # there is none now, or at the interpreter's end
+                self._begun.release()
+                if not isinstance(failure, (RuntimeError, MemoryError)):
+                    raise
+
+    def flush(self, seconds: float) -> bool:
+        """Wait until all that was put is done, for `seconds` s at most; return whether it is."""
+        if not self._begun.locked():
+            return self._work.empty()
+        done: SimpleQueue[None] = SimpleQueue()
+        self.put(partial(done.put, None))
+        try:
+            done.get(timeout=seconds)
+        except Empty:
+            self._late = done
+            return False
+        return True
+
+    @property
+    def hangs(self) -> bool:
+        """True if the newest `flush` was in vain, and still is."""
+        return self._late is not None and self._late.empty()
 
     def _run(self) -> None:
+        with suppress(Exception):
+            threading.current_thread().name = self._name
         while True:
-            entry = self._entries.get()
-            if isinstance(entry, threading.Event):
-                entry.set()
-                continue
-            logger, level, text, details = entry
             with suppress(Exception):  # a handler's own failure
-                logger.log(level, text, *details)
+                self._work.get()()
 
 
-_aside = _AsideLog()
+_log_thread = AsideThread("multidrop log")
 
 
 def log_aside(logger: logging.Logger, level: int, text: str, *details: object) -> None:
     """Log this soon, in the order of the calls; return at once."""
     if logger.isEnabledFor(level):
-        _aside.put((logger, level, text, details))
+        _log_thread.put(partial(logger.log, level, text, *details))
 
 
 def flush(seconds: float) -> None:
     """Wait until all is logged, for `seconds` s at most."""
-    if _aside.has_begun:
-        done = threading.Event()
-        _aside.put(done)
-        done.wait(seconds)
+    _log_thread.flush(seconds)
