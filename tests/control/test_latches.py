@@ -14,7 +14,7 @@ from multidrop.errors import Overtaken
 
 
 def test_a_thread_that_was_interrupted_in_a_stop_never_waits_for_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Else a `with` block that a signal's exception leaves would wait for ever; other threads' are waited for."""
+    """Else leaving a `with` block by a signal's exception would take for ever."""
     line, drive, _ = one(monkeypatch, InvtCHE(1))
     latches, stop = line.bus._latches, object()
     latches.begin(stop, [drive])
