@@ -1,6 +1,6 @@
 """Run a pump for some seconds, and stop it however the program ends: `python examples/pump.py [SECONDS]`.
 
-Try Ctrl-C: the pump is stopped first.
+Try Ctrl-C: standard error says that the pump is being stopped, and the loop ends once it stands.
 """
 
 from __future__ import annotations
@@ -31,6 +31,8 @@ def main(seconds: float) -> None:
             run(line.wires[0].path, seconds)
         except BusError as failure:
             print("failed:", failure)
+        except KeyboardInterrupt:  # after the stop
+            print("interrupted")
         print("the output frequency is now", motor["output_frequency"], "Hz")
 
 

@@ -10,6 +10,7 @@ from multidrop.control.attached import Attached, made
 from multidrop.control.audit_log import AuditLog
 from multidrop.control.broadcast import Broadcaster
 from multidrop.control.eeprom_ledger import Ledger
+from multidrop.control.exit_hook import without_internals
 from multidrop.control.latches import Latches
 from multidrop.control.leaving import Leaving
 from multidrop.control.outcome import Outcome, Stopped
@@ -131,7 +132,7 @@ class Bus:
         self._performer = Performer(self._exchanges, self._writer, self._stopper, self._latches, expiry)
         self._broadcaster = Broadcaster(self._writer, self._performer, self._latches)
         self._meter = LineMeter(self._exchanges)
-        self._leaving = Leaving(self._latches, self._stopper, self.stop_all)
+        self._leaving = Leaving(self._latches, self._stopper, self.stop_all, lambda: self.drives)
         self._is_closed = False
         self._attached = Attached(self, self._exchanges, self._latches, self._performer, self._stopper)
         register_at_fork(self)
@@ -163,7 +164,9 @@ class Bus:
     def __enter__(self) -> Bus:
         return self
 
-    def __exit__(self, *error: object) -> None:
+    def __exit__(self, kind: object, error: BaseException | None, *trace: object) -> None:
+        if isinstance(error, KeyboardInterrupt):
+            without_internals(error)
         self.close()
 
     def leave(self) -> None:
@@ -396,8 +399,9 @@ class Bus:
 
         Also on SIGINT and SIGTERM, at once, together with the drives of all other buses that asked for it;
         and on SIGHUP, of a terminal that is closed, unless the program handles or ignores that one.
-        The signal is held until that is done, and then does what it did before; three within a second cut
-        it short, with a message on standard error. From the signal on nothing that moves a motor is sent.
+        Standard error then says which drives are being stopped. The signal is held until that is done, and
+        then does what it did before: Ctrl-C raises KeyboardInterrupt. Three within a second cut it short.
+        From the signal on nothing that moves a motor is sent: a verb that would waits for its effect.
         Python handles it in the main thread: where that waits for a reply, when it has come or timed out.
         Without this call leaving sends nothing: the motors go on as they are. Call it from the main thread.
         """

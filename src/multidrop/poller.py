@@ -12,7 +12,7 @@ from typing import Any
 
 from multidrop.bus import Bus
 from multidrop.control.eeprom_ledger import Ledger
-from multidrop.control.exit_hook import exit_hook
+from multidrop.control.exit_hook import exit_hook, without_internals
 from multidrop.core import Mastership, RowQueue
 from multidrop.core.fork import register_at_fork
 from multidrop.drive.family import Drive
@@ -86,9 +86,11 @@ class Poller(RowSource):
             self._thread.start()
         return self
 
-    def __exit__(self, *error: object) -> None:
+    def __exit__(self, kind: object, error: BaseException | None, *trace: object) -> None:
         self._end()
-        if error[0] is not None:  # it goes on; a failure of the caller's function was logged
+        if isinstance(error, KeyboardInterrupt):
+            without_internals(error)
+        if error is not None:  # it goes on; a failure of the caller's function was logged
             self._caller = None
         self.close()
 

@@ -116,7 +116,7 @@ def test_the_third_signal_within_a_second_cuts_it_short_and_says_so(
         signal.raise_signal(signal.SIGINT)
         now += 0.1
         assert len(caught) == count
-    assert capfd.readouterr().err.encode() == CUT_SHORT
+    assert capfd.readouterr().err == f"multidrop: {CUT_SHORT}\n"
     hook.finish(made)  # nobody waits for it
     act.go_on.set()
     until(lambda: not threading_names() & {"multidrop exit"})
@@ -303,6 +303,23 @@ def test_a_signal_that_is_held_is_sent_on_once(caught: list[int], monkeypatch: p
     signal.raise_signal(sent[-1])
 
 
+def test_a_signal_says_at_once_which_drives_are_being_stopped(
+    caught: list[int], capfd: pytest.CaptureFixture[str]
+) -> None:
+    hook, acts = ExitHook(), [Act(), Act()]
+    names = [["pump"], [f"fan-{number}" for number in range(25)]]
+    for act, drives in zip(acts, names, strict=True):
+        hook.add(act.begin, act.work, lambda drives=drives: drives)
+    signal.raise_signal(signal.SIGINT)
+    signal.raise_signal(signal.SIGINT)
+    (told,) = capfd.readouterr().err.splitlines()
+    assert told.startswith("multidrop: SIGINT received: stopping pump, fan-0, fan-1, ")
+    assert told.endswith("fan-18 and 6 more; Ctrl-C three times within a second gives up")
+    for act in acts:
+        act.go_on.set()
+    until(lambda: caught)
+
+
 # ---- in processes ----
 
 CLIENT = """
@@ -318,8 +335,13 @@ with ExitStack() as stack:
             pump.start()
         bus.stop_on_exit()
     print("running", flush=True)
-    if sys.argv[1] == "wait":
+    while sys.argv[1] == "wait":
         time.sleep(600)
+    while sys.argv[1] == "steer":
+        for hz in (15, 20):
+            pump.set_frequency(hz)
+    while sys.argv[1] == "read":
+        bus.read(pump, pump.output_current)
 """
 
 
@@ -371,7 +393,24 @@ def test_a_third_signal_ends_the_process_though_a_drive_is_silent() -> None:
                 pass
         _, told = process.communicate(timeout=PATIENCE)
         assert process.returncode == -signal.SIGINT
-        assert CUT_SHORT.decode() in told
+        assert CUT_SHORT in told
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("how", ["wait", "steer", "read"])
+def test_ctrl_c_is_raised_in_the_user_s_code_once_the_motors_stand(how: str) -> None:
+    """Whatever the program does meanwhile, its traceback has none of our lines."""
+    with lines(1) as (received, ports), client(how, ports) as process:
+        process.send_signal(signal.SIGINT)
+        _, told = process.communicate(timeout=PATIENCE)
+        assert process.returncode == -signal.SIGINT
+        assert not any(each.sim.motor.energised for each in received[0])
+    first, *_, last = told.splitlines()
+    assert first.startswith("multidrop: SIGINT received: stopping invt-che@1, invt-che@2, ")
+    assert last == "KeyboardInterrupt"
+    files = [text for text in told.splitlines() if text.startswith("  File ")]
+    assert files
+    assert {text.partition(",")[0] for text in files} == {'  File "<string>"'}
 
 
 @pytest.mark.long

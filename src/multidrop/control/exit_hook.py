@@ -6,9 +6,11 @@ side: a handler that waited for them could wait for a lock of the very thread th
 
 from __future__ import annotations
 
+import _thread
 import atexit
 import logging
 import os
+import select
 import signal
 import sys
 import threading
@@ -24,7 +26,10 @@ from multidrop.core.fork import register_at_fork
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 IMPATIENT = 3  # signals within a second, after which nothing is waited for
 HANDLING_S = 0.05  # the longest that a signal waits to be handled
-CUT_SHORT = b"multidrop: the stops were cut short by a third signal: motors may still be turning\n"
+PACKAGE = __name__.partition(".")[0]
+MOST_NAMES = 20  # of drives in a message
+CUT_SHORT = "the stops were cut short by a third signal: motors may still be turning"
+STOPPING = "{} received: stopping {}; Ctrl-C three times within a second gives up"
 
 
 def _ending() -> tuple[signal.Signals, ...]:
@@ -45,12 +50,32 @@ def _send(number: int, ident: int) -> None:
         signal.pthread_kill(ident, number)
 
 
+def _tell(sentence: str) -> None:
+    """Write it on standard error at once, unless nobody is there, or a halted terminal would hold it up."""
+    with suppress(OSError, ValueError):
+        if sys.platform == "win32" or select.select([], [2], [], 0)[1]:
+            os.write(2, f"multidrop: {sentence}\n".encode(errors="backslashreplace"))
+
+
+def _listed(names: list[str]) -> str:
+    left = len(names) - MOST_NAMES
+    return ", ".join(names[:MOST_NAMES]) + (f" and {left} more" if left > 0 else "")
+
+
 class LastAct:
-    """Work that is done once, by a thread that waits for its turn from now on."""
+    """Work that is done once, by a thread that waits for its turn from now on.
+
+    `drives` returns the names of the drives that it stops.
+    """
 
     def __init__(
-        self, begin: Callable[[], object], work: Callable[[], object], over: Callable[[], None]
+        self,
+        begin: Callable[[], object],
+        work: Callable[[], object],
+        over: Callable[[], None],
+        drives: Callable[[], list[str]],
     ) -> None:
+        self.drives = drives
         self._on_begin = begin
         self._work = work
         self._on_over = over
@@ -93,7 +118,8 @@ class LastAct:
 class ExitHook:
     """Begins all last acts at exit, or on one of these signals, and holds the signal until they are over.
 
-    Then the signal has the effect that it had before; at once where IMPATIENT of them come within a second.
+    Standard error says at once which drives are being stopped, and how to give up. Then the signal has the
+    effect that it had before; at once if IMPATIENT of them come within a second.
     """
 
     def __init__(self) -> None:
@@ -114,13 +140,18 @@ class ExitHook:
             act.forget()
         self._acts = []
 
-    def add(self, begin: Callable[[], object], work: Callable[[], object]) -> LastAct:
+    def add(
+        self,
+        begin: Callable[[], object],
+        work: Callable[[], object],
+        drives: Callable[[], list[str]] = list,
+    ) -> LastAct:
         """Do `work` before the process ends, and call `begin` as its end begins, also in a signal handler.
 
         Raises ValueError outside the main thread, unless the signals are taken already.
         """
         self.take_signals()
-        act = LastAct(begin, work, self._one_is_over)
+        act = LastAct(begin, work, self._one_is_over, drives)
         self._acts.append(act)
         try:
             self.take_signals()  # the end of another one may have let them go
@@ -163,16 +194,19 @@ class ExitHook:
         now = time.monotonic()
         if number in _SIGNALS:  # a terminal that goes may send several, and nobody is impatient
             self._came = [*(at for at in self._came if now - at < 1.0), now]
-        if self._held is None:
+        is_first = self._held is None
+        if is_first:
             self._held, self._has_passed = number, False
         acts = [*self._acts]
         for act in acts:
             act.begin()
+        names = [name for act in acts if not act.is_over for name in act.drives()]
+        if is_first and names:
+            _tell(STOPPING.format(signal.Signals(number).name, _listed(names)))
         if all(act.is_over for act in acts):
             self._pass_on(number)
         elif len(self._came) >= IMPATIENT:
-            with suppress(OSError):  # nobody may be there to read it
-                os.write(2, CUT_SHORT)
+            _tell(CUT_SHORT)
             for act in acts:
                 act.is_cut_short = True
             self._pass_on(number)
@@ -188,9 +222,23 @@ class ExitHook:
             self._has_passed = True
         _send(held, ident)
 
+    def await_effect(self) -> None:
+        """In the main thread, wait until a signal that is held has its effect, such as KeyboardInterrupt."""
+        if self._held is None or threading.current_thread() is not threading.main_thread():
+            return
+        while self._held is not None:
+            time.sleep(HANDLING_S)
+        time.sleep(HANDLING_S)  # another thread sends it
+
     def _pass_on(self, number: int) -> None:
         self._let_go()
         self._held, self._came = None, []
+        ident = threading.main_thread().ident
+        if signal.getsignal(number) is signal.default_int_handler and ident is not None:
+            with suppress(RuntimeError, MemoryError):
+                # It raises KeyboardInterrupt where the main thread is then: not in here.
+                _thread.start_new_thread(_send, (number, ident))
+                return
         signal.raise_signal(number)
 
     def _let_go(self) -> None:
@@ -198,6 +246,21 @@ class ExitHook:
         for number, handler in self._before.items():
             if signal.getsignal(number) == self._on_signal:
                 signal.signal(number, signal.SIG_DFL if handler is None else handler)
+
+
+def without_internals(interruption: BaseException) -> None:
+    """Cut the traceback of an interruption before its first frame of this package."""
+    entry = interruption.__traceback__
+    while entry is not None and (behind := entry.tb_next) is not None:
+        if str(behind.tb_frame.f_globals.get("__name__")).partition(".")[0] == PACKAGE:
+            entry.tb_next = None
+        entry = entry.tb_next
+
+
+def await_signal() -> None:
+    """In the main thread, wait until a signal that began the stops has its effect; without one, return."""
+    if _hook is not None:
+        _hook.await_effect()
 
 
 _hook: ExitHook | None = None

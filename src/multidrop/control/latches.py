@@ -23,7 +23,7 @@ class Latches:
     def __init__(self, exchanges: Exchanges) -> None:
         self._exchanges = exchanges
         self._latches: dict[Drive, Latch] = {}
-        self._is_shut = False
+        self.is_shut = False
         self._forget_stops()
 
     def _forget_stops(self) -> None:
@@ -37,7 +37,7 @@ class Latches:
 
     def add(self, drive: Drive) -> Latch:
         latch = self._latches[drive] = Latch()
-        if self._is_shut:  # looked at afterwards: a thread that shuts them later sees this latch
+        if self.is_shut:  # looked at afterwards: a thread that shuts them later sees this latch
             latch.shut(LEFT)
         return latch
 
@@ -54,7 +54,7 @@ class Latches:
 
     def shut(self) -> None:
         """Send nothing any more that moves a motor. Takes no lock: a signal handler may call it."""
-        self._is_shut = True
+        self.is_shut = True
         for latch in list(self._latches.values()):
             latch.shut(LEFT)
 

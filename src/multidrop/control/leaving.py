@@ -19,8 +19,13 @@ class Leaving:
     """Ends all that moves the motors of a bus, and stops them where that was asked for."""
 
     def __init__(
-        self, latches: Latches, stopper: Stopper, stop_all: Callable[[], Mapping[str, Stopped]]
+        self,
+        latches: Latches,
+        stopper: Stopper,
+        stop_all: Callable[[], Mapping[str, Stopped]],
+        drives: Callable[[], Sequence[Drive]],
     ) -> None:
+        self._drives = drives
         self._latches = latches
         self._stopper = stopper
         self._stop_all = stop_all
@@ -34,7 +39,11 @@ class Leaving:
     def stop_on_exit(self) -> None:
         """Stop all drives at the end. Raises ValueError outside the main thread, the first time."""
         if self._last_act is None:
-            self._last_act = exit_hook().add(self._latches.shut, lambda: _warn_of(self._stop_all()))
+            self._last_act = exit_hook().add(
+                self._latches.shut,
+                lambda: _warn_of(self._stop_all()),
+                lambda: [drive.name for drive in self._drives()],
+            )
 
     def begin(self) -> None:
         """End all that moves a motor, and begin to stop the drives if that was asked for."""

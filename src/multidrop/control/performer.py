@@ -7,6 +7,7 @@ from typing import Any
 
 from multidrop.control import time_limit
 from multidrop.control.call import Call
+from multidrop.control.exit_hook import await_signal
 from multidrop.control.latches import Latches
 from multidrop.control.outcome import Outcome
 from multidrop.control.rules import check_plain, is_harmless, raw_count
@@ -58,6 +59,8 @@ class Performer:
         `seen`: how many stops of the drive had been called when the call began, if that was earlier.
         """
         permit = self._latches.latch(drive).permit(seen)
+        if self._latches.is_shut:
+            await_signal()
         return Call(drive, permit, self._expiry, verb, time_limit.present_limit_ns())
 
     def move(self, script: Script[Any], call: Call) -> Any:
