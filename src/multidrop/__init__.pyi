@@ -2,6 +2,7 @@
 
 from multidrop.bus import Bus as Bus
 from multidrop.control.audit_log import read_audit as read_audit
+from multidrop.control.author import noted_first as noted_first
 from multidrop.control.author import written_by as written_by
 from multidrop.control.eeprom_ledger import Ledger as Ledger
 from multidrop.control.outcome import Effect as Effect

@@ -14,16 +14,19 @@ from typing import Any
 
 import pytest
 from disks import full_at, read_only_directory
-from simulated_bus import one
+from simulated_bus import SimulatedBus, one
 
 from multidrop.cli import main
 from multidrop.control import records as write_records
 from multidrop.control.audit_log import AuditLog, read_audit
+from multidrop.control.author import noted_first, written_by
 from multidrop.control.eeprom_ledger import Ledger, LedgerCell
 from multidrop.control.outcome import Effect
 from multidrop.core import Message
 from multidrop.drives import DelixiModbus, ErmanERG220, InvtCHE
-from multidrop.errors import Refused
+from multidrop.errors import Refused, Unconfirmed
+from multidrop.sim import simulated
+from multidrop.transport.aside_log import flush
 
 CELL = LedgerCell("/dev/ttyUSB0", 1, "delixi-modbus", "frequency")
 HOUR = 3600.0
@@ -120,6 +123,8 @@ def test_a_full_disk_hinders_no_stop_and_what_comes_after_is_noted(
     drive.start()
     with full_at(path.stat().st_size + 50):
         drive.stop()
+        line.bus._records.flush(PATIENCE_S)
+    flush(PATIENCE_S)
     assert not sim.motor.energised
     assert "the audit log cannot be written: " in caplog.text
     assert line.bus.audit_trouble == "File too large"  # what `full_at` has a full disk say
@@ -131,6 +136,76 @@ def test_a_full_disk_hinders_no_stop_and_what_comes_after_is_noted(
         "control = FORWARD",
         "setpoint = 60.00 %",
     ]
+
+
+def test_what_must_be_noted_first_is_not_sent_on_a_full_disk_and_a_stop_is(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    path = tmp_path / "audit.jsonl"
+    line = SimulatedBus(monkeypatch, simulated(InvtCHE(1, maximum_frequency=50)), audit=path)
+    drive = line.attach(InvtCHE(1, maximum_frequency=50))
+    with noted_first():
+        drive.set_frequency(20)
+        drive.start()
+        before = len(line.written)
+        with full_at(path.stat().st_size):
+            for write in (
+                lambda: drive.set_frequency(25),
+                drive.start,
+                lambda: line.bus.raw(drive, 6, 0x1000, b"\0\1"),
+            ):
+                with pytest.raises(OSError, match=r"was not sent: the audit log cannot be written: \S"):
+                    write()
+            assert len(line.written) == before
+            drive.stop()
+            line.bus.write(drive, drive.control, drive.control.decode(5))
+        drive.set_frequency(25)
+    line.bus.close()
+    noted = [(record["write"], record["outcome"], "sent" in record) for record in read_audit(path)]
+    assert noted[:2] == [("setpoint = 40.00 %", "called", False), ("setpoint = 40.00 %", "done", True)]
+    assert noted[-2:] == [("setpoint = 50.00 %", "called", False), ("setpoint = 50.00 %", "done", True)]
+
+
+def test_a_stop_is_two_lines_however_often_it_is_sent(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """One when it is called, before its first frame: a process that is killed meanwhile leaves that."""
+    path = tmp_path / "audit.jsonl"
+    line = SimulatedBus(monkeypatch, *(simulated(InvtCHE(address)) for address in (1, 2)), audit=path)
+    drives = [line.attach(InvtCHE(address)) for address in (1, 2)]
+    monkeypatch.setattr(write_records, "CALLED_S", PATIENCE_S)
+    noted_at_first: list[dict[str, Any]] = []
+
+    def look(request: Message) -> bytes | None:
+        if not noted_at_first:
+            noted_at_first.extend(read_audit(path))
+        return None
+
+    line.answers = look
+    line.loses = lambda request: request.address == 1
+    with written_by("anna", "web"), pytest.raises(Unconfirmed):
+        drives[0].stop(seconds=15)
+    sent = len(line.written)
+    (called,) = noted_at_first
+    assert {key: called[key] for key in ("drive", "address", "write", "outcome", "by", "way")} == {
+        "drive": "invt-che@1",
+        "address": 1,
+        "write": "stop",
+        "outcome": "called",
+        "by": "anna",
+        "way": "web",
+    }
+    line.bus.stop_all(seconds=15)
+    line.bus.close()
+    first, ended, all_called, *each = read_audit(path)
+    assert first == called
+    assert (ended["outcome"], ended["sent"]) == ("sent but unknown", line.written[sent - 1])
+    assert ended["times"] == sent > 30
+    assert (all_called["drive"], all_called["outcome"]) == ("invt-che@1, invt-che@2", "called")
+    assert {one["drive"]: one["outcome"] for one in each} == {
+        "invt-che@1": "sent but unknown",
+        "invt-che@2": "stopped",
+    }
 
 
 def test_an_audit_log_in_a_read_only_directory_is_refused_before_anything_is_sent(

@@ -28,6 +28,7 @@ class _Named(NamedTuple):
 
 _named: ContextVar[_Named] = ContextVar("multidrop author")
 _NOBODY = _Named(Author(), None)
+_noted_first: ContextVar[bool] = ContextVar("multidrop noted first", default=False)
 
 
 def present_author() -> Author:
@@ -59,6 +60,25 @@ def written_by(who: str, way: str = "") -> Iterator[None]:
         yield
     finally:
         _named.reset(token)
+
+
+@contextmanager
+def noted_first() -> Iterator[None]:
+    """Send no write within the block before the bus's audit log has a line of it; a stop is always sent.
+
+    The `outcome` of that line is "called"; another one says what came of it. A write whose line cannot be
+    written raises OSError, and nothing is sent. It holds for this thread or task, as `written_by` does.
+    """
+    token = _noted_first.set(True)
+    try:
+        yield
+    finally:
+        _noted_first.reset(token)
+
+
+def is_noted_first() -> bool:
+    """Return True within `noted_first`."""
+    return _noted_first.get()
 
 
 def _mistake(name: str, text: object) -> Exception | None:

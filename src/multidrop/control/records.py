@@ -14,7 +14,7 @@ from functools import partial
 from typing import Any
 
 from multidrop.control.audit_log import AuditLog
-from multidrop.control.author import present_author
+from multidrop.control.author import Author, is_noted_first, present_author
 from multidrop.control.eeprom_ledger import LEAST_INTERVAL, Ledger, LedgerCell
 from multidrop.control.outcome import Effect, Stopped
 from multidrop.control.rules import refused
@@ -80,6 +80,19 @@ class WriteRecords:
         """Queue the note until `catch_up` or `catch_up_aside`, and log it aside."""
         self._put(self._record(drive, request, what, effect.value, why, held), partial(log_aside, _log))
 
+    def note_called(self, drive: Drive, request: Message, what: str) -> None:
+        """Write that this is about to be sent, if the present context says so (see `noted_first`).
+
+        Raises OSError if the audit log cannot be written.
+        """
+        if self.audit is None or not is_noted_first():
+            return
+        record = self._record(drive, request, what, CALLED, "", None)
+        del record["sent"]
+        self._append(clock.utc_ns(), self._complete(record))
+        if self.audit_trouble:
+            raise OSError(f"{what} was not sent: the audit log cannot be written: {self.audit_trouble}")
+
     def note_stops_called(self, verb: str, drives: Sequence[Drive]) -> None:
         """Note that these drives are about to be stopped. A disk that hangs delays them by CALLED_S, once."""
         of_one = {"model": drives[0].model, "address": drives[0].address} if len(drives) == 1 else {}
@@ -112,13 +125,19 @@ class WriteRecords:
 
     def _put(self, record: dict[str, Any], log: Callable[..., None], text: str = "") -> None:
         """Queue a record for the audit log, and log it, or this text for it."""
-        author = {key: text for key, text in present_author()._asdict().items() if text}
+        record = self._complete(record)
         if self.audit is not None:
-            self._unlogged.append((clock.utc_ns(), {"port": self._line.port, **record, **author}))
+            self._unlogged.append((clock.utc_ns(), record))
         why = f": {record['why']}" if "why" in record else ""
-        by = f" (by {', '.join(author.values())})" if "by" in author else ""
+        author = [record[key] for key in Author._fields if key in record]
+        by = f" (by {', '.join(author)})" if "by" in record else ""
         text = text or f"{record['drive']}: {record['write']}: {record['outcome']}{why}"
         log(logging.INFO, "%s%s", text, by)
+
+    def _complete(self, record: dict[str, Any]) -> dict[str, Any]:
+        """Add the port and the author."""
+        author = {key: text for key, text in present_author()._asdict().items() if text}
+        return {"port": self._line.port, **record, **author}
 
     def catch_up(self) -> None:
         """Write and count what was queued; a failure is logged as a warning."""

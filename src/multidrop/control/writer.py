@@ -71,6 +71,8 @@ class Writer:
                         drive.commanded = asked
                     return Outcome(drive.name, register, asked, Effect.DONE, held=asked)
             call.check(_in_words(register, asked))  # a write that is not sent is not counted
+        self.records.note_called(drive, write_request(drive, register, raw), _in_words(register, asked))
+        if kept is not Kept.RAM:
             self.records.count(drive, register, kept)
         return self._send(drive, register, raw, call, 0.0, self.records.log)
 
@@ -111,6 +113,7 @@ class Writer:
         frame = build_request(drive.framing, request)
         what = f"raw request {frame.hex(' ').upper()}"
         log = self.records.log
+        self.records.note_called(drive, request, what)
         with self._logged(drive, request, what, log):
             completion = self._carry_out(drive, request, what, call)
         try:
@@ -134,6 +137,8 @@ class Writer:
         """Write to all drives at once, by the table of one of them; without a call it is a stop."""
         request = write_request(drive, register, raw, address=0)
         what = _in_words(register, register.decode(raw))
+        if call:
+            self.records.note_called(drive, request, what)
         expires_ns, permit = (call.expires_ns, call.permit) if call else (0, None)
         with self._logged(drive, request, what, self.records.log_later):
             completion = self._exchanges.carry_out(

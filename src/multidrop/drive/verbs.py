@@ -139,6 +139,8 @@ class _BoundStop(_BoundVerb[P, R]):
         self, args: tuple[Any, ...], seconds: float | None = None, **kwargs: Any
     ) -> TypeError | None:
         """Return what is wrong with arguments that the stop does not take."""
+        if not args and not kwargs:
+            return None
         try:
             signature(self._script).bind(self.drive, *args, **kwargs)
         except TypeError as mistake:

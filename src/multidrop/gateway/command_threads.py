@@ -8,7 +8,7 @@ from contextlib import suppress
 from functools import partial
 from typing import TypeVar
 
-from multidrop import written_by
+from multidrop import noted_first, written_by
 from multidrop.gateway.rights import Caller
 from multidrop.gateway.supervisor import supervisor
 
@@ -45,7 +45,7 @@ def begin_stop(work: Callable[[float | None], R], caller: Caller) -> asyncio.Fut
 
 def in_thread(work: Callable[[], R], caller: Caller) -> asyncio.Future[R]:
     """Do work in a thread of its own, in this caller's name; it goes on though its waiter is cancelled."""
-    with written_by(*_author(caller)):  # the thread has the context of its start
+    with written_by(*_author(caller)), noted_first():  # the thread has the context of its start
         return supervisor().thread("command", COMMAND_S, work)
 
 
