@@ -23,7 +23,7 @@ from multidrop.control.outcome import Effect, Seen
 from multidrop.control.ramp import ramp, start_staggered
 from multidrop.control.stop_attempt import AT_ONCE, LEAST_S, PAUSE_S
 from multidrop.core import Completion, Exchange, Framing, Message, build_reply
-from multidrop.drive import Condition, Direction, Drive, Script, State, read, wait, write
+from multidrop.drive import Condition, Direction, Drive, Script, State, insist, read, wait, write
 from multidrop.drive.declare import reading, setting
 from multidrop.drive.table import Kept
 from multidrop.drive.verbs import verb
@@ -1149,6 +1149,39 @@ class Careful(Own):
         yield from write(self.run, 7 if ratio else 0)
         yield from wait(2)
         yield from write(self.run, 9)
+
+
+class Restless(Own):
+    """One whose stop reads without a wait, and never sees it stand."""
+
+    model = "restless"
+    title = "OWN 4"
+
+    @verb
+    def stop(self) -> Script[None]:
+        """Stop the motor."""
+        yield from insist(self.run, 0)
+        while (yield from read(self.ratio)) >= 0:
+            pass
+
+
+def test_a_stop_that_reads_without_a_wait_keeps_no_other_one_from_being_repeated(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    sims: list[Any] = [simulated(Restless(1)), simulated(InvtCHE(2, maximum_frequency=50))]
+    line = SimulatedBus(monkeypatch, *sims)
+    restless, other = (line.attach(sim.drive) for sim in sims)
+    other.set_frequency(20)
+    other.start()
+    line.bus.check_identity(restless)
+    begun, heard = len(line.frames), line.seconds + 1.0
+    line.deafens = lambda request: request.address == 2 and line.seconds < heard
+    found = line.bus.stop_all(seconds=12)
+    assert {name: stopped.seen for name, stopped in found.items()} == {
+        restless.name: Seen.SENT,
+        other.name: Seen.STOPPED,
+    }
+    assert [request.address for request in writes(line, begun)][:4] == [1, 2, 2, 2]
 
 
 def test_an_interrupted_stop_that_looks_first_is_sent_and_what_it_waits_for_is_not(

@@ -1,6 +1,7 @@
 """Audit log: every write that was sent, as one line of JSON in a file that only grows.
 
-A write is noted when its outcome is known: one that a killed process had under way is not there.
+A write is noted when its outcome is known: one that a killed process had under way is there only if it had to
+be noted first (`noted_first`). A stop is noted when it is called, and each drive's when it ends.
 A line that a crash or a full disk truncated harms no other: the next record begins a new line.
 """
 
@@ -43,8 +44,9 @@ class AuditLog:
 def read_audit(path: Path | str) -> Iterator[dict[str, Any]]:
     """Yield the records of a log in order, without those that a crash truncated.
 
-    Each has `time` (UTC), `port`, `drive`, `model`, `address`, `write`, `sent` (the frame) and `outcome`, and
-    where they are known `held` (what the drive holds since), `why`, `by` and `way` (see `written_by`). Raises
+    Each has `time` (UTC), `port`, `drive`, `write` and `outcome`, and if they are known `model`, `address`,
+    `sent` (the newest frame), `times` (how many frames a stop took), `held` (what the drive holds since),
+    `why`, `by` and `way` (see `written_by`). The `outcome` of what was about to be sent is "called". Raises
     OSError.
     """
     with Path(path).open("rb") as lines:
