@@ -278,5 +278,5 @@ def test_a_stop_that_never_left_is_no_sent_write_in_the_audit_log(tmp_path: Path
     after = [*read_audit(audit)]
     assert after[: len(before)] == before != []
     called, ended = after[len(before) :]
-    assert (called["outcome"], ended["outcome"], ended["times"]) == ("called", "failed", 0)
+    assert (called["outcome"], ended["outcome"], ended["frames"]) == ("called", "failed", 0)
     assert not any("sent" in record for record in (called, ended))

@@ -11,6 +11,7 @@ import socket
 import threading
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from errno import ENOSPC
 from functools import partial
 from importlib.resources import files
 from pathlib import Path
@@ -24,6 +25,7 @@ from lines import PATIENCE, until
 from tables import table
 
 from multidrop import Drive, PlantError
+from multidrop.control.audit_log import AuditLog
 from multidrop.gateway import drive_works, parts, request_fields
 from multidrop.gateway.command_threads import begin_stops
 from multidrop.gateway.parts import Part
@@ -465,6 +467,37 @@ def test_verbs_and_writes_say_what_became_of_them(tmp_path: Path) -> None:
         assert act("set_frequency", hz=20) == (
             "pump-1 takes its setpoint in percent of P0.04: declare maximum_frequency = HZ"
         )
+
+
+def test_only_stops_are_sent_while_the_audit_log_cannot_be_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(log: AuditLog, *record: object) -> None:
+        raise OSError(ENOSPC, "No space left on device")
+
+    with served(tmp_path, f'[serve]\naudit = "audit.jsonl"\n{MAY}') as gateway:
+        writer = {"authorization": gateway.bearer(Right.WRITE)}
+        commands: list[tuple[str, dict[str, object]]] = [
+            ("/api/write", {"drive": "pump-1", "register": "setpoint", "value": 50.0}),
+            ("/api/act", {"drive": "pump-1", "verb": "start", "options": {}}),
+        ]
+        first = {"drive": "pump-1", "register": "setpoint", "value": 40.0}
+        assert gateway.command("/api/write", first, **writer).json["done"] is True
+        with monkeypatch.context() as full:
+            full.setattr(AuditLog, "add", fail)
+            before = gateway.sims["pump-1"].counters.writes
+            for path, body in commands:
+                told = gateway.command(path, body, **writer).json
+                assert told["done"] is False
+                assert told["text"].endswith(
+                    " was not sent: the audit log cannot be written: No space left on device"
+                )
+            assert gateway.sims["pump-1"].counters.writes == before
+            assert [one["done"] for one in gateway.post("/api/stop").json.values()] == [True, True]
+            assert gateway.sims["pump-1"].counters.writes > before
+            assert gateway.get("/health").json["audit"].endswith("No space left on device")
+        assert [gateway.command(*one, **writer).json["done"] for one in commands] == [True, True]
+        assert gateway.get("/health").json["audit"] == "ok"
 
 
 @pytest.mark.usefixtures("_broken_parts")

@@ -45,7 +45,7 @@ def read_audit(path: Path | str) -> Iterator[dict[str, Any]]:
     """Yield the records of a log in order, without those that a crash truncated.
 
     Each has `time` (UTC), `port`, `drive`, `write` and `outcome`, and if they are known `model`, `address`,
-    `sent` (the newest frame), `times` (how many frames a stop took), `held` (what the drive holds since),
+    `sent` (the newest frame), `frames` (how many frames a stop took), `held` (what the drive holds since),
     `why`, `by` and `way` (see `written_by`). The `outcome` of what was about to be sent is "called". Raises
     OSError.
     """

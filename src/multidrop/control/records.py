@@ -101,11 +101,11 @@ class WriteRecords:
         self.catch_up_aside()
 
     def note_stop_ended(
-        self, verb: str, drive: Drive, stopped: Stopped, times: int, frame: Message | None
+        self, verb: str, drive: Drive, stopped: Stopped, frames: int, newest: Message | None
     ) -> None:
-        """Note what is known of one drive's stop at its end, and how often it was sent."""
-        record = self._record(drive, frame, verb, stopped.seen.value, stopped.why, None)
-        self._put({**record, "times": times}, partial(log_aside, _log), str(stopped))
+        """Note what is known of one drive's stop at its end, and how many frames it took."""
+        record = self._record(drive, newest, verb, stopped.seen.value, stopped.why, None)
+        self._put({**record, "frames": frames}, partial(log_aside, _log), str(stopped))
         self.catch_up_aside()
 
     def _record(

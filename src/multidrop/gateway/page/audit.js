@@ -5,7 +5,7 @@ import * as clock from "./clock.js";
 import { fill, find, glyph, make, named, tableHead } from "./dom.js";
 
 const COUNT = 100;
-const DONE = /^(ok|confirmed|done|written|unchanged)/i;
+const DONE = /^(ok|confirmed|done|written|unchanged|stopped|called)/i;
 
 let entries = [],
   more = false;
@@ -100,9 +100,15 @@ const at = time => clock.when(Date.parse(time));
 const repeated = (times, since) => make("p", { class: "note" }, `${times} times since ${at(since)}`);
 
 function row(entry, isWhole) {
-  const { time, drive, address, model, write, sent, outcome, held, why, by, way, times, since } = entry;
+  const { time, drive, address, model, write, sent, frames, outcome, held, why, by, way, times, since } =
+    entry;
   const isDone = DONE.test(outcome ?? ""),
-    became = [outcome ?? "unknown", held !== undefined && held !== null && `the drive holds ${held}`, why]
+    became = [
+      outcome ?? "unknown",
+      held !== undefined && held !== null && `the drive holds ${held}`,
+      frames > 1 && `${frames} frames`,
+      why,
+    ]
       .filter(Boolean)
       .join("; ");
   return make(
