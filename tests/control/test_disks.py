@@ -166,6 +166,26 @@ def test_what_must_be_noted_first_is_not_sent_on_a_full_disk_and_a_stop_is(
     assert noted[-2:] == [("setpoint = 50.00 %", "called", False), ("setpoint = 50.00 %", "done", True)]
 
 
+def test_a_stop_that_was_interrupted_is_noted_as_sent_but_unknown(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    path = tmp_path / "audit.jsonl"
+    line, drive, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=50), audit=path)
+    line.bus.check_identity(drive)
+
+    def press(request: Message) -> bytes | None:
+        raise KeyboardInterrupt
+
+    line.answers = press
+    with pytest.raises(KeyboardInterrupt):
+        drive.stop()
+    line.bus.close()
+    called, ended = read_audit(path)
+    assert (called["outcome"], ended["outcome"]) == ("called", "sent but unknown")
+    assert "sent 0 to 2 times" in ended["why"]
+    assert ended["why"].endswith("its caller was interrupted")
+
+
 def test_a_stop_is_two_lines_however_often_it_is_sent(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:

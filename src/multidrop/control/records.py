@@ -150,15 +150,15 @@ class WriteRecords:
             _ledger_thread.put(self._count_queued)
         if self._unlogged:
             _audit_thread.put(self._write_queued)
-            if not _audit_thread.hangs:
+            if not _audit_thread.hangs(CALLED_S):
                 _audit_thread.flush(CALLED_S)
 
     def flush(self, seconds: float) -> None:
         """Do so, and wait for each of the threads for `seconds` s at most."""
         self.catch_up_aside()
         for thread in (_audit_thread, _ledger_thread):
-            if not thread.flush(seconds) and not thread.hangs:  # there is no thread
-                self.catch_up()
+            if not thread.hangs(seconds) and not thread.flush(seconds) and not thread.hangs(seconds):
+                self.catch_up()  # there is no thread
 
     def _write_queued(self) -> None:
         self._writers.append(None)  # before a record is taken: `close` then waits for this thread

@@ -105,7 +105,7 @@ class StopRun:
             raise
         finally:
             for attempt in self._left():
-                latest.add_note(attempt.interrupted())
+                latest.add_note(attempt.break_off())
                 self._end(attempt)
             self._release()
 

@@ -231,7 +231,7 @@ class StopAttempt:
         if self._is_confirmed and not isinstance(failure, Unconfirmed):
             reason = f"it was confirmed, but its effect could not be seen: {failure}"
         elif self.is_sent and not self._is_confirmed:
-            reason = f"sent {self.times_sent} times, it was never confirmed: {failure}"
+            reason = f"sent {self._times()} times, it was never confirmed: {failure}"
         else:
             return failure
         unknown = Unconfirmed(self.drive.name, "the stop", reason)
@@ -259,15 +259,21 @@ class StopAttempt:
             return f"{self.drive.name}: the stop was sent, and is not confirmed yet{why}"
         return f"{self.drive.name}: no stop was sent yet{why}"
 
+    def _times(self) -> str:
+        least, most = self.times_sent, self.times_sent + self._times_in_doubt
+        return f"{least}" if least == most else f"{least} to {most}"
+
     def is_in_doubt(self) -> bool:
         """Return True if nobody knows of some of its frames whether they were sent."""
         return self._times_in_doubt > 0
 
-    def interrupted(self) -> str:
-        """Return what is known of it when its caller no longer waits."""
-        least, most = self.times_sent, self.times_sent + self._times_in_doubt
-        times = f"{least}" if least == most else f"{least} to {most}"
-        sent = f"the stop was sent {times} times" if most else "no stop was sent"
+    def break_off(self) -> str:
+        """Note that its caller no longer waits, and return what is known of it."""
+        self.is_sent |= self._times_in_doubt > 0
+        if self.failure is None:
+            self.failure = Unconfirmed(self.drive.name, "the stop", "its caller was interrupted")
+        is_sent = self.times_sent or self._times_in_doubt
+        sent = f"the stop was sent {self._times()} times" if is_sent else "no stop was sent"
         return f"{self.drive.name}: {sent}; the motor is not seen to stand"
 
 

@@ -26,7 +26,8 @@ class AsideThread:
     def forked(self) -> None:
         self._work: SimpleQueue[Callable[[], object]] = SimpleQueue()
         self._begun = threading.Lock()  # held once the thread has begun
-        self._late: SimpleQueue[None] | None = None  # the newest answer that did not come in time
+        # An answer that did not come in time, and for how many s it was waited for.
+        self._late: tuple[SimpleQueue[None], float] | None = None
 
     def put(self, work: Callable[[], object]) -> None:
         """Do this soon, in the order of the calls; return at once."""
@@ -49,14 +50,15 @@ class AsideThread:
         try:
             done.get(timeout=seconds)
         except Empty:
-            self._late = done
+            if not self.hangs(seconds):
+                self._late = done, seconds
             return False
         return True
 
-    @property
-    def hangs(self) -> bool:
-        """True if the newest `flush` was in vain, and still is."""
-        return self._late is not None and self._late.empty()
+    def hangs(self, seconds: float) -> bool:
+        """Return True if a `flush` of so many s or more was in vain, and still is."""
+        late = self._late
+        return late is not None and late[1] >= seconds and late[0].empty()
 
     def _run(self) -> None:
         with suppress(Exception):
