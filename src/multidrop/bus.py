@@ -167,7 +167,11 @@ class Bus:
     def __exit__(self, kind: object, error: BaseException | None, *trace: object) -> None:
         if isinstance(error, KeyboardInterrupt):
             without_internals(error)
-        self.close()
+        try:
+            self.close()
+        except KeyboardInterrupt as interruption:
+            interruption.__traceback__ = None
+            raise
 
     def leave(self) -> None:
         """End all that moves a motor, and begin to stop the drives if `stop_on_exit` was called."""

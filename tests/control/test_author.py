@@ -33,6 +33,7 @@ class Audited:
         self.bus = self.line.bus
 
     def noted(self) -> Noted:
+        self.bus._records.flush(60)
         return [(entry["write"], entry.get("by"), entry.get("way")) for entry in read_audit(self.path)]
 
 

@@ -522,10 +522,11 @@ def test_a_permit_is_good_until_its_latch_rises_and_never_while_that_is_held() -
     latch = Latch()
     before = latch.permit()
     assert before.is_good
-    with latch.held("a stop"):
-        assert not before.is_good
-        during = latch.permit()
-        assert not during.is_good
+    latch.hold("stop", "a stop")
+    assert not before.is_good
+    during = latch.permit()
+    assert not during.is_good
+    latch.let_go("stop")
     assert not during.is_good
     assert latch.permit().is_good
     latch.shut("the bus was left")
@@ -534,10 +535,20 @@ def test_a_permit_is_good_until_its_latch_rises_and_never_while_that_is_held() -
 
 def test_no_permit_is_good_until_the_last_of_several_stops_is_over() -> None:
     latch = Latch()
-    with latch.held("a stop"):
-        with latch.held("another stop"):
-            pass
-        assert not latch.permit().is_good
+    latch.hold(1, "a stop")
+    latch.hold(2, "another stop")
+    latch.let_go(2)
+    assert not latch.permit().is_good
+    latch.let_go(1)
+    assert latch.permit().is_good
+
+
+def test_a_permit_is_for_a_call_that_no_stop_came_after() -> None:
+    latch = Latch()
+    seen = latch.c[0]
+    assert latch.permit(seen).is_good
+    latch.rise("a stop")
+    assert not latch.permit(seen).is_good
     assert latch.permit().is_good
 
 

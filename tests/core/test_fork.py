@@ -212,9 +212,13 @@ def test_a_lock_that_was_held_does_not_hold_a_child_up(port: str) -> None:
 
     with Bus(port) as bus:
         assert current(bus) == 3.25
-        stop = bus._latches.stopping(bus.drives)  # of another thread, for which the child would wait
-        with stop, held(bus.line._lock, bus._attached.lock, bus._latches._over):
+        # A stop of another thread, for which the child would wait.
+        stop = threading.Thread(target=bus._latches.begin, args=["stop", bus.drives])
+        stop.start()
+        stop.join()
+        with held(bus.line._lock, bus._attached.lock):
             assert in_child(use) is None
+        bus._latches.over("stop")
         assert current(bus) == 3.25
 
 

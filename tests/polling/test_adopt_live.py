@@ -356,7 +356,7 @@ def test_a_stop_on_a_line_that_goes_holds_no_other_line_up(
         assert begun.wait(PATIENCE)
         removing = threading.Thread(target=poller.remove_line, args=["yard"])
         removing.start()
-        until(lambda: bus._latches._is_shut)
+        until(lambda: bus._latches.is_shut)
         others = threading.Thread(target=lambda: (poller.remove_line("hall"), poller.add_line(both.hall(1))))
         others.start()
         try:

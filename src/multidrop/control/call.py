@@ -7,10 +7,11 @@ from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager
 from math import inf
 
+from multidrop.control.exit_hook import await_signal
 from multidrop.control.outcome import Outcome
 from multidrop.core import Permit
 from multidrop.drive.family import Drive
-from multidrop.errors import Expired, Overtaken, Refused
+from multidrop.errors import Expired, Overtaken, Refused, Unconfirmed
 from multidrop.transport import clock
 
 MOST_CHARACTERS = 64  # of a request and its reply about one register
@@ -83,9 +84,15 @@ class Call:
 
     @contextmanager
     def noted(self) -> Iterator[None]:
-        """Log a refusal; add what was sent, and what is known of it, to an interruption."""
+        """Log a refusal; add what was sent, and what is known of it, to an interruption.
+
+        What a signal's stops ended raises what the signal does, such as KeyboardInterrupt.
+        """
         try:
             yield
+        except (Overtaken, Unconfirmed):
+            await_signal()
+            raise
         except Refused as refusal:
             _log.info("refused: %s", refusal)
             raise

@@ -6,7 +6,6 @@ side: a handler that waited for them could wait for a lock of the very thread th
 
 from __future__ import annotations
 
-import _thread
 import atexit
 import logging
 import os
@@ -22,6 +21,7 @@ from types import FrameType
 from typing import Any
 
 from multidrop.core.fork import register_at_fork
+from multidrop.errors import BusError
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 IMPATIENT = 3  # signals within a second, after which nothing is waited for
@@ -224,21 +224,14 @@ class ExitHook:
 
     def await_effect(self) -> None:
         """In the main thread, wait until a signal that is held has its effect, such as KeyboardInterrupt."""
-        if self._held is None or threading.current_thread() is not threading.main_thread():
+        if threading.current_thread() is not threading.main_thread():
             return
         while self._held is not None:
             time.sleep(HANDLING_S)
-        time.sleep(HANDLING_S)  # another thread sends it
 
     def _pass_on(self, number: int) -> None:
         self._let_go()
         self._held, self._came = None, []
-        ident = threading.main_thread().ident
-        if signal.getsignal(number) is signal.default_int_handler and ident is not None:
-            with suppress(RuntimeError, MemoryError):
-                # It raises KeyboardInterrupt where the main thread is then: not in here.
-                _thread.start_new_thread(_send, (number, ident))
-                return
         signal.raise_signal(number)
 
     def _let_go(self) -> None:
@@ -249,7 +242,12 @@ class ExitHook:
 
 
 def without_internals(interruption: BaseException) -> None:
-    """Cut the traceback of an interruption before its first frame of this package."""
+    """Cut the traceback of an interruption before its first frame of this package.
+
+    What the stops ended is no cause of it.
+    """
+    if isinstance(interruption.__context__, BusError):
+        interruption.__context__ = None
     entry = interruption.__traceback__
     while entry is not None and (behind := entry.tb_next) is not None:
         if str(behind.tb_frame.f_globals.get("__name__")).partition(".")[0] == PACKAGE:

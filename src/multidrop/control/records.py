@@ -99,6 +99,8 @@ class WriteRecords:
         names = ", ".join(drive.name for drive in drives)
         self._put({"drive": names, **of_one, "write": verb, "outcome": CALLED}, partial(log_aside, _log))
         self.catch_up_aside()
+        if self.audit is not None and not _audit_thread.hangs(CALLED_S):
+            _audit_thread.flush(CALLED_S)
 
     def note_stop_ended(
         self, verb: str, drive: Drive, stopped: Stopped, frames: int, newest: Message | None
@@ -145,13 +147,11 @@ class WriteRecords:
         self._count_queued()
 
     def catch_up_aside(self) -> None:
-        """Do so on threads of their own, and wait for CALLED_S at most, unless they hang already."""
+        """Do so soon, on threads of their own."""
         if self._uncounted:
             _ledger_thread.put(self._count_queued)
         if self._unlogged:
             _audit_thread.put(self._write_queued)
-            if not _audit_thread.hangs(CALLED_S):
-                _audit_thread.flush(CALLED_S)
 
     def flush(self, seconds: float) -> None:
         """Do so, and wait for each of the threads for `seconds` s at most."""

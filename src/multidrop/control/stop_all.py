@@ -114,10 +114,13 @@ class StopRun:
 
     def found(self) -> dict[str, Stopped]:
         """Return what is known of each, by drive's name. Raises what a script raised to end the program."""
-        for attempt in self.attempts:
-            if attempt.interruption is not None:
-                raise attempt.interruption
-        return {attempt.drive.name: attempt.result() for attempt in self.attempts}
+        found = {attempt.drive.name: attempt.result() for attempt in self.attempts}
+        for interruption in (attempt.interruption for attempt in self.attempts):
+            if interruption is not None:
+                for stopped in found.values():
+                    interruption.add_note(str(stopped))
+                raise interruption
+        return found
 
     def result(self) -> None:
         """Raise why the motor of one drive's stop is not seen to stand, if it is not."""
