@@ -119,9 +119,10 @@ def test_what_a_reset_wrote_is_taken_back_after_a_stop_and_noted(
     line.bus.close()
 
 
-def test_what_a_plain_write_stopped_is_noted_at_once(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_what_a_plain_write_stopped_is_noted(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     line, drive, _ = one(monkeypatch, InvtCHE(1), audit=tmp_path / "audit")
     line.bus.write(drive, drive.control, CHEControl.STOP)
+    line.bus._records.flush(60)
     (entry,) = read_audit(tmp_path / "audit")
     assert (entry["write"], entry["outcome"]) == ("control = STOP", "done")
     line.bus.close()
