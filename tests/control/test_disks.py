@@ -159,6 +159,7 @@ def test_what_must_be_noted_first_is_not_sent_on_a_full_disk_and_a_stop_is(
             assert len(line.written) == before
             drive.stop()
             line.bus.write(drive, drive.control, drive.control.decode(5))
+            line.bus._records.flush(PATIENCE_S)
         drive.set_frequency(25)
     line.bus.close()
     noted = [(record["write"], record["outcome"], "sent" in record) for record in read_audit(path)]
