@@ -78,6 +78,8 @@ from multidrop.history.history import History as History
 from multidrop.history.history import HistoryRows as HistoryRows
 from multidrop.history.writer import HistoryState as HistoryState
 from multidrop.history.writer import HistoryWriter as HistoryWriter
+from multidrop.plant.drive_names import RESERVED_NAMES as RESERVED_NAMES
+from multidrop.plant.drive_names import check_drive_name as check_drive_name
 from multidrop.plant.drive_names import drive_meant as drive_meant
 from multidrop.plant.loader import PlantError as PlantError
 from multidrop.plant.loader import load_plant as load_plant

@@ -31,8 +31,9 @@ from gateways import certificate, served
 from lines import until
 from peers import require_module
 
-from multidrop import InvtCHE, PolledDrive
+from multidrop import RESERVED_NAMES, InvtCHE, PolledDrive
 from multidrop.gateway.clock import boottime_ns
+from multidrop.gateway.commands import Told
 from multidrop.gateway.homeassistant import discovery_topic
 from multidrop.gateway.json_topics import JsonTopics
 from multidrop.gateway.mqtt import MqttSettings, build
@@ -629,15 +630,43 @@ def test_authorities_that_are_none_are_told_before_anything_is_polled(tmp_path: 
 
 def test_a_drive_that_cannot_be_a_topic_is_told(tmp_path: Path) -> None:
     plant = inside(tmp_path).plant
-    odd = tuple(PolledDrive(InvtCHE(3, name=name), ()) for name in ("a/b", "fine", "gateway"))
+    odd = tuple(PolledDrive(InvtCHE(3, name=name), ()) for name in ("a/b", "fine", "gateway", "stop"))
     plant = replace(plant, lines=(replace(plant.lines[0], drives=odd),))
     assert MqttSettings(password="secret").check(plant) == [
         f'password = "secret": there is no file {tmp_path}/secret',
+        "drive 'a/b' cannot be a topic: give it a name without + # and /",
         *(
-            f"drive {name!r} cannot be a topic: give it a name without + # and /"
-            for name in ("a/b", "gateway")
+            f'drive {name!r}: name "{name}" is reserved for {RESERVED_NAMES[name]}; give it another name'
+            for name in ("gateway", "stop")
         ),
     ]
+
+
+@pytest.mark.parametrize(
+    "topics", [{"prefix": "homeassistant/x"}, {"prefix": "spBv1.0"}, {"sparkplug": "STATE"}]
+)
+def test_topics_of_others_are_refused(topics: dict[str, str]) -> None:
+    with pytest.raises(ValueError, match=r"topic of others|another group"):
+        MqttSettings(**topics)
+
+
+def test_a_plant_file_s_name_that_cannot_be_an_edge_node_is_told(tmp_path: Path) -> None:
+    plant = replace(inside(tmp_path).plant, path=tmp_path / "a+b.toml")
+    assert MqttSettings().check(plant) == MqttSettings(sparkplug="works", node="hall").check(plant) == []
+    (sentence,) = MqttSettings(sparkplug="works").check(plant)
+    assert sentence == "the plant file's name 'a+b' cannot be an edge node; add node = \"hall-1\""
+
+
+def test_all_words_of_topics_are_reserved_names(tmp_path: Path) -> None:
+    topics = JsonTopics(MqttSettings(commands=True), inside(tmp_path), now_ms)
+    topics.outbox = PutMessages()
+    topics.connected()
+    topics._tell(FAN.name, "stop", Told(True, "done"))
+    said = {message.topic for message in topics.outbox.put_in} | {topic for topic, _ in topics.topics()}
+    words = {word for topic in said for word in topic.removeprefix("multidrop/").split("/")}
+    ours = words - {"+", FAN.name, "pump-1"}
+    assert ours == {"gateway", "stop", "act", "set", "available", "told"}
+    assert ours <= RESERVED_NAMES.keys()
 
 
 # ---- figures ----

@@ -1,10 +1,10 @@
-"""Drive names in the normal forms of Unicode, of which keyboards and file systems give one or the other."""
+"""Names of drives: the normal forms of Unicode, of which keyboards give one or the other; reserved names."""
 
 from __future__ import annotations
 
 import pytest
 
-from multidrop import drive_meant
+from multidrop import RESERVED_NAMES, check_drive_name, drive_meant
 
 # One letter and its two spellings each, by the code charts: U+00FC = U+0075 U+0308; U+0439 = U+0438 U+0306.
 COMPOSED, APART = "L\u00fcfter", "Lu\u0308fter"
@@ -29,3 +29,14 @@ SHORT, LONG = "\u0439", "\u0438\u0306"
 )
 def test_a_name_is_found_by_its_normal_form(given: str, names: list[str], meant: str) -> None:
     assert drive_meant(given, names) == meant
+
+
+@pytest.mark.parametrize("name", [*RESERVED_NAMES, "--all", "-"])
+def test_a_name_that_is_ours_is_refused(name: str) -> None:
+    with pytest.raises(ValueError, match="give it another name"):
+        check_drive_name(name)
+
+
+@pytest.mark.parametrize("name", ["stop-1", "Stop", "gateways", "...", "a-", "__proto"])
+def test_a_name_like_one_of_ours_is_taken(name: str) -> None:
+    assert check_drive_name(name)

@@ -480,6 +480,12 @@ def test_a_sentence_stays_one_line_whatever_the_names(mistakes: Mistakes) -> Non
     assert address.startswith(r'line "L", drive "D\n\x1b[2J": address 99')
 
 
+def test_reserved_names_of_lines_and_drives_are_refused(mistakes: Mistakes) -> None:
+    line, drive = mistakes((HEAD + TOY).replace('"L"', '".."').replace('"D"', '"stop"'))
+    assert line.startswith('line "..": name ".." is reserved for the folder above')
+    assert drive.startswith('line "..", drive "stop": name "stop" is reserved for the MQTT topic PREFIX/stop')
+
+
 def test_a_model_s_file_whose_name_is_too_long_is_a_sentence(mistakes: Mistakes) -> None:
     (sentence,) = mistakes(HEAD + TOY.replace("family.py:Toy", "a" * 300 + ".py"))
     assert sentence.endswith((".py: File name too long", ".py to take a model from"))  # the latter on Windows

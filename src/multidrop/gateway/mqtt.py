@@ -33,7 +33,7 @@ class Mqtt:
         self._speakers = speakers
         self._brokers = []
         for speaker in speakers:
-            name = f"{settings.prefix}-{inside.plant.path.stem}-{speaker.kind}"
+            name = f"{settings.prefix}/{inside.plant.path.stem}/{speaker.kind}"  # no other gateway's
             broker = Broker(address, login, name, speaker)
             speaker.outbox = broker.outbox
             self._brokers.append(broker)

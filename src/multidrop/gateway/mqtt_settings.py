@@ -9,12 +9,13 @@ from math import isfinite
 from pathlib import Path
 from typing import Any
 
-from multidrop import Plant, Register, parse_duration
+from multidrop import Plant, Register, check_drive_name, parse_duration
 from multidrop.gateway.broker import Login, parse_broker
 from multidrop.gateway.hub import Hub
 from multidrop.gateway.rights import Caller, Right
 
 LEVEL = re.compile(r"[^+#/\0]+")  # one level of a topic
+OTHERS = ("homeassistant", "spBv1.0")  # first levels of topics that are not ours: discovery and Sparkplug
 LEAST_EVERY_S, MOST_EVERY_S = 0.1, 3600.0
 
 
@@ -47,6 +48,10 @@ class MqttSettings:
             wrong.append(f'every = "{self.every}" is not "{LEAST_EVERY_S:g} s" to "{MOST_EVERY_S:g} s"')
         if not all(LEVEL.fullmatch(level) for level in self.prefix.split("/")) or self.prefix[0] == "$":
             wrong.append(f'prefix = "{self.prefix}" is no topic; write prefix = "multidrop"')
+        if self.prefix.split("/")[0] in OTHERS:
+            wrong.append(f'prefix = "{self.prefix}" is a topic of others; write prefix = "multidrop"')
+        if self.sparkplug == "STATE":
+            wrong.append('sparkplug = "STATE" is the topic of Sparkplug\'s hosts; name another group')
         wrong += [
             f'{key} = "{name}" is not one level of a topic: it has none of + # and /'
             for key, name in (("sparkplug", self.sparkplug), ("node", self.node))
@@ -83,7 +88,13 @@ class MqttSettings:
             + [
                 f"drive {name!r} cannot be a topic: give it a name without + # and /"
                 for name in names
-                if not LEVEL.fullmatch(name) or name == "gateway"
+                if not LEVEL.fullmatch(name)
+            ]
+            + [mistake for mistake in map(_reserved, names) if mistake]  # a plant need not come from a file
+            + [
+                f'the plant file\'s name {plant.path.stem!r} cannot be an edge node; add node = "hall-1"'
+                for _ in self.sparkplug[:1]
+                if not self.node and not LEVEL.fullmatch(plant.path.stem)
             ]
         )
 
@@ -91,6 +102,15 @@ class MqttSettings:
         """Return user, password and certificates. Raises OSError where the password cannot be read."""
         password = _beside(plant, self.password).read_text("utf-8").strip() if self.password else ""
         return Login(self.user, password, str(_beside(plant, self.authorities)) if self.authorities else None)
+
+
+def _reserved(drive: str) -> str:
+    """Return why a drive cannot have this name; "" where it can."""
+    try:
+        check_drive_name(drive)
+    except ValueError as mistake:
+        return f"drive {drive!r}: {mistake}"
+    return ""
 
 
 def _has_certificates(path: Path) -> bool:

@@ -1,9 +1,32 @@
-"""Drive names as people give them: keyboards and programs spell one letter in several ways."""
+"""Names of drives and lines: which are reserved, and which one is meant however its letters are spelt."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from typing import Final
 from unicodedata import normalize
+
+# Names that would be taken for a topic, path, file or key of ours, and what each of them is.
+RESERVED_NAMES: Final[Mapping[str, str]] = {
+    "gateway": "the MQTT topic PREFIX/gateway",
+    "stop": "the MQTT topic PREFIX/stop, which stops all drives",
+    "act": "the MQTT topic PREFIX/DRIVE/act, which takes verbs",
+    "set": "the MQTT topics PREFIX/DRIVE/set/REGISTER, which take writes",
+    "available": "the MQTT topic PREFIX/DRIVE/available",
+    "told": "the MQTT topic PREFIX/DRIVE/told",
+    ".": "this folder, in paths of files and URLs",
+    "..": "the folder above, in paths of files and URLs",
+    "__proto__": "a key of JavaScript's own, on the gateway's page",
+}
+
+
+def check_drive_name(name: str) -> bool:
+    """Return True for a name that a drive or a line may have. Raises ValueError for a reserved one."""
+    if name in RESERVED_NAMES:
+        raise ValueError(f'name "{name}" is reserved for {RESERVED_NAMES[name]}; give it another name')
+    if name.startswith("-"):
+        raise ValueError(f'name "{name}" begins with -, as options of commands do; give it another name')
+    return True
 
 
 def drive_meant(name: str, names: Iterable[str]) -> str:

@@ -16,6 +16,7 @@ from multidrop.drive.timing import Settings
 from multidrop.drives import MODELS
 from multidrop.drives.registry import find_model
 from multidrop.family_file.errors import FamilyError
+from multidrop.plant.drive_names import check_drive_name
 from multidrop.plant.model import Plant, PlantLine, Polled, PolledDrive
 from multidrop.toml_check import Key, TomlPlace, duration_of, read_document
 
@@ -106,6 +107,7 @@ def _line(table: Any, place: TomlPlace) -> PlantLine:
     given = place.check(table, _LINE)
     name, port = given.get("name", ""), given.get("port", "")
     if name:
+        place.attempt(check_drive_name, name)
         place.once("line", name, sentence="another line has this name too; every line needs its own")
     if port and not speaks_tcp(port):  # each line of one gateway is a connection with a request under way
         place.once("port", port, sentence=f"port {port} is that of {{first}} already; make them one line")
@@ -142,6 +144,7 @@ def _drive(table: Any, line: Mapping[str, Any], place: TomlPlace) -> PolledDrive
     model = _model(table, place)
     given = place.check(table, _DRIVE | _option_keys(model))
     if "name" in given:
+        place.attempt(check_drive_name, given["name"])
         place.once("drive", given["name"], sentence="{first} has this name too; every drive needs its own")
     if "address" in given:
         sentence = f"address {given['address']} is that of {{first}} already; give every drive its own"
