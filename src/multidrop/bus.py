@@ -50,15 +50,15 @@ def _facts(port: str, echo: str, transaction: str, rs485: str) -> tuple[Echo, Tr
 class Bus:
     """A line and the drives on it, which may differ in family, baud rate and format.
 
-    `port` is a device such as /dev/ttyUSB0, any pyserial URL, or tcp://10.0.0.7:502 for Modbus TCP, which all
-    drives on such a port then speak; `transaction` is "ignore" where its gateway replies with transaction ids
-    of its own. `baudrate` and `format` replace the families' defaults for drives that are attached without
-    their own, and `silence`, in s, the standard's t3.5 between frames, if all of them bear it. `echo` says
-    that the adapter repeats what it sends: "on", "off" (until it does), or "auto", to find out. `rs485` is
-    who switches between sending and receiving where the adapter does not: "kernel", the driver, or "rts-up"
-    or "rts-down", the core, by RTS being on or off while a request leaves. Raises LineError when the port
-    cannot be opened. Writes that may wear an EEPROM are counted in `ledger`, a file that all processes share,
-    and all writes are noted in the file `audit`.
+    `port` is a device such as /dev/ttyUSB0, a URL of socket:// or rfc2217://, or tcp://10.0.0.7:502 for
+    Modbus TCP, which all drives on such a port then speak; `transaction` is "ignore" where its gateway
+    replies with transaction ids of its own. `baudrate` and `format` replace the families' defaults for
+    drives that are attached without their own, and `silence`, in s, the standard's t3.5 between frames,
+    if all of them bear it. `echo` says that the adapter repeats what it sends: "on", "off" (until it
+    does), or "auto", to find out. `rs485` is who switches between sending and receiving where the adapter
+    does not: "kernel", the driver, or "rts-up" or "rts-down", the core, by RTS being on or off while a
+    request leaves. Raises LineError when the port cannot be opened. Writes that may wear an EEPROM are
+    counted in `ledger`, a file that all processes share, and all writes are noted in the file `audit`.
 
     A write is not sent when it is late by `expiry` seconds: since the verb was called, but for the time that
     its own steps may take. It is not sent either once a stop was called: that ends all that may move a motor

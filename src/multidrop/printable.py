@@ -2,6 +2,15 @@
 
 from __future__ import annotations
 
+import re
+
+_LOGIN = re.compile(r"(?<=://)\S*@")  # to the last @: a password may have one
+
+
+def masked(text: str) -> str:
+    """Return the text without the users and passwords of its URLs: nats://***@host:4222."""
+    return _LOGIN.sub("***@", text)
+
 
 def printable(text: str) -> str:
     r"""Return the text with all unprintable characters spelt out: an escape is `\x1b`.

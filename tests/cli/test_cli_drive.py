@@ -712,3 +712,16 @@ def test_a_stop_takes_the_seconds_that_it_is_given(run: Run, che: Che) -> None:
     assert "it was never confirmed" in err
     assert received.writes[0].data == b"\0\5"
     assert {write.data for write in received.writes} <= {b"\0\5", b"\0\x08"}  # a run's stop and a jog's
+
+
+@pytest.mark.parametrize(
+    "words", [["read", "{}", "invt-che", "1", "status"], ["scan", "{}"], ["sniff", "{}"]]
+)
+def test_ports_of_a_command_are_documented_urls(
+    words: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "precious").write_text("precious")
+    port = f"spy:///dev/null?file={tmp_path}/precious"
+    assert multidrop.cli.main([word.format(port) for word in words]) == 2
+    assert "there is no spy://" in capsys.readouterr().err
+    assert (tmp_path / "precious").read_text() == "precious"

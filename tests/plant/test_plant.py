@@ -480,6 +480,25 @@ def test_a_sentence_stays_one_line_whatever_the_names(mistakes: Mistakes) -> Non
     assert address.startswith(r'line "L", drive "D\n\x1b[2J": address 99')
 
 
+@pytest.mark.parametrize(
+    "port", ["spy:///dev/null?file={}", "SPY://x?file={}", "alt://x?class={}", "loop://"]
+)
+def test_other_urls_than_documented_ones_are_refused(mistakes: Mistakes, port: str) -> None:
+    """pyserial's spy:// empties the file that it names."""
+    (sentence,) = mistakes((HEAD + TOY).replace('port = "/dev/a"', f'port = "{port}"'))
+    scheme = port.partition(":")[0]
+    assert sentence.endswith(
+        f"there is no {scheme}://; a URL is such as tcp://10.0.0.7, socket://10.0.0.7:4001 or "
+        "rfc2217://10.0.0.7:4001"
+    )
+
+
+def test_a_port_s_url_has_no_user(mistakes: Mistakes) -> None:
+    (sentence,) = mistakes((HEAD + TOY).replace('port = "/dev/a"', 'port = "tcp://bob:S3C@ET@10.0.0.7"'))
+    assert "tcp://***@10.0.0.7: it has a user or a password" in sentence
+    assert "S3C" not in sentence
+
+
 def test_reserved_names_of_lines_and_drives_are_refused(mistakes: Mistakes) -> None:
     line, drive = mistakes((HEAD + TOY).replace('"L"', '".."').replace('"D"', '"stop"'))
     assert line.startswith('line "..": name ".." is reserved for the folder above')

@@ -399,3 +399,12 @@ def test_closing_ends_what_waits_for_a_reply() -> None:
     os.close(slave)
     os.close(master)
     assert [failure.port for failure in failures] == [bus.line.port]
+
+
+def test_a_file_named_by_a_port_s_url_stays_as_it_is(tmp_path: Path) -> None:
+    """pyserial's spy:// empties the file that it names."""
+    precious = tmp_path / "precious"
+    precious.write_text("precious")
+    with pytest.raises(LineError, match="there is no spy://"):
+        Line(f"spy:///dev/null?file={precious}").open()
+    assert precious.read_text() == "precious"

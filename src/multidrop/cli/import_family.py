@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from multidrop.cli.support.arguments import whole
 from multidrop.cli.support.files import refuse_overwriting
 from multidrop.cli.support.output import print_text, warn
 from multidrop.importers import ImportedDevice, family_text, plant_text, read_devices
@@ -18,7 +19,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=Path,
         help="CSV, TSV, YAML (Home Assistant, ESPHome), TOML (Telegraf) or JSON",
     )
-    parser.add_argument("--address", metavar="N", type=int, help="the device, where the file has several")
+    parser.add_argument("--address", metavar="N", type=whole, help="the device, where the file has several")
     parser.add_argument("--title", metavar="NAME", help="and its hub, where several have that address")
     parser.add_argument("--out", metavar="FAMILY.toml", type=Path, help="a new file; printed without it")
     parser.add_argument("--plant", metavar="PLANT.toml", type=Path, help="a new plant file with this device")

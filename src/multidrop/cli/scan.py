@@ -22,6 +22,7 @@ from multidrop.drive.line_facts import SERIAL_ADDRESSES
 from multidrop.drive.network import speaks_tcp
 from multidrop.drives import MODELS
 from multidrop.drives.registry import find_model
+from multidrop.plain_numbers import plain_whole
 from multidrop.scan import (
     ADDRESSES,
     Crowd,
@@ -263,7 +264,7 @@ def _addresses(text: str) -> list[int]:
     try:
         for part in text.split(","):
             first, _, last = part.partition("-")
-            spans.append((int(first), int(last or first)))
+            spans.append((plain_whole(first), plain_whole(last or first)))
     except ValueError:
         spans = []
     if not spans or not all(0 <= first <= last <= UNIT_IDS[-1] for first, last in spans):
@@ -275,7 +276,7 @@ def _addresses(text: str) -> list[int]:
 
 def _baudrates(text: str) -> list[int]:
     try:
-        return [int(part) for part in text.split(",")]
+        return [plain_whole(part) for part in text.split(",")]
     except ValueError:
         raise argparse.ArgumentTypeError(f"{text!r} is not baud rates such as 9600,19200") from None
 

@@ -11,7 +11,7 @@ from typing import Any
 from multidrop.bus import Bus
 from multidrop.cli import DONE, HARD_WIRED, MISTAKE, STOPS
 from multidrop.cli.stop_plant import add_plant_stop_arguments, names_plant, stop_plant
-from multidrop.cli.support.arguments import add_json_argument, add_writing_arguments, duration
+from multidrop.cli.support.arguments import add_json_argument, add_writing_arguments, duration, number
 from multidrop.cli.support.confirm import confirm
 from multidrop.cli.support.interruption import telling_what_was_sent
 from multidrop.cli.support.output import command_line, print_text, warn
@@ -48,7 +48,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
             help="the one in force if not given",
         )
     if command == "start":
-        parser.add_argument("--frequency", metavar="HZ", type=float, help="write this setpoint first")
+        parser.add_argument("--frequency", metavar="HZ", type=number, help="write this setpoint first")
     if command in STOPS:
         parser.add_argument(
             "--seconds",

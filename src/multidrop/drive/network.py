@@ -5,8 +5,26 @@ from __future__ import annotations
 from urllib.parse import SplitResult, urlsplit
 
 from multidrop.errors import NoSuchPort
+from multidrop.printable import masked
 
 MODBUS_PORT = 502  # where a URL names none
+SCHEMES = ("tcp", "socket", "rfc2217")  # pyserial has others too: its spy:// writes to any file
+URLS = "tcp://10.0.0.7, socket://10.0.0.7:4001 or rfc2217://10.0.0.7:4001"
+
+
+def check_port(port: str) -> str:
+    """Return a port's name from a file or a command line.
+
+    Raises NoSuchPort for a URL of another kind than these three, for one that has a user or a password, and
+    for one without its host or port number.
+    """
+    scheme, is_url, _ = port.partition("://")
+    if is_url and scheme.lower() not in SCHEMES:
+        raise NoSuchPort(masked(port), f"there is no {scheme}://; a URL is such as {URLS}")
+    if is_url and url_of(port).username is not None:
+        raise NoSuchPort(masked(port), "it has a user or a password, which no port takes: leave it out")
+    url_of(port)
+    return port
 
 
 def speaks_tcp(port: str) -> bool:

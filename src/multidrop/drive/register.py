@@ -19,6 +19,7 @@ from multidrop.core import NumberFormat
 from multidrop.drive.coding import MOST_POWER, Coding
 from multidrop.drive.number_format import FLOATS, SHORT_FLOATS, WHOLE, WORDS, bits_of, shortest
 from multidrop.drive.table import HOLDING, Carrier, Kept, Table
+from multidrop.plain_numbers import plain_number, plain_whole
 
 T = TypeVar("T", bound=float)
 
@@ -249,7 +250,7 @@ class Register(Generic[T]):
         """Return the value that a person typed: a number, or names joined by "|"; ValueError otherwise."""
         if self.values is None:
             try:
-                return cast(T, _number_in(text) if self.number_format in WHOLE else float(text))
+                return cast(T, _number_in(text) if self.number_format in WHOLE else plain_number(text))
             except ValueError:
                 unit = self.unit or "counts"
                 raise ValueError(f"{self.name} takes a number in {unit}, not {text!r}") from None
@@ -297,9 +298,9 @@ def unnamed_bits(value: Flag) -> list[str]:
 def _number_in(text: str) -> float:
     """Return the number, whole ones exactly. Raises ValueError for none."""
     try:
-        return int(text)
+        return plain_whole(text)
     except ValueError:
-        return float(text)
+        return plain_number(text)
 
 
 def _short(value: float) -> str:

@@ -15,8 +15,10 @@ _DIGIT_OF_TABLE = {table: digit for digit, table in _TABLE_OF_DIGIT.items()}
 LAST_ADDRESS = 0xFFFF
 
 _HEX = re.compile(r"0[xX]([0-9a-fA-F]{1,8})|([0-9a-fA-F]{1,8})[hH]")
-_NUMBERED = re.compile(r"[0134](\d{4}|\d{5})")  # 40001 or 400001: a table's digit, and a number from 1
-_EXPONENT = re.compile(r"\d+([.]\d+)?[eE][+-]?\d+")
+_NUMBERED = re.compile(
+    r"[0134](\d{4}|\d{5})", re.ASCII
+)  # 40001 or 400001: a table's digit, and a number from 1
+_EXPONENT = re.compile(r"\d+([.]\d+)?[eE][+-]?\d+", re.ASCII)
 
 
 @dataclass(frozen=True)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import re
 from typing import Any
 
-_NUMBER = re.compile(r"[+-]?(\d+([.]\d*)?|[.]\d+)([eE][+-]?\d+)?")
-_WHOLE = re.compile(r"[+-]?\d+")
+_NUMBER = re.compile(r"[+-]?(\d+([.]\d*)?|[.]\d+)([eE][+-]?\d+)?", re.ASCII)
+_WHOLE = re.compile(r"[+-]?\d+", re.ASCII)
 _HEX = re.compile(r"0[xX]([0-9a-fA-F]{1,16})|([0-9a-fA-F]{1,16})[hH]")
 _TRUTHS = {"true": True, "yes": True, "false": False, "no": False}
 

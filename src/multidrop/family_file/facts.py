@@ -138,7 +138,7 @@ def _exceptions(value: dict[str, Any]) -> dict[int, str]:
     for code, meaning in value.items():
         digits = code[:-1] if code[-1:] in ("h", "H") else code
         try:
-            number = int(digits, 16 if digits != code else 0)
+            number = int(digits, 16 if digits != code else 0) if code.isalnum() and code.isascii() else 0
         except ValueError:
             raise ValueError(f"{code!r} is no exception code") from None
         if not 1 <= number <= 255 or not isinstance(meaning, str) or not meaning.isprintable():

@@ -19,7 +19,7 @@ EXAMPLE = "127.0.0.1:9464"
 MOST_HEAD = 8192  # bytes of a request
 MOST_CLIENTS = 32
 PATIENCE_S = 5.0  # for a request, and for its answer
-NAMES = re.compile(r"(localhost|127\.0\.0\.1|\[::1\])(:\d{1,5})?")
+NAMES = re.compile(r"(localhost|127\.0\.0\.1|\[::1\])(:[0-9]{1,5})?")
 REASONS = {200: "OK", 400: "Bad Request", 403: "Forbidden", 404: "Not Found", 405: "Method Not Allowed"}
 
 Metrics = Callable[[], Iterable[MetricFamily]]
@@ -29,7 +29,7 @@ def parse_address(text: str) -> tuple[str, int]:
     """Return host and port. Raises ValueError for what is none, or can be reached by other machines."""
     host, _, port = text.rpartition(":")
     host = host.removeprefix("[").removesuffix("]")
-    if not host or not re.fullmatch(r"\d{1,5}", port) or int(port) > 65535:
+    if not host or not re.fullmatch(r"[0-9]{1,5}", port) or int(port) > 65535:
         raise ValueError(f"--metrics {text!r} is no address and port; write --metrics {EXAMPLE}")
     if not _is_loopback(host):
         raise ValueError(

@@ -13,7 +13,9 @@ from multidrop.gateway.guard import Denied
 
 MOST_RECORDS = 200  # of an answer
 
-_UTC = re.compile(r"\d{4}-\d\d-\d\d(T\d\d:\d\d(:\d\d(\.\d+)?)?Z?)?")  # also of its beginning, such as a day
+_UTC = re.compile(
+    r"\d{4}-\d\d-\d\d(T\d\d:\d\d(:\d\d(\.\d+)?)?Z?)?", re.ASCII
+)  # also of its beginning, such as a day
 
 
 def time_asked(query: Mapping[str, str]) -> str:

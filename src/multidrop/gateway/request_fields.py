@@ -12,6 +12,7 @@ from starlette.requests import ClientDisconnect, Request
 
 from multidrop.gateway.guard import Denied
 from multidrop.gateway.rights import Caller
+from multidrop.plain_numbers import plain_whole
 
 MOST_BYTES = 64 * 1024  # of a body
 BODY_S = 10.0  # that it may take to come
@@ -86,6 +87,6 @@ def frame_in(body: Mapping[str, Any]) -> int:
 
 def number_in(text: str, key: str) -> int:
     try:
-        return int(text)
+        return plain_whole(text)
     except ValueError:
         raise Denied(400, f"{key} = {text[:40]!r} is no whole number") from None

@@ -208,7 +208,7 @@ class OwnNames:
 @lru_cache(maxsize=64)  # each request of a viewer has the same one
 def _split(host: str) -> tuple[str, int | None] | None:
     """Return name and port of a Host header; None where it is not one."""
-    if not re.fullmatch(r"[A-Za-z0-9._-]+(:\d{1,5})?|\[[0-9A-Fa-f:.]+\](:\d{1,5})?", host):
+    if not re.fullmatch(r"[A-Za-z0-9._-]+(:[0-9]{1,5})?|\[[0-9A-Fa-f:.]+\](:[0-9]{1,5})?", host):
         return None
     split = urlsplit(f"//{host}")
     name = split.hostname or ""

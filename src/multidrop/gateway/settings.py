@@ -148,7 +148,7 @@ def _has_begun(given: Mapping[str, Any]) -> bool:
 def _address(text: str) -> tuple[str, int]:
     host, colon, port = text.rpartition(":")
     host = host[1:-1] if host.startswith("[") and host.endswith("]") else host
-    if not colon or not host or not re.fullmatch(r"\d{1,5}", port) or int(port) > 65535:
+    if not colon or not host or not re.fullmatch(r"[0-9]{1,5}", port) or int(port) > 65535:
         raise ValueError(f'listen = "{text}" is no address and port; write listen = "{LISTEN}"')
     return host, int(port)
 

@@ -14,7 +14,7 @@ _TABLES = {
 _ORDERS = {"BE_BE": "", "BE_LE": "CDAB", "LE_BE": "BADC", "LE_LE": "DCBA"}  # bytes, words
 _CELLS = 7  # a row's word, and name, address, type, access, unit and scale
 _FLAGS = re.compile(r"bool(8|16)?")
-_STRING = re.compile(r"string(\d{1,4})")
+_STRING = re.compile(r"string([0-9]{1,4})")
 
 
 def read_modpoll(rows: list[list[str]]) -> list[ImportedDevice]:

@@ -11,7 +11,7 @@ from typing import Any
 
 from multidrop.core import RS485, Echo, TransactionIds
 from multidrop.drive.family import Drive
-from multidrop.drive.network import speaks_tcp, url_of
+from multidrop.drive.network import check_port, speaks_tcp
 from multidrop.drive.timing import Settings
 from multidrop.drives import MODELS
 from multidrop.drives.registry import find_model
@@ -112,7 +112,7 @@ def _line(table: Any, place: TomlPlace) -> PlantLine:
     if port and not speaks_tcp(port):  # each line of one gateway is a connection with a request under way
         place.once("port", port, sentence=f"port {port} is that of {{first}} already; make them one line")
     if port:
-        place.attempt(url_of, port)
+        place.attempt(check_port, port)
     settings: dict[str, Any] = {
         "baudrate": place.attempt(Settings, given.get("baudrate", 9600), "8N1") and given.get("baudrate"),
         "format": place.attempt(Settings, 9600, given.get("format", "8N1")) and given.get("format"),

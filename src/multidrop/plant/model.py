@@ -10,6 +10,7 @@ from typing import Any, NoReturn
 
 from multidrop.core import RS485, Echo, TransactionIds
 from multidrop.drive.family import Drive
+from multidrop.drive.network import check_port
 from multidrop.drive.register import Register
 from multidrop.plant import metadata
 
@@ -99,8 +100,9 @@ class Plant:
 
         Raises ValueError for an unknown line, and where two lines would have one port.
         """
-        for name in ports:
+        for name, port in ports.items():
             self.find_line(name)
+            check_port(port)
         lines = tuple(line.at(ports.get(line.name, line.port)) for line in self.lines)
         owners: dict[str, str] = {}
         for line in lines:

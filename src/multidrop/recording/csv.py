@@ -113,6 +113,9 @@ def _parse(cells: list[str]) -> Row:
     if len(cells) != len(Row._fields):
         raise ValueError(len(cells))
     time, monotonic_ns, uncertainty_ns, drive, register, value, status = cells
+    numbers = f"{monotonic_ns}{uncertainty_ns}{value}"
+    if not numbers.isascii() or "_" in numbers:  # Python takes 1_0 for 10
+        raise ValueError(numbers)
     return Row(
         parse_time(time),
         int(monotonic_ns),

@@ -38,9 +38,10 @@ UNOPENED = "it is not opened: this process is not its master, and could end the 
 class Line:
     """A port on which exchanges are carried out once it is open, urgent ones ahead of those that are queued.
 
-    `port` is a device, any pyserial URL, or tcp://host:port for Modbus TCP, whose replies have their
-    requests' transaction ids unless `ids` says otherwise. `rs485` is who switches the transceiver. Where it
-    has a `mastership`, requests leave only while that holds. Every failure of the port is a LineError.
+    `port` is a device, a URL of socket:// or rfc2217://, or tcp://host:port for Modbus TCP, whose replies
+    have their requests' transaction ids unless `ids` says otherwise. `rs485` is who switches the
+    transceiver. Where it has a `mastership`, requests leave only while that holds. Every failure of the
+    port is a LineError.
     """
 
     def __init__(

@@ -1,4 +1,4 @@
-"""Finding and opening a port by its name: a device or any pyserial URL, its identity, and why it fails."""
+"""Finding and opening a port by its name: a device or a URL, its identity, and why it fails."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from urllib.parse import SplitResult
 import serial
 
 from multidrop.core import Failure, Mastership, Port
-from multidrop.drive.network import MODBUS_PORT, url_of
+from multidrop.drive.network import MODBUS_PORT, SCHEMES, URLS, url_of
 from multidrop.errors import NoSuchPort
 from multidrop.transport import port_identity
 from multidrop.transport.mixed_up import mixed_up
@@ -66,7 +66,7 @@ def why_lost(port: str, error: int, received: bytes) -> str:
     return f"what came is no Modbus TCP: {shown}{mixed_up(port, received)}"
 
 
-_URLS = "tcp://10.0.0.7, socket://10.0.0.7:4001 or rfc2217://10.0.0.7:4001"
+_FOR_PROGRAMS = ("loop", "spy")  # of pyserial, without options: spy://DEVICE?file=PATH empties that file
 
 
 def _socket_url(url: SplitResult) -> str:
@@ -79,18 +79,19 @@ def unopened(port: str) -> serial.Serial:
     if not isinstance(port, str):
         raise TypeError(f"a port is a device such as '/dev/ttyUSB0' or a pyserial URL, not {port!r}")
     url = url_of(port)
-    try:
-        if url.scheme == "rfc2217":
-            found = RFC2217Port()
-            found.port = port
-            return cast(serial.Serial, found)  # as pyserial types all of its kinds of ports
-        if url.scheme in ("socket", "tcp"):
-            connection = SocketPort()
-            connection.port = _socket_url(url) if url.scheme == "tcp" else port
-            return cast(serial.Serial, connection)
-        return serial.serial_for_url(port, do_not_open=True)
-    except ValueError as mistake:
-        raise NoSuchPort(port, f"there is no {url.scheme}://; a URL is such as {_URLS}") from mistake
+    scheme, is_url, rest = port.partition("://")
+    known = SCHEMES if "?" in rest else (*SCHEMES, *_FOR_PROGRAMS)
+    if is_url and scheme.lower() not in known:
+        raise NoSuchPort(port, f"there is no {scheme}://; a URL is such as {URLS}")
+    if url.scheme == "rfc2217":
+        found = RFC2217Port()
+        found.port = port
+        return cast(serial.Serial, found)  # as pyserial types all of its kinds of ports
+    if url.scheme in ("socket", "tcp"):
+        connection = SocketPort()
+        connection.port = _socket_url(url) if url.scheme == "tcp" else port
+        return cast(serial.Serial, connection)
+    return serial.serial_for_url(port, do_not_open=True)
 
 
 def is_bridged(port: serial.SerialBase) -> bool:

@@ -21,7 +21,7 @@ from multidrop.cli.doctor.findings import (
 )
 from multidrop.cli.doctor.other_way import other_way_finding, unit_finding
 from multidrop.cli.doctor.round_trip import measure
-from multidrop.cli.support.arguments import add_json_argument
+from multidrop.cli.support.arguments import add_json_argument, whole
 from multidrop.cli.support.output import print_text
 from multidrop.cli.support.plants import (
     add_line_arguments,
@@ -64,9 +64,9 @@ SETTING_UP = (
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_line_arguments(parser, name="NAME", kind="line or drive")
     parser.add_argument("--model", help="of a drive that answers there: the round trip is measured with it")
-    parser.add_argument("--address", type=int, metavar="N", help="its address")
+    parser.add_argument("--address", type=whole, metavar="N", help="its address")
     parser.add_argument(
-        "--baudrate", type=int, metavar="N", help="of the line; the family's default if not given, or 9600"
+        "--baudrate", type=whole, metavar="N", help="of the line; the family's default if not given, or 9600"
     )
     parser.add_argument(
         "--format",

@@ -20,6 +20,7 @@ from multidrop.cli.fleet.connection import STATE, add_server_arguments, run_acti
 from multidrop.cli.support.confirm import confirm
 from multidrop.cli.support.nats import nats_options
 from multidrop.cli.support.output import print_text, warn
+from multidrop.plain_numbers import plain_number
 from multidrop.printable import printable
 
 if TYPE_CHECKING:
@@ -104,7 +105,7 @@ def _what(arguments: argparse.Namespace) -> dict[str, Any]:
     options: dict[str, Any] = {}
     if action == "set-frequency":
         try:
-            options["hz"] = float(arguments.hz)
+            options["hz"] = plain_number(arguments.hz)
         except ValueError:
             raise ValueError(f"HZ = {arguments.hz} is no number; write 25") from None
     elif getattr(arguments, "direction", None):

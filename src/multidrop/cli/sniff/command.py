@@ -12,7 +12,7 @@ from pathlib import Path
 from multidrop.capture import Capture, CaptureWriter
 from multidrop.capture.lookup import line_of as captured_line
 from multidrop.cli.sniff.listener import Listener
-from multidrop.cli.support.arguments import add_json_argument, duration
+from multidrop.cli.support.arguments import add_json_argument, duration, whole
 from multidrop.cli.support.files import check_capture
 from multidrop.cli.support.output import print_text
 from multidrop.cli.support.plants import add_line_arguments, line_of, plant_at, usual_settings
@@ -32,7 +32,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--plant", metavar="PLANT.toml", help="for names and engineering units")
     parser.add_argument("--out", metavar="FILE.pcapng", type=Path, help="write a capture, for Wireshark too")
     parser.add_argument(
-        "--baudrate", type=int, metavar="N", help="as the plant file says, or 9600, if not given"
+        "--baudrate", type=whole, metavar="N", help="as the plant file says, or 9600, if not given"
     )
     parser.add_argument("--format", metavar="8N1", help="as the plant file says, or 8N1, if not given")
     parser.add_argument("--seconds", type=duration, metavar="S", help="how long; until Ctrl-C if not given")

@@ -42,7 +42,7 @@ def _open_device(port: str, settings: Settings) -> FileIO:
 
 
 def _open_url(url: str, settings: Settings) -> Any:
-    """Open a pyserial URL, with a `write` that refuses."""
+    """Open a URL, with a `write` that refuses."""
     port = unopened(url)
     vars(port)["write"] = _refuse
     port.baudrate = settings.baudrate
@@ -59,7 +59,7 @@ def _refuse(data: bytes) -> NoReturn:
 
 
 class Listener:
-    """A port or pyserial URL whose bytes go into `stream`. Every failure of the port is a LineError."""
+    """A port or URL whose bytes go into `stream`. Every failure of the port is a LineError."""
 
     def __init__(self, port: str, settings: Settings) -> None:
         self.port = port

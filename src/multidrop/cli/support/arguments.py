@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import argparse
 
+from multidrop.plain_numbers import plain_number, plain_whole
+
 
 def add_writing_arguments(parser: argparse.ArgumentParser, *, asks: bool = True) -> None:
     """Add --yes and --audit, for commands that may write; `asks`: this one asks before it does."""
@@ -20,10 +22,26 @@ def add_json_argument(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--json", action="store_true", help="print JSON for programs")
 
 
+def whole(text: str) -> int:
+    """Parse a whole number."""
+    try:
+        return plain_whole(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number such as 10") from None
+
+
+def number(text: str) -> float:
+    """Parse a number with a point."""
+    try:
+        return plain_number(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number such as 42.5") from None
+
+
 def duration(text: str) -> float:
     """Parse a number of seconds above 0."""
     try:
-        seconds = float(text)
+        seconds = plain_number(text)
     except ValueError:
         seconds = 0.0
     if not 0 < seconds < float("inf"):

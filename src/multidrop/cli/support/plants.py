@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 
 from multidrop.core import RS485
+from multidrop.drive.network import check_port
 from multidrop.drive.timing import Settings
 from multidrop.plant.loader import load_plant
 from multidrop.plant.model import Plant, PlantLine
@@ -54,7 +55,7 @@ def add_line_arguments(parser: argparse.ArgumentParser, *, name: str = "LINE", k
         "port",
         metavar="PORT",
         nargs="?",
-        help="a device such as /dev/ttyUSB0, or a pyserial URL; or a plant file",
+        help="a device such as /dev/ttyUSB0, or a URL such as socket://host:port; or a plant file",
     )
     parser.add_argument(
         "name", metavar=name, nargs="?", help=f"a {kind} of the plant file; its only line if not given"
@@ -94,6 +95,7 @@ def plant_at(arguments: argparse.Namespace) -> Plant | None:
         )
     if is_plant(arguments.port):
         return plant_of(arguments.port, arguments)
+    check_port(arguments.port)
     if arguments.ports:
         raise ValueError("--port is for the lines of a plant file; write the port in place of PORT")
     if arguments.name is not None:

@@ -3,18 +3,23 @@
 from __future__ import annotations
 
 import argparse
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from multidrop.bus import Bus
+from multidrop.cli.support.arguments import whole
 from multidrop.cli.support.output import command_line
 from multidrop.cli.support.plants import add_port_option, is_plant, plant_of
 from multidrop.core import RS485, Echo
 from multidrop.drive.family import Drive
+from multidrop.drive.network import check_port
 from multidrop.drives.registry import find_model
+from multidrop.plain_numbers import plain_number, plain_whole
 from multidrop.plant.drive_names import drive_meant
 
+_HEX = re.compile("0[xX][0-9A-Fa-f]+")
 _BY_HAND = ("PORT", "MODEL", "ADDRESS")
 _BY_PLANT = ("PLANT.toml", "DRIVE")
 _STOPS_AND_LOOKS = ("read", "state", "stop", "coast", "emergency-stop")
@@ -47,11 +52,11 @@ def add_target_arguments(parser: argparse.ArgumentParser, *further: str) -> None
         "words",
         metavar="PORT MODEL ADDRESS",
         nargs="*",
-        help="PORT: a device such as /dev/ttyUSB0, or a pyserial URL. MODEL: one of `multidrop models`, or "
-        "file.toml, or file.py:Class. ADDRESS: the drive's. In their place PLANT.toml DRIVE: a plant file "
-        "and the name of a drive in it",
+        help="PORT: a device such as /dev/ttyUSB0, or a URL such as socket://host:port. MODEL: one of "
+        "`multidrop models`, or file.toml, or file.py:Class. ADDRESS: the drive's. In their place "
+        "PLANT.toml DRIVE: a plant file and the name of a drive in it",
     )
-    parser.add_argument("--baudrate", type=int, metavar="N", help="where it is not the family's default")
+    parser.add_argument("--baudrate", type=whole, metavar="N", help="where it is not the family's default")
     parser.add_argument(
         "--format", metavar="8N1", help="data bits, parity and stop bits; the family's default if not given"
     )
@@ -101,7 +106,7 @@ def check_words(arguments: argparse.Namespace, words: Sequence[str], names: Sequ
 def number_of(arguments: argparse.Namespace, name: str, text: str) -> float:
     """Return the number that a word is. Raises ValueError."""
     try:
-        return float(text)
+        return plain_number(text)
     except ValueError:
         raise _mistaken(arguments, f"argument {name}: {text!r} is not a number such as 42.5") from None
 
@@ -126,9 +131,10 @@ def _by_plant(arguments: argparse.Namespace) -> Target:
 
 def _by_hand(arguments: argparse.Namespace) -> Target:
     port, model, text = arguments.words[: len(_BY_HAND)]
+    check_port(port)
     family = find_model(model)
     try:
-        address = int(text, 0)
+        address = int(text, 16) if _HEX.fullmatch(text) else plain_whole(text)
     except ValueError:
         raise _mistaken(arguments, f"argument ADDRESS: {text!r} is not a number such as 1") from None
     settings = {name: getattr(arguments, name) for name in _SETTINGS}
@@ -147,6 +153,6 @@ def _mistaken(arguments: argparse.Namespace, sentence: str) -> ValueError:
 def _option(text: str) -> tuple[str, float]:
     name, _, value = text.partition("=")
     try:
-        return name.replace("-", "_"), float(value)
+        return name.replace("-", "_"), plain_number(value)
     except ValueError:
         raise argparse.ArgumentTypeError(f"{text!r} is not NAME=VALUE with a number as its value") from None

@@ -1,0 +1,76 @@
+"""Numbers in words of a command, requests and files: decimal digits of ASCII alone."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import pytest
+
+from multidrop.cli import main
+from multidrop.drives import InvtCHE
+from multidrop.family_file import cells
+from multidrop.gateway.guard import Denied
+from multidrop.gateway.request_fields import number_in
+from multidrop.importers.device import unit_address
+from multidrop.importers.numbers import address_at, number
+from multidrop.plain_numbers import plain_number, plain_whole
+from multidrop.recording.csv import _parse
+
+# Fullwidth, Arabic-Indic, Devanagari and mathematical digits, and Python's own underscore.
+ODD = ["1_0", "\uff11\uff12", "\u0663", "\u0967\u0968", "\U0001d7cf", "\u00bd", "12\u00a0", "1\u066b5"]
+
+
+@pytest.mark.parametrize("text", [*ODD, "", "-", "0x10", "0b1", "1 2", "1,5"])
+def test_other_digits_are_no_number(text: str) -> None:
+    for parse in (plain_number, plain_whole):
+        with pytest.raises(ValueError, match="in decimal digits"):
+            parse(text)
+
+
+def test_plain_numbers_are_taken_as_they_are() -> None:
+    given = ("12", " 12 ", "+12", "-0", "12.", ".5", "1e1", "0012")
+    assert [plain_number(text) for text in given] == [12, 12, 12, 0, 12, 0.5, 10, 12]
+    assert [plain_whole(text) for text in ("12", " 12", "+12", "-3", "0012")] == [12, 12, 12, -3, 12]
+    assert math.isnan(plain_number("nan"))
+
+
+@pytest.mark.parametrize("text", [text for text in ODD if text.strip() == text])
+def test_other_digits_are_refused_in_requests_and_files(text: str) -> None:
+    row = ["2026-11-21T09:30:00.000000000Z", "1", "", "pump", "speed", text, "ok"]
+    attempts: list[tuple[Any, Any]] = [
+        (InvtCHE(1).setpoint.parse, text),
+        (cells.number, text),
+        (cells.whole, text),
+        (address_at, text),
+        (_parse, row),
+        (number_in, (text, "count")),
+    ]
+    for parse, given in attempts:
+        with pytest.raises((ValueError, Denied)):
+            parse(*given) if isinstance(given, tuple) else parse(given)
+    assert unit_address(text) is None
+    with pytest.raises(ValueError, match="is no number in decimal digits"):
+        number(text, 0)
+
+
+@pytest.mark.parametrize("text", ODD)
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["set-frequency", "/dev/none", "invt-che", "3", "--yes", "{}"],
+        ["set-frequency", "/dev/none", "invt-che", "{}", "--yes", "21"],
+        ["start", "/dev/none", "invt-che", "3", "--yes", "--frequency", "{}"],
+        ["write", "/dev/none", "invt-che", "3", "setpoint", "{}", "--yes"],
+        ["state", "/dev/none", "invt-che", "3", "--option", "maximum_frequency={}"],
+        ["state", "/dev/none", "invt-che", "3", "--baudrate", "{}"],
+        ["scan", "/dev/none", "--addresses", "{}"],
+        ["scan", "/dev/none", "--baudrates", "{}"],
+        ["doctor", "/dev/none", "--address", "{}"],
+    ],
+)
+def test_other_digits_are_a_mistake_of_the_command(
+    words: list[str], text: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main([word.format(text) for word in words]) == 2
+    assert "/dev/none: there is no such port" not in capsys.readouterr().err
