@@ -94,6 +94,9 @@ from multidrop.polling.batch import Batch as Batch
 from multidrop.polling.batch import BatchColumns as BatchColumns
 from multidrop.polling.batch import Row as Row
 from multidrop.polling.wide import WideRows as WideRows
+from multidrop.printable import masked as masked
+from multidrop.printable import plain_number as plain_number
+from multidrop.printable import plain_whole as plain_whole
 from multidrop.recording import convert as convert
 from multidrop.recording import open_reader as open_reader
 from multidrop.recording import open_writer as open_writer

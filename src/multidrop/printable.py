@@ -1,15 +1,20 @@
-"""Text from files and arguments, made harmless for a terminal or a page."""
+"""Text from files and arguments: made harmless for a terminal, a page or a log, and numbers in it."""
 
 from __future__ import annotations
 
 import re
 
-_LOGIN = re.compile(r"(?<=://)\S*@")  # to the last @: a password may have one
+# int() and float() also take `1_0` for 10, and digits of all scripts.
+_WHOLE = re.compile(r"[+-]?[0-9]+")
+_NUMBER = re.compile(
+    r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?|[+-]?(nan|inf)", re.IGNORECASE | re.ASCII
+)
+_LOGIN = re.compile(r"(?<=://)[^\s\"]*@")  # to the last @: a password may have one
 
 
 def masked(text: str) -> str:
-    """Return the text without the users and passwords of its URLs: nats://***@host:4222."""
-    return _LOGIN.sub("***@", text)
+    """Return the text without the users and passwords of its URLs: nats://host:4222."""
+    return _LOGIN.sub("", text)
 
 
 def printable(text: str) -> str:
@@ -21,3 +26,17 @@ def printable(text: str) -> str:
     if text.isprintable():
         return text
     return "".join(mark if mark.isprintable() else repr(mark)[1:-1] for mark in text)
+
+
+def plain_whole(text: str) -> int:
+    """Return a whole number. Raises ValueError for any other text."""
+    if not _WHOLE.fullmatch(text.strip(" ")):
+        raise ValueError(f"{text!r} is no whole number in decimal digits, such as 10")
+    return int(text)
+
+
+def plain_number(text: str) -> float:
+    """Return a number with a point, or nan or inf. Raises ValueError for any other text."""
+    if not _NUMBER.fullmatch(text.strip(" ")):
+        raise ValueError(f"{text!r} is no number in decimal digits, such as 42.5")
+    return float(text)

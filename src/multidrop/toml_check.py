@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
 
-from multidrop.printable import printable
+from multidrop.printable import masked, printable
 
 T = TypeVar("T")
 
@@ -109,7 +109,7 @@ class TomlPlace:
     def wrong(self, sentence: object) -> None:
         """Add an error. What a terminal would not print as it stands is spelt out."""
         text = ": ".join(filter(None, (", ".join(self.labels), str(sentence))))
-        self.config_errors.append(f"{self.path}: {printable(text)}")
+        self.config_errors.append(f"{self.path}: {printable(masked(text))}")
 
     def once(self, *what: object, sentence: str) -> None:
         """Add an error if this was seen before; `{first}` in the sentence is the place."""

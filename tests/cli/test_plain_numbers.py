@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 
+from multidrop import plain_number, plain_whole
 from multidrop.cli import main
 from multidrop.drives import InvtCHE
 from multidrop.family_file import cells
@@ -14,7 +15,6 @@ from multidrop.gateway.guard import Denied
 from multidrop.gateway.request_fields import number_in
 from multidrop.importers.device import unit_address
 from multidrop.importers.numbers import address_at, number
-from multidrop.plain_numbers import plain_number, plain_whole
 from multidrop.recording.csv import _parse
 
 # Fullwidth, Arabic-Indic, Devanagari and mathematical digits, and Python's own underscore.

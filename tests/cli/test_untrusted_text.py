@@ -21,8 +21,9 @@ from terminals import MULTIDROP
 import multidrop.cli
 from multidrop.cli.serve import _logging
 from multidrop.core import Framing, Message
+from multidrop.gateway.settings import read_plant
 from multidrop.plant.loader import PlantError, load_plant
-from multidrop.printable import printable
+from multidrop.printable import masked, printable
 
 # Clear the screen; set the title; write the clipboard; run from right to left; one-byte escape; two lines.
 TRAPS = ("\x1b[2J", "\x1b]0;title\x07", "\x1b]52;c;cm0gLXJm\x07", "\u202egpj.exe", "\x9b2J", "a\r\nb", "\0")
@@ -48,6 +49,76 @@ def test_a_gateway_s_log_has_one_line_for_whoever_asks(capfd: pytest.CaptureFixt
     assert "asked for by anna" in line
     assert not set(line) & {"\x1b", "\r", "\0"}
     assert form == "json" or line.isprintable()
+
+
+SECRET = "S3C@R:ET"  # users write such passwords as they are, though an @ should be escaped
+
+
+def test_a_url_is_told_without_its_login() -> None:
+    given = f"no server at nats://bob:{SECRET}@a:4222, tls://{SECRET}@b, nats://c; by anna@hall"
+    assert masked(given) == "no server at nats://a:4222, tls://b, nats://c; by anna@hall"
+
+
+@pytest.mark.parametrize(
+    ("words", "variables"),
+    [
+        (["fleet", "status", "--nats", "{}"], {}),
+        (["fleet", "status", "--nats", "x{}"], {}),
+        (["fleet", "status"], {"MULTIDROP_NATS": "{}"}),
+        (["fleet", "stop", "pump-1", "--nats", "{}"], {}),
+        (["fleet", "rights", "gw-1", "--nats", "{}00000"], {}),
+        (["hub", "{}", "--parquet", "x", "--once"], {}),
+        (["fleet", "status", "{}"], {}),
+        (["serve", "{}"], {}),
+        (["read", "{}", "invt-che", "1", "status"], {}),
+    ],
+)
+def test_no_message_of_a_command_has_a_url_s_password(
+    words: list[str],
+    variables: dict[str, str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    require_module("nats")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+    url = f"nats://bob:{SECRET}@127.0.0.1:1"
+    for name, value in variables.items():
+        monkeypatch.setenv(name, value.format(url))
+    assert multidrop.cli.main([word.format(url) for word in words]) != 0
+    said = "".join(capsys.readouterr())
+    assert said
+    assert "S3C" not in said
+    assert "R:ET" not in said
+
+
+def test_a_plant_file_s_mistakes_have_no_url_s_password(tmp_path: Path) -> None:
+    (tmp_path / "p.toml").write_text(
+        '[[line]]\nname = "L"\nport = "/dev/a"\n'
+        '[[line.drive]]\nname = "D"\nmodel = "invt-che"\naddress = 1\n'
+        f'[serve.mqtt]\nbroker = "mqtt://bob:{SECRET}@broker:1883"\n'
+        f'[serve.fleet]\nnats = ["x://bob:{SECRET}@host"]\n'
+    )
+    with pytest.raises(PlantError) as caught:
+        read_plant(lambda: load_plant(tmp_path / "p.toml"), {})
+    fleet, broker = caught.value.mistakes
+    assert (
+        'broker = "mqtt://broker:1883" comes with a login; write user = "name" and password = "FILE"'
+        in broker
+    )
+    assert "x://host" in fleet
+    assert "S3C" not in str(caught.value)
+
+
+@pytest.mark.parametrize("form", ["text", "json"])
+def test_a_gateway_s_log_has_no_url_s_password(capfd: pytest.CaptureFixture[str], form: str) -> None:
+    with _logging(form, logging.INFO):
+        failure = OSError(f"nats://bob:{SECRET}@host is lost")
+        logging.getLogger("multidrop.gateway").error("at %s", f"nats://{SECRET}@host", exc_info=failure)
+    said = capfd.readouterr().err
+    assert said.count("nats://host") == 2
+    assert "S3C" not in said
 
 
 @pytest.mark.parametrize("trap", TRAPS)

@@ -22,7 +22,7 @@ from multidrop.drive.line_facts import SERIAL_ADDRESSES
 from multidrop.drive.network import speaks_tcp
 from multidrop.drives import MODELS
 from multidrop.drives.registry import find_model
-from multidrop.plain_numbers import plain_whole
+from multidrop.printable import plain_whole
 from multidrop.scan import (
     ADDRESSES,
     Crowd,

@@ -29,7 +29,7 @@ from multidrop.drive.named_verbs import verbs_of
 from multidrop.drives import MODELS
 from multidrop.plant.loader import load_plant
 from multidrop.plant.model import Plant
-from multidrop.printable import printable
+from multidrop.printable import masked, printable
 
 if TYPE_CHECKING:
     from multidrop.gateway.reload import Read
@@ -201,10 +201,10 @@ class _JsonFormatter(logging.Formatter):
             "time": _time(record),
             "level": record.levelname.lower(),
             "logger": record.name,
-            "message": record.getMessage(),
+            "message": masked(record.getMessage()),
         }
         if record.exc_info:
-            found["exception"] = self.formatException(record.exc_info)
+            found["exception"] = masked(self.formatException(record.exc_info))
         return json.dumps(found, ensure_ascii=False)
 
 
@@ -212,8 +212,8 @@ class _TextFormatter(logging.Formatter):
     """Time, level and message on a line, whoever's names are in it; a traceback below it."""
 
     def format(self, record: logging.LogRecord) -> str:
-        text = f"{_time(record)} {record.levelname.lower()} {printable(record.getMessage())}"
-        return f"{text}\n{self.formatException(record.exc_info)}" if record.exc_info else text
+        text = f"{_time(record)} {record.levelname.lower()} {printable(masked(record.getMessage()))}"
+        return f"{text}\n{masked(self.formatException(record.exc_info))}" if record.exc_info else text
 
 
 def _time(record: logging.LogRecord) -> str:

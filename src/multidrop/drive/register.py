@@ -19,7 +19,7 @@ from multidrop.core import NumberFormat
 from multidrop.drive.coding import MOST_POWER, Coding
 from multidrop.drive.number_format import FLOATS, SHORT_FLOATS, WHOLE, WORDS, bits_of, shortest
 from multidrop.drive.table import HOLDING, Carrier, Kept, Table
-from multidrop.plain_numbers import plain_number, plain_whole
+from multidrop.printable import plain_number, plain_whole
 
 T = TypeVar("T", bound=float)
 

@@ -9,6 +9,7 @@ from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+from multidrop import masked
 from multidrop.fleet.errors import FleetError, MayNotSend, NoRight, NotAdmitted
 
 MOST_DENIALS = 1000
@@ -34,8 +35,8 @@ _log = logging.getLogger("multidrop.fleet")
 
 
 def failure_to_connect(url: str, failure: BaseException) -> FleetError:
-    """Return the sentence for a connection that did not come about."""
-    text = str(failure).removeprefix("nats: ")
+    """Return the sentence for a connection that did not come about; it has no password."""
+    url, text = masked(url), masked(str(failure).removeprefix("nats: "))
     if not text:
         text = "it said nothing in time; one that begins with TLS is named with tls://"
     for sign, sentence in REFUSALS:

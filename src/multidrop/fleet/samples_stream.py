@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 from nats.aio.client import Client
 from nats.errors import Error, NoRespondersError
 
+from multidrop import masked
 from multidrop.fleet.batch_client import BatchClient
 from multidrop.fleet.refusals import failure_to_connect
 from multidrop.fleet.servers import OLDEST
@@ -96,8 +97,9 @@ async def connect(servers: list[str], **options: Any) -> BatchClient:
     if (version.major, version.minor) < OLDEST:
         await close(client)
         raise StreamError(
-            f"the server of NATS at {', '.join(servers)} is {version.major}.{version.minor}.{version.patch}: "
-            f"a fleet needs {'.'.join(map(str, OLDEST))} or newer"
+            f"the server of NATS at {masked(', '.join(servers))} is "
+            f"{version.major}.{version.minor}.{version.patch}: a fleet needs "
+            f"{'.'.join(map(str, OLDEST))} or newer"
         )
     return client
 

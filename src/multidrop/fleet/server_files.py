@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import NamedTuple
 from urllib.parse import urlsplit
 
+from multidrop import masked
 from multidrop.fleet.accounts import accounts
 from multidrop.fleet.credentials import new_seed, public_key
 from multidrop.fleet.rights import rights_of
@@ -61,7 +62,7 @@ def addresses_of(urls: Sequence[str]) -> list[ServerAddress]:
         except ValueError:
             port = MOST_PORTS
         if not parts.hostname or port + ROUTE_PORTS > MOST_PORTS:
-            raise ValueError(f"{url} is no address of a NATS server: write nats://host:4222")
+            raise ValueError(f"{masked(url)} is no address of a NATS server: write nats://host:4222")
         found.append(ServerAddress(f"n{number}", parts.hostname, port))
     return found
 

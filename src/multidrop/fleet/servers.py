@@ -13,6 +13,7 @@ from nats.aio.msg import Msg
 from nats.aio.subscription import Subscription
 from nats.errors import Error as NatsError
 
+from multidrop import masked
 from multidrop.fleet.batch_client import BatchClient, DirectGet, DirectMessage, Request
 from multidrop.fleet.direct_gets import Spare, first_answer
 from multidrop.fleet.errors import FleetError, NobodyThere, NotAdmitted, NotDelivered, TooOld, Unsure
@@ -34,7 +35,8 @@ class ServerPath:
     """One connection, at its home where that server lives, else at any other."""
 
     def __init__(self, urls: Sequence[str], options: Mapping[str, Any] | None = None) -> None:
-        self.urls = list(urls)  # the first is home
+        self.urls = [masked(url) for url in urls]  # the first is home
+        self._full = dict(zip(self.urls, urls, strict=True))  # with users and passwords
         self.url = ""  # where it is
         self.others: Sequence[ServerPath] = ()  # of the same process
         self.spare = Spare()  # of the same process too
@@ -110,7 +112,7 @@ class ServerPath:
 
     async def _move(self, url: str) -> None:
         denials = Denials()
-        client = await connect(url, self._options, denials)
+        client = await connect(self._full[url], self._options, denials)
         async with self._changing:
             standing: dict[str, Subscription] = {}
             try:
@@ -244,7 +246,7 @@ async def connect(url: str, options: Mapping[str, Any], denials: Denials | None 
     if (found.major, found.minor) < OLDEST:
         await _close(client)
         raise TooOld(
-            f"the NATS server at {url} is {found.major}.{found.minor}; a fleet needs "
+            f"the NATS server at {masked(url)} is {found.major}.{found.minor}; a fleet needs "
             f"{'.'.join(map(str, OLDEST))} or newer: older ones may give one lease to two gateways"
         )
     return client

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import asyncio
-import re
 import time
 from collections.abc import Callable
 from typing import Any
 
+from multidrop import masked
 from multidrop.fleet.overview import FleetView
 
 EVERY_S = 1.0  # between looks
-SECRETS = re.compile(r"//[^/@\s]*@")  # name and password in an address: pages and logs must not tell them
 
 
 class FleetWatch:
@@ -29,7 +28,7 @@ class FleetWatch:
         try:
             await self._view.look()
         except OSError as failure:
-            self.trouble = SECRETS.sub("//", str(failure))
+            self.trouble = masked(str(failure))
         else:
             self._looked, self.trouble = begun, None
 

@@ -12,6 +12,7 @@ from contextlib import suppress
 from typing import Any, NamedTuple, Protocol
 from urllib.parse import urlsplit
 
+from multidrop import masked
 from multidrop.gateway.outbox import Outbox, Publication
 from multidrop.gateway.supervisor import Hung, supervisor
 
@@ -32,12 +33,16 @@ class Address(NamedTuple):
 
 
 def parse_broker(text: str) -> Address:
-    """Return the parts of `mqtt://host:port`. Raises ValueError for anything else."""
+    """Return the parts of `mqtt://host:port`. Raises ValueError for anything else, without its password."""
     try:
         parts = urlsplit(text)
         port = parts.port
     except ValueError:
         parts, port = urlsplit(""), None
+    if "@" in text:
+        raise ValueError(
+            f'broker = "{masked(text)}" comes with a login; write user = "name" and password = "FILE"'
+        )
     is_plain = not (parts.path.strip("/") or parts.query or parts.fragment or parts.username)
     if parts.scheme not in PORTS or not parts.hostname or not is_plain:
         raise ValueError(f'broker = "{text}" is no broker; write broker = "mqtt://broker:1883", or mqtts://')

@@ -20,8 +20,7 @@ from multidrop.cli.fleet.connection import STATE, add_server_arguments, run_acti
 from multidrop.cli.support.confirm import confirm
 from multidrop.cli.support.nats import nats_options
 from multidrop.cli.support.output import print_text, warn
-from multidrop.plain_numbers import plain_number
-from multidrop.printable import printable
+from multidrop.printable import plain_number, printable
 
 if TYPE_CHECKING:
     from multidrop.fleet.command_words import CommandAnswer

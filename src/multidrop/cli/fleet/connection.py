@@ -15,6 +15,7 @@ from multidrop.cli.support.extras import require_extra
 from multidrop.cli.support.nats import add_nats_arguments, nats_options
 from multidrop.cli.support.output import logging_to, warn
 from multidrop.control.eeprom_ledger import default_path
+from multidrop.printable import masked
 
 if TYPE_CHECKING:
     from multidrop.fleet.servers import ServerPath
@@ -43,9 +44,9 @@ def urls_of(arguments: argparse.Namespace) -> list[str]:
     found = [url.strip() for url in text.split(",") if url.strip()]
     for url in found:
         if not url.startswith(("nats://", "tls://")):
-            raise ValueError(f"{url} is no address of a NATS server; write {URLS}")
+            raise ValueError(f"{masked(url)} is no address of a NATS server; write {URLS}")
     if not found:
-        raise ValueError(f"{text!r} names no NATS server; write {URLS}")
+        raise ValueError(f"{masked(text)!r} names no NATS server; write {URLS}")
     return found
 
 

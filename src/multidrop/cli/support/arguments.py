@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from multidrop.plain_numbers import plain_number, plain_whole
+from multidrop.printable import plain_number, plain_whole
 
 
 def add_writing_arguments(parser: argparse.ArgumentParser, *, asks: bool = True) -> None:

@@ -1,4 +1,4 @@
-"""Output on stdout and stderr, with control characters in names, ports and paths spelt out."""
+"""Output on stdout and stderr: control characters are spelt out, and passwords of URLs left out."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from contextlib import contextmanager, suppress
 from io import TextIOWrapper
 from typing import TextIO
 
-from multidrop.printable import printable
+from multidrop.printable import masked, printable
 
 
 def spell_out_unencodable() -> None:
@@ -21,7 +21,7 @@ def spell_out_unencodable() -> None:
 
 def print_text(text: object, *, file: TextIO | None = None, flush: bool = False) -> None:
     """Print the text; of its control characters only \\n has its effect, and the others are spelt out."""
-    print("\n".join(map(printable, str(text).split("\n"))), file=file, flush=flush)
+    print("\n".join(map(printable, masked(str(text)).split("\n"))), file=file, flush=flush)
 
 
 def command_line(words: Sequence[str]) -> str:
@@ -39,7 +39,7 @@ def warn(sentences: str) -> None:
     Where nobody can be told, as on a terminal that was closed, that keeps nothing back: it may be a stop.
     """
     with suppress(OSError):
-        for sentence in sentences.splitlines():
+        for sentence in masked(sentences).splitlines():
             print(f"multidrop: {printable(sentence)}", file=sys.stderr)
 
 

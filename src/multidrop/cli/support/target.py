@@ -16,8 +16,8 @@ from multidrop.core import RS485, Echo
 from multidrop.drive.family import Drive
 from multidrop.drive.network import check_port
 from multidrop.drives.registry import find_model
-from multidrop.plain_numbers import plain_number, plain_whole
 from multidrop.plant.drive_names import drive_meant
+from multidrop.printable import plain_number, plain_whole
 
 _HEX = re.compile("0[xX][0-9A-Fa-f]+")
 _BY_HAND = ("PORT", "MODEL", "ADDRESS")
