@@ -6,9 +6,10 @@ import asyncio
 import json
 import signal
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
+from enum import IntEnum
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -31,10 +32,12 @@ from gateways import certificate, served
 from lines import until
 from peers import require_module
 
-from multidrop import RESERVED_NAMES, InvtCHE, PolledDrive
+from multidrop import RESERVED_NAMES, Drive, InvtCHE, PolledDrive
+from multidrop.drive.declare import reading, setting
+from multidrop.drives import MODELS
 from multidrop.gateway.clock import boottime_ns
 from multidrop.gateway.commands import Told
-from multidrop.gateway.homeassistant import discovery_topic
+from multidrop.gateway.homeassistant import discovery, discovery_topic
 from multidrop.gateway.json_topics import JsonTopics
 from multidrop.gateway.mqtt import MqttSettings, build
 from multidrop.gateway.outbox import MOST_UNDER_WAY
@@ -567,7 +570,9 @@ def test_home_assistant_is_told_of_each_drive(broker: Broker, listener: Listener
     found = json_of(said)
     assert found["availability"] == [{"topic": "multidrop/gateway"}, {"topic": "multidrop/pump-1/available"}]
     parts = found["cmps"]
-    assert set(parts) == {"state", "output_frequency", "status", "setpoint_set", "stop"}
+    assert set(parts) == {
+        *("state", "problem", "running", "output_frequency", "status", "setpoint_set", "stop")
+    }
     assert len({part["unique_id"] for part in parts.values()}) == len(parts)
     sensor = parts["output_frequency"]
     assert (sensor["unit_of_measurement"], sensor["device_class"]) == ("Hz", "frequency")
@@ -599,6 +604,141 @@ def test_a_name_is_an_id_that_no_other_name_has(listener: Listener, start: Start
     }
     assert len(ids) == 2
     assert all(topic.isascii() for topic in ids)
+
+
+def configured(drive: Drive, polled: Sequence[str], writable: Sequence[str], **more: Any) -> Any:
+    topics = {name: f"multidrop/{name}" for name in ("state", "gateway", "available", "set", "stop")}
+    details: Any = {"prefix": "works", "version": "1", "every_s": 1.0, "takes_commands": True, **more}
+    registers = [drive.register(name) for name in polled]
+    return json.loads(discovery(drive, registers, topics, writable=writable, **details))
+
+
+def rendered(part: dict[str, Any], said: dict[str, Any]) -> str:
+    jinja2 = require_module("jinja2")
+    return str(jinja2.Environment().from_string(part["value_template"]).render(value_json=said))
+
+
+# Keys of Home Assistant 2026.11's documentation of MQTT (device discovery, sensor, binary sensor, number,
+# select, button): those of each platform that are used here, and those without which it refuses a component.
+HA_KEYS = {
+    "sensor": (
+        {"state_topic"},
+        {"value_template", "expire_after", "device_class", "options", "state_class", "entity_category"}
+        | {"unit_of_measurement", "suggested_display_precision"},
+    ),
+    "binary_sensor": ({"state_topic"}, {"value_template", "expire_after", "device_class"}),
+    "number": (
+        {"command_topic", "min", "max"},  # without a span it is 1 to 100
+        {"state_topic", "value_template", "command_template", "retain", "step", "mode", "entity_category"}
+        | {"unit_of_measurement"},
+    ),
+    "select": (
+        {"command_topic", "options"},
+        {"state_topic", "value_template", "command_template", "retain", "entity_category"},
+    ),
+    "button": ({"command_topic"}, {"payload_press", "availability"}),
+}
+
+
+def check_components(found: Any) -> None:
+    assert not {"state_topic", "command_topic", "value_template"} & found.keys()  # all components have those
+    assert found["dev"]["ids"]
+    for part in found["cmps"].values():
+        needed, known = HA_KEYS[part["p"]]
+        given = part.keys() - {"p", "unique_id", "name"}
+        assert needed <= given <= needed | known
+        assert ("state_topic" in part) == ("value_template" in part)
+        if part["p"] == "number":
+            assert part["min"] < part["max"]
+            assert part["step"] >= 0.001
+        if part.get("device_class") == "enum":
+            assert part["options"]
+            assert not {"unit_of_measurement", "state_class"} & part.keys()
+        assert part.get("entity_category") in (None, "diagnostic", *["config"] * (part["p"] != "sensor"))
+    ids = [part["unique_id"] for part in found["cmps"].values()]
+    assert len(set(ids)) == len(ids)
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_home_assistant_takes_the_components_of_each_family(model: str) -> None:
+    drive = MODELS[model](1, name="pump-1")
+    registers = list(drive.registers)
+    polled = [name for name in registers if drive.register(name).readable]
+    writable = [name for name in registers if drive.register(name).writable]
+    found = configured(drive, polled, writable)
+    check_components(found)
+    assert len(found["cmps"]) == 4 + len(polled) + len(writable)
+
+
+class Awkward(Drive):
+    """A user's own, whose registers have the names of our components."""
+
+    title = "ACME A-1"
+    running = reading(1, "Hz")
+    problem = reading(2, "V")
+    value = reading(3, "A")
+    level = setting(4, "m", moves=False)
+    level_set = reading(5, "m")
+    mode = setting(6, values=IntEnum("Mode", {"SLOW": 1, "FAST": 7}), moves=False)
+
+
+def test_registers_with_the_names_of_components_keep_them_apart() -> None:
+    found = configured(Awkward(1, name="a"), [*Awkward.registers], ["level", "mode"], page="http://hall:8750")
+    check_components(found)
+    assert found["dev"] == {
+        **{"ids": "works-a", "name": "a", "mdl": "ACME A-1", "mf": "ACME", "cu": "http://hall:8750"}
+    }
+    parts = {part["unique_id"]: part for part in found["cmps"].values()}
+    assert parts["works-a-running"]["p"] == "binary_sensor"
+    assert parts["works-a-running-value"]["unit_of_measurement"] == "Hz"
+    assert parts["works-a-level-set"]["state_topic"] == "multidrop/state"
+    assert (parts["works-a-level-set"]["min"], parts["works-a-level-set"]["max"]) == (0, 65535)
+    mode = parts["works-a-mode-set"]
+    assert (mode["p"], mode["options"]) == ("select", ["SLOW", "FAST"])
+    jinja2 = require_module("jinja2")
+    command = jinja2.Environment().from_string(mode["command_template"])
+    assert json.loads(command.render(value="FAST", now=lambda: datetime.now(UTC)))["value"] == 7
+
+
+def test_a_number_that_is_not_polled_has_no_state() -> None:
+    drive = InvtCHE(1, name="a")
+    assert (
+        not {"state_topic", "value_template"}
+        & configured(drive, [], ["setpoint"])["cmps"]["setpoint_set"].keys()
+    )
+
+
+@pytest.mark.parametrize(
+    ("state", "problem", "running"),
+    [
+        ("runs", "OFF", "ON"),
+        ("stands", "OFF", "OFF"),
+        ("fault", "ON", "None"),
+        ("unknown", "None", "None"),
+        ("silent", "None", "None"),
+    ],
+)
+def test_binary_sensors_say_what_is_known(state: str, problem: str, running: str) -> None:
+    parts = configured(InvtCHE(1, name="a"), [], [])["cmps"]
+    assert [rendered(parts[key], {"state": state}) for key in ("problem", "running")] == [problem, running]
+    assert rendered(parts["state"], {"state": state}) in parts["state"]["options"]
+
+
+def test_a_choice_without_a_name_is_unknown_and_not_the_one_before() -> None:
+    """Home Assistant ignores a state that is no option, and shows the one before it."""
+    part = configured(InvtCHE(1, name="a"), ["status"], [])["cmps"]["status"]
+    values = [rendered(part, {"values": {"status": value}}) for value in ("FORWARD", "77", None)]
+    assert values == ["FORWARD", "None", "None"]
+
+
+def test_a_stop_is_there_while_its_drive_is_silent() -> None:
+    parts = configured(InvtCHE(1, name="a"), [], [])["cmps"]
+    assert parts["stop"]["availability"] == [{"topic": "multidrop/gateway"}]
+
+
+def test_two_gateways_have_no_id_of_one_another() -> None:
+    names = [("a-b", "c"), ("a", "b-c"), ("a_2d_b", "c"), ("a", "b_c"), ("a", "b c")]
+    assert len({discovery_topic(*one) for one in names}) == len(names)
 
 
 # ---- settings ----

@@ -207,6 +207,7 @@ class JsonTopics:
             every_s=self._settings.every_s,
             writable=writable,
             takes_commands=self._settings.commands,
+            page=self._inside.page,
         )
         self.outbox.put(self._kept(discovery_topic(self._settings.prefix, name), said))
 

@@ -84,5 +84,7 @@ def _state_topic(payload: bytes) -> str:
         said = json.loads(payload)
     except (ValueError, RecursionError):
         return ""
-    found = said.get("state_topic") if isinstance(said, dict) else None
+    parts = said.get("cmps") if isinstance(said, dict) else None
+    state = parts.get("state") if isinstance(parts, dict) else said  # the whole device had one once
+    found = state.get("state_topic") if isinstance(state, dict) else None
     return found if isinstance(found, str) else ""

@@ -107,8 +107,8 @@ class LiveParts:
     ) -> dict[str, Building]:
         """Build parts side by side; wait so long for them. Raises ValueError with what cannot be opened."""
         gateway, threads = self._gateway, supervisor()
-        folder = gateway.settings.folder
-        inside = Inside(plant, gateway.hub, gateway.commands, gateway.ask, folder, gateway.version)
+        folder, page = gateway.settings.folder, gateway.settings.page
+        inside = Inside(plant, gateway.hub, gateway.commands, gateway.ask, folder, gateway.version, page)
         built = {
             name: Building(
                 settings, plant, threads.thread(name, BUILD_S, partial(build, PARTS[name], settings, inside))

@@ -44,6 +44,7 @@ class Inside(NamedTuple):
     ask: Ask
     folder: Path  # for what is kept: relative paths of settings are relative to it
     version: str
+    page: str = ""  # the address of the gateway's page; "": other machines have none
 
 
 class Feed(Protocol):

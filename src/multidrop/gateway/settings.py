@@ -66,6 +66,15 @@ class ServeSettings:
     parts: Mapping[str, Any] = field(default_factory=dict)
     is_demo: bool = False
 
+    @property
+    def page(self) -> str:
+        """The page's address; "" where the gateway listens on all addresses, and no name of it is known."""
+        if self.behind_proxy:
+            return f"https://{self.names[0]}" if self.names else ""
+        host = self.names[0] if self.names else f"[{self.host}]" if ":" in self.host else self.host
+        is_known = host not in ("0.0.0.0", "[::]")
+        return f"{'https' if self.tls else 'http'}://{host}:{self.port}" if is_known else ""
+
 
 class Folders:
     """Folders in which files are found: the service manager's credentials, and then the plant file's own.
