@@ -9,11 +9,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from brokers import FAN, Broker, Running, inside, mosquitto, without_fan
+from brokers import FAN, Broker, Running, inside, mosquitto, sparkplug_messages, without_fan
 from peers import require_module
 from profile_families import VfdEl
 from sparkplug_host import ROOT, Host, command
 
+from multidrop import DelixiModbus, Drive, InvtCHE
 from multidrop.gateway.mqtt import MqttSettings, build
 from multidrop.gateway.outbox import Outbox, Publication
 from multidrop.gateway.sparkplug import DataType, Metric, payload, read_command
@@ -76,6 +77,41 @@ def test_a_fault_in_words_is_said_of_a_drive_whose_own_number_of_it_is_not_polle
     node = SparkplugNode(MqttSettings(sparkplug="works", node="line"), known, lambda: 7)
     (birth,) = [given for given in read_command(node._device_birth("mill"))[1] if given.name == "fault"]
     assert birth.value == "it shows a fault"
+
+
+@pytest.mark.parametrize("family", [VfdEl, InvtCHE, DelixiModbus])
+def test_a_register_called_fault_leaves_the_fault_in_words(tmp_path: Path, family: type[Drive]) -> None:
+    """The metric `fault` is a text for every family; the register's own metric has its own type."""
+    known = inside(tmp_path, family(2, name="mill"))
+    known.hub.states["mill"], known.hub.faults["mill"] = "fault", "it shows a fault"
+    register = family.registers["fault"]
+    known.hub.polled = lambda drive: (register,) if drive == "mill" else ()
+    known.hub.values["mill", "fault"] = 3.0
+    node = SparkplugNode(MqttSettings(sparkplug="works", node="line"), known, lambda: 7)
+    birth = sparkplug_messages().Payload.FromString(node._device_birth("mill"))
+    kinds = {metric.name: metric.datatype for metric in birth.metrics}
+    own = DataType.DOUBLE if register.values is None else DataType.STRING
+    assert kinds == {"state": DataType.STRING, "fault": DataType.STRING, "registers/fault": own}
+    assert {metric.name: metric.string_value for metric in birth.metrics}["fault"] == "it shows a fault"
+    assert len({metric.alias for metric in birth.metrics}) == 3
+
+
+def test_a_birth_says_units(host: Host, node: tuple[Any, Running]) -> None:
+    birth = host.wait_for("DBIRTH", "pump-1")
+    units = {
+        metric.name: dict(
+            zip(metric.properties.keys, (one.string_value for one in metric.properties.values), strict=True)
+        )
+        for metric in birth.metrics
+    }
+    assert {name: said for name, said in units.items() if said} == {
+        "output_frequency": {"engUnit": "Hz"},
+        "setpoint": {"engUnit": "%"},
+    }
+    known, running = node
+    known.hub.values[("pump-1", "output_frequency")] = 50.0
+    running.step()
+    assert not host.wait_for("DDATA", "pump-1").metrics[0].HasField("properties")
 
 
 def test_what_did_not_change_is_not_said(host: Host, node: tuple[Any, Running]) -> None:

@@ -17,8 +17,13 @@ SEQUENCES = 256  # seq and bdSeq go from 0 to 255, and again
 
 # Payload's and Metric's fields (section 6.4.1)
 _TIMESTAMP, _METRICS, _SEQ = 1, 2, 3
-_NAME, _ALIAS, _METRIC_TIME, _DATATYPE, _IS_NULL = 1, 2, 3, 4, 7
+_NAME, _ALIAS, _METRIC_TIME, _DATATYPE, _IS_NULL, _PROPERTIES = 1, 2, 3, 4, 7, 9
 _INT, _LONG, _FLOAT, _DOUBLE, _BOOLEAN, _STRING = 10, 11, 12, 13, 14, 15
+
+# PropertySet's and PropertyValue's fields
+_KEYS, _VALUES = 1, 2
+_TYPE, _TEXT = 1, 8
+ENGINEERING_UNIT = "engUnit"  # the property that hosts show as a metric's unit
 
 _VARINT, _EIGHT, _BYTES, _FOUR = 0, 1, 2, 5  # wire types
 MOST_PAYLOAD = 65_536  # bytes of a command
@@ -43,6 +48,7 @@ class Metric(NamedTuple):
     time_ms: int
     name: str = ""
     alias: int | None = None
+    unit: str = ""  # in a birth
 
 
 class Given(NamedTuple):
@@ -68,6 +74,9 @@ def _metric(metric: Metric) -> bytes:
     if metric.alias is not None:
         parts.append(_number(_ALIAS, metric.alias))
     parts += [_number(_METRIC_TIME, metric.time_ms), _number(_DATATYPE, metric.datatype)]
+    if metric.unit:
+        value = _number(_TYPE, DataType.STRING) + _bytes(_TEXT, metric.unit.encode())
+        parts.append(_bytes(_PROPERTIES, _bytes(_KEYS, ENGINEERING_UNIT.encode()) + _bytes(_VALUES, value)))
     parts.append(_number(_IS_NULL, 1) if metric.value is None else _value(metric.datatype, metric.value))
     return b"".join(parts)
 

@@ -26,6 +26,8 @@ from multidrop.gateway.sparkplug import (
 )
 
 STATE, FAULT, STOP = "state", "fault", "Device Control/Stop"
+OWN = (STATE, FAULT)  # of all drives alike, in words
+REGISTERS = "registers/"  # begins the metric of a register with the name of one of those
 _log = logging.getLogger("multidrop.gateway.mqtt")
 Value = float | str | None
 
@@ -157,7 +159,10 @@ class SparkplugNode:
         self._said[drive] = values
         self._changed.pop(drive, None)
         metrics = [
-            Metric(self._datatype(drive, name), value, now, name, self._alias(drive, name))
+            Metric(
+                *(self._datatype(drive, name), value, now, name, self._alias(drive, name)),
+                unit=self._unit(drive, name),
+            )
             for name, value in values.items()
         ]
         if self._settings.commands:
@@ -178,9 +183,9 @@ class SparkplugNode:
     def _values(self, drive: str) -> dict[str, Value]:
         shown = self._hub.seen(drive)
         found: dict[str, Value] = {STATE: shown.state, FAULT: shown.fault}
-        found |= fresh_values(self._hub, drive)
+        found |= {_metric_of(name): value for name, value in fresh_values(self._hub, drive).items()}
         for name in self._writable(drive):
-            found.setdefault(name, None)
+            found.setdefault(_metric_of(name), None)
         return found
 
     def _writable(self, drive: str) -> list[str]:
@@ -194,11 +199,16 @@ class SparkplugNode:
         return next((dict(one.registers) for one in drives if one.name == drive), {})
 
     def _datatype(self, drive: str, name: str) -> DataType:
-        """Return a metric's type; of the hub's words, whose place a polled register of this name takes."""
-        if name in (STATE, FAULT) and all(name != register.name for register in self._hub.polled(drive)):
-            return DataType.STRING
-        named = self._registers(drive)[name].values is not None
-        return DataType.STRING if named else DataType.DOUBLE
+        register = self._register(drive, name)
+        return DataType.DOUBLE if register and register.values is None else DataType.STRING
+
+    def _unit(self, drive: str, name: str) -> str:
+        register = self._register(drive, name)
+        return register.value_unit if register and register.values is None else ""
+
+    def _register(self, drive: str, name: str) -> Register[Any] | None:
+        """Return the register of a metric; None for those of all drives, which are in words."""
+        return None if name in OWN else self._registers(drive)[name.removeprefix(REGISTERS)]
 
     def _alias(self, drive: str, name: str) -> int:
         return self._aliases.setdefault((drive, name), len(self._aliases) + 1)
@@ -207,14 +217,16 @@ class SparkplugNode:
 
     def _order(self, drive: str, given: Given, sent_ms: int, *, is_retained: bool) -> None:
         name = given.name or self._name_of(drive, given.alias)
+        register = name.removeprefix(REGISTERS)
+        is_writable = name not in OWN and register in self._writable(drive)
         if name == STOP and given.value:
             self._orders.stop([drive])
         elif is_retained:
             self._orders.refuse(drive, name, "the broker had kept it; publish it without retain")
-        elif name not in self._writable(drive) or not isinstance(given.value, (int, float)):
+        elif not is_writable or not isinstance(given.value, (int, float)):
             self._orders.refuse(drive, name, "it is no register that [serve.may] lists, and a number for it")
         else:
-            self._orders.write(drive, name, float(given.value), sent_ms)
+            self._orders.write(drive, register, float(given.value), sent_ms)
 
     def _name_of(self, drive: str, alias: int | None) -> str:
         known = {number: name for (owner, name), number in self._aliases.items() if owner == drive}
@@ -222,3 +234,8 @@ class SparkplugNode:
 
     def _tell(self, drive: str, what: str, told: Told) -> None:
         (_log.info if told.is_done else _log.warning)("%s of %s: %s", what, drive, told.text)
+
+
+def _metric_of(register: str) -> str:
+    """Return the name of a register's metric."""
+    return f"{REGISTERS}{register}" if register in OWN else register
