@@ -48,6 +48,11 @@ def samples(state: dict[str, Any]) -> dict[str, float]:
     return {name.removeprefix("multidrop_fleet_"): float(value) for name, _, value in found}
 
 
+def test_lines_without_a_port_are_scraped() -> None:
+    found = samples({**STATE, "lost": ["hall-1"], "unopened": ["hall-2", "hall-3"]})
+    assert (found["lost_lines"], found["unopened_lines"]) == (1, 2)
+
+
 def test_what_a_gateway_says_is_scraped() -> None:
     found = samples(STATE)
     assert found['gateway_info{gateway="gw-1",version="1.0"}'] == 1

@@ -9,7 +9,7 @@ from __future__ import annotations
 import functools
 import hashlib
 from array import array
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 
 import pyarrow as pa
 import pyarrow.compute as pc
@@ -37,6 +37,19 @@ def assign(lines: Sequence[str], gateways: Sequence[str]) -> dict[str, str]:
             number = max(one[at].as_py() for one in weights if room[one[at].as_py() & _NUMBER]) & _NUMBER
         room[number] -= 1
         found[line] = gateways[number]
+    return found
+
+
+def hand_over(wanted: Mapping[str, str], unopened: Mapping[str, Collection[str]]) -> dict[str, str]:
+    """Return each line's gateway, where `unopened` says which lines each of these gateways cannot open.
+
+    A line that all of them cannot open stays where it is. Gateways that are not named are given nothing.
+    """
+    found = dict(wanted)
+    for line in {line for lines in unopened.values() for line in lines} & wanted.keys():
+        able = [name for name, lines in unopened.items() if line not in lines]
+        if able and line in unopened.get(wanted[line], ()):
+            found[line] = max(able, key=lambda name: _hash(f"{line}/{name}"))
     return found
 
 

@@ -78,7 +78,11 @@ class FleetGateway:
         self.log = CommandLog(folder / "commands.jsonl")
         self.commands = CommandSubjects(name, self.paths, held, self.log)
         commanded = CommandedLines(self.lines, self.commands, lambda: self.member.lease.left_s > SILENT_S)
-        self.member = Member(name, self.paths, commanded, self.mastership, lock=self.lock)
+        self.member = Member(
+            *(name, self.paths, commanded, self.mastership),
+            lock=self.lock,
+            why_lost=lambda line: self.lines.bus(line).why_lost,
+        )
         self.forwarder: Forwarder | None = None
         self._end = asyncio.Event()
 
@@ -156,6 +160,7 @@ class FleetGateway:
     def state(self) -> dict[str, Any]:
         """Return what `multidrop fleet status` shows of this gateway."""
         member, spool = self.member, self.spool.state()
+        lost = {line: f"port lost: {why}" for line, why in member.keeper.lost.items()}
         forwarder = self.forwarder.state() if self.forwarder else None
         last = forwarder.last if forwarder else None
         return {
@@ -166,7 +171,9 @@ class FleetGateway:
             "paths": [path.server_name for path in self.paths],
             "lines": len(member.polled),
             "moves": member.keeper.moves,
-            "troubles": dict(sorted(member.keeper.troubles.items())),
+            "troubles": dict(sorted({**member.keeper.troubles, **lost}.items())),
+            "lost": sorted(lost),
+            "unopened": sorted(member.unopened.named()),
             "trouble": member.trouble,
             "last_moves": [move.as_json() for move in member.records.moves.newest(TOLD)],
             "spool": {

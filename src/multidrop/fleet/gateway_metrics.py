@@ -32,6 +32,10 @@ _FIGURES = (
     _Figure("behind_messages", "gauge", "Messages that the stream lacks.", ("spool", "behind")),
     _Figure("behind_seconds", "gauge", "Age of the oldest message that it lacks.", ("spool", "lag_s")),
 )
+_LINES = {
+    "lost": "Lines of its own that nobody polls, for their port is lost.",
+    "unopened": "Lines that others should take, for it cannot open their ports.",
+}
 _SUFFIXES = {"gauge": "", "counter": "_total"}
 _PREFIX = "multidrop_fleet_"
 
@@ -50,6 +54,9 @@ def families_of(state: Mapping[str, Any], version: str) -> Iterator[MetricFamily
     servers = len(set(filter(None, state["paths"])))
     yield _family("servers", "gauge", "Servers that its three connections are at.", servers)
     yield _family("troubled_lines", "gauge", "Lines that cannot be taken.", len(state["troubles"]))
+    for key, text in _LINES.items():
+        if key in state:  # no earlier version says so
+            yield _family(f"{key}_lines", "gauge", text, len(state[key]))
     for figure in _FIGURES:
         value: Any = state
         for key in figure.keys:

@@ -17,6 +17,7 @@ from multidrop.fleet.lease import Lease
 from multidrop.fleet.owner_records import OwnerRecords
 from multidrop.fleet.ownership import Claim
 from multidrop.fleet.share_records import ShareRecords
+from multidrop.fleet.unopened_lines import UnopenedLines
 
 _log = logging.getLogger("multidrop.fleet")
 
@@ -46,21 +47,32 @@ class TakenLine(NamedTuple):
 class LineKeeper:
     """The lines that one gateway polls, and what is under way on each of them.
 
-    `on_change` is called when something is to be looked at anew.
+    `on_change` is called when something is to be looked at anew. `why_lost` returns why the port of a polled
+    line is lost and could not be opened again; None where it is open.
     """
 
     def __init__(
-        self, lines: Lines, lease: Lease, records: ShareRecords, on_change: Callable[[], object]
+        self,
+        lines: Lines,
+        lease: Lease,
+        records: ShareRecords,
+        on_change: Callable[[], object],
+        *,
+        unopened: UnopenedLines | None = None,
+        why_lost: Callable[[str], str | None] = lambda line: None,
     ) -> None:
         self.lines = lines
         self.polled: dict[str, TakenLine] = {}
         self.troubles: dict[str, str] = {}  # lines that could not be taken, and why
+        self.lost: dict[str, str] = {}  # lines that nobody polls now, for their port is not there, and why
         self.releasing: set[str] = set()  # ours, and to be given away
         self.may_claim = True  # beside gateways with other rules nothing is
         self._lease = lease
         self._records = records
         self._owners = OwnerRecords(lease, records, lambda: self.may_poll, self._take_new)
         self._on_change = on_change
+        self._unopened = unopened or UnopenedLines(lambda: lease.clock())
+        self._why_lost = why_lost
         self._is_leaving = False
         self._at_work: dict[str, asyncio.Task[None]] = {}  # by line: it is taken, let go or claimed
         self._tasks: set[asyncio.Task[None]] = set()
@@ -130,6 +142,7 @@ class LineKeeper:
         mine = {line: self._records.plant.records[line].revision for line in kept if self.is_mine(line)}
         for line in self.troubles.keys() - mine.keys():
             self._forget_trouble(line)
+        self._look_at_ports()
         now = time.monotonic()
         for line, polled in list(self.polled.items()):
             if mine.get(line) != polled.revision and line not in self._at_work:
@@ -143,6 +156,26 @@ class LineKeeper:
                 self._start(lines, self._owners.give_away(lines))
             doubted = filter(self._owners.doubted, kept - mine.keys())
             self.claim({line: claim for line in doubted if (claim := self.claim_of(line))})
+
+    def _look_at_ports(self) -> None:
+        """Note which ports of polled lines are lost: after a while others should take the lines."""
+        for line in self.polled.keys() - self._at_work.keys():
+            if why := self._why_lost(line):
+                if line not in self.lost:
+                    _log.warning("line %s is not polled, for its port is lost: %s", line, why)
+                self.lost[line] = why
+                self._unopened.lost(line)
+            else:
+                self._opened(line)
+
+    def _opened(self, line: str) -> None:
+        if self.lost.pop(line, None):
+            _log.warning("line %s is polled again", line)
+        self._unopened.opened(line)
+
+    def _not_ours(self, line: str) -> None:
+        self.lost.pop(line, None)
+        self._unopened.gone(line)
 
     async def let_all_go(self) -> None:
         """Let go of all lines, whatever is under way. Raises the error of a line that could not be."""
@@ -188,6 +221,9 @@ class LineKeeper:
                 await self.lines.take(line, record.value)
             except (OSError, ValueError) as failure:
                 told, self.troubles[line] = self.troubles.get(line), str(failure)
+                if isinstance(failure, OSError):
+                    self.lost[line] = str(failure)
+                    self._unopened.failed(line)
                 self._again_at[line] = time.monotonic() + TAKE_AGAIN_S
                 asyncio.get_running_loop().call_later(1.01 * TAKE_AGAIN_S, self._on_change)
                 if told != str(failure):
@@ -196,14 +232,18 @@ class LineKeeper:
                 if line in self.troubles:
                     _log.warning("line %s is taken now", line)
                     self._forget_trouble(line)
+                self.lost.pop(line, None)
+                self._unopened.opened(line)
                 self.polled[line] = TakenLine(record.revision, self._lease.clock())
 
     def _forget_trouble(self, line: str) -> None:
         del self.troubles[line], self._again_at[line]
+        self._not_ours(line)
 
     async def _let_go(self, line: str) -> None:
         await self.lines.let_go(line)
         self.polled.pop(line, None)
+        self._not_ours(line)
 
 
 def _some_at_once(lines: Iterable[str]) -> Iterator[list[str]]:

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Coroutine, Mapping, Sequence
+from collections.abc import Callable, Coroutine, Iterable, Mapping, Sequence
 from contextlib import suppress
 from enum import StrEnum
 from functools import partial
@@ -37,6 +37,7 @@ from multidrop.fleet.servers import ServerPath
 from multidrop.fleet.share_records import ShareRecords
 from multidrop.fleet.shares import Sharers, Shares
 from multidrop.fleet.task_end import end_tasks
+from multidrop.fleet.unopened_lines import UnopenedLines
 from multidrop.fleet.weak_session import WeakSession
 
 _log = logging.getLogger("multidrop.fleet")
@@ -68,6 +69,7 @@ class Member:
         *,
         lock: LifeLock | None = None,
         terms: Terms = USUAL,
+        why_lost: Callable[[str], str | None] = lambda line: None,
     ) -> None:
         self.name = names.checked_name("gateway", name)
         self.paths = paths
@@ -79,7 +81,10 @@ class Member:
         ]
         self.lease = Lease(name, own, mastership, lock=lock, terms=terms, note=self._note)
         self.records = ShareRecords(name, self.best, terms, self._wake, self._is_mine)
-        self.keeper = LineKeeper(lines, self.lease, self.records, self._mark_dirty)
+        self.unopened = UnopenedLines(lambda: self.lease.clock())
+        self.keeper = LineKeeper(
+            lines, self.lease, self.records, self._mark_dirty, unopened=self.unopened, why_lost=why_lost
+        )
         self._shares = Shares()
         self._share: set[str] = set()  # the lines that should be ours
         self._releases = Releases(self.best, self._mark_dirty)
@@ -145,6 +150,7 @@ class Member:
         return {
             "draining": self.is_draining,
             "lines": len(self.polled),
+            "unopened": sorted(self.unopened.named()),
             "margin_ms": max(0, round(1000 * self.lease.left_s)),
         }
 
@@ -265,11 +271,30 @@ class Member:
         sharing = self._see(present)
         if not self.is_draining and self.lease.session:
             sharing.add(self.name)
-        sharers = Sharers(tuple(sorted(sharing)), self.records.lines())
+        lines = self.records.lines()
+        sharers = Sharers(tuple(sorted(sharing)), lines, self._unopened(present, sharing, lines))
         if await self._shares.make(sharers, self.lease.clock(), is_settled=self._is_settled):
             self._share = self._shares.of(self.name)
             self.records.want(self._share)
             self._is_dirty = True
+
+    def _unopened(
+        self, present: Mapping[str, Mapping[str, Any]], sharing: Iterable[str], lines: Iterable[str]
+    ) -> tuple[tuple[str, frozenset[str]], ...]:
+        """Return the lines that each gateway could not open; none of versions that do not say so.
+
+        Those would not take what is given away for them.
+        """
+        told = {name: value.get("unopened") for name, value in present.items()}
+        told[self.name] = list(self.unopened.named())
+        known = {name: said for name in sorted(sharing) if isinstance(said := told.get(name), list)}
+        if not any(known.values()):
+            return ()
+        there = frozenset(lines)
+        return tuple(
+            (name, there.intersection(one for one in said if isinstance(one, str)))
+            for name, said in known.items()
+        )
 
     def _claim_and_release(self) -> None:
         me = (self.name, self.lease.session)

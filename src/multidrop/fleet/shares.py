@@ -12,10 +12,11 @@ QUIET_NS = SECOND // 2  # without a gateway that comes or goes, before shares ar
 
 
 class Sharers(NamedTuple):
-    """Those among whom lines are shared out, and the lines."""
+    """Those among whom lines are shared out, the lines, and which of them may be handed over."""
 
     gateways: tuple[str, ...]
     lines: tuple[str, ...]
+    unopened: tuple[tuple[str, frozenset[str]], ...] = ()  # lines that these gateways could not open
 
 
 class Shares:
@@ -46,7 +47,8 @@ class Shares:
         if sharers == self._made or is_early:
             return False
         loop = asyncio.get_running_loop()
-        self.wanted = await loop.run_in_executor(None, balance.assign, sharers.lines, sharers.gateways)
+        wanted = await loop.run_in_executor(None, balance.assign, sharers.lines, sharers.gateways)
+        self.wanted = balance.hand_over(wanted, dict(sharers.unopened))
         self._made = sharers
         return True
 
