@@ -12,6 +12,7 @@ import sys
 from argparse import Namespace
 from itertools import pairwise
 from typing import Any
+from unittest.mock import AsyncMock
 
 import pytest
 from commands import Run
@@ -148,6 +149,27 @@ def test_the_exit_status_says_that_a_master_is_missing(
 
     monkeypatch.setattr(look, "_seen", seen)
     assert asyncio.run(look._status(Namespace(json=False), [])) == status
+
+
+def test_a_gateway_that_is_missing_and_a_lost_port_are_told(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    gone = told() | {"lines": {"line-1": line("gw-1")}}
+    lost = told() | {"lines": {"line-1": line("gw-1"), "line-2": line("gw-2")}}
+    gone["missing"] = {"gw-9": {"host": "pc-9", "session": 4, "seen_ms": 1_764_000_000_000}}
+    why = "port lost: socket://10.0.0.7:4001: nothing listens there"
+    more = {"lost": ["line-1", 5], "troubles": {"line-1": why}, "unopened": ["line-2", "line-1"]}
+    lost["gateways"]["gw-1"]["says"] = SAYS | more
+    lost["gateways"]["gw-2"]["says"] = SAYS | {"lost": 7, "unopened": None}
+    for found, sentence in (
+        (gone, "gw-9 on pc-9 is missing: last seen 2025-11-24 16:00:00"),
+        (lost, f"gw-1: line line-1: {why}"),
+    ):
+        monkeypatch.setattr(look, "_seen", AsyncMock(return_value=found))
+        assert asyncio.run(look._status(Namespace(json=False), [])) == 1
+        assert sentence in capsys.readouterr().out.splitlines()
+    assert "1 with a lost port" in drawn(lost)
+    assert "gw-1: line line-2 cannot be opened from here, and was handed over" in drawn(lost)
 
 
 def test_lines_are_in_the_order_of_their_numbers() -> None:

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import asyncio
 import json
+import time
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from fleets import MemoryBucket
+from fleets import HandClock, MemoryBucket
 from peers import require_module
 from tables import table
 
@@ -16,7 +17,7 @@ require_module("nats")
 
 from multidrop.fleet import names  # noqa: E402
 from multidrop.fleet.errors import FleetError  # noqa: E402
-from multidrop.fleet.overview import FleetView  # noqa: E402
+from multidrop.fleet.overview import MISSED_MS, FleetView  # noqa: E402
 from multidrop.fleet.ownership import owner_value  # noqa: E402
 
 SPOOL = {"bytes": 1, "lost": 0, "behind": 0, "lag_s": 0.0, "trouble": None}
@@ -101,6 +102,34 @@ def test_who_does_not_answer_says_nothing() -> None:
 def test_moves_that_are_none_harm_nothing(moves: Any) -> None:
     found = looked(view({"gw-1": STATE | {"last_moves": moves}}))
     assert found["gateways"]["gw-1"]["says"] == STATE
+
+
+def test_a_gateway_whose_session_others_ended_is_missing() -> None:
+    now_ms = time.time_ns() // 1_000_000
+    made = view()
+    died = {  # by name: its newest record on each path, and whether it is missing
+        "gw-4": (lease(2, ended=True) | {"by": "gw-1", "at_ms": now_ms - 60_000}, True),
+        "gw-5": (lease(2, ended=True) | {"at_ms": now_ms}, False),  # it left
+        "gw-6": (lease(2, ended=True) | {"by": "gw-6", "at_ms": now_ms}, False),
+        "gw-7": (lease(2, ended=True) | {"by": "gw-1", "at_ms": now_ms - MISSED_MS}, False),
+        "gw-8": (lease(2, ended=True) | {"by": "gw-1"}, True),
+    }
+    clock = HandClock()
+    made._records.observer._clock = clock
+    for follower in made._records.observer.paths:
+        for name, (record, _) in died.items():
+            follower.bucket.store(name, record)  # type: ignore[attr-defined]
+    asyncio.run(made.look())
+    clock.pass_s(60)  # an end by others counts once the lease must have run out
+    found = looked(made)["missing"]
+    assert found.keys() == {name for name, (_, is_missing) in died.items() if is_missing}
+    assert found["gw-4"] == {"host": "pc", "session": 2, "seen_ms": now_ms - 60_000}
+    assert found["gw-8"]["seen_ms"] is None
+    for follower in made._records.observer.paths[:2]:
+        follower.bucket.store("gw-4", lease(3))  # type: ignore[attr-defined]
+    found = looked(made)
+    assert "gw-4" not in found["missing"]
+    assert found["gateways"]["gw-4"]["session"] == 3
 
 
 def test_without_a_connection_it_says_which_servers() -> None:

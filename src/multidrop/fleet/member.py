@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import time
 from collections.abc import Callable, Coroutine, Iterable, Mapping, Sequence
 from contextlib import suppress
 from enum import StrEnum
@@ -151,6 +152,7 @@ class Member:
             "draining": self.is_draining,
             "lines": len(self.polled),
             "unopened": sorted(self.unopened.named()),
+            "at_ms": time.time_ns() // 1_000_000,  # UTC, for people alone
             "margin_ms": max(0, round(1000 * self.lease.left_s)),
         }
 

@@ -105,6 +105,17 @@ class Observer:
                 found[name] = present[0]
         return found
 
+    def missing(self) -> dict[str, dict[str, Any]]:
+        """Return each gateway whose newest session others have ended, with its record: it did not leave."""
+        present = self.sessions()
+        found = {}
+        for name in sorted({name for follower in self.paths for name in follower.records} - present.keys()):
+            newest = max((record.value["session"] for _, record in self._of(name)), default=0)
+            of_it = [record for _, record in self._of(name) if record.value["session"] == newest]
+            if of_it and all(is_ended_by_another(record) or not record.value["ended"] for record in of_it):
+                found[name] = of_it[0].value
+        return found
+
     def weak(self) -> list[str]:
         """Return the gateways whose session others have ended on a path, and which go on by the rest."""
         return [

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import time
 from collections import Counter
 from collections.abc import Container, Mapping
 from contextlib import suppress
@@ -19,6 +20,7 @@ from multidrop.fleet.servers import ServerPath
 from multidrop.fleet.setup import check_buckets
 
 MOVES_SHOWN = 20
+MISSED_MS = 30 * 24 * 3600 * 1000  # for which a gateway that did not come back is told as missing
 _MAY_BE_NONE: Mapping[str, tuple[type, ...]] = {  # of the spool in a gateway's answer
     "behind": (int, NoneType),
     "lag_s": (int, float, NoneType),
@@ -62,10 +64,12 @@ class FleetView:
         return state if is_shown(state) else None
 
     def fleet(self) -> dict[str, Any]:
-        """Return gateways with a session that nobody ended, lines with their masters, and the last moves.
+        """Return gateways with a session that nobody ended, those that are missing, lines with their masters,
+        and the last moves.
 
         A gateway that died a moment ago is still there, until another one has ended its session; `says` is
-        None where it does not answer, and `unseen_s` tells for how long (s) this view saw no renewal.
+        None where it does not answer, and `unseen_s` tells for how long (s) this view saw no renewal. It is
+        missing afterwards, with the time (`seen_ms`, UTC) of its last renewal, until it runs again.
         """
         sessions = self._records.observer.sessions()
         lines = self._lines(sessions)
@@ -82,8 +86,14 @@ class FleetView:
             }
             for name, value in sessions.items()
         }
+        now_ms = time.time_ns() // 1_000_000
+        missing = {
+            name: {"host": value["host"], "session": value["session"], "seen_ms": seen_ms}
+            for name, value in self._records.observer.missing().items()
+            if (seen_ms := _ms(value.get("at_ms"))) is None or now_ms - seen_ms < MISSED_MS
+        }
         moves = [move.as_json() for move in self._records.moves.newest(MOVES_SHOWN)]
-        return {"gateways": gateways, "lines": lines, "moves": moves}
+        return {"gateways": gateways, "missing": missing, "lines": lines, "moves": moves}
 
     def _lines(self, sessions: Container[str]) -> dict[str, Any]:
         observer, plant = self._records.observer, self._records.plant.records
@@ -103,6 +113,10 @@ class FleetView:
                 "since_ms": record.value["since"] if record and record.value and gateway else None,
             }
         return found
+
+
+def _ms(found: object) -> int | None:
+    return found if type(found) is int else None
 
 
 def is_shown(state: Mapping[str, Any]) -> bool:

@@ -13,6 +13,7 @@ from multidrop.cli.support.fleet_tables import (
     free_lines,
     gateway_table,
     line_table,
+    lost_lines,
     move_table,
     natural,
     trouble_sentences,
@@ -48,7 +49,7 @@ async def _status(arguments: argparse.Namespace, paths: list[ServerPath]) -> int
         print_text(json.dumps(found, indent=2))
     else:
         print_text("\n".join(_table(found)))
-    return 1 if free_lines(found) or unsure_lines(found) else 0
+    return int(any((free_lines(found), unsure_lines(found), lost_lines(found), found.get("missing"))))
 
 
 def _table(found: dict[str, Any]) -> list[str]:

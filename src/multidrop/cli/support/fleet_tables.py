@@ -31,10 +31,10 @@ LINES_LEFT_OUT = ("PORT", "SINCE")
 UNITS = ("B", "kB", "MB", "GB", "TB")
 
 
-def moment(ms: int) -> str:
-    """Return a time (ms since 1970) as UTC; "?" for a number that no calendar has."""
+def moment(ms: int | None) -> str:
+    """Return a time (ms since 1970) as UTC; "?" for none, and for a number that no calendar has."""
     try:
-        return time.strftime("%Y-%m-%d %H:%M:%S", time.gmtime(ms // 1000))
+        return "?" if ms is None else time.strftime("%Y-%m-%d %H:%M:%S", time.gmtime(ms // 1000))
     except (OverflowError, ValueError, OSError):
         return "?"
 
@@ -118,9 +118,21 @@ def unsure_lines(fleet: Told) -> list[str]:
     return [name for name, line in fleet["lines"].items() if line["master"] in silent]
 
 
+def lost_lines(fleet: Told) -> list[str]:
+    """Return the lines whose master has lost their port: nobody polls them."""
+    return [line for gateway in fleet["gateways"].values() for line in _lines_in(gateway["says"], "lost")]
+
+
+def _lines_in(says: Told | None, key: str) -> list[str]:
+    """Return the lines that a gateway's answer lists; none for an answer without such a list."""
+    found = (says or {}).get(key)
+    return [line for line in found if isinstance(line, str)] if isinstance(found, list) else []
+
+
 def count_sentence(fleet: Told) -> str:
-    unsure = len(unsure_lines(fleet))
+    unsure, lost = len(unsure_lines(fleet)), len(lost_lines(fleet))
     more = f", {unsure} whose master does not answer" if unsure else ""
+    more += f", {lost} with a lost port" if lost else ""
     return f"{counted(len(fleet['lines']), 'line')}, {len(free_lines(fleet))} without a master{more}"
 
 
@@ -140,10 +152,18 @@ def _from_to(move: Told) -> tuple[str, str]:
 
 def trouble_sentences(fleet: Told) -> list[str]:
     """Return the troubles that gateways report, a sentence for each."""
-    found = []
+    found = [
+        f"{name} on {gateway['host']} is missing: last seen {moment(gateway['seen_ms'])}"
+        for name, gateway in fleet.get("missing", {}).items()
+    ]
     for name, gateway in fleet["gateways"].items():
         says = gateway["says"] or {}
         found += [f"{name}: line {line}: {why}" for line, why in (says.get("troubles") or {}).items()]
+        found += [
+            f"{name}: line {line} cannot be opened from here, and was handed over"
+            for line in _lines_in(says, "unopened")
+            if line in fleet["lines"] and fleet["lines"][line]["master"] != name
+        ]
         found += [
             f"{name}: {why}" for why in (says.get("trouble"), says.get("spool", {}).get("trouble")) if why
         ]
