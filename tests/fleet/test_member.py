@@ -17,8 +17,8 @@ from peers import require_module
 
 require_module("nats")
 
+from multidrop.fleet import line_keeper, names, releases, unopened_lines, weak_session  # noqa: E402
 from multidrop.fleet import member as member_module  # noqa: E402
-from multidrop.fleet import names, releases, weak_session  # noqa: E402
 from multidrop.fleet.buckets import Bucket  # noqa: E402
 from multidrop.fleet.cluster import Cluster as Servers  # noqa: E402
 from multidrop.fleet.cluster import Replica  # noqa: E402
@@ -175,6 +175,55 @@ def test_each_takes_its_share_and_a_dead_ones_lines_are_taken_over(fleet: Cluste
             assert not again.polled
             await until(lambda: len(again.polled) >= 5 and running.all_are_polled(), "it comes back")
             assert again.lease.session >= 2  # more where the machine let it stand still
+
+    asyncio.run(main())
+
+
+class Ports:
+    """The ports of a member's lines, which may be cut."""
+
+    def __init__(self, member: Member) -> None:
+        self.is_cut = False
+        self._take = member.keeper.lines.take
+        member.keeper.lines.take = self.take  # type: ignore[method-assign]
+        member.keeper._why_lost = self.why_lost
+
+    def why_lost(self, line: str) -> str | None:
+        return f"{line}: No route to host" if self.is_cut else None
+
+    async def take(self, line: str, description: object) -> None:
+        if self.is_cut:
+            raise OSError(self.why_lost(line))
+        await self._take(line, description)
+
+
+def test_lines_that_a_gateway_cannot_open_go_to_others_and_come_back(
+    fleet: Cluster, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It is cut off from its lines, and not from the servers; its lease stays valid."""
+    monkeypatch.setattr(unopened_lines, "LOST_NS", SECOND // 2)
+    for wait in ("FIRST_WAIT_NS", "LAST_WAIT_NS"):
+        monkeypatch.setattr(unopened_lines, wait, SECOND)
+    monkeypatch.setattr(line_keeper, "TAKE_AGAIN_S", 0.1)
+
+    async def main() -> None:
+        async with gateways(fleet, "a", "b", "c", terms=LONG) as running:
+            await until(running.are_shared, "shares")
+            ports = {name: Ports(member) for name, member in running.members.items()}
+            a, b, c = running.members.values()
+            ports["a"].is_cut = True
+            await until(lambda: len(b.polled) + len(c.polled) == len(LINES), "others have those of a")
+            assert a.lease.is_valid
+            ports["b"].is_cut = True
+            await until(lambda: len(c.polled) == len(LINES), "c has all")
+            ports["c"].is_cut = True
+            await until(lambda: len(c.keeper.lost) > 1, "nobody polls")
+            ports["b"].is_cut = False
+            await until(lambda: len(b.polled) == len(LINES) and not b.keeper.lost, "b has all")
+            for one in ports.values():
+                one.is_cut = False
+            await until(running.are_shared, "all are home")
+            assert not any(member.keeper.lost for member in (a, b, c))
 
     asyncio.run(main())
 

@@ -71,6 +71,21 @@ def test_one_line_at_a_time_is_tried_again_and_ever_more_rarely() -> None:
         wait_s = min(2 * wait_s, LAST_WAIT_NS / SECOND)
 
 
+def test_a_line_that_nobody_can_open_is_tried_first_and_as_often_as_before() -> None:
+    clock = HandClock()
+    unopened = UnopenedLines(clock)
+    for line in "abc":
+        failed(unopened, line)
+    unopened.hopeless = frozenset("b")
+    for _ in range(5):
+        clock.pass_s(FIRST_WAIT_NS / SECOND)
+        assert unopened.named() == {"a", "c"}
+        failed(unopened, "b")
+    unopened.hopeless = frozenset()
+    clock.pass_s(FIRST_WAIT_NS / SECOND)
+    assert unopened.named() == {"a", "b", "c"}
+
+
 def test_once_a_trial_ended_well_the_others_are_tried_without_a_wait() -> None:
     clock = HandClock()
     unopened = UnopenedLines(clock)

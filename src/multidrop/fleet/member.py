@@ -293,10 +293,12 @@ class Member:
         if not any(known.values()):
             return ()
         there = frozenset(lines)
-        return tuple(
-            (name, there.intersection(one for one in said if isinstance(one, str)))
+        found = {
+            name: there.intersection(one for one in said if isinstance(one, str))
             for name, said in known.items()
-        )
+        }
+        self.unopened.hopeless = there.intersection(*found.values())
+        return tuple(found.items())
 
     def _claim_and_release(self) -> None:
         me = (self.name, self.lease.session)

@@ -2,7 +2,8 @@
 
 A gateway that is cut off from a line, and not from NATS, names it in its lease after some failures. The line
 then goes to a gateway that has not named it. It comes back by trials, one line at a time and ever more
-rarely: during a failed trial nobody polls the line.
+rarely: during a failed trial nobody polls the line. A line that all gateways have named is polled by nobody
+anyway, so trials of it do not become rarer.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from multidrop.fleet.lease_rules import SECOND
 
 OPENINGS = 3  # that failed, before a line is named
 LOST_NS = 6 * SECOND  # for which a polled line's port is lost, before it is named
-FIRST_WAIT_NS, LAST_WAIT_NS = 900 * SECOND, 24 * 3600 * SECOND  # before a trial
+FIRST_WAIT_NS, LAST_WAIT_NS = 120 * SECOND, 24 * 3600 * SECOND  # before a trial
 TRIAL_NS = 60 * SECOND  # after which a line that did not come back is tried no more
 MOST_BYTES = 8_000  # of names in a lease's record
 
@@ -25,6 +26,7 @@ class UnopenedLines:
     """
 
     def __init__(self, clock: Callable[[], int]) -> None:
+        self.hopeless: frozenset[str] = frozenset()  # lines that all gateways have named
         self._clock = clock
         self._failures: dict[str, int] = {}
         self._lost_since: dict[str, int] = {}
@@ -64,8 +66,10 @@ class UnopenedLines:
         now = self._clock()
         if self._tried and now - self._tried_since >= TRIAL_NS:
             self._tried = ""
-        if self._named and not self._tried and now >= self._trial_at:
-            self._tried, self._tried_since = next(iter(self._named)), now
+        hopeless = [line for line in self._named if line in self.hopeless]
+        trial_at = min(self._trial_at, self._tried_since + FIRST_WAIT_NS) if hopeless else self._trial_at
+        if self._named and not self._tried and now >= trial_at:
+            self._tried, self._tried_since = next(iter(hopeless or self._named)), now
             del self._named[self._tried]
             self._trial_at = now + self._wait_ns
         return frozenset(self._named)
@@ -78,5 +82,5 @@ class UnopenedLines:
             self._tried, self._wait_ns = "", min(2 * self._wait_ns, LAST_WAIT_NS)
             self._trial_at = now + self._wait_ns
         elif not self._named and not self._tried:
-            self._trial_at = now + self._wait_ns
+            self._trial_at, self._tried_since = now + self._wait_ns, now
         self._named[line] = None
