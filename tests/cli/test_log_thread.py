@@ -3,14 +3,21 @@
 from __future__ import annotations
 
 import argparse
+import json
 import logging
 import os
+import re
 import sys
 from contextlib import suppress
+from datetime import datetime
+from pathlib import Path
+from typing import Any
 
 import pytest
 from lines import until
+from peers import require_module
 
+from multidrop.cli import hub, main
 from multidrop.cli.fleet import serve
 from multidrop.cli.support import log_thread
 from multidrop.cli.support.log_thread import LogThread
@@ -74,5 +81,29 @@ def test_a_gateway_of_a_fleet_waits_for_nobody_who_reads_its_log(monkeypatch: py
     with os.fdopen(unread) as reader, os.fdopen(log, "w") as stream:
         fill(log)
         monkeypatch.setattr(sys, "stderr", stream)
-        assert serve.run(argparse.Namespace()) == 7
-        assert reader.readline().strip() == "multidrop: a stop of pump-1"
+        assert serve.run(argparse.Namespace(log="text")) == 7
+        assert reader.readline().strip().endswith(" warning a stop of pump-1")
+
+
+@pytest.mark.parametrize("command", [serve, hub])
+def test_logs_of_a_fleet_have_time_and_level_also_as_json(
+    monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str], tmp_path: Path, command: Any
+) -> None:
+    require_module("nats")
+    from multidrop.fleet.hub import HubState
+
+    async def work(*_: object) -> Any:
+        logging.getLogger("multidrop.fleet").warning("line %s is lost\x1b", "hall-1")
+        return HubState(0, 0, 0, 0, 0, 0, None) if command is hub else 0
+
+    name = "_read_until_signal" if command is hub else "_serve"
+    monkeypatch.setattr(command, name, work)
+    for form in ("text", "json"):
+        words = ["hub", "--parquet", str(tmp_path)] if command is hub else ["fleet", "serve", "gw-1"]
+        assert main([*words, "--log", form]) == 0
+    text, told = capfd.readouterr().err.splitlines()
+    assert re.fullmatch(r"\d{4}-\d\d-\d\dT[0-9:.]+\+00:00 warning line hall-1 is lost\\x1b", text)
+    found = json.loads(told)
+    assert (found["level"], found["logger"]) == ("warning", "multidrop.fleet")
+    assert found["message"] == "line hall-1 is lost\x1b"
+    assert datetime.fromisoformat(found["time"]).tzinfo is not None

@@ -145,6 +145,22 @@ def test_no_server(
     assert told.count("\n") == 1
 
 
+def test_servers_of_the_environment(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ports = free_ports(2)
+    urls = ",".join(f"nats://127.0.0.1:{port}" for port in ports)
+    monkeypatch.setenv("MULTIDROP_NATS", urls)
+    status, told = refused(capsys, "--parquet", str(tmp_path))
+    assert status == 1
+    assert all(f"nats://127.0.0.1:{port}" in told for port in ports)
+    status, told = refused(capsys, "http://a:4222", "--parquet", str(tmp_path))
+    assert (status, told) == (
+        2,
+        "multidrop: http://a:4222 is no address of a NATS server; write nats://127.0.0.1:4222\n",
+    )
+
+
 def test_a_folder_of_something_else(
     running: Cluster, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -25,7 +25,7 @@ from multidrop.cli import serve as serve_command
 from multidrop.gateway.listener import listen
 from multidrop.gateway.rights import Right, digest, read_tokens
 
-UNIT = Path(__file__).parents[2] / "packaging" / "multidrop@.service"
+UNITS = sorted((Path(__file__).parents[2] / "packaging").glob("*.service"))
 
 
 @pytest.mark.long
@@ -273,9 +273,10 @@ def test_the_demo_is_live_and_everybody_here_may_stop_it(words: list[str]) -> No
 
 
 @pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="systemd-analyze is not installed")
-def test_the_unit_file_is_right_and_exposes_little(tmp_path: Path) -> None:
-    unit = tmp_path / "multidrop@hall.service"
-    unit.write_text(UNIT.read_text().replace("/opt/multidrop/bin/multidrop", "/bin/true"))
+@pytest.mark.parametrize("path", UNITS, ids=lambda path: path.stem)
+def test_a_unit_file_is_right_and_exposes_little(tmp_path: Path, path: Path) -> None:
+    unit = tmp_path / path.name.replace("@", "@hall")
+    unit.write_text(path.read_text().replace("/opt/multidrop/bin/multidrop", "/bin/true"))
     verified = subprocess.run(["systemd-analyze", "verify", unit], capture_output=True, text=True)
     assert (verified.returncode, verified.stderr) == (0, "")
     judge = ["systemd-analyze", "security", "--offline=true", "--threshold=20", "--no-pager", str(unit)]

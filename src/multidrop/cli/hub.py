@@ -6,13 +6,15 @@ import argparse
 import asyncio
 import json
 import logging
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from multidrop.cli.support.arguments import add_json_argument, duration
 from multidrop.cli.support.extras import require_extra
-from multidrop.cli.support.nats import add_nats_arguments, nats_options
-from multidrop.cli.support.output import logging_to, print_text, warn
+from multidrop.cli.support.log_thread import FORMATTERS, LogThread, add_log_argument
+from multidrop.cli.support.nats import URLS, add_nats_arguments, nats_options, nats_urls
+from multidrop.cli.support.output import logging_by, print_text
 from multidrop.cli.support.signals import end_signals_cancel
 from multidrop.cli.support.values import counted
 
@@ -23,7 +25,9 @@ EVERY_S = 10.0
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("servers", metavar="URL", nargs="+", help="servers of NATS: nats://host:4222")
+    parser.add_argument(
+        "servers", metavar="URL", nargs="*", help=f"servers of NATS; else MULTIDROP_NATS, or {URLS}"
+    )
     sinks = parser.add_mutually_exclusive_group(required=True)
     sinks.add_argument("--parquet", metavar="FOLDER", type=Path, help="keep samples in Parquet files there")
     sinks.add_argument("--postgres", metavar="WHERE", help="keep them in PostgreSQL: 'host=db dbname=plant'")
@@ -35,6 +39,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="seconds of samples in a commit; 10 if not given",
     )
     parser.add_argument("--once", action="store_true", help="end when all is kept that is there now")
+    add_log_argument(parser)
     add_nats_arguments(parser)
     add_json_argument(parser)
 
@@ -44,10 +49,12 @@ def run(arguments: argparse.Namespace) -> int:
         require_extra(library, "fleet", "hub")
     if arguments.postgres:
         require_extra("psycopg", "postgres", "hub")
+    arguments.servers = nats_urls(",".join(arguments.servers))
     options = {"name": "multidrop hub", **nats_options(arguments, arguments.servers)}
     sink = _sink(arguments)
     try:
-        with logging_to(warn, "multidrop.fleet", logging.INFO):
+        log = LogThread(sys.stderr, FORMATTERS[arguments.log]())
+        with logging_by(log, {"multidrop.fleet": logging.INFO}):
             state = asyncio.run(_read_until_signal(arguments, sink, options))
     finally:
         sink.close()

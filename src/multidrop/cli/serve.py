@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import asyncio
-import json
 import logging
 import os
 import sys
@@ -13,7 +12,6 @@ import time
 import webbrowser
 from collections.abc import Callable
 from contextlib import AbstractContextManager, suppress
-from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -21,7 +19,7 @@ from typing import TYPE_CHECKING
 
 from multidrop.cli.support.demo_plant import DRIVES, demo_port, plant_file, simulator, start_motors
 from multidrop.cli.support.extras import require_extra
-from multidrop.cli.support.log_thread import LogThread
+from multidrop.cli.support.log_thread import FORMATTERS, LogThread, add_log_argument
 from multidrop.cli.support.output import logging_by, print_text, warn
 from multidrop.cli.support.plants import add_port_option, plant_of
 from multidrop.cli.support.signals import on_end_signals, on_reload_signal
@@ -29,7 +27,6 @@ from multidrop.drive.named_verbs import verbs_of
 from multidrop.drives import MODELS
 from multidrop.plant.loader import load_plant
 from multidrop.plant.model import Plant
-from multidrop.printable import masked, printable
 
 if TYPE_CHECKING:
     from multidrop.gateway.reload import Read
@@ -46,7 +43,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--demo", action="store_true", help="serve a simulated plant, and open its page")
     parser.add_argument("--no-browser", action="store_true", help="open no page, with --demo")
     parser.add_argument("--check", action="store_true", help="check the file and its [serve], and do nothing")
-    parser.add_argument("--log", choices=("text", "json"), default="text", help="form of the log on stderr")
+    add_log_argument(parser)
     parser.add_argument(
         "--new-token",
         metavar="ROLE",
@@ -193,33 +190,6 @@ def _new_token(role: str | None, owner: str | None) -> int:
 # ---- logs ----
 
 
-class _JsonFormatter(logging.Formatter):
-    """One JSON object a line."""
-
-    def format(self, record: logging.LogRecord) -> str:
-        found = {
-            "time": _time(record),
-            "level": record.levelname.lower(),
-            "logger": record.name,
-            "message": masked(record.getMessage()),
-        }
-        if record.exc_info:
-            found["exception"] = masked(self.formatException(record.exc_info))
-        return json.dumps(found, ensure_ascii=False)
-
-
-class _TextFormatter(logging.Formatter):
-    """Time, level and message on a line, whoever's names are in it; a traceback below it."""
-
-    def format(self, record: logging.LogRecord) -> str:
-        text = f"{_time(record)} {record.levelname.lower()} {printable(masked(record.getMessage()))}"
-        return f"{text}\n{masked(self.formatException(record.exc_info))}" if record.exc_info else text
-
-
-def _time(record: logging.LogRecord) -> str:
-    return datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds")
-
-
 def _logging(form: str, level: int) -> AbstractContextManager[None]:
-    handler = LogThread(sys.stderr, _JsonFormatter() if form == "json" else _TextFormatter())
+    handler = LogThread(sys.stderr, FORMATTERS[form]())
     return logging_by(handler, {"multidrop": level, "uvicorn": logging.WARNING, "asyncio": logging.WARNING})

@@ -5,22 +5,19 @@ from __future__ import annotations
 import argparse
 import asyncio
 import logging
-import os
 from collections.abc import Awaitable, Callable, Coroutine
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from multidrop.cli.support.arguments import add_json_argument
 from multidrop.cli.support.extras import require_extra
-from multidrop.cli.support.nats import add_nats_arguments, nats_options
+from multidrop.cli.support.nats import URLS, add_nats_arguments, nats_options, nats_urls
 from multidrop.cli.support.output import logging_to, warn
 from multidrop.control.eeprom_ledger import default_path
-from multidrop.printable import masked
 
 if TYPE_CHECKING:
     from multidrop.fleet.servers import ServerPath
 
-URLS = "nats://127.0.0.1:4222"
 STATE = "~/.local/state/multidrop/fleet"  # state_folder(), where XDG_STATE_HOME is not set
 
 
@@ -40,14 +37,7 @@ def add_address_arguments(parser: argparse.ArgumentParser) -> None:
 
 def urls_of(arguments: argparse.Namespace) -> list[str]:
     """Return the servers' URLs. Raises ValueError for none, and for one that is not nats:// or tls://."""
-    text = arguments.nats or os.environ.get("MULTIDROP_NATS") or URLS
-    found = [url.strip() for url in text.split(",") if url.strip()]
-    for url in found:
-        if not url.startswith(("nats://", "tls://")):
-            raise ValueError(f"{masked(url)} is no address of a NATS server; write {URLS}")
-    if not found:
-        raise ValueError(f"{masked(text)!r} names no NATS server; write {URLS}")
-    return found
+    return nats_urls(arguments.nats)
 
 
 def state_folder() -> Path:

@@ -10,11 +10,10 @@ from contextlib import AsyncExitStack
 from pathlib import Path
 
 from multidrop.cli.fleet.connection import STATE, add_address_arguments, require_fleet, state_folder, urls_of
-from multidrop.cli.support.log_thread import LogThread
+from multidrop.cli.support.log_thread import FORMATTERS, LogThread, add_log_argument
 from multidrop.cli.support.nats import nats_options
 from multidrop.cli.support.output import logging_by, print_text
 from multidrop.cli.support.signals import on_end_signals
-from multidrop.printable import printable
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -29,20 +28,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--keep", metavar="SIZE", default="10 GB", help="most that the spool takes; 10 GB if not given"
     )
     parser.add_argument("--metrics", metavar="HOST:PORT", help="answer GET /metrics there")
+    add_log_argument(parser)
     add_address_arguments(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
     require_fleet()
-    with logging_by(LogThread(sys.stderr, _SentenceFormatter()), {"multidrop.fleet": logging.INFO}):
+    with logging_by(LogThread(sys.stderr, FORMATTERS[arguments.log]()), {"multidrop.fleet": logging.INFO}):
         return asyncio.run(_serve(arguments))
-
-
-class _SentenceFormatter(logging.Formatter):
-    """Sentences as `warn` prints them."""
-
-    def format(self, record: logging.LogRecord) -> str:
-        return "\n".join(f"multidrop: {printable(line)}" for line in record.getMessage().splitlines())
 
 
 async def _serve(arguments: argparse.Namespace) -> int:

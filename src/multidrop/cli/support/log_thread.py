@@ -1,13 +1,18 @@
-"""The log's own thread: no stop waits for a terminal that was halted, or a pipe that nobody reads."""
+"""The log's own thread, so that no stop waits for a halted terminal or a full pipe, and the log's forms."""
 
 from __future__ import annotations
 
+import argparse
+import json
 import logging
 import os
 import queue
 import threading
 from contextlib import suppress
+from datetime import UTC, datetime
 from typing import TextIO
+
+from multidrop.printable import masked, printable
 
 MOST_WAITING = 10_000  # lines
 ENDING_S = 1.0  # for which the last of them are waited for
@@ -63,3 +68,40 @@ class LogThread(logging.Handler):
     def _put(self, line: str) -> None:
         with suppress(OSError, ValueError):  # a full disk, or a reader that is gone
             self._file.write(f"{line}\n")
+
+
+# ---- forms ----
+
+
+class JsonFormatter(logging.Formatter):
+    """One JSON object a line."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        found = {
+            "time": _time(record),
+            "level": record.levelname.lower(),
+            "logger": record.name,
+            "message": masked(record.getMessage()),
+        }
+        if record.exc_info:
+            found["exception"] = masked(self.formatException(record.exc_info))
+        return json.dumps(found, ensure_ascii=False)
+
+
+class TextFormatter(logging.Formatter):
+    """Time, level and message on a line, whoever's names are in it; a traceback below it."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        text = f"{_time(record)} {record.levelname.lower()} {printable(masked(record.getMessage()))}"
+        return f"{text}\n{masked(self.formatException(record.exc_info))}" if record.exc_info else text
+
+
+def _time(record: logging.LogRecord) -> str:
+    return datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds")
+
+
+FORMATTERS = {"text": TextFormatter, "json": JsonFormatter}
+
+
+def add_log_argument(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--log", choices=FORMATTERS, default="text", help="form of the log on stderr")

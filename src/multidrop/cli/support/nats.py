@@ -1,4 +1,4 @@
-"""Options of commands that speak with a fleet's NATS servers: credentials, and the servers' certificate."""
+"""Options of commands that speak with a fleet's NATS servers: URLs, credentials and a certificate."""
 
 from __future__ import annotations
 
@@ -10,7 +10,9 @@ from pathlib import Path
 from typing import Any
 
 from multidrop.cli.support.extras import require_extra
+from multidrop.printable import masked
 
+URLS = "nats://127.0.0.1:4222"
 CREDENTIALS, CA = "MULTIDROP_NATS_CREDENTIALS", "MULTIDROP_NATS_CA"
 
 
@@ -24,6 +26,21 @@ def add_nats_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--ca", metavar="FILE", type=Path, help=f"certificate that the servers' are signed by; else {CA}"
     )
+
+
+def nats_urls(given: str | None) -> list[str]:
+    """Return the servers' URLs: those given, with commas, or else MULTIDROP_NATS.
+
+    Raises ValueError for none, and for one that is not nats:// or tls://.
+    """
+    text = given or os.environ.get("MULTIDROP_NATS") or URLS
+    found = [url.strip() for url in text.split(",") if url.strip()]
+    for url in found:
+        if not url.startswith(("nats://", "tls://")):
+            raise ValueError(f"{masked(url)} is no address of a NATS server; write {URLS}")
+    if not found:
+        raise ValueError(f"{masked(text)!r} names no NATS server; write {URLS}")
+    return found
 
 
 def nats_options(arguments: argparse.Namespace, urls: Sequence[str]) -> dict[str, Any]:
