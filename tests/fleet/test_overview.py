@@ -112,13 +112,15 @@ def test_a_gateway_whose_session_others_ended_is_missing() -> None:
         "gw-5": (lease(2, ended=True) | {"at_ms": now_ms}, False),  # it left
         "gw-6": (lease(2, ended=True) | {"by": "gw-6", "at_ms": now_ms}, False),
         "gw-7": (lease(2, ended=True) | {"by": "gw-1", "at_ms": now_ms - MISSED_MS}, False),
+        "gw-9": (lease(2), False),  # it begins, on one path
         "gw-8": (lease(2, ended=True) | {"by": "gw-1"}, True),
     }
     clock = HandClock()
     made._records.observer._clock = clock
-    for follower in made._records.observer.paths:
+    for at, follower in enumerate(made._records.observer.paths):
         for name, (record, _) in died.items():
-            follower.bucket.store(name, record)  # type: ignore[attr-defined]
+            if name != "gw-9" or at == 0:
+                follower.bucket.store(name, record)  # type: ignore[attr-defined]
     asyncio.run(made.look())
     clock.pass_s(60)  # an end by others counts once the lease must have run out
     found = looked(made)["missing"]

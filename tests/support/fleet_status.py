@@ -28,5 +28,7 @@ def fleet_status(environment: Mapping[str, str]) -> dict[str, Any]:
         return {"gateways": {}, "lines": {}}
     found: dict[str, Any] = json.loads(out.getvalue())
     silent = {name for name, gateway in found["gateways"].items() if gateway["says"] is None}
-    assert status == int(any(line["master"] in {None, *silent} for line in found["lines"].values()))
+    lost = any(gateway["says"]["lost"] for gateway in found["gateways"].values() if gateway["says"])
+    is_unpolled = any(line["master"] in {None, *silent} for line in found["lines"].values())
+    assert status == int(is_unpolled or lost or bool(found["missing"]))
     return found

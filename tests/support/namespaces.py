@@ -51,6 +51,13 @@ class Namespace:
         for other in others:
             self._know(other, NOBODYS_CARD)
 
+    def cut_to_here(self, address: str) -> None:
+        """Lose all that is sent to this machine's own address on the bridge."""
+        self._send_to(address, NOBODYS_CARD)
+
+    def heal_to_here(self, address: str) -> None:
+        self._send_to(address, BRIDGES_CARD)
+
     def heal(self, others: Iterable[Namespace]) -> None:
         """Undo both."""
         _ip("link", "set", self._cable, "master", self._bridge)
@@ -58,8 +65,11 @@ class Namespace:
             self._know(other, other.card)
 
     def _know(self, other: Namespace, card: str) -> None:
+        self._send_to(other.address, card)
+
+    def _send_to(self, address: str, card: str) -> None:
         known = ("lladdr", card, "nud", "permanent", "dev", "eth0")
-        _ip("-n", self.name, "neigh", "replace", other.address, *known)
+        _ip("-n", self.name, "neigh", "replace", address, *known)
 
     def close(self) -> None:
         subprocess.run(["ip", "netns", "del", self.name], check=False, capture_output=True)

@@ -54,7 +54,7 @@ class SerialHall:
         self._count = 0
         self._lock = threading.Lock()
         self._is_over = False
-        self._host = host
+        self.host = host
         self.refusing: set[str] = set()
         for at in range(number):
             listener = socket.create_server((host, 0))
@@ -69,7 +69,7 @@ class SerialHall:
     def plant(self, every: str = "100 ms") -> str:
         """Return a plant file with all lines."""
         return "\n".join(
-            f'[[line]]\nname = "{line.name}"\nport = "socket://{self._host}:{line.port}"\n'
+            f'[[line]]\nname = "{line.name}"\nport = "socket://{self.host}:{line.port}"\n'
             f'[[line.drive]]\nname = "drive-{line.name}"\nmodel = "innovert-ibd"\naddress = 1\n'
             f'poll = ["output_current"]\nevery = "{every}"\n'
             for line in self.lines.values()

@@ -112,8 +112,10 @@ class Observer:
         for name in sorted({name for follower in self.paths for name in follower.records} - present.keys()):
             newest = max((record.value["session"] for _, record in self._of(name)), default=0)
             of_it = [record for _, record in self._of(name) if record.value["session"] == newest]
-            if of_it and all(is_ended_by_another(record) or not record.value["ended"] for record in of_it):
-                found[name] = of_it[0].value
+            by_others = [record for record in of_it if is_ended_by_another(record)]
+            has_left = any(record.value["ended"] for record in of_it if record not in by_others)
+            if by_others and not has_left:
+                found[name] = by_others[0].value
         return found
 
     def weak(self) -> list[str]:
