@@ -54,4 +54,3 @@ def test_a_gateway_that_reaches_the_nodes_and_not_the_lines_hands_them_over(cut_
         cut_drill.gateways["gw-a"].kill()  # one that is started tries all lines at once
         cut_drill.gateways["gw-a"].wait()
     assert cut_drill.hall.overlaps() == 0
-    print(sorted(cut_drill.hall.gaps().values()))
