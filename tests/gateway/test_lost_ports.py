@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -77,7 +78,8 @@ def test_no_port_at_all_is_told_and_waited_for(tmp_path: Path) -> None:
 
 
 def test_nothing_is_left_open_where_a_port_can_never_be(tmp_path: Path) -> None:
-    plant = written(tmp_path, SERVE, port="nosuch://port")
+    plant = written(tmp_path, SERVE)
+    plant = replace(plant, lines=(plant.lines[0].at("nosuch://port"),))  # no plant file may name it
     gateway = Gateway(plant, read_settings(plant, {}))
     with pytest.raises(ValueError, match="nosuch"), running(gateway):
         pass
