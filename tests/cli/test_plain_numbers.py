@@ -13,8 +13,7 @@ from multidrop.drives import InvtCHE
 from multidrop.family_file import cells
 from multidrop.gateway.guard import Denied
 from multidrop.gateway.request_fields import number_in
-from multidrop.importers.device import unit_address
-from multidrop.importers.numbers import address_at, number
+from multidrop.importers.numbers import count, number
 from multidrop.recording.csv import _parse
 
 # Fullwidth, Arabic-Indic, Devanagari and mathematical digits, and Python's own underscore.
@@ -42,16 +41,14 @@ def test_other_digits_are_refused_in_requests_and_files(text: str) -> None:
         (InvtCHE(1).setpoint.parse, text),
         (cells.number, text),
         (cells.whole, text),
-        (address_at, text),
+        (count, text),
+        (number, (text, 0)),
         (_parse, row),
         (number_in, (text, "count")),
     ]
     for parse, given in attempts:
         with pytest.raises((ValueError, Denied)):
             parse(*given) if isinstance(given, tuple) else parse(given)
-    assert unit_address(text) is None
-    with pytest.raises(ValueError, match="is no number in decimal digits"):
-        number(text, 0)
 
 
 @pytest.mark.parametrize("text", ODD)
