@@ -7,7 +7,7 @@
 enum { FIRST_DOUBLING = 16, PARTS = 8, PART_BITS = 3 }; /* the second bucket begins near 2^16 ns */
 enum { NAK = 7, BUSY = 6 };                                /* Modbus exception codes */
 
-_Static_assert(MD_STATUSES == 1 - MD_OTHER_MASTER, "every status has a place");
+_Static_assert(MD_STATUSES == 1 - MD_POLLING_FAILED, "every status has a place");
 
 static int bucket(int64_t ns)
 {

@@ -14,7 +14,7 @@ enum {
     MD_MOST_FRAME = 513,      /* ':', 2 * 255 hex digits, CR, LF */
     MD_MOST_TCP = 260,        /* a frame of Modbus TCP */
     MD_KEPT_FRAME = 24,       /* the longest frame that its exchange keeps: that of any read */
-    MD_STATUSES = 21,         /* of a row without an exception */
+    MD_STATUSES = 22,         /* of a row without an exception */
     MD_EXCEPTION_CODES = 256,
     MD_DELAY_BUCKETS = 128,
     MD_MOST_OWED = 12,        /* requests of a drive whose replies may still come */
@@ -232,7 +232,8 @@ enum md_failure {
     MD_POLL_ENDED = -16,       /* the poll ended before its turn or its reply */
     MD_MAYBE_ECHO = -17,       /* the reply cannot be told from the adapter's echo */
     MD_NOT_MASTER = -19,       /* not sent: this process may not send any more; a part may have left before */
-    MD_OTHER_MASTER = -20      /* not sent: bytes come that another master causes */
+    MD_OTHER_MASTER = -20,     /* not sent: bytes come that another master causes */
+    MD_POLLING_FAILED = -21    /* not asked: the client that queues requests failed */
 };
 
 /* The result of an exchange. first_ns and last_ns are 0 where nothing came. */

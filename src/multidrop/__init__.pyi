@@ -65,6 +65,7 @@ from multidrop.errors import NotDone as NotDone
 from multidrop.errors import NotMaster as NotMaster
 from multidrop.errors import NoValue as NoValue
 from multidrop.errors import Overtaken as Overtaken
+from multidrop.errors import PollingFailed as PollingFailed
 from multidrop.errors import PortLost as PortLost
 from multidrop.errors import Refused as Refused
 from multidrop.errors import Unconfirmed as Unconfirmed

@@ -155,6 +155,10 @@ class NotMaster(BusError):
         return self
 
 
+class PollingFailed(BusError):
+    """A poller has ended by itself: its own thread failed, on all lines. The cause is `__cause__`."""
+
+
 class NotAttached(ValueError):
     """The drive is not, or no more, on this bus: a mistake of the caller."""
 

@@ -5,6 +5,7 @@ The lines are kept busy by the core's own thread; one thread here tends them all
 
 from __future__ import annotations
 
+import logging
 import threading
 from dataclasses import replace
 from pathlib import Path
@@ -17,25 +18,32 @@ from multidrop.core import Mastership, RowQueue
 from multidrop.core.fork import register_at_fork
 from multidrop.drive.family import Drive
 from multidrop.drive.register import Register
-from multidrop.errors import LineError
+from multidrop.errors import LineError, PollingFailed
 from multidrop.plant.model import Plant, PlantLine, PolledDrive
 from multidrop.polling.adoption import GONE, Adoption
 from multidrop.polling.line_set import LineSet
 from multidrop.polling.row_source import RowSource
 from multidrop.toml_check import check_period
 from multidrop.transport import clock
+from multidrop.transport.aside_log import log_aside, traceback_of, words_of
 from multidrop.transport.statistics import LineStatistics
 
 LOOK_NS = 50_000_000  # between looks at the lines, while one of them or a reader of `fileno` needs them
 BUSY_NS = 100_000_000  # the same, where they only have to be kept busy: a third of what is queued ahead
 REST_NS = 500_000_000  # the same, where nothing is to be done
+MOST_FAILURES = 8  # of the thread itself, in a row, before it gives up
+FAILED_NS = 50_000_000  # between its attempts
+
+_log = logging.getLogger("multidrop.polling")
 
 
 class Poller(RowSource):
     """Polls a plant as its file says, from `with` on until the block is left.
 
     Raises LineError when a port cannot be opened; later failures are rows that say why a value is
-    missing. Any thread may take batches, and add or remove drives; commands go through `bus(line)`, ahead
+    missing. An exception on one line, such as one of a user's own class, is logged, and that line is tried
+    again later: `line_failures`. If polling itself fails, `take`, `batches` and `close` raise PollingFailed:
+    `failure`. Any thread may take batches, and add or remove drives; commands go through `bus(line)`, ahead
     of the polling, and are counted in `ledger` and noted in `audit`, as Bus says. With a `mastership` nothing
     is sent on any line, and no port opened, unless that holds: each value that is due meanwhile has a row
     that says so.
@@ -58,7 +66,9 @@ class Poller(RowSource):
         self._lines = LineSet(row_queue, ledger, audit, mastership)
         super().__init__(row_queue, self._lines.names)
         self._path = plant.path
-        self._thread = threading.Thread(target=self._poll, name="multidrop poller", daemon=True)
+        self._thread = threading.Thread(target=self._run, name="multidrop poller", daemon=True)
+        self._look_ns = 0  # when lines that have not called are looked at again: each look costs them all
+        self._is_failure_raised = False
         register_at_fork(self)
         try:
             self._lines.fill(plant.lines)
@@ -75,8 +85,16 @@ class Poller(RowSource):
         self._wakeup.close()
 
     def __repr__(self) -> str:
-        state = "closed" if self._closing else "polling" if self._thread.is_alive() else "not started"
-        lines = ", ".join(f"{line.name}: {len(line.bus.drives)} drives" for line in self._lines)
+        if self._closing:
+            state = "closed"
+        elif self.failure:
+            state = str(self.failure)
+        else:
+            state = "polling" if self._thread.is_alive() else "not started"
+        failing = {name: f", failing ({why})" for name, why in self.line_failures.items()}
+        lines = ", ".join(
+            f"{line.name}: {len(line.bus.drives)} drives{failing.get(line.name, '')}" for line in self._lines
+        )
         return f"<Poller {state}; {lines or 'no lines'}>"
 
     def __enter__(self) -> Poller:
@@ -90,19 +108,23 @@ class Poller(RowSource):
         self._end()
         if isinstance(error, KeyboardInterrupt):
             without_internals(error)
-        if error is not None:  # it goes on; a failure of the caller's function was logged
-            self._caller = None
+        if error is not None:  # it goes on; other failures were logged
+            self._caller, self._is_failure_raised = None, True
         self.close()
 
     def close(self) -> None:
         """Stop polling and close the ports; rows not yet taken can still be.
 
         Exchanges under way are waited for, for a second at most; every slot that is over by now has a row.
-        A function that `on_batch` calls gets its last batches first. Raises its failure, if it had one.
+        A function that `on_batch` calls gets its last batches first. Raises its failure, if it had one, and
+        PollingFailed if polling had failed; each once.
         """
         self._end()
         if self._caller:
             self._caller.raise_failure()
+        if self.failure and not self._is_failure_raised:
+            self._is_failure_raised = True
+            raise self.failure
 
     def _end(self) -> None:
         if self._closing:
@@ -120,22 +142,47 @@ class Poller(RowSource):
         if self._caller:
             self._caller.join()
 
+    def _run(self) -> None:
+        try:
+            with self._lines.tended():
+                self._poll()
+        except BaseException as failure:  # else polling would end without a word
+            self.failure = PollingFailed(f"polling has ended on all lines: {words_of(failure)}")
+            self.failure.__cause__ = failure
+            self._lines.end_polling()
+            self._wakeup.set()
+            log_aside(_log, logging.CRITICAL, "%s\n%s", self.failure, traceback_of(failure))
+
     def _poll(self) -> None:
-        with self._lines.tended():
-            look_ns = 0  # when lines that have not called are looked at again: each look costs them all
-            while not self._closing:
-                seconds = max(0, look_ns - clock.now_ns()) / 1e9
-                called = self._lines.called(self._row_queue.await_calls(seconds))
-                now = clock.now_ns()
-                if now >= look_ns:
-                    restless = [line for line in self._lines if not line.is_steady(now)]
-                    called = list(dict.fromkeys([*restless, *called]))
-                    needs_looks = self._is_watched or not all(line.is_well(now) for line in restless)
-                    look_ns = now + (LOOK_NS if needs_looks else BUSY_NS if restless else REST_NS)
-                for line in called:
-                    line.tend(clock.now_ns())
-                if self._is_watched and self._row_queue.chunks:
-                    self._wakeup.set()
+        """Tend the lines until the poller is closed.
+
+        Raises what goes wrong MOST_FAILURES times in a row: memory may be short for a moment.
+        """
+        failures = 0
+        while not self._closing:
+            try:
+                self._tend_lines()
+                failures = 0
+            except BaseException:
+                failures += 1
+                if failures == MOST_FAILURES:
+                    raise
+                clock.sleep(FAILED_NS / 1e9)
+
+    def _tend_lines(self) -> None:
+        """Wait until lines call or are to be looked at, and tend them."""
+        seconds = max(0, self._look_ns - clock.now_ns()) / 1e9
+        called = self._lines.called(self._row_queue.await_calls(seconds))
+        now = clock.now_ns()
+        if now >= self._look_ns:
+            restless = [line for line in self._lines if not line.is_steady(now)]
+            called = list(dict.fromkeys([*restless, *called]))
+            needs_looks = self._is_watched or not all(line.is_well(now) for line in restless)
+            self._look_ns = now + (LOOK_NS if needs_looks else BUSY_NS if restless else REST_NS)
+        for line in called:
+            line.tend(clock.now_ns())
+        if self._is_watched and self._row_queue.chunks:
+            self._wakeup.set()
 
     # ---- lines and drives ----
 
@@ -215,6 +262,8 @@ class Poller(RowSource):
     def _check_polling(self) -> None:
         if self._closing:
             raise ValueError("polling has ended: no line comes or goes any more")
+        if self.failure:
+            raise self.failure
 
     def add(self, line: str, polled: PolledDrive) -> None:
         """Poll one more drive on this line, from now on.
@@ -276,6 +325,14 @@ class Poller(RowSource):
             line.bus.stop_on_exit()
 
     # ---- how it went ----
+
+    @property
+    def line_failures(self) -> dict[str, str]:
+        """By name, the lines on which polling raised an exception lately, and which; {}: none.
+
+        Such a line is tried again, at most 30 s later. It counts as sound after 10 s without another one.
+        """
+        return {line.name: line.failure for line in self._lines if line.failure}
 
     def statistics(self) -> dict[str, LineStatistics]:
         """Return statistics by line and drive since polling began, or `reset_statistics`; cheap."""

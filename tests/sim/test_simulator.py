@@ -1,14 +1,20 @@
-"""The simulator's thread: that it ends when it is told to."""
+"""The simulator's thread: it ends when it is told to, and a drive that fails silences no other wire."""
 
 from __future__ import annotations
 
+import select
 import signal
 import threading
 import time
+from typing import Any
 
+import pytest
+from lines import until
+from toy import Toy
 from wire_time import Own
 
-from multidrop.sim import Simulator, Wire, serve, simulated
+from multidrop import Bus, NoReply
+from multidrop.sim import EncodedDrive, Simulator, Wire, serve, simulated
 
 PATIENCE = 60.0
 
@@ -39,3 +45,46 @@ def test_a_signal_ends_it_though_its_handler_is_not_called() -> None:
     over.set()
     for thread in threads:
         thread.join()
+
+
+class Ill(Exception):
+    """Raised by a simulated drive."""
+
+
+class IllDrive(EncodedDrive):
+    def receive(self, frame: Any) -> Any:
+        raise Ill("of this drive")
+
+
+def test_a_drive_that_fails_is_silent_and_the_other_wires_go_on(caplog: pytest.LogCaptureFixture) -> None:
+    wires = [Wire([drive], unpaced=True) for drive in (IllDrive(Toy(1)), EncodedDrive(Toy(1)))]
+    simulator = Simulator(wires)
+
+    def ask() -> None:
+        with simulator, Bus(wires[0].path) as ill, Bus(wires[1].path) as well:
+            for _ in range(2):
+                with pytest.raises(NoReply):
+                    ill.read(ill.drives[0] if ill.drives else ill.attach(Toy, 1), Toy.output_current)
+                drive = well.drives[0] if well.drives else well.attach(Toy, 1)
+                well.read(drive, Toy.output_current)
+            assert isinstance(simulator.failure, Ill)
+
+    with pytest.raises(Ill, match="of this drive"):
+        ask()
+    assert [record.name for record in caplog.records if record.levelname == "ERROR"] == ["multidrop.sim"]
+
+
+def test_a_thread_that_ends_says_so(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    simulator = Simulator([Wire([EncodedDrive(Toy(1))])])
+
+    def fail(*details: object) -> None:
+        raise Ill("of select")
+
+    monkeypatch.setattr(select, "select", fail)
+    simulator.__enter__()
+    until(lambda: isinstance(simulator.failure, Ill))
+    with pytest.raises(Ill, match="of select"):
+        simulator.__exit__()
+    assert "no drive answers any more" in caplog.text

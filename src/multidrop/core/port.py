@@ -245,6 +245,11 @@ class Port:
         return int(self._progress.done)
 
     @property
+    def pending(self) -> int:
+        """Queued exchanges that were not carried out yet."""
+        return (int(self._progress.submitted) - self.done) & 0xFFFF_FFFF
+
+    @property
     def lost(self) -> bool:
         """True once the descriptor failed: nothing more is carried out on it."""
         return bool(self._progress.lost)

@@ -34,6 +34,7 @@ class Failure(IntEnum):
     MAYBE_ECHO = lib.MD_MAYBE_ECHO
     NOT_MASTER = lib.MD_NOT_MASTER
     OTHER_MASTER = lib.MD_OTHER_MASTER
+    POLLING_FAILED = lib.MD_POLLING_FAILED
 
 
 class Status(IntEnum):
@@ -60,6 +61,7 @@ class Status(IntEnum):
     NO_VALUE = lib.MD_NO_VALUE
     NOT_MASTER = -Failure.NOT_MASTER
     OTHER_MASTER = -Failure.OTHER_MASTER
+    POLLING_FAILED = -Failure.POLLING_FAILED
 
     def __str__(self) -> str:
         return STATUSES[self]
@@ -87,6 +89,7 @@ _WORDS: dict[int, str] = {
     Status.NO_VALUE: "no valid value",
     Status.NOT_MASTER: "not sent: not master",
     Status.OTHER_MASTER: "not sent: another master",
+    Status.POLLING_FAILED: "not asked: polling failed",
 }
 
 UNASKED = "not "  # begins the statuses of values for which no request left

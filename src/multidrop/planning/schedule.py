@@ -62,6 +62,10 @@ class Schedule(Generic[J]):
     """The jobs of one line."""
 
     def __init__(self) -> None:
+        self.clear()
+
+    def clear(self) -> None:
+        """Forget all jobs, and what is known of their drives."""
         self.jobs: list[J] = []
         self.unasked: list[tuple[J, int]] = []  # slots that passed, with the time at which each was due
         self.back_off = BackOff(self._begin_rest)

@@ -2,13 +2,44 @@
 
 from __future__ import annotations
 
+import inspect
 import logging
 import threading
-from collections.abc import Callable, Iterable
+from collections.abc import AsyncIterator, Awaitable, Callable, Generator, Iterable
+from functools import partial
 
+from multidrop.errors import PollingFailed
 from multidrop.polling.batch import Batch
 
 _log = logging.getLogger("multidrop.polling")
+
+
+_DEFERRED = (inspect.iscoroutinefunction, inspect.isgeneratorfunction, inspect.isasyncgenfunction)
+
+
+def check_function(function: object) -> None:
+    """Raise TypeError unless a call carries it out: that of an async or generator function begins nothing."""
+    if not callable(function):
+        raise TypeError(f"on_batch takes a function of one batch, not {function!r}")
+    while isinstance(function, partial):
+        function = function.func
+    calls = (function, getattr(type(function), "__call__", None))  # noqa: B004 (its class's own)
+    if any(is_deferred(call) for is_deferred in _DEFERRED for call in calls):
+        raise TypeError(_DEFERS.format(function))
+
+
+_DEFERS = (
+    "on_batch takes a plain function, and {!r} is async or a generator: it would be called and never carried "
+    "out. In asyncio, wait for poller.fileno() to be readable and call poller.take(): docs/howto/asyncio.md"
+)
+
+
+def _check_returned(function: object, returned: object) -> None:
+    """Raise TypeError for what is still to be carried out."""
+    if isinstance(returned, Awaitable | Generator | AsyncIterator):
+        if inspect.iscoroutine(returned):
+            returned.close()  # else Python warns, too
+        raise TypeError(_DEFERS.format(function))
 
 
 class BatchCaller:
@@ -27,7 +58,9 @@ class BatchCaller:
     def _run(self) -> None:
         try:
             for batch in self._batches:
-                self._function(batch)
+                _check_returned(self._function, self._function(batch))
+        except PollingFailed:
+            pass  # the poller has logged it, and raises it itself
         except BaseException as failure:  # whatever it is, the caller of close() must see it
             self._failure = failure
             _log.error("on_batch: the function failed, and is called no more", exc_info=failure)

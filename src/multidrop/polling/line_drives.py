@@ -76,6 +76,14 @@ class LineDrives:
         if jobs and not self._bus.peer(drive).has_answered:
             self.schedule.back_off.meet(drive.address)
 
+    def begin_anew(self, now_ns: int) -> None:
+        """Schedule the jobs of all drives as at the beginning, after a failure amid their planning."""
+        self.schedule.clear()
+        self._observed = []
+        for drive in self._present:
+            self._refusals.forget(drive)
+            self.begin(drive, now_ns)
+
     def slots(self, drive: Drive) -> list[Slot]:
         """Return the next slot of each of a drive's jobs that has a period."""
         return [(job, job.due_ns) for job in self._jobs(drive) if job.period_ns]

@@ -194,6 +194,11 @@ class LineSet:
             for line in self._lines:
                 line.bus.tended(False)
 
+    def end_polling(self) -> None:
+        """Begin nothing more that is polled; commands are still carried out."""
+        for line in self._lines:
+            line.bus.line.end()
+
     def let_go(self, lines: Iterable[PolledLine], why: str) -> None:
         """End these lines, and have them no more."""
         going = set(lines)

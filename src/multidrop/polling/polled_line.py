@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import threading
 from typing import Any
 
@@ -20,12 +21,18 @@ from multidrop.polling.refusals import Refusals
 from multidrop.polling.reopening import Reopening
 from multidrop.polling.summary import line_summary
 from multidrop.transport import clock
+from multidrop.transport.aside_log import log_aside, traceback_of, words_of
 from multidrop.transport.peers import GONE_S
 
 LEARN_NS = 1_000_000_000  # between looks at how long exchanges take
 RELEARN_NS = 2_000_000_000  # the same, where the core repeats the bus cycle
 REOPEN_NS = 500_000_000  # between attempts to open a port that was lost
-STANDBY_NS = 500_000_000  # between rows of a line that this process is not master of
+STANDBY_NS = 500_000_000  # between rows of a line that is not polled at present
+RETRY_NS = 500_000_000  # after a failure; doubled by each further one
+LONGEST_RETRY_NS = 30_000_000_000
+SOUND_NS = 10_000_000_000  # after which a line is polled well again
+
+_log = logging.getLogger("multidrop.polling")
 
 
 class PolledLine:
@@ -56,6 +63,10 @@ class PolledLine:
         self._reopening = Reopening(bus)
         self._reopen_ns = 0
         self._standby_ns = 0
+        self.failure = ""  # of its polling, lately; "": none
+        self._failures = 0  # in a row
+        self._retry_ns = 0  # after the last one
+        self._is_broken = False  # what is planned may be incomplete
         self._lock = threading.Lock()  # of all above: drives come and go on any thread
         register_at_fork(self)
         try:
@@ -165,15 +176,53 @@ class PolledLine:
         return is_asked and self.bus.line.may_send
 
     def tend(self, now_ns: int) -> None:
-        """Note the results of what was queued, and queue what comes next."""
+        """Note the results of what was queued, and queue what comes next.
+
+        Raises nothing: a failure, such as one of a user's own class, is logged, the line's values are rows
+        with the status POLLING_FAILED, and polling is tried again later.
+        """
         if self._is_left:  # its lock may be held until the port is closed
             return
+        try:
+            self._tend(now_ns)
+        except BaseException as failure:  # also SystemExit, of a user's class: other lines go on
+            self._fail(failure, now_ns)
+
+    def _fail(self, failure: BaseException, now_ns: int) -> None:
+        self._is_broken = True
+        delay_ns = min(RETRY_NS << min(self._failures, 10), LONGEST_RETRY_NS)
+        self._failures += 1
+        self._retry_ns = now_ns + delay_ns
+        self.failure = words_of(failure)
+        said = "line %s: polling failed, and is tried again in %g s: %s\n%s"
+        log_aside(_log, logging.ERROR, said, self.name, delay_ns / 1e9, self.failure, traceback_of(failure))
+
+    def _is_sound(self, now_ns: int) -> bool:
+        """Return True unless polling failed and is not to be tried again yet; then its values are missed."""
+        if self._is_broken:
+            self._queue.abandon()
+            self._drives.begin_anew(now_ns)
+            self._is_broken = False
+        port = self.bus.line.queue
+        if now_ns < self._retry_ns or (self._queue.port is None and port is not None and port.pending):
+            self._stand_by(now_ns, Status.POLLING_FAILED)
+            return False
+        if now_ns >= self._retry_ns + SOUND_NS:
+            self.failure, self._failures = "", 0
+        return True
+
+    def _tend(self, now_ns: int) -> None:
         with self._lock:
             port = self.bus.line.queue
             if self._is_left or not self._is_started:
                 return
+            if (self.failure or self._is_broken) and not self._is_sound(now_ns):
+                return
             if port is None:
-                (self._regain if self.bus.line.may_send else self._stand_by)(now_ns)
+                if self.bus.line.may_send:
+                    self._regain(now_ns)
+                else:
+                    self._stand_by(now_ns, Status.NOT_MASTER)
                 return
             if port is not self._queue.port:  # a stop may have opened it again before the loss was seen here
                 self._miss(self._queue.clear(now_ns), Status.LINE_LOST)
@@ -186,7 +235,7 @@ class PolledLine:
             self.bus.line.note_foreign()
             if not self.bus.line.may_send:
                 self._queue.pause(port)
-                self._stand_by(now_ns)
+                self._stand_by(now_ns, Status.NOT_MASTER)
                 return
             if now_ns - self._learnt_ns >= LEARN_NS:
                 self._learn(now_ns)
@@ -219,11 +268,11 @@ class PolledLine:
 
     # ---- not the master, a port that is lost, and the end ----
 
-    def _stand_by(self, now_ns: int) -> None:
-        """Queue nothing; until this process is the line's master, every value that is due is missed."""
+    def _stand_by(self, now_ns: int, why: Status) -> None:
+        """Queue nothing; meanwhile every value that is due is missed."""
         if now_ns >= self._standby_ns:
             self._standby_ns = now_ns + STANDBY_NS
-            self._miss(self._schedule.pass_all(now_ns), Status.NOT_MASTER)
+            self._miss(self._schedule.pass_all(now_ns), why)
 
     def _lose(self, port: Port, now_ns: int) -> None:
         port.stop()
@@ -258,6 +307,8 @@ class PolledLine:
         self.bus.line.why_closing = why
         with self._lock:
             ended_ns = self._ended_ns or clock.now_ns()
+            if self._is_broken:
+                self._queue.abandon()
             self._miss_unasked(ended_ns)
             port = self.bus.line.queue
             if port:
@@ -268,7 +319,7 @@ class PolledLine:
             else:
                 self._miss(self._schedule.pass_slots(ended_ns), Status.LINE_LOST)
             self._over_ns = clock.now_ns()
-            self._schedule = self._drives.schedule = Schedule()
+            self._schedule.clear()
             self.bus.close()
 
     # ---- how it went ----

@@ -33,8 +33,8 @@ class PortQueue:
         return bool(self._cycle)
 
     def move_to(self, port: Port) -> None:
-        """Go on on a port that was opened since; nothing is queued on it yet."""
-        self.port, self._done = port, 0
+        """Go on on a port on which nothing is queued now."""
+        self.port, self._done = port, port.done
 
     def conclude(self, port: Port) -> None:
         """Tell the schedule which exchanges were carried out."""
@@ -64,6 +64,15 @@ class PortQueue:
         if self._cycle:
             self._schedule.go_on(self._cycle[following])
             self._cycle = []
+
+    def abandon(self) -> None:
+        """Forget the port; it repeats nothing, and still carries out what is queued."""
+        port, self.port = self.port, None
+        self._queued.clear()
+        self._cycle = []
+        self._ahead_ns = 0
+        if port is not None:
+            port.repeat([])
 
     def _top_up(self, port: Port, now_ns: int) -> None:
         done_ns = max(now_ns + self._ahead_ns, self._queued[-1].not_before_ns if self._queued else 0)

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import logging
 import threading
 from contextlib import suppress
 
 from multidrop.bus import Bus
 from multidrop.errors import LineError
+from multidrop.transport.aside_log import log_aside, traceback_of
+
+_log = logging.getLogger("multidrop.polling")
 
 
 class Reopening:
@@ -35,5 +39,11 @@ class Reopening:
             self._thread.join()
 
     def _attempt(self) -> None:
-        with suppress(LineError):
+        try:
             self._bus.line.regain()
+        except LineError:
+            pass  # the line has logged it
+        except BaseException as failure:
+            log_aside(
+                _log, logging.ERROR, "%s: not opened again\n%s", self._bus.line.port, traceback_of(failure)
+            )

@@ -9,8 +9,9 @@ import threading
 from collections.abc import Callable, Iterator
 
 from multidrop.core import RowQueue
+from multidrop.errors import PollingFailed
 from multidrop.polling.batch import Batch
-from multidrop.polling.batch_caller import BatchCaller
+from multidrop.polling.batch_caller import BatchCaller, check_function
 from multidrop.polling.jobs import RowNames
 from multidrop.polling.line_set import NOBODY
 from multidrop.transport import clock
@@ -32,6 +33,8 @@ class RowSource:
         self._over = threading.Event()  # all lines are closed, and no row comes any more
         self._caller: BatchCaller | None = None
         self._changing = threading.Lock()  # one drive or line comes or goes at a time
+        self.failure: PollingFailed | None = None
+        """Why polling has ended by itself, on all lines; None: it has not."""
 
     def fileno(self) -> int:
         """Return a descriptor that is readable while rows wait to be taken, for select or an asyncio loop."""
@@ -40,21 +43,27 @@ class RowSource:
         return self._wakeup.fileno()
 
     def take(self) -> Batch | None:
-        """Return the oldest rows that wait, at once; None when there are none, or only a few new ones."""
+        """Return the oldest rows that wait, at once; None when there are none, or only a few new ones.
+
+        Raises PollingFailed if polling has failed, and no rows are left.
+        """
         now, chunks = clock.now_ns(), self._row_queue.chunks
         if chunks < 2:
             if self._is_watched:
                 self._wakeup.clear()
-            if now - self._taken_ns < FILLING_NS and not self._closing:
+            if now - self._taken_ns < FILLING_NS and not (self._closing or self.failure):
                 return None
             self._taken_ns = now
         columns = self._row_queue.take()
+        if columns is None and self.failure and not self._closing:
+            raise self.failure
         return Batch(columns, self._names.drives, self._names.registers) if columns else None
 
     def batches(self, seconds: float | None = None, *, every: float = 0.1) -> Iterator[Batch]:
         """Yield batches as they come, about one in `every` s, for `seconds` s or until the caller stops.
 
-        Once the poller is closed what is left comes at once, and then no more.
+        Once the poller is closed what is left comes at once, and then no more. Raises PollingFailed like
+        `take`.
         """
         end_ns = None if seconds is None else clock.now_ns() + round(seconds * 1e9)
         is_over = False
@@ -70,10 +79,10 @@ class RowSource:
         It holds no line up, however slow it is: rows gather meanwhile, as many as `take` leaves, and further
         ones are dropped and counted in `summary()`. Closing waits until it has had the last batch. When it
         raises, that is logged at once, it is called no more, and closing raises the same. A batch goes to
-        one taker: do not take others beside it. Raises ValueError for a second function.
+        one taker: do not take others beside it. Raises ValueError for a second function, and TypeError for
+        an async or generator function, which a call would not carry out.
         """
-        if not callable(function):
-            raise TypeError(f"on_batch takes a function of one batch, not {function!r}")
+        check_function(function)
         with self._changing:
             if self._caller:
                 raise ValueError("on_batch has a function already, which gets every batch")

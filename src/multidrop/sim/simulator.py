@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import heapq
+import logging
 import math
 import select
 import selectors
@@ -17,6 +18,8 @@ from multidrop.core.fork import register_at_fork
 from multidrop.sim.port import SimulatedEnd
 from multidrop.sim.wire import Wire
 
+_log = logging.getLogger("multidrop.sim")
+
 
 class Simulator:
     """Run wires while the context lasts: `with Simulator([wire]) as sim: sim.wires[0].path`."""
@@ -24,7 +27,9 @@ class Simulator:
     def __init__(self, wires: Sequence[Wire]) -> None:
         self.wires = tuple(wires)
         self._thread = threading.Thread(target=self._run_in_thread, name="multidrop-sim", daemon=True)
-        self._failure: BaseException | None = None
+        self.failure: BaseException | None = None
+        """What a simulated drive, or the thread itself, raised first; None: nothing."""
+        self._failed: set[int] = set()  # wires whose failure is in the log
         self._wakes: list[tuple[float, int]] = []  # a heap of (time, number of the wire)
         self._planned: dict[int, float] = {}  # of each wire, the wake-up that counts
         self._attended: dict[int, tuple[SimulatedEnd, int]] = {}  # of each wire, the port that is waited for
@@ -38,14 +43,15 @@ class Simulator:
         self.interrupt()
         self._thread.join()
         self.close()
-        if self._failure is not None:
-            raise self._failure
+        if self.failure is not None:
+            raise self.failure
 
     def _run_in_thread(self) -> None:
         try:
             self.run()
-        except BaseException as failure:
-            self._failure = failure
+        except BaseException as failure:  # of all wires, which are silent from now on
+            self.failure = self.failure or failure
+            _log.critical("the simulator has ended: no drive answers any more", exc_info=failure)
 
     def open(self) -> None:
         """Open every wire's port, or none; then the paths are known."""
@@ -83,7 +89,11 @@ class Simulator:
         return self._interrupter.fileno()
 
     def run(self) -> None:
-        """Run the wires until interrupted. Blocks."""
+        """Run the wires until interrupted. Blocks.
+
+        A simulated drive that raises an exception leaves that request without an answer. The first one of
+        each wire is logged.
+        """
         while True:
             self._sleep()
             for key, _ in self._selector.select(0):
@@ -109,19 +119,33 @@ class Simulator:
         else:
             select.select([self._selector], [], [], limit)
 
+    def _note(self, number: int, failure: Exception) -> None:
+        """Note a failure of one wire: the others go on, and so does this one."""
+        self.failure = self.failure or failure
+        if number not in self._failed:
+            self._failed.add(number)
+            _log.error("%s: a simulated drive failed", self.wires[number].name, exc_info=failure)
+
     def _receive(self, number: int) -> None:
         wire = self.wires[number]
         now = monotonic()
         chunk = wire.port.read() if wire.port else b""
         self._attend(number)
         if chunk and wire.port:
-            wire.receive(chunk, now, wire.port.baudrate())
+            try:
+                wire.receive(chunk, now, wire.port.baudrate())
+            except Exception as failure:
+                self._note(number, failure)
             self._advance(number)
 
     def _advance(self, number: int) -> None:
         """Send the bytes that have reached the client by now, and plan the wire's next wake-up."""
         wire = self.wires[number]
-        data = wire.advance(monotonic())
+        try:
+            data = wire.advance(monotonic())
+        except Exception as failure:
+            self._note(number, failure)
+            data = b""
         if data and wire.port:
             wire.port.write(data)
         self._attend(number)

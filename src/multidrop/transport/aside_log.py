@@ -5,6 +5,7 @@ from __future__ import annotations
 import _thread
 import logging
 import threading
+import traceback
 from collections.abc import Callable
 from contextlib import suppress
 from functools import partial
@@ -12,6 +13,7 @@ from queue import Empty, SimpleQueue
 
 from multidrop.core.fork import register_at_fork
 
+MOST_FRAMES = 30  # of a traceback, the innermost
 MOST_WAITING = 10_000  # pieces of work for what hangs; what comes then is dropped
 
 
@@ -64,7 +66,7 @@ class AsideThread:
         with suppress(Exception):
             threading.current_thread().name = self._name
         while True:
-            with suppress(Exception):  # a handler's own failure
+            with suppress(BaseException):  # a handler's own failure, SystemExit too
                 self._work.get()()
 
 
@@ -75,6 +77,22 @@ def log_aside(logger: logging.Logger, level: int, text: str, *details: object) -
     """Log this soon, in the order of the calls; return at once."""
     if logger.isEnabledFor(level):
         _log_thread.put(partial(logger.log, level, text, *details))
+
+
+def words_of(failure: BaseException) -> str:
+    """Return an exception's type and message on one line; its type alone if the message cannot be made."""
+    try:
+        return " ".join(f"{type(failure).__name__}: {failure}".split()).removesuffix(":")
+    except BaseException:  # of a class that a user wrote
+        return type(failure).__name__
+
+
+def traceback_of(failure: BaseException) -> str:
+    """Return an exception's traceback as text; "" if it cannot be made."""
+    try:
+        return "".join(traceback.format_exception(failure, limit=-MOST_FRAMES)).rstrip()
+    except BaseException:
+        return ""
 
 
 def flush(seconds: float) -> None:

@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import errno
+import logging
 import socket
 import struct
 import sys
 import threading
 import time
+from collections.abc import Callable
 from contextlib import suppress
 
 import serial
+
+from multidrop.transport.aside_log import log_aside, traceback_of
 
 try:
     import termios
@@ -18,6 +22,8 @@ except ImportError:  # Windows has none of its errors either
     _terminal_error: type[Exception] = OSError
 else:
     _terminal_error = termios.error
+
+_log = logging.getLogger("multidrop.line")
 
 # All exceptions with which a port can fail.
 PORT_FAILURES = (OSError, _terminal_error, serial.SerialException, ValueError, EOFError)
@@ -90,25 +96,36 @@ class Bridge:
         self._threads: list[threading.Thread] = []
         try:
             for copy in (self._out, self._in):
-                thread = threading.Thread(target=copy, daemon=True)
+                thread = threading.Thread(
+                    target=self._run, args=(copy,), name="multidrop bridge", daemon=True
+                )
                 thread.start()
                 self._threads.append(thread)
         except RuntimeError as failure:  # the system gives no more threads
             self.close()
             raise OSError(errno.ENOMEM, str(failure)) from failure
 
+    def _run(self, copy: Callable[[], None]) -> None:
+        """Copy until the port fails, in whatever way; then the core sees that it hung up."""
+        try:
+            copy()
+        except PORT_FAILURES:
+            pass  # the line logs that the port hung up
+        except BaseException as failure:
+            log_aside(_log, logging.ERROR, "%s: it failed\n%s", self._port.port, traceback_of(failure))
+        finally:
+            self._hang_up()
+
     def _out(self) -> None:
-        with suppress(*PORT_FAILURES):
-            while not self._closing.is_set():
-                try:
-                    request, is_fresh = self._take()
-                except TimeoutError:
-                    continue
-                if not request:
-                    break
-                if is_fresh:
-                    self._port.write(request)
-        self._hang_up()
+        while not self._closing.is_set():
+            try:
+                request, is_fresh = self._take()
+            except TimeoutError:
+                continue
+            if not request:
+                break
+            if is_fresh:
+                self._port.write(request)
 
     def _take(self) -> tuple[bytes, bool]:
         """Return what the core sends, and whether it was written just now; Windows has no `recvmsg`."""
@@ -118,14 +135,12 @@ class Bridge:
         return request, _is_fresh(stamps)
 
     def _in(self) -> None:
-        with suppress(*PORT_FAILURES):
-            while not self._closing.is_set():
-                received = self._port.read(1)  # waits for 10 ms at most
-                if received:
-                    received += self._port.read_all()
-                for at in range(0, len(received), MOST_CHUNK):
-                    self._hand_over(received[at : at + MOST_CHUNK])
-        self._hang_up()
+        while not self._closing.is_set():
+            received = self._port.read(1)  # waits for 10 ms at most
+            if received:
+                received += self._port.read_all()
+            for at in range(0, len(received), MOST_CHUNK):
+                self._hand_over(received[at : at + MOST_CHUNK])
 
     def _hand_over(self, chunk: bytes) -> None:
         """Give the core these bytes. While it takes none, more wait in the port."""

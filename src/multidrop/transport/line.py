@@ -23,7 +23,7 @@ from multidrop.core.fork import register_at_fork
 from multidrop.drive.network import speaks_tcp
 from multidrop.errors import LineError, NoSuchPort, PortLost
 from multidrop.transport import clock
-from multidrop.transport.aside_log import flush
+from multidrop.transport.aside_log import flush, words_of
 from multidrop.transport.bridge import PORT_FAILURES
 from multidrop.transport.line_log import LineLog
 from multidrop.transport.open_port import OpenPort
@@ -177,10 +177,11 @@ class Line:
                 return
             try:
                 self.reopen()
-            except LineError as failure:
-                self._why_closed = self._why_lost = failure.reason
-                self._log.unopened(failure.reason)
-                raise PortLost(self.port, failure.reason) from failure
+            except Exception as failure:  # of pyserial, a library of its kind, or for want of memory
+                reason = failure.reason if isinstance(failure, LineError) else words_of(failure)
+                self._why_closed = self._why_lost = reason
+                self._log.unopened(reason)
+                raise PortLost(self.port, reason) from failure
 
     # ---- what the port must do ----
 

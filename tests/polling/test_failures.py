@@ -1,0 +1,392 @@
+"""Exceptions in a poller's threads: a line's failure is that line's alone, and no thread ends in silence."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections import Counter
+from collections.abc import Callable, Iterator
+from functools import partial
+from typing import Any
+
+import pytest
+import serial
+from lines import PATIENCE, line, plant, polled, until
+from toy import Toy
+
+from multidrop import PollingFailed
+from multidrop.core import Port, RowQueue
+from multidrop.drive import Drive
+from multidrop.poller import Poller
+from multidrop.polling import line_drives, polled_line
+from multidrop.polling.batch import Row
+from multidrop.polling.port_queue import PortQueue
+from multidrop.sim import Simulator, Wire, simulated
+from multidrop.transport import clock
+from multidrop.transport.aside_log import flush
+from multidrop.transport.bridge import Bridge
+
+FAILED = "not asked: polling failed"
+CURRENT = Toy.registers["output_current"]
+
+
+class Ill(Exception):
+    """Raised by code under test."""
+
+
+class Two:
+    """A poller of two lines, each with a drive of the line's name, and its rows."""
+
+    def __init__(self, simulator: Simulator, every: float | None) -> None:
+        drives = (Toy(1, name="ill"), Toy(1, name="well"))
+        self.poller = Poller(
+            plant(
+                *(
+                    line(wire.path, polled(drive, [CURRENT], every), name=drive.name)
+                    for wire, drive in zip(simulator.wires, drives, strict=True)
+                )
+            )
+        )
+
+    def until(self, *wanted: tuple[str, str]) -> None:
+        """Take rows until each of these came, as drive and status; what came before does not count."""
+        self.rows()
+        missing = set(wanted)
+
+        def is_seen() -> bool:
+            missing.difference_update((row.drive, row.status) for row in self.rows())
+            return not missing
+
+        until(is_seen)
+
+    def rows(self) -> list[Row]:
+        found: list[Row] = []
+        while batch := self.poller.take():
+            found += batch
+        return found
+
+    def fails(self, *details: object) -> None:
+        """Fail in place of a method of the line "ill"."""
+        raise Ill("of this line")
+
+
+@pytest.fixture(params=[None, 0.01], ids=["as fast as it goes", "at a rate"])
+def two(request: pytest.FixtureRequest) -> Iterator[Two]:
+    with Simulator([Wire([simulated(Toy(1))]) for _ in range(2)]) as simulator:
+        made = Two(simulator, request.param)
+        with made.poller:
+            yield made
+
+
+@pytest.fixture(autouse=True)
+def _retried_soon(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(polled_line, "RETRY_NS", 50_000_000)
+    monkeypatch.setattr(polled_line, "STANDBY_NS", 10_000_000)
+    monkeypatch.setattr(polled_line, "LONGEST_RETRY_NS", 100_000_000)
+
+
+def of_line(name: str, method: Callable[..., Any], failure: BaseException) -> Callable[..., Any]:
+    """Return the method, which fails for the parts of this line."""
+
+    def act(self: Any, *details: Any, **more: Any) -> Any:
+        drives = getattr(self, "_present", None) or {job.owner for job in self._schedule.jobs}
+        if any(drive.name == name for drive in drives):
+            raise type(failure)(*failure.args)  # another one: each raising adds to its traceback
+        return method(self, *details, **more)
+
+    return act
+
+
+@pytest.mark.parametrize(
+    ("kind", "method"),
+    [
+        (line_drives.LineDrives, "observe"),
+        (line_drives.LineDrives, "measure"),
+        (PortQueue, "keep_busy"),
+        (PortQueue, "conclude"),
+    ],
+)
+@pytest.mark.parametrize("failure", [Ill("of this line"), MemoryError(), SystemExit(1)], ids=repr)
+def test_a_failure_on_one_line_is_that_lines_alone(
+    two: Two,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+    kind: type,
+    method: str,
+    failure: BaseException,
+) -> None:
+    two.until(("ill", "ok"), ("well", "ok"))
+    with monkeypatch.context() as broken:
+        broken.setattr(kind, method, of_line("ill", getattr(kind, method), failure))
+        two.until(("ill", FAILED), ("well", "ok"))
+        two.until(("ill", FAILED), ("well", "ok"))
+        assert list(two.poller.line_failures) == ["ill"]
+        assert two.poller.line_failures["ill"].startswith(type(failure).__name__)
+        assert "failing (" in repr(two.poller)
+    two.until(("ill", "ok"), ("well", "ok"))
+    until(lambda: "line ill: polling failed, and is tried again in " in caplog.text)
+    assert "Traceback" in caplog.text
+    assert "line well" not in caplog.text
+    assert two.poller.failure is None
+
+
+def test_a_line_that_failed_is_sound_again_after_a_while(two: Two, monkeypatch: pytest.MonkeyPatch) -> None:
+    with monkeypatch.context() as broken:
+        broken.setattr(PortQueue, "keep_busy", of_line("ill", PortQueue.keep_busy, Ill()))
+        two.until(("ill", FAILED))
+    monkeypatch.setattr(polled_line, "SOUND_NS", 0)
+    until(lambda: two.poller.line_failures == {})
+
+
+def test_a_line_that_goes_on_failing_is_tried_ever_more_rarely(
+    two: Two, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(polled_line, "RETRY_NS", 5_000_000)
+    monkeypatch.setattr(PortQueue, "keep_busy", of_line("ill", PortQueue.keep_busy, Ill()))
+    until(lambda: caplog.text.count("in 0.1 s") >= 2)
+    said = [
+        record.getMessage().split(":")[1] for record in caplog.records if record.name == "multidrop.polling"
+    ]
+    delays = [float(words.split(" in ")[1].removesuffix(" s")) for words in said]
+    assert delays[:6] == [0.005, 0.01, 0.02, 0.04, 0.08, 0.1]
+
+
+def test_what_was_queued_when_a_line_failed_is_carried_out(two: Two, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A failure right after requests were queued: their number is not known to the poller."""
+    submit, repeat = Port.submit, Port.repeat
+    left = 3
+
+    def fail_behind(act: Callable[..., Any], port: Port, exchanges: Any, *details: Any) -> Any:
+        nonlocal left
+        done = act(port, exchanges, *details)
+        if exchanges and left:
+            left -= 1
+            raise Ill
+        return done
+
+    monkeypatch.setattr(Port, "submit", lambda *details: fail_behind(submit, *details))
+    monkeypatch.setattr(Port, "repeat", lambda *details: fail_behind(repeat, *details))
+    for name in ("ill", "well"):
+        two.poller.set_rate(name, CURRENT, 0.02)
+    until(lambda: left == 0)
+    two.until(("ill", "ok"), ("well", "ok"))
+    taken = Counter(row.drive for row in two.rows())
+    assert taken.keys() <= {"ill", "well"}
+
+
+# ---- the poller's own thread ----
+
+
+def test_a_short_want_of_memory_ends_nothing(two: Two, monkeypatch: pytest.MonkeyPatch) -> None:
+    with monkeypatch.context() as short:
+        left = [MemoryError()] * 3
+        awaited = RowQueue.await_calls
+
+        def want(row_queue: RowQueue, seconds: float) -> list[int]:
+            if left:
+                raise left.pop()
+            return awaited(row_queue, seconds)
+
+        short.setattr(RowQueue, "await_calls", want)
+        until(lambda: not left)
+        two.until(("ill", "ok"), ("well", "ok"))
+    assert two.poller.failure is None
+
+
+@pytest.fixture
+def failed(two: Two, monkeypatch: pytest.MonkeyPatch) -> Two:
+    """A poller whose own thread fails for good."""
+    two.until(("ill", "ok"), ("well", "ok"))
+    monkeypatch.setattr(clock, "sleep", lambda seconds: None)
+    monkeypatch.setattr(RowQueue, "await_calls", two.fails)
+    two.poller._call_thread()
+    until(lambda: two.poller.failure and not two.poller._thread.is_alive())
+    flush(PATIENCE)
+    two.poller._is_failure_raised = True  # of the fixture's own end
+    return two
+
+
+def test_a_poller_that_failed_says_so_wherever_it_is_asked(
+    failed: Two, caplog: pytest.LogCaptureFixture
+) -> None:
+    poller = failed.poller
+    assert repr(poller).startswith("<Poller polling has ended on all lines: Ill: of this line;")
+    rows: list[Row] = []
+    with pytest.raises(PollingFailed) as raised:  # the rows that wait come first
+        rows.extend(row for batch in poller.batches() for row in batch)
+    assert rows
+    assert isinstance(raised.value.__cause__, Ill)
+    with pytest.raises(PollingFailed):
+        poller.take()
+    for act in (partial(poller.adopt, poller.plant), partial(poller.remove_line, "ill")):
+        with pytest.raises(PollingFailed):
+            act()
+    said = [record for record in caplog.get_records("setup") if record.levelno == logging.CRITICAL]
+    assert [record.getMessage().splitlines()[0] for record in said] == [str(poller.failure)]
+    poller._is_failure_raised = False
+    with pytest.raises(PollingFailed, match="Ill: of this line"):
+        poller.close()
+    poller.close()
+    assert not any(bus.is_open for bus in poller.buses.values())
+
+
+def test_a_poller_that_failed_polls_nothing_more_and_commands_go_on(failed: Two) -> None:
+    exchanges = failed.poller.statistics()["ill"].counters.exchanges
+    bus = failed.poller.bus("ill")
+    bus.read(bus.drives[0], CURRENT)
+    assert failed.poller.statistics()["ill"].counters.exchanges - exchanges <= 2  # one was under way
+
+
+def test_who_waits_for_rows_wakes_when_polling_fails(two: Two, monkeypatch: pytest.MonkeyPatch) -> None:
+    ended = threading.Event()
+
+    def wait() -> None:
+        with pytest.raises(PollingFailed):
+            for _ in two.poller.batches():
+                pass
+        ended.set()
+
+    waiting = threading.Thread(target=wait)
+    waiting.start()
+    monkeypatch.setattr(clock, "sleep", lambda seconds: None)
+    monkeypatch.setattr(RowQueue, "await_calls", two.fails)
+    until(ended.is_set)
+    waiting.join()
+    two.poller._is_failure_raised = True
+
+
+# ---- the other threads ----
+
+
+def test_a_failure_as_a_port_is_opened_again_is_logged_and_tried_again(
+    two: Two, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(polled_line, "REOPEN_NS", 10_000_000)
+    bus = two.poller.bus("ill")
+    regain = type(bus.line).regain
+    tried: list[BaseException] = [SystemExit(1), MemoryError()]
+
+    def fail(of_line: Any) -> None:
+        if tried:
+            raise tried.pop()
+        regain(of_line)
+
+    monkeypatch.setattr(type(bus.line), "regain", fail)
+    bus.line.drop()
+    two.until(("ill", "port lost"))
+    two.until(("ill", "ok"), ("well", "ok"))
+    assert tried == []
+    assert "not opened again\nTraceback" in caplog.text
+
+
+def test_a_library_that_fails_in_its_own_way_is_a_lost_port(
+    two: Two, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(polled_line, "REOPEN_NS", 10_000_000)
+    bus = two.poller.bus("ill")
+    with monkeypatch.context() as broken:
+        broken.setattr(serial.Serial, "open", two.fails)
+        bus.line.drop()
+        until(lambda: "Ill: of this line" in str(bus.why_lost))
+    two.until(("ill", "ok"))
+
+
+@pytest.mark.parametrize("method", ["_take", "_hand_over"])
+def test_a_bridge_that_fails_is_a_lost_port(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, method: str
+) -> None:
+    port = serial.serial_for_url("loop://", timeout=0)
+    with monkeypatch.context() as broken:
+        broken.setattr(Bridge, method, lambda *details: (_ for _ in ()).throw(Ill("of the bridge")))
+        bridge = Bridge(port)
+        try:
+            port.write(b"anything")
+            bridge.theirs.setblocking(True)
+            until(lambda: bridge.theirs.recv(64) == b"")
+        finally:
+            bridge.close()
+    until(lambda: "of the bridge" in caplog.text)
+
+
+def test_a_log_handler_that_exits_ends_no_log(two: Two, caplog: pytest.LogCaptureFixture) -> None:
+    class Exiting(logging.Handler):
+        def emit(self, record: logging.LogRecord) -> None:
+            raise SystemExit
+
+    handler = Exiting()
+    log = logging.getLogger("multidrop.line")
+    log.addHandler(handler)
+    try:
+        polled_line.log_aside(log, logging.ERROR, "first")
+        until(lambda: "first" in caplog.text or handler)
+    finally:
+        log.removeHandler(handler)
+    polled_line.log_aside(log, logging.ERROR, "second")
+    until(lambda: "second" in caplog.text)
+
+
+# ---- what the function of `on_batch` may be ----
+
+
+async def wait(batch: object) -> None:
+    """Would be called and never begun."""
+
+
+def give(batch: object) -> Iterator[object]:
+    yield batch
+
+
+async def give_later(batch: object) -> Any:
+    yield batch
+
+
+class Waiting:
+    async def __call__(self, batch: object) -> None:
+        """The same as an object."""
+
+
+@pytest.mark.parametrize(
+    "function", [wait, give, give_later, Waiting(), partial(wait), partial(partial(give))]
+)
+def test_a_function_that_a_call_does_not_carry_out_is_refused(two: Two, function: Any) -> None:
+    with pytest.raises(TypeError, match="is async or a generator: it would be called and never carried out"):
+        two.poller.on_batch(function)
+
+
+@pytest.mark.parametrize("function", [wait, give, give_later])
+def test_one_that_is_hidden_fails_with_its_first_batch(two: Two, function: Callable[[object], Any]) -> None:
+    two.poller.on_batch(lambda batch: function(batch))
+    caller = two.poller._caller
+    assert caller is not None
+    until(lambda: caller._failure)
+    with pytest.raises(TypeError, match="is async or a generator"):
+        two.poller.close()
+
+
+def test_own_classes_may_fail_later(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A user's class whose method fails only once it is polled."""
+    failing = threading.Event()
+
+    class Own(Toy):
+        model = "own"
+
+        def needed_silence(self) -> float:
+            if failing.is_set():
+                raise ZeroDivisionError("a bug of its author")
+            return super().needed_silence()
+
+    assert issubclass(Own, Drive)
+    monkeypatch.setattr(polled_line, "LEARN_NS", 10_000_000)
+    monkeypatch.setattr(line_drives, "MARGIN", -1.0)  # planned anew at each look
+    with Simulator([Wire([simulated(Toy(1))], unpaced=True) for _ in range(2)]) as simulator:
+        ill, well = (wire.path for wire in simulator.wires)
+        poller = Poller(
+            plant(
+                line(ill, polled(Own(1, name="own"), [Own.registers["output_current"]], 0.01), name="ill"),
+                line(well, polled(Toy(1, name="toy"), [CURRENT], 0.01), name="well"),
+            )
+        )
+        with poller:
+            failing.set()
+            until(lambda: poller.line_failures == {"ill": "ZeroDivisionError: a bug of its author"})
+            failing.clear()
