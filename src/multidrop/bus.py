@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, TypeVar, cast
@@ -10,7 +11,7 @@ from multidrop.control.attached import Attached, made
 from multidrop.control.audit_log import AuditLog
 from multidrop.control.broadcast import Broadcaster
 from multidrop.control.eeprom_ledger import Ledger
-from multidrop.control.exit_hook import without_internals
+from multidrop.control.exit_hook import exit_hook, without_internals
 from multidrop.control.latches import Latches
 from multidrop.control.leaving import Leaving
 from multidrop.control.outcome import Outcome, Stopped
@@ -21,6 +22,7 @@ from multidrop.control.time_limit import checked_expiry
 from multidrop.control.writer import Writer
 from multidrop.core import RS485, Echo, Mastership, Message, Peer, TransactionIds
 from multidrop.core.fork import register_at_fork
+from multidrop.core.undisturbed import undisturbed
 from multidrop.drive.family import Drive
 from multidrop.drive.own import check_drive, check_own, check_own_text
 from multidrop.drive.register import Register
@@ -93,7 +95,12 @@ class Bus:
         self.format = format
         self.silence = silence
         facts = _facts(port, echo, transaction, rs485)
-        self._begin(Line(port, *facts, mastership).open(), ledger, audit, expiry)
+        line = Line(port, *facts, mastership)
+        try:
+            self._begin(line.open(), ledger, audit, expiry)
+        except BaseException:  # also where the opening is interrupted
+            line.close()
+            raise
 
     @classmethod
     def awaiting(
@@ -118,12 +125,8 @@ class Bus:
         self, line: Line, ledger: Ledger | Path | str | None, audit: Path | str | None, expiry: float
     ) -> None:
         self.line = line
-        try:
-            book = ledger if isinstance(ledger, Ledger) else Ledger(ledger)
-            log = AuditLog(audit) if audit else None
-        except BaseException:
-            self.line.close()
-            raise
+        book = ledger if isinstance(ledger, Ledger) else Ledger(ledger)
+        log = AuditLog(audit) if audit else None
         self._exchanges = Exchanges(self.line)
         self._records = WriteRecords(self.line, book, log)
         self._latches = Latches(self._exchanges)
@@ -134,12 +137,14 @@ class Bus:
         self._meter = LineMeter(self._exchanges)
         self._leaving = Leaving(self._latches, self._stopper, self.stop_all, lambda: self.drives)
         self._is_closed = False
+        self._closing = threading.Lock()
         self._attached = Attached(self, self._exchanges, self._latches, self._performer, self._stopper)
         register_at_fork(self)
 
     def forked(self) -> None:
         """Be closed in the child, where nobody stops drives."""
         self._is_closed = True
+        self._closing = threading.Lock()
         self._latches.forked()
         self._attached.forked()
 
@@ -182,16 +187,26 @@ class Bus:
         self._leaving.finish()
 
     def close(self) -> None:
-        """Leave the line and close the port. A write that was sent and is not answered yet is Unconfirmed."""
-        try:
-            self.part()
-        finally:
-            self._is_closed = True
-            overruns = self.line.overruns()
-            self._exchanges.close()
-            self._meter.freeze(overruns)
-            self._records.close()
-            self._attached.free()
+        """Leave the line and close the port. A write that was sent and is not answered yet is Unconfirmed.
+
+        Where a signal interrupts the wait for that, it is done all the same; called again, this waits again.
+        """
+        self._close()
+        if self.stops_on_exit:
+            exit_hook().rest()
+
+    @undisturbed
+    def _close(self) -> None:
+        with self._closing:
+            try:
+                self.part()
+            finally:
+                self._is_closed = True
+                overruns = self.line.overruns()
+                self._exchanges.close()
+                self._meter.freeze(overruns)
+                self._records.close()
+                self._attached.free()
 
     def tended(self, is_tended: bool) -> None:
         """Note that a poller opens a lost port again: a stop waits for that, or else does it itself."""

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import logging
 import threading
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,7 @@ from multidrop.control.eeprom_ledger import Ledger
 from multidrop.control.exit_hook import exit_hook, without_internals
 from multidrop.core import Mastership, RowQueue
 from multidrop.core.fork import register_at_fork
+from multidrop.core.undisturbed import undisturbed
 from multidrop.drive.family import Drive
 from multidrop.drive.register import Register
 from multidrop.errors import LineError, PollingFailed
@@ -69,12 +71,19 @@ class Poller(RowSource):
         self._thread = threading.Thread(target=self._run, name="multidrop poller", daemon=True)
         self._look_ns = 0  # when lines that have not called are looked at again: each look costs them all
         self._is_failure_raised = False
+        self._ending = threading.Lock()
         register_at_fork(self)
         try:
-            self._lines.fill(plant.lines)
+            self._fill(plant)
         except BaseException:
-            self.close()
+            self._end()
             raise
+
+    @undisturbed
+    def _fill(self, plant: Plant) -> None:
+        with self._changing:
+            self._check_polling()  # whoever makes it may have been interrupted, and have closed it
+            self._lines.fill(plant.lines)
 
     def forked(self) -> None:
         """Be closed in the child, without rows."""
@@ -82,6 +91,7 @@ class Poller(RowSource):
         self._over, self._caller = threading.Event(), None
         self._over.set()
         self._changing = threading.Lock()
+        self._ending = threading.Lock()
         self._wakeup.close()
 
     def __repr__(self) -> str:
@@ -98,11 +108,20 @@ class Poller(RowSource):
         return f"<Poller {state}; {lines or 'no lines'}>"
 
     def __enter__(self) -> Poller:
+        try:
+            self._start()
+        except BaseException:  # then nobody leaves the block
+            self._end()
+            raise
+        return self
+
+    @undisturbed
+    def _start(self) -> None:
         with self._changing:
+            self._check_polling()
             for line in self._lines:
                 line.start()
             self._thread.start()
-        return self
 
     def __exit__(self, kind: object, error: BaseException | None, *trace: object) -> None:
         self._end()
@@ -116,19 +135,28 @@ class Poller(RowSource):
         """Stop polling and close the ports; rows not yet taken can still be.
 
         Exchanges under way are waited for, for a second at most; every slot that is over by now has a row.
+        Where a signal interrupts the wait for that, it is done all the same; called again, this waits again.
         A function that `on_batch` calls gets its last batches first. Raises its failure, if it had one, and
         PollingFailed if polling had failed; each once.
         """
         self._end()
+        if self._lines.stops_on_exit:
+            exit_hook().rest()
         if self._caller:
             self._caller.raise_failure()
         if self.failure and not self._is_failure_raised:
             self._is_failure_raised = True
             raise self.failure
 
+    @undisturbed
     def _end(self) -> None:
-        if self._closing:
-            return
+        with self._ending:
+            if not self._over.is_set():
+                self._end_lines()
+        if self._caller:
+            self._caller.join()
+
+    def _end_lines(self) -> None:
         self._closing = True
         for line in self._lines:
             line.bus.leave()  # all of them at once
@@ -139,8 +167,6 @@ class Poller(RowSource):
             self._lines.end(self._lines, "it is closed")
         self._wakeup.close()
         self._over.set()
-        if self._caller:
-            self._caller.join()
 
     def _run(self) -> None:
         try:
@@ -221,6 +247,11 @@ class Poller(RowSource):
         """
         if not isinstance(plant, Plant):
             raise TypeError(f"adopt takes a Plant, such as load_plant('plant.toml') gives, not {plant!r}")
+        self._take_signals()
+        return self._adopt(plant)
+
+    @undisturbed
+    def _adopt(self, plant: Plant) -> dict[str, LineError]:
         with self._changing:
             self._check_polling()
             adoption = Adoption(self._lines, plant)
@@ -233,6 +264,17 @@ class Poller(RowSource):
         Raises LineError when its port is not there, and ValueError where the plant with it would be wrong;
         then nothing has changed.
         """
+        self._take_signals()
+        self._add_line(line)
+
+    def _take_signals(self) -> None:
+        """Take the signals for lines that come, if this is the main thread: no other may."""
+        if self._lines.stops_on_exit:
+            with suppress(ValueError):
+                exit_hook().take_signals()
+
+    @undisturbed
+    def _add_line(self, line: PlantLine) -> None:
         with self._changing:
             self._check_polling()
             plant = self.plant
@@ -246,6 +288,7 @@ class Poller(RowSource):
             if self._thread.is_alive():
                 added.start()
 
+    @undisturbed
     def remove_line(self, name: str) -> None:
         """Poll a line no more, and close its port, as `adopt` does. Raises ValueError when there is none.
 
@@ -265,6 +308,7 @@ class Poller(RowSource):
         if self.failure:
             raise self.failure
 
+    @undisturbed
     def add(self, line: str, polled: PolledDrive) -> None:
         """Poll one more drive on this line, from now on.
 
@@ -276,6 +320,7 @@ class Poller(RowSource):
                 raise ValueError(f"another drive is called {polled.drive.name}; give every one its own name")
             self._lines.find(line).add(polled)
 
+    @undisturbed
     def remove(self, line: str, drive: str) -> None:
         """Poll the drive of this name no more; its motor goes on as it is.
 
@@ -289,6 +334,7 @@ class Poller(RowSource):
                     return polled.remove(attached)
         raise ValueError(f"there is no drive {drive!r} on line {line!r}")
 
+    @undisturbed
     def set_rate(self, drive: Drive | str, register: Register[Any] | str | None, every: float | None) -> None:
         """Read a register of a drive every so many seconds from now on; with None all that are polled of it.
 

@@ -177,6 +177,10 @@ class ExitHook:
         act.finish()
         with suppress(ValueError):  # another thread has finished it too
             self._acts.remove(act)
+        self.rest()
+
+    def rest(self) -> None:
+        """Give the signals back if nothing is to be done at the end any more; in the main thread alone."""
         if not self._acts and self._held is None and threading.current_thread() is threading.main_thread():
             self._let_go()
             if self._acts:  # another one came meanwhile

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import threading
-from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from enum import IntEnum, StrEnum
 from typing import Any
 from weakref import finalize
@@ -93,9 +93,10 @@ class _Engine:
         register_at_fork(self)
 
     def forked(self) -> None:
-        """Start another one, in the child, with the next port that is opened."""
+        """Start another one, in the child, with the next port that is opened; it has none of the parent's."""
         self._starting = threading.Lock()  # ports are opened beside each other
         self._c: Any = None
+        self._ports: set[_PortMemory] = set()
 
     @property
     def c(self) -> Any:
@@ -108,14 +109,57 @@ class _Engine:
                 self._c = started
             return self._c
 
+    def open(self, memory: _PortMemory, *details: int) -> Any:
+        """Open a port, whose memory is kept until `stop`. Raises OSError."""
+        engine = self.c
+        self._ports.add(memory)
+        made = lib.md_port_open(engine, *details)
+        if made == ffi.NULL:
+            self._ports.discard(memory)
+            raise OSError(ffi.errno, "the port cannot be waited for")
+        memory.c = ffi.gc(made, lib.md_port_free)
+        return memory.c
+
+    def stop(self, memory: _PortMemory) -> None:
+        """Have the core's thread let a port go, and wait for it; its memory is the caller's again."""
+        if memory.c is not None:
+            lib.md_port_stop(memory.c)
+        self._ports.discard(memory)
+
+    def __del__(self, stop: Callable[[Any], None] = lib.md_port_stop) -> None:
+        """Stop all ports at the interpreter's end.
+
+        Objects are freed in any order then, and `finalize` does nothing any more. This is called before any
+        memory that is only kept here is freed.
+        """
+        for memory in self._ports:
+            if memory.c is not None:
+                stop(memory.c)
+
+
+class _PortMemory:
+    """All of Python's memory that the core's thread reads and writes for one port.
+
+    What the core is given is put here first. `_Engine` keeps it until the thread has let the port go,
+    whatever becomes of the Port: that is interrupted, collected, or left open at the interpreter's end.
+    """
+
+    def __init__(self, room: int, mastership: Mastership | None) -> None:
+        self.c: Any = None  # struct md_port, freed with this
+        self.mastership = mastership
+        self.lasting: set[object] = set()  # as long as the port is open
+        self.queued: list[Exchange | None] = [None] * room  # as in the core's own ring
+        self._newest: dict[str, tuple[object, ...]] = {}
+
+    @contextmanager
+    def replacing(self, kind: str, new: object) -> Iterator[None]:
+        """Keep what replaces another of its kind, and the other too until the core has the new one."""
+        self._newest[kind] = (*self._newest.get(kind, ()), new)
+        yield
+        self._newest[kind] = (new,)
+
 
 _engine = _Engine()
-
-
-def _let_go(port: Any, mastership: Mastership | None) -> None:
-    """Free a port; until then the core looks at its mastership."""
-    lib.md_port_stop(port)
-    lib.md_port_free(port)
 
 
 class Port:
@@ -136,31 +180,29 @@ class Port:
         transactions: Transactions = Transactions.NONE,
         mastership: Mastership | None = None,
     ) -> None:
-        self.c = lib.md_port_open(_engine.c, fd, must_take, transactions, room)
-        if self.c == ffi.NULL:
-            raise OSError(ffi.errno, "the port cannot be waited for")
         self.room = room
+        self._memory = _PortMemory(room, mastership)
+        self._is_inherited = False
+        self._abandoned = finalize(self, _engine.stop, self._memory)
+        self._abandoned.atexit = False  # others may still use the port at exit
+        # Stopped with this object at the latest, in C: a signal may break off the function above.
+        self.c = ffi.gc(_engine.open(self._memory, fd, must_take, transactions, room), lib.md_port_stop)
         if mastership is not None:
             lib.md_port_fence(self.c, mastership.c)
         # Read in place: a call of the core would release the GIL, and wait to have it back.
         self._progress = lib.md_port_progress(self.c)
-        self._free = finalize(self, _let_go, self.c, mastership)  # before what the core still reads is freed
-        self._free.atexit = False  # others may still use the port at exit
-        self._kept: set[Exchange | Peer] = set()  # the core may still read them
-        self._submitted: deque[Exchange] = deque(maxlen=room)  # at most so many are pending
-        self._row_queue: RowQueue | None = None
-        self._round: object = None
         register_at_fork(self)
 
     def forked(self) -> None:
-        """Close it, in the child, without a word to the engine, whose thread is the parent's."""
-        self._free.detach()
-        self.close()
+        """Leave it to the parent, in the child: the engine's thread is there alone."""
+        self._abandoned.detach()
+        ffi.gc(self.c, None)
+        self._is_inherited = True
 
     def tap(self, tap: Tap) -> None:
         """Put all that goes over the line into this tap, and into no other any more."""
-        lib.md_port_tap(self.c, tap.c)
-        self._tap = tap
+        with self._memory.replacing("tap", tap):
+            lib.md_port_tap(self.c, tap.c)
 
     def tell_echo(self, echo: Echo) -> None:
         """Say whether its adapter echoes."""
@@ -182,7 +224,7 @@ class Port:
 
     def inherit(self, peer: Peer, before: Peer) -> None:
         """Have a peer take the place of another, which may be on the line."""
-        self._kept.update((peer, before))
+        self._memory.lasting.update((peer, before))
         lib.md_port_inherit(self.c, peer.c, before.c)
 
     def end(self) -> bool:
@@ -193,17 +235,11 @@ class Port:
         return bool(lib.md_port_end(self.c))
 
     def stop(self) -> None:
-        """Carry out nothing more, and give the descriptor back."""
-        if self._free.alive:
-            lib.md_port_stop(self.c)
+        """Carry out nothing more, and give the descriptor back. What it did can still be asked."""
+        if not self._is_inherited:
+            _engine.stop(self._memory)
 
-    def close(self) -> None:
-        """Stop, and free its memory. What it did can still be asked."""
-        self.stop()
-        if self.c is not None:
-            self._progress = ffi.new("struct md_progress *", self._progress[0])
-        self._free()
-        self.c = None
+    close = stop
 
     def report_to(self, row_queue: RowQueue, number: int) -> None:
         """Deliver rows to `row_queue`, and call it with `number` when the port needs attention.
@@ -211,19 +247,18 @@ class Port:
         That is when little is queued, when the port was lost or repeats nothing any more, and when a drive
         refuses, fails to answer, or answers again.
         """
-        self._row_queue = row_queue
-        lib.md_port_report(self.c, row_queue.c, number)
+        with self._memory.replacing("rows", row_queue):
+            lib.md_port_report(self.c, row_queue.c, number)
 
     def repeat(self, exchanges: Sequence[Exchange]) -> int:
         """Carry these out in turn while nothing that is queued is due, until they are replaced.
 
         Returns which of those that are replaced would have been next.
         """
-        self._kept.update(exchanges)  # one of them may be under way when they are replaced
+        self._memory.lasting.update(exchanges)  # one of them may be under way when they are replaced
         rounds = ffi.new("struct md_exchange *[]", [exchange.c for exchange in exchanges])
-        following = lib.md_port_repeat(self.c, rounds, len(exchanges))
-        self._round = rounds
-        return int(following)
+        with self._memory.replacing("round", rounds):
+            return int(lib.md_port_repeat(self.c, rounds, len(exchanges)))
 
     @property
     def repeating(self) -> bool:
@@ -234,10 +269,11 @@ class Port:
         """Queue exchanges, none to be sent before its time; return how many there was room for."""
         todo = ffi.new("struct md_exchange *[]", [exchange.c for exchange in exchanges])
         times = ffi.new("int64_t[]", not_before_ns)
-        taken = int(lib.md_port_submit(self.c, todo, times, len(exchanges)))
-        self._submitted.extend(exchanges[:taken])
-        self._kept.update(exchange.peer for exchange in exchanges)  # a late reply may come
-        return taken
+        self._memory.lasting.update(exchange.peer for exchange in exchanges)  # a late reply may come
+        free = exchanges[: self.room - self.pending]
+        for at, exchange in enumerate(free, int(self._progress.submitted)):
+            self._memory.queued[at & (self.room - 1)] = exchange
+        return int(lib.md_port_submit(self.c, todo, times, len(free)))
 
     @property
     def done(self) -> int:
@@ -280,7 +316,7 @@ class Port:
 
         After `expires_ns` (of CLOCK_BOOTTIME; 0: never), or after a stop, it is not sent.
         """
-        self._kept.add(exchange.peer)  # a late reply may come
+        self._memory.lasting.add(exchange.peer)  # a late reply may come
         found = into if into is not None and into.room == exchange.room else Completion(room=exchange.room)
         found.count = lib.md_port_carry_out(
             self.c, exchange.c, not_before_ns, expires_ns, found.c, found.values

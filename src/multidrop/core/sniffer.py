@@ -92,14 +92,16 @@ class Decoder:
 
     def __init__(self) -> None:
         self._c = ffi.new("struct md_decoder *")
-        self.forget()
+        self._known = ffi.new("struct md_known[]", self._PLACES)
+        self._blocks: list[RowLayout] = []
+        self._c.known, self._c.places = self._known, self._PLACES
 
     def forget(self) -> None:
         """Forget all requests."""
-        self._known = ffi.new("struct md_known[]", self._PLACES)
-        self._blocks: list[RowLayout] = []
-        self._c.known, self._c.places, self._c.taken = self._known, self._PLACES, 0
         self._c.block = ffi.NULL
+        ffi.buffer(self._known)[:] = bytes(ffi.sizeof(self._known))
+        self._c.taken = 0
+        self._blocks.clear()  # at last: the core knows none of them any more
 
     @property
     def asked(self) -> tuple[Framing, Message]:
@@ -156,8 +158,9 @@ class Unpacker:
 
     def look_at(self, piece: bytes, at: int) -> None:
         """Go on with these bytes of the file, which begin at its byte `at`."""
+        self._c.len = self._c.at = 0  # before the last piece is let go, and until the core has this one
         self._piece, self._begin = ffi.from_buffer("uint8_t[]", piece), at
-        self._c.bytes, self._c.len, self._c.at = self._piece, len(piece), 0
+        self._c.bytes, self._c.len = self._piece, len(piece)
 
     @property
     def at(self) -> int:

@@ -211,9 +211,10 @@ class LineSet:
     def end(self, lines: Iterable[PolledLine], why: str) -> None:
         """End what is under way on these lines and close their ports; what waits for one is told `why`."""
         going = list(lines)
-        self.wind_down(going)
-        for line in going:
-            line.close(why)
+        with ExitStack() as stack:
+            for line in reversed(going):
+                stack.callback(line.close, why)  # whatever becomes of the others
+            self.wind_down(going)
 
     def wind_down(self, lines: Sequence[PolledLine]) -> None:
         """Begin nothing more on these lines, and wait for what is under way; it may take a second.

@@ -306,21 +306,25 @@ class PolledLine:
         """Close the bus; every slot that is over by now has a row. Who uses the port later is told `why`."""
         self.bus.line.why_closing = why
         with self._lock:
-            ended_ns = self._ended_ns or clock.now_ns()
-            if self._is_broken:
-                self._queue.abandon()
-            self._miss_unasked(ended_ns)
-            port = self.bus.line.queue
-            if port:
-                port.stop()
-                self._queue.conclude(port)
-                slots = [*self._queue.slots(), *self._schedule.pass_slots(ended_ns)]
-                self._miss(_over(slots, ended_ns), Status.POLL_ENDED)
-            else:
-                self._miss(self._schedule.pass_slots(ended_ns), Status.LINE_LOST)
-            self._over_ns = clock.now_ns()
-            self._schedule.clear()
-            self.bus.close()
+            try:
+                self._miss_what_is_over(self._ended_ns or clock.now_ns())
+                self._over_ns = self._over_ns or clock.now_ns()
+                self._schedule.clear()
+            finally:
+                self.bus.close()
+
+    def _miss_what_is_over(self, ended_ns: int) -> None:
+        if self._is_broken:
+            self._queue.abandon()
+        self._miss_unasked(ended_ns)
+        port = self.bus.line.queue
+        if port:
+            port.stop()
+            self._queue.conclude(port)
+            slots = [*self._queue.slots(), *self._schedule.pass_slots(ended_ns)]
+            self._miss(_over(slots, ended_ns), Status.POLL_ENDED)
+        else:
+            self._miss(self._schedule.pass_slots(ended_ns), Status.LINE_LOST)
 
     # ---- how it went ----
 

@@ -9,6 +9,7 @@ import threading
 from collections.abc import Callable, Iterator
 
 from multidrop.core import RowQueue
+from multidrop.core.undisturbed import undisturbed
 from multidrop.errors import PollingFailed
 from multidrop.polling.batch import Batch
 from multidrop.polling.batch_caller import BatchCaller, check_function
@@ -73,6 +74,7 @@ class RowSource:
             while batch := self.take():
                 yield batch
 
+    @undisturbed
     def on_batch(self, function: Callable[[Batch], object], *, every: float = 0.1) -> None:
         """Call `function` with each of `batches()` on a thread of its own, until the poller is closed.
 

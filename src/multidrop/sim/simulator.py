@@ -15,6 +15,7 @@ from time import monotonic
 from typing import Self
 
 from multidrop.core.fork import register_at_fork
+from multidrop.core.undisturbed import undisturbed
 from multidrop.sim.port import SimulatedEnd
 from multidrop.sim.wire import Wire
 
@@ -30,21 +31,44 @@ class Simulator:
         self.failure: BaseException | None = None
         """What a simulated drive, or the thread itself, raised first; None: nothing."""
         self._failed: set[int] = set()  # wires whose failure is in the log
+        self._changing = threading.Lock()
+        self._is_over = False
+        self._is_open = False
         self._wakes: list[tuple[float, int]] = []  # a heap of (time, number of the wire)
         self._planned: dict[int, float] = {}  # of each wire, the wake-up that counts
         self._attended: dict[int, tuple[SimulatedEnd, int]] = {}  # of each wire, the port that is waited for
 
     def __enter__(self) -> Self:
-        self.open()
-        self._thread.start()
+        try:
+            self._start()
+        except BaseException:  # then nobody leaves the block
+            self._end()
+            raise
         return self
 
+    @undisturbed
+    def _start(self) -> None:
+        with self._changing:
+            if not self._is_over:  # whoever starts it may have been interrupted, and have ended it
+                self.open()
+                self._is_open = True
+                self._thread.start()
+
     def __exit__(self, *error: object) -> None:
-        self.interrupt()
-        self._thread.join()
-        self.close()
+        self._end()
         if self.failure is not None:
             raise self.failure
+
+    @undisturbed
+    def _end(self) -> None:
+        with self._changing:
+            self._is_over = True
+            if self._thread.is_alive():
+                self.interrupt()
+                self._thread.join()
+            if self._is_open:
+                self._is_open = False
+                self.close()
 
     def _run_in_thread(self) -> None:
         try:
@@ -64,7 +88,7 @@ class Simulator:
             for number, wire in enumerate(self.wires):
                 wire.open()
                 self._attend(number)
-        except (OSError, ValueError):
+        except BaseException:
             self.close()
             raise
 

@@ -20,16 +20,15 @@ from multidrop.core import (
     refused_names,
 )
 from multidrop.core.fork import register_at_fork
+from multidrop.core.undisturbed import undisturbed
 from multidrop.drive.network import speaks_tcp
 from multidrop.errors import LineError, NoSuchPort, PortLost
-from multidrop.transport import clock
 from multidrop.transport.aside_log import flush, words_of
 from multidrop.transport.bridge import PORT_FAILURES
 from multidrop.transport.line_log import LineLog
 from multidrop.transport.open_port import OpenPort
 from multidrop.transport.opening import check_port, is_lost_by, reason_of, why_lost
 
-LEAVING_NS = 1_000_000_000  # for callers to leave a port that was stopped
 LOGGING_S = 1.0  # that closing waits for loggers
 
 UNOPENED = "it is not opened: this process is not its master, and could end the master's connection"
@@ -74,7 +73,6 @@ class Line:
 
     def _make_locks(self) -> None:
         self._lock = threading.RLock()  # one thread opens or closes at a time
-        self._callers: set[object] = set()  # in `carry_out`; a set grows and shrinks without a lock
 
     def forked(self) -> None:
         """Close it in the child at once: a descriptor left open there would keep the port busy."""
@@ -93,9 +91,16 @@ class Line:
     # ---- opening and closing ----
 
     def open(self) -> Self:
-        """Open it and return it; LineError when it is not there."""
-        self.reopen()
+        """Open it and return it; LineError when it is not there, or was closed."""
+        self._open_first()
         return self
+
+    @undisturbed
+    def _open_first(self) -> None:
+        with self._lock:
+            if self._is_over:  # whoever opens it was interrupted, and has closed it
+                raise self._closed()
+            self._reopen()
 
     def _open(self) -> None:
         self._why_closed = "it is closed"
@@ -126,12 +131,8 @@ class Line:
             if core.lost:
                 self._log.lost("it failed")
             core.stop()
-            given_up_ns = clock.now_ns() + LEAVING_NS
-            while self._callers and clock.now_ns() < given_up_ns:
-                clock.sleep(0.001)
-            if not self._callers:  # nobody looks at its memory any more
-                core.close()
 
+    @undisturbed
     def close(self) -> None:
         """Drop the port and close it; no `regain` opens it any more."""
         with self._lock:
@@ -151,8 +152,12 @@ class Line:
             self.drop()
             self._opened.close()
 
+    @undisturbed
     def reopen(self) -> None:
         """Close what is left of the port and open it again; LineError when it is not there."""
+        self._reopen()
+
+    def _reopen(self) -> None:
         with self._lock:
             self._let_go()
             self._open()
@@ -168,6 +173,7 @@ class Line:
         """Why a lost port is not back, with its name; None where it is there, or was not tried yet."""
         return f"{self.port}: {self._why_lost}" if self.is_lost and self._why_lost else None
 
+    @undisturbed
     def regain(self) -> None:
         """Open it again if it is lost; PortLost when it is not there, and LineError once it was closed."""
         with self._lock:
@@ -176,7 +182,7 @@ class Line:
             if not self.is_lost:
                 return
             try:
-                self.reopen()
+                self._reopen()
             except Exception as failure:  # of pyserial, a library of its kind, or for want of memory
                 reason = failure.reason if isinstance(failure, LineError) else words_of(failure)
                 self._why_closed = self._why_lost = reason
@@ -226,17 +232,12 @@ class Line:
         """
         if self._opened.bridge and self.queue and self._opened.settings != exchange.settings:
             self.require(exchange.settings)
-        calling = object()
-        try:  # a signal that raises between any two steps leaves none behind, for which `drop` waited
-            self._callers.add(calling)  # before the port is looked at: `drop` then waits for this thread
-            core = self.queue
-            if core is None:
-                raise self._closed()
-            found = core.carry_out(exchange, not_before_ns, expires_ns, into)
-            is_lost = found.count < 0 and is_lost_by(found.result, core)
-            self.note_foreign()
-        finally:
-            self._callers.discard(calling)
+        core = self.queue
+        if core is None:
+            raise self._closed()
+        found = core.carry_out(exchange, not_before_ns, expires_ns, into)
+        is_lost = found.count < 0 and is_lost_by(found.result, core)
+        self.note_foreign()
         if self._log.shows(DEBUG):
             self._log.frames(exchange, found)
         if is_lost:
@@ -266,12 +267,7 @@ class Line:
 
     def counted_ns(self, now_ns: int) -> int:
         """Return until when its time is over and counted: now, or the beginning of what is under way."""
-        calling = object()
-        try:  # as in `carry_out`
-            self._callers.add(calling)
-            return now_ns if (core := self.queue) is None else min(now_ns, core.counted_ns())
-        finally:
-            self._callers.discard(calling)
+        return now_ns if (core := self.queue) is None else min(now_ns, core.counted_ns())
 
     def overruns(self) -> int | None:
         """Return how many characters came too fast since the driver was loaded; None where it is unknown."""

@@ -1,0 +1,249 @@
+"""Whatever interrupts the opening or closing of a bus, poller or simulator: closing again finishes the job.
+
+KeyboardInterrupt is raised before each bytecode of the main thread in turn, in the package's own files. This
+is more than a signal's handler can do: that runs between some of them alone.
+"""
+
+from __future__ import annotations
+
+import gc
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from functools import partial
+from itertools import count
+from pathlib import Path
+from time import sleep
+from types import FrameType
+from typing import Any
+
+import pytest
+from lines import line, plant, polled, until
+from toy import Toy
+
+import multidrop
+from multidrop import Bus, Poller
+from multidrop.sim import EncodedDrive, Simulator, Wire
+
+# A collection amid the work finalizes what an earlier interruption left, and may be interrupted itself.
+pytestmark = pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+
+PACKAGE = str(Path(multidrop.__file__).parent)
+CURRENT = Toy.registers["output_current"]
+STRIDE = 7  # bytecodes from one interruption to the next, unless all are wanted
+
+
+class Interruption(BaseException):
+    """Raised where KeyboardInterrupt may be: unlike that one it ends no test run."""
+
+
+@contextmanager
+def interrupted_before(nth: int) -> Iterator[list[str]]:
+    """Raise before the nth bytecode of the package on this thread; give a list, which then says where."""
+    left = nth
+    found: list[str] = []
+
+    def trace(frame: FrameType, event: str, argument: object) -> Any:
+        nonlocal left
+        if not frame.f_code.co_filename.startswith(PACKAGE):
+            return None
+        frame.f_trace_opcodes, frame.f_trace_lines = True, False
+        if event == "opcode" and not found:
+            left -= 1
+            if left == 0:
+                found.append(f"{frame.f_code.co_qualname}, line {frame.f_lineno}")
+                raise Interruption
+        return trace
+
+    before = sys.gettrace()
+    sys.settrace(trace)
+    try:
+        yield found
+    finally:
+        sys.settrace(before)
+
+
+@dataclass
+class Received:
+    """A simulated line, and how many requests came."""
+
+    path: str
+    drive: Counting
+
+
+class Counting(EncodedDrive):
+    requests = 0
+
+    def receive(self, frame: Any) -> Any:
+        self.requests += 1
+        return super().receive(frame)
+
+
+@pytest.fixture
+def hall() -> Iterator[Received]:
+    drive = Counting(Toy(1))
+    with Simulator([Wire([drive], unpaced=True)]) as simulator:
+        yield Received(simulator.wires[0].path, drive)
+
+
+def every(step: int, act: Callable[[int], bool]) -> int:
+    """Call this with 1, 1 + step and so on until it was not interrupted; return how often that was."""
+    for times in count():
+        if not act(1 + times * step):
+            return times
+    raise AssertionError
+
+
+def falls_silent(hall: Received) -> None:
+    """See that nothing more is sent, once the drive has taken what was: a poll takes a millisecond."""
+
+    def has_ended() -> bool:
+        before = hall.drive.requests
+        sleep(0.02)
+        return hall.drive.requests == before
+
+    until(has_ended, 10.0)
+
+
+def made(hall: Received) -> Poller:
+    return Poller(plant(line(hall.path, polled(Toy(1, name="pump"), [CURRENT]))))
+
+
+def ended(poller: Poller, hall: Received) -> None:
+    """Close again, and see that nothing is left."""
+    poller.close()
+    assert not any(bus.is_open for bus in poller.buses.values())
+    falls_silent(hall)
+    with Bus(hall.path) as bus:  # the port is free
+        bus.read(bus.attach(Toy, 1), CURRENT)
+
+
+def interrupted(act: Callable[[], object], nth: int, places: set[str]) -> bool:
+    with suppress(Interruption), interrupted_before(nth) as found:
+        act()
+    places.update(found)
+    return bool(found)
+
+
+STEPS = [STRIDE, pytest.param(1, marks=[pytest.mark.long, pytest.mark.slow])]
+
+
+@pytest.mark.parametrize("step", STEPS)
+@pytest.mark.parametrize("end", ["close", "__exit__"])
+def test_a_poller_is_closed_though_its_closing_is_interrupted(hall: Received, step: int, end: str) -> None:
+    places: set[str] = set()
+
+    def act(nth: int) -> bool:
+        poller = made(hall)
+        poller.__enter__()
+        until(poller.take)
+        details = () if end == "close" else (None, None, None)
+        was = interrupted(lambda: getattr(poller, end)(*details), nth, places)
+        ended(poller, hall)
+        return was
+
+    assert every(step, act) > 5
+    assert any("Poller" in place for place in places)
+
+
+@pytest.mark.parametrize("step", STEPS)
+def test_a_poller_that_is_interrupted_as_it_begins_is_closed(hall: Received, step: int) -> None:
+    places: set[str] = set()
+
+    def act(nth: int) -> bool:
+        poller = made(hall)
+        was = interrupted(poller.__enter__, nth, places)
+        ended(poller, hall)
+        return was
+
+    assert every(step, act) > 5
+    assert any("Poller" in place for place in places)
+
+
+@pytest.mark.parametrize("step", STEPS)
+@pytest.mark.parametrize("deed", ["take", "adopt", "set_rate"])
+def test_a_poller_is_closed_whatever_was_interrupted(hall: Received, step: int, deed: str) -> None:
+    def adopt(nth: int) -> None:
+        poller.adopt(plant(line(hall.path, polled(Toy(1, name=f"pump-{nth}"), [CURRENT]))))
+
+    def set_rate(nth: int) -> None:
+        poller.set_rate(poller.plant.lines[0].drives[0].drive, CURRENT, 0.001 * nth)
+
+    deeds = {"take": lambda nth: poller.take(), "adopt": adopt, "set_rate": set_rate}
+    poller = made(hall)
+    poller.__enter__()
+    assert every(step, lambda nth: interrupted(partial(deeds[deed], nth), nth, set())) > 1
+    ended(poller, hall)
+
+
+@pytest.mark.parametrize("step", STEPS)
+@pytest.mark.parametrize("deed", ["open", "close"])
+def test_a_bus_is_closed_though_that_is_interrupted(hall: Received, step: int, deed: str) -> None:
+    def act(nth: int) -> bool:
+        if deed == "open":
+            was = interrupted(lambda: Bus(hall.path), nth, set())
+            gc.collect()  # one that was interrupted on its way to its owner
+        else:
+            bus = Bus(hall.path)
+            bus.read(bus.attach(Toy, 1), CURRENT)
+            was = interrupted(bus.close, nth, set())
+            bus.close()
+            assert not bus.is_open
+        with Bus(hall.path) as again:
+            again.read(again.attach(Toy, 1), CURRENT)
+        return was
+
+    assert every(step, act) > 5
+
+
+@pytest.mark.parametrize("step", STEPS)
+@pytest.mark.parametrize("deed", ["__enter__", "__exit__"])
+def test_a_simulator_ends_though_that_is_interrupted(step: int, deed: str) -> None:
+    def act(nth: int) -> bool:
+        simulator = Simulator([Wire([EncodedDrive(Toy(1))], unpaced=True)])
+        if deed == "__exit__":
+            simulator.__enter__()
+        was = interrupted(getattr(simulator, deed), nth, set())
+        simulator.__exit__()
+        assert not simulator._thread.is_alive()
+        assert simulator.wires[0].port is None
+        return was
+
+    assert every(step, act) > 5
+
+
+# ---- what the core may still write to ----
+
+LEFT_OPEN = """
+import gc, sys
+sys.path[:0] = {path!r}
+from lines import line, plant, polled
+from toy import Toy
+from multidrop import Poller
+poller = Poller(plant(line({port!r}, polled(Toy(1, name="pump"), [Toy.output_current], {every}))))
+poller.__enter__()
+while not poller.take():
+    pass
+{end}
+"""
+ENDS = {
+    "at the end": "",
+    "by SystemExit": "sys.exit(0)",
+    "collected": "del poller; gc.collect()",
+    "in a cycle": "poller.itself = poller; del poller; gc.collect(); x = [bytearray(5000)] * 2000",
+    "used at exit": "import atexit; atexit.register(lambda: [poller.take() for _ in range(100)])",
+    "without an owner of its port": "line = poller.bus('line').line; line.queue = None; gc.collect()",
+}
+
+
+@pytest.mark.parametrize("every", ["None", "0.002"])
+@pytest.mark.parametrize("end", ENDS.values(), ids=ENDS)
+def test_a_poller_that_is_left_open_harms_no_memory(hall: Received, every: str, end: str) -> None:
+    """The interpreter frees its objects in any order, while the core's thread still runs."""
+    path = [each for each in sys.path if each]
+    code = LEFT_OPEN.format(path=path, port=hall.path, every=every, end=end)
+    ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
+    assert (ran.returncode, ran.stderr) == (0, "")
+    falls_silent(hall)
