@@ -4,15 +4,33 @@ from __future__ import annotations
 
 import random
 from collections.abc import Iterable
+from functools import partial
 from itertools import pairwise
 
 import pytest
 from frames import PRINTED, Printed
 from hypothesis import given
 from hypothesis import strategies as st
+from interruptions import every, interrupted
 from tables import table
 
-from multidrop.core import STREAM_ROOM, FrameSpan, Framing, Kind, Message, Side, Splitter, Stream
+from multidrop.core import (
+    STREAM_ROOM,
+    Columns,
+    Decoded,
+    Decoder,
+    Field,
+    FrameSpan,
+    Framing,
+    Kind,
+    Message,
+    NumberFormat,
+    RowLayout,
+    Side,
+    Splitter,
+    Stream,
+    Unpacker,
+)
 
 Pair = tuple[Printed, Printed]
 REPLIES = [each for each in PRINTED if each.request is not None and isinstance(each.says, Message)]
@@ -218,3 +236,25 @@ def test_framings_may_change_from_frame_to_frame() -> None:
     assert [span.framing for span in split(*frames, *frames)] == [
         framing for framing in (*by_framing, *by_framing) for _ in range(2)
     ]
+
+
+# ---- interruptions ----
+
+
+def test_a_sniffer_that_is_interrupted_reads_no_memory_that_was_freed() -> None:
+    """What a sanitizer sees: it goes on with the requests that it knew, and with the next bytes of a file."""
+
+    def act(nth: int) -> bool:
+        decoder, stream, columns = Decoder(), Stream(), Columns(16)
+        unpacker = Unpacker(0, is_pcapng=False, is_big_endian=False)
+        unpacker.look_at(bytes(100_000), 0)
+        was = interrupted(partial(unpacker.look_at, bytes(200_000), 0), nth, set())
+        unpacker.unpack()
+        for time in (0, 1):
+            stream.put(READ + ANSWER + READ, time)
+            while decoder.decode(stream, columns) is Decoded.UNKNOWN:
+                decoder.know(RowLayout(0, [Field(0, NumberFormat.U16, 0, 1, 1)]))
+            was |= interrupted(decoder.forget, nth, set())
+        return was
+
+    assert every(1, act) > 5

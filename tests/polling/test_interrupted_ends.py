@@ -9,60 +9,25 @@ from __future__ import annotations
 import gc
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
-from itertools import count
-from pathlib import Path
 from time import sleep
-from types import FrameType
 from typing import Any
 
 import pytest
+from interruptions import every, interrupted
 from lines import line, plant, polled, until
 from toy import Toy
 
-import multidrop
 from multidrop import Bus, Poller
 from multidrop.sim import EncodedDrive, Simulator, Wire
 
 # A collection amid the work finalizes what an earlier interruption left, and may be interrupted itself.
 pytestmark = pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 
-PACKAGE = str(Path(multidrop.__file__).parent)
 CURRENT = Toy.registers["output_current"]
 STRIDE = 7  # bytecodes from one interruption to the next, unless all are wanted
-
-
-class Interruption(BaseException):
-    """Raised where KeyboardInterrupt may be: unlike that one it ends no test run."""
-
-
-@contextmanager
-def interrupted_before(nth: int) -> Iterator[list[str]]:
-    """Raise before the nth bytecode of the package on this thread; give a list, which then says where."""
-    left = nth
-    found: list[str] = []
-
-    def trace(frame: FrameType, event: str, argument: object) -> Any:
-        nonlocal left
-        if not frame.f_code.co_filename.startswith(PACKAGE):
-            return None
-        frame.f_trace_opcodes, frame.f_trace_lines = True, False
-        if event == "opcode" and not found:
-            left -= 1
-            if left == 0:
-                found.append(f"{frame.f_code.co_qualname}, line {frame.f_lineno}")
-                raise Interruption
-        return trace
-
-    before = sys.gettrace()
-    sys.settrace(trace)
-    try:
-        yield found
-    finally:
-        sys.settrace(before)
 
 
 @dataclass
@@ -88,14 +53,6 @@ def hall() -> Iterator[Received]:
         yield Received(simulator.wires[0].path, drive)
 
 
-def every(step: int, act: Callable[[int], bool]) -> int:
-    """Call this with 1, 1 + step and so on until it was not interrupted; return how often that was."""
-    for times in count():
-        if not act(1 + times * step):
-            return times
-    raise AssertionError
-
-
 def falls_silent(hall: Received) -> None:
     """See that nothing more is sent, once the drive has taken what was: a poll takes a millisecond."""
 
@@ -118,13 +75,6 @@ def ended(poller: Poller, hall: Received) -> None:
     falls_silent(hall)
     with Bus(hall.path) as bus:  # the port is free
         bus.read(bus.attach(Toy, 1), CURRENT)
-
-
-def interrupted(act: Callable[[], object], nth: int, places: set[str]) -> bool:
-    with suppress(Interruption), interrupted_before(nth) as found:
-        act()
-    places.update(found)
-    return bool(found)
 
 
 STEPS = [STRIDE, pytest.param(1, marks=[pytest.mark.long, pytest.mark.slow])]

@@ -1,12 +1,18 @@
-"""Interruptions: Ctrl-C, or any failure, before any chosen line of the code under test."""
+"""Interruptions: Ctrl-C, or any failure, before any chosen line or bytecode of the code under test."""
 
 from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, contextmanager, suppress
+from itertools import count
+from pathlib import Path
 from types import FrameType
 from typing import Any
+
+import multidrop
+
+PACKAGE = str(Path(multidrop.__file__).parent)
 
 
 def interrupted_at(nth: int, counts: Callable[[FrameType], bool]) -> AbstractContextManager[list[str]]:
@@ -49,3 +55,51 @@ def calling_at(
         yield found
     finally:
         sys.settrace(before)
+
+
+# ---- before each bytecode ----
+
+
+class Interruption(BaseException):
+    """Raised where KeyboardInterrupt may be: unlike that one it ends no test run."""
+
+
+@contextmanager
+def interrupted_before(nth: int) -> Iterator[list[str]]:
+    """Raise before the nth bytecode of the package on this thread; give a list, which then says where."""
+    left = nth
+    found: list[str] = []
+
+    def trace(frame: FrameType, event: str, argument: object) -> Any:
+        nonlocal left
+        if not frame.f_code.co_filename.startswith(PACKAGE):
+            return None
+        frame.f_trace_opcodes, frame.f_trace_lines = True, False
+        if event == "opcode" and not found:
+            left -= 1
+            if left == 0:
+                found.append(f"{frame.f_code.co_qualname}, line {frame.f_lineno}")
+                raise Interruption
+        return trace
+
+    before = sys.gettrace()
+    sys.settrace(trace)
+    try:
+        yield found
+    finally:
+        sys.settrace(before)
+
+
+def every(step: int, act: Callable[[int], bool]) -> int:
+    """Call this with 1, 1 + step and so on until it was not interrupted; return how often that was."""
+    for times in count():
+        if not act(1 + times * step):
+            return times
+    raise AssertionError
+
+
+def interrupted(act: Callable[[], object], nth: int, places: set[str]) -> bool:
+    with suppress(Interruption), interrupted_before(nth) as found:
+        act()
+    places.update(found)
+    return bool(found)
