@@ -66,6 +66,13 @@ void md_port_stop(struct md_port *port)
     md_engine_leave(port->engine);
 }
 
+void md_port_let_go(struct md_port *port, void *memory)
+{
+    (void)memory;
+    md_port_stop(port);
+    md_port_free(port);
+}
+
 int md_port_end(struct md_port *port)
 {
     md_engine_enter(port->engine);

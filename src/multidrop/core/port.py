@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from enum import IntEnum, StrEnum
+from functools import partial
 from typing import Any
 from weakref import finalize
 
@@ -93,10 +94,9 @@ class _Engine:
         register_at_fork(self)
 
     def forked(self) -> None:
-        """Start another one, in the child, with the next port that is opened; it has none of the parent's."""
+        """Start another one, in the child, with the next port that is opened."""
         self._starting = threading.Lock()  # ports are opened beside each other
         self._c: Any = None
-        self._ports: set[_PortMemory] = set()
 
     @property
     def c(self) -> Any:
@@ -109,43 +109,14 @@ class _Engine:
                 self._c = started
             return self._c
 
-    def open(self, memory: _PortMemory, *details: int) -> Any:
-        """Open a port, whose memory is kept until `stop`. Raises OSError."""
-        engine = self.c
-        self._ports.add(memory)
-        made = lib.md_port_open(engine, *details)
-        if made == ffi.NULL:
-            self._ports.discard(memory)
-            raise OSError(ffi.errno, "the port cannot be waited for")
-        memory.c = ffi.gc(made, lib.md_port_free)
-        return memory.c
-
-    def stop(self, memory: _PortMemory) -> None:
-        """Have the core's thread let a port go, and wait for it; its memory is the caller's again."""
-        if memory.c is not None:
-            lib.md_port_stop(memory.c)
-        self._ports.discard(memory)
-
-    def __del__(self, stop: Callable[[Any], None] = lib.md_port_stop) -> None:
-        """Stop all ports at the interpreter's end.
-
-        Objects are freed in any order then, and `finalize` does nothing any more. This is called before any
-        memory that is only kept here is freed.
-        """
-        for memory in self._ports:
-            if memory.c is not None:
-                stop(memory.c)
-
 
 class _PortMemory:
     """All of Python's memory that the core's thread reads and writes for one port.
 
-    What the core is given is put here first. `_Engine` keeps it until the thread has let the port go,
-    whatever becomes of the Port: that is interrupted, collected, or left open at the interpreter's end.
+    What the core is given is put here first.
     """
 
     def __init__(self, room: int, mastership: Mastership | None) -> None:
-        self.c: Any = None  # struct md_port, freed with this
         self.mastership = mastership
         self.lasting: set[object] = set()  # as long as the port is open
         self.queued: list[Exchange | None] = [None] * room  # as in the core's own ring
@@ -160,6 +131,16 @@ class _PortMemory:
 
 
 _engine = _Engine()
+
+
+def _owner_of(port: Any, memory: _PortMemory) -> Any:
+    """Return the owner of a port and of its memory.
+
+    Once nothing refers to it the core's thread lets the port go, and then the memory is freed: cffi calls its
+    destructor before it drops the handle, and the garbage collector calls all destructors before it frees
+    anything, also at the interpreter's end. No Python code runs meanwhile that a signal could break off.
+    """
+    return ffi.gc(ffi.new_handle(memory), partial(lib.md_port_let_go, port))
 
 
 class Port:
@@ -183,10 +164,13 @@ class Port:
         self.room = room
         self._memory = _PortMemory(room, mastership)
         self._is_inherited = False
-        self._abandoned = finalize(self, _engine.stop, self._memory)
+        self.c = lib.md_port_open(_engine.c, fd, must_take, transactions, room)
+        if self.c == ffi.NULL:
+            raise OSError(ffi.errno, "the port cannot be waited for")
+        self._owner = _owner_of(self.c, self._memory)
+        # Before a collector finalizes what owns the descriptor, in any order.
+        self._abandoned = finalize(self, lib.md_port_stop, self.c)
         self._abandoned.atexit = False  # others may still use the port at exit
-        # Stopped with this object at the latest, in C: a signal may break off the function above.
-        self.c = ffi.gc(_engine.open(self._memory, fd, must_take, transactions, room), lib.md_port_stop)
         if mastership is not None:
             lib.md_port_fence(self.c, mastership.c)
         # Read in place: a call of the core would release the GIL, and wait to have it back.
@@ -196,7 +180,7 @@ class Port:
     def forked(self) -> None:
         """Leave it to the parent, in the child: the engine's thread is there alone."""
         self._abandoned.detach()
-        ffi.gc(self.c, None)
+        ffi.gc(self._owner, None)
         self._is_inherited = True
 
     def tap(self, tap: Tap) -> None:
@@ -237,7 +221,7 @@ class Port:
     def stop(self) -> None:
         """Carry out nothing more, and give the descriptor back. What it did can still be asked."""
         if not self._is_inherited:
-            _engine.stop(self._memory)
+            lib.md_port_stop(self.c)
 
     close = stop
 
