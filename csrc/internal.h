@@ -31,6 +31,9 @@ int md_columns_add(struct md_columns *columns, const struct md_block *block,
                    const struct md_completion *completion, int64_t utc_minus_monotonic_ns);
 /* Return how many of the block's fields have no value in a good reply. */
 uint64_t md_count_lacking(const struct md_block *block, const struct md_message *reply);
+/* Keep it until it is released, though its client frees it. */
+void md_row_queue_hold(struct md_row_queue *row_queue);
+void md_row_queue_release(struct md_row_queue *row_queue);
 /* Append to the newest chunk; a block that is NULL has no rows. */
 void md_row_queue_add(struct md_row_queue *row_queue, const struct md_block *block,
                       const struct md_completion *completion);

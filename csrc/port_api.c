@@ -22,6 +22,8 @@ static struct md_port *new_port(unsigned room)
 
 void md_port_free(struct md_port *port)
 {
+    if (port->turn.row_queue)
+        md_row_queue_release(port->turn.row_queue);
     free(port->turn.slots);
     free(port);
 }
@@ -137,10 +139,14 @@ void md_port_inherit(struct md_port *port, struct md_drive *drive, const struct 
 
 void md_port_report(struct md_port *port, struct md_row_queue *row_queue, uint32_t number)
 {
+    md_row_queue_hold(row_queue);
     md_engine_enter(port->engine);
+    struct md_row_queue *before = port->turn.row_queue;
     port->turn.row_queue = row_queue;
     port->turn.number = number;
     md_engine_leave(port->engine);
+    if (before)
+        md_row_queue_release(before);
 }
 
 int md_port_submit(struct md_port *port, const struct md_exchange *const *exchanges,

@@ -19,7 +19,7 @@ struct md_row_queue {
     size_t first, count;        /* of the chunks that hold rows */
     struct md_columns *spare[MOST_SPARE]; /* chunks that were given back */
     size_t spares;
-    size_t lent;                /* chunks that were taken and not given back yet */
+    size_t lent;                /* chunks that were taken and not given back yet, and ports that report to it */
     int is_done;                /* its client has freed it */
     uint64_t dropped;
     uint64_t called[WORDS];     /* a bit for each number */
@@ -87,7 +87,23 @@ static void destroy(struct md_row_queue *queue)
     free(queue);
 }
 
-/* A chunk may outlive its queue: a garbage collector frees them in any order. */
+void md_row_queue_hold(struct md_row_queue *queue)
+{
+    pthread_mutex_lock(&queue->mutex);
+    queue->lent++;
+    pthread_mutex_unlock(&queue->mutex);
+}
+
+void md_row_queue_release(struct md_row_queue *queue)
+{
+    pthread_mutex_lock(&queue->mutex);
+    int is_last = --queue->lent == 0 && queue->is_done;
+    pthread_mutex_unlock(&queue->mutex);
+    if (is_last)
+        destroy(queue);
+}
+
+/* A chunk or a port may outlive its queue: a garbage collector frees them in any order. */
 void md_row_queue_free(struct md_row_queue *queue)
 {
     pthread_mutex_lock(&queue->mutex);
@@ -182,12 +198,10 @@ void md_row_queue_give_back(struct md_row_queue *queue, struct md_columns *colum
     int is_kept = queue->spares < MOST_SPARE;
     if (is_kept)
         queue->spare[queue->spares++] = columns;
-    int is_last = --queue->lent == 0 && queue->is_done;
     pthread_mutex_unlock(&queue->mutex);
     if (!is_kept)
         md_columns_free(columns);
-    if (is_last)
-        destroy(queue);
+    md_row_queue_release(queue);
 }
 
 size_t md_row_queue_chunks(struct md_row_queue *queue)

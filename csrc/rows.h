@@ -110,7 +110,7 @@ struct md_row_queue;
 
 /* Keep up to `most_chunks` chunks of rows; rows that come when all are full are dropped and counted. */
 struct md_row_queue *md_row_queue_new(size_t chunk_rows, size_t most_chunks);
-/* Free it once no port reports to it. Chunks taken before may be given back afterwards. */
+/* Free it, once no port reports to it and the chunks that were taken are given back. */
 void md_row_queue_free(struct md_row_queue *row_queue);
 /* Add rows for values that were due at a time and not asked for. */
 void md_row_queue_miss(struct md_row_queue *row_queue, const struct md_block *block, int status,

@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 import serial
-from lines import PATIENCE, line, plant, polled, until
+from lines import PATIENCE, line, patient, plant, polled, until
 from toy import Toy
 
 from multidrop import PollingFailed
@@ -230,6 +230,7 @@ def test_a_poller_that_failed_says_so_wherever_it_is_asked(
     assert not any(bus.is_open for bus in poller.buses.values())
 
 
+@patient
 def test_a_poller_that_failed_polls_nothing_more_and_commands_go_on(failed: Two) -> None:
     exchanges = failed.poller.statistics()["ill"].counters.exchanges
     bus = failed.poller.bus("ill")

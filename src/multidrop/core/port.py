@@ -143,6 +143,14 @@ def _owner_of(port: Any, memory: _PortMemory) -> Any:
     return ffi.gc(ffi.new_handle(memory), partial(lib.md_port_let_go, port))
 
 
+def _stop(port: Any, memory: _PortMemory) -> None:
+    """Stop a port to which nothing refers any more, with all of its memory still there.
+
+    A collector calls this first. Then it finalizes all else in any order, also what owns the descriptor.
+    """
+    lib.md_port_stop(port)
+
+
 class Port:
     """A line driven on a descriptor by the core's thread (struct md_port).
 
@@ -168,8 +176,7 @@ class Port:
         if self.c == ffi.NULL:
             raise OSError(ffi.errno, "the port cannot be waited for")
         self._owner = _owner_of(self.c, self._memory)
-        # Before a collector finalizes what owns the descriptor, in any order.
-        self._abandoned = finalize(self, lib.md_port_stop, self.c)
+        self._abandoned = finalize(self, _stop, self.c, self._memory)
         self._abandoned.atexit = False  # others may still use the port at exit
         if mastership is not None:
             lib.md_port_fence(self.c, mastership.c)
