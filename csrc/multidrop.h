@@ -295,7 +295,6 @@ void md_port_inherit(struct md_port *port, struct md_drive *drive, const struct 
 /* Carry out nothing more, and give the descriptor back. What is under way after md_port_end() becomes
  * MD_POLL_ENDED. */
 void md_port_stop(struct md_port *port);
-void md_port_free(struct md_port *port); /* after md_port_stop() */
 /* Stop and free it; `memory` is what its client keeps for it, and outlives this call. */
 void md_port_let_go(struct md_port *port, void *memory);
 /* Say whether the adapter echoes: MD_ECHO is never unlearnt, MD_NO_ECHO holds until an echo shows. */

@@ -20,7 +20,7 @@ static struct md_port *new_port(unsigned room)
     return NULL;
 }
 
-void md_port_free(struct md_port *port)
+static void free_port(struct md_port *port)
 {
     if (port->turn.row_queue)
         md_row_queue_release(port->turn.row_queue);
@@ -54,7 +54,7 @@ struct md_port *md_port_open(struct md_engine *engine, int fd, int must_take, in
     if (!port->open_error)
         return port;
     int error = port->open_error;
-    md_port_free(port);
+    free_port(port);
     errno = error;
     return NULL;
 }
@@ -72,7 +72,7 @@ void md_port_let_go(struct md_port *port, void *memory)
 {
     (void)memory;
     md_port_stop(port);
-    md_port_free(port);
+    free_port(port);
 }
 
 int md_port_end(struct md_port *port)

@@ -19,7 +19,7 @@ struct md_row_queue {
     size_t first, count;        /* of the chunks that hold rows */
     struct md_columns *spare[MOST_SPARE]; /* chunks that were given back */
     size_t spares;
-    size_t lent;                /* chunks that were taken and not given back yet, and ports that report to it */
+    size_t lent;                /* chunks that were taken and not given back, and ports that report to it */
     int is_done;                /* its client has freed it */
     uint64_t dropped;
     uint64_t called[WORDS];     /* a bit for each number */

@@ -322,7 +322,7 @@ int main(void)
     check_unsent(&stop);
 
     md_port_stop(port);
-    md_port_free(port);
+    md_port_let_go(port, NULL);
     md_mastership_free(mastership);
     close(ends[0]);
     close(ends[1]);

@@ -242,7 +242,7 @@ def test_framings_may_change_from_frame_to_frame() -> None:
 
 
 def test_a_sniffer_that_is_interrupted_reads_no_memory_that_was_freed() -> None:
-    """What a sanitizer sees: it goes on with the requests that it knew, and with the next bytes of a file."""
+    """It goes on with the requests that it knew, and with the next bytes of a file, under a sanitizer."""
 
     def act(nth: int) -> bool:
         decoder, stream, columns = Decoder(), Stream(), Columns(16)

@@ -29,7 +29,7 @@ class Simulator:
         self.wires = tuple(wires)
         self._thread = threading.Thread(target=self._run_in_thread, name="multidrop-sim", daemon=True)
         self.failure: BaseException | None = None
-        """What a simulated drive, or the thread itself, raised first; None: nothing."""
+        """The first exception of a simulated drive, or of the thread itself; None: there was none."""
         self._failed: set[int] = set()  # wires whose failure is in the log
         self._changing = threading.Lock()
         self._is_over = False
