@@ -163,6 +163,48 @@ def test_a_viewers_key_is_enough(tmp_path: Path) -> None:
         assert json.loads(watched.stdout)["lines"]["hall"]["master"] is None
 
 
+@pytest.mark.long
+@pytest.mark.parametrize("user", ["viewer", "commander"])
+def test_the_page_stops_the_fleet_with_a_commanders_key_alone(tmp_path: Path, user: str) -> None:
+    require_module("nkeys")
+    from secured_fleets import secured_fleet
+
+    with secured_fleet(tmp_path / "fleet", 1) as fleet:
+        fleet.start("gw-1")
+        fleet.wait_for_polling()
+        servers = fleet.servers
+        table = f'nats = ["{servers.urls[0]}"]\ncommander = "{servers.key(user)}"\nca = "{servers.tls.ca}"'
+        may = '[serve.may]\nstop = "anyone"\n'
+        with served(tmp_path, f"[serve.fleet]\n{table}\n{may}") as gateway:
+            assert gateway.get("/api/plant").json["fleet_stop"] is True
+            part: Any = gateway.gateway.feeds["fleet"]
+            until(lambda: part._commands is not None)
+            told = gateway.post("/api/fleet/stop", {}).json
+    drives = {name: one["done"] for name, one in told.items()}
+    if user == "viewer":
+        assert drives == {"the fleet": False}
+        assert "NOT sent" in told["the fleet"]["text"]
+    else:
+        assert len(drives) > 1
+        assert set(drives.values()) == {True}, told
+
+
+def test_the_fleet_is_not_stopped_without_a_key_nor_without_its_servers(tmp_path: Path) -> None:
+    with served(tmp_path, '[serve.may]\nstop = "anyone"\n') as gateway:
+        assert gateway.get("/api/plant").json["fleet_stop"] is False
+        answer = gateway.post("/api/fleet/stop", {})
+        assert answer.status == 404
+        assert "add commander to [serve.fleet]" in answer.json["error"]
+    part = FleetPart(ServerPath([]), FleetWatch(Looks(ServerPath([]))), lambda: None)  # type: ignore[arg-type, return-value]
+    told = asyncio.run(part.stop("anna"))
+    assert told == {
+        "the fleet": (
+            False,
+            "the stop was NOT sent: no server of the fleet was reached yet; use the hard-wired stop",
+        )
+    }
+
+
 @pytest.mark.slow
 def test_servers_that_are_not_there_are_told(tmp_path: Path) -> None:
     [port] = free_ports(1)

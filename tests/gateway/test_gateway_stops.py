@@ -69,6 +69,69 @@ def stands(gateway: Served, drive: str) -> bool:
     return not gateway.sims[drive].motor.goal  # type: ignore[attr-defined]
 
 
+@pytest.mark.parametrize(
+    ("path", "body"),
+    [
+        ("/api/stop", {"drives": None}),
+        ("/api/act", {"drive": "pump-1", "verb": "coast"}),
+    ],
+)
+def test_the_head_of_the_answer_confirms_a_stop_that_is_not_over(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, path: str, body: dict[str, object]
+) -> None:
+    """A page that gets no head knows that the gateway has taken no stop."""
+    held = threading.Event()
+
+    async def slow(*args: object, **options: object) -> object:
+        await asyncio.to_thread(held.wait, PATIENCE)
+        told = Told(True, "stopped: seen to stand")
+        return told if path == "/api/act" else {"pump-1": told}
+
+    with served(tmp_path, MAY) as gateway:
+        monkeypatch.setattr(gateway.gateway.commands, "act" if path == "/api/act" else "stop", slow)
+        connection = http.client.HTTPConnection("127.0.0.1", gateway.gateway.port, timeout=PATIENCE)
+        connection.request("POST", path, json.dumps(body), {"content-type": "application/json"})
+        response = connection.getresponse()  # its head
+        assert (response.status, held.is_set()) == (200, False)
+        assert response.getheader("x-accel-buffering") == "no"
+        held.set()
+        told = json.loads(response.read())
+        assert (
+            told
+            if path == "/api/act"
+            else told["pump-1"]
+            == {
+                "done": True,
+                "text": "stopped: seen to stand",
+            }
+        )
+        connection.close()
+
+
+def test_a_stop_goes_on_when_its_asker_leaves(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    ends: list[str] = []
+    held = threading.Event()
+
+    async def slow(*args: object, **options: object) -> dict[str, Told]:
+        try:
+            await asyncio.to_thread(held.wait, PATIENCE)
+            ends.append("over")
+        except asyncio.CancelledError:
+            ends.append("cancelled")
+            raise
+        return {}
+
+    with served(tmp_path, MAY) as gateway:
+        monkeypatch.setattr(gateway.gateway.commands, "stop", slow)
+        with calling(gateway) as leaving:
+            leaving.sendall(STOP + b'16\r\n\r\n{"drives": null}')
+            assert leaving.recv(64).startswith(b"HTTP/1.1 200")
+        gateway.frame()
+        held.set()
+        until(lambda: ends)
+        assert ends == ["over"]
+
+
 @pytest.mark.slow
 def test_all_drives_are_stopped_and_seen_to_stand(tmp_path: Path) -> None:
     with served(tmp_path, MAY) as gateway:

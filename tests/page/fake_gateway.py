@@ -47,11 +47,13 @@ class FakeGateway:
         self.seen: list[int] = []  # the frames that commands named
         self.stops: dict[str, int] = {}  # that were called, by drive
         self.is_held: threading.Event | None = None  # for which answers to stops wait
+        self.confirms = False  # the head of such an answer waits for nothing
         self.token: str | None = None  # POST wants it where it is set
         self.has_history = True
         self.recorded: dict[str, dict[str, object]] = {}  # by series, what else its history says of it
         self.knows_since = 0  # UTC, ms: it has no alarms of before
         self.fleet: dict[str, Any] = {}  # keys of /api/fleet with other values
+        self.fleet_outcomes: dict[str, dict[str, Any]] = {}  # of a stop of the fleet
         self.reloaded: dict[str, Any] = {
             "done": True,
             "text": "plant.toml is in effect",
@@ -127,16 +129,25 @@ def _handler(gateway: FakeGateway) -> type[BaseHTTPRequestHandler]:
         def log_message(self, format: str, *args: object) -> None:
             pass
 
-        def answer(self, status: int, body: bytes, kind: str = "application/json", **headers: str) -> None:
+        def answer(
+            self,
+            status: int,
+            body: bytes,
+            kind: str = "application/json",
+            held: threading.Event | None = None,
+            **headers: str,
+        ) -> None:
             self.send_response(status)
             for name, value in {**HEADERS, "Content-Type": kind, **headers}.items():
                 self.send_header(name, value)
             self.send_header("Content-Length", str(len(body)))
             self.end_headers()
+            if held is not None:
+                held.wait()
             self.wfile.write(body)
 
-        def tell(self, value: object, status: int = 200) -> None:
-            self.answer(status, json.dumps(value).encode())
+        def tell(self, value: object, status: int = 200, held: threading.Event | None = None) -> None:
+            self.answer(status, json.dumps(value).encode(), held=held)
 
         def do_GET(self) -> None:
             url = urlsplit(self.path)
@@ -186,13 +197,16 @@ def _handler(gateway: FakeGateway) -> type[BaseHTTPRequestHandler]:
             gateway.posts.append((self.path, body))
             if self.path == "/api/reload":
                 self.tell(gateway.reloaded)
+            elif self.path == "/api/fleet/stop":
+                self.tell(gateway.fleet_outcomes)
             elif self.path == "/api/stop":
-                if gateway.is_held is not None:
-                    gateway.is_held.wait()
                 names = body["drives"] or [
                     d["name"] for line in fake_plant.plant(gateway.renamed)["lines"] for d in line["drives"]
                 ]
-                self.tell({n: gateway.outcomes.get(n, {"done": True, "text": "stopped"}) for n in names})
+                told = {n: gateway.outcomes.get(n, {"done": True, "text": "stopped"}) for n in names}
+                if gateway.is_held is not None and not gateway.confirms:
+                    gateway.is_held.wait()
+                self.tell(told, held=gateway.is_held)
             else:
                 self.tell(gateway.outcomes.get(body["drive"], {"done": True, "text": "held by the drive"}))
 

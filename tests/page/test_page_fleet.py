@@ -125,3 +125,48 @@ def test_it_is_reached_by_its_key(opened: Opener) -> None:
     page.keyboard.press("6")
     await_note(page, "Looked at once a second")
     assert page.locator("nav a[aria-current]").inner_text() == "Fleet"
+
+
+def test_stop_all_names_what_it_stops(opened: Opener, gateway: FakeGateway) -> None:
+    page = opened("#/fleet")
+    stopall = page.locator("#stopall")
+    assert stopall.inner_text() == "Stop this plant"
+    stopall.click()
+    assert page.locator("#ask-title").inner_text() == "Stop all 31 drives of bottling plant?"
+    asked = page.locator("#ask").inner_text()
+    assert "none of the fleet's" in asked
+    assert "multidrop fleet stop --all" in asked
+    page.get_by_role("button", name="Stop all 31 drives of bottling plant").click()
+    page.get_by_role("heading", name="All 31 drives are stopped").wait_for()
+    assert gateway.posts == [("/api/stop", {"drives": None})]
+    page.keyboard.press("Escape")
+    page.evaluate("location.hash = '#/drives'")
+    until(page, "document.querySelector('#stopall').textContent === 'Stop all'")
+
+
+def test_stop_all_stops_the_fleet_with_a_commanders_key(opened: Opener, gateway: FakeGateway) -> None:
+    gateway.plant_changes = {"fleet_stop": True}
+    gateway.fleet_outcomes = {"hall-9.pump": {"done": True, "text": "stopped"}}
+    page = opened("#/fleet")
+    assert page.locator("#stopall").inner_text() == "Stop the fleet"
+    page.locator("#stopall").click()
+    assert page.locator("#ask-title").inner_text() == "Stop the whole fleet?"
+    assert "all 31 drives of bottling plant" in page.locator("#ask").inner_text()
+    page.get_by_role("button", name="Stop the whole fleet").click()
+    page.get_by_role("heading", name="All 32 drives are stopped").wait_for()
+    assert sorted(gateway.posts) == [("/api/fleet/stop", {}), ("/api/stop", {"drives": None})]
+
+
+def test_what_became_of_each_part_is_told(opened: Opener, gateway: FakeGateway) -> None:
+    """The fleet's servers are gone: the gateway's own drives were stopped all the same."""
+    gateway.plant_changes = {"fleet_stop": True}
+    gateway.fleet_outcomes = {"the fleet": {"done": False, "text": "the stop was NOT sent"}}
+    page = opened("#/fleet")
+    page.locator("#stopall").click()
+    page.get_by_role("button", name="Stop the whole fleet").click()
+    page.get_by_role("heading", name="1 of 32 drives not known to be stopped").wait_for()
+    assert page.locator("#ask .outcome li").all_inner_texts() == ["the fleet: the stop was NOT sent"]
+    page.route("**/api/fleet/stop", lambda route: route.abort())
+    page.get_by_role("button", name="Send the stop again").click()
+    page.get_by_role("heading", name="It is not known that the stop was sent").wait_for()
+    assert "All 31 drives are stopped." in page.locator("#ask").inner_text()

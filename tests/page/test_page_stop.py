@@ -192,6 +192,63 @@ def test_a_stop_that_may_not_have_arrived_is_not_called_sent(opened: Opener, gat
     assert page.get_by_role("button", name="Send the stop again").is_visible()
 
 
+UNTAKEN = "The gateway has not taken the stop"
+
+
+@pytest.mark.parametrize("is_closed", [False, True])
+def test_a_frozen_gateway_is_told_of_within_two_seconds(
+    opened: Opener, gateway: FakeGateway, is_closed: bool
+) -> None:
+    gateway.is_held = threading.Event()
+    page = opened()
+    page.locator("#stopall").click()
+    page.get_by_role("button", name="Stop all 31 drives").click()
+    until_met(page, lambda: gateway.posts)
+    if is_closed:
+        page.get_by_role("button", name="Close").click()
+    told(page, UNTAKEN)
+    assert "Use the hard stop at the machine now." in page.locator("#ask p.bad").inner_text()
+    gateway.is_held.set()
+    told(page, "All 31 drives are stopped")
+
+
+def test_a_stop_that_was_taken_is_waited_for(opened: Opener, gateway: FakeGateway) -> None:
+    """Its drives may take half a minute."""
+    gateway.is_held, gateway.confirms = threading.Event(), True
+    page = opened()
+    page.locator("#stopall").click()
+    page.get_by_role("button", name="Stop all 31 drives").click()
+    until_met(page, lambda: gateway.posts)
+    page.wait_for_timeout(2500)
+    assert title(page).inner_text() == "Stopping all 31 drives …"
+    assert "The gateway has taken the stop." in page.locator("#ask").inner_text()
+    gateway.is_held.set()
+    told(page, "All 31 drives are stopped")
+
+
+def test_a_frozen_gateway_is_told_of_after_a_verb_that_stops(opened: Opener, gateway: FakeGateway) -> None:
+    page = opened("#/drives/pump-1")
+    held: list[Any] = []
+    page.route("**/api/act", lambda route: held.append(route))
+    page.get_by_role("button", name="emergency stop").click()
+    page.get_by_role("button", name="emergency stop pump-1").click()
+    told(page, UNTAKEN)
+    held[0].fulfill(json={"done": True, "text": "stopped"})
+    page.locator("#outcomes li").wait_for()
+
+
+def test_a_token_that_is_typed_is_no_frozen_gateway(opened: Opener, gateway: FakeGateway) -> None:
+    gateway.token = "right"
+    page = opened()
+    page.locator("#stopall").click()
+    page.get_by_role("button", name="Stop all 31 drives").click()
+    page.get_by_label("Token").fill("right")
+    page.wait_for_timeout(2500)
+    assert title(page).inner_text() == "Who are you?"
+    press_enter(page)
+    told(page, "All 31 drives are stopped")
+
+
 def test_a_stop_without_the_right_asks_for_a_token_and_goes_on(opened: Opener, gateway: FakeGateway) -> None:
     gateway.token = "right"
     page = opened()

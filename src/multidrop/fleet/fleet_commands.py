@@ -184,18 +184,25 @@ class FleetCommands:
     # ---- stops ----
 
     async def stop(
-        self, drives: Sequence[str] | None = None, *, line: str = "", on_news: News = _tell_nobody
+        self,
+        drives: Sequence[str] | None = None,
+        *,
+        line: str = "",
+        on_news: News = _tell_nobody,
+        by: str = "",
     ) -> CommandAnswer:
         """Stop these drives, or all of the plant with None; the stops of many lines go side by side.
 
-        With `line` the plant is not looked at, and the drives are its. `on_news` is called in the loop with
-        what is known of a stop that is not over within half a second, and again when something else is.
-        A drive that is not in the plant is told as refused, and keeps no other's stop back. Raises ValueError
-        where none of them is, FleetError where the plant cannot be read; then no stop was sent.
+        `by` names who asks, if that is somebody else than this object's `by`. With `line` the plant is not
+        looked at, and the drives are its. `on_news` is called in the loop with what is known of a stop that
+        is not over within half a second, and again when something else is. A drive that is not in the plant
+        is told as refused, and keeps no other's stop back. Raises ValueError where none of them is,
+        FleetError where the plant cannot be read; then no stop was sent.
         """
         drives = [drives] if isinstance(drives, str) else drives
         wanted, unknown = await self._lines_of(drives, line)
-        answers = await asyncio.gather(*(self._stop(one, wanted[one], on_news) for one in wanted))
+        asked = spelt(by or self.by) or NOBODY  # no name keeps a stop back
+        answers = await asyncio.gather(*(self._stop(one, wanted[one], on_news, asked) for one in wanted))
         answers += unknown
         if len(answers) == 1:
             return answers[0]
@@ -228,9 +235,8 @@ class FleetCommands:
             raise ValueError(unknown[0].text)
         return found, unknown
 
-    async def _stop(self, line: str, drives: list[str] | None, on_news: News) -> CommandAnswer:
+    async def _stop(self, line: str, drives: list[str] | None, on_news: News, by: str) -> CommandAnswer:
         """Send a stop until a gateway answers, and go on until it is over."""
-        by = spelt(self.by) or NOBODY  # no name keeps a stop back
         request = StopRequest(uuid.uuid4().hex, by, None if drives is None else tuple(drives))
         what = f"the stop of {', '.join(drives) if drives else f'all drives of line {line}'}"
         record = {"id": request.id, "line": line, "what": what, "by": by}

@@ -1,4 +1,4 @@
-"""The part `fleet` of `multidrop serve`: looks at a fleet for the page, and touches nothing of it.
+"""The part `fleet` of `multidrop serve`: looks at a fleet for the page, and stops it with a commander's key.
 
 `multidrop.gateway` finds it by its name, as its own parts.
 """
@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
@@ -13,19 +14,26 @@ from typing import TYPE_CHECKING, Any, Protocol
 from multidrop.fleet.task_end import end_tasks
 
 if TYPE_CHECKING:
+    from multidrop.fleet.fleet_commands import FleetCommands
     from multidrop.fleet.servers import ServerPath
     from multidrop.fleet.watching import FleetWatch
 
 EXAMPLE = "nats://127.0.0.1:4222"
 OLD_S = 5.0  # an older look is not well
+AGAIN_S = 1.0  # between two tries to reach the servers as a commander
+LOG = "fleet-commands.jsonl"
 
 
 @dataclass(frozen=True)
 class FleetSettings:
-    """The table `[serve.fleet]`: the servers of the fleet, and files as for `fleet watch`."""
+    """The table `[serve.fleet]`: the servers of the fleet, and files as for `fleet watch`.
+
+    `commander` is the file of a commander's key: with it the page stops the whole fleet.
+    """
 
     nats: tuple[str, ...] = (EXAMPLE,)
     credentials: str = ""
+    commander: str = ""
     ca: str = ""
 
     def __post_init__(self) -> None:
@@ -39,23 +47,64 @@ class FleetSettings:
 
 
 class FleetPart:
-    """A part that looks at a fleet once a second."""
+    """A part that looks at a fleet once a second.
 
-    def __init__(self, path: ServerPath, watch: FleetWatch) -> None:
+    `command` returns a commander of the fleet that is not connected yet; None: nobody may stop it from here.
+    """
+
+    def __init__(
+        self, path: ServerPath, watch: FleetWatch, command: Callable[[], FleetCommands] | None = None
+    ) -> None:
         self._path = path
         self._watch = watch
+        self._command = command
+        self._commands: FleetCommands | None = None  # while it is connected
+        self._why = "no server of the fleet was reached yet"
+
+    @property
+    def can_stop(self) -> bool:
+        """Return True if the plant file names a commander's key."""
+        return self._command is not None
 
     def take(self, batch: object) -> None:
         """Ignore them: they are of the gateway's own lines, and not of the fleet's."""
 
     async def run(self) -> None:
-        tasks = [asyncio.create_task(work) for work in (self._path.keep(), self._watch.run())]
+        works = [self._path.keep(), self._watch.run()]
+        if self._command is not None:
+            works.append(self._keep_commander(self._command))
+        tasks = [asyncio.create_task(work) for work in works]
         try:
             ended, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
             for task in ended:
                 task.result()
         finally:
             await end_tasks(*tasks)
+
+    async def _keep_commander(self, command: Callable[[], FleetCommands]) -> None:
+        """Stay connected as a commander, so that a stop waits for no connection."""
+        while True:
+            try:
+                async with command() as self._commands:
+                    await asyncio.Event().wait()
+            except (OSError, ValueError) as failure:
+                self._why = _without_secrets(failure)
+            finally:
+                self._commands = None
+            await asyncio.sleep(AGAIN_S)
+
+    async def stop(self, by: str) -> Mapping[str, tuple[bool, str]]:
+        """Stop all drives of the fleet; return by drive if it is stopped, and what is known of it."""
+        try:
+            if self._commands is None:
+                raise ConnectionError(f"the stop was NOT sent: {self._why}; use the hard-wired stop")
+            answer = await self._commands.stop(by=by)
+        except (OSError, ValueError) as failure:
+            return {"the fleet": (False, _without_secrets(failure))}
+        found = {name: (one.is_done, one.text) for name, one in answer.drives.items()}
+        if not found or not answer.is_done:  # a line without a master has no drives here
+            found["the fleet"] = answer.is_done, answer.text
+        return found
 
     async def close(self) -> None:
         await self._path.close()
@@ -73,6 +122,12 @@ class FleetPart:
         return self._watch.told()
 
 
+def _without_secrets(failure: Exception) -> str:
+    from multidrop.fleet.watching import SECRETS
+
+    return SECRETS.sub("//", str(failure))
+
+
 class HasFolder(Protocol):
     """The gateway, as this part sees it."""
 
@@ -85,10 +140,18 @@ def build(settings: FleetSettings, inside: HasFolder) -> FleetPart:
     Raises ImportError without NATS' client, OSError or ValueError for files that are none.
     """
     from multidrop.fleet.credentials import connect_options
+    from multidrop.fleet.fleet_commands import FleetCommands
     from multidrop.fleet.overview import FleetView
     from multidrop.fleet.servers import ServerPath
     from multidrop.fleet.watching import FleetWatch
 
-    credentials, ca = (inside.folder / name if name else None for name in (settings.credentials, settings.ca))
-    path = ServerPath(settings.nats, connect_options(settings.nats, credentials, ca))
-    return FleetPart(path, FleetWatch(FleetView(path)))
+    def options(credentials: str) -> dict[str, Any]:
+        files = (inside.folder / name if name else None for name in (credentials, settings.ca))
+        return connect_options(settings.nats, *files)
+
+    path = ServerPath(settings.nats, options(settings.credentials))
+    watch = FleetWatch(FleetView(path))
+    if not settings.commander:
+        return FleetPart(path, watch)
+    key, log = options(settings.commander), inside.folder / LOG
+    return FleetPart(path, watch, lambda: FleetCommands(settings.nats, by="page", log=log, options=key))

@@ -25,6 +25,7 @@ def describe(
     has_file: bool = False,
     mistakes: Sequence[str] = (),
     has_fleet: bool = False,
+    can_stop_fleet: bool = False,
 ) -> dict[str, Any]:
     """Return what GET /api/plant answers to a caller with this right."""
     is_writer = right is Right.WRITE
@@ -35,6 +36,7 @@ def describe(
         "demo": is_demo,
         "file": has_file,  # that can be read again
         "fleet": has_fleet,  # that /api/fleet tells of
+        "fleet_stop": can_stop_fleet,  # by /api/fleet/stop
         "mistakes": list(mistakes),  # of the file, where the newest reload was refused
         "may": {
             "role": None if right is None else right.name.lower(),

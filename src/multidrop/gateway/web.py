@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+import asyncio
 import logging
-from collections.abc import Mapping
+from collections.abc import AsyncIterator, Coroutine, Mapping
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from starlette.applications import Starlette
 from starlette.requests import Request
-from starlette.responses import FileResponse, PlainTextResponse, Response
+from starlette.responses import FileResponse, PlainTextResponse, Response, StreamingResponse
 from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp, Receive, Scope, Send
@@ -37,6 +38,8 @@ PAGE = Path(__file__).parent / "page"
 MOST_QUERIES = 2  # of the audit log, at the same time
 AUDIT_S = 20.0  # that one may take
 COOKIE_S = 30 * 24 * 3600
+HEAD_S = 0.5  # after which a stop's answer begins: its head confirms that the stop was taken
+UNBUFFERED = {"x-accel-buffering": "no"}  # a proxy passes the head on at once
 RIGHTS_RULES = (NOT_ALLOWED, NOT_LISTED, NEVER_THIS_WAY)
 
 NEEDED: Mapping[str, Needed] = {
@@ -46,6 +49,7 @@ NEEDED: Mapping[str, Needed] = {
     "/health": Needed("GET", Right.LOOK),
     "/metrics": Needed("GET", Right.LOOK),
     "/api/stop": Needed("POST", Right.STOP),
+    "/api/fleet/stop": Needed("POST", Right.STOP),
     "/api/act": Needed("POST", Right.STOP),  # the verb's own right is looked at by Commands
     "/api/write": Needed("POST", Right.WRITE),
     "/api/reload": Needed("POST", Right.WRITE),
@@ -72,6 +76,7 @@ def make_app(gateway: Gateway) -> ASGIApp:
         Route("/health", pages.health),
         Route("/metrics", pages.metrics),
         Route("/api/stop", pages.stop, methods=["POST"]),
+        Route("/api/fleet/stop", pages.stop_fleet, methods=["POST"]),
         Route("/api/write", pages.write, methods=["POST"]),
         Route("/api/act", pages.act, methods=["POST"]),
         Route("/api/reload", pages.reload, methods=["POST"]),
@@ -122,6 +127,22 @@ def _answer(told: Told) -> Response:
     return JsonResponse(_told(told) | ({"error": told.text} if is_denied else {}), 403 if is_denied else 200)
 
 
+async def _answer_one(work: Coroutine[Any, Any, Told]) -> Response:
+    return _answer(await work)
+
+
+async def _answer_all(work: Coroutine[Any, Any, Mapping[str, Told]]) -> Response:
+    return JsonResponse({name: _told(one) for name, one in (await work).items()})
+
+
+async def _answer_fleet(work: Coroutine[Any, Any, Mapping[str, tuple[bool, str]]]) -> Response:
+    return JsonResponse({name: {"done": done, "text": text} for name, (done, text) in (await work).items()})
+
+
+async def _body_of(task: asyncio.Task[Response]) -> AsyncIterator[bytes]:
+    yield bytes((await asyncio.shield(task)).body)
+
+
 class _Pages:
     """The routes' functions."""
 
@@ -149,6 +170,7 @@ class _Pages:
             has_file=gateway.reload.has_file,
             mistakes=gateway.reload.mistakes,
             has_fleet="fleet" in gateway.feeds,
+            can_stop_fleet=getattr(gateway.feeds.get("fleet"), "can_stop", False),
         )
         return JsonResponse(described)
 
@@ -219,8 +241,28 @@ class _Pages:
 
     async def stop(self, request: Request) -> Response:
         drives = await drives_to_stop(request)
-        told = await self._gateway.commands.stop(drives, caller_of(request))
-        return JsonResponse({name: _told(one) for name, one in told.items()})
+        stopping = self._gateway.commands.stop(drives, caller_of(request))
+        return await self._answer_stop(_answer_all(stopping))
+
+    async def stop_fleet(self, request: Request) -> Response:
+        """Stop all drives of the fleet, with the commander's key of `[serve.fleet]`."""
+        part: Any = self._gateway.feeds.get("fleet")
+        if part is None or not part.can_stop:
+            raise Denied(404, "no fleet is stopped from here; add commander to [serve.fleet]")
+        caller = caller_of(request)
+        _log.warning("stop of the whole fleet, asked for by %s", caller.by)
+        return await self._answer_stop(_answer_fleet(part.stop(caller.by)))
+
+    async def _answer_stop(self, work: Coroutine[Any, Any, Response]) -> Response:
+        """Return the answer to a stop, which goes on even if its client leaves.
+
+        The answer to a longer one begins after HEAD_S: a client without it knows that no stop was taken.
+        """
+        task = supervisor().start("stop", work)
+        await asyncio.wait({task}, timeout=HEAD_S)
+        if task.done():
+            return task.result()
+        return StreamingResponse(_body_of(task), media_type="application/json", headers=UNBUFFERED)
 
     async def write(self, request: Request) -> Response:
         body = await body_of(request)
@@ -242,7 +284,8 @@ class _Pages:
             raise Denied(400, "options is no JSON object")
         caller = caller_of(request)
         admit = self._admission(drive, (verb, repr(options), caller), body)
-        return _answer(await self._gateway.commands.act(drive, verb, options, caller, admit))
+        acting = _answer_one(self._gateway.commands.act(drive, verb, options, caller, admit))
+        return await (self._answer_stop(acting) if verb in STOPPING else acting)
 
     def _admission(self, drive: str, command: object, body: Mapping[str, Any]) -> Admit:
         """Return what admits a command by the frame that its sender had seen; stops need none."""

@@ -5,6 +5,7 @@ import { DANGER, STOP, confirm, confirmForm, send } from "./ask.js";
 import * as clock from "./clock.js";
 import { fill, find, glyph, make, named, say } from "./dom.js";
 import { now } from "./link.js";
+import { watchStop } from "./stop.js";
 import { mayAct, reading, stops, store } from "./store.js";
 import { text, unit, withUnit, words } from "./values.js";
 
@@ -78,7 +79,8 @@ function seen(drive) {
 
 async function deliver(drive, what, path, confirmed, kind = DANGER) {
   try {
-    const { done, text: told } = await send(path, confirmed, { kind });
+    const watch = kind === STOP ? { watch: watchStop(drive) } : {};
+    const { done, text: told } = await send(path, confirmed, { kind, ...watch });
     note(drive, what, done === true, told);
   } catch (error) {
     const isRefused = error.status >= 400 && error.status < 500;

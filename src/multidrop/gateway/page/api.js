@@ -9,7 +9,7 @@ export class Refused extends Error {
 
 const PATIENCE_MS = 15000;
 
-async function ask(path, options, patience) {
+async function ask(path, options, patience, answered = () => {}) {
   let response;
   try {
     response = await fetch(path, { cache: "no-store", signal: AbortSignal.timeout(patience), ...options });
@@ -21,6 +21,7 @@ async function ask(path, options, patience) {
         : "The gateway cannot be reached.",
     );
   }
+  answered();
   const body = await response.json().catch(() => null);
   if (!response.ok)
     throw new Refused(response.status, body?.error ?? `The gateway answers ${response.status}.`);
@@ -31,8 +32,8 @@ async function ask(path, options, patience) {
 export const get = (path, patience = PATIENCE_MS) => ask(path, {}, patience);
 
 // Browsers open six connections to a host for all tabs together, which other tabs' waiting frames may hold:
-// a command goes ahead of what is queued for them.
-export const post = (path, body, patience = PATIENCE_MS) =>
+// a command goes ahead of what is queued for them. `answered` is called when the head of the answer is here.
+export const post = (path, body, patience = PATIENCE_MS, answered = undefined) =>
   ask(
     path,
     {
@@ -42,6 +43,7 @@ export const post = (path, body, patience = PATIENCE_MS) =>
       body: JSON.stringify(body),
     },
     patience,
+    answered,
   );
 
 export const query = pairs => new URLSearchParams(pairs).toString();

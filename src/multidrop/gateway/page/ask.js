@@ -170,18 +170,28 @@ export async function askToken(why, yes = "Sign in", kind = DANGER) {
   }
 }
 
+const IDLE = { sent: () => {}, answered: () => {} };
 const patienceOf = kind => (kind === STOP ? STOP_PATIENCE_MS : undefined);
 
 // Send what the person confirmed, and once more after a sign-in where the right to it was missing: `body`
-// is called at each confirmation, and `kind` is the class of its button. Return the answer. Raises Refused.
-export async function send(path, body, { kind = DANGER, patience = patienceOf(kind) } = {}) {
+// is called at each confirmation, and `kind` is the class of its button. `watch` has `sent` and `answered`,
+// which are called around each request. Return the answer. Raises Refused.
+export async function send(path, body, { kind = DANGER, patience = patienceOf(kind), watch = IDLE } = {}) {
   dispatchEvent(new Event("command"));
+  const sent = async () => {
+    watch.sent();
+    try {
+      return await post(path, body(), patience, watch.answered);
+    } finally {
+      watch.answered();
+    }
+  };
   try {
-    return await post(path, body(), patience);
+    return await sent();
   } catch (error) {
     if (error.status !== 401 && error.status !== 403) throw error;
     const why = `${error.message} A token with the right to it is needed.`;
     if (!(await askToken(why, "Sign in and send it", kind))) throw error;
-    return await post(path, body(), patience);
+    return await sent();
   }
 }

@@ -1,53 +1,135 @@
 // Stops: of all drives and of one. This file needs the dialog and nothing else of the page.
 
 import { STOP, confirm, send, tell } from "./ask.js";
-import { find, glyph, make, named } from "./dom.js";
+import { fill, find, glyph, make, named } from "./dom.js";
 
 const HOW =
   "A stop goes ahead of all polling and is repeated until the drive confirms it. " +
   "Motors come down as their drives are set.";
-const WAITING =
-  "The stop is on its way. Where a drive does not answer it is repeated for 30 s, and told of after that.";
+const SENT = "The stop is being sent.";
+const TAKEN =
+  "The gateway has taken the stop. If a drive does not answer, its stop is repeated for 30 s, and its " +
+  "outcome is shown after that.";
+const UNTAKEN = "The gateway has not taken the stop";
 const HARD = "Use the hard stop at the machine if a motor must stand now.";
+const HARD_NOW = "Use the hard stop at the machine now. This page goes on waiting for the gateway.";
+const TAKEN_MS = 1500; // within which a gateway that works confirms that it has taken a stop
+
+// Return what "Stop all" stops in the view that is shown: its label, its name, and its requests.
+function target() {
+  const { drives, lines, plant, fleet } = find("#stopall").dataset;
+  const all = drives > 1 ? `all ${drives} drives` : "all drives";
+  const where = lines > 1 ? `All ${lines} lines at once. ` : "";
+  const own = ["api/stop", { drives: null }];
+  if (!fleet || !location.hash.startsWith("#/fleet"))
+    return { label: "Stop all", what: all, where, requests: [own] };
+  const here = `${all} of ${plant}`;
+  if (fleet === "stops")
+    return {
+      label: "Stop the fleet",
+      what: "the whole fleet",
+      where: `All drives of all lines of the fleet, and ${here}. `,
+      requests: [own, ["api/fleet/stop", {}]],
+    };
+  return {
+    label: "Stop this plant",
+    what: here,
+    where:
+      "Only the drives of this plant are stopped, and none of the fleet's: for those, run " +
+      "`multidrop fleet stop --all`. ",
+    requests: [own],
+  };
+}
+
+// Show on the button what it stops.
+export function showTarget() {
+  const { label, what } = target();
+  find("#stopall").textContent = label;
+  find("#stopall").title = `Stop ${what}`;
+}
 
 // Ask, and stop all drives.
 export async function stopAll() {
-  const { drives, lines } = find("#stopall").dataset;
-  const all = drives > 1 ? `all ${drives} drives` : "all drives";
-  const where = lines > 1 ? `All ${lines} lines at once. ` : "";
-  const isSure = await confirm(`Stop ${all}?`, [make("p", {}, where + HOW)], `Stop ${all}`, STOP);
-  if (isSure) await stop(null, "all drives");
+  const { what, where, requests } = target();
+  if (await confirm(`Stop ${what}?`, [make("p", {}, where + HOW)], `Stop ${what}`, STOP))
+    await stop(requests, what);
 }
 
 // Ask, and stop this drive.
 export async function stopOne(name) {
   const [title, yes] = [["Stop ", named(name), "?"], ["Stop ", named(name)]];
-  if (await confirm(title, [make("p", {}, HOW)], yes, STOP)) await stop([name], name);
+  if (await confirm(title, [make("p", {}, HOW)], yes, STOP))
+    await stop([["api/stop", { drives: [name] }]], name);
 }
 
-async function stop(drives, what) {
+// Show how far a stop is. Return what watches each of its requests: a gateway that works confirms within
+// half a second that it has taken the stop.
+function showProgress(what, isShown) {
+  const title = make("span"),
+    words = make("p", { role: "alert" });
+  const show = (head, text, isBad) => {
+    fill(title, ...head);
+    fill(words, isBad ? glyph("fault") : null, ` ${text}`);
+    words.className = isBad ? "bad" : "";
+  };
+  const open = () => void tell(title, [words]).catch(() => {});
+  const stopping = ["Stopping ", named(what), " …"];
+  show(stopping, `${SENT} ${HARD}`, false);
+  if (isShown) open();
+  const waiting = new Set(); // timers of requests that are not confirmed
+  const late = () => {
+    show([UNTAKEN], `No confirmation came within ${TAKEN_MS / 1000} s. ${HARD_NOW}`, true);
+    if (!words.closest("dialog[open]")) open();
+  };
+  return () => {
+    let timer = null;
+    return {
+      sent: () => waiting.add((timer = setTimeout(late, TAKEN_MS))),
+      answered: () => {
+        clearTimeout(timer);
+        if (waiting.delete(timer) && !waiting.size) show(stopping, `${TAKEN} ${HARD}`, false);
+      },
+    };
+  };
+}
+
+// Return what watches a verb that stops a drive: a dialog opens only if the gateway does not take it.
+export const watchStop = name => showProgress(name, false)();
+
+async function stop(requests, what) {
   let again = "again";
   while (again === "again") {
-    const closed = tell(["Stopping ", named(what), " …"], [make("p", {}, `${WAITING} ${HARD}`)]);
-    closed.catch(() => {});
-    let shown;
-    try {
-      const told = await send("api/stop", () => ({ drives }), { kind: STOP });
-      shown = outcome(told);
-    } catch (error) {
-      const isRefused = error.status >= 400 && error.status < 500;
-      const title = isRefused ? "The stop was not sent" : "It is not known that the stop was sent";
-      shown = {
-        title,
-        contents: [make("p", { class: "bad" }, glyph("fault"), ` ${error.message} ${HARD}`)],
-      };
-    }
+    const watch = showProgress(what, true);
+    const ends = await Promise.all(requests.map(([path, body]) => ending(path, body, watch())));
+    const failed = ends.find(end => end.error);
+    const shown = failed ? failure(failed.error, ends) : outcome(Object.assign({}, ...ends.map(e => e.told)));
     again = await tell(
       shown.title,
       shown.contents,
       shown.isWhole ? [] : [["again", "Send the stop again", STOP]],
     );
   }
+}
+
+async function ending(path, body, watch) {
+  try {
+    return { told: await send(path, () => body, { kind: STOP, watch }) };
+  } catch (error) {
+    return { error };
+  }
+}
+
+// Return what to show of a stop of which a request failed: that, and what became of the others.
+function failure(error, ends) {
+  const isRefused = error.status >= 400 && error.status < 500;
+  const others = ends.filter(end => end.told).map(end => outcome(end.told));
+  return {
+    title: isRefused ? "The stop was not sent" : "It is not known that the stop was sent",
+    contents: [
+      make("p", { class: "bad" }, glyph("fault"), ` ${error.message} ${HARD}`),
+      ...others.flatMap(({ title, contents }) => [make("p", {}, `${title}.`), ...contents]),
+    ],
+  };
 }
 
 // Return a title, what to show and whether every drive stands, of the gateway's answer.
@@ -91,6 +173,7 @@ setTimeout(() => {
 }, WHOLE_MS);
 
 find("#stopall").addEventListener("click", stopAll);
+addEventListener("hashchange", showTarget);
 // Stop all lies behind an open dialog, and is at hand all the same: in place of what else is asked.
 find("#ask").addEventListener("click", event => {
   const isIn = element => {

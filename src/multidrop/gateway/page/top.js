@@ -3,6 +3,7 @@
 import * as clock from "./clock.js";
 import { fill, find, glyph, make, named, put, say, setClass } from "./dom.js";
 import { correction, link, now } from "./link.js";
+import { showTarget } from "./stop.js";
 import { LIVE_MS, isLive, lasting, state, store } from "./store.js";
 import { count } from "./values.js";
 
@@ -21,6 +22,9 @@ export function showPlant() {
   const stopall = find("#stopall");
   stopall.dataset.drives = store.drives.size;
   stopall.dataset.lines = store.lines.size;
+  stopall.dataset.plant = name;
+  stopall.dataset.fleet = plant.fleet ? (plant.fleet_stop ? "stops" : "looks") : "";
+  showTarget();
   put(find("#role"), `${plant.demo ? "simulated, " : ""}may ${plant.may?.role ?? "look"}`);
 }
 
