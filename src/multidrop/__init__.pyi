@@ -32,7 +32,9 @@ from multidrop.drive.declaration_check import DeclarationError as DeclarationErr
 from multidrop.drive.declare import command as command
 from multidrop.drive.declare import reading as reading
 from multidrop.drive.declare import setting as setting
+from multidrop.drive.known_state import FAULT_RECORDS as FAULT_RECORDS
 from multidrop.drive.known_state import StateReader as StateReader
+from multidrop.drive.known_state import can_show_fault as can_show_fault
 from multidrop.drive.named_verbs import verb_arguments as verb_arguments
 from multidrop.drive.named_verbs import verbs_of as verbs_of
 from multidrop.drive.register import Access as Access

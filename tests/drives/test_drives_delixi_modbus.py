@@ -148,7 +148,7 @@ def test_the_only_setpoint_wears_the_eeprom() -> None:
     ("says", "state"),
     [
         ({"fault": DelixiFault.NONE, "output_frequency": 12.0}, State(Condition.RUNNING)),
-        ({"fault": DelixiFault.OH_OVERHEAT}, State(Condition.FAULT, fault="OH_OVERHEAT")),
+        ({"fault": DelixiFault.OH_OVERHEAT}, State(Condition.FAULT, fault="overheat")),
         ({"fault": 99}, State(Condition.FAULT, fault="99")),
     ],
 )
@@ -176,7 +176,7 @@ def test_identify() -> None:
     [
         ("run_source", DelixiRunSource.KEYPAD, r"P00\.00 must be 2"),
         ("frequency_source", 0, r"P00\.01"),
-        ("fault", DelixiFault.OH_OVERHEAT, "OH_OVERHEAT"),
+        ("fault", DelixiFault.OH_OVERHEAT, "overheat"),
         ("frequency", 0.0, "set_frequency"),
     ],
 )

@@ -127,7 +127,7 @@ def test_no_motor_is_started_that_could_run_later(status: int, sentence: str) ->
     ("says", "sentence"),
     [
         ({"run_source": DelixiRunSource.KEYPAD}, "is not commanded by the line"),
-        ({"fault": DelixiFault.OC_OVERCURRENT}, "has a fault, OC_OVERCURRENT: see to it"),
+        ({"fault": DelixiFault.OC_OVERCURRENT}, "has a fault, overcurrent: see to it"),
     ],
 )
 def test_a_drive_that_would_not_obey_is_not_started(says: dict[str, object], sentence: str) -> None:
@@ -205,7 +205,7 @@ def test_faults_are_read_as_decimal_and_as_hex_digits(raw: int, fault: int) -> N
         ),
         (
             {"status": DelixiNativeStatus.FAULT, "fault": DelixiFault.OC_OVERCURRENT},
-            State(Condition.FAULT, fault="OC_OVERCURRENT"),
+            State(Condition.FAULT, fault="overcurrent"),
         ),
         (
             {"status": DelixiNativeStatus.UNDERVOLTAGE, "fault": DelixiFault.NONE},
@@ -283,7 +283,7 @@ def test_what_the_document_does_not_have(name: str) -> None:
 @pytest.mark.parametrize("status", [DelixiNativeStatus.FAULT, DelixiNativeStatus.UNDERVOLTAGE])
 def test_a_fault_that_stands_after_its_reset_is_told(status: DelixiNativeStatus) -> None:
     wire = Wire(DelixiNative(1), {**STANDING, "status": status, "fault": DelixiFault.OC_OVERCURRENT})
-    with pytest.raises(NotDone, match=r"the fault reset.*the fault stands: OC_OVERCURRENT"):
+    with pytest.raises(NotDone, match=r"the fault reset.*the fault stands: overcurrent"):
         wire.drive.reset_fault()
     assert wire.sent == [RESET]  # once
 

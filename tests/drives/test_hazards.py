@@ -212,7 +212,7 @@ HAZARDS = [
         run,
         naive="01 05 00 00 FF 00",
         sends=("01 06 00 02 00 C8",),
-        refuses=r"OVERHEAT.*reset_fault",
+        refuses=r"overheat.*reset_fault",
         shows={"last_fault": ErmanFault.OVERHEAT},
     ),
     Hazard(

@@ -102,7 +102,7 @@ def test_a_state_is_what_the_family_makes_of_its_registers(
 def test_a_fault_has_the_drives_words(hub: Hub) -> None:
     hub.take(all_of(10, TRIPPED, fault=4))
     assert hub.state("pump-1") == "fault"
-    assert hub.seen("pump-1").fault == "OC1_OVERCURRENT_ACCELERATING"
+    assert hub.seen("pump-1").fault == "overcurrent while accelerating"
     assert hub.seen("pump-1").why_silent is None
     assert hub.state("pump-2") == "unknown"
 
@@ -111,7 +111,7 @@ def test_a_status_alone_shows_a_fault(hub: Hub) -> None:
     hub.take(rows((10, STATUS, TRIPPED), (10, FREQUENCY, 0)))
     assert hub.seen("pump-1") == Shown("fault", "it shows a fault")
     hub.take(rows((11, FAULT, 4)))
-    assert hub.seen("pump-1").fault == "OC1_OVERCURRENT_ACCELERATING"
+    assert hub.seen("pump-1").fault == "overcurrent while accelerating"
 
 
 def test_one_lost_reply_is_no_silence_and_many_are(hub: Hub, clock: HubClock) -> None:
@@ -320,7 +320,7 @@ def test_a_fault_lasts_while_only_some_of_its_drive_is_known(
     assert look() == [(10, None)]
     clock.now_ns = 30 * PERIOD
     hub.take(rows((30, STATUS, Status.NO_REPLY), (30, FREQUENCY, 0), (30, CURRENT, 0), (30, FAULT, 4)))
-    assert hub.seen("pump-1") == Shown("unknown", INCOMPLETE)
+    assert hub.seen("pump-1") == Shown("unknown", INCOMPLETE, "status is not known")
     assert look() == [(10, None)]
     clock.now_ns = 31 * PERIOD
     hub.take(all_of(31, status, fault=4))

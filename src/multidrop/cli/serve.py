@@ -23,6 +23,7 @@ from multidrop.cli.support.log_thread import FORMATTERS, LogThread, add_log_argu
 from multidrop.cli.support.output import logging_by, print_text, warn
 from multidrop.cli.support.plants import add_port_option, plant_of
 from multidrop.cli.support.signals import on_end_signals, on_reload_signal
+from multidrop.drive.known_state import can_show_fault
 from multidrop.drive.named_verbs import verbs_of
 from multidrop.drives import MODELS
 from multidrop.plant.loader import load_plant
@@ -73,6 +74,8 @@ def run(arguments: argparse.Namespace) -> int:
     plant, settings = read()
     if arguments.check:
         parts = ", ".join(settings.parts) or "none"
+        for sentence in blind_spots(plant):
+            warn(sentence)
         print_text(f"{plant.path}: no mistake found; {_url(settings, settings.port)}, parts: {parts}")
         return 0
     with _logging(arguments.log, logging.INFO):
@@ -100,6 +103,19 @@ def serve_demo(*, is_shown: bool = True, log: str = "text") -> int:
             return _serve(plant, _demo_settings(plant, folder), on_ready)
 
 
+def blind_spots(plant: Plant) -> list[str]:
+    """Return a sentence for each drive of which no polled register can show a fault."""
+    found = []
+    for line in plant.lines:
+        for drive, polled in ((one.drive, [poll.register.name for poll in one.polls]) for one in line.drives):
+            if can_show_fault(drive, polled):
+                continue
+            others = [one.name for one in drive.readings() if can_show_fault(drive, [*polled, one.name])]
+            advice = f"poll {' or '.join(others[:3])} too" if others else "its family names no such register"
+            found.append(f"{drive.name}: no register that is polled can show a fault: {advice}")
+    return found
+
+
 def _require_server() -> None:
     for library in ("starlette", "uvicorn"):
         require_extra(library, "serve", "serve")
@@ -125,7 +141,10 @@ def _demo_settings(plant: Plant, folder: Path) -> ServeSettings:
     with suppress(ValueError):  # this build has no history
         parts["history"] = settings_class(PARTS["history"])()
     audit = folder / "audit.jsonl"
-    return ServeSettings(port=DEMO_PORTS[0], may=may, audit=audit, folder=folder, parts=parts, is_demo=True)
+    alarms = folder / "alarms.jsonl"
+    return ServeSettings(
+        port=DEMO_PORTS[0], may=may, audit=audit, alarms=alarms, folder=folder, parts=parts, is_demo=True
+    )
 
 
 def _tell_ready(settings: ServeSettings, port: int) -> None:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from copy import copy
-from typing import Any
+from typing import Any, cast
 
 from multidrop.drive.family import Drive
 from multidrop.drive.register import Register
@@ -14,6 +14,7 @@ from multidrop.errors import BusError
 
 MOST_STEPS = 20
 FAULT = "fault"  # the register of a fault's code, in every family that has one
+FAULT_RECORDS = ("last_fault", "fault_record_1")  # of the newest fault, which may be past
 
 
 class StateReader:
@@ -27,6 +28,8 @@ class StateReader:
         self._shown: tuple[dict[str, float | None], State | None] | None = None  # by these values, last time
         self.has_state = type(drive).state is not Drive.state
         """True where the family's document has a state at all."""
+        self.lacks = ""
+        """The register whose value the newest look lacked; "" if it lacked none."""
 
     def state(self, values: Mapping[str, float]) -> State | None:
         """Return the state that these values, by register's name, show; None where they do not suffice.
@@ -38,6 +41,7 @@ class StateReader:
         """
         if self._shown and all(values.get(name) == value for name, value in self._shown[0].items()):
             return self._shown[1]
+        self.lacks = ""
         notes, read = dict(vars(self._drive)), dict[str, float | None]()
         found = self._look(values, read)
         is_all_there_was = found is not None and notes == vars(self._drive)
@@ -56,6 +60,7 @@ class StateReader:
                 value = read[register.name] = values.get(register.name)
                 if value is None:
                     if register.name != FAULT:
+                        self.lacks = register.name
                         return None
                     value = 0.0  # no fault: the family shows one only where the status says so
                 step = script.send(value if register.values is None else register.decode(value))
@@ -71,3 +76,29 @@ def _known(state: object, read: Mapping[str, float | None]) -> State | None:
     if not isinstance(state, State) or read.get(FAULT, 0) is not None:
         return state if isinstance(state, State) else None
     return State(Condition.FAULT) if state.condition is Condition.FAULT else None
+
+
+def can_show_fault(drive: Drive, polled: Collection[str]) -> bool:
+    """Return True if some values of these registers, by name, show a fault of the drive.
+
+    A record of the newest fault shows one when it changes.
+    """
+    if {FAULT, *FAULT_RECORDS} & {*polled}:
+        return True
+    choices = {name: _choices(drive.registers[name]) for name in polled}
+    tried: list[dict[str, float]] = [{}]
+    while tried:
+        values = tried.pop()
+        reader = StateReader(drive)
+        found = reader.state(values)
+        if found is not None and found.condition is Condition.FAULT:
+            return True
+        if found is None and reader.lacks not in values:
+            tried += [values | {reader.lacks: choice} for choice in choices.get(reader.lacks, ())]
+    return False
+
+
+def _choices(register: Register[Any]) -> list[float]:
+    """Return values of a register that a state may depend on."""
+    members: list[Any] = [] if register.values is None else list(cast(Any, register.values))
+    return [0.0, 1.0, *(float(member.value) for member in members)]

@@ -13,7 +13,7 @@ from decimal import Decimal
 from enum import Enum, Flag, IntEnum
 from fractions import Fraction
 from functools import cached_property
-from typing import Any, Generic, TypeVar, cast
+from typing import Any, Generic, Self, TypeVar, cast
 
 from multidrop.core import NumberFormat
 from multidrop.drive.coding import MOST_POWER, Coding
@@ -22,6 +22,20 @@ from multidrop.drive.table import HOLDING, Carrier, Kept, Table
 from multidrop.printable import plain_number, plain_whole
 
 T = TypeVar("T", bound=float)
+ACRONYMS = frozenset({"DC", "EEPROM", "PID", "PWM"})  # in the names of values
+
+
+class Worded(IntEnum):
+    """Named numbers; a name that is a code of the manual's has its meaning in words beside it."""
+
+    words: str
+
+    def __new__(cls, value: int, words: str = "") -> Self:
+        """Return the member of this number."""
+        member = int.__new__(cls, value)
+        member._value_ = value
+        member.words = words
+        return member
 
 
 class Access(Enum):
@@ -277,6 +291,17 @@ class Register(Generic[T]):
         unit = self.unit if self.step is not None else "(scale not stated)"
         return f"{self._number(value)} {unit}".rstrip()
 
+    def in_words(self, value: T) -> str:
+        """Return a named value in words that need no manual; others as `format` does."""
+        if isinstance(value, Flag):
+            known = [member.name for member in value]
+            rest = int(value) & ~sum(int(member) for member in type(value))
+            bits = [f"bit {bit}" for bit in range(rest.bit_length()) if rest >> bit & 1]
+            return ", ".join([*(_spaced(str(name)) for name in known), *bits]) or "none"
+        if isinstance(value, Worded) and value.words:
+            return value.words
+        return _spaced(value.name) if isinstance(value, Enum) else self.format(value)
+
     def _number(self, value: float) -> str:
         if self.number_format in WHOLE and isinstance(value, int) and not self.decimals:
             return str(value)
@@ -293,6 +318,10 @@ def unnamed_bits(value: Flag) -> list[str]:
     for member in value:
         rest &= ~int(member.value)
     return [f"bit {bit}" for bit in range(rest.bit_length()) if rest >> bit & 1]
+
+
+def _spaced(name: str) -> str:
+    return " ".join(part if part in ACRONYMS else part.lower() for part in name.split("_"))
 
 
 def _number_in(text: str) -> float:

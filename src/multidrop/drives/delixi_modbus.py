@@ -161,7 +161,7 @@ class DelixiModbus(DelixiParameters, table=HOLDING):
         """Report the fault by name, or that the motor turns; at rest the state is unknown."""
         fault = yield from read(self.fault)
         if fault:
-            return State(Condition.FAULT, fault=self.fault.format(fault))
+            return State(Condition.FAULT, fault=self.fault.in_words(fault))
         if (yield from self._stands()):
             return State(Condition.UNKNOWN, note="output frequency 0: stopped, or running at a setpoint of 0")
         return State(Condition.RUNNING)

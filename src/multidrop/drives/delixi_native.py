@@ -155,7 +155,7 @@ class DelixiNative(DelixiParameters, table=PARAMETER):
         yield from write(self.control, DelixiNativeControl.RESET_FAULT)
         status = yield from read(self.status)
         if status in (DelixiNativeStatus.FAULT, DelixiNativeStatus.UNDERVOLTAGE):
-            fault = self.fault.format((yield from read(self.fault)))
+            fault = self.fault.in_words((yield from read(self.fault)))
             raise NotDone(self.name, "the fault reset", f"the fault stands: {fault}")
 
     @verb
@@ -173,7 +173,7 @@ class DelixiNative(DelixiParameters, table=PARAMETER):
             return State(condition, direction, note="output frequency 0" if still else "")
         if status in (DelixiNativeStatus.FAULT, DelixiNativeStatus.UNDERVOLTAGE):
             fault = yield from read(self.fault)
-            return State(Condition.FAULT, fault=self.fault.format(fault) if fault else status.name)
+            return State(Condition.FAULT, fault=self.fault.in_words(fault) if fault else status.name)
         return State(Condition.UNKNOWN, note=f"K = 03 says {int(status):04X}H, which is not explained")
 
 

@@ -8,7 +8,7 @@ from enum import IntEnum
 from multidrop.drive import Drive, Refused
 from multidrop.drive.declare import reading, setting
 from multidrop.drive.options import Option
-from multidrop.drive.register import Register
+from multidrop.drive.register import Register, Worded
 from multidrop.drive.script import Script, read
 from multidrop.drive.table import Table
 
@@ -24,24 +24,24 @@ def parameter(group: int, index: int) -> int:
     return group * 100 + index
 
 
-class DelixiFault(IntEnum):
+class DelixiFault(Worded):
     """P05.31. The codes 10 to 14 are printed as digits that may be decimal or hex: both are read."""
 
     NONE = 0
-    OC_OVERCURRENT = 1
-    OC_1_OVERCURRENT_ACCELERATING = 2
-    OC_2_OVERCURRENT_DECELERATING = 3
-    OU_OVERVOLTAGE = 4
-    OU_1_OVERVOLTAGE_ACCELERATING = 5
-    OU_2_OVERVOLTAGE_DECELERATING = 6
-    POFF_UNDERVOLTAGE = 7
-    OH_OVERHEAT = 8
-    OL_OVERLOAD = 9
-    EF_EXTERNAL = 10
-    PARAMETER_WRITE = 11
-    VFOP_VF1_CHANNEL_BROKEN = 12
-    IFOP_VF2_CHANNEL_BROKEN = 13
-    FLT_MODULE = 14
+    OC_OVERCURRENT = 1, "overcurrent"
+    OC_1_OVERCURRENT_ACCELERATING = 2, "overcurrent while accelerating"
+    OC_2_OVERCURRENT_DECELERATING = 3, "overcurrent while decelerating"
+    OU_OVERVOLTAGE = 4, "overvoltage"
+    OU_1_OVERVOLTAGE_ACCELERATING = 5, "overvoltage while accelerating"
+    OU_2_OVERVOLTAGE_DECELERATING = 6, "overvoltage while decelerating"
+    POFF_UNDERVOLTAGE = 7, "undervoltage"
+    OH_OVERHEAT = 8, "overheat"
+    OL_OVERLOAD = 9, "overload"
+    EF_EXTERNAL = 10, "external fault"
+    PARAMETER_WRITE = 11, "fault of a parameter write"
+    VFOP_VF1_CHANNEL_BROKEN = 12, "channel VF1 is broken"
+    IFOP_VF2_CHANNEL_BROKEN = 13, "channel VF2 is broken"
+    FLT_MODULE = 14, "module fault"
 
     @classmethod
     def _missing_(cls, value: object) -> DelixiFault | None:
@@ -163,7 +163,7 @@ class DelixiParameters(Drive):
         fault = yield from read(self.fault)
         if fault:
             raise Refused(
-                f"{self.name} has a fault, {self.fault.format(fault)}: see to it and reset it first"
+                f"{self.name} has a fault, {self.fault.in_words(fault)}: see to it and reset it first"
             )
         if (yield from read(self.run_source)) != DelixiRunSource.LINE:
             raise Refused(f"{self.name} is not commanded by the line: {self.remote}")

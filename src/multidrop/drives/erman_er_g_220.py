@@ -236,7 +236,7 @@ class ErmanERG220(Drive):
                 f"{reset.command} and {declare.command}",
                 f"{reset.command}, or {declare.plant}",
             )
-            shown = self.last_fault.format(fault)
+            shown = self.last_fault.in_words(fault)
             raise Refused(f"{self.name} may have a fault, {shown}: see to it, then {way.program}", advice=way)
         yield from self._setpoint_in_force()
         yield from write(self.stop_coil, Coil.OFF)
@@ -313,5 +313,5 @@ class ErmanERG220(Drive):
         notes = ["motor overloaded"] if status & OVERLOAD else []
         condition = CONDITIONS[status & PHASE]
         if condition is Condition.STOPPED and fault:
-            notes.append(f"last fault {self.last_fault.format(fault)}, which may still be in force")
+            notes.append(f"last fault {self.last_fault.in_words(fault)}, which may still be in force")
         return State(condition, note="; ".join(notes))

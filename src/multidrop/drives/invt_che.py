@@ -10,7 +10,7 @@ from multidrop.drive import ANOTHER_FAMILY, Advice, BusError, Drive, DriveRefuse
 from multidrop.drive.declare import Details, command, declaration, reading, setting
 from multidrop.drive.number_format import NumberFormat
 from multidrop.drive.options import Option
-from multidrop.drive.register import Register
+from multidrop.drive.register import Register, Worded
 from multidrop.drive.script import Script, insist, read, write
 from multidrop.drive.state import Condition, Direction, State
 from multidrop.drive.table import HOLDING, Kept
@@ -51,31 +51,31 @@ class Device(IntEnum):
 OTHER_SERIES = {0x010A: "Goodrive300L", 0x010C: "Goodrive200L"}  # what their manuals have at 3016H
 
 
-class CHEFault(IntEnum):
+class CHEFault(Worded):
     NONE = 0
-    OUT1_PHASE_U = 1
-    OUT2_PHASE_V = 2
-    OUT3_PHASE_W = 3
-    OC1_OVERCURRENT_ACCELERATING = 4
-    OC2_OVERCURRENT_DECELERATING = 5
-    OC3_OVERCURRENT_CONSTANT = 6
-    OV1_OVERVOLTAGE_ACCELERATING = 7
-    OV2_OVERVOLTAGE_DECELERATING = 8
-    OV3_OVERVOLTAGE_CONSTANT = 9
-    UV_UNDERVOLTAGE = 10
-    OL1_MOTOR_OVERLOAD = 11
-    OL2_INVERTER_OVERLOAD = 12
-    SPI_INPUT_PHASE = 13
-    SPO_OUTPUT_PHASE = 14
-    OH1_RECTIFIER_OVERHEAT = 15
-    OH2_INVERTER_OVERHEAT = 16
-    EF_EXTERNAL = 17
-    CE_COMMUNICATION = 18
-    ITE_CURRENT_DETECTION = 19
-    TE_AUTOTUNING = 20
-    EEP_EEPROM = 21
-    PIDE_FEEDBACK = 22
-    BCE_BRAKE_UNIT = 23
+    OUT1_PHASE_U = 1, "fault of output phase U"
+    OUT2_PHASE_V = 2, "fault of output phase V"
+    OUT3_PHASE_W = 3, "fault of output phase W"
+    OC1_OVERCURRENT_ACCELERATING = 4, "overcurrent while accelerating"
+    OC2_OVERCURRENT_DECELERATING = 5, "overcurrent while decelerating"
+    OC3_OVERCURRENT_CONSTANT = 6, "overcurrent at constant speed"
+    OV1_OVERVOLTAGE_ACCELERATING = 7, "overvoltage while accelerating"
+    OV2_OVERVOLTAGE_DECELERATING = 8, "overvoltage while decelerating"
+    OV3_OVERVOLTAGE_CONSTANT = 9, "overvoltage at constant speed"
+    UV_UNDERVOLTAGE = 10, "undervoltage"
+    OL1_MOTOR_OVERLOAD = 11, "motor overload"
+    OL2_INVERTER_OVERLOAD = 12, "inverter overload"
+    SPI_INPUT_PHASE = 13, "input phase failure"
+    SPO_OUTPUT_PHASE = 14, "output phase failure"
+    OH1_RECTIFIER_OVERHEAT = 15, "rectifier overheat"
+    OH2_INVERTER_OVERHEAT = 16, "inverter overheat"
+    EF_EXTERNAL = 17, "external fault"
+    CE_COMMUNICATION = 18, "communication fault"
+    ITE_CURRENT_DETECTION = 19, "current detection fault"
+    TE_AUTOTUNING = 20, "autotuning fault"
+    EEP_EEPROM = 21, "EEPROM fault"
+    PIDE_FEEDBACK = 22, "PID feedback lost"
+    BCE_BRAKE_UNIT = 23, "brake unit fault"
 
 
 class CommunicationFault(IntEnum):
@@ -296,7 +296,7 @@ class InvtCHE(Drive):
     def _forward(self, direction: Direction | None) -> Script[bool]:
         status = yield from read(self.status)
         if status == CHEStatus.FAULT:
-            fault = self.fault.format((yield from read(self.fault)))
+            fault = self.fault.in_words((yield from read(self.fault)))
             raise self._reset_first(fault)
         if status not in STATES:
             raise Refused(f"{self.name} has {int(status):04X}H at 1001H, which is not explained")
@@ -348,7 +348,7 @@ class InvtCHE(Drive):
             raise Refused(f"{self.name} runs: it has no fault to reset")
         yield from write(self.control, CHEControl.RESET_FAULT)
         if (yield from read(self.status)) == CHEStatus.FAULT:
-            fault = self.fault.format((yield from read(self.fault)))
+            fault = self.fault.in_words((yield from read(self.fault)))
             raise NotDone(self.name, "the fault reset", f"the fault stands: {fault}")
 
     @verb
@@ -370,7 +370,7 @@ class InvtCHE(Drive):
         status = yield from read(self.status)
         if status == CHEStatus.FAULT:
             fault = yield from read(self.fault)
-            return State(Condition.FAULT, fault=self.fault.format(fault) if fault else None)
+            return State(Condition.FAULT, fault=self.fault.in_words(fault) if fault else None)
         return STATES.get(status, State(Condition.UNKNOWN, note=f"1001H = {int(status)} is not explained"))
 
 

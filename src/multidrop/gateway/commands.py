@@ -57,11 +57,19 @@ class PolledLines(ChangingLines, Protocol):
 
 
 class Commands:
-    """Carries commands out on the lines of a poller."""
+    """Carries commands out on the lines of a poller.
 
-    def __init__(self, lines: PolledLines, may: May) -> None:
+    `on_reset` is called with the name of a drive whose fault was reset.
+    """
+
+    def __init__(
+        self, lines: PolledLines, may: May, on_reset: Callable[[str], object] = lambda drive: None
+    ) -> None:
         self.may = may
         self.withheld = ""  # why nothing but stops is written
+        self._on_reset = on_reset
+        self._halts: Counter[str] = Counter()  # commands besides stops that end a run, by drive
+        self._jogging: Counter[str] = Counter()  # jogs under way
         self._lines = lines
         self.called = 0  # commands that passed all rights, so far
         self._under_way: dict[str, int] = {}  # writes, by line
@@ -86,6 +94,10 @@ class Commands:
     def stopped_ns(self, drive: str) -> int | None:
         """Return when the latest stop of a drive was called (CLOCK_BOOTTIME); None without one."""
         return self._stopped_ns.get(drive)
+
+    def halts(self, drive: str) -> int | None:
+        """Return how many commands that end a run of a drive's motor were called; None while it jogs."""
+        return None if self._jogging[drive] else self.stops[drive] + self._halts[drive]
 
     def _note_stop(self, drives: Iterable[str]) -> None:
         drives = [*drives]
@@ -164,6 +176,8 @@ class Commands:
             return denied(caller, Right.WRITE, f"a write of {what}")
         if what not in self.may.write:
             return failed(not_listed(what, "write"))
+        if self._moves(drive, register):
+            self._halts[drive] += 1
         work = partial(write_one, register=register, value=value)
         return await self._carry_out(drive, caller, f"{what} = {value!r}", work, admit)
 
@@ -197,7 +211,22 @@ class Commands:
         if verb in STOPPING:
             return await self._carry_out_stop(drive, verb, caller)
         work = partial(act_one, verb=verb, arguments=arguments)
-        return await self._carry_out(drive, caller, what, work, admit)
+        is_jog = verb == "jog"
+        self._jogging[drive] += is_jog
+        try:
+            told = await self._carry_out(drive, caller, what, work, admit)
+        finally:
+            self._jogging[drive] -= is_jog
+            self._halts[drive] += is_jog
+        if verb == "reset_fault" and told.is_done:
+            self._on_reset(drive)
+        return told
+
+    def _moves(self, drive: str, register: str) -> bool:
+        """Return True for a register whose writes may start or stop the motor."""
+        known = drives_of(self._lines.plant).get(drive)
+        found = known.registers.get(register) if known is not None else None
+        return found is not None and found.commands
 
     async def _carry_out_stop(self, drive: str, verb: str, caller: Caller) -> Told:
         """Carry out a verb that stops the motor: neither writes under way nor other stops keep it back.

@@ -96,7 +96,7 @@ def _register(register: Register[Any]) -> dict[str, Any]:
     least, most = register.span or (None, None)
     kind = "number" if values is None else "bits" if issubclass(values, Flag) else "words"
     members: list[Any] = [] if values is None else list(cast(Any, values))
-    words = {str(int(member)): member.name.lower() for member in members}
+    words = {str(int(member)): register.in_words(member) for member in members}
     return {
         "name": register.name,
         "unit": register.value_unit,

@@ -7,7 +7,7 @@ from math import isfinite
 from typing import Any
 
 from multidrop import Bus, BusError, Drive, Effect, Register
-from multidrop.gateway.told import Told, failed
+from multidrop.gateway.told import Told, failed, in_words
 
 
 def stop_one(drive: Drive, seconds: float | None) -> dict[str, Told]:
@@ -35,7 +35,10 @@ def write_one(drive: Drive, register: str, value: float) -> Told:
         return failed(failure)
     if outcome.effect is Effect.DONE:
         return Told(True, str(outcome))
-    return Told(False, str(outcome), outcome.failure or BusError(str(outcome)))
+    text = str(outcome)
+    if outcome.failure is not None:
+        text = text.replace(str(outcome.failure), in_words(outcome.failure))
+    return Told(False, text, outcome.failure or BusError(text))
 
 
 def _typed(register: Register[Any], value: float) -> Any:

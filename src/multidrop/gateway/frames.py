@@ -63,7 +63,7 @@ def frame_of(
         "lines": {
             line.name: lately.line(line.name) | {"lost": lost_of(hub, line.name)} for line in hub.plant.lines
         },
-        "alarms": [alarm._asdict() for alarm in events.shown()],
+        "alarms": [alarm.as_json() for alarm in events.shown()],
     }
 
 
@@ -83,6 +83,7 @@ def _drive(hub: Hub, name: str, time_ns: int) -> dict[str, Any]:
         "state": shown.state,
         "fault": shown.fault,
         "why": shown.why_silent,
+        "note": shown.note,
         "seen": None if seen is None or answered_ns is None else places[seen, answered_ns],
         "ages_ms": [_age_ms(now, asked) for asked in places],
         "values": values,

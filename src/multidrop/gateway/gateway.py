@@ -11,16 +11,18 @@ from collections.abc import Awaitable, Callable, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
+from math import inf
 from typing import Any
 
 import uvicorn
 
 import multidrop
 from multidrop import Batch, Bus, Ledger, LineError, Plant, Poller
+from multidrop.gateway.alarm_file import AlarmFile
 from multidrop.gateway.clock import boottime_ns, now_and_slept_ns, utc_ms
 from multidrop.gateway.commands import Commands
 from multidrop.gateway.connections import Connections, Watched, WatchedProtocol
-from multidrop.gateway.events import Events
+from multidrop.gateway.events import Alarm, Events
 from multidrop.gateway.frames import Frames, frame_of, lost_of
 from multidrop.gateway.guard import MOST_HEAD
 from multidrop.gateway.hub import SILENT, Hub
@@ -43,6 +45,7 @@ TAKE_S = 0.1  # between looks for new rows: half of the time between two frames
 LOOK_S = 0.2  # between looks for faults and silence; frames are made then, of what was just seen
 TICK_S = 1.0  # between readings of the statistics
 LOG_S = 60.0  # between log lines of a part that goes on failing
+RESTORE_S = 2.0  # for which the alarms of earlier runs are waited for
 MOST_ASKED = 16  # requests past a register table at the same time
 ASKED_S = 30.0  # that one of them may take
 END_S = 4.0  # that the end may take, stops included
@@ -87,11 +90,13 @@ class Gateway:
         self.tokens = Tokens(settings.tokens)
         self.hub = Hub(plant, now_and_slept_ns)
         self.newcomers = Newcomers()
-        self.events = Events(utc_ms())
+        self.events = Events(utc_ms(), self._note_alarm)
+        self.alarm_file = AlarmFile(settings.alarms) if settings.alarms else None
+        self._is_restored = self.alarm_file is None
         self.lately = Lately(plant)
         self.notifier = Notifier()
         self.reload = Reload(self, read)
-        self.commands = Commands(self, settings.may)
+        self.commands = Commands(self, settings.may, lambda drive: self.hub.note_reset(drive))
         self.seen_frames = SeenFrames(boottime_ns, self.commands.stopped_ns)
         self.frames = Frames(self._frame, self.clock, begin=secrets.randbits(48))
         self.side_reads = SideReads(self.bus, self._is_there, self.clock, utc_ms)
@@ -110,6 +115,9 @@ class Gateway:
         server = _Server(self._server_config())
         end = supervisor().start("end", self._end.wait())
         try:
+            if self.alarm_file is not None:
+                keeping = supervisor().thread("alarms", inf, self.alarm_file.run)
+                supervisor().watch("alarms", lambda: not keeping.done())
             built = await self.parts.build(self.settings.parts)
             await self._find_audit()
             poller = Poller(nothing, ledger=self.ledger, audit=self.audit)
@@ -156,6 +164,10 @@ class Gateway:
             await supervisor().release("polling", "statistics", "identities")
             self.guarded("hub", self.hand_out, self.poller)  # what came while it closed
         await self._end_of("parts", left_s(0.2), self.parts.close(left_s(0.4)))
+        if self.alarm_file is not None:
+            await self._end_of(
+                "alarms", left_s(0.1), supervisor().within("alarm file", END_S, self.alarm_file.close)
+            )
         self.listener.close()
         for name in dict.fromkeys(supervisor().under_way):
             _log.error("%s goes on at the end, and is not waited for", name)
@@ -240,14 +252,47 @@ class Gateway:
             self.guarded(name, feed.take, batch)
 
     def _look_for_events(self) -> None:
+        if not self._is_restored and not self._restore_alarms():
+            return
+        now = utc_ms()
         for name in self.hub.drives:
-            self.events.look(utc_ms(), name, self.hub.seen(name))
-        for line in [line for line in self.hub.unopened if lost_of(self.hub, line) is None]:
-            del self.hub.unopened[line]  # it came: should it go again, that has another reason
+            stops = None if self.hub.is_set_to_zero(name) else self.commands.halts(name)
+            self.events.look(now, name, self.hub.seen(name), stops)
+        for line in self.plant.lines:
+            lost = lost_of(self.hub, line.name)
+            self.events.look_at_line(now, line.name, lost)
+            if lost is None and any(self.hub.seen_at(polled.drive.name) for polled in line.drives):
+                self.events.note_there(line.name)
+            if lost is None and self.hub.taken:
+                self.hub.unopened.pop(line.name, None)  # should it go again, that has another reason
 
-    def forget(self, drive: str) -> None:
-        """End the alarms of a drive that is no longer there."""
-        self.events.forget(drive, utc_ms())
+    def _restore_alarms(self) -> bool:
+        """Take the alarms of earlier runs, once they are read; a disk that hangs is not waited for long."""
+        past = self.alarm_file.past if self.alarm_file is not None else []
+        if past is None and self.clock() - self.begun < RESTORE_S:
+            return False
+        if past is not None:
+            names = [line.name for line in self.plant.lines]
+            self.events.restore(past, utc_ms(), {*names, *self.hub.drives})
+            self._is_restored = True
+        return True
+
+    def _note_alarm(self, alarm: Alarm) -> None:
+        """Log an alarm that began, ended or changed, and keep it."""
+        where = alarm.drive or f"line {alarm.line}"
+        if alarm.ended is not None:
+            _log.info("alarm of %s is over: %s: %s", where, alarm.kind, alarm.text)
+        elif alarm.acknowledged is not None:
+            note = f": {alarm.note}" if alarm.note else ""
+            _log.info("alarm of %s, %s, acknowledged by %s%s", where, alarm.text, alarm.by, note)
+        else:
+            _log.warning("alarm of %s: %s: %s", where, alarm.kind, alarm.text)
+        if self.alarm_file is not None:
+            self.alarm_file.note(alarm)
+
+    def forget(self, name: str) -> None:
+        """End the alarms of a drive or a line that is no longer there."""
+        self.events.forget(name, utc_ms())
 
     def guarded(self, name: str, work: Callable[..., object], *arguments: object) -> None:
         try:

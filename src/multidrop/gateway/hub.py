@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any, NamedTuple
 
-from multidrop import Batch, Condition, Plant, PolledDrive, Register, StateReader
+from multidrop import FAULT_RECORDS, Batch, Condition, Plant, PolledDrive, Register, StateReader
 from multidrop.gateway.kept_rows import FreshValues, Known, RegisterRows
 
 RUNS, STANDS, FAULT, SILENT, UNKNOWN = "runs", "stands", "fault", "silent", "unknown"
@@ -28,6 +28,8 @@ _STATES = {
 }
 LEAST_SLEEP_NS = 100_000_000  # less is two clocks that were not read at once
 
+FAULT_REGISTER = "fault"
+RAN_NS = 3_000_000_000  # for which a motor must turn after its fault record changed, to have no fault
 _TURNING = ("output_frequency", "motor_speed")  # other than 0: the motor turns
 _ANSWERED = ("exception ", "no valid value")  # begin the statuses of misses that are replies all the same
 
@@ -47,6 +49,7 @@ class Shown(NamedTuple):
 
     state: str
     words: str | None
+    note: str = ""  # what else the drive says, or why its state is unknown
 
     @property
     def fault(self) -> str | None:
@@ -58,6 +61,13 @@ class Shown(NamedTuple):
         return self.words if self.state == SILENT else None
 
 
+class _Trip(NamedTuple):
+    """A fault that a drive told by a change of its fault record alone."""
+
+    words: str
+    at_ns: int
+
+
 class _Watched:
     """One drive of the plant."""
 
@@ -67,6 +77,8 @@ class _Watched:
         self.names = tuple(poll.register.name for poll in polled.polls)
         self.cycle_ns = cycle_ns  # of its line, as planned
         self.reader = StateReader(polled.drive)
+        self.record: float | None = None  # of its newest fault
+        self.trip: _Trip | None = None
         self.cells: dict[str, RegisterRows] = {}
 
     def cell(self, register: str) -> RegisterRows:
@@ -248,21 +260,46 @@ class Hub:
         watched = self._watched.get(drive)
         return Shown(UNKNOWN, None) if watched is None else self._look(watched)
 
+    def is_set_to_zero(self, drive: str) -> bool:
+        """Return True if a drive's setpoint is known to be 0: its motor may stand though it runs."""
+        watched = self._watched[drive]
+        setpoint = watched.polled.drive.setpoint_name
+        return bool(FreshValues(watched.cells, *self._times()).get(setpoint) == 0)
+
+    def note_reset(self, drive: str) -> None:
+        """Forget the fault that a drive's record told: it was reset."""
+        watched = self._watched.get(drive)
+        if watched is not None:
+            _forget_trip(watched)
+
     def _look(self, watched: _Watched) -> Shown:
         fresh = FreshValues(watched.cells, *self._times())
+        shown = self._shown(watched, fresh)
+        if FAULT_REGISTER not in watched.names:
+            _look_for_trip(watched)
+        if watched.trip is None or shown.state == SILENT:
+            return shown
+        if shown.state == RUNS and _turns_since(watched, watched.trip.at_ns + RAN_NS):
+            _forget_trip(watched)
+            return shown
+        return shown if shown.state == FAULT else Shown(FAULT, watched.trip.words, shown.note)
+
+    def _shown(self, watched: _Watched, fresh: FreshValues) -> Shown:
         found = watched.reader.state(fresh)
         if found is not None and found.condition is not Condition.UNKNOWN:
             fault = found.fault or UNNAMED
-            return Shown(_STATES[found.condition], fault if found.condition is Condition.FAULT else None)
+            words = fault if found.condition is Condition.FAULT else None
+            return Shown(_STATES[found.condition], words, found.note)
         if not any(True for _ in fresh):
             return self._unseen(watched)
-        if not watched.reader.has_state and fresh.get("fault"):
-            register = watched.polled.drive.registers["fault"]
-            return Shown(FAULT, _words(register, fresh["fault"]))
+        if not watched.reader.has_state and fresh.get(FAULT_REGISTER):
+            register = watched.polled.drive.registers[FAULT_REGISTER]
+            return Shown(FAULT, _words(register, fresh[FAULT_REGISTER]))
         is_turning = any(fresh.get(name) for name in _TURNING)  # 0 Hz may be a run at a setpoint of 0
         if is_turning:
             return Shown(RUNS, None)
-        return Shown(UNKNOWN, INCOMPLETE if any(name not in fresh for name in watched.names) else None)
+        note = found.note if found is not None else _lack(watched)
+        return Shown(UNKNOWN, INCOMPLETE if any(name not in fresh for name in watched.names) else None, note)
 
     def _unseen(self, watched: _Watched) -> Shown:
         """Tell a silent drive from one that refuses, and from one that was not asked lately."""
@@ -280,6 +317,42 @@ class Hub:
         return Shown(SILENT, asked)
 
 
+def _lack(watched: _Watched) -> str:
+    """Return the reason why a drive's state cannot be worked out."""
+    reader = watched.reader
+    if not reader.has_state:
+        return "its family has no register for its state"
+    if not reader.lacks:
+        return "at rest its state takes two readings one after the other, which polled values are not"
+    return f"{reader.lacks} is {'not known' if reader.lacks in watched.names else 'not polled'}"
+
+
+def _look_for_trip(watched: _Watched) -> None:
+    """Note a fault that the drive's record tells by a change; a record from before polling may be past."""
+    name = next((name for name in FAULT_RECORDS if name in watched.names), "")
+    cell = watched.cells.get(name)
+    if cell is None or cell.good is None:
+        return
+    _, at_ns, value, _ = cell.good
+    before, watched.record = watched.record, value
+    if before is not None and value != before:
+        words = _words(watched.polled.drive.registers[name], value)
+        watched.trip = _Trip(words, at_ns) if value else None
+
+
+def _turns_since(watched: _Watched, since_ns: int) -> bool:
+    """Return True if all that tells that the motor turns was asked for after this time."""
+    cells = [cell for name in ("status", *_TURNING) if (cell := watched.cells.get(name)) and cell.good]
+    return all(cell.good[1] > since_ns for cell in cells if cell.good)
+
+
+def _forget_trip(watched: _Watched) -> None:
+    watched.trip = None
+    watched.reader = StateReader(watched.polled.drive)  # what it noted of the record is old too
+
+
 def _words(register: Register[Any], value: float) -> str:
-    """Return a value's name, or the number that it is."""
-    return register.format(value if register.values is None else register.decode(value))
+    """Return a value in words, or the number that it is with its register's name."""
+    if register.values is not None:
+        return register.in_words(register.decode(value))
+    return f"{register.name.replace('_', ' ')}: {register.format(value)}"

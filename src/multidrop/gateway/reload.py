@@ -147,7 +147,8 @@ class Reload:
         gateway, plant = self._gateway, poller.plant
         gateway.hand_out(poller)  # the rest of what is of the plant before
         there = {polled.drive.name for line in plant.lines for polled in line.drives}
-        for name in set(gateway.hub.drives) - there:
+        lines = {line.name for line in gateway.plant.lines} - {line.name for line in plant.lines}
+        for name in {*gateway.hub.drives} - there | lines:
             gateway.forget(name)
         gateway.plant = plant
         gateway.revision += 1

@@ -39,6 +39,7 @@ _SERVE = {
     "behind_proxy": Key(bool, "behind_proxy = true"),
     "tokens": Key(str, 'tokens = "tokens"'),
     "audit": Key(str, 'audit = "audit.jsonl"'),
+    "alarms": Key(str, 'alarms = "alarms.jsonl"'),
     "may": Key(dict, "[serve.may], a table"),
 } | {name: Key(dict, f"[serve.{name}], a table") for name in PARTS}
 
@@ -62,6 +63,7 @@ class ServeSettings:
     tokens: tuple[Token, ...] = ()
     may: May = May()  # noqa: RUF009 (it cannot change)
     audit: Path | None = None
+    alarms: Path | None = None
     folder: Path = Path()
     parts: Mapping[str, Any] = field(default_factory=dict)
     is_demo: bool = False
@@ -144,8 +146,9 @@ def read_settings(plant: Plant, environment: Mapping[str, str]) -> ServeSettings
     if place.config_errors:
         raise PlantError(tuple(place.config_errors))
     digest = _digest(folders.find(given[key]) for key in ("certificate", "key")) if tls else ""
+    alarms = folders.state / given.get("alarms", "alarms.jsonl")
     return ServeSettings(
-        host, port, names, tls, digest, behind_proxy, tuple(tokens), may, audit, folders.state, parts
+        host, port, names, tls, digest, behind_proxy, tuple(tokens), may, audit, alarms, folders.state, parts
     )
 
 

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from typing import NamedTuple
 
 from multidrop import BusError, Refused, Seen, Stopped
 from multidrop.gateway.rights import NOT_ALLOWED, NOT_LISTED, Caller, Right
+from multidrop.gateway.verb_rules import VERBS
+
+_CALL = re.compile(r"(?P<how>call |run `multidrop )?\b(?P<verb>[a-z_-]+)(?P<end>\(\)|`)?")
 
 
 class Told(NamedTuple):
@@ -21,7 +25,23 @@ def failed(failure: BaseException) -> Told:
     """Return the end of a command that failed so."""
     if not isinstance(failure, (BusError, ValueError)):
         failure = ValueError(str(failure) or type(failure).__name__)
-    return Told(False, str(failure), failure)
+    return Told(False, in_words(failure), failure)
+
+
+def in_words(failure: BusError | ValueError) -> str:
+    """Return a failure's sentence with what a gateway's user does in place of what a program would call."""
+    text = str(failure)
+    advice = failure.advice if isinstance(failure, Refused) else None
+    if advice is not None and advice.plant:
+        text = text.replace(advice.program, advice.plant)
+    return _CALL.sub(_used, text)
+
+
+def _used(call: re.Match[str]) -> str:
+    verb = call["verb"].replace("-", "_")
+    how = "use " if call["how"] else ""
+    is_call = verb in VERBS and (call["how"] or call["end"])
+    return f'{how}"{verb.replace("_", " ")}"' if is_call else call[0]
 
 
 def of_stop(stopped: Stopped) -> Told:

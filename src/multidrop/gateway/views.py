@@ -132,12 +132,13 @@ def health_of(gateway: Gateway) -> dict[str, Any]:
 
 def parts_of(gateway: Gateway) -> dict[str, str]:
     """Return "ok" of each part, or what is not well with it."""
-    parts, dead = gateway.parts, supervisor().dead
+    parts, dead, kept = gateway.parts, supervisor().dead, gateway.alarm_file
     return (
         {name: _health_of_part(feed) for name, feed in parts.feeds.items()}
         | dict.fromkeys(parts.coming, "it is not there yet: its files do not answer")
         | parts.dead
         | {name: why for name, why in dead.items() if name in parts.feeds}
+        | ({"alarms": kept.trouble} if kept is not None and kept.trouble else {})
     )
 
 

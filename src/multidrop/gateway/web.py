@@ -18,6 +18,7 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 
 from multidrop import Refused, expose_metrics
 from multidrop.gateway.audit import MOST_RECORDS, newest_records, time_asked
+from multidrop.gateway.clock import utc_ms
 from multidrop.gateway.commands import Admit, Told
 from multidrop.gateway.describe import describe
 from multidrop.gateway.exports import Exports
@@ -38,6 +39,7 @@ PAGE = Path(__file__).parent / "page"
 MOST_QUERIES = 2  # of the audit log, at the same time
 AUDIT_S = 20.0  # that one may take
 COOKIE_S = 30 * 24 * 3600
+MOST_NOTE = 500  # characters beside an alarm
 HEAD_S = 0.5  # after which a stop's answer begins: its head confirms that the stop was taken
 UNBUFFERED = {"x-accel-buffering": "no"}  # a proxy passes the head on at once
 RIGHTS_RULES = (NOT_ALLOWED, NOT_LISTED, NEVER_THIS_WAY)
@@ -51,6 +53,7 @@ NEEDED: Mapping[str, Needed] = {
     "/api/stop": Needed("POST", Right.STOP),
     "/api/fleet/stop": Needed("POST", Right.STOP),
     "/api/act": Needed("POST", Right.STOP),  # the verb's own right is looked at by Commands
+    "/api/acknowledge": Needed("POST", Right.STOP),
     "/api/write": Needed("POST", Right.WRITE),
     "/api/reload": Needed("POST", Right.WRITE),
     "/api/token": Needed("POST", None),
@@ -79,6 +82,7 @@ def make_app(gateway: Gateway) -> ASGIApp:
         Route("/api/fleet/stop", pages.stop_fleet, methods=["POST"]),
         Route("/api/write", pages.write, methods=["POST"]),
         Route("/api/act", pages.act, methods=["POST"]),
+        Route("/api/acknowledge", pages.acknowledge, methods=["POST"]),
         Route("/api/reload", pages.reload, methods=["POST"]),
         Route("/api/token", pages.token, methods=["POST"]),
         Route("/api/forget", pages.forget, methods=["POST"]),
@@ -209,8 +213,21 @@ class _Pages:
         query = request.query_params
         begin, end = (number_in(query.get(key, ""), key) for key in ("from", "to"))
         events = self._gateway.events
-        found = [alarm._asdict() for alarm in events.between(begin, end)]
+        found = [alarm.as_json() for alarm in events.between(begin, end)]
         return JsonResponse({"alarms": found, "since": events.since})
+
+    async def acknowledge(self, request: Request) -> Response:
+        """Note that the caller has seen an alarm, with what he has to say of it."""
+        body = await body_of(request)
+        alarm, note = text_in(body, "alarm"), body.get("note", "")
+        if not isinstance(note, str) or len(note) > MOST_NOTE or not note.isprintable():
+            raise Denied(400, f"note is no text of at most {MOST_NOTE} printable characters")
+        try:
+            found = self._gateway.events.acknowledge(alarm, utc_ms(), caller_of(request).by, note.strip())
+        except KeyError:
+            raise Denied(404, "there is no such alarm; its list may have changed meanwhile") from None
+        self._gateway.frames.note_news()
+        return JsonResponse(found.as_json())
 
     # ---- history ----
 

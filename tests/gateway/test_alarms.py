@@ -1,0 +1,402 @@
+"""Alarms: trips of every family, lost ports, restarts, who acknowledged what, and a disk that is full."""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from batches import SECOND, UTC_0, completion
+from commands import Run
+from completions import add_rows
+from gateways import POLL, Served, plant_text, running, served, written
+from lines import until
+from tables import table
+
+from multidrop import BusError, Refused, can_show_fault, load_plant
+from multidrop.core import Columns, Field, Names, NumberFormat, RowLayout
+from multidrop.drives import MODELS
+from multidrop.drives.erman_er_g_220 import ErmanFault
+from multidrop.errors import Advice
+from multidrop.gateway.alarm_file import AlarmFile, alarm_in
+from multidrop.gateway.events import Alarm, Events
+from multidrop.gateway.gateway import Gateway
+from multidrop.gateway.hub import RAN_NS, Hub, Shown
+from multidrop.gateway.rights import Right
+from multidrop.gateway.settings import read_settings
+from multidrop.gateway.told import in_words
+from multidrop.polling.batch import Batch
+
+ERMAN = '["status", "output_frequency", "last_fault"]'
+REGISTERS = ("status", "output_frequency", "last_fault", "fault_record_1")
+NOT_AT_REST = "at rest its state takes two readings one after the other, which polled values are not"
+RUNNING, STOPPED = 1, 0  # of an ERMAN
+
+
+def hub_of(folder: Path, model: str, poll: str) -> Hub:
+    text = plant_text("/dev/ttyUSB0", ["pump-1"]).replace("invt-che", model)
+    text = text.replace("38400", str(MODELS[model].baudrates[0]))
+    start = text.index("poll = ")
+    path = folder / f"{model}.toml"
+    path.write_text(f"{text[:start]}poll = {poll}\n")
+    return Hub(load_plant(path), lambda: (now_ns[0], 0))
+
+
+now_ns = [0]  # by the clock of rows
+
+
+def take(hub: Hub, at_s: float, **values: int) -> None:
+    """Take good rows of the drive, and let it be that time."""
+    columns = Columns(len(values))
+    for name, value in values.items():
+        layout = RowLayout(0, [Field(0, NumberFormat.U16, REGISTERS.index(name), 1.0, 1.0)])
+        assert add_rows(columns, layout, completion(round(at_s * SECOND), words=(value,)), UTC_0)
+    now_ns[0] = round(at_s * SECOND)
+    hub.take(Batch(columns, Names(("pump-1",)), Names(REGISTERS)))
+
+
+def test_a_trip_that_only_a_fault_record_tells_is_a_fault(tmp_path: Path) -> None:
+    hub = hub_of(tmp_path, "erman-er-g-220", ERMAN)
+    take(hub, 10, status=RUNNING, output_frequency=500, last_fault=0)
+    assert hub.seen("pump-1").state == "runs"
+    take(hub, 11, last_fault=ErmanFault.OVERHEAT | 1 << 8)
+    assert hub.seen("pump-1") == Shown("fault", "overheat, bit 8")  # while its older rows say that it runs
+    take(hub, 12, status=STOPPED, output_frequency=0, last_fault=ErmanFault.OVERHEAT | 1 << 8)
+    assert hub.seen("pump-1")[:2] == ("fault", "overheat, bit 8")
+    for at_s in (20, 20 + RAN_NS / SECOND):
+        take(hub, at_s, status=RUNNING, output_frequency=500, last_fault=ErmanFault.OVERHEAT | 1 << 8)
+    assert hub.seen("pump-1").state == "runs"
+    take(hub, 30, status=STOPPED, output_frequency=0, last_fault=ErmanFault.OVERHEAT | 1 << 8)
+    assert hub.seen("pump-1").state == "stands"
+
+
+def test_a_reset_ends_such_a_fault_and_an_old_record_is_none(tmp_path: Path) -> None:
+    hub = hub_of(tmp_path, "erman-er-g-220", ERMAN)
+    take(hub, 10, status=STOPPED, output_frequency=0, last_fault=ErmanFault.OVERHEAT)
+    past = "last fault overheat, which may still be in force"
+    assert hub.seen("pump-1") == Shown("stands", None, past)
+    take(hub, 11, status=STOPPED, last_fault=ErmanFault.LOW_DC_VOLTAGE)
+    assert hub.seen("pump-1").fault == "low DC voltage"
+    hub.note_reset("pump-1")
+    assert hub.seen("pump-1").state == "stands"
+    take(hub, 12, status=STOPPED, last_fault=ErmanFault.OVERHEAT)
+    assert hub.seen("pump-1").state == "fault"
+    take(hub, 13, status=STOPPED, last_fault=0)
+    assert hub.seen("pump-1").state == "stands"
+
+
+def test_an_unknown_state_says_why_and_a_yd1000_shows_its_trips(tmp_path: Path) -> None:
+    hub = hub_of(tmp_path, "yd1000", '["output_frequency", "status", "fault_record_1"]')
+    take(hub, 10, output_frequency=0, status=0, fault_record_1=1)
+    shown = hub.seen("pump-1")
+    assert (shown.state, shown.note) == ("unknown", NOT_AT_REST)
+    take(hub, 12, output_frequency=0, fault_record_1=18)
+    assert hub.seen("pump-1").fault == "fault record 1: 18"
+    hub = hub_of(tmp_path, "erman-er-g-220", '["status", "output_frequency"]')
+    take(hub, 10, output_frequency=0, status=STOPPED)
+    assert hub.seen("pump-1") == Shown("unknown", None, "last_fault is not polled")
+
+
+@table(
+    ("model", "polled", "is_seen"),
+    [
+        ("erman-er-g-220", ("status", "output_frequency"), False),
+        ("erman-er-g-220", ("status", "last_fault"), True),
+        ("yd1000", ("output_frequency", "status"), False),
+        ("yd1000", ("output_frequency", "fault_record_1"), True),
+        ("invt-che", ("output_frequency",), False),
+        ("invt-che", ("status",), True),
+        ("innovert-ibd", ("terminals",), False),
+        ("innovert-ibd", ("terminals", "output_m01", "output_m02", "output_yabc", "output_virtual"), True),
+        ("delixi-modbus", ("output_frequency",), False),
+        ("delixi-native", ("status",), True),
+    ],
+)
+def test_registers_that_cannot_show_a_fault(model: str, polled: tuple[str, ...], is_seen: bool) -> None:
+    assert can_show_fault(MODELS[model](1), polled) is is_seen
+
+
+def test_check_warns_of_registers_that_cannot_show_a_fault(run: Run, tmp_path: Path) -> None:
+    plant = written(tmp_path, "[serve]\n")
+    status, _, errors = run("serve", "--check", plant.path)
+    assert (status, errors) == (0, "")
+    plant.path.write_text(plant.path.read_text().replace(POLL, '["output_frequency"]', 1))
+    status, _, errors = run("serve", "--check", plant.path)
+    advice = "no register that is polled can show a fault: poll status or fault too"
+    assert (status, errors.count("\n")) == (0, 1)
+    assert f"pump-1: {advice}" in errors
+
+
+# ---- begin and end ----
+
+
+RUNS, STANDS = Shown("runs", None), Shown("stands", None)
+
+
+def seen(events: Events) -> list[tuple[str, str, int, int | None]]:
+    return [(one.drive or one.line, one.kind, one.time, one.ended) for one in events.between(0, 10**9)]
+
+
+@pytest.mark.parametrize("standing", [STANDS, Shown("unknown", None)])
+def test_a_motor_that_stopped_though_nobody_stopped_it_is_an_alarm(standing: Shown) -> None:
+    events = Events()
+    for time, shown, stops in ((1, standing, 0), (2, RUNS, 0), (3, standing, 0)):
+        events.look(time, "pump-1", shown, stops)
+    assert seen(events) == [("pump-1", "stopped", 3, None)]
+    events.look(4, "pump-1", RUNS, 0)
+    assert seen(events) == [("pump-1", "stopped", 3, 4)]
+    events.look(5, "pump-1", standing, 1)  # a stop was called
+    events.look(6, "pump-1", RUNS, 1)
+    events.look(7, "pump-1", standing, None)  # it jogged, or its setpoint is 0
+    assert seen(events) == [("pump-1", "stopped", 3, 4)]
+
+
+def test_a_fault_is_no_stop_of_its_own() -> None:
+    events = Events()
+    for time, shown in enumerate((RUNS, Shown("silent", "no reply"), Shown("fault", "a"), STANDS), 1):
+        events.look(time, "pump-1", shown, 0)
+    assert {kind for _, kind, _, _ in seen(events)} == {"fault", "silent"}
+
+
+def test_the_gravest_comes_first_and_what_was_acknowledged_last() -> None:
+    events = Events()
+    events.look(1, "pump-1", Shown("fault", "overheat"))
+    events.look(2, "pump-2", RUNS, 0)
+    events.look(3, "pump-2", STANDS, 0)
+    events.look_at_line(4, "hall", "there is no such port")
+    events.look(5, "pump-3", Shown("silent", "no reply"))
+    events.look(6, "pump-4", Shown("silent", "port lost"))  # that is its line's
+    assert [one.kind for one in events.shown()] == ["fault", "stopped", "port", "silent"]
+    first = events.acknowledge(events.shown()[0].id, 7, "anna by page", "fan is dirty")
+    assert (first.acknowledged, first.by, first.note) == (7, "anna by page", "fan is dirty")
+    assert [one.kind for one in events.shown()] == ["stopped", "port", "silent", "fault"]
+    stopped = events.acknowledge(events.shown()[0].id, 8, "anna by page")
+    assert ("pump-2", "stopped", 3, 8) in seen(events)  # who knows of it needs it no longer
+    with pytest.raises(KeyError):
+        events.acknowledge("1 fault pump-9", 9, "anna")
+    events.acknowledge(stopped.id, 10, "boris", "the switch")
+    assert next(one for one in events.between(0, 99) if one.kind == "stopped").by == "boris"
+    events.look_at_line(11, "hall", None)
+    assert ("hall", "port", 4, 11) in seen(events)
+
+
+def test_an_alarm_at_the_first_look_began_before() -> None:
+    events = Events()
+    events.look(1, "pump-1", Shown("fault", "overheat"))
+    events.look(1, "pump-2", RUNS)
+    events.look(2, "pump-2", Shown("fault", "overheat"))
+    events.look_at_line(3, "hall", "port lost")
+    events.note_there("roof")
+    events.look_at_line(3, "roof", "port lost")
+    assert {one.drive or one.line: one.is_before for one in events.lasting} == {
+        "pump-1": True, "pump-2": False, "hall": True, "roof": False,
+    }  # fmt: skip
+
+
+def test_alarms_of_an_earlier_run_go_on_or_are_over() -> None:
+    kept: dict[str, Alarm] = {}
+    before = Events(0, lambda alarm: kept.update({alarm.id: alarm}))
+    for drive in ("goes-on", "is-over", "is-another", "is-gone", "is-silent"):
+        before.look(1, drive, RUNS, 0)
+        before.look(2, drive, Shown("fault", "overheat"))
+    before.acknowledge(before.shown()[0].id, 3, "anna", "seen")
+    events = Events(100)
+    events.restore(kept.values(), 101, ["goes-on", "is-over", "is-another", "is-silent"])
+    events.look(102, "goes-on", Shown("fault", "overheat"))
+    events.look(102, "is-over", STANDS)
+    events.look(102, "is-another", Shown("fault", "overcurrent"))
+    events.look(102, "is-silent", Shown("silent", "no reply"))
+    found = {(one.drive, one.text): (one.time, one.ended) for one in events.between(0, 999)}
+    assert found == {
+        ("goes-on", "overheat"): (2, None),
+        ("is-over", "overheat"): (2, 102),
+        ("is-another", "overheat"): (2, 102),
+        ("is-another", "overcurrent"): (102, None),
+        ("is-gone", "overheat"): (2, 101),
+        ("is-silent", "overheat"): (2, None),
+        ("is-silent", "no reply"): (102, None),
+    }
+    assert events.since == 2
+    assert [one.note for one in events.between(0, 999) if one.by] == ["seen"]
+
+
+def test_alarms_that_are_read_late_meet_those_of_now() -> None:
+    """A slow disk: the drives were looked at before."""
+    events = Events(100)
+    events.look(101, "pump-1", Shown("fault", "overheat"))
+    events.look(101, "pump-2", STANDS)
+    kept = [Alarm(2, name, "overheat", None, "fault") for name in ("pump-1", "pump-2")]
+    events.restore(kept, 102, ["pump-1", "pump-2"])
+    assert seen(events) == [("pump-1", "fault", 2, None), ("pump-2", "fault", 2, 102)]
+
+
+# ---- the file ----
+
+
+ALARM = Alarm(1, "pump-1", "overheat", None, "fault", "", False, 2, "anna", "a note")
+
+
+def past_of(path: Path) -> list[Alarm]:
+    kept = AlarmFile(path)
+    until(lambda: kept.past is not None)
+    kept.close()
+    return kept.past or []
+
+
+def test_the_file_keeps_the_newest_line_of_each_alarm(tmp_path: Path) -> None:
+    path = tmp_path / "alarms.jsonl"
+    kept = AlarmFile(path)
+    for alarm in (ALARM, ALARM._replace(ended=5), ALARM._replace(time=9)):
+        kept.note(alarm)
+    kept.close()
+    with path.open("ab") as file:
+        file.write(b'{"id": "trunc')
+    assert past_of(path) == [ALARM._replace(ended=5), ALARM._replace(time=9)]
+    kept = AlarmFile(path)
+    kept.note(ALARM._replace(time=10))  # beside what is truncated
+    kept.close()
+    assert len(past_of(path)) == 3
+
+
+@pytest.mark.parametrize(
+    "change", [{"time": "1"}, {"time": True}, {"ended": 1.5}, {"kind": "x"}, {"drive": None}, {"note": 1}]
+)
+def test_a_line_that_is_no_alarm_is_left_out(change: Mapping[str, object]) -> None:
+    whole = json.loads(json.dumps(ALARM.as_json()))
+    assert alarm_in(json.dumps(whole).encode()) == ALARM
+    assert alarm_in(json.dumps(whole | change).encode()) is None
+    for line in (b"", b"[]", b"{}", b"\xff", b"[" * 100_000):
+        assert alarm_in(line) is None
+
+
+def test_a_long_file_is_written_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("multidrop.gateway.alarm_file.MOST_BYTES", 2000)
+    path = tmp_path / "alarms.jsonl"
+    kept = AlarmFile(path)
+    for _ in range(100):
+        kept.note(ALARM)
+        until(kept._waiting.empty)
+    kept.close()
+    assert path.stat().st_size < 3000
+    assert past_of(path) == [ALARM]
+
+
+def test_a_disk_that_takes_nothing_is_reported_and_written_whole_later(tmp_path: Path) -> None:
+    folder = tmp_path / "none"
+    kept = AlarmFile(folder / "alarms.jsonl")
+    kept.note(ALARM)
+    until(lambda: "No such file" in kept.trouble)
+    folder.mkdir()
+    kept.note(ALARM._replace(time=9))
+    until(lambda: not kept.trouble)
+    kept.close()
+    assert past_of(folder / "alarms.jsonl") == [ALARM, ALARM._replace(time=9)]
+
+
+# ---- a gateway ----
+
+
+def alarms(gateway: Served) -> list[tuple[str, str, int | None]]:
+    return [(one["drive"], one["text"], one["ended"]) for one in gateway.frame()["alarms"]]
+
+
+def test_alarms_are_logged_acknowledged_and_last_over_a_restart(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.INFO, "multidrop.gateway")
+    words = "overcurrent while accelerating"
+    stopper: dict[str, str] = {}
+    with served(tmp_path) as gateway:
+        gateway.await_state("pump-1", "stands")
+        gateway.sims["pump-1"].trip(4)  # type: ignore[attr-defined]
+        until(lambda: alarms(gateway) == [("pump-1", words, None)])
+        [alarm] = gateway.frame()["alarms"]
+        assert alarm["is_before"] is False
+        stopper = {"authorization": gateway.bearer(Right.STOP)}
+        body = {"alarm": alarm["id"], "note": "belt stuck"}
+        assert gateway.post("/api/acknowledge", body).status == 401
+        assert gateway.post("/api/acknowledge", body | {"note": "a\x1b[0m"}, **stopper).status == 400
+        assert gateway.post("/api/acknowledge", {"alarm": "1 fault x"}, **stopper).status == 404
+        told = gateway.post("/api/acknowledge", body, **stopper).json
+        assert (told["note"], told["by"].split()[0]) == ("belt stuck", "stopper")
+    assert f"alarm of pump-1: fault: {words}" in caplog.messages
+    assert any(
+        text.startswith(f"alarm of pump-1, {words}, acknowledged by stopper") for text in caplog.messages
+    )
+    with served(tmp_path) as gateway:  # the drive is well again meanwhile
+        until(lambda: gateway.frame()["alarms"] and gateway.frame()["alarms"][0]["ended"])
+        [again] = gateway.frame()["alarms"]
+        kept = ("id", "time", "text", "by", "note", "acknowledged")
+        assert {key: again[key] for key in kept} == {key: told[key] for key in kept}
+    assert f"alarm of pump-1 is over: fault: {words}" in caplog.messages
+
+
+def test_alarms_that_cannot_be_kept_are_in_the_health(tmp_path: Path) -> None:
+    (tmp_path / "alarms.jsonl").mkdir()
+    with served(tmp_path) as gateway:
+        until(lambda: "alarms are not kept" in gateway.get("/health").json["parts"].get("alarms", ""))
+        gateway.await_state("pump-1", "stands")
+        assert any("alarms are not kept" in one for one in gateway.frame()["troubles"])
+
+
+def test_a_lost_port_is_one_alarm_of_its_line(tmp_path: Path) -> None:
+    (tmp_path / "plant.toml").write_text(plant_text(str(tmp_path / "none"), ["pump-1", "pump-2"]))
+    plant = load_plant(tmp_path / "plant.toml")
+    gateway = Gateway(plant, replace(read_settings(plant, {}), port=0))
+    with running(gateway):
+        page = Served(gateway, {}, {})
+        page.await_state("pump-1", "silent")
+        page.await_state("pump-2", "silent")
+        until(lambda: page.frame()["alarms"])
+        [alarm] = page.frame()["alarms"]
+        assert (alarm["line"], alarm["drive"], alarm["kind"], alarm["is_before"]) == (
+            "hall",
+            "",
+            "port",
+            True,
+        )
+        assert "there is no such port" in alarm["text"]
+
+
+def test_a_stop_that_was_called_here_is_no_alarm_and_another_is(tmp_path: Path) -> None:
+    serve = '[serve.may]\nstop = "anyone"\nwrite = ["pump-1.setpoint"]\nverbs = ["pump-1.start"]\n'
+    with served(tmp_path, serve) as gateway:
+        writer = {"authorization": gateway.bearer(Right.WRITE)}
+        value = {"drive": "pump-1", "register": "setpoint", "value": 50.0}
+        assert gateway.command("/api/write", value, **writer).json["done"] is True
+        start = {"drive": "pump-1", "verb": "start", "options": {}}
+        assert gateway.command("/api/act", start, **writer).json["done"] is True
+        gateway.await_state("pump-1", "runs")
+        assert gateway.post("/api/stop", {"drives": ["pump-1"]}).json["pump-1"]["done"] is True
+        gateway.await_state("pump-1", "stands")
+        assert "stopped" not in [one["kind"] for one in gateway.frame()["alarms"]]
+        assert gateway.command("/api/act", start, **writer).json["done"] is True
+        gateway.await_state("pump-1", "runs")
+        gateway.sims["pump-1"].motor.stop()  # type: ignore[attr-defined]
+        until(lambda: "stopped" in [one["kind"] for one in gateway.frame()["alarms"]])
+
+
+# ---- words ----
+
+
+@table(
+    ("failure", "said"),
+    [
+        (
+            Refused("pump-1 has a fault: then call reset_fault()", advice=Advice.call("reset_fault")),
+            'pump-1 has a fault: then use "reset fault"',
+        ),
+        (
+            Refused("x: declare confirmed = 1", advice=Advice.declare("confirmed", 1)),
+            "x: write confirmed = 1 below its [[line.drive]]",
+        ),
+        (Refused("call set_frequency before start"), 'use "set frequency" before start'),
+        (BusError("it needs reset_fault() to start"), 'it needs "reset fault" to start'),
+        (BusError("pump-1.coast: no stop of start"), "pump-1.coast: no stop of start"),
+    ],
+)
+def test_no_page_says_what_a_program_would_call(failure: BusError, said: str) -> None:
+    assert in_words(failure) == said
