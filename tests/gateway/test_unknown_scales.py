@@ -56,6 +56,11 @@ def test_the_page_has_a_unit_for_what_has_a_scale_alone(model: str) -> None:
     for register in told["lines"][0]["drives"][0]["registers"]:
         known = drive.registers[register["name"]]
         assert register["unit"] == ("raw count" if known.step is None else known.unit)
+        if known.writable and known.values is None:  # a dialog has a span for each
+            assert register["least"] < register["most"], known.name
+            known.encode(register["least"])
+            known.encode(register["most"])
+            assert (register["at_least"], register["at_most"]) == (known.at_least, known.at_most)
 
 
 def test_the_common_block_has_no_number_for_a_raw_count() -> None:

@@ -43,6 +43,7 @@ class FakeGateway:
         self.clocked: str | None = None  # a drive whose frequency is the time
         self.plant_changes: dict[str, Any] = {}  # keys of the plant with other values
         self.changes: dict[str, Any] = {}  # keys of the frame with other values
+        self.drive_changes: dict[str, dict[str, Any]] = {}  # keys of a drive in it, by its name
         self.posts: list[tuple[str, Any]] = []  # without what they had seen
         self.seen: list[int] = []  # the frames that commands named
         self.stops: dict[str, int] = {}  # that were called, by drive
@@ -52,6 +53,8 @@ class FakeGateway:
         self.has_history = True
         self.recorded: dict[str, dict[str, object]] = {}  # by series, what else its history says of it
         self.knows_since = 0  # UTC, ms: it has no alarms of before
+        self.maximum_hz = 50.0  # that the drive holds
+        self.has_changed = False  # it knows no alarm that is acknowledged
         self.fleet: dict[str, Any] = {}  # keys of /api/fleet with other values
         self.fleet_outcomes: dict[str, dict[str, Any]] = {}  # of a stop of the fleet
         self.reloaded: dict[str, Any] = {
@@ -94,7 +97,7 @@ class FakeGateway:
                 if self.clocked:
                     told["drives"][self.clocked]["values"]["output_frequency"][0] = time.time() % 1000
                 for name, drive in told["drives"].items():
-                    drive["stops"] = self.stops.get(name, 0)
+                    drive |= {"stops": self.stops.get(name, 0), **self.drive_changes.get(name, {})}
                 newest = [*self._made.items()][-REMEMBERED:]
                 self._made = dict([*newest, (number, {**told, **self.changes})])
             told = self._made[number]
@@ -197,6 +200,8 @@ def _handler(gateway: FakeGateway) -> type[BaseHTTPRequestHandler]:
             gateway.posts.append((self.path, body))
             if self.path == "/api/reload":
                 self.tell(gateway.reloaded)
+            elif self.path == "/api/acknowledge":
+                self.tell({"error": "there is no such alarm"}, 404) if gateway.has_changed else self.tell({})
             elif self.path == "/api/fleet/stop":
                 self.tell(gateway.fleet_outcomes)
             elif self.path == "/api/stop":
@@ -223,6 +228,7 @@ def drive(name: str, gateway: FakeGateway) -> dict[str, Any]:
         "values": {
             "acceleration_time": [20.0, hour, "ok"],
             "run_hours": [4012, int(time.time() * 1000), "ok"],
+            "maximum_frequency": [gateway.maximum_hz, int(time.time() * 1000), "ok"],
         },
     }  # fmt: skip
 
@@ -292,6 +298,7 @@ def history(handler: Any, gateway: FakeGateway, asked: dict[str, list[str]]) -> 
 def alarms(handler: Any, gateway: FakeGateway, asked: dict[str, list[str]]) -> None:
     start, end = float(asked["from"][0]), float(asked["to"][0])
     found = fake_plant.alarms(gateway.renamed, gateway.began)
+    found = gateway.changes.get("alarms", found)
     told = [a for a in found if a["time"] < end and (a["ended"] or math.inf) > start]
     handler.tell({"alarms": told, "since": gateway.knows_since})
 

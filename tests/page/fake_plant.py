@@ -17,6 +17,7 @@ FAMILIES = ("innovert-ibd", "invt-che", "yd1000", "delixi-modbus", "erman-er-g-2
 STANDING = {"pump-4", "mixer-2", "screw", "capper-2", "chilled-2", "exhaust-2"}
 FAULTS = {"conveyor-2": ("overcurrent in acceleration", 240), "booster-1": ("undervoltage", 5220)}
 SILENT = {"labeller": 42}
+KINDS = ("fault", "stopped", "port", "silent")  # the gravest first
 SPEEDS = ("38400 8N1", "9600 8N1", "38400 8N1")
 
 
@@ -27,13 +28,23 @@ def register(name: str, unit: str, digits: int, place: str, **more: Any) -> dict
     return {
         "name": name, "unit": unit, "digits": digits, "kind": "number", "words": {}, "access": "reading",
         "place": place, "period_s": 0.1, "holds_s": 1.0, "least": None, "most": None, "step": 10.0**-digits,
+        "at_least": "", "at_most": "",
         **more,
     }  # fmt: skip
 
 
 REGISTERS = [
     register("output_frequency", "Hz", 2, "section 7.2, 1000H"),
-    register("frequency_setpoint", "Hz", 1, "section 7.1, 2001H", access="setting", least=0, most=50),
+    register(
+        "frequency_setpoint",
+        "Hz",
+        1,
+        "section 7.1, 2001H",
+        access="setting",
+        least=0,
+        most=50,
+        at_most="maximum_frequency",
+    ),
     register("output_current", "A", 1, "section 7.2, 1001H"),
     register("dc_bus_voltage", "V", 0, "section 7.2, 1002H"),
     register("output_torque", "%", 1, "section 7.2, 1005H"),
@@ -53,6 +64,7 @@ REGISTERS = [
         holds_s=None,
     ),
     register("run_hours", "h", 0, "P7.11", **UNPOLLED),
+    register("maximum_frequency", "Hz", 1, "P0.03", **UNPOLLED),
 ]
 KEY = {"frequency": "output_frequency", "current": "output_current", "setpoint": "frequency_setpoint"}
 
@@ -66,7 +78,7 @@ def plant(renamed: dict[str, str]) -> dict[str, Any]:
                 {
                     "name": renamed.get(name, name), "family": FAMILIES[(2 * n + (i > 5)) % 5],
                     "address": i + 1, "speed": SPEEDS[n], "key": KEY, "registers": REGISTERS,
-                    "verbs": ["start", "stop", "reset_fault", "emergency_stop"],
+                    "verbs": ["start", "stop", "reset_fault", "set_frequency", "emergency_stop"],
                 }
                 for i, name in enumerate(names.split())
             ],
@@ -79,7 +91,7 @@ def plant(renamed: dict[str, str]) -> dict[str, Any]:
         "may": {
             "role": "write",
             "write": ["pump-1.frequency_setpoint"],
-            "verbs": ["pump-1.start", "pump-1.reset_fault", "pump-1.emergency_stop"],
+            "verbs": [f"pump-1.{v}" for v in ("start", "reset_fault", "set_frequency", "emergency_stop")],
         },
     }  # fmt: skip
 
@@ -111,6 +123,7 @@ def values(name: str, number: int, now: float) -> dict[str, float]:
         "status_bits": 5 if runs else 1,
         "acceleration_time": 20,
         "run_hours": 4012 + 37 * number,
+        "maximum_frequency": 50,
     }
 
 
@@ -119,7 +132,7 @@ def alarms(renamed: dict[str, str], now: float) -> list[dict[str, Any]]:
     since = {**{name: (text, age, "fault") for name, (text, age) in FAULTS.items()}}
     since |= {name: ("no reply", age, "silent") for name, age in SILENT.items()}
     lasting = [
-        {"time": ms(now - age), "drive": renamed.get(name, name), "text": text, "ended": None, "kind": kind}
+        alarm(ms(now - age), renamed.get(name, name), text, None, kind)
         for name, (text, age, kind) in since.items()
     ]
     ended = [
@@ -127,13 +140,20 @@ def alarms(renamed: dict[str, str], now: float) -> list[dict[str, Any]]:
         ("filler-2", "no reply", "silent", 2900, 90),
     ]
     past = [
-        {
-            "time": ms(now - ago), "drive": renamed.get(name, name), "text": text, "kind": kind,
-            "ended": ms(now - ago + lasted),
-        }
+        alarm(ms(now - ago), renamed.get(name, name), text, ms(now - ago + lasted), kind)
         for name, text, kind, ago, lasted in ended
-    ]  # fmt: skip
-    return sorted(lasting + past, key=lambda alarm: -float(str(alarm["time"])))
+    ]
+    return sorted(lasting, key=lambda one: KINDS.index(one["kind"])) + past
+
+
+def alarm(
+    time_ms: int, drive: str, text: str, ended: int | None, kind: str, line: str = "", **more: Any
+) -> dict[str, Any]:
+    return {
+        "id": f"{time_ms} {kind} {drive or line}", "time": time_ms, "drive": drive, "text": text,
+        "ended": ended, "kind": kind, "line": line, "is_before": False, "acknowledged": None, "by": "",
+        "note": "", **more,
+    }  # fmt: skip
 
 
 def ms(seconds: float) -> int:
@@ -163,6 +183,7 @@ def frame(n: int, began: float, renamed: dict[str, str], stuck: dict[str, float]
         drives[renamed.get(name, name)] = {
             "state": state(name), "fault": FAULTS[name][0] if name in FAULTS else None, "seen": len(ages) - 1,
             "ages_ms": ages, "values": rows, "why": "no reply" if name in SILENT else None,
+            "note": "",
             "missed": {"labeller": 1.0, "tower-fan-2": 0.031}.get(name, 0), "p99": 6.1,
         }  # fmt: skip
     return {

@@ -166,7 +166,7 @@ def test_plots_that_cannot_be_loaded_take_nothing_else_with_them(opened: Opener)
     page.reload()
     until(page, LIVE)
     page.get_by_text("Plots could not be loaded.").wait_for()
-    assert page.locator(".registers tbody tr").count() == 11
+    assert page.locator(".registers tbody tr").count() == 12
 
 
 def test_drives_that_did_not_stop_are_named(opened: Opener, gateway: FakeGateway) -> None:

@@ -25,7 +25,7 @@ def test_a_write_is_confirmed_by_name_and_sent_once(opened: Opener, gateway: Fak
     assert page.get_by_role("button", name="Change").count() == 1  # the plant file allows one register
     page.get_by_role("button", name="Change frequency setpoint").click()
     assert page.locator("#ask-title").inner_text() == "Change frequency setpoint of pump-1?"
-    assert "It is 20.0 Hz. From 0 to 50 Hz." in page.locator("#ask").inner_text()
+    assert "frequency setpoint is 20.0 Hz. Allowed: from 0 to 50 Hz." in page.locator("#ask").inner_text()
     page.get_by_label("New value, Hz").fill("31.5")
     page.get_by_role("button", name="Write to pump-1").dblclick()
     page.locator("#outcomes li").wait_for()
@@ -286,3 +286,37 @@ def test_what_may_not_be_done_is_not_offered(opened: Opener) -> None:
     page.locator(".registers").wait_for()
     assert page.locator(".verbs button, .change").count() == 0
     assert page.get_by_role("button", name="Stop pump-2").is_visible()
+
+
+def test_set_frequency_shows_value_and_span_and_refuses_before_sending(
+    opened: Opener, gateway: FakeGateway
+) -> None:
+    gateway.maximum_hz = 45.0
+    page = opened("#/drives/pump-1")
+    page.locator(".registers tr", has_text="maximum frequency").get_by_text("45.0").wait_for()
+    page.get_by_role("button", name="set frequency", exact=True).click()
+    asked = page.locator("#ask").inner_text()
+    assert "frequency setpoint is 20.0 Hz. Allowed: from 0 to 45 Hz." in asked
+    for value in ("", "-1", "45.5", "500"):
+        page.locator("#new-value").fill(value)
+        page.get_by_role("button", name="set frequency pump-1").click()
+        assert page.locator("#ask").evaluate("dialog => dialog.open"), value
+    assert gateway.posts == []
+    page.locator("#new-value").fill("45")
+    page.get_by_role("button", name="set frequency pump-1").click()
+    page.locator("#outcomes li").wait_for()
+    assert gateway.posts == [
+        ("/api/act", {"drive": "pump-1", "verb": "set_frequency", "options": {"hz": 45}})
+    ]
+
+
+def test_a_write_is_bounded_by_what_other_registers_hold(opened: Opener, gateway: FakeGateway) -> None:
+    gateway.maximum_hz = 45.0
+    page = opened("#/drives/pump-1")
+    page.locator(".registers tr", has_text="maximum frequency").get_by_text("45.0").wait_for()
+    page.get_by_role("button", name="Change frequency setpoint").click()
+    assert "frequency setpoint is 20.0 Hz. Allowed: from 0 to 45 Hz." in page.locator("#ask").inner_text()
+    page.get_by_label("New value, Hz").fill("45.1")
+    page.get_by_role("button", name="Write to pump-1").click()
+    assert page.locator("#ask").evaluate("dialog => dialog.open")
+    assert gateway.posts == []

@@ -93,7 +93,7 @@ def digits_of(register: Register[Any]) -> int | None:
 
 def _register(register: Register[Any]) -> dict[str, Any]:
     values = register.values
-    least, most = register.span or (None, None)
+    least, most = _span(register)
     kind = "number" if values is None else "bits" if issubclass(values, Flag) else "words"
     members: list[Any] = [] if values is None else list(cast(Any, values))
     words = {str(int(member)): register.in_words(member) for member in members}
@@ -108,5 +108,21 @@ def _register(register: Register[Any]) -> dict[str, Any]:
         "note": register.note,
         "least": least,
         "most": most,
+        "at_least": register.at_least,  # registers whose values are limits too
+        "at_most": register.at_most,
         "step": None if register.is_float else register.step,
     }
+
+
+def _span(register: Register[Any]) -> tuple[float | None, float | None]:
+    """Return the least and the largest value that may be written: the manual's, or else what fits.
+
+    None: a float without a span, or named values.
+    """
+    if register.span is not None:
+        return register.span
+    if register.values is not None or register.is_float or not register.writable:
+        return None, None
+    ends = (register.coding.value_of(float(raw)) for raw in register.coding.raw_span)
+    least, most = sorted(ends)
+    return least, most

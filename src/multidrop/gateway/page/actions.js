@@ -6,7 +6,7 @@ import * as clock from "./clock.js";
 import { fill, find, glyph, make, named, say } from "./dom.js";
 import { now } from "./link.js";
 import { watchStop } from "./stop.js";
-import { mayAct, reading, stops, store } from "./store.js";
+import { key, known, mayAct, stops, store } from "./store.js";
 import { text, unit, withUnit, words } from "./values.js";
 
 const MOST = 20; // outcomes that are kept on the page; the log has all
@@ -98,50 +98,87 @@ async function deliver(drive, what, path, confirmed, kind = DANGER) {
 // Ask, and give a verb: with a frequency where it takes one.
 export async function act(drive, verb) {
   const turns = TURNS.some(word => verb.includes(word)),
-    field = WITH_HZ.has(verb) ? hertz() : null,
+    asked = WITH_HZ.has(verb) ? hertz(drive) : null,
     withSeen = seen(drive),
     isStop = STOPS.has(verb),
     kind = isStop ? STOP : DANGER;
   const warning = turns
     ? "The motor will turn. Make sure that nobody is near what it drives."
     : "It is sent once.";
-  const contents = [make("p", { class: turns ? "bad" : "" }, warning)];
-  if (field) contents.push(make("label", { class: "field", for: field.id }, "Frequency, Hz", field));
-  const asks = field ? confirmForm : confirm;
+  const contents = [make("p", { class: turns ? "bad" : "" }, warning), ...(asked?.contents ?? [])];
+  const asks = asked ? confirmForm : confirm;
   const title = [`${words(verb)}: `, named(drive), "?"],
     yes = [`${words(verb)} `, named(drive)];
   if (!(await asks(title, contents, yes, kind))) return;
-  const options = field ? { hz: Number(field.value) } : {};
-  const what = field ? `${words(verb)} ${options.hz} Hz` : words(verb);
+  const options = asked ? { hz: Number(asked.field.value) } : {};
+  const what = asked ? `${words(verb)} ${options.hz} Hz` : words(verb);
   const body = { drive, verb, options };
   await deliver(drive, what, "api/act", isStop ? () => body : withSeen(body), kind);
 }
 
-const hertz = () =>
-  make("input", {
-    id: "new-value",
-    type: "number",
-    min: 0,
-    step: "any",
-    required: true,
-    "data-first": true,
-  });
+// Return the field of a frequency and what stands around it. Of a setpoint in another unit than Hz the value
+// is shown, and a register of the largest frequency alone is a limit.
+function hertz(drive) {
+  const { registers } = store.drives.get(drive);
+  const setpoint = registers.get(key(drive, "setpoint"));
+  const isHertz = setpoint && unit(setpoint) === "Hz";
+  const maximum = registers.get("maximum_frequency");
+  const [least, most] = isHertz
+    ? limits(drive, setpoint)
+    : [0, maximum ? held(drive, maximum.name) : null];
+  const field = make("input", { ...FIELD, type: "number", min: least ?? 0, max: most, step: "any" });
+  return {
+    field,
+    contents: [
+      make("p", {}, setpoint ? `${present(drive, setpoint)} ${span([least ?? 0, most], "Hz")}` : ""),
+      make("label", { class: "field", for: field.id }, "Frequency, Hz", field),
+    ],
+  };
+}
+
+// Return the value of a register, or null where it is not known now.
+function held(drive, register) {
+  const found = known(drive, register, now());
+  return found && !found.isOld ? found.value : null;
+}
+
+// Return the least and the largest value that may be written: the register's own, and those that other
+// registers of the drive hold.
+function limits(drive, { least, most, at_least: atLeast, at_most: atMost }) {
+  const ends = [
+    [least, held(drive, atLeast)],
+    [most, held(drive, atMost)],
+  ].map(pair => pair.filter(end => typeof end === "number"));
+  return [Math.max(...ends[0]), Math.min(...ends[1])].map(end => (Number.isFinite(end) ? end : null));
+}
+
+// Say what a register holds, as far as that is known.
+function present(drive, register) {
+  const current = known(drive, register.name, now());
+  if (!current || current.value === null) return `The value of ${words(register.name)} is not known.`;
+  const shown = withUnit(text(current.value, register), register);
+  const past = current.isOld ? `not known now; ${clock.lasting(current.age)} ago it was ` : "";
+  return `${words(register.name)} is ${past}${shown}.`;
+}
+
+// Say which values may be written.
+function span([least, most], of) {
+  const bounds = [
+    ["from", least],
+    ["to", most],
+  ].flatMap(([word, end]) => (end === null ? [] : [`${word} ${end}`]));
+  return bounds.length ? `Allowed: ${`${bounds.join(" ")} ${of}`.trim()}.` : "No limits are known.";
+}
 
 // Ask for a value, and write it.
 export async function change(drive, register) {
-  const current = reading(drive, register.name, now()),
-    name = words(register.name),
-    withSeen = seen(drive);
-  const field = editor(register);
-  const held =
-    current?.value === null || !current ? null : withUnit(text(current.value, register), register);
-  const past = current?.isOld ? `not known now; ${clock.lasting(current.age)} ago it was ` : "";
-  const is = held === null ? "Its value is not known." : `It is ${past}${held}.`;
-  const limits = isLimited(register)
-    ? ` From ${register.least} to ${withUnit(register.most, register)}.`
-    : "";
+  const name = words(register.name),
+    withSeen = seen(drive),
+    ends = limits(drive, register);
+  const field = editor(register, ends);
+  const isNumber = register.kind === "number";
   const contents = [
-    make("p", {}, is + limits),
+    make("p", {}, `${present(drive, register)}${isNumber ? ` ${span(ends, unit(register))}` : ""}`),
     make(
       "label",
       { class: "field", for: "new-value" },
@@ -159,15 +196,14 @@ export async function change(drive, register) {
   await deliver(drive, what, "api/write", withSeen({ drive, register: register.name, value }));
 }
 
-const isLimited = ({ least, most }) => typeof least === "number" && typeof most === "number";
+const FIELD = { id: "new-value", required: true, "data-first": true };
 
 // It begins empty: Enter alone sends nothing, least of all a value that is no longer true.
-function editor(register) {
-  const common = { id: "new-value", required: true, "data-first": true };
+function editor(register, [least, most]) {
   if (register.kind === "words" && register.words) {
     return make(
       "select",
-      common,
+      FIELD,
       make("option", { value: "" }, "choose"),
       Object.entries(register.words).map(([value, word]) =>
         make("option", { value }, `${word} (${value})`),
@@ -175,12 +211,12 @@ function editor(register) {
     );
   }
   return make("input", {
-    ...common,
+    ...FIELD,
     type: "number",
     inputmode: "decimal",
     autocomplete: "off",
     step: register.step ?? "any",
-    min: register.least ?? null,
-    max: register.most ?? null,
+    min: least,
+    max: most,
   });
 }

@@ -65,6 +65,10 @@ export function lasting(ms) {
   return `${Math.round(s / 86400)} days`;
 }
 
+// Return for how long an alarm has lasted; one that was there at the first look began before.
+export const since = ({ time: begin, is_before: isBefore }, t) =>
+  isBefore ? `since before ${when(begin).slice(0, -3)}` : lasting(t - begin);
+
 // Return texts for a plot's time axis, as fine as its ticks lie apart. uPlot counts in seconds.
 export function ticks(splits, step) {
   return splits.map(s => {

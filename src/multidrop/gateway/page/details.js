@@ -3,7 +3,7 @@
 import { get } from "./api.js";
 import { auditRows } from "./audit.js";
 import { fill, find, make, tableHead } from "./dom.js";
-import { takeOthers } from "./registers.js";
+import { takeOthers } from "./store.js";
 import { UNKNOWN, milliseconds, share, words } from "./values.js";
 
 let name = null;
@@ -27,7 +27,7 @@ export async function refresh() {
     get("api/audit?count=200"),
   ]);
   if (asked !== name || !find("#delays")) return;
-  if (told.status === "fulfilled") takeOthers(told.value.values);
+  if (told.status === "fulfilled") takeOthers(asked, told.value.values);
   fill(
     find("#delays"),
     make("h3", {}, "Delays and misses"),

@@ -7,7 +7,7 @@ import { fill, find, glyph, make, named, put } from "./dom.js";
 import { now } from "./link.js";
 import * as plots from "./panel_plots.js";
 import * as registers from "./registers.js";
-import { driveAge, isLive, onPlant, state, store } from "./store.js";
+import { driveAge, isLive, known, noteOf, onPlant, state, store } from "./store.js";
 import { stopOne } from "./stop.js";
 import { STATES, makeValue, showValue } from "./values.js";
 
@@ -53,7 +53,8 @@ export function show(name, isOpen) {
 }
 
 function build({ spec, line }) {
-  parts = { shape: make("span"), word: make("span"), age: make("span"), keys: [] };
+  parts = { shape: make("span"), word: make("span"), age: make("span"), note: make("p"), keys: [] };
+  parts.note.className = "note";
   parts.says = make("span", {}, parts.shape, " ", parts.word);
   const where = [
     `${spec.family} · address ${spec.address} on `,
@@ -74,6 +75,7 @@ function build({ spec, line }) {
       make("h2", { tabindex: "-1" }, named(spec.name)),
       make("p", {}, where),
       make("p", { class: "stateline" }, parts.says, parts.age),
+      parts.note,
       make(
         "div",
         { class: "acts" },
@@ -107,7 +109,7 @@ export function draw() {
     is = state(chosen),
     age = driveAge(chosen, t);
   for (const [register, value] of parts.keys)
-    showValue(value, registers.known(chosen, register, t), drive.registers.get(register));
+    showValue(value, known(chosen, register, t), drive.registers.get(register));
   if (parts.state !== is) fill(parts.shape, glyph(STATES[is] ? is : "unknown"));
   parts.state = is;
   const words_ =
@@ -115,6 +117,8 @@ export function draw() {
   put(parts.word, isLive(t) || !store.frame ? words_ : `last: ${words_}`);
   parts.says.className = `stateword ${is}`;
   put(parts.age, age === null ? "never answered" : `last reply ${clock.lasting(age)} ago`);
+  put(parts.note, noteOf(chosen));
+  parts.note.hidden = !noteOf(chosen);
   registers.draw(t);
 }
 

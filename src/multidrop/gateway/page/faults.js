@@ -1,14 +1,16 @@
-// Faults, silences and lost ports: those that last, and those that ended.
+// Alarms: faults, motors that stopped by themselves, lost ports and silences; those that last and that ended.
 
 import { get, query } from "./api.js";
+import { confirmForm, send, tell } from "./ask.js";
 import * as clock from "./clock.js";
 import { fill, find, glyph, make, named, tableHead } from "./dom.js";
 import { now } from "./link.js";
 import { alarms, isLive, store } from "./store.js";
+import { ALARMS } from "./values.js";
 
-const WORDS = { fault: "fault", silent: "silent", port: "port lost" };
 const SPAN_MS = 30 * 86400e3;
 const AROUND_MS = 15 * 60e3;
+const MOST_NOTE = 500; // characters
 
 let shown = "",
   shownAt = 0;
@@ -16,12 +18,11 @@ let shown = "",
 // Return what was wrong between two times, newest first: as the gateway remembers it, or as the frame has it;
 // and since when the gateway knows of all, null where it does not say.
 export async function read(from, to) {
-  const known = alarms();
   try {
     const told = await get(`api/alarms?${query({ from: Math.floor(from), to: Math.ceil(to) })}`);
-    return [known.filter(alarm => alarm.kind === "port").concat(told.alarms), told.since];
+    return [told.alarms, told.since];
   } catch {
-    return [known.filter(alarm => (alarm.ended ?? Infinity) > from && alarm.time < to), null];
+    return [alarms().filter(alarm => (alarm.ended ?? Infinity) > from && alarm.time < to), null];
   }
 }
 
@@ -31,11 +32,11 @@ export function begin() {
     make(
       "div",
       { class: "card" },
-      make("h2", {}, "Faults and silences"),
+      make("h2", {}, "Alarms"),
       make(
         "p",
         { class: "note" },
-        "What lasts, and what ended in the last 30 days since the gateway began.",
+        "What lasts, the gravest first, and what ended in the last 30 days.",
       ),
       make("div", { id: "fault-list", class: "scroll" }),
     ),
@@ -49,7 +50,11 @@ export async function show() {
     list = find("#fault-list");
   if (sign === shown && (now() - shownAt < 5000 || list.contains(document.activeElement))) return;
   [shown, shownAt] = [sign, now()];
-  const lasting = found.filter(alarm => alarm.ended === null),
+  const kinds = Object.keys(ALARMS), // the gravest first
+    rank = ({ kind, acknowledged }) => [acknowledged ? 1 : 0, kinds.indexOf(kind)].join(),
+    lasting = found
+      .filter(alarm => alarm.ended === null)
+      .sort((a, b) => rank(a).localeCompare(rank(b)) || b.time - a.time),
     ended = found.filter(alarm => alarm.ended !== null);
   fill(list, part(`Lasting: ${lasting.length}`, lasting), part(`Ended: ${ended.length}`, ended));
 }
@@ -72,33 +77,62 @@ function part(title, alarms) {
 }
 
 function row(alarm) {
-  const { kind } = alarm,
+  const { kind, drive, line, acknowledged } = alarm,
     isLasting = alarm.ended === null;
-  const from = Math.floor(alarm.time - AROUND_MS),
-    to = Math.ceil((alarm.ended ?? now()) + AROUND_MS);
-  const where = alarm.drive ? `#/drives/${encodeURIComponent(alarm.drive)}` : "#/lines";
-  const t = now(),
-    isNew = isLive(t) || store.frame === null, // before the first frame the gateway has just told the list
-    seen = alarm.ended ?? (isNew ? t : store.time), // of a dead gateway nothing lasts on
-    lasted = `${clock.lasting(seen - alarm.time)}${isLasting ? " so far" : ""}`;
+  const where = drive ? `#/drives/${encodeURIComponent(drive)}` : "#/lines";
   return make(
     "tr",
-    { class: isLasting ? kind : "" },
-    make("td", {}, alarm.time === null ? "–" : clock.when(alarm.time)),
-    make("td", { class: "who" }, make("a", { href: where }, named(alarm.drive ?? alarm.line))),
-    make("td", { class: "kind" }, glyph(kind), ` ${WORDS[kind]}`),
-    make("td", { class: "words" }, make("bdi", {}, alarm.text)),
-    make("td", {}, alarm.time === null ? "" : lasted),
-    make(
-      "td",
-      {},
-      alarm.drive
-        ? make(
-            "a",
-            { href: `#/trends?drive=${encodeURIComponent(alarm.drive)}&from=${from}&to=${to}` },
-            "Trend",
-          )
-        : "",
-    ),
+    { class: isLasting && !acknowledged ? kind : "" },
+    make("td", {}, `${alarm.is_before ? "before " : ""}${clock.when(alarm.time)}`),
+    make("td", { class: "who" }, make("a", { href: where }, named(drive || `line ${line}`))),
+    make("td", { class: "kind" }, glyph(kind), ` ${ALARMS[kind] ?? kind}`),
+    make("td", { class: "words" }, make("bdi", {}, alarm.text), acknowledgement(alarm)),
+    make("td", {}, lasted(alarm)),
+    make("td", { class: "acts" }, acknowledged ? null : acknowledgeButton(alarm), trendLink(alarm)),
   );
+}
+
+// Return for how long an alarm lasted. Of a dead gateway nothing lasts on.
+function lasted({ time, ended, is_before: isBefore }) {
+  const t = now(),
+    isNew = isLive(t) || store.frame === null, // before the first frame the gateway has just told the list
+    seen = ended ?? (isNew ? t : store.time);
+  return `${isBefore ? "over " : ""}${clock.lasting(seen - time)}${ended === null ? " so far" : ""}`;
+}
+
+function acknowledgement({ acknowledged, by, note }) {
+  if (!acknowledged) return null;
+  const words = note ? `: ${note}` : "";
+  return make(
+    "p",
+    { class: "note" },
+    `acknowledged ${clock.when(acknowledged)} by `,
+    named(by),
+    make("bdi", {}, words),
+  );
+}
+
+const acknowledgeButton = alarm =>
+  make("button", { type: "button", onclick: () => acknowledge(alarm) }, "Acknowledge");
+
+function trendLink({ drive, time, ended }) {
+  if (!drive) return null;
+  const [from, to] = [Math.floor(time - AROUND_MS), Math.ceil((ended ?? now()) + AROUND_MS)];
+  return make("a", { href: `#/trends?drive=${encodeURIComponent(drive)}&from=${from}&to=${to}` }, "Trend");
+}
+
+// Ask for a note, and tell the gateway that somebody has seen an alarm.
+async function acknowledge({ id, drive, line, text }) {
+  const field = make("input", { id: "ack-note", maxlength: MOST_NOTE, "data-first": true });
+  const contents = [
+    make("p", {}, named(drive || `line ${line}`), ": ", named(text)),
+    make("label", { class: "field", for: "ack-note" }, "Note, if any", field),
+  ];
+  if (!(await confirmForm("Acknowledge this alarm?", contents, "Acknowledge"))) return;
+  try {
+    await send("api/acknowledge", () => ({ alarm: id, note: field.value.trim() }));
+  } catch (error) {
+    await tell("The alarm is not acknowledged", [make("p", { class: "bad" }, error.message)]);
+  }
+  await show();
 }

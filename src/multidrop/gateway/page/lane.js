@@ -3,10 +3,11 @@
 import { fill, glyph, make, named } from "./dom.js";
 import { read } from "./faults.js";
 import { now } from "./link.js";
+import { store } from "./store.js";
 
-const KINDS = [
-  ["fault", "faults"],
-  ["silent", "silent"],
+const LANES = [
+  ["faults", ["fault", "stopped"]],
+  ["silent", ["silent", "port"]],
 ];
 let serial = 0;
 
@@ -18,13 +19,14 @@ export async function draw(place, from, to, drives) {
     return;
   }
   const [all, since] = await read(from, to),
-    alarms = all.filter(alarm => drives.includes(alarm.drive));
+    lines = drives.map(name => store.drives.get(name)?.line.name),
+    alarms = all.filter(({ drive, line }) => (drive ? drives.includes(drive) : lines.includes(line)));
   if (mine !== serial) return;
   fill(
     place,
-    KINDS.map(([kind, title]) => {
+    LANES.map(([title, kinds]) => {
       const there = alarms.filter(
-        alarm => alarm.kind === kind && (alarm.ended ?? now()) > from && alarm.time < to,
+        alarm => kinds.includes(alarm.kind) && (alarm.ended ?? now()) > from && alarm.time < to,
       );
       return make(
         "div",
@@ -52,12 +54,13 @@ function unknown(since, from, to) {
 }
 
 function bar(alarm, from, to) {
-  const text = `${alarm.drive}: ${alarm.text}`;
+  const who = alarm.drive || `line ${alarm.line}`,
+    text = `${who}: ${alarm.text}`;
   const shown = make(
     "span",
     { class: alarm.kind, title: text },
     glyph(alarm.kind),
-    named(alarm.drive),
+    named(who),
     `: ${alarm.text}`,
   );
   const start = Math.max(0, (alarm.time - from) / (to - from)),

@@ -3,19 +3,15 @@
 import { change } from "./actions.js";
 import * as clock from "./clock.js";
 import { make, put, tableHead } from "./dom.js";
-import { isLive, key, mayWrite, reading, state, store } from "./store.js";
+import { key, known, mayWrite, store } from "./store.js";
 import { UNKNOWN, makeValue, showValue, withUnit, words } from "./values.js";
 
-const LOOK_MS = 60000; // in which the gateway looks at all registers of a drive that somebody looks at
-
 let name = null,
-  rows = [],
-  others = {};
+  rows = [];
 
 // Make the table for a drive.
 export function build(spec) {
   name = spec.name;
-  others = {};
   rows = spec.registers.map(register => ({
     register,
     value: makeValue(),
@@ -75,22 +71,6 @@ function about({ place, access, least, most, step, period_s: period, ...register
   ]
     .filter(Boolean)
     .join(" · ");
-}
-
-// Take the newest values of registers that are not polled: {register: [value, ms, status]}.
-export function takeOthers(values) {
-  others = values ?? {};
-}
-
-// Return the reading of a register, polled or looked at.
-export function known(drive, register, t) {
-  const polled = reading(drive, register, t),
-    row = drive === name ? others[register] : undefined;
-  if (polled || !row) return polled;
-  const [value, ms, status] = row,
-    age = t - ms,
-    isSilent = state(drive) === "silent" || !isLive(t);
-  return { value, ms, status, age, isOld: status !== "ok" || age > LOOK_MS || isSilent };
 }
 
 export function draw(t) {

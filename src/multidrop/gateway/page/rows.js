@@ -2,10 +2,11 @@
 
 import * as clock from "./clock.js";
 import { fill, glyph, make, named, put, setClass } from "./dom.js";
-import { driveAge, isLive, key, reading, state, store } from "./store.js";
+import { driveAge, isLive, key, noteOf, reading, state, store } from "./store.js";
 import { STATES, UNKNOWN, makeValue, share, showValue } from "./values.js";
 
 export const COLUMNS = 8;
+const MANY = 0.01; // a share of misses from which they are a warning
 const FULL_HZ = [50, 60, 80, 100, 150, 200, 300, 400, 600, 1000, 2000, 4000]; // a full bar's length
 
 // Return a line's row and its parts.
@@ -131,7 +132,7 @@ export function drawRow(r, t, full) {
   put(r.age, age === null ? UNKNOWN : clock.lasting(age));
   const missed = drive?.missed ?? null;
   put(r.missed, missed === null ? UNKNOWN : missed === 0 ? "0" : share(missed));
-  setClass(r.missed, "warn", missed > 0);
+  setClass(r.missed, "warn", missed >= MANY);
   setClass(r.missed, "none", missed === 0);
   return changed;
 }
@@ -146,7 +147,8 @@ function drawState(r, is, drive, age, t) {
   }
   const word = stateWord(is, drive, age);
   put(r.word, isLive(t) || !store.frame ? word : `last: ${word}`);
-  if (r.word.title !== word) r.word.title = word;
+  const title = [word, noteOf(r.name)].filter(Boolean).join(": ");
+  if (r.word.title !== title) r.word.title = title;
   return changed;
 }
 
@@ -170,5 +172,6 @@ export function drawHead(h) {
           ? `${misses} missed in the last minute`
           : "none missed",
   );
-  setClass(h.missed, "warn", Boolean(lost) || misses > 0);
+  const asked = rate === null ? 0 : rate * 60; // in the last minute
+  setClass(h.missed, "warn", Boolean(lost) || (misses > 1 && misses >= MANY * asked));
 }

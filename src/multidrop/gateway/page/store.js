@@ -6,6 +6,7 @@ import { Ring } from "./ring.js";
 const SAMPLES = 2e6; // of all registers together
 const UNPOLLED_S = 5; // for which a value of a register holds that is no longer polled
 const FAILED_LIMIT_MS = 1000; // and one whose newest request failed
+const LOOK_MS = 60000; // in which the gateway looks at all registers of a drive that somebody looks at
 const UNSEEN_MS = 5000; // between two frames: what was then is not known
 export const LIVE_MS = 1500; // a frame comes each second at least
 
@@ -127,6 +128,24 @@ export function reading(name, register, now) {
   };
 }
 
+let others = { drive: null, values: {} }; // of a drive's registers that are not polled
+
+// Take the newest values of a drive's registers that are not polled: {register: [value, ms, status]}.
+export function takeOthers(drive, values) {
+  others = { drive, values: values ?? {} };
+}
+
+// Return the reading of a register, polled or looked at.
+export function known(drive, register, t) {
+  const polled = reading(drive, register, t),
+    row = others.drive === drive ? others.values[register] : undefined;
+  if (polled || !row) return polled;
+  const [value, ms, status] = row,
+    age = t - ms,
+    isSilent = state(drive) === "silent" || !isLive(t);
+  return { value, ms, status, age, isOld: status !== "ok" || age > LOOK_MS || isSilent };
+}
+
 // Return for how long, in ms, a value of a register holds.
 export const holdsFor = (name, register) =>
   1000 * (store.drives.get(name)?.registers.get(register)?.holds_s ?? UNPOLLED_S);
@@ -142,26 +161,22 @@ export function driveAge(name, now) {
 // Return how many stops of a drive were called so far.
 export const stops = name => store.frame?.drives[name]?.stops ?? 0;
 
-export const state = name => store.frame?.drives[name]?.state ?? "unknown";
+// Return a drive's state. One of unknown state whose frequency is 0 is "still", which is no fault: at rest,
+// or running at a setpoint of 0.
+export function state(name) {
+  const drive = store.frame?.drives[name],
+    is = drive?.state ?? "unknown";
+  return is === "unknown" && drive?.values?.[key(name, "frequency")]?.[0] === 0 ? "still" : is;
+}
+
+// Return what else a drive says, or why its state is not known.
+export const noteOf = name => store.frame?.drives[name]?.note ?? "";
 
 // Return the register that has this part in the drive, "frequency" for one, or null.
 export const key = (name, part) => store.drives.get(name)?.spec.key?.[part] ?? null;
 
-const KINDS = ["fault", "silent", "port"];
-
-// Return what is and was wrong, newest first; lines whose port is gone come before.
-export function alarms() {
-  const { alarms: told = [], lines = {} } = store.frame ?? {};
-  const gone = Object.entries(lines)
-    .filter(([, line]) => line.lost)
-    .map(([line, { lost }]) => ({ kind: "port", line, text: lost, time: null, ended: null }));
-  return gone.concat(told.map(alarm => ({ ...alarm, kind: kindOf(alarm) })));
-}
-
-function kindOf({ kind, drive, ended }) {
-  if (KINDS.includes(kind)) return kind;
-  return ended === null && state(drive) === "silent" ? "silent" : "fault";
-}
+// Return what is and was wrong: what lasts first, the gravest before the others.
+export const alarms = () => store.frame?.alarms ?? [];
 
 export const lasting = () => alarms().filter(alarm => alarm.ended === null);
 

@@ -19,7 +19,7 @@ const HEADS = [
 const SHOWN = {
   all: ["All", () => true],
   runs: ["Running", s => s === "runs"],
-  stands: ["Stopped", s => s === "stands"],
+  stands: ["Stopped", s => s === "stands" || s === "still"],
   bad: ["Fault, silent, unknown", s => s === "fault" || s === "silent" || s === "unknown"],
 };
 

@@ -85,19 +85,20 @@ function tellChange(isNow) {
 function drawStrip(t) {
   const alarms = lasting(),
     most = innerWidth < 641 ? 2 : 5;
-  const number = find("#count");
-  put(number, String(alarms.length || ""));
-  number.hidden = alarms.length === 0;
+  const number = find("#count"),
+    open = alarms.filter(alarm => !alarm.acknowledged);
+  put(number, String(open.length || ""));
+  number.hidden = open.length === 0;
   const shown = alarms.slice(0, most);
   setClass(
     find("#strip"),
     "bad",
-    alarms.some(alarm => alarm.kind === "fault"),
+    open.some(alarm => alarm.kind === "fault"),
   );
   const sign = JSON.stringify([shown, alarms.length, calm()]);
   if (sign !== shownStrip) buildStrip(shown, alarms.length - shown.length);
   shownStrip = sign;
-  for (const [age, time] of ages) put(age, time === null ? "" : `, ${clock.lasting(t - time)}`);
+  for (const [age, alarm] of ages) put(age, `, ${clock.since(alarm, t)}`);
 }
 
 // Return the words for a plant where no alarm lasts.
@@ -120,13 +121,22 @@ function buildStrip(alarms, more) {
     );
 }
 
-function item({ kind, drive, line, text, time }) {
+function item(alarm) {
+  const { kind, drive, line, text, acknowledged } = alarm;
   const age = make("span", { class: "since" });
-  ages.push([age, time]);
+  ages.push([age, alarm]);
   const href = drive ? `#/drives/${encodeURIComponent(drive)}` : "#/lines";
   return make(
     "li",
     {},
-    make("a", { class: kind, href }, glyph(kind), named(drive ?? line), ": ", named(text), age),
+    make(
+      "a",
+      { class: acknowledged ? "seen" : kind, href },
+      glyph(kind),
+      named(drive || `line ${line}`),
+      ": ",
+      named(text),
+      age,
+    ),
   );
 }

@@ -8,8 +8,10 @@ export const STATES = {
   stands: "stopped",
   fault: "fault",
   silent: "silent",
+  still: "at rest: 0 Hz",
   unknown: "unknown",
 };
+export const ALARMS = { fault: "fault", stopped: "stopped by itself", port: "port lost", silent: "silent" };
 export const UNKNOWN = "–";
 const MOST_BITS = 32;
 
