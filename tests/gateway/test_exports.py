@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import asyncio
 import threading
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
+from urllib.parse import parse_qs, unquote
 
 from gateways import served
 from lines import PATIENCE, until
+from tables import table
 
-from multidrop.gateway.exports import MOST_EXPORTS
+from multidrop.gateway.exports import MOST_EXPORTS, Exports
 
 EXPORT = "/api/export?from=0&to=1&format={}"
 
@@ -60,3 +63,34 @@ def test_few_exports_go_on_at_a_time_and_hold_no_stop_up(tmp_path: Path) -> None
             part.go_on.set()
         assert [done.result(PATIENCE).body for done in exports] == [b"PAR1"] * MOST_EXPORTS
         until(lambda: gateway.get(EXPORT.format("csv")).status == 200)
+
+
+@table(
+    ("asked", "name"),
+    [
+        ("series=pump-1.speed&", "pump-1.speed 2026-11-21T12-00-00Z to 2026-11-21T12-10-00Z"),
+        ("series=pump-1.speed&series=pump-1.current&", "pump-1 2026-11-21T12-00-00Z to 2026-11-21T12-10-00Z"),
+        ("series=a.x&series=b.x&series=c.x&", "a and 2 more 2026-11-21T12-00-00Z to 2026-11-21T12-10-00Z"),
+        ("", "all drives 2026-11-21T12-00-00Z to 2026-11-21T12-10-00Z"),
+        ("series=..%2F%22x%0A.y&", "..__x_.y 2026-11-21T12-00-00Z to 2026-11-21T12-10-00Z"),
+        ("series=%D0%BD%D0%B0%D1%81%D0%BE%D1%81.y&", "насос.y 2026-11-21T12-00-00Z to 2026-11-21T12-10-00Z"),
+    ],
+)
+def test_a_files_name_says_drive_and_range(asked: str, name: str) -> None:
+    noon = 1_795_262_400_000
+
+    class Quick(SlowHistory):
+        async def export(self, names: Sequence[str], begin: int, end: int, kind: str) -> Iterator[bytes]:
+            return iter(())
+
+    async def named() -> str:
+        part: Any = Quick()
+        names = parse_qs(asked).get("series", [])
+        response = await Exports().respond(part, names, noon, noon + 600_000, "csv")
+        return response.headers["content-disposition"]
+
+    said = asyncio.run(named())
+    plain, _, whole = said.partition("; filename*=UTF-8''")
+    assert unquote(whole) == f"{name}.csv"
+    assert plain.isascii()
+    assert plain.count('"') == 2

@@ -127,7 +127,13 @@ def test_an_export_is_what_is_read(folder: Path, rows: list[list[Row]]) -> None:
             with pytest.raises(ValueError, match="is there already"):
                 history.export(folder / name, names, begin, end)
         text = b"".join(history.csv(names, begin, end))
-    assert text == (folder / "a.csv").read_bytes()
+    without = [line.rpartition(b",") for line in text.splitlines()]
+    assert b"".join(line + b"\n" for line, _, _ in without) == (folder / "a.csv").read_bytes()
+    assert {unit for _, _, unit in without} == {b"unit", b"rpm", b""}
+    (folder / "units.csv").write_bytes(text)
+    assert [row for batch in open_reader(folder / "units.csv") for row in batch] == [
+        row for batch in open_reader(folder / "a.csv") for row in batch
+    ]
 
 
 @pytest.mark.slow

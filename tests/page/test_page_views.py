@@ -210,6 +210,65 @@ def test_trends_zoom_and_move_by_keyboard_and_have_markers(opened: Opener) -> No
     assert page.locator("#span").inner_text().count(":45:00") == 1
 
 
+def test_markers_and_cursor_show_each_drives_newest_value_while_it_holds(
+    opened: Opener, gateway: FakeGateway
+) -> None:
+    """Zoomed in, each drive was read at instants of its own."""
+    begin = 1764075600000
+    for drive, offset in (("pump-1", 0), ("pump-2", 400)):
+        times = [begin + offset + 1000 * n for n in range(10) if n < 5 or drive == "pump-1"]
+        means: list[float | None] = [20.0 + n for n in range(len(times))]
+        gateway.recorded[f"{drive}.output_frequency"] = {
+            "time": times, "mean": means, "least": means, "most": means, "missed": [0] * len(times),
+        }  # fmt: skip
+    page = opened(f"#/trends?drive=pump-1&from={begin}&to={begin + 10000}")
+    page.get_by_label("output current, A").uncheck()
+    page.get_by_label("pump-2", exact=True).check()
+    until(page, "document.querySelectorAll('#trend-plots .plothead .wide').length === 3")
+    for name in ("A", "B"):
+        page.get_by_role("button", name=f"Marker {name}").click()  # at 1/3 and 2/3
+    rows = page.locator("#marks tbody tr")
+    until_met(page, lambda: rows.count() == 2)
+    assert rows.nth(0).locator("td").all_inner_texts()[:2] == ["23.00", "26.00"]
+    assert rows.nth(1).locator("td").all_inner_texts()[:2] == ["22.00", "\u2013"]  # it holds for a second
+    plot = page.locator("#trend-plots .u-over").first
+    box = plot.bounding_box()
+    page.mouse.move(box["x"] + box["width"] * 0.3, box["y"] + 20)
+    head = page.locator("#trend-plots .plothead").first
+    until_met(page, lambda: head.inner_text().count(".00") == 2)
+
+
+def test_an_unpolled_register_has_no_empty_plot(opened: Opener, gateway: FakeGateway) -> None:
+    """A plot whose box is not there could not be taken away."""
+    gateway.plant_changes = {"lines": fake_plant.plant({})["lines"]}
+    for line in gateway.plant_changes["lines"]:
+        for drive in line["drives"]:
+            drive["registers"] = [
+                one | ({"period_s": None} if one["name"] == "output_frequency" else {})
+                for one in drive["registers"]
+            ]
+    page = opened("#/trends?drive=pump-1")
+    heads = page.locator("#trend-plots .plothead b")
+    until_met(page, lambda: heads.all_inner_texts() == ["output current, A"])
+    assert page.get_by_label("output frequency, Hz").count() == 0
+
+
+def test_dates_are_chosen_and_an_end_before_the_begin_is_refused(opened: Opener) -> None:
+    page = opened("#/trends?drive=pump-2&from=1764075600000&to=1764079200000")
+    until(page, DRAWN)
+    page.locator("#span").click()
+    begin, end = page.get_by_label("From, UTC"), page.get_by_label("To, UTC")
+    assert (begin.input_value()[:16], end.input_value()[:16]) == ("2025-11-25T13:00", "2025-11-25T14:00")
+    begin.fill("2025-11-20T08:30:00")
+    end.fill("2025-11-20T08:00:00")
+    page.get_by_role("button", name="Show", exact=True).click()
+    assert page.locator("#ask").evaluate("dialog => dialog.open")
+    end.fill("2025-11-20T09:00:00")
+    page.get_by_role("button", name="Show", exact=True).click()
+    span = "20 Nov 2025, 08:30:00 \u2013 20 Nov 2025, 09:00:00 UTC"
+    until_met(page, lambda: page.locator("#span").inner_text() == span)
+
+
 def test_on_a_phone_several_drives_are_chosen_at_once_and_told_apart(opened: Opener) -> None:
     page = opened("#/trends?drive=pump-2&from=1764075600000&to=1764079200000", size="phone")
     until(page, DRAWN)

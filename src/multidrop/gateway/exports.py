@@ -5,9 +5,12 @@ Each takes a thread while its next piece is made, and a file of Parquet takes ro
 
 from __future__ import annotations
 
+import re
 from collections.abc import AsyncIterator, Callable, Generator, Iterator, Sequence
+from datetime import UTC, datetime
 from functools import partial
 from typing import Protocol, TypeVar
+from urllib.parse import quote
 
 from starlette.responses import Response, StreamingResponse
 from starlette.types import Receive, Scope, Send
@@ -18,6 +21,8 @@ from multidrop.gateway.supervisor import supervisor
 MOST_EXPORTS = 8  # under way
 PIECE_S = 600.0  # that a piece may take: the first one of Parquet has the whole file behind it
 R = TypeVar("R")
+MOST_NAME = 80  # characters of a series in a file's name
+FORBIDDEN = re.compile(r'[\x00-\x1f\x7f/\\:*?"<>|]')  # in the names of files
 KINDS = {"csv": "text/csv; charset=utf-8", "parquet": "application/vnd.apache.parquet"}
 
 
@@ -50,15 +55,16 @@ class Exports:
             if isinstance(failure, ValueError):
                 raise Denied(400, str(failure)) from failure
             raise
-        return _Export(self, pieces, kind)
+        return _Export(self, pieces, kind, f"{_what(names)} {_moment(begin)} to {_moment(end)}.{kind}")
 
 
 class _Export(StreamingResponse):
     """One export, until its client has all of it or is gone."""
 
-    def __init__(self, exports: Exports, pieces: Iterator[bytes], kind: str) -> None:
-        name = {"content-disposition": f'attachment; filename="multidrop.{kind}"'}
-        super().__init__(_through(pieces), media_type=KINDS[kind], headers=name)
+    def __init__(self, exports: Exports, pieces: Iterator[bytes], kind: str, name: str) -> None:
+        plain = name.encode("ascii", "replace").decode().replace("?", "_")
+        named = f"attachment; filename=\"{plain}\"; filename*=UTF-8''{quote(name)}"
+        super().__init__(_through(pieces), media_type=KINDS[kind], headers={"content-disposition": named})
         self._exports = exports
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
@@ -80,3 +86,21 @@ async def _through(pieces: Iterator[bytes]) -> AsyncIterator[bytes]:
 
 async def _in_thread(work: Callable[[], R]) -> R:
     return await supervisor().within("exports", PIECE_S, work, most=MOST_EXPORTS)
+
+
+def _what(names: Sequence[str]) -> str:
+    """Return the drives of these series as a file's name may have them."""
+    drives = list(dict.fromkeys(name.rpartition(".")[0] for name in names))
+    if not drives:
+        return "all drives"
+    first = names[0] if len(names) == 1 else drives[0]
+    more = f" and {len(drives) - 1} more" if len(drives) > 1 else ""
+    return f"{FORBIDDEN.sub('_', first)[:MOST_NAME]}{more}"
+
+
+def _moment(ms: int) -> str:
+    """Return a time of UTC without the colons that some systems forbid in names."""
+    try:
+        return datetime.fromtimestamp(ms / 1000, UTC).strftime("%Y-%m-%dT%H-%M-%SZ")
+    except (ValueError, OverflowError, OSError):
+        return "a time"

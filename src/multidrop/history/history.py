@@ -12,7 +12,7 @@ from multidrop.history.buckets import Buckets, Grid, grid_of
 from multidrop.history.database import MissingDuckDB
 from multidrop.history.folder import HistoryFile, Listing, listing
 from multidrop.history.kept_series import Series
-from multidrop.history.quantities import OtherColumn, Parting
+from multidrop.history.quantities import OtherColumn, Parting, units_of
 from multidrop.history.queries import (
     OF_ROWS,
     OF_TENS,
@@ -27,7 +27,7 @@ from multidrop.history.told_units import UnitBuckets
 from multidrop.polling.batch import Row, Rows
 from multidrop.recording import open_writer
 from multidrop.recording.append_file import new_file
-from multidrop.recording.csv import HEADER, lines_of
+from multidrop.recording.csv import WITH_UNITS, lines_with_units
 from multidrop.recording.format import Metadata, RecordingReader
 from multidrop.recording.rows import from_rows
 
@@ -219,9 +219,11 @@ class History:
         begin: Moment | None = None,
         end: Moment | None = None,
     ) -> Iterator[bytes]:
-        """Yield the rows of `read` as the text of a .csv recording, piece by piece."""
+        """Yield the rows of `read` as the text of a .csv recording with a column of units, piece by piece."""
         rows = self.read(series, begin, end)
-        return (piece for batches in ([HEADER.encode()], map(lines_of, rows)) for piece in batches)
+        units = units_of(rows.metadata)
+        lines = (lines_with_units(batch, units) for batch in rows)
+        return (piece for pieces in ([WITH_UNITS.encode()], lines) for piece in pieces)
 
     def export(
         self,

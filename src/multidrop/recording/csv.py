@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import os
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from functools import lru_cache
 from itertools import islice
@@ -18,6 +18,7 @@ from multidrop.recording.format import AppendingWriter, Metadata, RecordingReade
 from multidrop.recording.rows import from_rows
 
 HEADER = ",".join(Row._fields) + "\n"
+WITH_UNITS = ",".join([*Row._fields, "unit"]) + "\n"  # of a text that has no metadata beside it
 FORMULA = re.compile(r"'*[=+\-@\t\r\n]")  # a spreadsheet evaluates it unless an apostrophe is in front
 ESCAPED = re.compile(r"'+[=+\-@\t\r\n]")
 EXAMPLE = "2026-11-21T09:30:00.123456789Z,17,250000,pump-1,output_current,1.5,ok"
@@ -69,7 +70,7 @@ class CsvReader(RecordingReader):
     def __init__(self, path: Path) -> None:
         super().__init__(path)
         with path.open("rb") as file:
-            if file.read(len(HEADER)) != HEADER.encode():
+            if file.readline(len(WITH_UNITS)).decode(errors="replace") not in (HEADER, WITH_UNITS):
                 raise self._not_a_recording(f"its first line is not {HEADER.strip()}")
             size = file.seek(0, os.SEEK_END)
             self._whole = _whole_lines(file, size)
@@ -110,9 +111,9 @@ def _lines(file: BinaryIO, size: int) -> Iterator[str]:
 
 
 def _parse(cells: list[str]) -> Row:
-    if len(cells) != len(Row._fields):
+    if len(cells) - len(Row._fields) not in (0, 1):  # with or without a unit
         raise ValueError(len(cells))
-    time, monotonic_ns, uncertainty_ns, drive, register, value, status = cells
+    time, monotonic_ns, uncertainty_ns, drive, register, value, status = cells[: len(Row._fields)]
     numbers = f"{monotonic_ns}{uncertainty_ns}{value}"
     if not numbers.isascii() or "_" in numbers:  # Python takes 1_0 for 10
         raise ValueError(numbers)
@@ -130,6 +131,13 @@ def _parse(cells: list[str]) -> Row:
 def lines_of(rows: Rows) -> bytes:
     """Return the rows as lines of text."""
     return "".join(map(_line, rows)).encode()
+
+
+def lines_with_units(rows: Rows, units: Mapping[tuple[str, str], str]) -> bytes:
+    """Return the rows as lines of text, each with the unit of its drive's register."""
+    return "".join(
+        f"{_line(row)[:-1]},{_quote(units.get((row.drive, row.register), ''))}\n" for row in rows
+    ).encode()
 
 
 def _line(row: Row) -> str:

@@ -55,6 +55,13 @@ export const when = ms => (day(ms) === day(Date.now()) ? time(ms) : moment(ms));
 
 export const zoneName = () => (isUtc() ? "UTC" : "local");
 
+// Return a time as a field for dates and times has it, and the time (ms) of such a text.
+export function field(ms) {
+  const shift = isUtc() ? 0 : new Date(ms).getTimezoneOffset() * 60000;
+  return new Date(ms - shift).toISOString().slice(0, 19);
+}
+export const parsed = text => Date.parse(isUtc() ? `${text}Z` : text);
+
 // Return a duration in its largest whole unit: "0.4 s", "42 s", "7 min", "3.5 h", "12 days".
 export function lasting(ms) {
   const s = Math.max(0, ms) / 1000;

@@ -3,6 +3,7 @@
 import * as clock from "./clock.js";
 import { colour, fill, find, make, named, tableHead } from "./dom.js";
 import { label } from "./history.js";
+import { heldAt } from "./plots.js";
 import { number } from "./values.js";
 
 const marks = { A: null, B: null }; // ms
@@ -83,11 +84,8 @@ export function mark(u) {
   }
 }
 
-// Return the mean of a column at a time: of the point nearest to it, or null in a gap.
-function at(u, column, ms) {
-  if (ms === null || !u.data[0].length) return null;
-  return u.data[column][u.valToIdx(ms / 1000)] ?? null;
-}
+// Return the mean of a column at a time, while it holds, or null in a gap.
+const at = (u, column, ms, holdMs) => (ms === null ? null : heldAt(u, column, ms / 1000, holdMs));
 
 // Write the table of what the markers stand on.
 export function draw() {
@@ -96,9 +94,9 @@ export function draw() {
     fill(place);
     return;
   }
-  const rows = plots().flatMap(({ plot, drives, spec, register, unit }) =>
+  const rows = plots().flatMap(({ plot, drives, holds, spec, register, unit }) =>
     drives.map((drive, k) => {
-      const [a, b] = [at(plot, 3 + 3 * k, marks.A), at(plot, 3 + 3 * k, marks.B)],
+      const [a, b] = [marks.A, marks.B].map(ms => at(plot, 3 + 3 * k, ms, holds[k])),
         write = v => (v === null ? "–" : number(v, spec.digits));
       return make(
         "tr",

@@ -4,8 +4,8 @@ import * as clock from "./clock.js";
 import { colour, fill, find, make, put } from "./dom.js";
 import { exportLink, isPresent, label, leftOut, read } from "./history.js";
 import { now } from "./link.js";
-import { COLOURS, isThere, join, line, makePlot, summary, wide } from "./plots.js";
-import { isLive, store } from "./store.js";
+import { COLOURS, heldAt, isThere, join, line, makePlot, summary, wide } from "./plots.js";
+import { holdsFor, isLive, store } from "./store.js";
 import { text, unit, words } from "./values.js";
 
 const RANGES = [
@@ -176,7 +176,10 @@ function picker(choices) {
 function under(u, specs) {
   const i = u.cursor.idx;
   if (i === null || i === undefined || u.data[0][i] === undefined) return "";
-  const values = specs.map((r, k) => text(u.data[k + 1][i], r)).join(" / ");
+  const stepMs = needsHistory() ? (range * 1000) / POINTS : 0;
+  const values = specs
+    .map((r, k) => text(heldAt(u, k + 1, u.data[0][i], holdsFor(spec.name, r.name) + stepMs), r))
+    .join(" / ");
   return `${clock.time(u.data[0][i] * 1000)}  ${values}`;
 }
 

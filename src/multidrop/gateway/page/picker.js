@@ -31,10 +31,9 @@ export function takePlant() {
   wanted = null;
   const all = [...store.drives.keys()];
   if (!chosen.length) chosen = [...all.filter(name => state(name) === "runs"), ...all].slice(0, 1);
-  if (!registers.length)
-    registers = [...new Set(chosen.flatMap(name => [key(name, "frequency"), key(name, "current")]))].filter(
-      Boolean,
-    );
+  if (!quantities().length)
+    registers = [...new Set(chosen.flatMap(name => [key(name, "frequency"), key(name, "current")]))];
+  if (!quantities().length) registers = numbers().map(({ name }) => name).slice(0, 1);
   draw();
 }
 
@@ -43,14 +42,16 @@ export function choose(name) {
   if (!store.plant) wanted = name;
   if (!store.drives.has(name)) return;
   chosen = [name];
-  registers = [...new Set([...registers, key(name, "frequency"), key(name, "current")])].filter(
-    r => r && store.drives.get(name).registers.has(r),
-  );
+  registers = [...new Set([...registers, key(name, "frequency"), key(name, "current")])];
   draw();
 }
 
 export const drives = () => chosen;
-export const quantities = () => registers;
+// Return the chosen registers that a chosen drive has polled: others cannot be taken away by their box.
+export const quantities = () => {
+  const there = numbers().map(({ name }) => name);
+  return registers.filter(name => there.includes(name));
+};
 export const showsFaults = () => faults;
 export const index = name => chosen.indexOf(name);
 

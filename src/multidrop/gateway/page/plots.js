@@ -65,6 +65,16 @@ export function alone({ data }, k) {
   return places.filter((_, n) => !isGap(n) && isGap(n - 1) && isGap(n + 1));
 }
 
+// Return the newest value of a column at a time (s), as long as it holds (ms), or null: several registers are
+// read one after the other, and at the time of one the others have no sample of their own.
+export function heldAt({ data }, column, time, holdMs) {
+  const times = data[0],
+    values = data[column];
+  let i = times.findLastIndex(at => at <= time);
+  while (i >= 0 && values[i] === undefined) i--;
+  return i >= 0 && (time - times[i]) * 1000 <= holdMs ? values[i] : null;
+}
+
 // Return a visible line. `index` gives colour and dashes.
 export const line = (index, label) => ({
   label,

@@ -5,12 +5,12 @@ import { colour, fill, make, named } from "./dom.js";
 import { label } from "./history.js";
 import * as markers from "./markers.js";
 import * as picker from "./picker.js";
-import { COLOURS, join, line, makePlot, summary, swatch, wide } from "./plots.js";
-import { store } from "./store.js";
+import { COLOURS, heldAt, join, line, makePlot, summary, swatch, wide } from "./plots.js";
+import { holdsFor, store } from "./store.js";
 import { number, words } from "./values.js";
 
 // Make the plot of one quantity of these drives. `set` shows the span that was dragged over.
-export function makeTrend(place, { register, unit, drives }, told, { view, set, count }) {
+export function makeTrend(place, { register, unit, drives }, told, { view, set, count, stepMs }) {
   const spec = store.drives.get(drives[0]).registers.get(register);
   const out = make("output"),
     box = make("div", { class: "plotbox", role: "img" });
@@ -48,7 +48,8 @@ export function makeTrend(place, { register, unit, drives }, told, { view, set, 
   }
   const marks = drives.map(name => (drives.length > 1 ? swatch(picker.index(name)) : null)),
     widths = tables.map(([, most, least]) => widest([...most, ...least], spec.digits)),
-    legend = u => fill(out, under(u, drives, marks, widths, spec));
+    holds = drives.map(name => holdsFor(name, register) + stepMs),
+    legend = u => fill(out, under(u, { drives, marks, widths, holds, spec }));
   const height = Math.max(150, Math.min(300, (innerHeight - 300) / count));
   const plot = makePlot(box, join(tables), {
     series,
@@ -75,7 +76,7 @@ export function makeTrend(place, { register, unit, drives }, told, { view, set, 
   });
   legend(plot);
   box.setAttribute("aria-label", `${words(register)}. ${said.join(". ")}`);
-  return { plot, drives, spec, register, unit };
+  return { plot, drives, holds, spec, register, unit };
 }
 
 // Return the characters of the longest value.
@@ -87,13 +88,13 @@ function widest(values, digits) {
 
 // Return the drives with what they had at the cursor; without a cursor, which line is whose, where they are
 // several. It takes the same room then: else the plot would move under the cursor that comes.
-function under(u, drives, marks, widths, spec) {
+function under(u, { drives, marks, widths, holds, spec }) {
   const i = u.cursor.idx ?? null,
     at = i === null ? undefined : u.data[0][i];
   if (at === undefined && drives.length < 2) return [];
   return [
     ...drives.map((name, k) => {
-      const value = at === undefined ? undefined : (u.data[3 + 3 * k][i] ?? null);
+      const value = at === undefined ? undefined : heldAt(u, 3 + 3 * k, at, holds[k]);
       const told = value === undefined ? "" : value === null ? "–" : number(value, spec.digits);
       return make("span", {}, marks[k], named(name), " ", wideText(told, widths[k]));
     }),

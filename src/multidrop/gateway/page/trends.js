@@ -1,5 +1,6 @@
 // Recorded values over any time: zoom, markers, faults beside them, and files to take away.
 
+import { confirmForm } from "./ask.js";
 import * as clock from "./clock.js";
 import { fill, find, make, put } from "./dom.js";
 import { exportLink, label, leftOut, read, unitOf } from "./history.js";
@@ -60,7 +61,7 @@ export function begin() {
           make("button", { type: "button", "aria-label": name, title: name, onclick: what }, sign),
         ),
         markers.buttons(),
-        make("span", { class: "span", id: "span" }),
+        make("button", { class: "span", id: "span", type: "button", title: "Dates", onclick: askDates }),
         make("a", { id: "csv", download: true }, "CSV"),
         make("a", { id: "parquet", download: true }, "Parquet"),
       ),
@@ -113,6 +114,28 @@ const zoom = by => {
   set(middle - half, middle + half, false);
 };
 
+// Ask for two dates, and show what lies between them.
+async function askDates() {
+  const [from, to] = [
+    ["dates-from", view.from],
+    ["dates-to", view.to],
+  ].map(([id, ms]) =>
+    make("input", { id, type: "datetime-local", step: 1, required: true, value: clock.field(ms) }),
+  );
+  from.dataset.first = "";
+  const check = () =>
+    to.setCustomValidity(
+      clock.parsed(to.value) > clock.parsed(from.value) ? "" : "The end is not after the begin.",
+    );
+  for (const field of [from, to]) field.addEventListener("input", check);
+  const contents = [
+    make("label", { class: "field", for: from.id }, `From, ${clock.zoneName()}`, from),
+    make("label", { class: "field", for: to.id }, `To, ${clock.zoneName()}`, to),
+  ];
+  if (await confirmForm("Which time?", contents, "Show", ""))
+    set(clock.parsed(from.value), clock.parsed(to.value), false);
+}
+
 export function back() {
   const before = view.back.pop();
   if (!before) return;
@@ -141,11 +164,16 @@ function showSpan() {
   }
 }
 
+const isPolled = (name, register) => {
+  const period = store.drives.get(name).registers.get(register)?.period_s;
+  return period !== undefined && period !== null;
+};
+
 const wanted = () =>
   picker.quantities().flatMap(register =>
     picker
       .drives()
-      .filter(name => store.drives.get(name).registers.has(register))
+      .filter(name => isPolled(name, register))
       .map(name => label(name, register)),
   );
 
@@ -197,7 +225,8 @@ export function draw() {
   fill(place);
   if (!isShown || !told || !isThere()) return;
   const shown = parted();
-  for (const one of shown) plots.push(makeTrend(place, one, told.series, { view, set, count: shown.length }));
+  const around = { view, set, count: shown.length, stepMs: told.step_ms };
+  for (const one of shown) plots.push(makeTrend(place, one, told.series, around));
   markers.draw();
 }
 
