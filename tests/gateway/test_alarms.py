@@ -143,15 +143,23 @@ def seen(events: Events) -> list[tuple[str, str, int, int | None]]:
 @pytest.mark.parametrize("standing", [STANDS, Shown("unknown", None)])
 def test_a_motor_that_stopped_though_nobody_stopped_it_is_an_alarm(standing: Shown) -> None:
     events = Events()
-    for time, shown, stops in ((1, standing, 0), (2, RUNS, 0), (3, standing, 0)):
+    for time, shown in ((1000, standing), (2000, RUNS), (3000, standing), (4999, standing)):
+        events.look(time, "pump-1", shown, 0)
+    assert seen(events) == []  # it may reverse
+    events.look(5000, "pump-1", standing, 0)
+    assert seen(events) == [("pump-1", "stopped", 3000, None)]
+    events.look(6000, "pump-1", RUNS, 0)
+    told = [("pump-1", "stopped", 3000, 6000)]
+    assert seen(events) == told
+    for time, shown, stops in (
+        (7000, standing, 1),
+        (9000, standing, 1),
+        (10000, RUNS, 1),
+    ):  # a stop was called
         events.look(time, "pump-1", shown, stops)
-    assert seen(events) == [("pump-1", "stopped", 3, None)]
-    events.look(4, "pump-1", RUNS, 0)
-    assert seen(events) == [("pump-1", "stopped", 3, 4)]
-    events.look(5, "pump-1", standing, 1)  # a stop was called
-    events.look(6, "pump-1", RUNS, 1)
-    events.look(7, "pump-1", standing, None)  # it jogged, or its setpoint is 0
-    assert seen(events) == [("pump-1", "stopped", 3, 4)]
+    for time, stops in ((11000, None), (13000, 1)):  # it jogged, or its setpoint is 0
+        events.look(time, "pump-1", standing, stops)
+    assert seen(events) == told
 
 
 def test_a_fault_is_no_stop_of_its_own() -> None:
@@ -166,6 +174,7 @@ def test_the_gravest_comes_first_and_what_was_acknowledged_last() -> None:
     events.look(1, "pump-1", Shown("fault", "overheat"))
     events.look(2, "pump-2", RUNS, 0)
     events.look(3, "pump-2", STANDS, 0)
+    events.look(2003, "pump-2", STANDS, 0)
     events.look_at_line(4, "hall", "there is no such port")
     events.look(5, "pump-3", Shown("silent", "no reply"))
     events.look(6, "pump-4", Shown("silent", "port lost"))  # that is its line's

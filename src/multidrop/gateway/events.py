@@ -11,6 +11,7 @@ from multidrop.gateway.hub import FAULT, INCOMPLETE, NOT_ASKED, RUNS, SILENT, ST
 STOPPED, PORT = "stopped", "port"  # kinds beside "fault" and "silent"
 KINDS = (FAULT, STOPPED, PORT, SILENT)  # the gravest first
 UNCALLED = "the motor stopped, and no stop was called here"
+STANDS_MS = 2000  # for which a motor must stand: one that reverses passes 0 Hz
 MOST_ENDED = 1000  # that are remembered
 MOST_SHOWN = 20  # of them beside those that last
 LOST = ("port lost", "port refused its settings")  # statuses of all rows of a line that is not there
@@ -53,6 +54,7 @@ class Events:
         self._ended: deque[Alarm] = deque(maxlen=MOST_ENDED)
         self._known: set[tuple[str, str]] = set()  # lines and drives of which something was seen
         self._runs: dict[str, int] = {}  # stops that were called before a drive's motor was seen to run
+        self._stands: dict[str, int] = {}  # since when a motor that ran has stood
         self.begun = 0  # so far
 
     # ---- what is seen ----
@@ -71,7 +73,7 @@ class Events:
             return
         self._end(time, "", drive, SILENT)
         if state == FAULT:
-            self._runs.pop(drive, None)
+            self._forget_run(drive)
             self._end(time, "", drive, STOPPED)
             self._begin(time, "", drive, FAULT, words or UNNAMED)
         elif words != INCOMPLETE:
@@ -80,13 +82,22 @@ class Events:
             self._known.add(("", drive))
 
     def _look_at_run(self, time: int, drive: str, state: str, stops: int | None) -> None:
+        """Note a motor that stopped though nobody stopped it, once it has stood for STANDS_MS."""
         if state == RUNS:
             self._runs.setdefault(drive, stops or 0)
+            self._stands.pop(drive, None)
             self._end(time, "", drive, STOPPED)
         elif state in (STANDS, UNKNOWN) and drive in self._runs:
-            before = self._runs.pop(drive)
-            if stops == before:
-                self._begin(time, "", drive, STOPPED, UNCALLED)
+            since = self._stands.setdefault(drive, time)
+            is_called = stops != self._runs[drive]
+            if is_called or time - since >= STANDS_MS:
+                self._forget_run(drive)
+            if not is_called and time - since >= STANDS_MS:
+                self._begin(since, "", drive, STOPPED, UNCALLED)
+
+    def _forget_run(self, drive: str) -> None:
+        self._runs.pop(drive, None)
+        self._stands.pop(drive, None)
 
     def look_at_line(self, time: int, line: str, lost: str | None) -> None:
         """Note that a line's port is lost, and why, or with None that it is there."""
@@ -101,7 +112,7 @@ class Events:
 
     def forget(self, name: str, time: int) -> None:
         """End the alarms of a drive or a line that is no longer there."""
-        self._runs.pop(name, None)
+        self._forget_run(name)
         self._known -= {("", name), (name, "")}
         for line, drive, kind in list(self._lasting):
             if name in (line, drive):
