@@ -498,7 +498,7 @@ def test_a_trip_while_starting(monkeypatch: pytest.MonkeyPatch) -> None:
     control = sim.obeys[3, 0x1000]
     trips = {(3, 0x1000): lambda sim, raw: sim.trip(4) if raw == 1 else control(sim, raw)}
     monkeypatch.setattr(type(sim), "obeys", trips)
-    with pytest.raises(NotDone, match="tripped: OC1"):
+    with pytest.raises(NotDone, match=r"tripped: overcurrent while accelerating .OC1"):
         drive.start()
     assert len(starts(line, "invt-che")) == 1
     with pytest.raises(Refused, match=r"OC1.*reset_fault"):

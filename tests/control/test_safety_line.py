@@ -119,7 +119,7 @@ def test_a_trip_while_starting(monkeypatch: pytest.MonkeyPatch) -> None:
         drive.set_frequency(20)
         run = sim.motor.run
         monkeypatch.setattr(sim.motor, "run", lambda direction: sim.trip(4))
-        with pytest.raises(NotDone, match="tripped: OC1"):
+        with pytest.raises(NotDone, match=r"tripped: overcurrent while accelerating .OC1"):
             drive.start()
         with pytest.raises(Refused, match=r"OC1.*reset_fault"):
             drive.start()

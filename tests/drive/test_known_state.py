@@ -98,5 +98,5 @@ def test_a_faults_code_tells_its_name_when_it_comes() -> None:
     assert reader.state({"status": 4.0}) == State(Condition.FAULT)
     assert reader.state({"status": 4.0}) == State(Condition.FAULT)
     named = reader.state({"status": 4.0, "fault": 4.0})
-    assert named == State(Condition.FAULT, fault="overcurrent while accelerating")
+    assert named == State(Condition.FAULT, fault="overcurrent while accelerating (OC1)")
     assert reader.state({"status": 4.0}) == State(Condition.FAULT)

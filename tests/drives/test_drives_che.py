@@ -325,7 +325,7 @@ def test_a_negative_setpoint_cannot_be_written_at_all() -> None:
         ({"status": CHEStatus.REVERSE}, State(Condition.RUNNING, Direction.REVERSE)),
         (
             {"status": CHEStatus.FAULT, "fault": CHEFault.OL1_MOTOR_OVERLOAD},
-            State(Condition.FAULT, fault="motor overload"),
+            State(Condition.FAULT, fault="motor overload (OL1)"),
         ),
         ({"status": CHEStatus.FAULT, "fault": CHEFault.NONE}, State(Condition.FAULT)),  # read before
         ({"status": CHEStatus.FAULT, "fault": 99}, State(Condition.FAULT, fault="99")),

@@ -148,7 +148,7 @@ def test_the_only_setpoint_wears_the_eeprom() -> None:
     ("says", "state"),
     [
         ({"fault": DelixiFault.NONE, "output_frequency": 12.0}, State(Condition.RUNNING)),
-        ({"fault": DelixiFault.OH_OVERHEAT}, State(Condition.FAULT, fault="overheat")),
+        ({"fault": DelixiFault.OH_OVERHEAT}, State(Condition.FAULT, fault="overheat (OH)")),
         ({"fault": 99}, State(Condition.FAULT, fault="99")),
     ],
 )

@@ -127,7 +127,7 @@ def test_no_motor_is_started_that_could_run_later(status: int, sentence: str) ->
     ("says", "sentence"),
     [
         ({"run_source": DelixiRunSource.KEYPAD}, "is not commanded by the line"),
-        ({"fault": DelixiFault.OC_OVERCURRENT}, "has a fault, overcurrent: see to it"),
+        ({"fault": DelixiFault.OC_OVERCURRENT}, "has a fault, overcurrent .OC.: see to it"),
     ],
 )
 def test_a_drive_that_would_not_obey_is_not_started(says: dict[str, object], sentence: str) -> None:
@@ -205,11 +205,11 @@ def test_faults_are_read_as_decimal_and_as_hex_digits(raw: int, fault: int) -> N
         ),
         (
             {"status": DelixiNativeStatus.FAULT, "fault": DelixiFault.OC_OVERCURRENT},
-            State(Condition.FAULT, fault="overcurrent"),
+            State(Condition.FAULT, fault="overcurrent (OC)"),
         ),
         (
             {"status": DelixiNativeStatus.UNDERVOLTAGE, "fault": DelixiFault.NONE},
-            State(Condition.FAULT, fault="UNDERVOLTAGE"),
+            State(Condition.FAULT, fault="undervoltage"),
         ),
         ({"status": 9}, State(Condition.UNKNOWN, note="K = 03 says 0009H, which is not explained")),
     ],

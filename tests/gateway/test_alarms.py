@@ -7,6 +7,7 @@ import logging
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 from batches import SECOND, UTC_0, completion
@@ -308,21 +309,22 @@ def test_a_disk_that_takes_nothing_is_reported_and_written_whole_later(tmp_path:
 # ---- a gateway ----
 
 
-def alarms(gateway: Served) -> list[tuple[str, str, int | None]]:
-    return [(one["drive"], one["text"], one["ended"]) for one in gateway.frame()["alarms"]]
+def faults(gateway: Served) -> list[Any]:
+    """Return alarms of faults: on a busy machine a drive may be silent for a moment too."""
+    return [one for one in gateway.frame()["alarms"] if one["kind"] == "fault"]
 
 
 def test_alarms_are_logged_acknowledged_and_last_over_a_restart(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level(logging.INFO, "multidrop.gateway")
-    words = "overcurrent while accelerating"
+    words = "overcurrent while accelerating (OC1)"
     stopper: dict[str, str] = {}
     with served(tmp_path) as gateway:
         gateway.await_state("pump-1", "stands")
         gateway.sims["pump-1"].trip(4)  # type: ignore[attr-defined]
-        until(lambda: alarms(gateway) == [("pump-1", words, None)])
-        [alarm] = gateway.frame()["alarms"]
+        until(lambda: [(one["drive"], one["text"]) for one in faults(gateway)] == [("pump-1", words)])
+        [alarm] = faults(gateway)
         assert alarm["is_before"] is False
         stopper = {"authorization": gateway.bearer(Right.STOP)}
         body = {"alarm": alarm["id"], "note": "belt stuck"}
@@ -336,8 +338,8 @@ def test_alarms_are_logged_acknowledged_and_last_over_a_restart(
         text.startswith(f"alarm of pump-1, {words}, acknowledged by stopper") for text in caplog.messages
     )
     with served(tmp_path) as gateway:  # the drive is well again meanwhile
-        until(lambda: gateway.frame()["alarms"] and gateway.frame()["alarms"][0]["ended"])
-        [again] = gateway.frame()["alarms"]
+        until(lambda: [one for one in faults(gateway) if one["ended"]])
+        [again] = faults(gateway)
         kept = ("id", "time", "text", "by", "note", "acknowledged")
         assert {key: again[key] for key in kept} == {key: told[key] for key in kept}
     assert f"alarm of pump-1 is over: fault: {words}" in caplog.messages
@@ -359,7 +361,7 @@ def test_a_lost_port_is_one_alarm_of_its_line(tmp_path: Path) -> None:
         page = Served(gateway, {}, {})
         page.await_state("pump-1", "silent")
         page.await_state("pump-2", "silent")
-        until(lambda: page.frame()["alarms"])
+        until(lambda: "port" in [one["kind"] for one in page.frame()["alarms"]])
         [alarm] = page.frame()["alarms"]
         assert (alarm["line"], alarm["drive"], alarm["kind"], alarm["is_before"]) == (
             "hall",

@@ -102,7 +102,7 @@ def test_a_state_is_what_the_family_makes_of_its_registers(
 def test_a_fault_has_the_drives_words(hub: Hub) -> None:
     hub.take(all_of(10, TRIPPED, fault=4))
     assert hub.state("pump-1") == "fault"
-    assert hub.seen("pump-1").fault == "overcurrent while accelerating"
+    assert hub.seen("pump-1").fault == "overcurrent while accelerating (OC1)"
     assert hub.seen("pump-1").why_silent is None
     assert hub.state("pump-2") == "unknown"
 
@@ -111,7 +111,7 @@ def test_a_status_alone_shows_a_fault(hub: Hub) -> None:
     hub.take(rows((10, STATUS, TRIPPED), (10, FREQUENCY, 0)))
     assert hub.seen("pump-1") == Shown("fault", "it shows a fault")
     hub.take(rows((11, FAULT, 4)))
-    assert hub.seen("pump-1").fault == "overcurrent while accelerating"
+    assert hub.seen("pump-1").fault == "overcurrent while accelerating (OC1)"
 
 
 def test_one_lost_reply_is_no_silence_and_many_are(hub: Hub, clock: HubClock) -> None:

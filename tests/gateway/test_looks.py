@@ -122,7 +122,7 @@ def test_a_silent_drives_values_are_said_to_be_old(gateway: Served) -> None:
 def test_a_fault_is_told_in_the_drives_words(gateway: Served) -> None:
     gateway.sims["pump-1"].trip(4)  # type: ignore[attr-defined]
     gateway.await_state("pump-1", "fault")
-    until(lambda: gateway.frame()["drives"]["pump-1"]["fault"] == "overcurrent while accelerating")
+    until(lambda: gateway.frame()["drives"]["pump-1"]["fault"] == "overcurrent while accelerating (OC1)")
 
 
 @pytest.mark.long

@@ -178,7 +178,7 @@ def test_what_is_not_known_is_a_dash_and_never_a_nought(opened: Opener, gateway:
     assert cell(page, "pump-2", "frequency").inner_text().strip() == DASH
     assert cell(page, "pump-1", "state").inner_text().strip() == "unknown"
     shown = page.locator(".registers .number")
-    until_met(page, lambda: {*shown.all_inner_texts()} == {DASH, "20.0", "4012"})  # two are looked at
+    until_met(page, lambda: {*shown.all_inner_texts()} == {DASH, "20.0", "4012", "50.0"})  # three looks
     assert page.locator("tr.head .wire").first.inner_text().split() == [
         "wire",
         DASH,

@@ -173,7 +173,9 @@ class DelixiNative(DelixiParameters, table=PARAMETER):
             return State(condition, direction, note="output frequency 0" if still else "")
         if status in (DelixiNativeStatus.FAULT, DelixiNativeStatus.UNDERVOLTAGE):
             fault = yield from read(self.fault)
-            return State(Condition.FAULT, fault=self.fault.in_words(fault) if fault else status.name)
+            return State(
+                Condition.FAULT, fault=self.fault.in_words(fault) if fault else self.status.in_words(status)
+            )
         return State(Condition.UNKNOWN, note=f"K = 03 says {int(status):04X}H, which is not explained")
 
 

@@ -28,20 +28,20 @@ class DelixiFault(Worded):
     """P05.31. The codes 10 to 14 are printed as digits that may be decimal or hex: both are read."""
 
     NONE = 0
-    OC_OVERCURRENT = 1, "overcurrent"
-    OC_1_OVERCURRENT_ACCELERATING = 2, "overcurrent while accelerating"
-    OC_2_OVERCURRENT_DECELERATING = 3, "overcurrent while decelerating"
-    OU_OVERVOLTAGE = 4, "overvoltage"
-    OU_1_OVERVOLTAGE_ACCELERATING = 5, "overvoltage while accelerating"
-    OU_2_OVERVOLTAGE_DECELERATING = 6, "overvoltage while decelerating"
-    POFF_UNDERVOLTAGE = 7, "undervoltage"
-    OH_OVERHEAT = 8, "overheat"
-    OL_OVERLOAD = 9, "overload"
-    EF_EXTERNAL = 10, "external fault"
+    OC_OVERCURRENT = 1, "overcurrent (OC)"
+    OC_1_OVERCURRENT_ACCELERATING = 2, "overcurrent while accelerating (OC-1)"
+    OC_2_OVERCURRENT_DECELERATING = 3, "overcurrent while decelerating (OC-2)"
+    OU_OVERVOLTAGE = 4, "overvoltage (OU)"
+    OU_1_OVERVOLTAGE_ACCELERATING = 5, "overvoltage while accelerating (OU-1)"
+    OU_2_OVERVOLTAGE_DECELERATING = 6, "overvoltage while decelerating (OU-2)"
+    POFF_UNDERVOLTAGE = 7, "undervoltage (POFF)"
+    OH_OVERHEAT = 8, "overheat (OH)"
+    OL_OVERLOAD = 9, "overload (OL)"
+    EF_EXTERNAL = 10, "external fault (EF)"
     PARAMETER_WRITE = 11, "fault of a parameter write"
-    VFOP_VF1_CHANNEL_BROKEN = 12, "channel VF1 is broken"
-    IFOP_VF2_CHANNEL_BROKEN = 13, "channel VF2 is broken"
-    FLT_MODULE = 14, "module fault"
+    VFOP_VF1_CHANNEL_BROKEN = 12, "channel VF1 is broken (VFOP)"
+    IFOP_VF2_CHANNEL_BROKEN = 13, "channel VF2 is broken (IFOP)"
+    FLT_MODULE = 14, "module fault (FLT)"
 
     @classmethod
     def _missing_(cls, value: object) -> DelixiFault | None:
