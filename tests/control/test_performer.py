@@ -216,7 +216,7 @@ def test_a_trip_while_the_motor_changes_its_direction_ends_the_start(monkeypatch
         return False
 
     line.loses = trip
-    with pytest.raises(NotDone, match="it tripped: OC1"):
+    with pytest.raises(NotDone, match=r"it tripped: overcurrent while accelerating .OC1"):
         drive.start(Direction.REVERSE)
 
 

@@ -294,10 +294,8 @@ class Register(Generic[T]):
     def in_words(self, value: T) -> str:
         """Return a named value in words that need no manual; others as `format` does."""
         if isinstance(value, Flag):
-            known = [member.name for member in value]
-            rest = int(value) & ~sum(int(member) for member in type(value))
-            bits = [f"bit {bit}" for bit in range(rest.bit_length()) if rest >> bit & 1]
-            return ", ".join([*(_spaced(str(name)) for name in known), *bits]) or "none"
+            names = [_spaced(str(member.name)) for member in value]
+            return ", ".join([*names, *unnamed_bits(value)]) or "none"
         if isinstance(value, Worded) and value.words:
             return value.words
         return _spaced(value.name) if isinstance(value, Enum) else self.format(value)
