@@ -144,7 +144,7 @@ def parts_of(gateway: Gateway) -> dict[str, str]:
 
 def failing_lines_of(gateway: Gateway) -> dict[str, str]:
     """Return by name why a line is not polled at present: an exception, such as one of a user's class."""
-    failures: dict[str, str] = getattr(gateway.poller, "line_failures", {})
+    failures = {} if gateway.poller is None else gateway.poller.line_failures
     return {line: f"polling fails: {why}" for line, why in failures.items()}
 
 
