@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import threading
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -249,8 +250,15 @@ def test_alarms_that_are_read_late_meet_those_of_now() -> None:
 ALARM = Alarm(1, "pump-1", "overheat", None, "fault", "", False, 2, "anna", "a note")
 
 
-def past_of(path: Path) -> list[Alarm]:
+def started(path: Path) -> AlarmFile:
+    """Return an alarm file whose thread runs."""
     kept = AlarmFile(path)
+    threading.Thread(target=kept.run, daemon=True).start()
+    return kept
+
+
+def past_of(path: Path) -> list[Alarm]:
+    kept = started(path)
     until(lambda: kept.past is not None)
     kept.close()
     return kept.past or []
@@ -258,14 +266,14 @@ def past_of(path: Path) -> list[Alarm]:
 
 def test_the_file_keeps_the_newest_line_of_each_alarm(tmp_path: Path) -> None:
     path = tmp_path / "alarms.jsonl"
-    kept = AlarmFile(path)
+    kept = started(path)
     for alarm in (ALARM, ALARM._replace(ended=5), ALARM._replace(time=9)):
         kept.note(alarm)
     kept.close()
     with path.open("ab") as file:
         file.write(b'{"id": "trunc')
     assert past_of(path) == [ALARM._replace(ended=5), ALARM._replace(time=9)]
-    kept = AlarmFile(path)
+    kept = started(path)
     kept.note(ALARM._replace(time=10))  # beside what is truncated
     kept.close()
     assert len(past_of(path)) == 3
@@ -285,7 +293,7 @@ def test_a_line_that_is_no_alarm_is_left_out(change: Mapping[str, object]) -> No
 def test_a_long_file_is_written_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("multidrop.gateway.alarm_file.MOST_BYTES", 2000)
     path = tmp_path / "alarms.jsonl"
-    kept = AlarmFile(path)
+    kept = started(path)
     for _ in range(100):
         kept.note(ALARM)
         until(kept._waiting.empty)
@@ -296,7 +304,7 @@ def test_a_long_file_is_written_anew(tmp_path: Path, monkeypatch: pytest.MonkeyP
 
 def test_a_disk_that_takes_nothing_is_reported_and_written_whole_later(tmp_path: Path) -> None:
     folder = tmp_path / "none"
-    kept = AlarmFile(folder / "alarms.jsonl")
+    kept = started(folder / "alarms.jsonl")
     kept.note(ALARM)
     until(lambda: "No such file" in kept.trouble)
     folder.mkdir()

@@ -80,7 +80,7 @@ def test_a_files_name_says_drive_and_range(asked: str, name: str) -> None:
     noon = 1_795_262_400_000
 
     class Quick(SlowHistory):
-        async def export(self, names: Sequence[str], begin: int, end: int, kind: str) -> Iterator[bytes]:
+        def export(self, names: Sequence[str], begin: int, end: int, kind: str) -> Iterator[bytes]:
             return iter(())
 
     async def named() -> str:

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
 from multidrop.fleet.task_end import end_tasks
+from multidrop.printable import masked
 
 if TYPE_CHECKING:
     from multidrop.fleet.fleet_commands import FleetCommands
@@ -88,7 +89,7 @@ class FleetPart:
                 async with command() as self._commands:
                     await asyncio.Event().wait()
             except (OSError, ValueError) as failure:
-                self._why = _without_secrets(failure)
+                self._why = masked(str(failure))
             finally:
                 self._commands = None
             await asyncio.sleep(AGAIN_S)
@@ -100,7 +101,7 @@ class FleetPart:
                 raise ConnectionError(f"the stop was NOT sent: {self._why}; use the hard-wired stop")
             answer = await self._commands.stop(by=by)
         except (OSError, ValueError) as failure:
-            return {"the fleet": (False, _without_secrets(failure))}
+            return {"the fleet": (False, masked(str(failure)))}
         found = {name: (one.is_done, one.text) for name, one in answer.drives.items()}
         if not found or not answer.is_done:  # a line without a master has no drives here
             found["the fleet"] = answer.is_done, answer.text
@@ -120,12 +121,6 @@ class FleetPart:
     def told(self) -> dict[str, Any]:
         """Return the fleet for the page, with its age."""
         return self._watch.told()
-
-
-def _without_secrets(failure: Exception) -> str:
-    from multidrop.fleet.watching import SECRETS
-
-    return SECRETS.sub("//", str(failure))
 
 
 class HasFolder(Protocol):
