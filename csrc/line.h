@@ -209,8 +209,8 @@ int md_owed_parse(const struct md_owed *owed, const uint8_t *bytes, size_t len);
 int64_t md_owed_last_ns(const struct md_owed *owed); /* when it was sent last */
 void md_owed_add_time(struct md_owed *owed, int64_t sent_ns);
 void md_owed_drop_time(struct md_owed *owed); /* the earliest */
-/* The reply is an exception, or its one register lies between these; `most` 0: anything. */
-int md_is_in_range(const struct md_message *reply, uint16_t least, uint16_t most);
+/* The reply is an exception, or its one register is at least this and below `end`; `end` 0: anything. */
+int md_is_in_range(const struct md_message *reply, uint16_t least, uint32_t end);
 int md_is_read(int framing, uint8_t function);
 
 /* ---- proof.c: which of its proofs a drive answers ---- */

@@ -116,8 +116,9 @@ struct md_counters {
 struct md_owed {
     int64_t sent_ns[MD_TIMES_KEPT]; /* earliest first; later ones without room count as the last */
     uint32_t times;
+    uint32_t end;   /* of the reply, as in md_exchange */
+    uint16_t least; /* likewise */
     uint16_t start, count, reply_len;
-    uint16_t least, most; /* of the reply, as in md_exchange */
     uint8_t framing, address, function, data_len;
     uint8_t data[4];
     uint8_t is_doubtful; /* a reply came that may answer another process's request */
@@ -211,7 +212,8 @@ struct md_exchange {
     struct md_settings settings;
     int framing;
     int insists;          /* a stop: sent even where a late reply may pass for its own */
-    uint16_t least, most; /* the reply's one register lies between these; most 0: anything */
+    uint32_t end;         /* the reply's one register is below this; 0: it holds anything */
+    uint16_t least;       /* and not below this */
     uint8_t is_proof;     /* of its drive */
     uint8_t frame_len;    /* 0: the frame is built when its turn comes */
     uint8_t frame[MD_KEPT_FRAME];

@@ -18,7 +18,7 @@ struct md_owed md_owed_of(const struct md_exchange *exchange)
     struct md_owed owed = {.framing = (uint8_t)exchange->framing, .address = request->address,
                            .function = request->function, .start = request->start, .count = request->count,
                            .reply_len = (uint16_t)md_reply_length(exchange->framing, request),
-                           .least = exchange->least, .most = exchange->most,
+                           .least = exchange->least, .end = exchange->end,
                            .data_len = data_kept(request)};
     memcpy(owed.data, request->data, owed.data_len);
     return owed;
@@ -29,7 +29,7 @@ int md_owed_is_same(const struct md_owed *owed, const struct md_exchange *exchan
     const struct md_message *request = &exchange->request;
     return owed->framing == exchange->framing && owed->function == request->function &&
            owed->start == request->start && owed->count == request->count &&
-           owed->least == exchange->least && owed->most == exchange->most &&
+           owed->least == exchange->least && owed->end == exchange->end &&
            memcmp(owed->data, request->data, data_kept(request)) == 0;
 }
 
@@ -37,7 +37,7 @@ int md_owed_is_same(const struct md_owed *owed, const struct md_exchange *exchan
 
 static int may_hold_the_same(const struct md_owed *owed, const struct md_exchange *exchange)
 {
-    return !owed->most || !exchange->most || (owed->least <= exchange->most && exchange->least <= owed->most);
+    return !owed->end || !exchange->end || (owed->least < exchange->end && exchange->least < owed->end);
 }
 
 int md_is_read(int framing, uint8_t function)
@@ -64,10 +64,10 @@ int md_owed_is_mistakable(const struct md_owed *owed, const struct md_exchange *
            may_hold_the_same(owed, exchange);
 }
 
-int md_is_in_range(const struct md_message *reply, uint16_t least, uint16_t most)
+int md_is_in_range(const struct md_message *reply, uint16_t least, uint32_t end)
 {
-    int value = md_get16(reply->data);
-    return most == 0 || reply->exception || reply->data_len < 2 || (value >= least && value <= most);
+    uint32_t value = md_get16(reply->data);
+    return end == 0 || reply->exception || reply->data_len < 2 || (value >= least && value < end);
 }
 
 int md_owed_parse(const struct md_owed *owed, const uint8_t *bytes, size_t len)
@@ -79,7 +79,7 @@ int md_owed_parse(const struct md_owed *owed, const uint8_t *bytes, size_t len)
     if (owed->framing == MD_RTU && bytes[0] != owed->address)
         return MD_BAD_ADDRESS;
     int used = md_parse_reply(owed->framing, bytes, len, &request, &reply);
-    return used > 0 && !md_is_in_range(&reply, owed->least, owed->most) ? MD_BAD_ECHO : used;
+    return used > 0 && !md_is_in_range(&reply, owed->least, owed->end) ? MD_BAD_ECHO : used;
 }
 
 /* ---- when it was sent ---- */

@@ -13,7 +13,7 @@ int md_reply_parse(const struct md_line *line, size_t at, struct md_message *rep
 {
     const struct md_exchange *exchange = line->exchange;
     int used = md_parse_reply(exchange->framing, line->rx + at, line->rx_len - at, &exchange->request, reply);
-    return used > 0 && !md_is_in_range(reply, exchange->least, exchange->most) ? MD_BAD_ECHO : used;
+    return used > 0 && !md_is_in_range(reply, exchange->least, exchange->end) ? MD_BAD_ECHO : used;
 }
 
 /* ---- when to look ---- */

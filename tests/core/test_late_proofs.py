@@ -248,3 +248,18 @@ def test_the_first_reply_is_taken_where_nothing_proves(line: LineDriver, drive: 
     ask(line, drive, READ)
     line.receive(reply(1111))
     assert (line.want, line.completion.reply.data) == ("done", words(1111))
+
+
+@pytest.mark.parametrize("least", [0, 1, 0xFFFF])
+def test_a_known_count_of_any_size_tells_a_reply_from_another(
+    line: LineDriver, drive: Peer, least: int
+) -> None:
+    """Delixi's P04.28 is 0 at 1200 baud: taken for "any count", it would bar all of the drive's reads."""
+    known = exchange(READ, drive, answer=(least, least))
+    drive.prove_by([known, exchange(OTHER, drive, answer=(7, 7))])
+    time_out(line, drive, Message(1, 3, 90, 1))
+    send(line, known)
+    line.receive(reply(7))
+    assert line.listens
+    line.receive(reply(least))
+    assert (line.want, line.completion.reply.data) == ("done", words(least))

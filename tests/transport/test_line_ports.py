@@ -21,6 +21,8 @@ from toy import PatientToy, Toy
 from multidrop.bus import Bus
 from multidrop.capture import Capture, CaptureWriter, Decoding, Tapped
 from multidrop.core import Echo, Port, set_settings
+from multidrop.drive import Drive
+from multidrop.drives import MODELS
 from multidrop.errors import LineError, NoReply, Unconfirmed
 from multidrop.poller import Poller
 from multidrop.sim import Simulator, Wire, simulated
@@ -48,6 +50,19 @@ def test_a_socket() -> None:
     with Simulator([wire("socket://127.0.0.1:0")]) as sim, Bus(sim.wires[0].path) as bus:
         read_and_write(bus)
     assert sim.wires[0].drives[0]["frequency"] == 25.0
+
+
+@pytest.mark.parametrize(
+    ("family", "baudrate"),
+    [(family, baudrate) for family in MODELS.values() for baudrate in family.baudrates],
+)
+def test_every_documented_baud_rate_can_be_read(family: type[Drive], baudrate: int) -> None:
+    """A drive may hold the code of its baud rate, which is then part of what its replies prove."""
+    drive = simulated(family(1, baudrate=baudrate))
+    with Simulator([Wire([drive], unpaced=True)]) as sim, Bus(sim.wires[0].path) as bus:
+        attached = bus.attach(family, 1, baudrate=baudrate)
+        first = next(iter(attached.readings()))
+        assert bus.read(attached, first) == drive[first.name]
 
 
 @pytest.mark.skipif(not hasattr(socket, "TCP_USER_TIMEOUT"), reason="this system knows no such time-out")

@@ -183,7 +183,7 @@ class Exchange:
         echo_probe: Exchange | None = None,
         permit: Permit | None = None,
     ) -> None:
-        least, most = answer or (0, 0)
+        least, most = answer or (0, -1)  # the core takes the first count above them; 0: none is
         frame = build_request(framing, request)
         kept = frame if len(frame) <= lib.MD_KEPT_FRAME else b""  # the core builds a longer one again
         self.framing = framing
@@ -212,7 +212,7 @@ class Exchange:
                 "insists": insists,
                 "timeout_ns": round(timeout * 1e9),
                 "least": least,
-                "most": most,
+                "end": most + 1,
                 "drive": peer.c,
                 "block": block.c if block else ffi.NULL,
                 "echo_probe": echo_probe.c if echo_probe else ffi.NULL,
