@@ -71,9 +71,12 @@ int64_t md_timeout_ns(const struct md_exchange *exchange)
     return later(md_vain_ns(drive), later(learnt(&drive->patience_ns), exchange->timeout_ns));
 }
 
+/* A write waits longer than the drive's time-out: the window goes on for as long after either. */
 int64_t md_window_ns(const struct md_exchange *exchange)
 {
-    return later(3 * md_vain_ns(exchange->drive), exchange->drive->most_timeout_ns);
+    const struct md_drive *drive = exchange->drive;
+    int64_t longer_ns = later(md_timeout_ns(exchange) - md_vain_ns(drive), 0);
+    return longer_ns + later(3 * md_vain_ns(drive), drive->most_timeout_ns);
 }
 
 int64_t md_present_timeout_ns(const struct md_drive *drive)

@@ -370,6 +370,18 @@ def test_what_a_late_answer_of_delixi_s_own_protocol_could_be_taken_for(
     assert line.completion.result == Failure.LATE_ANSWER_DUE
 
 
+def test_a_late_answer_of_a_write_is_expected_beyond_its_own_time_out(line: LineDriver, drive: Peer) -> None:
+    """Its late refusal would be told as the next write's, whose motor has started."""
+    line.begin(exchange(WRITE, drive, timeout=5 * MOST / 1e9))
+    line.wait_until_write()
+    line.wait_until_done()
+    line.now += 3 * LEAST
+    line.begin(exchange(Message(1, 6, 9, data=words(1)), drive))
+    assert (line.want, line.completion.result) == ("done", Failure.LATE_ANSWER_DUE)
+    line.now = drive.late_until_ns
+    ask(line, drive, WRITE)
+
+
 def test_a_stop_waits_for_no_late_answer(line: LineDriver, drive: Peer) -> None:
     time_out(line, drive, WRITE)
     stop = exchange(WRITE, drive)
