@@ -325,10 +325,11 @@ class Bus:
         return self._performer.write(drive, register, value)
 
     def raw(self, drive: Drive, function: int, start: int, data: bytes = b"", *, count: int = 0) -> bytes:
-        """Send any request once, past every rule, and return the data of the reply.
+        """Send any request but a Modbus read once, past every rule, and return the data of the reply.
 
         The one deliberate way round: no check of the drive's identity, no span, no budget. It may start a
-        motor. Raises Unconfirmed when no answer comes, and DriveRefused; Overtaken and Expired as `write`.
+        motor. Raises Unconfirmed when no answer comes, and DriveRefused; Overtaken and Expired as `write`;
+        ValueError for functions 1 to 4, which `ask` sends.
         """
         check_drive(drive)
         if not isinstance(data, bytes | bytearray):

@@ -124,6 +124,15 @@ def test_what_is_no_number_is_told(simulated: SimulatedBus, asked: tuple[int, in
     assert simulated.frames == []
 
 
+@pytest.mark.parametrize("function", [1, 2, 3, 4])
+def test_a_raw_request_is_no_read(simulated: SimulatedBus, function: int) -> None:
+    """It waits as long as a write may take: a late reply to the one before could then be its own."""
+    bus, (toy,) = simulated.bus, simulated.bus.drives
+    with pytest.raises(ValueError, match=rf"{function:02X}H is a read.*call bus.ask\(drive, {function}, 80, 2\)"):
+        bus.raw(toy, function, 80, count=2)
+    assert simulated.frames == []
+
+
 def test_limits_of_families(monkeypatch: pytest.MonkeyPatch) -> None:
     bus, native, _ = one(monkeypatch, DelixiNative(1))
     with pytest.raises(ValueError, match="speaks Delixi's own protocol"):

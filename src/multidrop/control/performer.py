@@ -16,6 +16,7 @@ from multidrop.control.writer import Writer
 from multidrop.core import Message
 from multidrop.drive.family import Drive
 from multidrop.drive.register import Register
+from multidrop.drive.request import check_no_read
 from multidrop.drive.script import Insist, Read, Script, Step, Wait, Write, carry_out
 from multidrop.errors import (
     BadReply,
@@ -100,7 +101,8 @@ class Performer:
                 return self._writer.verified(drive, outcome)
 
     def raw(self, drive: Drive, request: Message) -> bytes:
-        """Send any request once, and return the data of the reply."""
+        """Send any request once, and return the data of the reply; ValueError for a Modbus read."""
+        check_no_read(drive, request)
         call = self.call(drive)
         with call.noted():
             return self._writer.raw(drive, request, call)

@@ -51,6 +51,19 @@ def write_request(drive: Drive, register: Register[Any], raw: float, address: in
     return Message(to, _WRITE_WORDS, at, count=register.words, data=words)
 
 
+def check_no_read(drive: Drive, request: Message) -> None:
+    """Raise ValueError for a read of Modbus.
+
+    One that waits as long as a write may return the late reply to another read.
+    """
+    if drive.framing is not Framing.DELIXI and request.function in FUNCTIONS:
+        asked = f"{request.function}, {request.start}, {request.count}"
+        raise ValueError(
+            f"function {request.function:02X}H is a read, which bus.raw does not send: call "
+            f"bus.ask(drive, {asked}), which returns no late reply to another request"
+        )
+
+
 def any_read(drive: Drive, function: int, start: int, count: int) -> Message:
     """Return the request that reads addresses by one of Modbus' functions 01 to 04, declared or not.
 
