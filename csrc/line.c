@@ -86,7 +86,6 @@ void md_line_begin(struct md_line *line, const struct md_exchange *exchange, str
     line->exchange = exchange;
     line->completion = completion;
     line->tx_at = 0;
-    line->echo_due = line->echo != MD_NO_ECHO && !line->transactions;
     line->silence_ns = later(line->silence_ns, silence_of(line, exchange));
     line->give_up_ns = later(now_ns, md_line_silent_ns(line)) + exchange->drive->most_timeout_ns;
     md_line_go(line, MD_BEGUN);
@@ -148,7 +147,7 @@ int md_line_want(struct md_line *line, int64_t now_ns)
             md_line_go(line, MD_TIME_OUT);
         return MD_READ;
     case MD_LAST_LOOK:
-        finish(line, line->transactions ? md_tcp_missed(line) : md_reply_missed(line));
+        finish(line, line->transactions ? md_tcp_missed(line) : md_reply_missed(line, now_ns));
         return MD_DONE;
     default:
         return MD_DONE;
@@ -175,6 +174,7 @@ void md_line_sent(struct md_line *line, size_t len, int64_t begun_ns, int64_t no
     md_echo_keep(line);
     int reply_len = md_reply_length(exchange->framing, &exchange->request);
     if (reply_len > 0) {
+        line->echo_due = (uint8_t)md_echo_is_due(line, reply_len);
         md_reply_await(line, reply_len);
         return;
     }

@@ -65,6 +65,7 @@ struct md_line {
     uint8_t echo;        /* of the adapter (enum md_echo): learnt, never forgotten by failures */
     uint8_t echo_is_told; /* to be there, and is not unlearnt */
     uint8_t echo_due;    /* a copy of the request is still to come, and is not its reply */
+    uint8_t lone_copies; /* in a row that were taken for replies, up to a bound */
     uint8_t transactions; /* enum md_transactions; the line is told before its first exchange */
     uint8_t is_out_of_step; /* what came is no header of Modbus TCP: the port is to be lost */
     uint8_t waited;      /* since the request left a wait was granted */
@@ -154,7 +155,7 @@ void md_reply_foresee(struct md_line *line, int64_t now_ns);
 /* Anything came, but at most the request's echo. */
 int md_reply_has_begun(const struct md_line *line);
 /* End the exchange at its time-out. */
-struct md_ending md_reply_missed(struct md_line *line);
+struct md_ending md_reply_missed(struct md_line *line, int64_t now_ns);
 /* Recognise late replies among stray bytes, from here on; what follows is looked for behind them. */
 void md_reply_find_late(struct md_line *line, size_t from, int64_t now_ns);
 
@@ -188,14 +189,21 @@ struct md_ending md_tcp_missed(struct md_line *line);
 
 /* ---- echo.c: adapters that repeat what they send ---- */
 
+/* A copy of the request may come that is not its reply. */
+int md_echo_is_due(const struct md_line *line, int reply_len);
 /* A copy of the request is there. */
 int md_echo_is_copy(const struct md_line *line, size_t at);
 /* All that is there begins as the request does, and is shorter. */
 int md_echo_may_follow(const struct md_line *line, size_t at);
 /* Learn from a reply that is no copy of its request. */
 void md_echo_learn(struct md_line *line, size_t reply_at);
-/* Learn from a copy that is all that came before the time-out; 1: it may have been the reply. */
-int md_echo_learn_alone(struct md_line *line, int is_reply);
+/* Learn from a copy that is all that came before the time-out: whether it was the reply, as far as it can be. */
+enum md_copy { MD_COPY_IS_ECHO, MD_COPY_MAY_BE_REPLY, MD_COPY_IS_REPLY };
+enum md_copy md_echo_learn_alone(struct md_line *line, int may_be_reply);
+/* Learn from a request to which nothing came, not even its copy. */
+void md_echo_learn_silence(struct md_line *line);
+/* An echo probe is to be sent first. */
+int md_echo_is_in_doubt(const struct md_line *line);
 /* Drop what came while the request was leaving, but the beginning of its echo. */
 void md_echo_keep(struct md_line *line);
 

@@ -5,7 +5,7 @@
 enum { MOST_PROOFS_SENT = 12 }; /* before one exchange */
 
 const struct md_exchange *md_before_find(struct md_before *before, const struct md_exchange *exchange,
-                                         int echo, int64_t now_ns)
+                                         int is_echo_in_doubt, int64_t now_ns)
 {
     const struct md_drive *drive = exchange->drive;
     if (before->then != exchange)
@@ -17,7 +17,7 @@ const struct md_exchange *md_before_find(struct md_before *before, const struct 
         before->replies = md_replies(drive);
         return proof;
     }
-    if (!exchange->echo_probe || echo != MD_ECHO_UNKNOWN || before->is_probed)
+    if (!exchange->echo_probe || !is_echo_in_doubt || before->is_probed)
         return NULL;
     before->is_probed = 1;
     return exchange->echo_probe;

@@ -42,7 +42,7 @@ static int64_t ready_ns(const struct md_exchange *exchange)
 static int begin(struct md_turn *turn, int whose, const struct md_exchange *exchange,
                  struct md_completion *completion, int64_t now_ns)
 {
-    const struct md_exchange *first = md_before_find(&turn->before, exchange, turn->line.echo, now_ns);
+    const struct md_exchange *first = md_before_find(&turn->before, exchange, md_echo_is_in_doubt(&turn->line), now_ns);
     turn->whose = first ? MD_BEFOREHAND : whose;
     md_line_begin(&turn->line, first ? first : exchange, first ? &turn->completion : completion, now_ns);
     if (turn->progress.lost)

@@ -254,13 +254,22 @@ static int is_damaged_answer(const struct md_line *line, size_t begin, int found
     return found == MD_BAD_CHECKSUM;
 }
 
-struct md_ending md_reply_missed(struct md_line *line)
+struct md_ending md_reply_missed(struct md_line *line, int64_t now_ns)
 {
     const struct md_exchange *exchange = line->exchange;
     struct md_message reply;
+    struct md_ending ending;
     size_t begin = md_echo_is_copy(line, 0) ? line->tx_len : 0; /* the adapter's echo says nothing */
-    int is_alone = begin > 0 && begin == line->rx_len;
-    int is_doubtful = is_alone && md_echo_learn_alone(line, md_reply_parse(line, 0, &reply) > 0);
+    int is_doubtful = 0;
+    if (line->rx_len == 0)
+        md_echo_learn_silence(line);
+    if (begin > 0 && begin == line->rx_len) {
+        int used = md_reply_parse(line, 0, &reply);
+        enum md_copy copy = md_echo_learn_alone(line, used > 0);
+        if (copy == MD_COPY_IS_REPLY && md_reply_judge(line, 0, used, &reply, now_ns, &ending))
+            return ending;
+        is_doubtful = copy == MD_COPY_MAY_BE_REPLY;
+    }
     int first = begin == line->rx_len ? MD_NO_REPLY : md_reply_parse(line, begin, &reply);
     /* With others outstanding it may be the answer to one of them. */
     if (exchange->drive->owed_count || !is_damaged_answer(line, begin, first))

@@ -73,7 +73,7 @@ void md_turn_close(struct md_turn *turn);           /* end everything */
 
 /* Return what to send before the exchange; NULL: it is its turn. */
 const struct md_exchange *md_before_find(struct md_before *before, const struct md_exchange *exchange,
-                                         int echo, int64_t now_ns);
+                                         int is_echo_in_doubt, int64_t now_ns);
 /* Its turn is over; 1: its reply may have been an earlier one, and it is sent again. */
 int md_before_is_again(struct md_before *before, const struct md_exchange *exchange,
                        const struct md_completion *completion);

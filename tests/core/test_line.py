@@ -672,3 +672,60 @@ def test_delixi_s_query_of_a_zero_behind_its_echo(line: LineDriver) -> None:
         assert line.wait_until_write() == ask_value
         answer(line, ask_value + reply)
         assert (line.completion.reply.data, line.completion.skipped) == (words(0, frequency), 21)
+
+
+QUERY = Message(1, 0x07, 500, data=bytes(4))
+ECHO = build_request(Framing.DELIXI, QUERY)  # as a reply it says 0
+
+
+def query(line: LineDriver) -> None:
+    """Ask a Delixi drive for a parameter; first for its state, whose reply shows that there is no echo."""
+    line.begin(exchange(Message(1, 3, 0, data=words(0, 0)), framing=Framing.DELIXI))
+    line.wait_until_write()
+    answer(line, b":010300030000000007\r\n")
+    line.begin(exchange(QUERY, framing=Framing.DELIXI))
+    line.wait_until_write()
+
+
+@pytest.mark.parametrize("piece", [4096, 1], ids=["whole", "byte by byte"])
+@pytest.mark.parametrize("gap", [0, 5 * MS, TIMEOUT // 2])
+def test_the_first_echo_of_a_line_that_had_none_is_no_value_of_0(
+    line: LineDriver, gap: int, piece: int
+) -> None:
+    query(line)
+    line.receive(ECHO, piece)
+    assert line.listens
+    line.now += gap
+    answer(line, build_reply(Framing.DELIXI, replace(QUERY, data=b"\0\0\x13\x88")), piece)
+    assert (line.completion.reply.data, line.completion.skipped) == (b"\0\0\x13\x88", 21)
+    assert line.echo == lib.MD_ECHO
+
+
+def test_a_value_of_0_is_taken_when_no_reply_comes_behind_it(line: LineDriver) -> None:
+    query(line)
+    line.now += 40 * MS
+    line.receive(ECHO)
+    came = line.now
+    assert line.listens
+    line.wait_until_done()
+    assert (line.completion.reply.data, line.completion.raw) == (bytes(4), ECHO)
+    assert (line.completion.first_ns <= came, line.completion.last_ns) == (True, came)
+    assert line.echo == lib.MD_NO_ECHO
+
+
+def test_a_value_of_0_that_comes_twice_leaves_the_echo_open(line: LineDriver) -> None:
+    query(line)
+    answer(line, ECHO + ECHO)
+    assert line.completion.reply.data == bytes(4)
+    assert line.echo == lib.MD_ECHO_UNKNOWN
+
+
+def test_coils_that_are_a_copy_of_their_request_are_taken_when_nothing_follows(line: LineDriver) -> None:
+    """A read of 17 coils from 03xxH has a reply of its own request's length and first three bytes."""
+    copy = rtu("01 01 03 20 00 11")
+    ask(line)
+    answer(line, reply_of(1))
+    for reply in (copy, copy + rtu("01 01 03 55 55 01")):
+        ask(line, Message(1, 1, 0x320, 17))
+        answer(line, reply)
+        assert line.completion.reply.data == reply[-5:-2]

@@ -128,7 +128,9 @@ def test_what_is_no_number_is_told(simulated: SimulatedBus, asked: tuple[int, in
 def test_a_raw_request_is_no_read(simulated: SimulatedBus, function: int) -> None:
     """It waits as long as a write may take: a late reply to the one before could then be its own."""
     bus, (toy,) = simulated.bus, simulated.bus.drives
-    with pytest.raises(ValueError, match=rf"{function:02X}H is a read.*call bus.ask\(drive, {function}, 80, 2\)"):
+    with pytest.raises(
+        ValueError, match=rf"{function:02X}H is a read.*call bus.ask\(drive, {function}, 80, 2\)"
+    ):
         bus.raw(toy, function, 80, count=2)
     assert simulated.frames == []
 
