@@ -75,9 +75,18 @@ int md_tcp_length(const uint8_t *bytes, size_t len)
     return whole < MD_TCP_HEAD + 2 || whole > MD_MOST_TCP ? MD_NO_START : whole;
 }
 
+int md_tcp_is_exception(const uint8_t *bytes, size_t len, const struct md_message *request)
+{
+    const uint8_t *body = bytes + MD_TCP_HEAD;
+    return request && len >= MD_TCP_HEAD + 2 && md_get16(bytes + 2) == 0 && body[0] == request->address &&
+           body[1] == (request->function | MD_EXCEPTION_BIT);
+}
+
 static int open_tcp(const uint8_t *bytes, size_t len, const struct md_message *request, const uint8_t **body)
 {
     int whole = md_tcp_length(bytes, len);
+    if (md_tcp_is_exception(bytes, len, request))
+        whole = MD_TCP_EXCEPTION;
     if (whole <= 0)
         return whole;
     size_t have = len < (size_t)whole ? len : (size_t)whole;

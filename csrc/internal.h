@@ -59,7 +59,11 @@ int md_body_get_reply(int framing, const uint8_t *body, const struct md_message 
 
 /* ---- frame.c, reason.c ---- */
 
-enum { MD_MOST_ADDRESS = 247, MD_TCP_HEAD = 6 /* before the unit id, which is the address */ };
+enum {
+    MD_MOST_ADDRESS = 247,
+    MD_TCP_HEAD = 6, /* before the unit id, which is the address */
+    MD_TCP_EXCEPTION = MD_TCP_HEAD + 3
+};
 
 enum { MD_WRITE_COIL = 0x05, MD_WRITE_ONE = 0x06, MD_LOOPBACK = 0x08, MD_EXCEPTION_BIT = 0x80 };
 
@@ -84,6 +88,8 @@ void md_copy_message(struct md_message *to, const struct md_message *from);
 int md_hex_byte(const uint8_t digits[2]); /* value of two upper-case hex digits; -1 where they are none */
 /* Return the length that a header of Modbus TCP announces, an enum md_frame_fault where it is none. */
 int md_tcp_length(const uint8_t *bytes, size_t len);
+/* An exception to this request begins there. Its length is fixed, and some devices announce another one. */
+int md_tcp_is_exception(const uint8_t *bytes, size_t len, const struct md_message *request);
 /* A gateway has no path to the drive, or no reply from it: the drive itself said nothing. */
 int md_is_gateways(int framing, const struct md_message *reply);
 /* Return why these bytes, which came in place of the reply, are none: an enum md_frame_fault, MD_CUT_SHORT or

@@ -162,6 +162,7 @@ void md_line_sent(struct md_line *line, size_t len, int64_t begun_ns, int64_t no
     if (line->tx_at == 0) {
         line->completion->sent_ns = begun_ns;
         line->rx_len = line->rx_from = 0;
+        md_tcp_disown(line);
     }
     if (line->tap)
         line->tap->ahead_ns = line->completion->utc_ahead_ns;
@@ -240,7 +241,7 @@ static void take_frames(struct md_line *line, const uint8_t *bytes, size_t len, 
             if (line->completion->first_ns == 0)
                 line->completion->first_ns = now_ns;
         }
-        size_t taken = md_tcp_put(line, bytes, len);
+        size_t taken = md_tcp_put(line, bytes, len, now_ns);
         bytes += taken;
         len -= taken;
         if (md_tcp_find(line, now_ns, &ending))

@@ -68,6 +68,8 @@ struct md_line {
     uint8_t lone_copies; /* in a row that were taken for replies, up to a bound */
     uint8_t transactions; /* enum md_transactions; the line is told before its first exchange */
     uint8_t is_out_of_step; /* what came is no header of Modbus TCP: the port is to be lost */
+    uint8_t is_adrift;      /* a frame was longer or shorter than its header says: the next head is looked for */
+    uint8_t is_proven;      /* a good reply came on this connection */
     uint8_t waited;      /* since the request left a wait was granted */
     uint32_t looks;      /* at the port, since then */
     uint32_t cut;        /* bytes of late replies, since then */
@@ -180,8 +182,10 @@ static inline int64_t md_wire_ns(const struct md_exchange *exchange, int64_t len
 
 /* Give the request that is about to leave a transaction of its own. */
 void md_tcp_begin(struct md_line *line);
+/* A frame that has begun to come is no reply to the request that leaves now. */
+void md_tcp_disown(struct md_line *line);
 /* Take in bytes, up to the end of a frame; return how many. */
-size_t md_tcp_put(struct md_line *line, const uint8_t *bytes, size_t len);
+size_t md_tcp_put(struct md_line *line, const uint8_t *bytes, size_t len, int64_t now_ns);
 /* Look at the frame, if it is whole; 1: the exchange ends. */
 int md_tcp_find(struct md_line *line, int64_t now_ns, struct md_ending *ending);
 /* End the exchange at its time-out. */

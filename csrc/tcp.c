@@ -4,8 +4,9 @@
  * skipped. So no late reply can pass for another's, whatever it holds. Where a gateway replies with ids of
  * its own, the rules of late.c hold instead.
  *
- * A frame's length stands in its header alone. What is no header leaves no place to begin again: the
- * connection must be made anew. */
+ * A frame's length is in its header alone. Where a device sends more or less than its header says, the head of
+ * the awaited reply is looked for by its id, unit and function. If no good reply has come yet, what is no
+ * header says that the far end speaks something else: the connection is lost. */
 #include "line.h"
 
 #include <string.h>
@@ -17,21 +18,122 @@ void md_tcp_begin(struct md_line *line)
 
 /* ---- whole frames ---- */
 
-size_t md_tcp_put(struct md_line *line, const uint8_t *bytes, size_t len)
-{
-    int whole = md_tcp_length(line->frame, line->frame_len);
-    size_t wanted = (whole > 0 ? (size_t)whole : MD_TCP_HEAD) - line->frame_len;
-    size_t taken = len < wanted ? len : wanted;
-    memcpy(line->frame + line->frame_len, bytes, taken);
-    line->frame_len = (uint16_t)(line->frame_len + taken);
-    line->is_out_of_step = md_tcp_length(line->frame, line->frame_len) < 0;
-    return taken;
-}
+enum { KNOWN_HEAD = MD_TCP_HEAD + 2 /* with the unit id and the function code */ };
 
 static int is_ours(const struct md_line *line)
 {
     return line->transactions == MD_IGNORED ||
            (line->frame_len >= 2 && md_get16(line->frame) == line->transaction);
+}
+
+/* The awaited reply may begin there, as far as these bytes go and whatever length they announce. */
+static int may_be_awaited(const struct md_line *line, const uint8_t *bytes, size_t len)
+{
+    if (line->state < MD_AWAITING)
+        return 0;
+    const struct md_message *request = &line->exchange->request;
+    uint8_t any_id = line->transactions == MD_IGNORED ? 0xFF : 0;
+    uint8_t head[KNOWN_HEAD] = {(uint8_t)(line->transaction >> 8), (uint8_t)line->transaction,
+                                [MD_TCP_HEAD] = request->address, request->function};
+    const uint8_t any[KNOWN_HEAD] = {any_id, any_id, 0, 0, 0xFF, 0xFF, 0, MD_EXCEPTION_BIT};
+    for (size_t i = 0; i < len && i < KNOWN_HEAD; i++)
+        if ((bytes[i] ^ head[i]) & ~any[i])
+            return 0;
+    return 1;
+}
+
+/* Return the length of the frame that has begun, as md_tcp_length(). Of the awaited reply an exception has
+ * its own, and a length that cannot be leaves no more than the head. */
+static int frame_length(const struct md_line *line)
+{
+    int whole = md_tcp_length(line->frame, line->frame_len);
+    if (line->frame_told || line->frame_len < MD_TCP_HEAD ||
+        !may_be_awaited(line, line->frame, line->frame_len))
+        return whole;
+    if (md_tcp_is_exception(line->frame, line->frame_len, &line->exchange->request))
+        return MD_TCP_EXCEPTION;
+    return line->frame_len < KNOWN_HEAD || whole < 0 ? KNOWN_HEAD : whole;
+}
+
+/* Report bytes that are no part of a frame. */
+static void skip(struct md_line *line, const uint8_t *bytes, size_t len, int64_t now_ns)
+{
+    md_tap_put(line->tap, MD_NOISE, now_ns, bytes, len);
+    if (line->state >= MD_AWAITING)
+        line->completion->skipped += (uint32_t)len;
+    else if (line->state != MD_IDLE)
+        line->completion->stale += (uint32_t)len;
+}
+
+static void cut_off(struct md_line *line, size_t len)
+{
+    line->frame_len = (uint16_t)(line->frame_len - len);
+    memmove(line->frame, line->frame + len, line->frame_len);
+}
+
+/* Leave the beginning of the awaited reply at most. */
+static void realign(struct md_line *line, int64_t now_ns)
+{
+    cut_off(line, line->frame_told);
+    line->frame_told = 0;
+    while (line->frame_len && !may_be_awaited(line, line->frame, line->frame_len)) {
+        skip(line, line->frame, 1, now_ns);
+        cut_off(line, 1);
+    }
+}
+
+/* Take in bytes up to the head of the awaited reply. */
+static size_t seek(struct md_line *line, const uint8_t *bytes, size_t len, int64_t now_ns)
+{
+    size_t taken = 0;
+    if (line->state < MD_AWAITING) {
+        skip(line, bytes, len, now_ns);
+        return len;
+    }
+    while (taken < len && line->frame_len < KNOWN_HEAD) {
+        line->frame[line->frame_len++] = bytes[taken++];
+        realign(line, now_ns);
+    }
+    line->is_adrift = line->frame_len < KNOWN_HEAD;
+    return taken;
+}
+
+/* Be done with a frame that is part of no exchange. */
+static void drop(struct md_line *line, int64_t now_ns)
+{
+    md_tap_put(line->tap, MD_NOISE, now_ns, line->frame + line->frame_told,
+               (size_t)(line->frame_len - line->frame_told));
+    line->frame_len = line->frame_told = 0;
+}
+
+void md_tcp_disown(struct md_line *line)
+{
+    size_t untold = (size_t)(line->frame_len - line->frame_told);
+    md_tap_put(line->tap, MD_NOISE, line->completion->sent_ns, line->frame + line->frame_told, untold);
+    line->completion->stale += (uint32_t)untold;
+    line->frame_told = line->frame_len;
+    line->is_adrift |= line->frame_len > 0;
+}
+
+size_t md_tcp_put(struct md_line *line, const uint8_t *bytes, size_t len, int64_t now_ns)
+{
+    size_t enough = line->transactions == MD_IGNORED ? KNOWN_HEAD : MD_TCP_HEAD;
+    if (line->is_adrift && line->frame_told && len >= enough && may_be_awaited(line, bytes, len))
+        drop(line, now_ns); /* its rest never comes */
+    if (line->is_adrift && !line->frame_told)
+        return seek(line, bytes, len, now_ns);
+    int whole = frame_length(line);
+    size_t end = whole > 0 ? (size_t)whole : MD_TCP_HEAD;
+    size_t wanted = end > line->frame_len ? end - line->frame_len : 0, taken = len < wanted ? len : wanted;
+    memcpy(line->frame + line->frame_len, bytes, taken);
+    line->frame_len = (uint16_t)(line->frame_len + taken);
+    if (frame_length(line) >= 0)
+        return taken;
+    line->is_adrift |= line->is_proven;
+    line->is_out_of_step = !line->is_adrift;
+    if (line->is_adrift)
+        realign(line, now_ns);
+    return taken;
 }
 
 /* Put what there is of a frame behind those that came before it, and report no byte of it twice. */
@@ -45,13 +147,6 @@ static size_t keep(struct md_line *line)
     memcpy(line->rx + at, line->frame, line->frame_len);
     line->rx_len = (uint16_t)(at + line->frame_len);
     return at;
-}
-
-/* Be done with a frame that is part of no exchange. */
-static void drop(struct md_line *line, int64_t now_ns)
-{
-    md_tap_put(line->tap, MD_NOISE, now_ns, line->frame + line->frame_told,
-               (size_t)(line->frame_len - line->frame_told));
 }
 
 /* ---- late replies ---- */
@@ -143,6 +238,10 @@ static int judge(struct md_line *line, size_t at, int64_t now_ns, struct md_endi
 {
     struct md_message reply;
     int used = md_reply_parse(line, at, &reply);
+    int is_odd = used > 0 ? used != md_tcp_length(line->frame, line->frame_len)
+                          : used == MD_BAD_LENGTH || used == MD_NO_START;
+    line->is_adrift |= (uint8_t)is_odd;
+    line->is_proven |= used > 0;
     if (used > 0 && md_is_gateways(MD_TCP, &reply)) { /* the drive said nothing, and may still say it */
         expect(line);
         *ending = (struct md_ending){MD_NO_REPLY, at, line->frame_len};
@@ -165,7 +264,9 @@ static int judge(struct md_line *line, size_t at, int64_t now_ns, struct md_endi
 int md_tcp_find(struct md_line *line, int64_t now_ns, struct md_ending *ending)
 {
     int is_awaited = line->state >= MD_AWAITING, is_end = 0;
-    int whole = md_tcp_length(line->frame, line->frame_len);
+    int whole = frame_length(line);
+    if (line->is_adrift && !line->frame_told)
+        return 0;
     if (whole == MD_INCOMPLETE || (whole > 0 && line->frame_len < whole))
         return 0;
     if (is_awaited)
@@ -181,6 +282,7 @@ int md_tcp_find(struct md_line *line, int64_t now_ns, struct md_ending *ending)
             line->completion->first_ns = 0;
     } else {
         pass(line, now_ns);
+        line->is_adrift = 0;
     }
     line->frame_len = line->frame_told = 0;
     return is_end;
@@ -195,6 +297,7 @@ struct md_ending md_tcp_missed(struct md_line *line)
         keep(line);
         line->frame_told = line->frame_len;
     }
+    line->is_adrift |= line->frame_len > 0;
     expect(line);
     md_learn_silence(exchange->drive);
     int reason = md_reason(MD_TCP, &exchange->request, line->rx, line->rx_len);

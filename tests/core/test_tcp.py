@@ -38,6 +38,7 @@ from multidrop.core import (
 
 TCP = Framing.TCP
 NUMBER = 400  # random frames
+EXCEPTION = 9  # bytes of one, whatever its header says
 
 # As printed: in the messaging guide for TCP/IP V1.0b, 4.4.2 (read one register of unit FF), and in a panel
 # meter's manual (write one register, and its reply).
@@ -85,7 +86,10 @@ def test_bodies_mean_what_they_mean_over_rtu(replies: bool) -> None:
             assert found == replace(meant, transaction=number)
             assert network == len(frame)
         elif serial in (FrameFault.INCOMPLETE, FrameFault.BAD_CHECKSUM) or serial > 0:
-            assert network == FrameFault.BAD_LENGTH
+            is_exception = replies and frame[6:8] == bytes(
+                [said.request.address, said.request.function | 0x80]
+            )
+            assert network == (EXCEPTION if is_exception else FrameFault.BAD_LENGTH)
         else:
             assert network == serial
     assert seen == {True, False}
@@ -304,6 +308,94 @@ def test_a_wrong_reply_with_the_right_id_is_told_at_the_time_out(
     line.wait_until_done()
     assert line.completion.result == result
     assert line.completion.raw == tcp(transaction, body)
+
+
+# ---- devices whose headers lie ----
+
+
+def odd(transaction: int, body: bytes, length: int) -> bytes:
+    """A frame whose header announces another length."""
+    return transaction.to_bytes(2) + b"\0\0" + length.to_bytes(2) + body
+
+
+def is_read(line: LineDriver, drive: Peer, raw: int, piece: int = 4096) -> bool:
+    line.receive(value(ask(line, drive), raw), piece)
+    return line.want == "done" and line.completion.reply.data == words(raw)
+
+
+@pytest.mark.parametrize("piece", [1, 4096])
+@pytest.mark.parametrize("more", [b"", b"\0", b"\1\2\3"], ids=["short", "a byte more", "three bytes more"])
+@pytest.mark.parametrize("length", [0, 1, 2, 4, 6, 9, 254, 255, 0xFFFF])
+def test_an_exception_is_two_bytes_whatever_its_header_says(
+    line: LineDriver, drive: Peer, length: int, more: bytes, piece: int
+) -> None:
+    assert is_read(line, drive, 1)
+    line.receive(odd(ask(line, drive), bytes([1, 0x83, 3]) + more, length), piece)
+    assert (line.want, line.completion.reply.exception) == ("done", 3)
+    assert is_read(line, drive, 2, piece)
+    assert not line.is_out_of_step
+
+
+@pytest.mark.parametrize("piece", [1, 6, 4096])
+@pytest.mark.parametrize("length", [0, 2, 4, 6, 12, 255])
+def test_a_reply_of_another_length_than_its_header_s_ends_one_exchange(
+    line: LineDriver, drive: Peer, length: int, piece: int
+) -> None:
+    assert is_read(line, drive, 1)
+    line.receive(odd(ask(line, drive), bytes([1, 3, 2]) + words(7), length), piece)
+    line.wait_until_done()
+    assert line.completion.result in (FrameFault.BAD_LENGTH, FrameFault.NO_START)
+    assert is_read(line, drive, 2, max(piece, 6))
+    assert is_read(line, drive, 3, piece)
+    assert not line.is_out_of_step
+
+
+@pytest.mark.parametrize("missing", range(1, 10))
+@pytest.mark.parametrize("transactions", [Transactions.MATCHED, Transactions.IGNORED])
+def test_a_reply_whose_end_never_comes_ends_one_exchange(
+    drive: Peer, missing: int, transactions: Transactions
+) -> None:
+    line = LineDriver(transactions)
+    assert is_read(line, drive, 1)
+    line.receive(value(ask(line, drive), 7)[:-missing])
+    line.wait_until_done()
+    assert line.completion.result == Failure.CUT_SHORT
+    line.now += max(0, drive.late_until_ns - line.now)
+    assert is_read(line, drive, 2)
+    assert is_read(line, drive, 3)
+    assert not line.is_out_of_step
+
+
+def test_what_began_to_come_before_a_request_is_no_reply_to_it(line: LineDriver, drive: Peer) -> None:
+    following = ask(line, drive) + 1
+    line.receive(value(following - 1, 1))
+    assert line.want == "done"
+    line.receive(value(following, 7)[:8])
+    assert ask(line, drive) == following
+    line.receive(value(following, 7)[8:])
+    assert line.listens
+    line.receive(value(following, 9))
+    assert (line.want, line.completion.reply.data) == ("done", words(9))
+
+
+def test_a_reply_whose_end_never_comes_ends_two_exchanges_byte_by_byte(line: LineDriver, drive: Peer) -> None:
+    assert is_read(line, drive, 1)
+    line.receive(value(ask(line, drive), 7)[:-1])
+    line.wait_until_done()
+    assert not is_read(line, drive, 2, 1)
+    line.wait_until_done()
+    assert is_read(line, drive, 3, 1)
+
+
+@pytest.mark.parametrize("piece", [1, 4096])
+@pytest.mark.parametrize("noise", [b"\0", b"\xff\xff", bytes(30), b"\1\3\2\0\7\xf9\x86"])
+def test_bytes_behind_good_replies_lose_neither_a_reply_nor_the_connection(
+    line: LineDriver, drive: Peer, noise: bytes, piece: int
+) -> None:
+    for raw in range(5):
+        assert is_read(line, drive, raw, piece)
+        line.receive(noise, piece)
+    assert not line.is_out_of_step
 
 
 def test_a_write_is_confirmed_by_its_copy(line: LineDriver, drive: Peer) -> None:

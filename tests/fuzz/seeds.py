@@ -59,12 +59,21 @@ def frame() -> Iterator[bytes]:
         yield request * 2 + sent
 
 
+def came(frame: bytes) -> bytes:
+    return bytes([3, len(frame)]) + frame
+
+
 def tcp() -> Iterator[bytes]:
     for header in (bytes([0, 20]), bytes([1, 20])):
         for each in RTU:
             request, _, answered = over_tcp(each, 1)
             yield header + b"\0" + request + bytes([3, len(answered)]) + answered
             yield header + b"\0" + request + bytes([2, 2, 0]) + request + bytes([3, len(answered)]) + answered
+            good, again = header + b"\0" + request + came(answered), b"\0" + request
+            second, third = (struct.pack(">H", number) + answered[2:] for number in (2, 3))
+            lying = second[:5] + bytes([second[5] + 1]) + second[6:]
+            for odd in (second[:-1], lying, second + b"\0\0"):  # and the exchange after it
+                yield good + again + came(odd) + b"\2\2" + again + came(third)
 
 
 def line() -> Iterator[bytes]:
