@@ -257,7 +257,8 @@ struct md_completion {
 /* Progress of a port. Each number only grows, and wraps around. */
 struct md_progress {
     uint32_t submitted, done;
-    uint32_t lost;        /* the descriptor failed: all that follows is MD_LINE_LOST */
+    uint32_t lost;        /* the descriptor failed: all urgent ones that follow are MD_LINE_LOST */
+    uint32_t cut_off;     /* the newest polled exchange was lost with it, after replies to others on it */
     uint32_t repeating;   /* exchanges are repeated */
     uint32_t switches;    /* of baud rate and format */
     uint32_t echo;        /* of its adapter (enum md_echo), as far as is known */

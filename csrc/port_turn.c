@@ -110,7 +110,7 @@ static int take_queued(struct md_turn *turn, int64_t *wake_ns, int64_t now_ns)
 
 static int take_polled(struct md_turn *turn, int64_t *wake_ns, int64_t now_ns)
 {
-    if (turn->is_ending)
+    if (turn->is_ending || turn->progress.lost) /* what is queued waits for its client, who has it sent elsewhere */
         return 0;
     if (pending(turn) && take_queued(turn, wake_ns, now_ns))
         return 1;
@@ -276,9 +276,14 @@ int md_turn_want(struct md_turn *turn, int64_t *wake_ns, int64_t now_ns)
 
 void md_turn_lose(struct md_turn *turn, int error)
 {
+    int is_polled = turn->whose == MD_QUEUED || turn->whose == MD_REPEATED;
+    int is_cut_off = is_polled && turn->line.is_proven && md_line_is_under_way(&turn->line);
     turn->lost_error = error;
+    md_store(&turn->progress.cut_off, (uint32_t)is_cut_off);
     md_store(&turn->progress.lost, 1);
     md_line_abandon(&turn->line, MD_LINE_LOST, error);
+    if (is_cut_off && turn->whose == MD_REPEATED)
+        step_back(turn);
     stop_repeating(turn);
 }
 

@@ -113,6 +113,7 @@ void md_reply_accept(struct md_line *line, size_t at, int used, const struct md_
         note_answer(line, line->exchange->drive);
     md_copy_message(&line->completion->reply, reply);
     line->completion->skipped -= (uint32_t)used;
+    line->is_proven = 1;
     if (!line->transactions) {
         md_echo_learn(line, at);
         learn_burst(line, at, used);

@@ -711,17 +711,41 @@ def test_broadcast_is_sent_and_nobody_waited_for(drive: Drive) -> None:
     assert read_back.sent_ns - sent.sent_ns >= 1_000_000  # the turnaround delay
 
 
-def test_all_that_is_queued_on_a_lost_port_says_so() -> None:
+def test_what_is_queued_on_a_lost_port_stays_queued() -> None:
+    """Its client has it sent on the port that is opened next."""
     near, far = socket.socketpair()
     near.setblocking(False)
     with closing(Port(near.fileno(), NO_SETTINGS)) as port:
-        rows = Rows(port)
         far.close()
-        queued = [read(0), read(1), read(2)]
-        port.submit(queued, [0] * 3)
-        assert rows.of("status", 3) == [Status.LINE_LOST] * 3
-        assert port.lost
+        until(lambda: port.lost)
+        assert port.submit([read(0), read(1), read(2)], [0] * 3) == 3
+        assert (port.done, port.cut_off) == (0, False)
         assert port.carry_out(read(0)).result == Failure.LINE_LOST
+    near.close()
+
+
+@pytest.mark.parametrize("way", ["queued", "repeated"])
+@pytest.mark.parametrize("answered", [0, 1])
+def test_the_exchange_that_a_port_is_lost_with_is_known_unless_it_was_the_first(
+    answered: int, way: str
+) -> None:
+    near, far = socket.socketpair()
+    near.setblocking(False)
+    with closing(Port(near.fileno(), NO_SETTINGS)) as port:
+        todo = [read(0), read(1), read(2)]
+        port.submit(todo, [0] * 3) if way == "queued" else port.repeat(todo)
+        for _ in range(answered):
+            _, request = parse_request(Framing.RTU, far.recv(64))
+            assert request
+            far.send(echo_start(request))
+        far.recv(64)
+        far.close()
+        until(lambda: port.lost)
+        assert port.cut_off is (answered > 0)
+        if way == "queued":
+            until(lambda: port.done == answered + 1)
+        else:
+            assert port.repeat([]) == 1  # the one that was cut off, or the one after the first
     near.close()
 
 

@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
+import socket
 import threading
-from collections.abc import Iterator
-from contextlib import ExitStack
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from itertools import count
 from pathlib import Path
 
 import pytest
 from examples import usually
 from lines import line, plant, polled, rows_of, until
 
+from multidrop.core import Framing, Message, build_reply, parse_request
+from multidrop.drive import Drive
+from multidrop.drive.declare import reading
+from multidrop.drive.table import HOLDING
 from multidrop.drives import InvtCHE
 from multidrop.errors import LineError
 from multidrop.poller import Poller
@@ -124,3 +131,65 @@ def test_a_stop_opens_the_port_once_the_poller_has_failed(
         hall.poller.bus("hall").read(hall.drive, hall.drive.status)
     hall.stack.enter_context(hall.there())
     hall.stop()
+
+
+@contextmanager
+def server(is_last: Callable[[int, int], bool]) -> Iterator[str]:
+    """A server of Modbus TCP for one client; it ends a connection where `is_last(nth, address)` says so.
+
+    A connection's first request is its 1st. The server says each address as its value; one that it ends the
+    connection with before a reply is `DEADLY`.
+    """
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+
+        def serve(connection: socket.socket) -> None:
+            for nth in count(1):
+                _, request = parse_request(Framing.TCP, connection.recv(64))
+                if request is None or request.start == DEADLY:
+                    return
+                reply = Message(1, 3, data=request.start.to_bytes(2), transaction=request.transaction)
+                connection.sendall(build_reply(Framing.TCP, reply))
+                if is_last(nth, request.start):
+                    return
+
+        def accept() -> None:
+            with suppress(OSError):
+                while True:
+                    connection, _ = listener.accept()
+                    with connection, suppress(OSError):
+                        serve(connection)
+
+        thread = threading.Thread(target=accept, daemon=True)
+        thread.start()
+        yield f"tcp://127.0.0.1:{listener.getsockname()[1]}"
+        listener.shutdown(socket.SHUT_RDWR)
+    thread.join()
+
+
+DEADLY = 40
+
+
+class Scattered(Drive):
+    title = "Scattered"
+    framings = (Framing.TCP,)
+    most_registers = {HOLDING: 1}
+    near = reading(1, table=HOLDING)
+    far = reading(20, table=HOLDING)
+    deadly = reading(DEADLY, table=HOLDING)
+
+
+@pytest.mark.parametrize("every", [None, 0.1])
+@pytest.mark.parametrize("most", [1, 2, 3])
+def test_each_register_has_its_turn_though_connections_end_early(every: float | None, most: int) -> None:
+    """What was cut off comes first on the next connection, but for what a connection begins and ends with."""
+    seen = Counter[tuple[str, float | None]]()
+    with server(lambda nth, address: nth == most) as port:
+        drive = polled(Scattered(1, name="pump"), list(Scattered.registers.values()), every)
+        with Poller(plant(line(port, drive))) as poller:
+
+            def look() -> bool:
+                seen.update((row.register, row.value) for row in rows_of(poller) if row.status == "ok")
+                return all(seen[name, value] >= 3 for name, value in (("near", 1), ("far", 20)))
+
+            until(look)
+    assert {name for name, _ in seen} == {"near", "far"}

@@ -131,6 +131,10 @@ class ClockedPort:
         return bool(self._turn.progress.repeating)
 
     @property
+    def cut_off(self) -> bool:
+        return bool(self._turn.progress.cut_off)
+
+    @property
     def has_echo(self) -> bool:
         return int(self._turn.progress.echo) == int(lib.MD_ECHO)
 

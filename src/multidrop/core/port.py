@@ -218,6 +218,11 @@ class Port:
         self._memory.lasting.update((peer, before))
         lib.md_port_inherit(self.c, peer.c, before.c)
 
+    @property
+    def cut_off(self) -> bool:
+        """True once the port was lost in the middle of a polled exchange, and not of the first one on it."""
+        return bool(self._progress.cut_off)
+
     def end(self) -> bool:
         """Begin nothing more of the queue; return True while one of it is under way.
 
@@ -244,8 +249,10 @@ class Port:
     def repeat(self, exchanges: Sequence[Exchange]) -> int:
         """Carry these out in turn while nothing that is queued is due, until they are replaced.
 
-        Returns which of those that are replaced would have been next.
+        Returns which of those that are replaced would have been next; on a closed port 0.
         """
+        if self.c is None:
+            return 0
         self._memory.lasting.update(exchanges)  # one of them may be under way when they are replaced
         rounds = ffi.new("struct md_exchange *[]", [exchange.c for exchange in exchanges])
         with self._memory.replacing("round", rounds):

@@ -261,6 +261,22 @@ class Schedule(Generic[J]):
             self._begun.remove(job)
             self._await(job)
 
+    def put_back(self, turns: Sequence[Turn[J]]) -> None:
+        """Take these turns again, in their order: they were not carried out."""
+        for turn in reversed(turns):
+            job = turn.job
+            self.back_off.conclude(job.drive)
+            if job not in self.jobs:
+                continue
+            if turn.due_ns is None:
+                self.go_on(job)
+                continue
+            self._begun = [begun for begun in self._begun if begun is not job]
+            self._waiting = [waiting for waiting in self._waiting if waiting[2] is not job]
+            heapq.heapify(self._waiting)
+            job.due_ns, job.taken_ns = turn.due_ns, 0
+            self._await(job)
+
     # ---- slots without a request ----
 
     def _begin_rest(self, drive: int, now_ns: int) -> None:

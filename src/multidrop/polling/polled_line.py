@@ -61,7 +61,7 @@ class PolledLine:
         self._is_started = False
         self._learnt_ns = 0
         self._reopening = Reopening(bus)
-        self._reopen_ns = 0
+        self._lost_ns = self._reopen_ns = 0
         self._standby_ns = 0
         self.failure = ""  # of its polling, lately; "": none
         self._failures = 0  # in a row
@@ -225,7 +225,7 @@ class PolledLine:
                     self._stand_by(now_ns, Status.NOT_MASTER)
                 return
             if port is not self._queue.port:  # a stop may have opened it again before the loss was seen here
-                self._miss(self._queue.clear(now_ns), Status.LINE_LOST)
+                self._queue.give_back()
                 self._queue.move_to(port)
                 port.report_to(self._row_queue, self.number)
             self._queue.conclude(port)
@@ -276,15 +276,19 @@ class PolledLine:
 
     def _lose(self, port: Port, now_ns: int) -> None:
         port.stop()
-        self._miss(self._queue.clear(now_ns), Status.LINE_LOST)
+        self._queue.give_back()
         self.bus.line.drop()
-        self._reopen_ns = now_ns
+        self._lost_ns = self._reopen_ns = now_ns
 
     def _regain(self, now_ns: int) -> None:
-        """Open the port again in a thread; until it is back every value that is due is missed."""
+        """Open the port again in a thread; until it is back every value that is due is missed.
+
+        At the first attempt nothing is missed yet: a port that is back at once goes on where it was lost.
+        """
         if now_ns < self._reopen_ns or self._reopening.is_under_way:
             return
-        self._miss(self._schedule.pass_all(now_ns), Status.LINE_LOST)
+        if now_ns - self._lost_ns >= REOPEN_NS:
+            self._miss(self._schedule.pass_all(now_ns), Status.LINE_LOST)
         self._reopen_ns = now_ns + REOPEN_NS
         self._reopening.begin()
 

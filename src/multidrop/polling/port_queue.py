@@ -26,6 +26,7 @@ class PortQueue:
         self._done = 0  # exchanges on it, when they were counted last
         self._queued: deque[Turn[PolledJob]] = deque()  # that the core has not carried out yet
         self._ahead_ns = 0  # that these will take
+        self._newest: Turn[PolledJob] | None = None  # of those that the core has carried out
         self._cycle: list[PolledJob] = []  # that the core repeats
 
     @property
@@ -42,7 +43,8 @@ class PortQueue:
             return
         done = port.done
         for _ in range((done - self._done) & 0xFFFF_FFFF):
-            job = self._queued.popleft().job
+            self._newest = self._queued.popleft()
+            job = self._newest.job
             self._ahead_ns -= job.duration_ns
             self._schedule.back_off.conclude(job.drive)
         self._done = done
@@ -91,19 +93,20 @@ class PortQueue:
         """Return the slots that are queued and not carried out."""
         return [(turn.job, turn.due_ns) for turn in self._queued if turn.due_ns is not None]
 
-    def clear(self, now_ns: int) -> list[Slot]:
-        """Forget what is queued: the port failed. Returns the slots, those without a time as of now.
+    def give_back(self) -> None:
+        """Give the schedule back what was not carried out: the port failed.
 
-        What was carried out before has its rows already.
+        What was cut off in the middle comes first, and is asked again. If it was the first exchange on its
+        port it is not: a device may end the connection at each request that it does not like.
         """
         if self.port is not None:
             self.conclude(self.port)
-        slots = [
-            (turn.job, now_ns if turn.due_ns is None else min(turn.due_ns, now_ns)) for turn in self._queued
-        ]
-        for job, _ in slots:
-            self._schedule.back_off.conclude(job.drive)
+            if self._cycle:
+                self._schedule.go_on(self._cycle[self.port.repeat([])])
+            elif self.port.cut_off and self._newest:
+                self._queued.appendleft(self._newest)
+        self._schedule.put_back(self._queued)
         self._queued.clear()
+        self._newest = None
         self._cycle = []
         self._ahead_ns = 0
-        return slots
