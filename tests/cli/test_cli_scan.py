@@ -191,6 +191,8 @@ def test_every_finding_is_a_sentence() -> None:
         "address 5: yd1000 or delixi-modbus at 9600 8N1 rtu, 5.1 ms to answer (1 of 9 replies were damaged)"
     )
     assert "several drives seem to have this address" in sentence(Crowd(5, USUAL, Framing.RTU))
+    whole = Crowd(5, USUAL, Framing.RTU, "reply from another address (received 63 03 02 00 00)")
+    assert sentence(whole).endswith("no reply to what was asked: " + whole.reply)
     assert "at 30 of 31 addresses" in sentence(Noise(USUAL, Framing.RTU, 30, 31))
     assert sentence(Untried(USUAL, Framing.RTU, "no parity")) == "not asked at 9600 8N1 rtu: no parity"
 

@@ -236,6 +236,13 @@ def test_a_slow_round_trip_is_told_apart_from_a_usual_one() -> None:
     assert "did not answer once in 4 requests" in round_trip_finding(drive, [], 4).what
 
 
+def test_what_came_in_place_of_good_replies_is_told() -> None:
+    came = "reply from another address (received 63 03 02 00 00)"
+    nothing_good = round_trip_finding(InvtCHE(1), [], 4, came=came).what
+    assert nothing_good == f"invt-che@1 gave no good reply to 4 requests; what came: {came}"
+    assert round_trip_finding(InvtCHE(1), [0.005], 2, came=came).what.endswith(f"in their place: {came}")
+
+
 def test_a_network_s_round_trip_has_the_wire_in_it() -> None:
     told = round_trip_finding(InvtCHE(1), [0.0004, 0.0005, 0.0006], 3, 0.0094)
     assert told.what.endswith(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterator, Sequence
 
+import checksums
 import pytest
 from line_driver import LineDriver
 from tables import table
@@ -277,6 +278,19 @@ def test_two_drives_at_one_address_are_recognised() -> None:
     assert [finding for finding in findings if not isinstance(finding, Found)] == [
         Crowd(3, Settings(9600, "8N1"), Framing.RTU)
     ]
+
+
+class Misaddressed(Pair):
+    """Every reply is a whole frame that comes from another address."""
+
+    def distort(self, reply: bytes) -> bytes:
+        return checksums.rtu(b"\x63" + reply[1:-2])
+
+
+def test_whole_frames_that_are_no_reply_are_told_as_they_came() -> None:
+    findings = found(Line(Misaddressed([simulated(InvtCHE(1))])), sweeps([InvtCHE], baudrates=[9600]))
+    (crowd, *_) = [finding for finding in findings if isinstance(finding, Crowd)]
+    assert crowd.reply.startswith("reply from another address (received 63 ")
 
 
 class Everything(Echo, Junk):

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
+
+import checksums
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -10,7 +13,7 @@ from simulated_bus import SimulatedBus
 
 from multidrop.core import NumberFormat
 from multidrop.drive.declare import reading
-from multidrop.errors import DriveRefused, NoReply
+from multidrop.errors import BadReply, DriveRefused, NoReply
 
 WIDE = 24
 
@@ -118,3 +121,17 @@ def test_a_dead_drive_costs_one_request_more(monkeypatch: pytest.MonkeyPatch) ->
     with pytest.raises(NoReply):
         bus.bus.read_many(drive, drive.registers.values())
     assert sim.asked == [(0, WIDE)] * 3
+
+
+@pytest.mark.parametrize("silent", [{1}, {1, 2}, {0, 2}])
+def test_bytes_that_came_for_one_attempt_are_told(monkeypatch: pytest.MonkeyPatch, silent: set[int]) -> None:
+    """A read of several is asked in parts, and again: none of that may forget what came at first."""
+    drive = family(2)(1, name="pump-1")
+    bus = SimulatedBus(monkeypatch, Picky(drive))
+    bus.attach(drive)
+    attempts = itertools.count()
+    foreign = checksums.rtu(bytes.fromhex("63 03 02 00 07"))
+    bus.loses = lambda request: next(attempts) in silent
+    bus.answers = lambda request: foreign
+    with pytest.raises(BadReply, match="another address"):
+        bus.bus.read_many(drive, drive.registers.values())

@@ -194,6 +194,11 @@ def sentence(finding: Finding) -> str:
                 f"address {finding.address}: {what} at {at}, {finding.response_delay * 1e3:.1f} ms to answer"
             )
             return f"{text} ({finding.doubt})" if finding.doubt else text
+        case Crowd() if finding.reply:
+            return (
+                f"address {finding.address}: whole frames at {at} that are no reply to what was asked: "
+                f"{finding.reply}"
+            )
         case Crowd():
             return (
                 f"address {finding.address}: garbage instead of replies at {at}: several drives seem to have "
@@ -247,7 +252,7 @@ def _record(finding: Finding) -> dict[str, Any]:
                 "doubt": finding.doubt or None,
             }
         case Crowd():
-            return {"address": finding.address, **record}
+            return {"address": finding.address, **record, "reply": finding.reply or None}
         case Noise():
             return {**record, "garbled": finding.garbled, "asked": finding.asked}
         case Untried():

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Protocol
 
-from multidrop.core import Completion, Failure, Message, Peer
+from multidrop.core import STATUSES, Completion, Failure, FrameFault, Framing, Message, Peer, crc16
 from multidrop.drive.family import Drive
 from multidrop.scan.identify import identify
 from multidrop.scan.results import Found
@@ -17,6 +17,17 @@ MOST_TIMEOUT = 1.0  # s: for a drive of which only the address is known
 TRIES = 3
 LATE_NS = 500_000_000  # for which late replies are waited for
 SHORTEST_REPLY = 5  # bytes, of an exception; less is noise
+
+
+# Results for frames that answer another request.
+_MISDIRECTED = (FrameFault.BAD_ADDRESS, FrameFault.BAD_FUNCTION, FrameFault.BAD_LENGTH)
+
+
+def is_whole(framing: Framing, received: bytes) -> bool:
+    """Tell whether one frame with a good checksum is all that came."""
+    if framing is Framing.RTU:
+        return len(received) >= SHORTEST_REPLY and crc16(received, len(received)) == 0
+    return framing is Framing.TCP or (received[:1] == b":" and received[-2:] == b"\r\n")
 
 
 class Scan(Protocol):
@@ -36,6 +47,7 @@ class Probe:
         self._address = address
         self._peer = scan.peer(LEAST_TIMEOUT, MOST_TIMEOUT)
         self.answers = self.damaged = self.followed = 0
+        self.whole_frame = ""  # why a frame with a good checksum was no reply to the request, and the frame
         self.excess = 0.0
         self._answered = False  # the last request
         self._has_missed = False  # some request
@@ -51,6 +63,8 @@ class Probe:
         self.answers += self._answered
         self.damaged += not self._answered and completion.result != Failure.NO_REPLY
         self._has_missed |= not self._answered
+        if completion.result in _MISDIRECTED and is_whole(self._sweep.framing, completion.raw):
+            self.whole_frame = f"{STATUSES[-completion.result]} (received {completion.raw.hex(' ').upper()})"
         self._asked_ns = completion.begun_ns
         return completion
 

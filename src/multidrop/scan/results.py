@@ -28,11 +28,15 @@ class Found:
 
 @dataclass(frozen=True)
 class Crowd:
-    """An address that answers with garbage every time: several drives seem to have it."""
+    """An address that answers every time with bytes that are no reply to the request.
+
+    Several drives seem to have it, unless `reply` says why a whole frame with a good checksum is none.
+    """
 
     address: int
     settings: Settings
     framing: Framing
+    reply: str = ""
 
 
 @dataclass(frozen=True)

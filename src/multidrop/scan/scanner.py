@@ -22,7 +22,7 @@ from multidrop.core import (
 )
 from multidrop.drive.family import Drive
 from multidrop.errors import LineError
-from multidrop.scan.probe import MOST_TIMEOUT, TRIES, Probe
+from multidrop.scan.probe import MOST_TIMEOUT, TRIES, Probe, is_whole
 from multidrop.scan.results import Crowd, Finding, Noise, Progress, Untried
 from multidrop.scan.sweep import Sweep
 
@@ -70,7 +70,7 @@ class _Scan:
 
     def _sweep(self, sweep: Sweep, left_after: float) -> Iterator[Finding]:
         addresses = [address for address in sweep.addresses if _key(sweep, address) not in self._found]
-        garbled: list[int] = []
+        garbled: dict[int, str] = {}  # address: what came, if that was a whole frame
         peers: dict[int, Peer] = {}
         for number, address in enumerate(addresses, 1):
             peers[address] = self._sweep_peer(sweep)
@@ -95,19 +95,19 @@ class _Scan:
                     yield probe.found(self._families)
                     self._excess = max(self._excess, probe.excess)
                 elif not probe.answers and probe.damaged == TRIES:
-                    garbled.append(suspect)
+                    garbled[suspect] = probe.whole_frame
             left = left_after + (len(addresses) - number) * sweep.each
             yield Progress(sweep.settings, sweep.framing, address, left)
         yield from self._explain(sweep, garbled, len(addresses))
 
-    def _explain(self, sweep: Sweep, garbled: list[int], asked: int) -> Iterator[Finding]:
+    def _explain(self, sweep: Sweep, garbled: dict[int, str], asked: int) -> Iterator[Finding]:
         if len(garbled) >= LEAST_NOISY and len(garbled) > NOISY * asked:
             yield Noise(sweep.settings, sweep.framing, len(garbled), asked)
             return
-        for address in garbled:
+        for address, whole_frame in garbled.items():
             if _key(sweep, address) not in self._crowded:
                 self._crowded.add(_key(sweep, address))
-                yield Crowd(address, sweep.settings, sweep.framing)
+                yield Crowd(address, sweep.settings, sweep.framing, whole_frame)
 
     def ask(self, sweep: Sweep, request: Message, peer: Peer, not_before_ns: int = 0) -> Completion:
         """Carry out an exchange; an echo of the request is no reply."""
@@ -165,6 +165,9 @@ def _late(sweep: Sweep, earlier: Sequence[int], completion: Completion) -> list[
     for address in earlier:
         request = sweep.request.to(address)
         replies = find_replies(sweep.framing, completion.raw, request)
-        if any(reply != build_request(sweep.framing, request) for reply in replies):
+        is_its_own = sweep.framing is Framing.RTU and completion.raw[0] == address
+        if any(reply != build_request(sweep.framing, request) for reply in replies) or (
+            is_its_own and is_whole(Framing.RTU, completion.raw)
+        ):
             found.append(address)
     return found

@@ -229,14 +229,22 @@ class Exchanges:
         return reply
 
     def _good(self, drive: Drive, exchange: Exchange, attempts: int, completion: Completion) -> Completion:
-        """Return the good reply to a read that was sent once, and is sent again where it is lost."""
+        """Return the good reply to a read that was sent once, and is sent again where it is lost.
+
+        Raises BadReply if any bytes came for one of the attempts, even if the others met silence.
+        """
+        came: BadReply | None = None
         while completion.count < 0:
             attempts -= 1
             self._note_answer(drive, completion)
             try:
                 good_reply(drive, completion)  # raises
             except (NoReply, BadReply, DriveRefused) as failure:
+                if isinstance(failure, BadReply):
+                    came = failure
                 is_final = isinstance(failure, DriveRefused) and failure.code not in drive.damaged
+                if came and isinstance(failure, NoReply) and not attempts:
+                    raise came from None
                 if not attempts or is_final:
                     raise
             completion = self._carry_out(drive, exchange)

@@ -114,21 +114,28 @@ def _answered_finding(found: Completion, sent: bytes, settings: Settings) -> Fin
 
 
 def round_trip_finding(
-    drive: Drive, delays: list[float], asked: int, wire: float = 0.0, refusals: Collection[int] = ()
+    drive: Drive,
+    delays: list[float],
+    asked: int,
+    wire: float = 0.0,
+    refusals: Collection[int] = (),
+    came: str = "",
 ) -> Finding:
     """Judge the delays of the replies to `asked` requests.
 
     `delays` are sorted, in s, from the request's last bit to the reply's first. Where the port does not
     show bits, as a network, they begin when the request was handed over; `wire` is then the time, in s, of
     the request and the first character on a wire. `refusals` are the codes of replies that are exceptions:
-    a gateway's are none of the drive's, and have no delay.
+    a gateway's are none of the drive's, and have no delay. `came` says what came in place of good replies.
     """
     codes = ", ".join(f"{code:02X}" for code in sorted(set(refusals)))
     if not delays:
         unreached = f": exception {codes} came, as from a gateway that does not reach it" if refusals else ""
+        nothing = f"did not answer once in {counted(asked, 'request')}{unreached}"
+        only = f"gave no good reply to {counted(asked, 'request')}; what came: {came}"
         return Finding(
             "round trip",
-            f"{drive.name} did not answer once in {counted(asked, 'request')}{unreached}",
+            f"{drive.name} {only if came and not refusals else nothing}",
             "check its address, baud rate, format, wiring and power; `multidrop scan` looks for it",
             is_failure=True,
         )
@@ -140,6 +147,8 @@ def round_trip_finding(
     what = f"{drive.name} begins to answer after {figures}{since}{lost if len(delays) < asked else ''}"
     if refusals:
         what += f"; {len(refusals)} replies were exceptions: {codes}"
+    if came:
+        what += f"; what came in their place: {came}"
     if median - wire - drive.response_delay > SLOW_S:
         rest = "the adapter's or the network's" if wire else "the adapter's"
         return Finding(

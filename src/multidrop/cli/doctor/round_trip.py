@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from multidrop.bus import Bus
 from multidrop.cli.doctor.findings import ROUNDS, Finding, round_trip_finding
 from multidrop.core import (
     RS485,
+    STATUSES,
     Completion,
     Exchange,
+    Failure,
     Framing,
     Message,
     build_request,
@@ -54,7 +57,18 @@ def measure(port: str, rs485: RS485, drive: Drive | None) -> tuple[Finding, bool
     delays = sorted(max(0.0, delay - wire) if shows_bits else delay for delay in seen)
     refusals = [code for done in completions if (code := _exception(drive.framing, poll.request, done))]
     wire = 0.0 if shows_bits else wire
-    return round_trip_finding(drive, delays, len(completions), wire, refusals), bool(delays or refusals)
+    finding = round_trip_finding(drive, delays, len(completions), wire, refusals, _what_came(completions))
+    return finding, bool(delays or refusals)
+
+
+def _what_came(completions: Sequence[Completion]) -> str:
+    """Return the most frequent reason why bytes were no good reply, with an example; "" without one."""
+    bad = [done for done in completions if done.result < 0 and done.raw and done.result != Failure.NO_REPLY]
+    if not bad:
+        return ""
+    (result, _), *_ = Counter(done.result for done in bad).most_common(1)
+    example = next(done.raw for done in bad if done.result == result)
+    return f"{STATUSES[-result]} (received {example.hex(' ').upper()})"
 
 
 def _exception(framing: Framing, request: Message, done: Completion) -> int:
