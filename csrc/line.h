@@ -70,6 +70,7 @@ struct md_line {
     uint8_t is_out_of_step; /* what came is no header of Modbus TCP: the port is to be lost */
     uint8_t is_adrift;      /* a frame was longer or shorter than its header says: the next head is looked for */
     uint8_t is_proven;      /* a good reply came on this port */
+    uint8_t is_quicker;     /* a reply came sooner than its characters could over a wire */
     uint8_t waited;      /* since the request left a wait was granted */
     uint32_t looks;      /* at the port, since then */
     uint32_t cut;        /* bytes of late replies, since then */

@@ -81,8 +81,12 @@ static void measure(struct md_line *line, int reply_len)
     struct md_drive *drive = exchange->drive;
     int64_t request_ns = md_wire_ns(exchange, line->tx_len), reply_ns = md_wire_ns(exchange, reply_len);
     int64_t left_ns = line->quiet_ns, begun_ns = completion->last_ns - reply_ns;
-    /* Characters that follow each other tell better when the first came than a late look at them. */
-    completion->first_ns = sooner(completion->first_ns, later(begun_ns + exchange->character_ns, left_ns));
+    /* Characters that follow each other tell better when the first came than a late look at them, but not on
+     * a port that is quicker than its settings, such as a pseudo-terminal: there all may come at once. */
+    line->is_quicker |= begun_ns < left_ns;
+    if (!line->is_quicker)
+        completion->first_ns =
+            sooner(completion->first_ns, later(begun_ns + exchange->character_ns, left_ns));
     int is_whole = line->waited && line->looks == 1;
     int64_t delay_ns = md_learn_delay(exchange, later(begun_ns - left_ns, 0), is_whole);
     int64_t ideal_ns = line->silence_ns + request_ns + delay_ns + reply_ns;

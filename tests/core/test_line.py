@@ -90,6 +90,21 @@ def test_the_time_of_a_value_is_never_after_its_reply(line: LineDriver) -> None:
     assert (line.completion.sent_ns, line.completion.first_ns) == (begun, begun + 10 * MS)
 
 
+def test_a_port_that_was_quicker_than_its_settings_tells_the_time_of_no_first_character(
+    line: LineDriver,
+) -> None:
+    """A pseudo-terminal's replies come at once: its drive may have made the value just before."""
+    ask(line)
+    line.now += 1 * MS
+    answer(line, reply_of(7))
+    line.now += 10 * MS
+    ask(line)
+    line.now += 60 * MS
+    came = line.now
+    answer(line, reply_of(7))
+    assert (line.completion.first_ns, line.completion.last_ns) == (came, came)
+
+
 def test_a_request_that_may_have_left_late_has_its_whole_time_out(line: LineDriver) -> None:
     line.begin(exchange(READ))
     while line.want != "write":
