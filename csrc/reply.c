@@ -209,6 +209,24 @@ int md_reply_judge(struct md_line *line, size_t at, int used, const struct md_me
     return 0;
 }
 
+/* Find a read of another master in front of a reply to a read: then that reply is its, as far as anybody can
+ * tell. Return where it begins; SIZE_MAX: there is none. */
+static size_t find_foreign_read(const struct md_line *line, size_t reply_at)
+{
+    const struct md_exchange *exchange = line->exchange;
+    const struct md_message *own = &exchange->request;
+    struct md_message request;
+    if (exchange->framing == MD_DELIXI || !md_is_read(exchange->framing, own->function))
+        return SIZE_MAX; /* a reply of Delixi's looks like a request */
+    for (size_t at = 0; at < reply_at; at++) {
+        int used = md_parse_request(exchange->framing, line->rx + at, reply_at - at, &request);
+        if (used > 0 && request.address == own->address && request.function == own->function &&
+            !md_echo_is_copy(line, at))
+            return at;
+    }
+    return SIZE_MAX;
+}
+
 /* Look at every place where the reply may still begin. A late reply is looked for only where what precedes it
  * cannot be the reply's beginning: it may be the inside of the reply. */
 int md_reply_find(struct md_line *line, int64_t now_ns, struct md_ending *ending)
@@ -223,6 +241,13 @@ int md_reply_find(struct md_line *line, int64_t now_ns, struct md_ending *ending
             line->echo_due = 0; /* the adapter's, or it cannot be told from that */
             at += line->tx_len;
             first_open = SIZE_MAX;
+            continue;
+        }
+        size_t foreign_at = used > 0 ? find_foreign_read(line, at) : SIZE_MAX;
+        if (foreign_at != SIZE_MAX) {
+            md_reply_cut_out(line, foreign_at, at + (size_t)used - foreign_at);
+            at = foreign_at;
+            first_open = first_open < at ? first_open : SIZE_MAX;
             continue;
         }
         if (used > 0 && md_reply_judge(line, at, used, &reply, now_ns, ending))

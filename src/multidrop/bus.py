@@ -59,8 +59,10 @@ class Bus:
     if all of them bear it. `echo` says that the adapter repeats what it sends: "on", "off" (until it
     does), or "auto", to find out. `rs485` is who switches between sending and receiving where the adapter
     does not: "kernel", the driver, or "rts-up" or "rts-down", the core, by RTS being on or off while a
-    request leaves. Raises LineError when the port cannot be opened. Writes that may wear an EEPROM are
-    counted in `ledger`, a file that all processes share, and all writes are noted in the file `audit`.
+    request leaves. Devices that are deaf after the port opens, such as an Arduino that this resets, are sent
+    nothing for `settle` seconds, at most 10. Raises LineError when the port cannot be opened. Writes that may
+    wear an EEPROM are counted in `ledger`, a file that all processes share, and all writes are noted in the
+    file `audit`.
 
     A write is not sent when it is late by `expiry` seconds: since the verb was called, but for the time that
     its own steps may take. It is not sent either once a stop was called: that ends all that may move a motor
@@ -85,6 +87,7 @@ class Bus:
         echo: str = "auto",
         transaction: str = "match",
         rs485: str = "off",
+        settle: float = 0.0,
         ledger: Ledger | Path | str | None = None,
         audit: Path | str | None = None,
         expiry: float = EXPIRY,
@@ -95,7 +98,7 @@ class Bus:
         self.format = format
         self.silence = silence
         facts = _facts(port, echo, transaction, rs485)
-        line = Line(port, *facts, mastership)
+        line = Line(port, *facts, mastership, settle)
         try:
             self._begin(line.open(), ledger, audit, expiry)
         except BaseException:  # also where the opening is interrupted
@@ -110,6 +113,7 @@ class Bus:
         echo: str = "auto",
         transaction: str = "match",
         rs485: str = "off",
+        settle: float = 0.0,
         ledger: Ledger | Path | str | None = None,
         audit: Path | str | None = None,
         mastership: Mastership | None = None,
@@ -118,7 +122,7 @@ class Bus:
         bus = cls.__new__(cls)
         bus.baudrate = bus.format = bus.silence = None
         facts = _facts(port, echo, transaction, rs485)
-        bus._begin(Line(port, *facts, mastership), ledger, audit, EXPIRY)
+        bus._begin(Line(port, *facts, mastership, settle), ledger, audit, EXPIRY)
         return bus
 
     def _begin(

@@ -293,6 +293,7 @@ def test_doctor_measures_with_a_drive_of_a_plant(run: Run, plant: Path, port: st
     assert "has no drive 'pump-7'; did you mean" in run("doctor", plant, "pump-7")[2]
     assert "--rs485 is a matter of the plant file" in run("doctor", plant, "pump-1", "--rs485", "kernel")[2]
     assert "--rs485 is a matter of the plant file" in run("scan", plant, "hall-1", "--rs485", "kernel")[2]
+    assert "--settle is a matter of the plant file" in run("scan", plant, "hall-1", "--settle", "1 s")[2]
     assert "--model is a matter of the plant file" in run("doctor", plant, "pump-1", "--model", TOY)[2]
 
 

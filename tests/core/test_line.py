@@ -486,6 +486,27 @@ def teach_echo(line: LineDriver) -> None:
     assert (line.completion.result, line.completion.skipped) == (7, 8)
 
 
+@pytest.mark.parametrize("piece", [4096, 1], ids=["whole", "byte by byte"])
+def test_the_reply_behind_another_masters_read_is_not_ours(line: LineDriver, piece: int) -> None:
+    """Both ask the same drive: its first reply then answers the other master, as far as anybody can tell."""
+    ask(line)
+    line.receive(rtu("01 03 00 40 00 01") + reply_of(0x1234), piece)
+    assert line.listens
+    line.receive(reply_of(7), piece)
+    assert (line.want, line.completion.reply.data) == ("done", words(7))
+    line.now += 10 * MS
+    ask(line)
+    answer(line, rtu("01 03 00 40 00 01") + reply_of(0x1234), piece)
+    assert line.completion.result == Failure.NO_REPLY
+
+
+@pytest.mark.parametrize("before", ["02 03 00 40 00 01", "01 04 00 40 00 01", "01 06 00 40 00 01"])
+def test_the_reply_behind_another_masters_other_request_is_ours(line: LineDriver, before: str) -> None:
+    ask(line)
+    answer(line, rtu(before) + reply_of(7))
+    assert line.completion.reply.data == words(7)
+
+
 def confirmation() -> bytes:
     return build_reply(Framing.RTU, WRITE)
 

@@ -181,6 +181,8 @@ def test_a_line_s_silence_takes_the_place_of_the_standard_s_and_of_no_family_s(l
     assert line.switching == 0
     (line,) = load(SILENT.replace('silence = "500 us"\n', 'switching = "2 ms"\n')).lines
     assert line.switching == 2e-3
+    (line,) = load(SILENT.replace('silence = "500 us"\n', 'settle = "1.5 s"\n')).lines
+    assert (line.settle, line.at("socket://127.0.0.1:1").settle) == (1.5, 1.5)
     assert [polled.drive.needed_silence() for polled in line.drives] == pytest.approx([1.75e-3, 10e-3, 0])
 
 
@@ -236,7 +238,7 @@ def test_five_mistakes_in_one_file_are_all_reported_at_once(mistakes: Mistakes) 
         (
             "line = [3]",
             "line number 1: 3 is not a table with name, port, baudrate, format, silence, switching, echo, "
-            "rs485, transaction, drive",
+            "rs485, settle, transaction, drive",
         ),
         (
             HEAD,
@@ -341,6 +343,10 @@ def test_five_mistakes_in_one_file_are_all_reported_at_once(mistakes: Mistakes) 
             HEAD + TOY + 'every = "0 ms"',
             'line "L", drive "D": every = \'0 ms\' is not a duration from 100 us to 24 h, '
             'such as "50 ms", "2 s" or "1 min"',
+        ),
+        (
+            HEAD + 'settle = "11 s"\n' + TOY,
+            'line "L": settle = 11.0 is not a number of seconds from 0 to 10',
         ),
         (
             HEAD + 'switching = "now"\n' + TOY,

@@ -311,7 +311,13 @@ class ClockedLines:
         return clocked
 
     def _line(
-        self, port: str, echo: object, ids: TransactionIds, rs485: object, mastership: None
+        self,
+        port: str,
+        echo: object,
+        ids: TransactionIds,
+        rs485: object,
+        mastership: None,
+        settle: float,
     ) -> ClockedLine:
         return ClockedLine(self, port, ids)
 

@@ -26,7 +26,7 @@ from multidrop.drives import MODELS
 from multidrop.errors import LineError, NoReply, Unconfirmed
 from multidrop.poller import Poller
 from multidrop.sim import Simulator, Wire, simulated
-from multidrop.transport import open_port
+from multidrop.transport import clock, open_port
 from multidrop.transport.bridge import MOST_STALL_MS
 from multidrop.transport.line import Line
 
@@ -90,6 +90,35 @@ def test_what_is_told_of_the_echo_is_told_again_when_the_port_is_reopened(
     with Simulator([wire()]) as sim, Bus(sim.wires[0].path, echo=echo) as bus:
         bus.line.reopen()
         assert told == [Echo(echo)] * 2
+
+
+def test_a_port_settles_after_each_opening_and_what_came_is_discarded(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A gateway that restarts when its port is opened says so, and hears nothing for a while."""
+    slept: list[float] = []
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        host, number = listener.getsockname()
+        accepted: list[socket.socket] = []
+
+        def boot(seconds: float) -> None:
+            slept.append(seconds)
+            accepted.append(listener.accept()[0])
+            accepted[-1].sendall(b"ets Jun  8 2016\r\n")
+
+        monkeypatch.setattr(clock, "sleep", boot)
+        with Bus(f"tcp://{host}:{number}", settle=1.5) as bus:
+            bus.line.reopen()
+            assert not bus.line.is_lost
+        assert slept == [1.5, 1.5]
+        for connection in accepted:
+            connection.close()
+
+
+@pytest.mark.parametrize("settle", [-1, 10.1, float("nan"), "1.5 s", True])
+def test_a_port_settles_for_a_number_of_seconds(settle: object) -> None:
+    with pytest.raises(ValueError, match="is not a number of seconds from 0 to 10"):
+        Bus("/dev/nowhere", settle=settle)  # type: ignore[arg-type]
 
 
 def test_an_echo_is_told_in_one_of_three_words() -> None:

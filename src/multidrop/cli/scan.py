@@ -13,7 +13,15 @@ from typing import Any
 from multidrop.cli.support.arguments import add_json_argument
 from multidrop.cli.support.files import check_writable
 from multidrop.cli.support.output import print_text
-from multidrop.cli.support.plants import add_line_arguments, add_rs485_argument, line_of, plant_at, rs485_at
+from multidrop.cli.support.plants import (
+    add_line_arguments,
+    add_rs485_argument,
+    add_settle_argument,
+    line_of,
+    plant_at,
+    rs485_at,
+    settle_at,
+)
 from multidrop.cli.support.values import counted
 from multidrop.core import RS485
 from multidrop.drive.fact_check import UNIT_IDS
@@ -60,6 +68,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--quick", action="store_true", help="do not ask again for drives that answer later than usual"
     )
     add_rs485_argument(parser)
+    add_settle_argument(parser)
     parser.add_argument("--out", metavar="PLANT.toml", type=Path, help="write a plant file of what is found")
     add_json_argument(parser)
 
@@ -70,16 +79,18 @@ def run(arguments: argparse.Namespace) -> int:
     plant = plant_at(arguments)
     declared = line_of(plant, arguments.name) if plant else None
     arguments.port = declared.port if declared else arguments.port
-    rs485 = rs485_at(arguments, declared)
+    rs485, settle = rs485_at(arguments, declared), settle_at(arguments, declared)
     families = _families(arguments.model)
     planned = _planned(arguments, list(families.values()))
     begun = time.monotonic()
-    found, finished = _scan(arguments, rs485, planned, list(families.values()))
+    found, finished = _scan(arguments, rs485, settle, planned, list(families.values()))
     seconds = round(time.monotonic() - begun, 3)
     drives = [finding for finding in found if isinstance(finding, Found)]
     written = None
     if arguments.out and any(drive.models for drive in drives):
-        arguments.out.write_text(plant_text(lasting_name(arguments.port), drives, families, rs485), "utf-8")
+        arguments.out.write_text(
+            plant_text(lasting_name(arguments.port), drives, families, rs485, settle), "utf-8"
+        )
         written = str(arguments.out)
     if arguments.json:
         record = {"port": arguments.port, "seconds": seconds, "finished": finished}
@@ -94,11 +105,15 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _scan(
-    arguments: argparse.Namespace, rs485: RS485, planned: Sequence[Sweep], families: Sequence[type[Drive]]
+    arguments: argparse.Namespace,
+    rs485: RS485,
+    settle: float,
+    planned: Sequence[Sweep],
+    families: Sequence[type[Drive]],
 ) -> tuple[list[Finding], bool]:
     """Return what was found, and False where Ctrl-C cut it short: what came until then is kept."""
     found: list[Finding] = []
-    line = Line(arguments.port, rs485=rs485).open()
+    line = Line(arguments.port, rs485=rs485, settle=settle).open()
     try:
         found.extend(_shown(scan(line.carry_out, planned, families), arguments.json))
     except KeyboardInterrupt:

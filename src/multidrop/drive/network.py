@@ -44,3 +44,13 @@ def url_of(port: str) -> SplitResult:
     if url.scheme in ("socket", "rfc2217") and not (host and number):
         raise NoSuchPort(port, f"it needs a host and a port number, such as {url.scheme}://10.0.0.7:4001")
     return url
+
+
+MOST_SETTLE = 10.0  # s: the end of a process may have to wait for it
+
+
+def check_settle(settle: float) -> None:
+    """Raise ValueError unless this is a time in s that a line may wait after its port is opened."""
+    is_number = isinstance(settle, int | float) and not isinstance(settle, bool)
+    if not (is_number and 0 <= settle <= MOST_SETTLE):
+        raise ValueError(f"settle = {settle!r} is not a number of seconds from 0 to {MOST_SETTLE:g}")

@@ -11,7 +11,7 @@ from typing import Any
 
 from multidrop.core import RS485, Echo, TransactionIds
 from multidrop.drive.family import Drive
-from multidrop.drive.network import check_port, speaks_tcp
+from multidrop.drive.network import check_port, check_settle, speaks_tcp
 from multidrop.drive.timing import Settings
 from multidrop.drives import MODELS
 from multidrop.drives.registry import find_model
@@ -79,6 +79,7 @@ _LINE = {
     "switching": Key(str, 'switching = "2 ms"'),
     "echo": Key(str, 'echo = "auto"'),
     "rs485": Key(str, 'rs485 = "kernel"'),
+    "settle": Key(str, 'settle = "1.5 s"'),
     "transaction": Key(str, 'transaction = "match"'),
     "drive": Key(list, "[[line.drive]], in two brackets, with its name, model and address", needed=True),
 }
@@ -117,7 +118,10 @@ def _line(table: Any, place: TomlPlace) -> PlantLine:
         "baudrate": place.attempt(Settings, given.get("baudrate", 9600), "8N1") and given.get("baudrate"),
         "format": place.attempt(Settings, 9600, given.get("format", "8N1")) and given.get("format"),
     }
-    silence, switching = (duration_of(given, key, place) for key in ("silence", "switching"))
+    silence, switching, settle = (
+        duration_of(given, key, place) for key in ("silence", "switching", "settle")
+    )
+    place.attempt(check_settle, settle or 0.0)
     echo = place.attempt(Echo, given.get("echo", "auto"))
     rs485 = place.attempt(RS485, given.get("rs485", "off")) or RS485.OFF
     place.attempt(rs485.check_port, port)
@@ -136,6 +140,7 @@ def _line(table: Any, place: TomlPlace) -> PlantLine:
         echo=echo or Echo.AUTO,
         ids=ids or TransactionIds.MATCH,
         rs485=rs485,
+        settle=settle or 0.0,
     )
 
 

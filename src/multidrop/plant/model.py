@@ -65,6 +65,7 @@ class PlantLine:
     echo: Echo = Echo.AUTO
     ids: TransactionIds = TransactionIds.MATCH
     rs485: RS485 = RS485.OFF
+    settle: float = 0.0  # s after the port is opened, in which nothing is sent
 
     def at(self, port: str) -> PlantLine:
         """Return the same line at another port; a network has no transceiver to switch."""

@@ -76,7 +76,8 @@ def _mistakes(place: str, check: Callable[[], object]) -> list[str]:
 
 def has_same_port(line: PlantLine, other: PlantLine) -> bool:
     """Return True where a port that is open for one serves the other."""
-    return (line.port, line.echo, line.ids, line.rs485) == (other.port, other.echo, other.ids, other.rs485)
+    facts, others = ((each.port, each.echo, each.ids, each.rs485, each.settle) for each in (line, other))
+    return facts == others
 
 
 def is_same_drive(drive: Drive, other: Drive) -> bool:

@@ -152,6 +152,7 @@ class LineSet:
             echo=line.echo,
             transaction=line.ids,
             rs485=line.rs485,
+            settle=line.settle,
             ledger=self._ledger,
             audit=self._audit,
             mastership=self._mastership,

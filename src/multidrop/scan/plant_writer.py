@@ -12,7 +12,11 @@ from multidrop.scan.results import GUESS, Found
 
 
 def plant_text(
-    port: str, found: Sequence[Found], families: Mapping[str, type[Drive]], rs485: RS485 = RS485.OFF
+    port: str,
+    found: Sequence[Found],
+    families: Mapping[str, type[Drive]],
+    rs485: RS485 = RS485.OFF,
+    settle: float = 0.0,
 ) -> str:
     """Return the file's text; `families` by their model in a plant file.
 
@@ -21,7 +25,8 @@ def plant_text(
     names = {family.model or family.__name__: name for name, family in families.items()}
     taken: dict[int, str] = {}
     switch = f'rs485 = "{rs485}"\n' if rs485 is not RS485.OFF else ""
-    tables = [f'[[line]]\nname = "line-1"\nport = {_text(port)}\n{switch}']
+    wait = f'settle = "{round(settle * 1e3, 3):g} ms"\n' if settle else ""
+    tables = [f'[[line]]\nname = "line-1"\nport = {_text(port)}\n{switch}{wait}']
     for device in sorted(found, key=lambda device: (not device.models, device.address)):
         address = device.address
         if not device.models:

@@ -21,7 +21,7 @@ from multidrop.core import (
 )
 from multidrop.core.fork import register_at_fork
 from multidrop.core.undisturbed import undisturbed
-from multidrop.drive.network import speaks_tcp
+from multidrop.drive.network import check_settle, speaks_tcp
 from multidrop.errors import LineError, NoSuchPort, PortLost
 from multidrop.transport.aside_log import flush, words_of
 from multidrop.transport.bridge import PORT_FAILURES
@@ -39,7 +39,8 @@ class Line:
 
     `port` is a device, a URL of socket:// or rfc2217://, or tcp://host:port for Modbus TCP, whose replies
     have their requests' transaction ids unless `ids` says otherwise. `rs485` is who switches the
-    transceiver. Where it has a `mastership`, requests leave only while that holds. Every failure of the
+    transceiver. For `settle` seconds after each opening nothing is sent, and what comes is discarded. Where
+    it has a `mastership`, requests leave only while that holds. Every failure of the
     port is a LineError.
     """
 
@@ -50,7 +51,9 @@ class Line:
         ids: TransactionIds = TransactionIds.MATCH,
         rs485: RS485 = RS485.OFF,
         mastership: Mastership | None = None,
+        settle: float = 0.0,
     ) -> None:
+        check_settle(settle)
         if mastership is not None:
             check_port(port, mastership)
         self.port = port
@@ -59,7 +62,7 @@ class Line:
         self.is_tcp = isinstance(port, str) and speaks_tcp(port)
         self.ids = ids
         self._echo = echo
-        self._opened = OpenPort(port, ids, rs485, mastership)
+        self._opened = OpenPort(port, ids, rs485, mastership, settle)
         # The core's port, on which exchanges are queued; None once that is about to be closed.
         self.queue: Port | None = None
         self._tap: Tap | None = None

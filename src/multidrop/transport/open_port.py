@@ -18,6 +18,7 @@ from multidrop.core import (
 )
 from multidrop.drive.network import speaks_tcp
 from multidrop.errors import LineError
+from multidrop.transport import clock
 from multidrop.transport.bridge import PORT_FAILURES, Bridge, hand_on_nothing_late, set_up
 from multidrop.transport.opening import (
     connection_of,
@@ -51,7 +52,14 @@ class OpenPort:
     It may be opened and closed again and again, by one thread at a time.
     """
 
-    def __init__(self, name: str, ids: TransactionIds, rs485: RS485, mastership: Mastership | None) -> None:
+    def __init__(
+        self,
+        name: str,
+        ids: TransactionIds,
+        rs485: RS485,
+        mastership: Mastership | None,
+        settle: float = 0.0,
+    ) -> None:
         self.name = name
         self.identity = name  # see port_identity; known once it was open
         self.bridge: Bridge | None = None
@@ -59,11 +67,15 @@ class OpenPort:
         self._ids = ids
         self._rs485 = rs485
         self._mastership = mastership
+        self._settle = settle
         self._serial: serial.SerialBase | None = None
         self._adapter: USBAdapter | None = None  # with which it was open first
 
     def open(self) -> Port:
-        """Open it for the core. Raises LineError, or one of PORT_FAILURES; then close it."""
+        """Open it for the core, and return it when it has settled: what came until then is discarded.
+
+        Raises LineError, or one of PORT_FAILURES; then close it.
+        """
         port = self._serial = unopened(self.name)
         port.timeout = 0
         if isinstance(port, serial.Serial):
@@ -73,6 +85,9 @@ class OpenPort:
         if isinstance(port, serial.Serial) and not self.name.startswith(BY_PLACE):
             self._require_same_adapter(device_of(port))
         self.identity = identity_of(port, self.name)
+        if self._settle:
+            clock.sleep(self._settle)
+            port.reset_input_buffer()
         core = self._drive(port)
         with suppress(*PORT_FAILURES, AttributeError, NotImplementedError):
             port.set_low_latency_mode(True)  # a USB adapter else holds bytes back for 16 ms

@@ -26,9 +26,11 @@ from multidrop.cli.support.output import print_text
 from multidrop.cli.support.plants import (
     add_line_arguments,
     add_rs485_argument,
+    add_settle_argument,
     line_of,
     plant_at,
     rs485_at,
+    settle_at,
     usual_settings,
 )
 from multidrop.cli.support.values import wrapped
@@ -47,7 +49,7 @@ from multidrop.drive.timing import Settings
 from multidrop.drives.registry import find_model
 from multidrop.errors import LineError
 from multidrop.planning.blocks import first_block
-from multidrop.plant.model import Plant
+from multidrop.plant.model import Plant, PlantLine
 from multidrop.transport.line import Line
 from multidrop.transport.mixed_up import other_port
 from multidrop.transport.peers import LEAST_TIMEOUT
@@ -75,13 +77,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--framing", metavar="rtu", help="of the drive; the family's first if not given")
     add_rs485_argument(parser)
+    add_settle_argument(parser)
     add_json_argument(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
     plant = plant_at(arguments)
-    drive, settings, rs485 = _of_plant(plant, arguments) if plant else _by_hand(arguments)
-    findings = list(_findings(arguments.port, rs485, drive, settings))
+    drive, settings, line = _of_plant(plant, arguments) if plant else _by_hand(arguments)
+    rs485, settle = rs485_at(arguments, line), settle_at(arguments, line)
+    findings = list(_findings(arguments.port, rs485, settle, drive, settings))
     if arguments.json:
         records = [asdict(finding) for finding in findings]
         print_text(json.dumps({"port": arguments.port, "findings": records}, indent=2))
@@ -90,8 +94,8 @@ def run(arguments: argparse.Namespace) -> int:
     return 1 if any(finding.is_failure for finding in findings) else 0
 
 
-def _of_plant(plant: Plant, arguments: argparse.Namespace) -> tuple[Drive | None, Settings, RS485]:
-    """Return the drive to measure with if one is named, its or its line's settings, and who switches.
+def _of_plant(plant: Plant, arguments: argparse.Namespace) -> tuple[Drive | None, Settings, PlantLine | None]:
+    """Return the drive to measure with if one is named, its or its line's settings, and its line.
 
     Sets `arguments.port` to the line's port. Raises ValueError for options that only a port by hand takes.
     """
@@ -102,16 +106,16 @@ def _of_plant(plant: Plant, arguments: argparse.Namespace) -> tuple[Drive | None
     if arguments.name is None or arguments.name in lines:
         line = line_of(plant, arguments.name)
         arguments.port = line.port
-        return None, usual_settings(line), rs485_at(arguments, line)
+        return None, usual_settings(line), line
     line, drive = plant.find_drive(arguments.name)
     arguments.port = line.port
-    return drive, drive.settings, rs485_at(arguments, line)
+    return drive, drive.settings, line
 
 
-def _by_hand(arguments: argparse.Namespace) -> tuple[Drive | None, Settings, RS485]:
+def _by_hand(arguments: argparse.Namespace) -> tuple[Drive | None, Settings, PlantLine | None]:
     drive = _drive(arguments)
     settings = drive.settings if drive else _line_settings(arguments)
-    return drive, settings, rs485_at(arguments, None)
+    return drive, settings, None
 
 
 def _drive(arguments: argparse.Namespace) -> Drive | None:
@@ -134,14 +138,16 @@ def _line_settings(arguments: argparse.Namespace) -> Settings:
     )
 
 
-def _findings(port: str, rs485: RS485, drive: Drive | None, settings: Settings) -> Iterator[Finding]:
+def _findings(
+    port: str, rs485: RS485, settle: float, drive: Drive | None, settings: Settings
+) -> Iterator[Finding]:
     if "://" in port:
         yield from _remote(port)
     else:
         yield from _local(port, rs485)
     nobody = Message(NOBODY, 0x03, 0, 1)
     yield unit_finding(port, nobody, settings) if speaks_tcp(port) else _echo(port, rs485, settings)
-    measured, speaks = measure(port, rs485, drive)
+    measured, speaks = measure(port, rs485, settle, drive)
     yield measured
     if not other_port(port) or speaks:
         return

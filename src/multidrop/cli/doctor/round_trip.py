@@ -32,7 +32,7 @@ LOOK_S = 0.05  # between attempts to send a request that was held back
 OF_GATEWAYS = (0x0A, 0x0B)  # no path, and no response from the device (application protocol V1.1b3, 7)
 
 
-def measure(port: str, rs485: RS485, drive: Drive | None) -> tuple[Finding, bool]:
+def measure(port: str, rs485: RS485, settle: float, drive: Drive | None) -> tuple[Finding, bool]:
     """Return the finding, and True where the far end has answered anything in the port's framing."""
     if drive is None:
         return Finding(
@@ -44,7 +44,7 @@ def measure(port: str, rs485: RS485, drive: Drive | None) -> tuple[Finding, bool
     block = first_block(drive)
     if block is None:
         return Finding("round trip", f"not measured: nothing of it can be read ({drive.name})"), False
-    with Bus(port, rs485=rs485) as bus:
+    with Bus(port, rs485=rs485, settle=settle) as bus:
         bus.attach(drive)
         poll = make_exchange(drive, block.request, bus.peer(drive))
         completions = list(_repeat(bus.line, poll))

@@ -9,6 +9,7 @@ from multidrop.drive.network import check_port
 from multidrop.drive.timing import Settings
 from multidrop.plant.loader import load_plant
 from multidrop.plant.model import Plant, PlantLine
+from multidrop.toml_check import parse_duration
 
 
 def add_plant_argument(parser: argparse.ArgumentParser) -> None:
@@ -82,6 +83,24 @@ def rs485_at(arguments: argparse.Namespace, line: PlantLine | None) -> RS485:
     if arguments.rs485 is not None:
         raise ValueError("--rs485 is a matter of the plant file: write it into the line there")
     return line.rs485
+
+
+def add_settle_argument(parser: argparse.ArgumentParser) -> None:
+    """Add --settle, for a port by hand; `settle_at` has its value."""
+    parser.add_argument(
+        "--settle",
+        metavar="TIME",
+        help='such as "1.5 s": send nothing for so long after the port is opened, for devices that it resets',
+    )
+
+
+def settle_at(arguments: argparse.Namespace, line: PlantLine | None) -> float:
+    """Return how long this line, or a port by hand, needs after its opening, in s. Raises ValueError."""
+    if line is not None:
+        if arguments.settle is not None:
+            raise ValueError("--settle is a matter of the plant file: write it into the line there")
+        return line.settle
+    return parse_duration(arguments.settle) if arguments.settle is not None else 0.0
 
 
 def plant_at(arguments: argparse.Namespace) -> Plant | None:

@@ -34,12 +34,13 @@ class Target:
     port: str
     echo: Echo
     rs485: RS485
+    settle: float
     words: tuple[str, ...]
     model: str
 
     def open_bus(self, audit: Path | str | None = None) -> Bus:
         """Open the drive's line, with the drive alone on it. Raises LineError."""
-        bus = Bus(self.port, echo=self.echo, rs485=self.rs485, audit=audit)
+        bus = Bus(self.port, echo=self.echo, rs485=self.rs485, settle=self.settle, audit=audit)
         bus.attach(self.drive)
         return bus
 
@@ -126,7 +127,9 @@ def _by_plant(arguments: argparse.Namespace) -> Target:
     line, drive = plant.find_drive(name)
     ports = [f"--port={name}={port}" for name, port in arguments.ports]
     words = (path, drive.name, *ports)
-    return Target(drive, line.port, line.echo, line.rs485, words, command_line((path, drive.name)))
+    return Target(
+        drive, line.port, line.echo, line.rs485, line.settle, words, command_line((path, drive.name))
+    )
 
 
 def _by_hand(arguments: argparse.Namespace) -> Target:
@@ -143,7 +146,7 @@ def _by_hand(arguments: argparse.Namespace) -> Target:
     for name, value in settings.items():
         words += [] if value is None else [f"--{name}", str(value)]
     words += [f"--option={name}={value:g}" for name, value in arguments.option]
-    return Target(drive, port, Echo.AUTO, RS485.OFF, tuple(words), model)
+    return Target(drive, port, Echo.AUTO, RS485.OFF, 0.0, tuple(words), model)
 
 
 def _mistaken(arguments: argparse.Namespace, sentence: str) -> ValueError:
