@@ -82,7 +82,7 @@ def test_a_drive_that_was_silent_is_looked_at_once_before_the_next_write(
 
 
 @every_family
-@pytest.mark.usefixtures("_patient")
+@pytest.mark.usefixtures("_turns_awaited")
 @pytest.mark.parametrize("pause", ["idle", "asleep", "read since"])
 def test_a_drive_of_which_nothing_was_heard_for_ten_seconds_is_looked_at_once(
     model: str, pause: str, monkeypatch: pytest.MonkeyPatch
@@ -154,7 +154,7 @@ def _on_another_port(bus: Bus, drive: Any, monkeypatch: pytest.MonkeyPatch) -> N
     bus.line.reopen()
 
 
-@pytest.mark.usefixtures("_patient")
+@pytest.mark.usefixtures("_turns_awaited")
 @pytest.mark.parametrize("model", ["innovert-ibd", "delixi-native"])
 @pytest.mark.parametrize("lose", [_asleep, _idle, _idle_and_asleep, _read_since, _on_another_port])
 def test_a_setpoint_that_cannot_be_read_is_forgotten_once_the_drive_may_have_lost_its_power(
@@ -184,7 +184,7 @@ def test_a_setpoint_is_forgotten_where_the_look_before_start_ends_a_long_silence
         assert received.writes == []
 
 
-@pytest.mark.usefixtures("_patient")
+@pytest.mark.usefixtures("_turns_awaited")
 @pytest.mark.parametrize("model", ["innovert-ibd", "delixi-native"])
 def test_a_setpoint_that_was_written_through_another_bus_is_not_known(model: str) -> None:
     with known(model) as (bus, drive, received):
