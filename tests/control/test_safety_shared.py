@@ -136,7 +136,7 @@ def test_starts_and_stops_while_another_client_talks(model: str) -> None:
             until(lambda: attempt(drive.stop) is None)
             until(lambda: not first.sim.motor.energised)
         assert second.starts == []
-        assert stranger.exchanges
+        until(lambda: stranger.exchanges)  # its reads may take their time-outs beside ours
         assert pair.collisions
 
 
