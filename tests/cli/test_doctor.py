@@ -229,11 +229,18 @@ def test_a_slow_round_trip_is_told_apart_from_a_usual_one() -> None:
     usual = round_trip_finding(drive, [0.005] * ROUNDS, ROUNDS)
     assert usual.what.endswith("after 5.0 ms at least, 5.0 in the middle, 5.0 at most")
     assert usual.advice == ""
-    slow = round_trip_finding(drive, [0.005] * 3 + [0.0201] * 10, 17)
+    slow = round_trip_finding(drive, [0.005] * 3 + [0.0201] * 10, 13)
     assert "20.1 in the middle" in slow.what
-    assert slow.what.endswith("4 of 17 requests stayed without a good reply")
     assert "usually takes 5.0 ms" in slow.advice
+    assert not slow.is_failure
     assert "did not answer once in 4 requests" in round_trip_finding(drive, [], 4).what
+
+
+def test_lost_requests_are_a_failure_with_advice() -> None:
+    lost = round_trip_finding(InvtCHE(1), [0.005] * 10, 17)
+    assert lost.what.endswith("7 of 17 requests got no good reply")
+    assert lost.advice.startswith("look at termination, bias, cable and signal ground")
+    assert lost.is_failure
 
 
 def test_what_came_in_place_of_good_replies_is_told() -> None:
@@ -329,6 +336,35 @@ def test_the_round_trip_is_measured_with_a_drive(run: Run, port: str) -> None:
     assert status == 0
     findings = {load["topic"]: load for load in json.loads(out)["findings"]}
     assert findings["round trip"]["what"].startswith("innovert-ibd@2 begins to answer after ")
+
+
+@pytest.mark.slow
+def test_all_drives_of_a_plant_are_tried(run: Run, port: str, tmp_path: Path) -> None:
+    plant = tmp_path / "plant.toml"
+    drive = '[[line.drive]]\nname = "{}"\nmodel = "{}"\naddress = {}\n'
+    plant.write_text(
+        f'[[line]]\nname = "hall"\nport = "{port}"\n'
+        + drive.format("che", "invt-che", 1).replace("address", "maximum_frequency = 50\naddress")
+        + drive.format("ibd", "innovert-ibd", 2) + 'framing = "ascii"\n'
+        + '[[line]]\nname = "roof"\nport = "/dev/none"\n' + drive.format("fan", "yd1000", 1)
+    )  # fmt: skip
+    status, out, _ = run("doctor", plant, "--json")
+    assert status == 1
+    hall, roof = json.loads(out)["lines"]
+    trips = [one["what"] for one in hall["findings"] if one["topic"] == "round trip"]
+    assert [trip.split(" after ")[0] for trip in trips] == ["che begins to answer", "ibd begins to answer"]
+    assert [one["what"] for one in roof["findings"]] == ["/dev/none: there is no such port"]
+    status, out, _ = run("doctor", plant, "hall")
+    assert (status, out.count("round trip")) == (0, 2)
+    assert run("doctor", plant)[1].startswith(f"hall: {port}\n")
+    assert "has no drive 'holl'; there are che, ibd, fan" in run("doctor", plant, "holl")[2]
+
+
+@pytest.mark.slow
+def test_a_silent_drive_gets_few_requests(run: Run, port: str) -> None:
+    status, out, _ = run("doctor", port, "--model", "invt-che", "--address", "9")
+    assert status == 1
+    assert "did not answer once in 5 requests" in " ".join(out.split())
 
 
 @pytest.mark.parametrize("port", ["pty", "socket://127.0.0.1:0"], indirect=True)

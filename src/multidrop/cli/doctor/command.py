@@ -6,8 +6,8 @@ import argparse
 import json
 import os
 import sys
-from collections.abc import Iterator
-from dataclasses import asdict
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from multidrop.cli.doctor.adapter import com_description, find_adapter, low_latency, rs485_mode
@@ -27,7 +27,6 @@ from multidrop.cli.support.plants import (
     add_line_arguments,
     add_rs485_argument,
     add_settle_argument,
-    line_of,
     plant_at,
     rs485_at,
     settle_at,
@@ -49,7 +48,7 @@ from multidrop.drive.timing import Settings
 from multidrop.drives.registry import find_model
 from multidrop.errors import LineError
 from multidrop.planning.blocks import first_block
-from multidrop.plant.model import Plant, PlantLine
+from multidrop.plant.model import Plant
 from multidrop.transport.line import Line
 from multidrop.transport.mixed_up import other_port
 from multidrop.transport.peers import LEAST_TIMEOUT
@@ -81,41 +80,70 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_json_argument(parser)
 
 
+@dataclass(frozen=True)
+class _Target:
+    """A port to examine, the drives to measure with, and the settings to look for an echo with."""
+
+    port: str
+    drives: Sequence[Drive]
+    settings: Settings
+    rs485: RS485
+    settle: float
+    line: str = ""  # its name in the plant file
+
+
 def run(arguments: argparse.Namespace) -> int:
     plant = plant_at(arguments)
-    drive, settings, line = _of_plant(plant, arguments) if plant else _by_hand(arguments)
-    rs485, settle = rs485_at(arguments, line), settle_at(arguments, line)
-    findings = list(_findings(arguments.port, rs485, settle, drive, settings))
+    targets = list(_of_plant(plant, arguments)) if plant else [_by_hand(arguments)]
+    found = [(target, list(_examined(target, is_alone=len(targets) == 1))) for target in targets]
     if arguments.json:
-        records = [asdict(finding) for finding in findings]
-        print_text(json.dumps({"port": arguments.port, "findings": records}, indent=2))
+        records = [
+            {"port": target.port, "findings": [asdict(finding) for finding in findings]}
+            | ({"line": target.line} if target.line else {})
+            for target, findings in found
+        ]
+        print_text(json.dumps(records[0] if len(records) == 1 else {"lines": records}, indent=2))
     else:
-        print_text("\n".join(_text(findings)))
-    return 1 if any(finding.is_failure for finding in findings) else 0
+        heads = [f"{target.line}: {target.port}\n" if len(found) > 1 else "" for target, _ in found]
+        texts = ("\n".join(_text(findings)) for _, findings in found)
+        print_text("\n\n".join(map(str.__add__, heads, texts)))
+    return 1 if any(finding.is_failure for _, findings in found for finding in findings) else 0
 
 
-def _of_plant(plant: Plant, arguments: argparse.Namespace) -> tuple[Drive | None, Settings, PlantLine | None]:
-    """Return the drive to measure with if one is named, its or its line's settings, and its line.
+def _of_plant(plant: Plant, arguments: argparse.Namespace) -> Iterator[_Target]:
+    """Yield the line that is named with all of its drives, or the drive that is named; without a name all.
 
-    Sets `arguments.port` to the line's port. Raises ValueError for options that only a port by hand takes.
+    Raises ValueError for options that belong to a port without a plant file.
     """
     for name in ("model", "address", "baudrate", "format", "framing"):
         if getattr(arguments, name) is not None:
             raise ValueError(f"--{name} is a matter of the plant file: write it into {plant.path}")
-    lines = {line.name for line in plant.lines}
-    if arguments.name is None or arguments.name in lines:
-        line = line_of(plant, arguments.name)
-        arguments.port = line.port
-        return None, usual_settings(line), line
-    line, drive = plant.find_drive(arguments.name)
-    arguments.port = line.port
-    return drive, drive.settings, line
+    for line in plant.lines:
+        rs485, settle = rs485_at(arguments, line), settle_at(arguments, line)
+        if arguments.name in (None, line.name):
+            drives = [polled.drive for polled in line.drives]
+            yield _Target(line.port, drives, usual_settings(line), rs485, settle, line.name)
+    if arguments.name not in {None, *(line.name for line in plant.lines)}:
+        line, drive = plant.find_drive(arguments.name)
+        rs485, settle = rs485_at(arguments, line), settle_at(arguments, line)
+        yield _Target(line.port, [drive], drive.settings, rs485, settle, line.name)
 
 
-def _by_hand(arguments: argparse.Namespace) -> tuple[Drive | None, Settings, PlantLine | None]:
+def _by_hand(arguments: argparse.Namespace) -> _Target:
     drive = _drive(arguments)
     settings = drive.settings if drive else _line_settings(arguments)
-    return drive, settings, None
+    rs485, settle = rs485_at(arguments, None), settle_at(arguments, None)
+    return _Target(arguments.port, [drive] if drive else [], settings, rs485, settle)
+
+
+def _examined(target: _Target, *, is_alone: bool) -> Iterator[Finding]:
+    """Yield the findings of a port. One of several that cannot be opened is a finding, and no error."""
+    try:
+        yield from _findings(target)
+    except LineError as failure:
+        if is_alone:
+            raise
+        yield Finding("port", str(failure), is_failure=True)
 
 
 def _drive(arguments: argparse.Namespace) -> Drive | None:
@@ -138,20 +166,24 @@ def _line_settings(arguments: argparse.Namespace) -> Settings:
     )
 
 
-def _findings(
-    port: str, rs485: RS485, settle: float, drive: Drive | None, settings: Settings
-) -> Iterator[Finding]:
+def _findings(target: _Target) -> Iterator[Finding]:
+    port, settings = target.port, target.settings
     if "://" in port:
         yield from _remote(port)
     else:
-        yield from _local(port, rs485)
+        yield from _local(port, target.rs485)
     nobody = Message(NOBODY, 0x03, 0, 1)
-    yield unit_finding(port, nobody, settings) if speaks_tcp(port) else _echo(port, rs485, settings)
-    measured, speaks = measure(port, rs485, settle, drive)
-    yield measured
+    yield unit_finding(port, nobody, settings) if speaks_tcp(port) else _echo(port, target.rs485, settings)
+    speaks = False
+    drives: Sequence[Drive | None] = target.drives or [None]
+    for drive in drives:
+        measured, answers = measure(port, target.rs485, target.settle, drive)
+        speaks |= answers
+        yield measured
     if not other_port(port) or speaks:
         return
-    if drive and (block := first_block(drive)):
+    block = first_block(target.drives[0]) if target.drives else None
+    if block:
         yield other_way_finding(port, block.request, settings)
     elif not speaks_tcp(port):  # a line without drives says nothing in the other way
         yield other_way_finding(port, nobody, settings)

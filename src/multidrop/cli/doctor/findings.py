@@ -24,7 +24,7 @@ class Finding:
     topic: str
     what: str
     advice: str = ""
-    is_failure: bool = False  # the named drive does not answer
+    is_failure: bool = False  # a drive does not answer, or not every time
 
 
 def adapter_finding(adapter: Adapter, port: str, lasting: str) -> Finding:
@@ -143,12 +143,20 @@ def round_trip_finding(
     figures = f"{least * 1e3:.1f} ms at least, {median * 1e3:.1f} in the middle, {most * 1e3:.1f} at most"
     alone = f"a wire at {drive.settings} alone takes {wire * 1e3:.1f} ms"
     since = f", from when its request was handed over ({alone})" if wire else ""
-    lost = f"; {asked - len(delays)} of {asked} requests stayed without a good reply"
+    lost = f"; {asked - len(delays)} of {asked} requests got no good reply"
     what = f"{drive.name} begins to answer after {figures}{since}{lost if len(delays) < asked else ''}"
     if refusals:
         what += f"; {len(refusals)} replies were exceptions: {codes}"
     if came:
         what += f"; what came in their place: {came}"
+    if len(delays) < asked:
+        return Finding(
+            "round trip",
+            what,
+            "look at termination, bias, cable and signal ground, and for another master; "
+            "`multidrop poll` and `multidrop report` show when requests are lost",
+            is_failure=True,
+        )
     if median - wire - drive.response_delay > SLOW_S:
         rest = "the adapter's or the network's" if wire else "the adapter's"
         return Finding(

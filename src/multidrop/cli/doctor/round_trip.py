@@ -27,6 +27,7 @@ from multidrop.planning.blocks import first_block
 from multidrop.transport.line import Line
 from multidrop.transport.prepared import make_exchange
 
+UNANSWERED = 5  # requests to a drive that has answered none
 MOST_S = 5.0  # that all rounds take, where the drive is slow or silent
 LOOK_S = 0.05  # between attempts to send a request that was held back
 OF_GATEWAYS = (0x0A, 0x0B)  # no path, and no response from the device (application protocol V1.1b3, 7)
@@ -89,14 +90,16 @@ def _is_gateway_s(drive: Drive, done: Completion) -> bool:
 def _repeat(line: Line, poll: Exchange) -> Iterator[Completion]:
     """Send ROUNDS requests, or those that fit into MOST_S, and return what became of each.
 
-    A request that is held back, because an earlier answer may still come, does not count.
+    A request that is held back, because an earlier answer may still come, does not count. A drive that is
+    silent from the start gets UNANSWERED requests.
     """
     end = time.monotonic() + MOST_S
-    count = 0
-    while count < ROUNDS and (time.monotonic() < end or not count):
+    count, is_silent = 0, True
+    while count < (UNANSWERED if is_silent else ROUNDS) and (time.monotonic() < end or not count):
         found = line.carry_out(poll)
         if found.sent_ns:
             count += 1
+            is_silent &= not found.raw
             yield found
         else:
             time.sleep(LOOK_S)
