@@ -68,7 +68,7 @@ struct md_line {
     uint8_t lone_copies; /* in a row that were taken for replies, up to a bound */
     uint8_t transactions; /* enum md_transactions; the line is told before its first exchange */
     uint8_t is_out_of_step; /* what came is no header of Modbus TCP: the port is to be lost */
-    uint8_t is_adrift;      /* a frame was longer or shorter than its header says: the next head is looked for */
+    uint8_t is_adrift;      /* a frame's length was not its header's: look for the next head */
     uint8_t is_proven;      /* a good reply came on this port */
     uint8_t is_quicker;     /* a reply came sooner than its characters could over a wire */
     uint8_t waited;      /* since the request left a wait was granted */
@@ -202,7 +202,7 @@ int md_echo_is_copy(const struct md_line *line, size_t at);
 int md_echo_may_follow(const struct md_line *line, size_t at);
 /* Learn from a reply that is no copy of its request. */
 void md_echo_learn(struct md_line *line, size_t reply_at);
-/* Learn from a copy that is all that came before the time-out: whether it was the reply, as far as it can be. */
+/* Learn from a copy that is all that came before the time-out: return whether it was the reply. */
 enum md_copy { MD_COPY_IS_ECHO, MD_COPY_MAY_BE_REPLY, MD_COPY_IS_REPLY };
 enum md_copy md_echo_learn_alone(struct md_line *line, int may_be_reply);
 /* Learn from a request to which nothing came, not even its copy. */

@@ -42,7 +42,8 @@ static int64_t ready_ns(const struct md_exchange *exchange)
 static int begin(struct md_turn *turn, int whose, const struct md_exchange *exchange,
                  struct md_completion *completion, int64_t now_ns)
 {
-    const struct md_exchange *first = md_before_find(&turn->before, exchange, md_echo_is_in_doubt(&turn->line), now_ns);
+    const struct md_exchange *first =
+        md_before_find(&turn->before, exchange, md_echo_is_in_doubt(&turn->line), now_ns);
     turn->whose = first ? MD_BEFOREHAND : whose;
     md_line_begin(&turn->line, first ? first : exchange, first ? &turn->completion : completion, now_ns);
     if (turn->progress.lost)
@@ -110,7 +111,7 @@ static int take_queued(struct md_turn *turn, int64_t *wake_ns, int64_t now_ns)
 
 static int take_polled(struct md_turn *turn, int64_t *wake_ns, int64_t now_ns)
 {
-    if (turn->is_ending || turn->progress.lost) /* what is queued waits for its client, who has it sent elsewhere */
+    if (turn->is_ending || turn->progress.lost) /* the client sends the queue elsewhere */
         return 0;
     if (pending(turn) && take_queued(turn, wake_ns, now_ns))
         return 1;

@@ -4,9 +4,9 @@
  * skipped. So no late reply can pass for another's, whatever it holds. Where a gateway replies with ids of
  * its own, the rules of late.c hold instead.
  *
- * A frame's length is in its header alone. Where a device sends more or less than its header says, the head of
- * the awaited reply is looked for by its id, unit and function. If no good reply has come yet, what is no
- * header says that the far end speaks something else: the connection is lost. */
+ * A frame's length is in its header alone. If a device sends more or less than its header says, the head of
+ * the awaited reply is found by its id, unit and function. Bytes that are no header, before any good reply,
+ * mean that the far end speaks another protocol: the connection is lost. */
 #include "line.h"
 
 #include <string.h>

@@ -45,6 +45,7 @@ FILES_TOUCHING_THE_SYSTEM = {
     "control/eeprom_ledger.py",
     "control/audit_log.py",
     "control/exit_hook.py",
+    "control/latches.py",
     "gateway/clock.py",
     "gateway/connections.py",
     "gateway/gateway.py",

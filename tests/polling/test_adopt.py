@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import threading
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
@@ -298,10 +299,12 @@ def calls_to_add_one_to(count: int) -> int:
 
     with clocked(*lines) as made:
         sys.setprofile(note)
+        threading.setprofile(note)  # of the thread that adopts
         try:
             made.poller.adopt(plant(*lines, yard(*fans())))
         finally:
             sys.setprofile(None)
+            threading.setprofile(None)
         assert_rate(made.run(10), "fan-1", 10, 0.1)
     return calls
 

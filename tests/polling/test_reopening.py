@@ -181,7 +181,7 @@ class Scattered(Drive):
 @pytest.mark.parametrize("every", [None, 0.1])
 @pytest.mark.parametrize("most", [1, 2, 3])
 def test_each_register_has_its_turn_though_connections_end_early(every: float | None, most: int) -> None:
-    """What was cut off comes first on the next connection, but for what a connection begins and ends with."""
+    """A request that was cut off comes first on the next connection, unless it was the connection's first."""
     seen = Counter[tuple[str, float | None]]()
     with server(lambda nth, address: nth == most) as port:
         drive = polled(Scattered(1, name="pump"), list(Scattered.registers.values()), every)

@@ -123,7 +123,8 @@ class WriteRecords:
             frame = build_request(drive.framing, request)
             record["sent"] = frame.decode().strip() if frame.startswith(b":") else frame.hex(" ").upper()
         more = {"held": None if held is None else float(held), "why": why}
-        return record | {"outcome": outcome} | {key: it for key, it in more.items() if it not in (None, "")}
+        known = {key: value for key, value in more.items() if value not in (None, "")}
+        return record | {"outcome": outcome} | known
 
     def _put(self, record: dict[str, Any], log: Callable[..., None], text: str = "") -> None:
         """Queue a record for the audit log, and log it, or this text for it."""

@@ -21,7 +21,7 @@ P = ParamSpec("P")
 R = TypeVar("R")
 
 
-class _Work:
+class _Act:
     """Work that is carried out once, by the thread that takes it first."""
 
     def __init__(self, act: Callable[[], Any]) -> None:
@@ -67,7 +67,7 @@ def undisturbed(function: Callable[P, R]) -> Callable[P, R]:
     def carry_out(*details: P.args, **more: P.kwargs) -> R:
         if threading.current_thread() is not threading.main_thread():
             return function(*details, **more)
-        work = _Work(partial(function, *details, **more))
+        work = _Act(partial(function, *details, **more))
         thread = threading.Thread(
             target=copy_context().run, args=(work.run,), name="multidrop undisturbed", daemon=True
         )

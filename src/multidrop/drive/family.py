@@ -21,7 +21,7 @@ from multidrop.drive.scale_check import scale_errors
 from multidrop.drive.script import Script, read, until, write
 from multidrop.drive.state import Condition, Direction, State
 from multidrop.drive.text import Text, text_errors
-from multidrop.drive.verbs import MOVING, StopRun, UnattachedStop, verb, verb_errors
+from multidrop.drive.verbs import MOVING, CalledStop, UnattachedStop, verb, verb_errors
 from multidrop.errors import Advice, NotAttached, NotDone, Refused, Unconfirmed, Unsupported
 
 START_TIME = 5.0  # s, after which a motor that was started must be seen to run
@@ -117,7 +117,7 @@ class Drive(ManualFacts):
         # A call's permit, which a stop ends that is called after `seen` of them.
         self.begin_call: Callable[[str, int], Any] = lambda verb, seen: None
         self.carry_out_move: Callable[[Script[Any], Any], Any] = self._move_nowhere
-        self.begin_stop: Callable[[str, Callable[[], Script[Any]], float | None], StopRun] = (
+        self.begin_stop: Callable[[str, Callable[[], Script[Any]], float | None], CalledStop] = (
             lambda verb, make, seconds: UnattachedStop(self, make)
         )
 

@@ -39,7 +39,7 @@ _TAKES: Mapping[str, tuple[str, tuple[type, ...], str]] = {
 TRIES = 150  # of a stop, while the system has no memory or descriptors for it
 
 
-class StopRun(Protocol):
+class CalledStop(Protocol):
     """A stop that was called, and goes on where it was left when it is carried out again."""
 
     def carry_out(self) -> None: ...
@@ -111,7 +111,7 @@ class _BoundStop(_BoundVerb[P, R]):
     """One that stops the motor, whatever interrupts it from its first step on."""
 
     def __call__(self, *args: Any, **kwargs: Any) -> R:
-        run: StopRun | None = None
+        run: CalledStop | None = None
         tried = 0
         while True:
             try:
@@ -130,7 +130,7 @@ class _BoundStop(_BoundVerb[P, R]):
             raise mistake
         return cast(R, result)
 
-    def _called(self, args: tuple[Any, ...], seconds: float | None = None, **kwargs: Any) -> StopRun:
+    def _called(self, args: tuple[Any, ...], seconds: float | None = None, **kwargs: Any) -> CalledStop:
         if self._mistake(args, **kwargs):
             args, kwargs = (), {}
         return self.drive.begin_stop(self.name, lambda: self.script(*args, **kwargs), seconds)

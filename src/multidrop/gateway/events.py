@@ -18,7 +18,7 @@ LOST = ("port lost", "port refused its settings")  # statuses of all rows of a l
 
 
 class Alarm(NamedTuple):
-    """What was wrong with a drive or a line; times are UTC in ms."""
+    """Something that is or was wrong with a drive or a line; times are UTC in ms."""
 
     time: int
     drive: str  # "" for a line's

@@ -163,7 +163,7 @@ def _columns(rows: list[list[str]], stem: str) -> list[ImportedDevice]:
 
 
 class _Layout:
-    """What the first line of a table says of its columns. Raises ValueError if none is an address."""
+    """The columns of a table, by its first line. Raises ValueError if none is an address."""
 
     def __init__(self, rows: list[list[str]]) -> None:
         header = [_plain_name(cell) for cell in rows[0]]

@@ -13,7 +13,7 @@ from typing import Any
 from multidrop.importers.device import ImportedDevice, ImportedRegister, key_table, uncarried, unit_address
 from multidrop.importers.line_settings import UNKNOWN_LINE, LineSettings, serial_settings
 from multidrop.importers.numbers import bits_text, number, put_number, scaled, whole, words_of
-from multidrop.importers.yaml_text import Tag
+from multidrop.importers.yaml_text import YamlTag
 
 PLATFORM = "modbus_controller"
 _TABLES = {"coil": "coil", "discrete_input": "discrete", "holding": "holding", "read": "input"}
@@ -127,7 +127,7 @@ def _substitutions(document: Any) -> dict[str, str]:
 
 def _substituted(value: Any, known: Mapping[str, str], depth: int) -> Any:
     """Return a value with each ${name} that the document itself substitutes."""
-    if isinstance(value, str) and "$" in value and not isinstance(value, Tag):
+    if isinstance(value, str) and "$" in value and not isinstance(value, YamlTag):
         return re.sub(r"\$(?:\{(\w+)\}|(\w+))", lambda name: known.get(name[1] or name[2], name[0]), value)
     if depth < 5 and known:
         if isinstance(value, dict):
@@ -163,7 +163,7 @@ class _Devices:
 
     def _add_controller(self, controller: Mapping[str, Any]) -> None:
         given, name = controller.get("address", 1), str(controller.get("id"))
-        is_elsewhere = isinstance(given, Tag) or "$" in str(given)
+        is_elsewhere = isinstance(given, YamlTag) or "$" in str(given)
         address = None if is_elsewhere else unit_address(given, f"{PLATFORM}: address")
         bus = str(controller.get("modbus_id"))
         place = (bus, name if address is None else address)
@@ -233,7 +233,7 @@ def _add(device: ImportedDevice, kind: str, name: str, entry: Mapping[str, Any])
     if kind == "text_sensor":
         _text(device, register, entry, offset)
         return
-    if (unit := entry.get("unit_of_measurement")) and (isinstance(unit, Tag) or "${" in str(unit)):
+    if (unit := entry.get("unit_of_measurement")) and (isinstance(unit, YamlTag) or "${" in str(unit)):
         register.gaps.append(f"its unit is {unit}")
     elif unit:
         register.details["unit"] = str(unit)

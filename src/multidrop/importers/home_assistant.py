@@ -13,7 +13,7 @@ from typing import Any
 from multidrop.importers.device import ImportedDevice, ImportedRegister, key_table, uncarried, unit_address
 from multidrop.importers.line_settings import UNKNOWN_LINE, LineSettings, network_settings, serial_settings
 from multidrop.importers.numbers import count, put_number, scaled, whole, words_of
-from multidrop.importers.yaml_text import Tag
+from multidrop.importers.yaml_text import YamlTag
 
 _SWAPS = {"byte": "BADC", "word": "CDAB", "word_byte": "DCBA", "none": "", "": ""}
 _TABLES = {
@@ -73,7 +73,7 @@ def read_home_assistant(document: Any) -> list[ImportedDevice]:
             name = str(entry.get("name", "register"))
             with whole_hub.entry(name):
                 slave = entry.get("slave", entry.get("device_address"))
-                address = None if isinstance(slave, Tag) else unit_address(slave, "slave")
+                address = None if isinstance(slave, YamlTag) else unit_address(slave, "slave")
                 device = found.setdefault((which, address), ImportedDevice(title, address, line=line))
                 with device.entry(name):
                     if kind in _NOT_READ:
@@ -98,7 +98,7 @@ def _lack(document: Any, hubs: list[Mapping[str, Any]]) -> str:
         return f"`modbus:` has no {', '.join(KEYS)} with entries"
     keys = ", ".join(str(key)[:40] for key in list(document)[:8]) if isinstance(document, dict) else ""
     what = f"its keys are {keys}" if keys else f"it is {type(document).__name__}"
-    if isinstance(document, dict) and isinstance(elsewhere := document.get("modbus"), Tag):
+    if isinstance(document, dict) and isinstance(elsewhere := document.get("modbus"), YamlTag):
         return f"`modbus:` stands in another file: {elsewhere}"
     return (
         "has no `modbus:` (Home Assistant), no entity of the platform modbus_controller (ESPHome), and is no "
@@ -190,7 +190,7 @@ def _entries(hub: Mapping[str, Any], lost: ImportedDevice) -> Iterator[tuple[str
             if isinstance(entry, dict):
                 yield kind, entry
             else:
-                where = "stands in another file" if isinstance(entry, Tag) else "is no entity"
+                where = "stands in another file" if isinstance(entry, YamlTag) else "is no entity"
                 lost.lose(kind, f"{str(entry)[:60]!r} {where}")
 
 
@@ -206,7 +206,7 @@ def _add(device: ImportedDevice, kind: str, name: str, entry: Mapping[str, Any])
         return
     register = ImportedRegister(name, whole(entry, "address"), table)
     register.note_write(is_written=is_written)
-    if isinstance(unit := entry.get("unit_of_measurement"), Tag):
+    if isinstance(unit := entry.get("unit_of_measurement"), YamlTag):
         register.gaps.append(f"its unit is {unit}")
     elif unit:
         register.details["unit"] = str(unit)

@@ -9,12 +9,12 @@ MOST_CHARACTERS = 1_000_000
 MOST_NODES = 50_000  # where each alias counts as all that it stands for
 
 
-class Tag(str):
+class YamlTag(str):
     """A value that stands elsewhere or is a program, such as `!secret host`, as it is spelt."""
 
 
 def parse_yaml(text: str) -> Any:
-    """Return the document; a value with a tag such as !secret is a `Tag`.
+    """Return the document; a value with a tag such as !secret is a `YamlTag`.
 
     Raises ImportError without PyYAML, ValueError for what is no YAML, too long, or blown up by aliases.
     """
@@ -53,7 +53,7 @@ def parse_yaml(text: str) -> Any:
                         each for pair in value for each in (pair if isinstance(pair, tuple) else (pair,))
                     ]
 
-    Loader.add_multi_constructor("!", lambda loader, suffix, node: Tag(_spelt(suffix, node.value)))
+    Loader.add_multi_constructor("!", lambda loader, suffix, node: YamlTag(_spelt(suffix, node.value)))
     try:
         return yaml.load(text, Loader)
     except yaml.YAMLError as failure:

@@ -6,7 +6,7 @@ and convert.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from io import BufferedWriter
 from pathlib import Path
@@ -28,9 +28,8 @@ from multidrop.recording.rows import RecordedRows
 
 GROUP_ROWS = 1 << 17  # that wait in memory
 TEXTS = ("drive", "register", "status")
-LONGEST_TEXT = 4096  # bytes of a name or a status, on average of a batch
-MOST_TEXT = 1 << 28  # bytes that a text column of a batch may take, whatever its dictionary holds
-MOST_OF_COLUMN = 1 << 28  # unpacked bytes of a column in a group of rows
+MOST_TEXT = 1 << 26  # bytes of a text column in GROUP_ROWS rows
+MOST_OF_GROUP = 1 << 29  # unpacked bytes of a group of rows
 UNREADABLE = "nothing of it can be read, because a Parquet file is readable only once it is closed"
 ENCODING = {
     "compression": "zstd",
@@ -42,6 +41,7 @@ ENCODING = {
 def _pyarrow(path: Path) -> Any:
     try:
         import pyarrow as arrow
+        import pyarrow.compute
         import pyarrow.parquet
     except ImportError as failure:
         raise RecordingError(path, "Parquet needs pyarrow: pip install 'multidrop[parquet]'") from failure
@@ -116,37 +116,34 @@ class ParquetReader(RecordingReader):
     def __iter__(self) -> Iterator[Rows]:
         c_array = nanoarrow().c_array
         rows = 0
-        with self._open() as file:
+        with self._open(read_dictionary=TEXTS) as file:
             # Not by groups: a damaged one may claim any size.
-            batches = file.iter_batches(self._batch_rows(file.metadata), columns=self._columns)
+            batches = file.iter_batches(GROUP_ROWS, columns=self._columns)
             while (batch := self._next(batches, rows)) is not None:
                 yield RecordedRows(c_array(batch))
                 rows += len(batch)
 
     @contextmanager
-    def _open(self) -> Iterator[Any]:
+    def _open(self, read_dictionary: Sequence[str] = ()) -> Iterator[Any]:
         with self.path.open("rb") as file:
             try:
-                opened = self._arrow.parquet.ParquetFile(file)
+                opened = self._arrow.parquet.ParquetFile(file, read_dictionary=read_dictionary)
             except (OSError, ValueError, self._arrow.ArrowException) as failure:
                 raise self._not_a_recording(f"it is no whole Parquet file; {UNREADABLE}") from failure
+            self._check_sizes(opened.metadata)
             yield opened
 
-    def _batch_rows(self, described: Any) -> int:
-        """Return how many rows are read at once: even if all have one long text, they fit into memory.
+    def _check_sizes(self, described: Any) -> None:
+        """Raise ValueError for a group of rows that would take too much memory once it is unpacked.
 
-        Raises ValueError for a column that would take too much memory once it is unpacked.
+        pyarrow aborts the process if the columns of a damaged group are asked for their own sizes.
         """
-        longest = 1
         for number in range(described.num_row_groups):
-            group = described.row_group(number)
-            for place, name in enumerate(self._columns):
-                size = group.column(place).total_uncompressed_size
-                longest = max(longest, size if name in TEXTS else 0)
-                if size > MOST_OF_COLUMN:
-                    what = f"its column {name} takes {size} bytes unpacked"
-                    raise self._not_a_recording(f"{what}, at most {MOST_OF_COLUMN} are read")
-        return max(1, min(GROUP_ROWS, MOST_TEXT // longest))
+            size = described.row_group(number).total_byte_size
+            if size > MOST_OF_GROUP:
+                raise self._not_a_recording(
+                    f"a group of its rows takes {size} bytes unpacked, at most {MOST_OF_GROUP} are read"
+                )
 
     def _next(self, batches: Iterator[Any], rows: int) -> Any:
         """Return the next batch, None after the last."""
@@ -157,16 +154,23 @@ class ParquetReader(RecordingReader):
             batch.validate(full=True)
         except (OSError, ValueError, self._arrow.ArrowException) as failure:
             raise self._damaged(rows, "what follows cannot be unpacked") from failure
-        self._check_texts(batch, rows)
+        batch = self._with_texts(batch, rows)
         for field in self._arrow.schema(schema()):
             if not field.nullable and batch[field.name].null_count:
                 raise self._damaged(rows, f"there is a row without a {field.name}")
-        return batch.replace_schema_metadata()
+        return batch
 
-    def _check_texts(self, batch: Any, rows: int) -> None:
-        for name in TEXTS:
-            if batch[name].nbytes > LONGEST_TEXT * (len(batch) + 1):
-                raise self._damaged(rows, f"the texts of column {name} are longer than {LONGEST_TEXT} bytes")
+    def _with_texts(self, batch: Any, rows: int) -> Any:
+        """Return the batch with texts in place of numbers into a dictionary of texts."""
+        compute, columns = self._arrow.compute, []
+        for name, column in zip(self._columns, batch.columns, strict=True):
+            if name in TEXTS:
+                lengths = compute.take(compute.binary_length(column.dictionary), column.indices)
+                if (compute.sum(lengths).as_py() or 0) > MOST_TEXT:
+                    raise self._damaged(rows, f"the texts of column {name} take more than {MOST_TEXT} bytes")
+                column = column.dictionary_decode()
+            columns.append(column)
+        return self._arrow.RecordBatch.from_arrays(columns, schema=self._arrow.schema(schema()))
 
 
 writer, reader = ParquetWriter, ParquetReader
