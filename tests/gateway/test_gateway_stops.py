@@ -528,7 +528,8 @@ def test_verbs_and_writes_say_what_became_of_them(tmp_path: Path) -> None:
         assert act("set_frequency", hz=10**400).endswith("0 is no number")
         assert act("set_frequency", hz=None) == "set_frequency needs a frequency: hz = 20.0"
         assert act("set_frequency", hz=20) == (
-            "pump-1 takes its setpoint in percent of P0.04: write maximum_frequency = HZ below its [[line.drive]]"
+            "pump-1 takes its setpoint in percent of P0.04: "
+            "write maximum_frequency = HZ below its [[line.drive]]"
         )
 
 

@@ -33,9 +33,8 @@ def lacks_encoding(call: ast.Call) -> bool:
     if name in ("open", "os.fdopen"):
         return not any("b" in mode for mode in modes)
     is_text = name.endswith(".open") and any(mode and set(mode) <= TEXT_MODES for mode in modes)
-    return (
-        is_text or not options.isdisjoint({"text", "universal_newlines"}) and not name.endswith("._replace")
-    )
+    names_text = not options.isdisjoint({"text", "universal_newlines"})
+    return is_text or (names_text and not name.endswith("._replace"))
 
 
 def lacking(source: str) -> Iterator[int]:
