@@ -11,7 +11,7 @@ from multidrop.control.attached import Attached, made
 from multidrop.control.audit_log import AuditLog
 from multidrop.control.broadcast import Broadcaster
 from multidrop.control.eeprom_ledger import Ledger
-from multidrop.control.exit_hook import exit_hook, without_internals
+from multidrop.control.exit_hook import give_signals_back, without_internals
 from multidrop.control.latches import Latches
 from multidrop.control.leaving import Leaving
 from multidrop.control.outcome import Outcome, Stopped
@@ -197,7 +197,7 @@ class Bus:
         """
         self._close()
         if self.stops_on_exit:
-            exit_hook().rest()
+            give_signals_back()
 
     @undisturbed
     def _close(self) -> None:

@@ -14,7 +14,7 @@ from typing import Any
 
 from multidrop.bus import Bus
 from multidrop.control.eeprom_ledger import Ledger
-from multidrop.control.exit_hook import exit_hook, without_internals
+from multidrop.control.exit_hook import exit_hook, give_signals_back, without_internals
 from multidrop.core import Mastership, RowQueue
 from multidrop.core.fork import register_at_fork
 from multidrop.core.undisturbed import undisturbed
@@ -140,8 +140,7 @@ class Poller(RowSource):
         PollingFailed if polling had failed; each once.
         """
         self._end()
-        if self._lines.stops_on_exit:
-            exit_hook().rest()
+        give_signals_back()
         if self._caller:
             self._caller.raise_failure()
         if self.failure and not self._is_failure_raised:

@@ -269,6 +269,28 @@ def test_a_signal_that_was_put_back_after_the_end_has_the_effect_it_had(caught: 
         caught.clear()
 
 
+@pytest.mark.parametrize("is_over", [True, False], ids=["the first bus is closed", "the first bus is open"])
+def test_a_later_bus_takes_signals_that_the_program_has_handled_since(
+    caught: list[int], is_over: bool
+) -> None:
+    """A bus that is closed on another thread gives no signals back; its drives' stops must not depend on it."""
+    hook, acts, handled = ExitHook(), [Act(), Act()], list[int]()
+    first = hook.add(acts[0].begin, acts[0].work)
+    acts[0].go_on.set()
+    if is_over:
+        thread = threading.Thread(target=hook.finish, args=[first])
+        thread.start()
+        thread.join(PATIENCE)
+    signal.signal(signal.SIGTERM, lambda number, frame: handled.append(number))
+    hook.add(acts[1].begin, acts[1].work)
+    signal.raise_signal(signal.SIGTERM)
+    assert acts[1].is_begun
+    assert handled == []
+    acts[1].go_on.set()
+    until(lambda: handled)
+    assert (handled, caught) == ([signal.SIGTERM], [])
+
+
 def test_a_child_begins_its_own_last_acts_though_its_parent_was_ending(caught: list[int]) -> None:
     hook, acts = ExitHook(), [Act(), Act()]
     hook.add(acts[0].begin, acts[0].work)
@@ -484,3 +506,48 @@ def test_a_poller_stops_the_drives_of_all_its_lines(monkeypatch: pytest.MonkeyPa
                 drive.start()
             poller.stop_on_exit()
         assert not any(each.sim.motor.energised for one in received for each in one)
+
+
+@pytest.mark.parametrize("leaves", ["poller", "line"])
+def test_a_poller_gives_the_signals_back_that_one_of_its_buses_took(caught: list[int], leaves: str) -> None:
+    from lines import line, plant, polled
+
+    from multidrop.poller import Poller
+
+    drive = InvtCHE(1, maximum_frequency=50, name="pump")
+    before = signal.getsignal(signal.SIGTERM)
+    with lines(1) as (received, (port,)):
+        with Poller(plant(line(port, polled(drive, [drive.output_frequency])))) as poller:
+            poller.bus("line").stop_on_exit()
+            assert signal.getsignal(signal.SIGTERM) != before
+            if leaves == "line":
+                poller.remove_line("line")
+        assert stops(received[0])
+    assert signal.getsignal(signal.SIGTERM) == before
+
+
+def test_a_signal_stops_a_drive_though_the_program_handled_it_since_the_last_poller(
+    caught: list[int],
+) -> None:
+    """The program handles SIGTERM itself in between, and its handler still runs, once the motor stands."""
+    from lines import line, plant, polled
+
+    from multidrop.bus import Bus
+    from multidrop.poller import Poller
+
+    drive = InvtCHE(1, maximum_frequency=50, name="pump")
+    energised: list[bool] = []
+    with lines(2) as (received, ports):
+        motor = received[1][0].sim.motor
+        with Poller(plant(line(ports[0], polled(drive, [drive.output_frequency])))) as poller:
+            poller.bus("line").stop_on_exit()
+        signal.signal(signal.SIGTERM, lambda number, frame: energised.append(motor.energised))
+        with Bus(ports[1]) as bus:
+            pump = bus.attach(InvtCHE(1, maximum_frequency=50))
+            bus.stop_on_exit()
+            pump.set_frequency(20)
+            pump.start()
+            signal.raise_signal(signal.SIGTERM)
+            until(lambda: energised)
+        assert energised == [False]
+        assert stops(received[1])

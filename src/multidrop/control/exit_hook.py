@@ -163,13 +163,17 @@ class ExitHook:
         return act
 
     def take_signals(self) -> None:
-        """Take these signals. Raises ValueError outside the main thread, the only one that may."""
-        if self._has_taken:
+        """Take these signals from any other handler, which has its turn after the stops.
+
+        Raises ValueError outside the main thread, the only one that may, unless they were taken before.
+        """
+        if self._has_taken and threading.current_thread() is not threading.main_thread():
             return
         for number in _ending():
-            had = signal.signal(number, self._on_signal)
-            if had != self._on_signal:  # else whoever had it for a while has put it back
-                self._before[number] = had
+            had = signal.getsignal(number)
+            if had != self._on_signal:
+                self._before[number] = had  # noted first: the signal may come at once
+                signal.signal(number, self._on_signal)
         self._has_taken = True
 
     def finish(self, act: LastAct) -> None:
@@ -257,6 +261,12 @@ def without_internals(interruption: BaseException) -> None:
         if str(behind.tb_frame.f_globals.get("__name__")).partition(".")[0] == PACKAGE:
             entry.tb_next = None
         entry = entry.tb_next
+
+
+def give_signals_back() -> None:
+    """In the main thread, give the signals back if no bus is to be stopped at the end any more."""
+    if _hook is not None:
+        _hook.rest()
 
 
 def await_signal() -> None:
