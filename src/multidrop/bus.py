@@ -427,6 +427,7 @@ class Bus:
         then does what it did before: Ctrl-C raises KeyboardInterrupt. Three within a second cut it short.
         From the signal on nothing that moves a motor is sent: a verb that would waits for its effect.
         Python handles it in the main thread: where that waits for a reply, when it has come or timed out.
+        A handler that the program installs later replaces this, until another bus calls `stop_on_exit`.
         Without this call leaving sends nothing: the motors go on as they are. Call it from the main thread.
         """
         self._leaving.stop_on_exit()

@@ -273,7 +273,7 @@ def test_a_signal_that_was_put_back_after_the_end_has_the_effect_it_had(caught: 
 def test_a_later_bus_takes_signals_that_the_program_has_handled_since(
     caught: list[int], is_over: bool
 ) -> None:
-    """A bus that is closed on another thread gives no signals back; its drives' stops must not depend on it."""
+    """The first bus was closed on another thread, which cannot give the signals back, or is still open."""
     hook, acts, handled = ExitHook(), [Act(), Act()], list[int]()
     first = hook.add(acts[0].begin, acts[0].work)
     acts[0].go_on.set()
