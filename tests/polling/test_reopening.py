@@ -19,7 +19,7 @@ from multidrop.drive import Drive
 from multidrop.drive.declare import reading
 from multidrop.drive.table import HOLDING
 from multidrop.drives import InvtCHE
-from multidrop.errors import LineError
+from multidrop.errors import LineError, PollingFailed
 from multidrop.poller import Poller
 from multidrop.polling.polled_line import PolledLine
 from multidrop.sim import MotorDrive, Simulator, Wire, simulated
@@ -116,7 +116,6 @@ def test_lines_are_opened_though_the_system_gives_few_threads(
 
 
 @pytest.mark.slow
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
 def test_a_stop_opens_the_port_once_the_poller_has_failed(
     hall: Plant, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -131,6 +130,8 @@ def test_a_stop_opens_the_port_once_the_poller_has_failed(
         hall.poller.bus("hall").read(hall.drive, hall.drive.status)
     hall.stack.enter_context(hall.there())
     hall.stop()
+    with pytest.raises(PollingFailed):
+        hall.poller.close()
 
 
 @contextmanager
