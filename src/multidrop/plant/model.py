@@ -13,14 +13,22 @@ from multidrop.drive.family import Drive
 from multidrop.drive.network import check_port
 from multidrop.drive.register import Register
 from multidrop.plant import metadata
+from multidrop.toml_check import check_period
 
 
 @dataclass(frozen=True)
 class Polled:
-    """A register that is read every so many seconds; None: as fast as the line allows."""
+    """A register that is read every so many seconds; None: as fast as the line allows.
+
+    Raises ValueError unless `every` is from 0.0001 to 86400 s, or None.
+    """
 
     register: Register[Any]
     every: float | None
+
+    def __post_init__(self) -> None:
+        if self.every is not None:
+            check_period(self.every)
 
 
 @dataclass(frozen=True)
