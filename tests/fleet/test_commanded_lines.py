@@ -20,6 +20,7 @@ require_module("nats")
 from multidrop.fleet import command_desk, names  # noqa: E402
 from multidrop.fleet.command_subjects import CommandedLines, CommandSubjects  # noqa: E402
 from multidrop.fleet.command_words import CommandAnswer, CommandOutcome  # noqa: E402
+from multidrop.supervisor import supervisor  # noqa: E402
 
 
 class HeardPath:
@@ -66,7 +67,7 @@ class SlowLines:
 
 
 async def settled(subjects: CommandSubjects) -> None:
-    await asyncio.gather(*subjects._tasks)
+    await asyncio.gather(*supervisor().started)
 
 
 def test_a_line_that_is_let_go_answers_for_its_stops_until_it_is_closed(tmp_path: Path) -> None:

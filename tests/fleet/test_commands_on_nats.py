@@ -27,6 +27,7 @@ from multidrop.fleet.fleet_commands import FleetCommands  # noqa: E402
 from multidrop.fleet.plant_store import store  # noqa: E402
 from multidrop.fleet.servers import ServerPath, paths_of  # noqa: E402
 from multidrop.fleet.setup import open_all  # noqa: E402
+from multidrop.supervisor import supervisor  # noqa: E402
 
 pytestmark = [pytest.mark.slow, pytest.mark.long]
 
@@ -58,7 +59,7 @@ class OnNats:
         await self._settled()
 
     async def _settled(self) -> None:
-        await asyncio.gather(*self.subjects._tasks)
+        await asyncio.gather(*supervisor().started)
         for path in self.paths:
             assert path._client is not None
             await path._client.flush()

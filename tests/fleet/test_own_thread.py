@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -16,38 +17,31 @@ require_module("nats")
 from multidrop.fleet import own_thread  # noqa: E402
 from multidrop.fleet.command_words import CommandAnswer, CommandOutcome  # noqa: E402
 from multidrop.fleet.own_thread import AGAIN_S, TURN_S, Answers, begin_stops  # noqa: E402
+from multidrop.supervisor import Supervisor  # noqa: E402
 
 STANDS = CommandAnswer(CommandOutcome.DONE, "it stands")
 UNKNOWN = CommandAnswer(CommandOutcome.UNKNOWN, "it is not seen to stand")
 
 
-class Executors:
-    """Executors of which so many get a thread."""
+class Threads(Supervisor):
+    """A supervisor that gets so many threads."""
 
-    def __init__(self, threads: int) -> None:
-        self.threads = threads
+    def __init__(self) -> None:
+        super().__init__()
+        self.threads = 0
         self.failure: Exception = RuntimeError("can't start new thread")
 
-    def __call__(self, *_: Any) -> Any:
-        return self
-
-    def submit(self, work: Any) -> Any:
+    def thread(self, name: str, limit_s: float, work: Callable[[], Any]) -> asyncio.Future[Any]:
         if self.threads == 0:
             raise self.failure
         self.threads -= 1
-        return REAL(1).submit(work)
-
-    def shutdown(self, *, wait: bool) -> None:
-        """Wait for nobody."""
-
-
-REAL = own_thread.ThreadPoolExecutor
+        return super().thread(name, limit_s, work)
 
 
 @pytest.fixture
-def executors(monkeypatch: pytest.MonkeyPatch) -> Executors:
-    made = Executors(0)
-    monkeypatch.setattr(own_thread, "ThreadPoolExecutor", made)
+def threads(monkeypatch: pytest.MonkeyPatch) -> Threads:
+    made = Threads()
+    monkeypatch.setattr(own_thread, "supervisor", lambda: made)
     return made
 
 
@@ -72,8 +66,8 @@ class Motors:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("failure", [RuntimeError("can't start new thread"), MemoryError()])
-def test_all_stops_are_sent_before_one_is_waited_for(executors: Executors, failure: Exception) -> None:
-    executors.threads, executors.failure = 1, failure
+def test_all_stops_are_sent_before_one_is_waited_for(threads: Threads, failure: Exception) -> None:
+    threads.threads, threads.failure = 1, failure
     motors = Motors(a=1, b=3, c=2)
     assert asyncio.run(motors.stop_all()) == {"a": STANDS, "b": STANDS, "c": STANDS}
     without = [noted for noted in motors.noted if noted != ("a", None)]
@@ -81,7 +75,7 @@ def test_all_stops_are_sent_before_one_is_waited_for(executors: Executors, failu
 
 
 @pytest.mark.slow
-def test_the_loop_goes_on_and_a_thread_that_comes_free_is_taken(executors: Executors) -> None:
+def test_the_loop_goes_on_and_a_thread_that_comes_free_is_taken(threads: Threads) -> None:
     motors = Motors(a=3, b=2)
     turns = 0
 
@@ -90,7 +84,7 @@ def test_the_loop_goes_on_and_a_thread_that_comes_free_is_taken(executors: Execu
         stopping = asyncio.create_task(motors.stop_all())
         while not stopping.done():
             turns += 1
-            executors.threads = 2 * (len(motors.noted) >= 3)
+            threads.threads = 2 * (len(motors.noted) >= 3)
             await asyncio.sleep(AGAIN_S / 10)
         return stopping.result()
 
@@ -101,7 +95,7 @@ def test_the_loop_goes_on_and_a_thread_that_comes_free_is_taken(executors: Execu
 
 
 def test_a_stop_that_is_never_seen_is_told_so_in_the_end(
-    executors: Executors, monkeypatch: pytest.MonkeyPatch
+    threads: Threads, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(own_thread, "STOP_S", 0.0)
     motors = Motors(a=1000)
@@ -110,7 +104,7 @@ def test_a_stop_that_is_never_seen_is_told_so_in_the_end(
 
 
 @pytest.mark.slow
-def test_a_motor_is_stopped_without_a_thread(executors: Executors, tmp_path: Path) -> None:
+def test_a_motor_is_stopped_without_a_thread(threads: Threads, tmp_path: Path) -> None:
     with desks(tmp_path) as desk:
         stopped = asyncio.run(desk.stop(drives=["pump"]))
     assert stopped is not None

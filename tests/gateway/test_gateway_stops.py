@@ -356,7 +356,7 @@ def test_what_was_asked_for_before_a_stop_is_not_sent_after_it(tmp_path: Path) -
             target=lambda: told.append(gateway.command("/api/act", body, **writer).json["text"])
         )
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr("multidrop.gateway.supervisor.threading", SimpleNamespace(Thread=Late))
+            patch.setattr("multidrop.supervisor.threading", SimpleNamespace(Thread=Late))
             asked.start()
             until(lambda: len(begun) == 1)
         assert gateway.post("/api/stop").json["pump-1"]["done"] is True
@@ -376,7 +376,7 @@ def test_a_stop_is_sent_where_the_system_gives_no_thread(tmp_path: Path) -> None
     with served(tmp_path, MAY) as gateway:
         start(gateway, "pump-1")
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr("multidrop.gateway.supervisor.threading", SimpleNamespace(Thread=NoThread))
+            patch.setattr("multidrop.supervisor.threading", SimpleNamespace(Thread=NoThread))
             writer = {"authorization": gateway.bearer(Right.WRITE)}
             body = {"drive": "pump-1", "register": "setpoint", "value": 10.0}
             told = gateway.command("/api/write", body, **writer).json
@@ -406,7 +406,7 @@ def test_without_threads_all_stops_are_sent_before_one_is_waited_for(
     async def begin() -> list[str]:
         return await asyncio.gather(*begin_stops([partial(work, line=line) for line in "abc"], caller))
 
-    monkeypatch.setattr("multidrop.gateway.supervisor.threading", SimpleNamespace(Thread=LastThread))
+    monkeypatch.setattr("multidrop.supervisor.threading", SimpleNamespace(Thread=LastThread))
     assert asyncio.run(begin()) == ["a stands", "b stands", "c stands"]
     assert done == [("a", None), ("b", 0.0), ("c", 0.0), ("b", None), ("c", None)]
 

@@ -204,7 +204,7 @@ def test_a_command_that_waits_for_its_thread_until_it_is_too_late_is_not_sent(tm
         start = {**START, "seen": gateway.frame_number()}
         gateway.gateway.seen_frames.clock = lambda: 0  # it came at once
         with pytest.MonkeyPatch.context() as patch, held_up(gateway, "/api/act", start) as client:
-            patch.setattr("multidrop.gateway.supervisor.threading", SimpleNamespace(Thread=Late))
+            patch.setattr("multidrop.supervisor.threading", SimpleNamespace(Thread=Late))
             client.sendall(b"}")
             until(lambda: begun)
             due_ns = boottime_ns() + 50_000_000

@@ -21,6 +21,7 @@ from multidrop.fleet.command_words import CommandAnswer, CommandOutcome, Offered
 from multidrop.fleet.held_lines import HeldLines
 from multidrop.fleet.stop_desk import StopDesk
 from multidrop.sim import SimulatedDrive, Simulator, Wire, simulated
+from multidrop.supervisor import supervisor
 
 LINE = "hall-1"
 PATIENCE_S = 60.0
@@ -109,7 +110,7 @@ class Desks:
         answer = await self.stops.stop(LINE, data)
         while answer is not None and answer.outcome is CommandOutcome.UNDER_WAY:
             answer = await self.stops.stop(LINE, data)
-        await asyncio.gather(*self.stops._notes)
+        await asyncio.gather(*(one for one in supervisor().started if one.get_name() == "note of a stop"))
         return answer
 
 

@@ -17,11 +17,13 @@ from multidrop.cli.support.nats import URLS, add_nats_arguments, nats_options, n
 from multidrop.cli.support.output import logging_by, print_text
 from multidrop.cli.support.signals import end_signals_cancel
 from multidrop.cli.support.values import counted
+from multidrop.supervisor import supervisor
 
 if TYPE_CHECKING:
     from multidrop.fleet.hub import HubState, SampleSink
 
 EVERY_S = 10.0
+LEVELS = dict.fromkeys(("multidrop.fleet", "multidrop.supervisor"), logging.INFO)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -54,7 +56,7 @@ def run(arguments: argparse.Namespace) -> int:
     sink = _sink(arguments)
     try:
         log = LogThread(sys.stderr, FORMATTERS[arguments.log]())
-        with logging_by(log, {"multidrop.fleet": logging.INFO}):
+        with logging_by(log, LEVELS):
             state = asyncio.run(_read_until_signal(arguments, sink, options))
     finally:
         sink.close()
@@ -87,26 +89,25 @@ async def _read_until_signal(
 
 
 async def _read(arguments: argparse.Namespace, sink: SampleSink, options: dict[str, Any]) -> HubState:
+    from multidrop.fleet.compaction import compact_for_ever
     from multidrop.fleet.hub import SampleHub
     from multidrop.fleet.samples_stream import close, connect
+    from multidrop.fleet.task_end import end_tasks
 
     client = await connect(arguments.servers, **options)
     try:
         hub = SampleHub(client, sink, every=arguments.every)
-        tending = asyncio.create_task(_tend(arguments.parquet))
+        if arguments.parquet:  # PostgreSQL needs no merging
+            supervisor().keep("compaction", compact_for_ever(arguments.parquet))
+        reading = asyncio.ensure_future(hub.run(once=arguments.once))
+        failing = asyncio.ensure_future(supervisor().has_dead.wait())
         try:
-            await hub.run(once=arguments.once)
+            await asyncio.wait([reading, failing], return_when=asyncio.FIRST_COMPLETED)
+            supervisor().check()
+            reading.result()
         finally:
-            tending.cancel()
-            await asyncio.wait([tending])
+            await supervisor().release("compaction")
+            await end_tasks(reading, failing)
         return hub.state()
     finally:
         await close(client)
-
-
-async def _tend(folder: Path | None) -> None:
-    """Merge files of samples while others are read; PostgreSQL needs no merging."""
-    if folder:
-        from multidrop.fleet.compaction import compact_for_ever
-
-        await compact_for_ever(folder)

@@ -157,7 +157,7 @@ def _serve(
     from dataclasses import replace
 
     from multidrop.gateway.gateway import Gateway
-    from multidrop.gateway.supervisor import supervisor
+    from multidrop.supervisor import supervisor
 
     try:
         gateway = Gateway(plant, settings, read=read)

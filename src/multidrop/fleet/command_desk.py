@@ -29,6 +29,7 @@ from multidrop.fleet.held_lines import HeldLine, HeldLines
 from multidrop.fleet.lease import boottime_ns
 from multidrop.fleet.offers import Offer, Offers
 from multidrop.fleet.own_thread import in_own_thread
+from multidrop.supervisor import supervisor
 
 HOLD_S = 0.5  # for which an answer waits for the end; after that it says "under way"
 AWAITED_S = 3.0  # by a line that is let go: a write and its reading back take less on most lines
@@ -56,7 +57,6 @@ class CommandDesk:
         self._lines = lines
         self._log = log
         self._under_way: dict[str, int] = {}  # by line
-        self._tasks: set[asyncio.Task[None]] = set()
 
     # ---- an offer ----
 
@@ -95,9 +95,7 @@ class CommandDesk:
         if "do" not in message:
             self.offers.take_back(offer, "its asker asked what became of it before telling to do it")
         elif self.offers.take(offer):
-            task = asyncio.create_task(self._carry_out(offer))
-            self._tasks.add(task)
-            task.add_done_callback(self._tasks.discard)
+            supervisor().start("command", self._carry_out(offer))
         with suppress(TimeoutError):
             await asyncio.wait_for(offer.over.wait(), HOLD_S)
         found = offer.answer or CommandAnswer(CommandOutcome.UNDER_WAY, f"{offer.prepared.text}: under way")

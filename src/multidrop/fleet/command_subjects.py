@@ -25,6 +25,7 @@ from multidrop.fleet.fleet_lines import FleetLines
 from multidrop.fleet.held_lines import HeldLines
 from multidrop.fleet.servers import ServerPath
 from multidrop.fleet.stop_desk import StopDesk
+from multidrop.supervisor import supervisor
 
 _log = logging.getLogger("multidrop.fleet")
 Heard = Callable[[bytes], Awaitable[Offered | CommandAnswer | None]]
@@ -38,7 +39,6 @@ class CommandSubjects:
         self._lines = lines
         self.desk = CommandDesk(gateway, names.do_subject(gateway, secrets.token_hex(8)), lines, log)
         self._stops = StopDesk(gateway, lines, self.desk.offers, log)
-        self._tasks: set[asyncio.Task[None]] = set()
 
     async def begin(self) -> None:
         """Hear the tokens of this run's offers."""
@@ -47,35 +47,41 @@ class CommandSubjects:
     def open(self, line: str, description: Any) -> None:
         """Take commands for a line from now on."""
         self._lines.open(line, description)
-        self._begin(self._hear(names.command_subject(line), partial(self._offer, line)))
-        self._begin(self._hear(names.stop_subject(line), partial(self._stops.stop, line)))
+        self._change(self._hear(names.command_subject(line), partial(self._offer, line)))
+        self._change(self._hear(names.stop_subject(line), partial(self._stops.stop, line)))
 
     def leave(self, line: str) -> None:
         """Take stops alone from now on, and carry out nothing that was offered."""
         self._lines.leave(line)
-        self._begin(self._deafen(names.command_subject(line)))
+        self._change(self._deafen(names.command_subject(line)))
 
     def shut(self, line: str) -> None:
         """Take nothing any more."""
         self._lines.shut(line)
-        self._begin(self._deafen(names.command_subject(line), names.stop_subject(line)))
+        self._change(self._deafen(names.command_subject(line), names.stop_subject(line)))
 
     async def _offer(self, line: str, data: bytes) -> Offered | CommandAnswer | None:
         return self.desk.offer(line, data)
 
     async def _hear(self, subject: str, heard: Heard) -> None:
         async def take(message: Msg) -> None:
-            self._begin(_answer(message, heard))  # none waits for another
+            supervisor().start("answer", _answer(message, heard))  # none waits for another
 
         await asyncio.gather(*(path.subscribe(subject, take) for path in self._paths))
 
     async def _deafen(self, *subjects: str) -> None:
         await asyncio.gather(*(path.unsubscribe(one) for path in self._paths for one in subjects))
 
-    def _begin(self, work: Coroutine[Any, Any, None]) -> None:
-        task = asyncio.create_task(work)
-        self._tasks.add(task)
-        task.add_done_callback(self._tasks.discard)
+    def _change(self, work: Coroutine[Any, Any, None]) -> None:
+        """Begin to change which subjects are heard. If that fails, a stop might not be heard: it is fatal."""
+
+        async def change() -> None:
+            try:
+                await work
+            except Exception as failure:
+                supervisor().note_dead("commands", f"{type(failure).__name__}: {failure}", failure)
+
+        supervisor().start("subjects", change())
 
 
 async def _answer(message: Msg, heard: Heard) -> None:
@@ -105,9 +111,13 @@ class CommandedLines:
         self._may_wait = may_wait
 
     async def take(self, line: str, description: Any) -> None:
-        """Open the line, poll it and take commands. Raises OSError or ValueError where that fails."""
+        """Open the line, poll it and take commands; if that raises, it is not polled, and its port closed."""
         await self._lines.take(line, description)
-        self._subjects.open(line, description)
+        try:
+            self._subjects.open(line, description)
+        except BaseException:
+            await self.let_go(line)
+            raise
 
     async def let_go(self, line: str) -> None:
         """Take no commands any more, poll the line no more, and close it.

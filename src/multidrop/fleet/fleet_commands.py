@@ -33,6 +33,7 @@ from multidrop.fleet.servers import ServerPath, paths_of
 from multidrop.fleet.setup import open_all
 from multidrop.fleet.stop_asking import HARD_WIRED, News, first_answer
 from multidrop.fleet.task_end import end_tasks
+from multidrop.supervisor import Ended, reason_of
 
 LOST_S = 6.0  # without any answer, after which what became of a command stays unknown
 AGAIN_S = 0.2
@@ -69,6 +70,13 @@ class FleetCommands:
             raise
         self._keeping = [asyncio.create_task(path.keep()) for path in self._paths]
         return self
+
+    async def stay(self) -> None:
+        """Stay connected until cancelled. Raises Ended if what keeps a connection has ended."""
+        ended, _ = await asyncio.wait(self._keeping, return_when=asyncio.FIRST_COMPLETED)
+        for task in ended:
+            failure = None if task.cancelled() else task.exception()
+            raise Ended(f"a connection to the fleet has ended: {reason_of(failure)}") from failure
 
     async def __aexit__(self, *error: object) -> None:
         await self.close()

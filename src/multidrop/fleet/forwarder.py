@@ -95,6 +95,8 @@ class Forwarder:
                 await self._forward()
             except (StreamError, NotOurLog, OSError) as failure:
                 self._note(str(failure))
+            except Exception as failure:  # a mistake of ours, or a want of memory
+                self._note(f"{type(failure).__name__}: {failure}", failure)
             await asyncio.sleep(AGAIN_S)
 
     async def _forward(self) -> None:
@@ -150,9 +152,9 @@ class Forwarder:
         self._last = sequence
         self._spool.acknowledge(sequence)
 
-    def _note(self, trouble: str | None) -> None:
+    def _note(self, trouble: str | None, cause: Exception | None = None) -> None:
         if trouble and trouble != self._trouble:
-            _log.error("samples are not forwarded: %s", trouble)
+            _log.error("samples are not forwarded: %s", trouble, exc_info=cause)
         if self._trouble and not trouble:
             _log.warning("samples are forwarded again, behind message %s", self._last)
         self._trouble = trouble

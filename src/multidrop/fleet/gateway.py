@@ -12,7 +12,7 @@ from typing import Any
 
 from nats.aio.msg import Msg
 
-from multidrop import Mastership
+from multidrop import Mastership, PollingFailed
 from multidrop.fleet import names
 from multidrop.fleet.command_log import CommandLog
 from multidrop.fleet.command_subjects import CommandedLines, CommandSubjects
@@ -32,6 +32,7 @@ from multidrop.fleet.servers import ServerPath, paths_of
 from multidrop.fleet.setup import check_buckets, open_all
 from multidrop.fleet.spool import Spool
 from multidrop.fleet.task_end import end_tasks
+from multidrop.supervisor import Ended, supervisor
 
 SPOOL_BYTES = 10_000_000_000
 STATE = {"state": str, "lines": int, "margin_s": float, "troubles": dict, "spool": dict}
@@ -40,6 +41,7 @@ FORWARD_S = 10.0  # for what is left at the end; the rest is forwarded after the
 IN_TROUBLE_S = 3.0  # the same, where something is wrong with the stream
 SYNC_S = 3.0  # for the disk, before that
 ENDING_S = 0.05
+LOOK_S = 0.2  # between looks at the threads
 
 _log = logging.getLogger("multidrop.fleet")
 
@@ -89,7 +91,8 @@ class FleetGateway:
     async def run(self, on_ready: Callable[[], object] = lambda: None) -> None:
         """Poll and forward until `end` is called; then let all lines go, and forward what is left.
 
-        Raises FleetError where no server is reached, or the fleet was not set up.
+        Raises FleetError where no server is reached, or the fleet was not set up; Ended, after the same, if
+        a task or a thread that must go on has ended, or polling has failed: others take the lines over.
         """
         try:
             await open_all(self.paths)
@@ -99,27 +102,49 @@ class FleetGateway:
             await self._close()
             raise
         self.forwarder = Forwarder(self.spool, client)
-        forwarding = asyncio.create_task(self.forwarder.run())
+        forwarding = supervisor().keep("forwarder", self.forwarder.run())
+        supervisor().watch("spool", self.spool.is_alive)
         try:
             await self.paths[0].subscribe_or_raise(names.gateway_subject(self.name, "*"), self._answer)
             await self.commands.begin()
             self.lines.poller.on_batch(self.spool.append)
             with self.lines.poller:
-                member = asyncio.create_task(self.member.run())
-                end = asyncio.create_task(self._end.wait())
+                member = supervisor().keep("member", self.member.run())
+                looking = supervisor().keep("look", self._look())
                 on_ready()
-                await asyncio.wait({member, end, forwarding}, return_when=asyncio.FIRST_COMPLETED)
-                end.cancel()
-                member.cancel()
-                with suppress(asyncio.CancelledError):
-                    await member
-                await self.lines.close()
+                await self._until_the_end()
+                for name in ("look", "member"):
+                    supervisor().let_go(name)
+                self.member.end()  # a part of it may have ended: then it is leaving already
+                await asyncio.wait([member])
+                await end_tasks(looking)
+                with suppress(Ended, PollingFailed, asyncio.CancelledError):  # they are among the dead
+                    member.result()
+                with suppress(PollingFailed):
+                    await self.lines.close()
             await asyncio.to_thread(self.spool.sync, SYNC_S)
             await self._forward_the_rest(forwarding)
         finally:
+            supervisor().let_go("forwarder")
             await end_tasks(forwarding)
             await close(client)
             await self._close()
+        supervisor().check()
+
+    async def _until_the_end(self) -> None:
+        """Wait until `end` is called, or something has ended that must go on."""
+        waits = [asyncio.ensure_future(one.wait()) for one in (self._end, supervisor().has_dead)]
+        await asyncio.wait(waits, return_when=asyncio.FIRST_COMPLETED)
+        await end_tasks(*waits)
+
+    async def _look(self) -> None:
+        """Look for threads that have ended, and for a failure of polling, for ever."""
+        while True:
+            supervisor().look()
+            if failure := self.lines.poller.failure:
+                supervisor().note_dead("polling", str(failure), failure.__cause__)
+                return
+            await asyncio.sleep(LOOK_S)
 
     def end(self) -> None:
         """Let `run` come to its end. Call it in the loop."""
@@ -161,6 +186,7 @@ class FleetGateway:
         """Return what `multidrop fleet status` shows of this gateway."""
         member, spool = self.member, self.spool.state()
         lost = {line: f"port lost: {why}" for line, why in member.keeper.lost.items()}
+        failing = {line: f"polling fails: {why}" for line, why in self.lines.poller.line_failures.items()}
         forwarder = self.forwarder.state() if self.forwarder else None
         last = forwarder.last if forwarder else None
         return {
@@ -171,8 +197,9 @@ class FleetGateway:
             "paths": [path.server_name for path in self.paths],
             "lines": len(member.polled),
             "moves": member.keeper.moves,
-            "troubles": dict(sorted({**member.keeper.troubles, **lost}.items())),
+            "troubles": dict(sorted({**member.keeper.troubles, **failing, **lost}.items())),
             "lost": sorted(lost),
+            "failing": sorted(failing),
             "unopened": sorted(member.unopened.named()),
             "trouble": member.trouble,
             "last_moves": [move.as_json() for move in member.records.moves.newest(TOLD)],

@@ -34,6 +34,7 @@ _FIGURES = (
 )
 _LINES = {
     "lost": "Lines of its own that nobody polls, for their port is lost.",
+    "failing": "Lines on which polling raised an exception lately, and is tried again.",
     "unopened": "Lines that others should take, for it cannot open their ports.",
 }
 _SUFFIXES = {"gauge": "", "counter": "_total"}

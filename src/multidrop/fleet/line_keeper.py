@@ -31,7 +31,10 @@ class Lines(Protocol):
     """The lines that this gateway polls."""
 
     async def take(self, line: str, description: Any) -> None:
-        """Open the line and poll it. Raises OSError or ValueError where that fails; it is tried again."""
+        """Open the line and poll it.
+
+        If that raises, nothing of the line is left open, and it is tried again.
+        """
 
     async def let_go(self, line: str) -> None:
         """Poll the line no more, and close it: when this returns nothing of ours is sent on it."""
@@ -219,15 +222,20 @@ class LineKeeper:
                 return
             try:
                 await self.lines.take(line, record.value)
-            except (OSError, ValueError) as failure:
-                told, self.troubles[line] = self.troubles.get(line), str(failure)
+            except Exception as failure:  # such as of a user's own class: it is this line's alone
+                is_foreseen = isinstance(failure, (OSError, ValueError))
+                why = str(failure) if is_foreseen else f"{type(failure).__name__}: {failure}"
+                told, self.troubles[line] = self.troubles.get(line), why
                 if isinstance(failure, OSError):
                     self.lost[line] = str(failure)
                     self._unopened.failed(line)
                 self._again_at[line] = time.monotonic() + TAKE_AGAIN_S
                 asyncio.get_running_loop().call_later(1.01 * TAKE_AGAIN_S, self._on_change)
-                if told != str(failure):
-                    _log.warning("line %s is not taken, and tried again and again: %s", line, failure)
+                if told != why:
+                    cause = None if is_foreseen else failure
+                    _log.warning(
+                        "line %s is not taken, and tried again and again: %s", line, why, exc_info=cause
+                    )
             else:
                 if line in self.troubles:
                     _log.warning("line %s is taken now", line)

@@ -40,6 +40,7 @@ from multidrop.fleet.shares import Sharers, Shares
 from multidrop.fleet.task_end import end_tasks
 from multidrop.fleet.unopened_lines import UnopenedLines
 from multidrop.fleet.weak_session import WeakSession
+from multidrop.supervisor import Ended, supervisor
 
 _log = logging.getLogger("multidrop.fleet")
 
@@ -96,6 +97,7 @@ class Member:
         self._weak = WeakSession(self.lease, self.records.observer, self.best)
         self._other_rules = OtherRules(name, self.records.observer)
         self._stepped: tuple[Any, ...] = ()
+        self._over = asyncio.Event()
 
     # ---- what others ask ----
 
@@ -159,27 +161,44 @@ class Member:
     # ---- life ----
 
     async def run(self) -> None:
-        """Live until cancelled; then give all lines away and end the session."""
-        works: list[Coroutine[Any, Any, None]] = [
-            *(path.keep() for path in self.paths),
-            *(self.lease.renew(path) for path in range(len(self.paths))),
-            *self.records.works(),
-            self._guard(),
-            keep_leaders(self.best, self._keeps_leaders),
-            self._weak.watch(lambda: self._settled_at),
-            self._releases.watch(),
-            self._live(),
-            self.keeper.fail(),
-        ]
-        tasks = [asyncio.create_task(work) for work in works]
+        """Live until `end` is called, or this is cancelled; then give all lines away and end the session.
+
+        Raises Ended, after the same, if a part of this has ended by itself.
+        """
+        works = {f"{self.name}: {name}": work for name, work in self._works().items()}
+        tasks = {name: supervisor().keep(name, work) for name, work in works.items()}
+        over = asyncio.ensure_future(self._over.wait())
+        ended: set[asyncio.Task[Any]] = set()
         try:
-            await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+            ended, _ = await asyncio.wait([over, *tasks.values()], return_when=asyncio.FIRST_COMPLETED)
         finally:
-            ended = await end_tasks(*tasks)
+            for name in tasks:
+                supervisor().let_go(name)
+            await end_tasks(over, *tasks.values())
             await self._leave()
-            for failure in ended:
-                if isinstance(failure, Exception):
-                    raise failure
+        ended.discard(over)
+        for task in ended:
+            failure = None if task.cancelled() else task.exception()
+            raise Ended(f"{task.get_name()} has ended: {supervisor().dead[task.get_name()]}") from failure
+
+    def end(self) -> None:
+        """Let `run` come to its end; called again, it disturbs nothing."""
+        self._over.set()
+
+    def _works(self) -> dict[str, Coroutine[Any, Any, None]]:
+        """Return what must go on, by name."""
+        records = {f"records {at}": work for at, work in enumerate(self.records.works(), 1)}
+        return {
+            **{f"path {at}": path.keep() for at, path in enumerate(self.paths, 1)},
+            **{f"lease {at + 1}": self.lease.renew(at) for at in range(len(self.paths))},
+            **records,
+            "guard": self._guard(),
+            "leaders": keep_leaders(self.best, self._keeps_leaders),
+            "weak session": self._weak.watch(lambda: self._settled_at),
+            "releases": self._releases.watch(),
+            "steps": self._live(),
+            "lines": self.keeper.fail(),
+        }
 
     async def _leave(self) -> None:
         """Let all lines go, and end the session: others take over at once."""

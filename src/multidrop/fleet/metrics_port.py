@@ -7,6 +7,7 @@ header `Host` too: a page of another site, whose name was made to lead here, rea
 from __future__ import annotations
 
 import asyncio
+import logging
 import re
 import socket
 from collections.abc import AsyncIterator, Callable, Iterable
@@ -21,7 +22,9 @@ MOST_CLIENTS = 32
 PATIENCE_S = 5.0  # for a request, and for its answer
 NAMES = re.compile(r"(localhost|127\.0\.0\.1|\[::1\])(:[0-9]{1,5})?")
 REASONS = {200: "OK", 400: "Bad Request", 403: "Forbidden", 404: "Not Found", 405: "Method Not Allowed"}
+REASONS |= {500: "Internal Server Error"}
 
+_log = logging.getLogger("multidrop.fleet")
 Metrics = Callable[[], Iterable[MetricFamily]]
 
 
@@ -66,7 +69,7 @@ async def serving(listener: socket.socket, metrics: Metrics) -> AsyncIterator[No
         try:
             if len(clients) <= MOST_CLIENTS:
                 async with asyncio.timeout(PATIENCE_S):
-                    writer.write(answer(await reader.readuntil(b"\r\n\r\n"), metrics))
+                    writer.write(_answer(await reader.readuntil(b"\r\n\r\n"), metrics))
                     await writer.drain()
         except (OSError, TimeoutError, asyncio.IncompleteReadError, asyncio.LimitOverrunError):
             pass  # it has gone, takes too long, or says too much
@@ -83,6 +86,14 @@ async def serving(listener: socket.socket, metrics: Metrics) -> AsyncIterator[No
             writer.transport.abort()
         with suppress(OSError):
             await server.wait_closed()
+
+
+def _answer(head: bytes, metrics: Metrics) -> bytes:
+    try:
+        return answer(head, metrics)
+    except Exception:  # whoever scrapes sees it, and so does the log
+        _log.exception("metrics cannot be told")
+        return _response(500, "this gateway fails to tell its metrics; its log says why")
 
 
 def answer(head: bytes, metrics: Metrics) -> bytes:

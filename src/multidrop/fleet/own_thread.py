@@ -5,11 +5,12 @@ from __future__ import annotations
 import asyncio
 from collections import deque
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from functools import partial
+from math import inf
 from typing import TypeVar
 
 from multidrop.fleet.command_words import CommandAnswer
+from multidrop.supervisor import supervisor
 
 AGAIN_S = 0.2  # between turns of stops that have no thread
 TURN_S = 0.2  # of such a stop: nothing else is done meanwhile
@@ -24,7 +25,7 @@ def in_own_thread(work: Callable[[], R]) -> asyncio.Future[R]:
     """Begin work in a thread of its own, or here and now where the system gives none."""
     try:
         return _in_thread(work)
-    except RuntimeError:
+    except (RuntimeError, MemoryError):
         future: asyncio.Future[R] = asyncio.get_running_loop().create_future()
         future.set_result(work())
         return future
@@ -73,9 +74,5 @@ async def _without_threads(works: Sequence[StopWork]) -> Answers:
 
 
 def _in_thread(work: Callable[[], R]) -> asyncio.Future[R]:
-    """Begin work in a thread of its own. Raises RuntimeError where the system gives none."""
-    executor = ThreadPoolExecutor(1, "multidrop command")
-    try:
-        return asyncio.get_running_loop().run_in_executor(executor, work)
-    finally:
-        executor.shutdown(wait=False)
+    """Begin work in a thread of its own. Raises RuntimeError or MemoryError where the system gives none."""
+    return supervisor().thread("command", inf, work)

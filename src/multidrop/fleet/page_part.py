@@ -87,7 +87,7 @@ class FleetPart:
         while True:
             try:
                 async with command() as self._commands:
-                    await asyncio.Event().wait()
+                    await self._commands.stay()
             except (OSError, ValueError) as failure:
                 self._why = masked(str(failure))
             finally:

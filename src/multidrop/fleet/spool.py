@@ -87,7 +87,17 @@ class Spool:
     # ---- for the poller: any thread ----
 
     def append(self, batch: Batch) -> None:
-        """Copy the rows for the thread to write. It takes microseconds, and raises nothing for the disk."""
+        """Copy the rows for the thread to write. It takes microseconds, and raises nothing for the disk.
+
+        If they cannot be copied, as for want of memory, they are lost and counted; later ones are taken.
+        """
+        try:
+            self._append(batch)
+        except Exception as failure:
+            with self._changing:
+                self._lose(len(batch), f"{type(failure).__name__}: {failure}")
+
+    def _append(self, batch: Batch) -> None:
         columns = batch.columns()
         with self._changing:
             rows = len(columns.time)
@@ -108,6 +118,10 @@ class Spool:
             wanted = self._wanted = self._taken
             self._changing.notify_all()
             return self._changing.wait_for(lambda: self._written >= wanted, timeout)
+
+    def is_alive(self) -> bool:
+        """True until the thread that writes has ended."""
+        return self._thread.is_alive()
 
     def state(self) -> SpoolState:
         """Return how much is where, and what is wrong."""
@@ -153,23 +167,31 @@ class Spool:
     # ---- the thread ----
 
     def _run(self) -> None:
-        while True:
-            with self._changing:
-                if not self._is_due():
-                    self._changing.wait(self._patience())
-                if self._over and not (self._waiting or self._packed):
-                    return
-                if not self._is_due():
-                    continue
-                waiting, self._waiting, self._first_s = self._waiting, deque(), None
-            for buffer in waiting:
-                self._pack(buffer)
-            while self._packed:
-                if not self._write(self._packed[0]):
-                    break
-                self._packed.popleft()
-            if self._packed and self._pause():
-                return
+        is_over = False
+        while not is_over:
+            try:
+                is_over = self._write_what_is_due()
+            except Exception as failure:  # such as a want of memory: it goes on with what waits
+                _log.error("the spool %s is interrupted", self._folder.path, exc_info=failure)
+                time.sleep(AGAIN_S)
+
+    def _write_what_is_due(self) -> bool:
+        """Wait until rows are to be written, and write them; True when the spool has ended."""
+        with self._changing:
+            if not self._is_due():
+                self._changing.wait(self._patience())
+            if self._over and not (self._waiting or self._packed):
+                return True
+            if not self._is_due():
+                return False
+            waiting, self._waiting, self._first_s = self._waiting, deque(), None
+        for buffer in waiting:
+            self._pack(buffer)
+        while self._packed:
+            if not self._write(self._packed[0]):
+                break
+            self._packed.popleft()
+        return bool(self._packed) and self._pause()
 
     def _pack(self, buffer: RowBuffer) -> None:
         try:

@@ -28,6 +28,7 @@ from multidrop.fleet.drive_commands import answers_of_stops, stop_drive
 from multidrop.fleet.held_lines import HeldLine, HeldLines
 from multidrop.fleet.offers import Offers
 from multidrop.fleet.own_thread import Answers, StopWork, begin_stops
+from multidrop.supervisor import supervisor
 
 REMEMBERED = 1000  # stops, of which the oldest are forgotten
 CALLED = "a stop was called"
@@ -45,7 +46,6 @@ class StopDesk:
         self._log = log
         self._stops: dict[tuple[int, object], asyncio.Task[CommandAnswer]] = {}  # by line and message
         self._repeated = RepeatedStops(stop_drive)
-        self._notes: set[asyncio.Task[None]] = set()
 
     async def stop(self, line: str, data: bytes) -> CommandAnswer | None:
         """Stop drives of a line now; None where we are not its master and must keep silent.
@@ -66,7 +66,7 @@ class StopDesk:
             request = request._replace(drives=tuple(drive_meant(one, held.drives) for one in request.drives))
         key = (held.number, sha256(data).digest() if request.id else object())
         if key not in self._stops:
-            self._stops[key] = asyncio.create_task(self._stop(held, request))
+            self._stops[key] = supervisor().start("stop", self._stop_or_tell(held, request))
             while len(self._stops) > REMEMBERED:
                 del self._stops[next(iter(self._stops))]
         task = self._stops[key]
@@ -86,6 +86,15 @@ class StopDesk:
         text = "; ".join(answer.text for answer in drives.values())
         text = text or f"line {held.name}: a stop is under way"
         return CommandAnswer(CommandOutcome.UNDER_WAY, text, self.gateway, drives=drives)
+
+    async def _stop_or_tell(self, held: HeldLine, request: StopRequest) -> CommandAnswer:
+        """Stop them; a failure of ours is logged, and is the answer."""
+        try:
+            return await self._stop(held, request)
+        except Exception as failure:
+            _log.exception("a stop on line %s, asked for by %s", held.name, request.by)
+            text = f"it is not known whether the stop was sent: {type(failure).__name__}: {failure}"
+            return CommandAnswer(CommandOutcome.UNKNOWN, text, self.gateway)
 
     async def _stop(self, held: HeldLine, request: StopRequest) -> CommandAnswer:
         """Begin the stops of all drives side by side; of a drive whose stop is repeated, one more is sent."""
@@ -122,14 +131,12 @@ class StopDesk:
 
     def _note(self, record: Mapping[str, Any]) -> None:
         """Note it, in the order of the calls, whoever waits for the stop."""
-        task = asyncio.create_task(self._write(record))
-        self._notes.add(task)
-        task.add_done_callback(self._notes.discard)
+        supervisor().start("note of a stop", self._write(record))
 
     async def _write(self, record: Mapping[str, Any]) -> None:
         try:
             await self._log.note(record)
-        except OSError as failure:
+        except Exception as failure:
             _log.warning("a stop is not in the log of commands: %s", failure)
 
 

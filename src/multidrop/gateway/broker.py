@@ -14,7 +14,7 @@ from urllib.parse import urlsplit
 
 from multidrop import masked
 from multidrop.gateway.outbox import Outbox, Publication
-from multidrop.gateway.supervisor import Hung, supervisor
+from multidrop.supervisor import Hung, supervisor
 
 PORTS = {"mqtt": 1883, "mqtts": 8883}
 RETRY_S = (1, 30)  # before the first attempt to connect again, and at most

@@ -10,7 +10,7 @@ from typing import TypeVar
 
 from multidrop import noted_first, written_by
 from multidrop.gateway.rights import Caller
-from multidrop.gateway.supervisor import supervisor
+from multidrop.supervisor import supervisor
 
 COMMAND_S = 60.0  # after which /health says that a command goes on: a stop is repeated for 30 s
 

@@ -16,7 +16,7 @@ from starlette.responses import Response, StreamingResponse
 from starlette.types import Receive, Scope, Send
 
 from multidrop.gateway.guard import Denied
-from multidrop.gateway.supervisor import supervisor
+from multidrop.supervisor import supervisor
 
 MOST_EXPORTS = 8  # under way
 PIECE_S = 600.0  # that a piece may take: the first one of Parquet has the whole file behind it

@@ -37,9 +37,9 @@ from multidrop.gateway.sd_notify import Notifier
 from multidrop.gateway.seen_frames import SeenFrames
 from multidrop.gateway.settings import AUDIT_S, ServeSettings, check_writable
 from multidrop.gateway.side_reads import SideReads
-from multidrop.gateway.supervisor import Hung, supervisor
 from multidrop.gateway.views import troubles_of
 from multidrop.gateway.web import make_app
+from multidrop.supervisor import Hung, supervisor
 
 TAKE_S = 0.1  # between looks for new rows: half of the time between two frames
 LOOK_S = 0.2  # between looks for faults and silence; frames are made then, of what was just seen

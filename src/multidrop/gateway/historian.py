@@ -27,7 +27,7 @@ from multidrop import (
     parse_size,
 )
 from multidrop.gateway.metrics import counter
-from multidrop.gateway.supervisor import supervisor
+from multidrop.supervisor import supervisor
 
 MS_NS = 1_000_000
 LOOK_S = 1.0  # between looks at the thread that writes

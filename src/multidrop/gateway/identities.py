@@ -8,7 +8,7 @@ from collections.abc import Callable
 from functools import partial
 
 from multidrop import Bus, BusError, Drive, Plant, Refused
-from multidrop.gateway.supervisor import supervisor
+from multidrop.supervisor import supervisor
 
 PAUSE_S = 0.2  # between two drives that are asked: the polling keeps the line
 ROUND_S = 2.0  # between two looks for drives that are not known

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from multidrop import Plant
 from multidrop.gateway.parts import PARTS, Feed, Inside, build
-from multidrop.gateway.supervisor import supervisor
+from multidrop.supervisor import supervisor
 
 if TYPE_CHECKING:
     from multidrop.gateway.gateway import Gateway

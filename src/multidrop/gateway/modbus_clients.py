@@ -14,7 +14,7 @@ from typing import Any, cast
 from multidrop.gateway.mbap import Garbage, MbapRequest, function_of, request_of, take_frame, take_request
 from multidrop.gateway.modbus_codes import ModbusCode
 from multidrop.gateway.pdu import WRITES
-from multidrop.gateway.supervisor import supervisor
+from multidrop.supervisor import supervisor
 
 SLICE = 64  # requests of a client that are answered before others have their turn,
 SLICE_S = 0.002  # or so much time,

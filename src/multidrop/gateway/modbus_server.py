@@ -26,8 +26,8 @@ from multidrop.gateway.modbus_settings import ModbusSettings
 from multidrop.gateway.passing import LineShare, PassingBusy
 from multidrop.gateway.pdu import WRITES, read_range, reply_data
 from multidrop.gateway.rights import Caller, Right
-from multidrop.gateway.supervisor import supervisor
 from multidrop.gateway.units import MAIN, StopWrite, Unit, Units
+from multidrop.supervisor import supervisor
 
 if TYPE_CHECKING:
     from multidrop.gateway.parts import Inside

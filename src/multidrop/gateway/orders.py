@@ -14,7 +14,7 @@ from typing import Any
 from multidrop.gateway.clock import boottime_ns
 from multidrop.gateway.commands import MOST_AGE_S, Commands, Told
 from multidrop.gateway.rights import Caller
-from multidrop.gateway.supervisor import supervisor
+from multidrop.supervisor import supervisor
 
 MOST_AGE_MS = round(MOST_AGE_S * 1e3)  # a broker that stood still delivers those of the whole time
 MOST_AHEAD_MS = 2_000  # by which the sender's clock may be fast

@@ -12,7 +12,7 @@ from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 from typing import Any
 
-from multidrop.gateway.supervisor import supervisor
+from multidrop.supervisor import supervisor
 
 SHARE = 0.2  # of a line's time
 BURST_S = 0.2  # of line time that may be used at once after a rest

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from multidrop import Plant, PlantError, Poller
 from multidrop.gateway.parts import PARTS
 from multidrop.gateway.settings import AUDIT_S, check_writable
-from multidrop.gateway.supervisor import Hung, supervisor
+from multidrop.supervisor import Hung, supervisor
 
 if TYPE_CHECKING:
     from multidrop.gateway.gateway import Gateway

@@ -16,7 +16,7 @@ from typing import Any
 from multidrop import MAY_LISTS, Key, Plant, PlantError, TomlPlace, check_listed
 from multidrop.gateway.parts import PARTS, Part, settings_class
 from multidrop.gateway.rights import May, Right, Token, is_loopback, read_tokens
-from multidrop.gateway.supervisor import Hung, in_time
+from multidrop.supervisor import Hung, in_time
 
 LISTEN = "127.0.0.1:8750"
 AUDIT_S = 2.0  # within which the disk of the audit log must answer

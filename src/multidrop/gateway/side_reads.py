@@ -9,7 +9,7 @@ from math import isfinite
 from typing import Any
 
 from multidrop import Bus, BusError, Drive, NoReply, Plant
-from multidrop.gateway.supervisor import supervisor
+from multidrop.supervisor import supervisor
 
 PAUSE_S = 0.2  # between two reads on a line,
 SHARE = 20  # or so many times what the last one took, if that is more: the polling keeps the line

@@ -7,7 +7,7 @@ from collections.abc import Awaitable, Callable, Sequence
 from typing import Protocol, TypeVar
 
 from multidrop import Drive, Plant, PlantLine, drive_meant
-from multidrop.gateway.supervisor import supervisor
+from multidrop.supervisor import supervisor
 
 LOOK_S = 0.02  # between looks at what a reload changes
 

@@ -12,7 +12,7 @@ from multidrop.gateway.frames import lost_of
 from multidrop.gateway.lately import asked_of, misses_of
 from multidrop.gateway.metrics import Figures
 from multidrop.gateway.stops_amid_reload import drives_of
-from multidrop.gateway.supervisor import Hung, supervisor
+from multidrop.supervisor import Hung, supervisor
 
 if TYPE_CHECKING:
     from multidrop.gateway.gateway import Gateway

@@ -28,9 +28,9 @@ from multidrop.gateway.json_response import JsonResponse
 from multidrop.gateway.metrics import families_of
 from multidrop.gateway.request_fields import body_of, caller_of, drives_to_stop, frame_in, number_in, text_in
 from multidrop.gateway.rights import NEVER_THIS_WAY, NOT_ALLOWED, NOT_LISTED, Right
-from multidrop.gateway.supervisor import Hung, supervisor
 from multidrop.gateway.verb_rules import STOPPING
 from multidrop.gateway.views import figures_of, health_of, look_at, look_at_lines
+from multidrop.supervisor import Hung, supervisor
 
 if TYPE_CHECKING:
     from multidrop.gateway.gateway import Gateway

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from multidrop.cli.fleet.connection import add_server_arguments, run_with_paths
 from multidrop.cli.support.fleet_tables import (
     count_sentence,
+    failing_lines,
     free_lines,
     gateway_table,
     line_table,
@@ -49,7 +50,7 @@ async def _status(arguments: argparse.Namespace, paths: list[ServerPath]) -> int
         print_text(json.dumps(found, indent=2))
     else:
         print_text("\n".join(_table(found)))
-    return int(any((free_lines(found), unsure_lines(found), lost_lines(found), found.get("missing"))))
+    return int(any((found.get("missing"), *(lines(found) for lines in _BAD))))
 
 
 def _table(found: dict[str, Any]) -> list[str]:
@@ -65,4 +66,5 @@ async def _lines(arguments: argparse.Namespace, paths: list[ServerPath]) -> int:
     return 0
 
 
+_BAD = (free_lines, unsure_lines, lost_lines, failing_lines)
 _LOOKS = {"status": _status, "lines": _lines}

@@ -14,6 +14,7 @@ from multidrop.cli.support.log_thread import FORMATTERS, LogThread, add_log_argu
 from multidrop.cli.support.nats import nats_options
 from multidrop.cli.support.output import logging_by, print_text
 from multidrop.cli.support.signals import on_end_signals
+from multidrop.supervisor import supervisor
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -34,11 +35,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     require_fleet()
-    with logging_by(LogThread(sys.stderr, FORMATTERS[arguments.log]()), {"multidrop.fleet": logging.INFO}):
-        return asyncio.run(_serve(arguments))
+    log = LogThread(sys.stderr, FORMATTERS[arguments.log]())
+    with logging_by(log, {"multidrop": logging.INFO, "asyncio": logging.WARNING}):
+        return asyncio.run(_serve(arguments, log))
 
 
-async def _serve(arguments: argparse.Namespace) -> int:
+async def _serve(arguments: argparse.Namespace, log: LogThread) -> int:
     from importlib.metadata import version
 
     from multidrop.fleet.gateway import FleetGateway
@@ -53,6 +55,7 @@ async def _serve(arguments: argparse.Namespace) -> int:
     options = nats_options(arguments, urls)
     gateway = FleetGateway(name, urls, folder, options=options, spool_bytes=parse_size(arguments.keep))
     on_end_signals(gateway.end)
+    supervisor().watch("log", log.is_alive)
     async with AsyncExitStack() as stack:
         if listener:
             release = version("multidrop")

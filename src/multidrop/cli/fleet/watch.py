@@ -16,6 +16,7 @@ from multidrop.cli.fleet.connection import add_server_arguments, run_with_paths
 from multidrop.cli.support.extras import require_extra
 from multidrop.cli.support.output import print_text
 from multidrop.cli.support.signals import on_end_signals
+from multidrop.supervisor import supervisor
 
 if TYPE_CHECKING:
     from multidrop.fleet.servers import ServerPath
@@ -49,18 +50,23 @@ async def watch(paths: list[ServerPath], *, is_json: bool) -> int:
     await view.check()
     over = asyncio.Event()
     on_end_signals(over.set)
-    keeping = asyncio.create_task(path.keep())
+    keeping = supervisor().keep("path", path.keep())
     try:
         with _lines() if is_json else drawing() as show:
             await follow(FleetWatch(view), show, over)
     finally:
+        supervisor().let_go("path")
         await end_tasks(keeping)
     return 0
 
 
 async def follow(watch: FleetWatch, show: Callable[[dict[str, Any]], object], over: asyncio.Event) -> None:
-    """Look once a second, and show what was found with its age, until it is over."""
+    """Look once a second, and show what was found with its age, until it is over.
+
+    Raises Ended if what keeps the connection has ended.
+    """
     while not over.is_set():
+        supervisor().check()
         begun = time.monotonic()
         await watch.look()
         show(watch.told())

@@ -123,6 +123,11 @@ def lost_lines(fleet: Told) -> list[str]:
     return [line for gateway in fleet["gateways"].values() for line in _lines_in(gateway["says"], "lost")]
 
 
+def failing_lines(fleet: Told) -> list[str]:
+    """Return the lines on which polling raises exceptions: their values are missed."""
+    return [line for gateway in fleet["gateways"].values() for line in _lines_in(gateway["says"], "failing")]
+
+
 def _lines_in(says: Told | None, key: str) -> list[str]:
     """Return the lines that a gateway's answer lists; none for an answer without such a list."""
     found = (says or {}).get(key)
@@ -130,9 +135,10 @@ def _lines_in(says: Told | None, key: str) -> list[str]:
 
 
 def count_sentence(fleet: Told) -> str:
-    unsure, lost = len(unsure_lines(fleet)), len(lost_lines(fleet))
+    unsure, lost, failing = (len(lines(fleet)) for lines in (unsure_lines, lost_lines, failing_lines))
     more = f", {unsure} whose master does not answer" if unsure else ""
     more += f", {lost} with a lost port" if lost else ""
+    more += f", {failing} on which polling fails" if failing else ""
     return f"{counted(len(fleet['lines']), 'line')}, {len(free_lines(fleet))} without a master{more}"
 
 

@@ -1,8 +1,9 @@
-"""Supervisor: starts every task and every thread of the gateway; no other module of the gateway starts any.
+"""Supervisor: the tasks and threads of a process that must go on, and those that work for a while.
 
-It knows which of the tasks and threads that must go on have ended. It also knows which work takes too long,
-such as a read from a file system that hangs. /health reports both. Its threads are daemons: they never keep
-the process from ending.
+The gateway starts all of its own here, and the fleet those that must go on. The supervisor knows which of
+them have ended: the gateway's /health reports that, and a fleet's gateway ends. It also knows which work
+takes too long, such as a read from a file system that hangs. Its threads are daemons: they never keep the
+process from ending.
 """
 
 from __future__ import annotations
@@ -21,11 +22,15 @@ from weakref import WeakKeyDictionary
 
 R = TypeVar("R")
 
-_log = logging.getLogger("multidrop.gateway")
+_log = logging.getLogger("multidrop.supervisor")
 
 
 class Hung(OSError):
     """Work that did not end in its time; its thread goes on."""
+
+
+class Ended(OSError):
+    """Tasks or threads that must go on have ended; which, and why, in one sentence."""
 
 
 class _Work(NamedTuple):
@@ -39,6 +44,7 @@ class Supervisor:
 
     def __init__(self) -> None:
         self.dead: dict[str, str] = {}  # tasks and threads that must go on, and why they ended
+        self.has_dead = asyncio.Event()  # set at the first of them
         self._kept: dict[str, asyncio.Task[Any]] = {}
         self._watched: dict[str, Callable[[], bool]] = {}
         self._short: set[asyncio.Task[Any]] = set()
@@ -50,6 +56,11 @@ class Supervisor:
     def kept(self) -> dict[str, asyncio.Task[Any]]:
         """The tasks that must go on, by name."""
         return dict(self._kept)
+
+    @property
+    def started(self) -> list[asyncio.Task[Any]]:
+        """The tasks that end by themselves, and have not."""
+        return [*self._short]
 
     @property
     def watched(self) -> list[str]:
@@ -69,7 +80,7 @@ class Supervisor:
         if self._kept.get(name) is not task:
             return  # it was released
         del self._kept[name]
-        self.note_dead(name, "it was cancelled" if task.cancelled() else _reason(failure), failure)
+        self.note_dead(name, "it was cancelled" if task.cancelled() else reason_of(failure), failure)
 
     def let_go(self, name: str) -> asyncio.Task[Any] | None:
         """Return a task that may end from now on; None if it has ended."""
@@ -106,7 +117,14 @@ class Supervisor:
     def note_dead(self, name: str, why: str, failure: BaseException | None = None) -> None:
         """Note and log that something which must go on has ended."""
         self.dead[name] = why
+        self.has_dead.set()
         _log.error("%s has ended, and does not come back: %s", name, why, exc_info=failure)
+
+    def check(self) -> None:
+        """Raise Ended if a task or a thread that must go on has ended."""
+        self.look()
+        if self.dead:
+            raise Ended("; ".join(f"{name} has ended: {why}" for name, why in self.dead.items()))
 
     # ---- threads ----
 
@@ -130,7 +148,7 @@ class Supervisor:
             try:
                 settle = partial(future.set_result, call(work))
             except BaseException as failure:
-                settle = partial(future.set_exception, _for_a_future(failure))
+                settle = partial(future.set_exception, for_a_future(failure))
             try:
                 loop.call_soon_threadsafe(finish, settle)
             except RuntimeError:  # the loop is closed
@@ -214,12 +232,13 @@ def in_time(name: str, seconds: float, work: Callable[[], R]) -> R:
         raise Hung(f"{name}: not done within {seconds:g} s; does the disk answer?") from late
 
 
-def _for_a_future(failure: BaseException) -> Exception:
+def for_a_future(failure: BaseException) -> Exception:
     """Return a failure as a future takes it: SystemExit would end the loop, and StopIteration is refused."""
     if isinstance(failure, Exception) and not isinstance(failure, StopIteration):
         return failure
-    return RuntimeError(_reason(failure))
+    return RuntimeError(reason_of(failure))
 
 
-def _reason(failure: BaseException | None) -> str:
+def reason_of(failure: BaseException | None) -> str:
+    """Return why something ended that raised this; None: it raised nothing."""
     return "it returned" if failure is None else f"{type(failure).__name__}: {failure}"
