@@ -121,8 +121,7 @@ class Supervisor:
         _log.error("%s has ended, and does not come back: %s", name, why, exc_info=failure)
 
     def check(self) -> None:
-        """Raise Ended if a task or a thread that must go on has ended."""
-        self.look()
+        """Raise Ended if a task or a thread that must go on is known to have ended."""
         if self.dead:
             raise Ended("; ".join(f"{name} has ended: {why}" for name, why in self.dead.items()))
 

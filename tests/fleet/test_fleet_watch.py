@@ -31,6 +31,7 @@ from multidrop.cli.support.fleet_screen import picture  # noqa: E402
 from multidrop.cli.support.fleet_tables import moment, move_table, size  # noqa: E402
 from multidrop.fleet.overview import is_shown  # noqa: E402
 from multidrop.fleet.watching import FleetWatch  # noqa: E402
+from multidrop.supervisor import Ended, supervisor  # noqa: E402
 
 SPOOL = {"bytes": 81234, "lost": 0, "behind": 2, "lag_s": 1.5, "trouble": None}
 SAYS = {"state": "working", "margin_s": 1.94, "troubles": {}, "trouble": "", "spool": SPOOL}
@@ -239,6 +240,18 @@ def test_a_look_that_fails_is_told_with_the_age_of_what_is_shown(monkeypatch: py
     asyncio.run(main())
     assert [one["trouble"] for one in shown] == [None, "no server", "no server"]
     assert shown[0]["age_s"] < shown[1]["age_s"] < shown[2]["age_s"]
+
+
+def test_a_watch_whose_connection_is_kept_no_more_ends() -> None:
+    """Else it would show the last look for ever."""
+
+    async def main() -> None:
+        supervisor().keep("path", asyncio.sleep(0)).cancel()
+        watch: Any = FleetWatch(FailingView())  # type: ignore[arg-type]
+        with pytest.raises(Ended, match="path has ended: it was cancelled"):
+            await fleet_watch.follow(watch, lambda told: None, asyncio.Event())
+
+    asyncio.run(main())
 
 
 def test_without_a_terminal_it_says_what_works(run: Run) -> None:

@@ -18,7 +18,7 @@ from terminals import closing_terminal
 
 from multidrop import History
 from multidrop.cli import main
-from multidrop.fleet import samples_stream
+from multidrop.fleet import compaction, samples_stream
 from multidrop.fleet.forwarder import Forwarder
 from multidrop.fleet.hub import SampleHub
 from multidrop.fleet.samples_stream import connect, create_stream
@@ -116,6 +116,19 @@ def test_a_signal_waits_for_what_the_hub_is_doing(
     monkeypatch.setattr(SampleHub, "run", read)
     assert main(["hub", running.urls[0], "--parquet", str(tmp_path)]) == 130
     assert done == ["went on", "ended"]
+
+
+def test_a_hub_whose_compaction_ends_fails(
+    running: Cluster, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    async def end(folder: Path) -> None:
+        raise ZeroDivisionError("a mistake")
+
+    monkeypatch.setattr(compaction, "compact_for_ever", end)
+    assert main(["hub", running.urls[0], "--parquet", str(tmp_path)]) == 1
+    said = capsys.readouterr().err
+    assert "Traceback" in said  # in the log
+    assert said.endswith("multidrop: compaction has ended: ZeroDivisionError: a mistake\n")
 
 
 def test_a_connection_whose_end_does_not_come_is_left(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -506,6 +506,34 @@ def test_a_line_that_is_not_closed_for_certain_ends_the_gateway() -> None:
     asyncio.run(main())
 
 
+def test_a_line_on_which_anything_fails_is_that_line_s_alone(caplog: pytest.LogCaptureFixture) -> None:
+    """Such as a user's own class: it is logged with its cause, and tried again."""
+
+    async def main() -> None:
+        trial = Trial()
+        take, failures = trial.lines.take, [ZeroDivisionError("of a user's class")]
+
+        async def fail(line: str, description: Any) -> None:
+            if failures:
+                raise failures.pop()
+            await take(line, description)
+
+        trial.lines.take = fail  # type: ignore[method-assign]
+        await trial.read_and_begin()
+        trial.claim_now()
+        await until(lambda: bool(trial.keeper.troubles))
+        assert trial.keeper.troubles == {"hall": "ZeroDivisionError: of a user's class"}
+        assert (trial.keeper.lost, trial.keeper._failure) == ({}, None)
+        await until(lambda: not trial.keeper._tasks)
+        trial.keeper._again_at["hall"] = 0.0
+        trial.keeper.reconcile()
+        await until(lambda: "hall" in trial.keeper.polled)
+        assert trial.keeper.troubles == {}
+
+    asyncio.run(main())
+    assert "Traceback" in caplog.text
+
+
 class BrokenLines(NotedLines):
     """Lines whose port cannot be opened, for this reason; "" for none."""
 

@@ -6,6 +6,7 @@ import os
 import re
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 from tables import table
@@ -13,8 +14,9 @@ from tables import table
 from multidrop.core import Echo
 from multidrop.drive import Framing
 from multidrop.drive.timing import Settings
+from multidrop.drives.yd1000 import YD1000
 from multidrop.plant.loader import PlantError, load_plant
-from multidrop.plant.model import Plant
+from multidrop.plant.model import Plant, Polled
 from multidrop.toml_check import parse_duration
 
 FAMILY = """\
@@ -609,3 +611,12 @@ def test_lines_and_drives_are_found_by_name(tmp_path: Path) -> None:
     assert (line.name, drive.name) == ("roof", "pump-2")
     with pytest.raises(ValueError, match=r"has no drive 'fan'; there are pump-1, pump-2"):
         plant.find_drive("fan")
+
+
+@table("every", [0, 0.0, -1.0, 0.00009, 86401.0, float("nan"), float("inf"), True, "1 s"])
+def test_a_period_that_no_plant_file_may_have_is_refused(every: Any) -> None:
+    """Of 0 s, it would end the polling of its line."""
+    register = YD1000.register("status")
+    with pytest.raises(ValueError, match=rf"^every = {every!r} is not a number of seconds from 0\.0001 to "):
+        Polled(register, every)
+    assert Polled(register, None).every is None

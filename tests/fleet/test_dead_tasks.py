@@ -1,0 +1,383 @@
+"""All tasks and threads of a fleet's gateway that must go on: each that ends is logged, and ends the gateway.
+
+A failure on one line is that line's alone.
+"""
+
+from __future__ import annotations
+
+import ast
+import asyncio
+import json
+import threading
+from collections.abc import Awaitable, Callable, Iterator
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from command_desks import LINE, desks
+from lines import until
+from nats_clusters import Cluster
+from peers import require_module
+from spooled import numbered
+from toy import Toy
+
+require_module("nats")
+require_module("pyarrow")
+
+import multidrop.fleet  # noqa: E402
+from multidrop import Mastership, Poller, PollingFailed  # noqa: E402
+from multidrop.cli.support.fleet_tables import count_sentence, failing_lines  # noqa: E402
+from multidrop.fleet import compaction, fleet_lines, metrics_port, names  # noqa: E402
+from multidrop.fleet import forwarder as forwarder_module  # noqa: E402
+from multidrop.fleet import gateway as fleet_gateway  # noqa: E402
+from multidrop.fleet import spool as spool_module  # noqa: E402
+from multidrop.fleet.command_log import CommandLog  # noqa: E402
+from multidrop.fleet.command_subjects import CommandedLines, CommandSubjects  # noqa: E402
+from multidrop.fleet.command_words import CommandOutcome  # noqa: E402
+from multidrop.fleet.fleet_commands import FleetCommands  # noqa: E402
+from multidrop.fleet.fleet_lines import FleetLines  # noqa: E402
+from multidrop.fleet.forwarder import Forwarder  # noqa: E402
+from multidrop.fleet.gateway import FleetGateway  # noqa: E402
+from multidrop.fleet.polled_units import PolledUnits  # noqa: E402
+from multidrop.fleet.spool import Spool  # noqa: E402
+from multidrop.sim import Simulator, Wire, simulated  # noqa: E402
+from multidrop.supervisor import Ended, supervisor  # noqa: E402
+
+STARTERS = {
+    *("Thread", "ThreadPoolExecutor", "TaskGroup", "Timer"),
+    *("create_task", "ensure_future", "to_thread", "run_in_executor"),
+}
+WAITED_FOR = {  # modules that start tasks and threads, and themselves wait for them
+    *("direct_gets", "fleet_commands", "forwarder", "gateway", "hub", "leaders", "line_keeper", "member"),
+    *("observer", "owner_records", "own_thread", "page_part", "servers", "shares", "stop_asking"),
+    *("command_log", "fleet_lines"),  # whose callers wait for their threads
+    "spool",  # whose thread the gateway watches
+}
+MEMBER = (
+    *(f"path {at}" for at in (1, 2, 3)),
+    *(f"lease {at}" for at in (1, 2, 3)),
+    *(f"records {at}" for at in range(1, 1 + len(names.BUCKETS))),
+    *("guard", "leaders", "weak session", "releases", "steps", "lines"),
+)
+TASKS = ("forwarder", "member", "look", *(f"gw-1: {name}" for name in MEMBER))
+THREADS = ("multidrop spool", "multidrop poller", "multidrop batches")
+
+
+class Ill(Exception):
+    """Raised by code under test."""
+
+
+async def fail(*details: object) -> None:
+    raise Ill("a mistake")
+
+
+def test_no_other_module_of_the_fleet_starts_a_task_or_a_thread() -> None:
+    found = set()
+    for path in Path(multidrop.fleet.__file__).parent.glob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text("utf-8"))):
+            if isinstance(node, ast.Call) and ast.unparse(node.func).rpartition(".")[2] in STARTERS:
+                found.add(path.stem)
+    assert found <= WAITED_FOR
+
+
+# ---- a gateway ----
+
+
+@pytest.fixture
+def gateway(
+    fleet: Cluster, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> Iterator[Callable[[Callable[[FleetGateway], Awaitable[object]]], None]]:
+    """A function that runs a gateway of real servers until its end, and calls another once it is ready."""
+
+    def run(act: Callable[[FleetGateway], Awaitable[object]]) -> None:
+        async def main() -> None:
+            made = FleetGateway("gw-1", fleet.urls, tmp_path)
+            monkeypatch.setattr(made.mastership, "extend", lambda until_ns: None)  # no timer kills the test
+            ready = asyncio.Event()
+            running = asyncio.ensure_future(made.run(ready.set))
+            await asyncio.wait([running, asyncio.ensure_future(ready.wait())], return_when="FIRST_COMPLETED")
+            while not made.member.lease.session and not running.done():
+                await asyncio.sleep(0.01)
+            await act(made)
+            try:
+                await asyncio.wait_for(running, 60)
+            finally:
+                assert made.member.lease.session == 0  # it was ended: others take over at once
+                assert [one.get_name() for one in asyncio.all_tasks() if one.get_name() in TASKS] == []
+
+        asyncio.run(main())
+
+    return run
+
+
+def test_the_list_of_all_tasks_and_threads(gateway: Any) -> None:
+    async def look(made: FleetGateway) -> None:
+        assert set(supervisor().kept) == set(TASKS)
+        assert supervisor().watched == ["spool"]
+        there = {thread.name for thread in threading.enumerate()}
+        assert there >= set(THREADS)
+        made.end()
+
+    gateway(look)
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(one, marks=[pytest.mark.slow] * (one[-1] in "23456")) for one in TASKS]
+)
+def test_a_task_that_is_killed_is_logged_and_ends_the_gateway(
+    gateway: Any, name: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    async def kill(made: FleetGateway) -> None:
+        supervisor().kept[name].cancel()
+
+    with pytest.raises(Ended, match=f"{name} has ended: it was cancelled"):
+        gateway(kill)
+    assert f"{name} has ended, and does not come back: it was cancelled" in caplog.text
+
+
+def test_what_a_task_raised_is_logged_with_its_cause(
+    gateway: Any, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    async def kill(made: FleetGateway) -> None:
+        monkeypatch.setattr(made.member, "step", fail)
+
+    with pytest.raises(Ended, match="gw-1: steps has ended: Ill: a mistake"):
+        gateway(kill)
+    assert "Traceback" in caplog.text
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
+def test_a_spool_whose_thread_ends_ends_the_gateway(gateway: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    def leave() -> bool:
+        raise SystemExit
+
+    async def kill(made: FleetGateway) -> None:
+        monkeypatch.setattr(made.spool, "_write_what_is_due", leave)
+        made.spool.sync(0.01)
+
+    monkeypatch.setattr(fleet_gateway, "FORWARD_S", 0.0)
+    with pytest.raises(Ended, match="spool has ended: its thread has ended"):
+        gateway(kill)
+
+
+def test_a_poller_that_fails_ends_the_gateway(gateway: Any) -> None:
+    async def kill(made: FleetGateway) -> None:
+        made.lines.poller.failure = PollingFailed("polling has ended on all lines: Ill: of the poller")
+
+    with pytest.raises(Ended, match="polling has ended: polling has ended on all lines: Ill: of the poller"):
+        gateway(kill)
+
+
+def test_subjects_that_cannot_be_heard_end_the_gateway(gateway: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A stop would not be heard."""
+
+    async def kill(made: FleetGateway) -> None:
+        monkeypatch.setattr(made.paths[1], "subscribe", fail)
+        made.commands._change(made.commands._hear("stop.hall", made.commands.desk.do))
+
+    with pytest.raises(Ended, match="commands has ended: Ill: a mistake"):
+        gateway(kill)
+
+
+def test_a_commander_whose_connection_ends_says_so(fleet: Cluster, tmp_path: Path) -> None:
+    """The page then connects anew."""
+
+    async def main() -> None:
+        async with FleetCommands(fleet.urls, by="page", log=tmp_path / "log.jsonl") as commands:
+            commands._keeping[1].cancel()
+            with pytest.raises(Ended, match="a connection to the fleet has ended"):
+                await asyncio.wait_for(commands.stay(), 60)
+
+    asyncio.run(main())
+
+
+# ---- what goes on ----
+
+
+def test_a_forwarder_that_fails_is_logged_and_tries_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(forwarder_module, "AGAIN_S", 0.0)
+    spool = Spool(tmp_path / "spool", "gw-1")
+    nowhere: Any = None
+    forwarder = Forwarder(spool, nowhere)
+    asked: list[str | None] = []
+
+    async def ask() -> None:
+        asked.append(forwarder.state().trouble)
+        raise Ill("a mistake")
+
+    async def main() -> None:
+        monkeypatch.setattr(forwarder, "_ask", ask)
+        running = asyncio.create_task(forwarder.run())
+        while len(asked) < 3:
+            await asyncio.sleep(0)
+        running.cancel()
+
+    asyncio.run(main())
+    spool.close()
+    assert asked[:2] == [None, "Ill: a mistake"]
+    assert caplog.text.count("samples are not forwarded: Ill: a mistake") == 1
+    assert "Traceback" in caplog.text
+
+
+def test_a_spool_goes_on_behind_failures_and_counts_rows_that_cannot_be_copied(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(spool_module, "AGAIN_S", 0.0)
+    spool = Spool(tmp_path / "spool", "gw-1")
+    left = [MemoryError(), Ill("a mistake")]
+    write = spool._write_what_is_due
+
+    def written() -> bool:
+        if left:
+            raise left.pop()
+        return write()
+
+    class Uncopied:
+        def columns(self) -> None:
+            raise MemoryError
+
+        def __len__(self) -> int:
+            return 7
+
+    monkeypatch.setattr(spool, "_write_what_is_due", written)
+    uncopied: Any = Uncopied()
+    spool.append(uncopied)
+    spool.append(numbered(0, 5))
+    assert spool.sync(60.0)
+    until(lambda: not left)
+    assert (spool.state().written, spool.state().lost) == (50, 7)
+    spool.close()
+    assert "MemoryError" in caplog.text
+
+
+def test_a_compaction_that_cannot_begin_is_tried_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    require_module("duckdb")
+    tried: list[object] = []
+
+    async def fail_to_begin(words: object) -> None:
+        tried.append(words)
+        raise BlockingIOError("no process is left")
+
+    async def main() -> None:
+        merging = asyncio.create_task(compaction.compact_for_ever(tmp_path, every=0.0))
+        while len(tried) < 3:
+            await asyncio.sleep(0)
+        merging.cancel()
+
+    monkeypatch.setattr(compaction, "_compact", fail_to_begin)
+    asyncio.run(main())
+    assert "no process is left" in caplog.text
+
+
+def test_metrics_that_fail_are_an_error_of_the_server(caplog: pytest.LogCaptureFixture) -> None:
+    def families() -> Any:
+        raise Ill("a mistake")
+
+    head = b"GET /metrics HTTP/1.1\r\nHost: localhost\r\n\r\n"
+    assert metrics_port._answer(head, families).startswith(b"HTTP/1.1 500 Internal Server Error\r\n")
+    assert "Ill: a mistake" in caplog.text
+
+
+def test_a_stop_that_fails_in_the_desk_is_answered(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with desks(tmp_path) as desk:
+        monkeypatch.setattr(desk.stops, "_begin", lambda *details: asyncio.run(fail()))
+        answer = asyncio.run(desk.stop())
+    assert answer is not None
+    assert (answer.outcome, answer.is_done) == (CommandOutcome.UNKNOWN, False)
+    assert "it is not known whether the stop was sent" in answer.text
+
+
+# ---- one line ----
+
+
+class Taken:
+    """The lines of a gateway, with a simulated one to take."""
+
+    def __init__(self, port: str, folder: Path) -> None:
+        self.mastership = Mastership()
+        self.lines = FleetLines(self.mastership, folder, PolledUnits())
+        self.description = {"line": {"name": LINE, "port": port}}
+
+    def close(self) -> None:
+        self.lines.poller.close()
+        self.mastership.end()
+
+
+@pytest.fixture
+def taken(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Taken]:
+    from lines import line, polled
+
+    with Simulator([Wire([simulated(Toy(1))])]) as simulator:
+        path = simulator.wires[0].path
+        described = line(path, polled(Toy(1, name="pump"), [Toy.registers["output_current"]]), name=LINE)
+        monkeypatch.setattr(fleet_lines, "line_of", lambda record, folder: described)
+        made = Taken(path, tmp_path)
+        yield made
+        made.close()
+
+
+@pytest.mark.parametrize("failure", [Ill("amid it"), MemoryError(), SystemExit("of a user")], ids=repr)
+def test_a_line_whose_taking_fails_is_not_polled(
+    taken: Taken, monkeypatch: pytest.MonkeyPatch, failure: BaseException
+) -> None:
+    """Another gateway may be its master before long."""
+    add_line = taken.lines.poller.add_line
+
+    def add(described: Any) -> None:
+        add_line(described)
+        raise failure
+
+    monkeypatch.setattr(taken.lines.poller, "add_line", add)
+    with pytest.raises(RuntimeError if isinstance(failure, SystemExit) else type(failure)):
+        asyncio.run(taken.lines.take(LINE, taken.description))
+    assert taken.lines.poller.buses == {}
+
+
+def test_a_line_that_cannot_be_opened_to_commands_is_not_polled(
+    taken: Taken, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    log = CommandLog(tmp_path / "commands.jsonl")
+    held: Any = SimpleNamespace(leave=lambda line: None, shut=lambda line: None)
+
+    async def main() -> None:
+        subjects = CommandSubjects("gw-1", [], held, log)
+        monkeypatch.setattr(subjects, "open", lambda *details: asyncio.run(fail()))
+        with pytest.raises(RuntimeError):
+            await CommandedLines(taken.lines, subjects).take(LINE, taken.description)
+
+    asyncio.run(main())
+    log.close()
+    assert taken.lines.poller.buses == {}
+
+
+def test_lines_are_let_go_of_though_polling_has_failed(taken: Taken) -> None:
+    async def main() -> None:
+        await taken.lines.take(LINE, taken.description)
+        taken.lines.poller.failure = PollingFailed("polling has ended on all lines: Ill: of the poller")
+        await taken.lines.let_go(LINE)
+
+    asyncio.run(main())
+    assert not taken.lines.bus(LINE).is_open
+    taken.lines.poller._is_failure_raised = True
+
+
+def test_lines_on_which_polling_fails_are_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    failures = {"hall": "Ill: of its class"}
+    monkeypatch.setattr(Poller, "line_failures", property(lambda poller: failures))
+
+    async def main() -> dict[str, Any]:
+        made = FleetGateway("gw-1", ["nats://127.0.0.1:1"], tmp_path)
+        state = made.state()
+        await made._close()
+        return json.loads(json.dumps(state))  # type: ignore[no-any-return]
+
+    state = asyncio.run(main())
+    assert (state["failing"], state["troubles"]) == (["hall"], {"hall": "polling fails: Ill: of its class"})
+    fleet = {"gateways": {"gw-1": {"says": state}}, "lines": {}}
+    assert failing_lines(fleet) == ["hall"]
+    assert count_sentence(fleet) == "0 lines, 0 without a master, 1 on which polling fails"
