@@ -65,7 +65,7 @@ class Interruption(BaseException):
 
 
 @contextmanager
-def interrupted_before(nth: int) -> Iterator[list[str]]:
+def interrupted_before(nth: int, failure: type[BaseException] = Interruption) -> Iterator[list[str]]:
     """Raise before the nth bytecode of the package on this thread; give a list, which then says where."""
     left = nth
     found: list[str] = []
@@ -79,7 +79,7 @@ def interrupted_before(nth: int) -> Iterator[list[str]]:
             left -= 1
             if left == 0:
                 found.append(f"{frame.f_code.co_qualname}, line {frame.f_lineno}")
-                raise Interruption
+                raise failure
         return trace
 
     before = sys.gettrace()

@@ -91,6 +91,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     _replace_closed_streams()
     if not words or words[0] in ("-h", "--help", "--version"):
         return _guarded(partial(_describe_itself, words))
+    return _guarded(partial(_run_interruptible, words))
+
+
+def _run_interruptible(words: list[str]) -> int:
     from multidrop.cli.support.output import logging_to, spell_out_unencodable, warn
     from multidrop.cli.support.signals import end_signals_interrupt, outliving_the_terminal
 
@@ -98,7 +102,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     command = words[1] if words[0] == "fleet" and words[1:] else words[0]
     going_on = outliving_the_terminal() if command in STOPS else nullcontext()
     with end_signals_interrupt(), going_on, logging_to(warn, "multidrop.drives.registry", logging.INFO):
-        return _guarded(partial(_run, words[0], words[1:]))
+        return _run(words[0], words[1:])
 
 
 def _replace_closed_streams() -> None:
@@ -128,7 +132,9 @@ def _guarded(run: Callable[[], int]) -> int:
         status = run()
         sys.stdout.flush()
     except KeyboardInterrupt as interruption:  # its notes say what was sent
-        return _fail("\n".join(["interrupted", *getattr(interruption, "__notes__", ())]), INTERRUPTED)
+        with suppress(KeyboardInterrupt):  # a second one at once
+            return _fail("\n".join(["interrupted", *getattr(interruption, "__notes__", ())]), INTERRUPTED)
+        return INTERRUPTED
     except BrokenPipeError:  # such as of `multidrop models | head`
         _abandon_output()
         return DONE

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import asyncio
 import logging
 import os
 import sys
@@ -22,7 +21,7 @@ from multidrop.cli.support.extras import require_extra
 from multidrop.cli.support.log_thread import FORMATTERS, LogThread, add_log_argument
 from multidrop.cli.support.output import logging_by, print_text, warn
 from multidrop.cli.support.plants import add_port_option, plant_of
-from multidrop.cli.support.signals import on_end_signals, on_reload_signal
+from multidrop.cli.support.signals import on_end_signals, on_reload_signal, run_loop
 from multidrop.drive.known_state import can_show_fault
 from multidrop.drive.named_verbs import verbs_of
 from multidrop.drives import MODELS
@@ -179,7 +178,7 @@ def _serve(
             on_reload_signal(gateway.reload.begin, end)
         await gateway.run(lambda: on_ready(gateway.port))
 
-    asyncio.run(live())
+    run_loop(live())
     return 0
 
 

@@ -8,7 +8,7 @@ import secrets
 import struct
 import time
 from collections.abc import Awaitable, Callable, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from functools import partial
 from math import inf
@@ -39,7 +39,7 @@ from multidrop.gateway.settings import AUDIT_S, ServeSettings, check_writable
 from multidrop.gateway.side_reads import SideReads
 from multidrop.gateway.views import troubles_of
 from multidrop.gateway.web import make_app
-from multidrop.supervisor import Hung, supervisor
+from multidrop.supervisor import Hung, in_time, supervisor
 
 TAKE_S = 0.1  # between looks for new rows: half of the time between two frames
 LOOK_S = 0.2  # between looks for faults and silence; frames are made then, of what was just seen
@@ -81,7 +81,8 @@ class Gateway:
         self._looked = 0.0
         self._has_news = False  # for a frame
         self.ledger = ledger or Ledger()
-        self.poller: Poller | None = None
+        self.poller: Poller | None = None  # once it polls
+        self._made: Poller | None = None  # the same, from its making on
         self._end = asyncio.Event()
         self.listener = listen(settings.host, settings.port)
         self.connections = self.listener.connections = Connections(self.clock)
@@ -109,8 +110,19 @@ class Gateway:
     async def run(self, on_ready: Callable[[], object] = lambda: None) -> None:
         """Poll and serve until `end` is called; then return within END_S, whatever hangs.
 
-        Raises RuntimeError if the web server ends by itself.
+        If this is interrupted, nothing is polled when it raises. Raises RuntimeError if the web server ends
+        by itself.
         """
+        try:
+            await self._run(on_ready)
+        except BaseException:
+            self.listener.close()
+            if self._made is not None:
+                with suppress(Exception):  # one that hangs was logged, and so were its other failures
+                    in_time("polling", END_S, self._made.close)
+            raise
+
+    async def _run(self, on_ready: Callable[[], object]) -> None:
         nothing = replace(self.plant, lines=())
         server = _Server(self._server_config())
         end = supervisor().start("end", self._end.wait())
@@ -120,7 +132,7 @@ class Gateway:
                 supervisor().watch("alarms", lambda: not keeping.done())
             built = await self.parts.build(self.settings.parts)
             await self._find_audit()
-            poller = Poller(nothing, ledger=self.ledger, audit=self.audit)
+            poller = self._made = Poller(nothing, ledger=self.ledger, audit=self.audit)
             self.poller = poller.__enter__()  # it is left in a thread: that may take its time
             adopting = supervisor().thread("adoption", ADOPTION_S, partial(poller.adopt, self.plant))
             either: set[asyncio.Future[Any]] = {end, adopting}

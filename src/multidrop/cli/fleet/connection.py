@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import asyncio
 import logging
 from collections.abc import Awaitable, Callable, Coroutine
 from pathlib import Path
@@ -13,6 +12,7 @@ from multidrop.cli.support.arguments import add_json_argument
 from multidrop.cli.support.extras import require_extra
 from multidrop.cli.support.nats import URLS, add_nats_arguments, nats_options, nats_urls
 from multidrop.cli.support.output import logging_to, warn
+from multidrop.cli.support.signals import run_loop
 from multidrop.control.eeprom_ledger import default_path
 
 if TYPE_CHECKING:
@@ -58,7 +58,7 @@ def run_action(work: Callable[[], Coroutine[Any, Any, int]]) -> int:
     """Run an action in an event loop of its own, and print the errors that the fleet logs."""
     require_fleet()
     with logging_to(warn, "multidrop.fleet", logging.ERROR):
-        return asyncio.run(work())
+        return run_loop(work())
 
 
 def run_with_paths(arguments: argparse.Namespace, work: Callable[[list[ServerPath]], Awaitable[int]]) -> int:

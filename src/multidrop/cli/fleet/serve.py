@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import asyncio
 import logging
 import sys
 from contextlib import AsyncExitStack
@@ -13,7 +12,7 @@ from multidrop.cli.fleet.connection import STATE, add_address_arguments, require
 from multidrop.cli.support.log_thread import FORMATTERS, LogThread, add_log_argument
 from multidrop.cli.support.nats import nats_options
 from multidrop.cli.support.output import logging_by, print_text
-from multidrop.cli.support.signals import on_end_signals
+from multidrop.cli.support.signals import on_end_signals, run_loop
 from multidrop.supervisor import supervisor
 
 
@@ -37,7 +36,7 @@ def run(arguments: argparse.Namespace) -> int:
     require_fleet()
     log = LogThread(sys.stderr, FORMATTERS[arguments.log]())
     with logging_by(log, {"multidrop": logging.INFO, "asyncio": logging.WARNING}):
-        return asyncio.run(_serve(arguments, log))
+        return run_loop(_serve(arguments, log))
 
 
 async def _serve(arguments: argparse.Namespace, log: LogThread) -> int:

@@ -11,10 +11,13 @@ from __future__ import annotations
 import os
 import signal
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Coroutine, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
+from typing import Any, TypeVar
+
+T = TypeVar("T")
 
 
 @contextmanager
@@ -90,11 +93,12 @@ def noting_signals() -> Iterator[Interruption]:
 def on_end_signals(end: Callable[[], object]) -> None:
     """Call `end` in the running asyncio loop, once, at the first SIGINT, SIGTERM or SIGHUP.
 
-    A second SIGINT or SIGTERM interrupts.
+    A second SIGINT or SIGTERM cancels this task, and a third one interrupts wherever it comes.
     """
     import asyncio
 
-    loop = asyncio.get_running_loop()
+    loop, task = asyncio.get_running_loop(), asyncio.current_task()
+    came: set[signal.Signals] = set()
     has_ended = False
 
     def end_once() -> None:
@@ -103,19 +107,33 @@ def on_end_signals(end: Callable[[], object]) -> None:
             has_ended = True
             end()
 
-    def first(number: signal.Signals) -> None:
-        if sys.platform != "win32":
-            loop.remove_signal_handler(number)
-        signal.signal(number, signal.default_int_handler)
+    def come(number: signal.Signals) -> None:
         end_once()
+        if number in came:
+            if sys.platform != "win32":
+                loop.remove_signal_handler(number)
+            signal.signal(number, signal.default_int_handler)
+            if task is not None:
+                task.cancel()
+        came.add(number)
 
     for number in (signal.SIGINT, signal.SIGTERM):
         if sys.platform == "win32":  # whose loops handle none
-            signal.signal(number, lambda came, frame: loop.call_soon_threadsafe(first, signal.Signals(came)))
+            signal.signal(number, lambda given, frame: loop.call_soon_threadsafe(come, signal.Signals(given)))
         else:
-            loop.add_signal_handler(number, first, number)
+            loop.add_signal_handler(number, come, number)
     for number in _hangup():
         loop.add_signal_handler(number, end_once)
+
+
+def run_loop(work: Coroutine[Any, Any, T]) -> T:
+    """Do the same as `asyncio.run`; if a signal cancels the work, raise KeyboardInterrupt."""
+    import asyncio
+
+    try:
+        return asyncio.run(work)
+    except asyncio.CancelledError:
+        raise KeyboardInterrupt from None
 
 
 @contextmanager

@@ -1,0 +1,131 @@
+"""Whatever interrupts the start or the end of a gateway: it ends, and nothing is sent afterwards."""
+
+from __future__ import annotations
+
+import asyncio
+import gc
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
+from time import monotonic, sleep
+from typing import Any
+
+import pytest
+from gateways import simulated_plant
+from interruptions import every, interrupted_before
+from kills import BoundProcess
+from lines import PATIENCE, until
+
+from multidrop import Bus, InvtCHE, load_plant
+from multidrop.gateway.gateway import Gateway
+from multidrop.gateway.settings import ServeSettings
+from multidrop.sim import EncodedDrive, Simulator, Wire
+
+# A collection amid the work finalizes what an earlier interruption left, and may be interrupted itself.
+pytestmark = pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+
+
+class CtrlC(KeyboardInterrupt):
+    """Raised by the test."""
+
+
+class Counting(EncodedDrive):
+    """A drive that counts the requests that came."""
+
+    requests = 0
+
+    def receive(self, frame: Any) -> Any:
+        self.requests += 1
+        return super().receive(frame)
+
+
+@pytest.fixture
+def drive(tmp_path: Path) -> Iterator[Counting]:
+    """The drive of the line of plant.toml."""
+    drive = Counting(InvtCHE(1, baudrate=38400))
+    with Simulator([Wire([drive], unpaced=True)]) as simulator:
+        (tmp_path / "plant.toml").write_text(
+            f'[[line]]\nname = "hall"\nport = "{simulator.wires[0].path}"\nbaudrate = 38400\n'
+            '[[line.drive]]\nname = "pump"\nmodel = "invt-che"\naddress = 1\npoll = ["output_current"]\n'
+        )
+        yield drive
+
+
+def falls_silent(drive: Counting) -> None:
+    def has_ended() -> bool:
+        before = drive.requests
+        sleep(0.02)  # a poll takes a millisecond
+        return drive.requests == before
+
+    until(has_ended, 10.0)
+
+
+@pytest.mark.parametrize("step", [1009, pytest.param(53, marks=pytest.mark.slow)])
+def test_a_gateway_that_is_interrupted_anywhere_ends(drive: Counting, tmp_path: Path, step: int) -> None:
+    """KeyboardInterrupt before every so many bytecodes of the main thread, from its making to its end."""
+    plant = load_plant(tmp_path / "plant.toml")
+
+    def live() -> None:
+        gateway = Gateway(plant, ServeSettings(port=0))
+        asyncio.run(asyncio.wait_for(gateway.run(gateway.end), PATIENCE))
+
+    def act(nth: int) -> bool:
+        with suppress(CtrlC), interrupted_before(nth, CtrlC) as found:
+            live()
+        falls_silent(drive)
+        gc.collect()
+        with Bus(plant.lines[0].port, baudrate=38400) as bus:  # the port is free
+            bus.read(bus.attach(InvtCHE, 1), InvtCHE.registers["output_current"])
+        return bool(found)
+
+    assert every(step, act) > 1
+
+
+# ---- signals ----
+
+SIGNALLED = """
+import os, sys, threading, time
+from multidrop.cli import main
+
+def send():
+    for delay in {delays}:
+        time.sleep(delay)
+        os.kill(os.getpid(), {number})
+
+threading.Thread(target=send, daemon=True).start()
+sys.exit(main(["serve", {path!r}]))
+"""
+
+
+def started(path: Path, number: int, *delays: float) -> BoundProcess[str]:
+    """`multidrop serve`, which gets a signal after each of these delays (s), counted from the one before."""
+    code = SIGNALLED.format(delays=list(delays), number=int(number), path=str(path))
+    return BoundProcess(
+        [sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("again", [None, 0.0, 0.02, 0.2], ids=repr)
+def test_a_signal_at_any_moment_ends_the_command(tmp_path: Path, number: int, again: float | None) -> None:
+    """As it starts, serves and ends; a second one ends it at once. No motor is moved or stopped by that."""
+    serve = '[serve]\nlisten = "127.0.0.1:0"\naudit = "audit.jsonl"\n[serve.may]\nstop = "anyone"\n'
+    with simulated_plant(tmp_path, serve) as path:
+        with started(path, number) as process:
+            begun = monotonic()
+            assert process.stdout is not None
+            assert process.stdout.readline().startswith("ready ")
+            usual_s = monotonic() - begun
+            process.send_signal(number)
+            process.communicate(timeout=PATIENCE)
+        for moment in range(20):
+            delays = [usual_s * moment / 15] + ([] if again is None else [again])
+            with started(path, number, *delays) as process:
+                _, errors = process.communicate(timeout=PATIENCE)
+            assert process.returncode in (0, 130, -number), errors
+            assert "Traceback" not in errors
+        assert not (tmp_path / "audit.jsonl").exists() or (tmp_path / "audit.jsonl").read_text() == ""
