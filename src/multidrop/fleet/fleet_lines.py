@@ -51,10 +51,11 @@ class FleetLines:
         polled = {drive.name for bus in self.poller.buses.values() for drive in bus.drives}
         if not any(one.drive.name in polled for one in line.drives):  # else `add_line` refuses it
             self._units.note(line, time.monotonic_ns())  # before the first of its rows
+        before = self.poller.buses.get(line.name)
         try:
             self.poller.add_line(line)
         except BaseException:  # amid the work: another gateway may be its master before long
-            if line.name in self.poller.buses:
+            if self.poller.buses.get(line.name) is not before:
                 self.poller.remove_line(line.name)
             raise
 
