@@ -72,7 +72,7 @@ def test_all_lines_are_there_when_it_is_closed_and_a_reader_that_goes_harms_nobo
 
 
 def test_a_gateway_of_a_fleet_waits_for_nobody_who_reads_its_log(monkeypatch: pytest.MonkeyPatch) -> None:
-    async def work(_: argparse.Namespace) -> int:
+    async def work(*_: object) -> int:
         logging.getLogger("multidrop.fleet").warning("a stop of pump-1")
         return 7
 

@@ -416,10 +416,6 @@ def broken() -> dict[str, tuple[Plant, str]]:
             plant(yard(*fans(0.5)), hall(polled(Toy(1, name="pump-1"), (*ALL, Toy.control), 0.1), other)),
             'line "hall", drive "pump-1": control of pump-1 cannot be read: it is a command',
         ),
-        "no rate": (
-            plant(hall(toy("pump-1", 1, -1.0))),
-            'line "hall", drive "pump-1": every = -1.0 is not a number of seconds',
-        ),
     }
 
 
