@@ -13,7 +13,6 @@ from multidrop.drive.own import check_own, check_readable
 from multidrop.drive.register import Register
 from multidrop.plant.loader import PlantError
 from multidrop.plant.model import Plant, PlantLine, PolledDrive
-from multidrop.toml_check import check_period
 
 
 class DriveChanges(NamedTuple):
@@ -55,10 +54,8 @@ def check_plant(plant: Plant, *, is_free: Callable[[Drive], bool]) -> None:
                 found += _mistakes(at, partial(framed.take_framing_of, line.port))
             for poll in polled.polls:
                 found += _mistakes(at, partial(_check_polled, drive, poll.register))
-                if poll.every is not None:
-                    found += _mistakes(at, partial(check_period, poll.every))
     if found:
-        raise PlantError(tuple(dict.fromkeys(found)))  # many registers may have the same rate
+        raise PlantError(tuple(dict.fromkeys(found)))  # many registers may have the same one
 
 
 def _check_polled(drive: Drive, register: Register[Any]) -> None:
