@@ -195,7 +195,9 @@ def test_the_fleet_is_not_stopped_without_a_key_nor_without_its_servers(tmp_path
         answer = gateway.post("/api/fleet/stop", {})
         assert answer.status == 404
         assert "add commander to [serve.fleet]" in answer.json["error"]
-    part = FleetPart(ServerPath([]), FleetWatch(Looks(ServerPath([]))), lambda: None)  # type: ignore[arg-type, return-value]
+    path: Any = ServerPath([])
+    nobody: Any = object
+    part = FleetPart(path, FleetWatch(Looks(path)), nobody)
     told = asyncio.run(part.stop("anna"))
     assert told == {
         "the fleet": (

@@ -112,7 +112,7 @@ def started(path: Path, number: int, *delays: float) -> BoundProcess[str]:
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 @pytest.mark.parametrize("again", [None, 0.0, 0.02, 0.2], ids=repr)
 def test_a_signal_at_any_moment_ends_the_command(tmp_path: Path, number: int, again: float | None) -> None:
-    """As it starts, serves and ends; a second one ends it at once. No motor is moved or stopped by that."""
+    """Send it at the start, while serving and at the end; a second one ends it at once. No motor is moved."""
     serve = '[serve]\nlisten = "127.0.0.1:0"\naudit = "audit.jsonl"\n[serve.may]\nstop = "anyone"\n'
     with simulated_plant(tmp_path, serve) as path:
         with started(path, number) as process:

@@ -615,7 +615,7 @@ def test_lines_and_drives_are_found_by_name(tmp_path: Path) -> None:
 
 @table("every", [0, 0.0, -1.0, 0.00009, 86401.0, float("nan"), float("inf"), True, "1 s"])
 def test_a_period_that_no_plant_file_may_have_is_refused(every: Any) -> None:
-    """Of 0 s, it would end the polling of its line."""
+    """A period of 0 s would end the polling of its line."""
     register = YD1000.register("status")
     with pytest.raises(ValueError, match=rf"^every = {every!r} is not a number of seconds from 0\.0001 to "):
         Polled(register, every)
