@@ -51,7 +51,7 @@ def _send(number: int, ident: int) -> None:
 
 
 def _tell(sentence: str) -> None:
-    """Write it on standard error at once, unless nobody is there, or a halted terminal would hold it up."""
+    """Write a sentence to standard error at once; skip it if that is closed or would block."""
     with suppress(OSError, ValueError):
         if sys.platform == "win32" or select.select([], [2], [], 0)[1]:
             os.write(2, f"multidrop: {sentence}\n".encode(errors="backslashreplace"))
@@ -184,7 +184,7 @@ class ExitHook:
         self.rest()
 
     def rest(self) -> None:
-        """Give the signals back if nothing is to be done at the end any more; in the main thread alone."""
+        """Give the signals back once no last act is left; only the main thread may, others return."""
         if not self._acts and self._held is None and threading.current_thread() is threading.main_thread():
             self._let_go()
             if self._acts:  # another one came meanwhile
@@ -252,7 +252,7 @@ class ExitHook:
 def without_internals(interruption: BaseException) -> None:
     """Cut the traceback of an interruption before its first frame of this package.
 
-    What the stops ended is no cause of it.
+    A command that the stops ended is not shown as its cause.
     """
     if isinstance(interruption.__context__, BusError):
         interruption.__context__ = None
@@ -264,7 +264,7 @@ def without_internals(interruption: BaseException) -> None:
 
 
 def give_signals_back() -> None:
-    """In the main thread, give the signals back if no bus is to be stopped at the end any more."""
+    """In the main thread, give the signals back once no bus has to be stopped at exit."""
     if _hook is not None:
         _hook.rest()
 

@@ -251,7 +251,7 @@ class StopAttempt:
         return Stopped(self.drive.name, seen, seconds, why)
 
     def so_far(self) -> str:
-        """Return what is known of it while it goes on: the same text as long as nothing changes."""
+        """Return the progress of a stop under way; the text stays the same until something changes."""
         why = f": {self.failure}" if self.failure else ""
         if self._is_confirmed:
             return f"{self.drive.name}: the stop was confirmed, and the motor is not seen to stand yet{why}"

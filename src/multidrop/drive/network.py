@@ -28,7 +28,7 @@ def check_port(port: str) -> str:
 
 
 def speaks_tcp(port: str) -> bool:
-    """Return True for a port that carries Modbus TCP and nothing else."""
+    """Return True for a Modbus TCP port."""
     return port.partition("://")[0].lower() == "tcp"
 
 

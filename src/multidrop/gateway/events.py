@@ -82,7 +82,7 @@ class Events:
             self._known.add(("", drive))
 
     def _look_at_run(self, time: int, drive: str, state: str, stops: int | None) -> None:
-        """Note a motor that stopped though nobody stopped it, once it has stood for STANDS_MS."""
+        """Raise an alarm for a motor that stopped without a command and stayed at rest for STANDS_MS."""
         if state == RUNS:
             self._runs.setdefault(drive, stops or 0)
             self._stands.pop(drive, None)

@@ -50,7 +50,7 @@ class Identities:
             await asyncio.sleep(ROUND_S)
 
     def _knows(self, line: str, drive: Drive) -> bool:
-        """Return True where a drive need not be asked, or is no longer there."""
+        """Return True if a drive need not be asked, or has been removed."""
         try:
             return self._bus(line).knows_identity(drive)
         except ValueError:

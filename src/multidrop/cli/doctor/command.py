@@ -256,7 +256,7 @@ def _opened(port: str, rs485: RS485) -> Iterator[Finding]:
 
 
 def _echo(port: str, rs485: RS485, settings: Settings) -> Finding:
-    """Read from an address that nobody should have: only the request itself may come back."""
+    """Read from an unused address: only an echo of the request may come back."""
     request = Message(NOBODY, 0x03, 0, 1)
     peer = Peer(least_timeout=4 * LEAST_TIMEOUT, most_timeout=4 * LEAST_TIMEOUT)
     probe = Exchange(
