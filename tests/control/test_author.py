@@ -56,14 +56,15 @@ def test_every_kind_of_write_has_its_author(audited: Audited) -> None:
     with written_by("boris"):
         drive.set_frequency(30)
     drive.set_frequency(10)
-    *annas, boris, nobody = audited.noted()
+    noted = audited.noted()
+    annas = [entry for entry in noted if entry[1] == "anna"]  # a stop's last record may follow later writes
     assert {write.partition(" = ")[0] for write, _, _ in annas} >= {"setpoint", "control"}
     assert len(annas) >= 6
-    assert {(by, way) for _, by, way in annas} == {("anna", "web, 10.0.0.7")}
-    assert (boris, nobody) == (
+    assert {way for _, _, way in annas} == {"web, 10.0.0.7"}
+    assert [entry for entry in noted if entry[1] != "anna"] == [
         ("setpoint = 60.00 %", "boris", None),
         ("setpoint = 20.00 %", None, None),
-    )
+    ]
 
 
 def test_a_write_in_doubt_has_its_author(audited: Audited) -> None:
