@@ -18,7 +18,7 @@ import pyarrow
 from bench.players.replay import Played, Unpaced, Unreliable
 from multidrop.core import Port
 from multidrop.drive import Drive
-from multidrop.drives import MODELS
+from multidrop.families import MODELS
 from multidrop.planning.blocks import planned
 from multidrop.planning.prediction import predict
 from multidrop.plant.model import Plant, PlantLine, Polled, PolledDrive

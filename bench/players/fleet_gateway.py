@@ -18,9 +18,9 @@ sys.path.append(str(Path(__file__).parents[2] / "tests" / "support"))
 from spooled import numbered
 
 from multidrop.core import Names
-from multidrop.fleet.forwarder import Forwarder
-from multidrop.fleet.samples_stream import StreamError, connect
-from multidrop.fleet.spool import Spool
+from multidrop.fleet.samples.forwarder import Forwarder
+from multidrop.fleet.samples.samples_stream import StreamError, connect
+from multidrop.fleet.samples.spool import Spool
 
 EXCHANGES = 100  # of a batch
 RATE = 1000  # exchanges a second: 10,000 values

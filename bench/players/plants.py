@@ -19,7 +19,7 @@ from pathlib import Path
 from threading import Thread
 
 from multidrop.cli.support.demo_plant import DRIVES, OPTIONS
-from multidrop.drives import MODELS
+from multidrop.families import MODELS
 from multidrop.plant.loader import load_plant
 from multidrop.plant.model import Plant
 from multidrop.sim import EncodedDrive, Faults, FaultyWire, Simulator, Wire, proof, serve, simulated

@@ -19,7 +19,7 @@ from responder_drives import KINDS
 
 from multidrop.bus import Bus
 from multidrop.drive import Drive
-from multidrop.drives import MODELS
+from multidrop.families import MODELS
 from multidrop.plant.model import Plant, PlantLine, Polled, PolledDrive
 from multidrop.poller import Poller
 

@@ -31,7 +31,7 @@ from spooled import NOON, STEP
 
 from bench.players.fleet_gateway import GAP
 from bench.support import tables
-from multidrop.fleet.samples_stream import StreamError, connect, create_stream, last_of, subject_of
+from multidrop.fleet.samples.samples_stream import StreamError, connect, create_stream, last_of, subject_of
 
 ROOT = Path(__file__).parents[2]
 GATEWAYS = ("gateway-1", "gateway-2")
@@ -242,7 +242,7 @@ def in_parquet(folder: Path) -> Numbers:
 def in_postgres(database: Postgres) -> Numbers:
     query = f"""
         select d.name, (e.time_ns - {NOON}) / {STEP}, count(*), min(array_length(e.values, 1))
-        from multidrop.exchanges e join multidrop.drives d on d.id = e.drive group by 1, 2"""
+        from multidrop.exchanges e join multidrop.families d on d.id = e.drive group by 1, 2"""
     found: Numbers = {name: Counter() for name in GATEWAYS}
     for drive, number, rows, registers in database.ask(query):
         assert registers == 10

@@ -29,12 +29,12 @@ from postgres_clusters import Postgres, postgres
 
 from bench.support import tables
 from multidrop import BatchColumns, PlantLine
-from multidrop.fleet.hub import Commit, SampleSink
-from multidrop.fleet.message import Packed, RowBuffer, unpack
-from multidrop.fleet.parquet_sink import ParquetSink
-from multidrop.fleet.polled_units import PolledUnits
-from multidrop.fleet.postgres_sink import PostgresSink
-from multidrop.fleet.spool_folder import SpoolFolder
+from multidrop.fleet.samples.hub import Commit, SampleSink
+from multidrop.fleet.samples.message import Packed, RowBuffer, unpack
+from multidrop.fleet.samples.parquet_sink import ParquetSink
+from multidrop.fleet.samples.polled_units import PolledUnits
+from multidrop.fleet.samples.postgres_sink import PostgresSink
+from multidrop.fleet.samples.spool_folder import SpoolFolder
 
 UTC = 1_795_253_399_123_456_789
 DRIVES = 16  # a line

@@ -28,16 +28,16 @@ from simulated_pumps import FIRST_READING, POLLED, write_plant
 from bench.support import tables
 from multidrop import expose_metrics, load_plant
 from multidrop.core import Columns, Counters, Names, Status
-from multidrop.gateway.connections import Connections, Watched
-from multidrop.gateway.frames import WHOLE
 from multidrop.gateway.gateway import Gateway
+from multidrop.gateway.http.connections import Connections, Watched
+from multidrop.gateway.http.routes import make_app
+from multidrop.gateway.live.frames import WHOLE
+from multidrop.gateway.live.views import figures_of
 from multidrop.gateway.metrics import families_of
-from multidrop.gateway.modbus_clients import ModbusClient, ModbusPort
-from multidrop.gateway.modbus_server import ModbusServer
-from multidrop.gateway.modbus_settings import ModbusSettings
+from multidrop.gateway.modbus_server.clients import ModbusClient, ModbusPort
+from multidrop.gateway.modbus_server.server import ModbusServer
+from multidrop.gateway.modbus_server.settings import ModbusSettings
 from multidrop.gateway.settings import ServeSettings
-from multidrop.gateway.views import figures_of
-from multidrop.gateway.web import make_app
 from multidrop.polling.batch import Batch
 from multidrop.transport.statistics import line_statistics
 

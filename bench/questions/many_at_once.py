@@ -25,8 +25,8 @@ from bench.players import plants
 from bench.questions.soak import MOST_GROWTH_KB, resident_kb
 from bench.support import tables
 from multidrop.drive import Drive
-from multidrop.drives import YD1000, InnovertIBD
 from multidrop.errors import BusError
+from multidrop.families import YD1000, InnovertIBD
 from multidrop.plant.model import Plant, PlantLine, Polled, PolledDrive
 from multidrop.poller import Poller
 from multidrop.sim import EncodedDrive, Wire, simulated

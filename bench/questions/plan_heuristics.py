@@ -17,7 +17,7 @@ from bench.support import tables
 from multidrop.drive import Drive
 from multidrop.drive.register import Register
 from multidrop.drive.table import Table
-from multidrop.drives import MODELS
+from multidrop.families import MODELS
 from multidrop.planning.blocks import Block, Planned, blocks, sending
 from multidrop.planning.bus_time import gap
 from multidrop.planning.bus_time import in_order as cycle_order

@@ -24,7 +24,7 @@ from bench.support import tables
 from bench.support.programs import paced_line
 from multidrop.core import Framing, Status
 from multidrop.drive import Drive
-from multidrop.drives import YD1000, DelixiModbus, DelixiNative, ErmanERG220, InnovertIBD, InvtCHE
+from multidrop.families import YD1000, DelixiModbus, DelixiNative, ErmanERG220, InnovertIBD, InvtCHE
 from multidrop.planning.blocks import Planned, planned
 from multidrop.planning.prediction import predict
 from multidrop.plant.model import Plant, PlantLine, Polled, PolledDrive

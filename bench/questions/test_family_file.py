@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from multidrop.family_file import loader
+from multidrop.families.files import loader
 
 REGISTERS = 40
 HEAD = '[family]\ntitle = "Meter"\nmanual = "M"\ncounts_from = 0\n'

@@ -12,8 +12,8 @@ from docutils.parsers.rst import Directive
 
 from multidrop.cli import COMMANDS, main
 from multidrop.cli.fleet import ACTIONS as FLEET
-from multidrop.drives import MODELS
-from multidrop.drives.registry import SHIPPED
+from multidrop.families import MODELS
+from multidrop.families.registry import SHIPPED
 
 WIDTH = "92"
 

@@ -26,7 +26,7 @@ from multidrop.capture.anomalies import AnomalyWatch
 from multidrop.capture.pcapng_writer import WRAPPINGS
 from multidrop.cli.poll.command import tap_text
 from multidrop.core import Exchange, Framing, Message, NumberFormat, Peer, Splitter, Status, Tap
-from multidrop.drives import InnovertIBD
+from multidrop.families import InnovertIBD
 from multidrop.plant.model import PolledDrive
 from multidrop.poller import Poller
 from multidrop.polling.batch import Row

@@ -11,7 +11,7 @@ from peers import require_program
 
 from multidrop.capture import Capture, CaptureWriter, Decoding, Pairing, SniffedExchange, Tapped
 from multidrop.core import FrameSpan, Framing, Kind, Message
-from multidrop.drives import InnovertIBD
+from multidrop.families import InnovertIBD
 from multidrop.plant.loader import load_plant
 from multidrop.poller import Poller
 from multidrop.polling.batch import Row

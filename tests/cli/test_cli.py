@@ -19,8 +19,8 @@ from tables import table
 from multidrop.cli import COMMANDS, main
 from multidrop.cli.fleet import ACTIONS as FLEET
 from multidrop.drive import Advice, Refused, carry_out
-from multidrop.drives import MODELS, ErmanERG220, InnovertIBD, InvtCHE
-from multidrop.drives.registry import SHIPPED, find_model
+from multidrop.families import MODELS, ErmanERG220, InnovertIBD, InvtCHE
+from multidrop.families.registry import SHIPPED, find_model
 
 
 def test_help_lists_every_command(run: Run) -> None:
@@ -207,7 +207,7 @@ def test_a_ledger_that_is_named_must_be_there(
 
 def test_a_sheet_says_where_a_register_is_written_without_wear(run: Run, tmp_path: Path) -> None:
     (tmp_path / "mine.py").write_text(
-        "from multidrop.drives.invt_che import InvtCHE, parameter\n\n\n"
+        "from multidrop.families.invt_che import InvtCHE, parameter\n\n\n"
         'class Mine(InvtCHE):\n    """With a parameter."""\n\n'
         '    ramp = parameter(11, "s", step=0.1, span=(0, 3600))\n'
     )

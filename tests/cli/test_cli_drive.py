@@ -31,9 +31,9 @@ from multidrop.bus import Bus
 from multidrop.cli.support.confirm import confirm
 from multidrop.control import eeprom_ledger as ledger
 from multidrop.core import Message
-from multidrop.drives.innovert_ibd import InnovertIBD
-from multidrop.drives.invt_che import InvtCHE
 from multidrop.errors import Refused
+from multidrop.families.innovert_ibd import InnovertIBD
+from multidrop.families.invt_che import InvtCHE
 from multidrop.recording import open_reader
 from multidrop.sim import MotorDrive, simulated
 from multidrop.sim.drive import Reason, Refusal, SimulatedDrive

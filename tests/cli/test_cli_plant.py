@@ -16,8 +16,8 @@ from multidrop.bus import Bus
 from multidrop.cli import stop_plant
 from multidrop.cli.monitor import command as monitor
 from multidrop.drive import Drive
-from multidrop.drives import InvtCHE
-from multidrop.drives.registry import find_model
+from multidrop.families import InvtCHE
+from multidrop.families.registry import find_model
 from multidrop.plant.model import Plant
 from multidrop.sim import simulated
 from multidrop.sim.drive import SimulatedDrive

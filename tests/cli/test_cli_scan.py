@@ -18,10 +18,10 @@ import multidrop.scan.probe
 from multidrop.cli.scan import sentence
 from multidrop.core import RS485, Framing
 from multidrop.drive.timing import Settings
-from multidrop.drives.delixi_modbus import DelixiModbus
-from multidrop.drives.innovert_ibd import InnovertIBD
-from multidrop.drives.invt_che import InvtCHE
-from multidrop.drives.registry import find_model
+from multidrop.families.delixi_modbus import DelixiModbus
+from multidrop.families.innovert_ibd import InnovertIBD
+from multidrop.families.invt_che import InvtCHE
+from multidrop.families.registry import find_model
 from multidrop.plant.loader import load_plant
 from multidrop.scan import Crowd, Finding, Found, Noise, Untried, plant_text
 from multidrop.scan.results import Progress

@@ -29,9 +29,9 @@ from multidrop.cli.sniff.listener import Listener
 from multidrop.cli.support.traffic import TrafficPrinter
 from multidrop.core import Framing, Message, Splitter, Stream, build_reply, build_request
 from multidrop.drive.timing import Settings
-from multidrop.drives.delixi_native import DelixiNative
-from multidrop.drives.innovert_ibd import InnovertIBD
-from multidrop.drives.invt_che import InvtCHE
+from multidrop.families.delixi_native import DelixiNative
+from multidrop.families.innovert_ibd import InnovertIBD
+from multidrop.families.invt_che import InvtCHE
 from multidrop.sim import EncodedDrive, Simulator, Wire
 
 DRIVES = (InnovertIBD(1), InvtCHE(2), InnovertIBD(3, framing="ascii"), DelixiNative(4))

@@ -42,9 +42,9 @@ from multidrop.cli.doctor.findings import (
 )
 from multidrop.core import RS485, Completion, Failure, Framing, Message, build_reply
 from multidrop.drive.timing import Settings
-from multidrop.drives.innovert_ibd import InnovertIBD
-from multidrop.drives.invt_che import InvtCHE
-from multidrop.drives.registry import find_model
+from multidrop.families.innovert_ibd import InnovertIBD
+from multidrop.families.invt_che import InvtCHE
+from multidrop.families.registry import find_model
 from multidrop.sim import Simulator, Wire, simulated
 
 USUAL = Settings(9600, "8N1")

@@ -90,7 +90,7 @@ def test_logs_of_a_fleet_have_time_and_level_also_as_json(
     monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str], tmp_path: Path, command: Any
 ) -> None:
     require_module("nats")
-    from multidrop.fleet.hub import HubState
+    from multidrop.fleet.samples.hub import HubState
 
     async def work(*_: object) -> Any:
         logging.getLogger("multidrop.fleet").warning("line %s is lost\x1b", "hall-1")

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 from multidrop.drive import Drive
-from multidrop.drives import MODELS
-from multidrop.drives.registry import find_model
+from multidrop.families import MODELS
+from multidrop.families.registry import find_model
 
 FAN = """\
 from multidrop.drive.family import Drive

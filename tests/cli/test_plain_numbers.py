@@ -9,10 +9,10 @@ import pytest
 
 from multidrop import plain_number, plain_whole
 from multidrop.cli import main
-from multidrop.drives import InvtCHE
-from multidrop.family_file import cells
-from multidrop.gateway.guard import Denied
-from multidrop.gateway.request_fields import number_in
+from multidrop.families import InvtCHE
+from multidrop.families.files import cells
+from multidrop.gateway.http.guard import Denied
+from multidrop.gateway.http.request_fields import number_in
 from multidrop.importers.numbers import count, number
 from multidrop.recording.csv import _parse
 

@@ -20,7 +20,7 @@ from taps import tapped
 
 from multidrop.core import FrameSpan, Framing, Kind, Message, Splitter, Stream, build_request, parse_reply
 from multidrop.drive import Drive
-from multidrop.drives import DelixiNative, InnovertIBD, InvtCHE
+from multidrop.families import DelixiNative, InnovertIBD, InvtCHE
 from multidrop.sim import EncodedDrive, Simulator, Wire
 
 EXCHANGES = int(os.environ.get("SNIFFED_EXCHANGES", "300"))

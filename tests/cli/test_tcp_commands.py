@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from commands import Run, running
 
-from multidrop.drives import ErmanERG220, InnovertIBD, InvtCHE
+from multidrop.families import ErmanERG220, InnovertIBD, InvtCHE
 from multidrop.plant.loader import load_plant
 from multidrop.sim import Simulator, Wire, simulated
 

@@ -16,9 +16,9 @@ from multidrop.control.audit_log import read_audit
 from multidrop.control.author import written_by
 from multidrop.control.ramp import start_staggered
 from multidrop.drive import Condition
-from multidrop.drives import InvtCHE
-from multidrop.drives.invt_che import CHEControl
 from multidrop.errors import BusError, Unconfirmed
+from multidrop.families import InvtCHE
+from multidrop.families.invt_che import CHEControl
 
 Noted = list[tuple[str, str | None, str | None]]
 

@@ -20,8 +20,8 @@ from multidrop.drive import Condition, Drive, Script, State
 from multidrop.drive.declare import command, setting
 from multidrop.drive.table import Kept
 from multidrop.drive.verbs import verb
-from multidrop.drives import MODELS, InvtCHE
 from multidrop.errors import BusError, Expired, Overtaken, PortLost, Refused, Unconfirmed
+from multidrop.families import MODELS, InvtCHE
 from multidrop.sim import simulated
 
 BROADCASTING = [model for model, family in MODELS.items() if family.broadcasts]

@@ -20,9 +20,6 @@ from multidrop.drive import Drive, Script
 from multidrop.drive.declare import command, reading, setting
 from multidrop.drive.table import HOLDING, Kept
 from multidrop.drive.verbs import verb
-from multidrop.drives import YD1000, DelixiModbus, DelixiNative, ErmanERG220, InnovertIBD, InvtCHE
-from multidrop.drives.innovert_ibd import IBDControl
-from multidrop.drives.invt_che import parameter
 from multidrop.errors import (
     BadReply,
     BusError,
@@ -33,6 +30,9 @@ from multidrop.errors import (
     Refused,
     Unconfirmed,
 )
+from multidrop.families import YD1000, DelixiModbus, DelixiNative, ErmanERG220, InnovertIBD, InvtCHE
+from multidrop.families.innovert_ibd import IBDControl
+from multidrop.families.invt_che import parameter
 from multidrop.poller import Poller
 from multidrop.sim import EncodedDrive, SimulatedDrive, Simulator, Wire, simulated
 from multidrop.transport import peers

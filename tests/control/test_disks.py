@@ -23,8 +23,8 @@ from multidrop.control.author import noted_first, written_by
 from multidrop.control.eeprom_ledger import Ledger, LedgerCell
 from multidrop.control.outcome import Effect
 from multidrop.core import Message
-from multidrop.drives import DelixiModbus, ErmanERG220, InvtCHE
 from multidrop.errors import Refused, Unconfirmed
+from multidrop.families import DelixiModbus, ErmanERG220, InvtCHE
 from multidrop.sim import simulated
 from multidrop.transport.aside_log import flush
 

@@ -18,7 +18,7 @@ from lines import PATIENCE, until
 from motors import ReceivedRequests
 
 from multidrop.control.exit_hook import CUT_SHORT, ExitHook, LastAct
-from multidrop.drives import InvtCHE
+from multidrop.families import InvtCHE
 from multidrop.sim import MotorDrive, Simulator, Wire, simulated
 
 BOTH = pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

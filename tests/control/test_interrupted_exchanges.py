@@ -14,7 +14,7 @@ from lines import PATIENCE
 from motors import ReceivedRequests
 
 from multidrop import Bus
-from multidrop.drives import InvtCHE
+from multidrop.families import InvtCHE
 from multidrop.sim import MotorDrive, Simulator, Wire, simulated
 from multidrop.transport import clock
 from multidrop.transport import line as of_a_port

@@ -9,8 +9,8 @@ from weakref import ref
 import pytest
 from simulated_bus import one
 
-from multidrop.drives import InvtCHE
 from multidrop.errors import Overtaken
+from multidrop.families import InvtCHE
 
 
 def test_a_thread_that_was_interrupted_in_a_stop_never_waits_for_it(monkeypatch: pytest.MonkeyPatch) -> None:

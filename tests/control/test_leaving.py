@@ -11,8 +11,8 @@ from lines import until
 from simulated_bus import SimulatedBus
 
 from multidrop.core import Message
-from multidrop.drives import InvtCHE
 from multidrop.errors import Overtaken, PortLost
+from multidrop.families import InvtCHE
 from multidrop.sim import simulated
 from multidrop.transport.aside_log import flush
 

@@ -22,9 +22,9 @@ from multidrop.drive import Direction, Drive, Script, read, write
 from multidrop.drive.declare import reading, setting
 from multidrop.drive.table import Kept
 from multidrop.drive.verbs import verb
-from multidrop.drives import YD1000, DelixiModbus, ErmanERG220, InvtCHE
-from multidrop.drives.invt_che import CHEControl
 from multidrop.errors import BusError, Expired, NotDone, Overtaken, Refused, Unconfirmed
+from multidrop.families import YD1000, DelixiModbus, ErmanERG220, InvtCHE
+from multidrop.families.invt_che import CHEControl
 from multidrop.sim import MotorDrive, simulated
 
 

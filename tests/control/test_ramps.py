@@ -19,8 +19,8 @@ from multidrop.drive import Drive, Script, read
 from multidrop.drive.declare import setting
 from multidrop.drive.table import Kept
 from multidrop.drive.verbs import verb
-from multidrop.drives import YD1000, InnovertIBD, InvtCHE
 from multidrop.errors import NoReply, Refused
+from multidrop.families import YD1000, InnovertIBD, InvtCHE
 from multidrop.sim import simulated
 
 # ---- ramps ----

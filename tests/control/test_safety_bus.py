@@ -27,8 +27,6 @@ from multidrop.drive import Condition, Direction, Drive, Script, State, read, wa
 from multidrop.drive.declare import command, reading, setting
 from multidrop.drive.table import COIL, Kept
 from multidrop.drive.verbs import verb
-from multidrop.drives import MODELS, YD1000, DelixiModbus, ErmanERG220, InnovertIBD, InvtCHE
-from multidrop.drives.invt_che import CHEControl, parameter
 from multidrop.errors import (
     DriveRefused,
     Expired,
@@ -40,6 +38,8 @@ from multidrop.errors import (
     Unconfirmed,
     Unsupported,
 )
+from multidrop.families import MODELS, YD1000, DelixiModbus, ErmanERG220, InnovertIBD, InvtCHE
+from multidrop.families.invt_che import CHEControl, parameter
 from multidrop.sim import MotorDrive, simulated
 from multidrop.transport.exchange import READ_ATTEMPTS
 

@@ -11,8 +11,8 @@ from multidrop.control.audit_log import read_audit
 from multidrop.control.outcome import Effect
 from multidrop.core import Message, build_request
 from multidrop.drive import Drive
-from multidrop.drives import YD1000, DelixiModbus, DelixiNative, ErmanERG220, InnovertIBD, InvtCHE
 from multidrop.errors import Unconfirmed
+from multidrop.families import YD1000, DelixiModbus, DelixiNative, ErmanERG220, InnovertIBD, InvtCHE
 
 DRIVES = (
     ErmanERG220(1),

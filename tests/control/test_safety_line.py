@@ -16,8 +16,8 @@ from motors import MAKE, ReceivedRequests
 
 from multidrop.bus import Bus
 from multidrop.drive import Condition, Drive, read
-from multidrop.drives import YD1000, DelixiModbus, ErmanERG220, InnovertIBD, InvtCHE
 from multidrop.errors import NoReply, NotDone, Refused, Unconfirmed
+from multidrop.families import YD1000, DelixiModbus, ErmanERG220, InnovertIBD, InvtCHE
 from multidrop.sim import MotorDrive, Simulator, Wire, simulated
 from multidrop.transport import peers
 

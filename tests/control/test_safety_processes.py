@@ -20,8 +20,8 @@ from kills import BoundProcess
 from multidrop.bus import Bus
 from multidrop.control.audit_log import AuditLog, read_audit
 from multidrop.control.eeprom_ledger import BUDGET, YEAR, Ledger, LedgerCell
-from multidrop.drives import InvtCHE
 from multidrop.errors import NoReply, Unconfirmed
+from multidrop.families import InvtCHE
 from multidrop.sim import MotorDrive, Simulator, Wire, simulated
 
 CLIENT = """

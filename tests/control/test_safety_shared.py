@@ -24,8 +24,8 @@ from shared_pair import SharedPair, shared
 from multidrop.bus import Bus
 from multidrop.core import Framing, Message, parse_request
 from multidrop.drive import Condition
-from multidrop.drives import InvtCHE
 from multidrop.errors import BusError, DriveRefused, NotDone, Refused, Unconfirmed
+from multidrop.families import InvtCHE
 from multidrop.sim import MotorDrive, Simulator, Wire, simulated
 from multidrop.transport import peers
 

@@ -27,8 +27,8 @@ from multidrop.control.ramp import start_staggered
 from multidrop.control.stop_attempt import LEAST_S, StopAttempt
 from multidrop.core import Completion, Exchange
 from multidrop.drive import Script, verb
-from multidrop.drives import InvtCHE
 from multidrop.errors import Overtaken, Refused, Unconfirmed
+from multidrop.families import InvtCHE
 from multidrop.sim import simulated
 from multidrop.transport import clock
 from multidrop.transport.aside_log import flush

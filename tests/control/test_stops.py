@@ -27,8 +27,6 @@ from multidrop.drive import Condition, Direction, Drive, Script, State, insist, 
 from multidrop.drive.declare import reading, setting
 from multidrop.drive.table import Kept
 from multidrop.drive.verbs import verb
-from multidrop.drives import YD1000, DelixiModbus, ErmanERG220, InnovertIBD, InvtCHE
-from multidrop.drives.invt_che import CHEControl
 from multidrop.errors import (
     BusError,
     Expired,
@@ -40,6 +38,8 @@ from multidrop.errors import (
     Refused,
     Unconfirmed,
 )
+from multidrop.families import YD1000, DelixiModbus, ErmanERG220, InnovertIBD, InvtCHE
+from multidrop.families.invt_che import CHEControl
 from multidrop.sim import simulated
 from multidrop.transport.aside_log import flush
 

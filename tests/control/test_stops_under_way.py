@@ -7,8 +7,8 @@ from simulated_bus import SimulatedBus, is_write, one
 
 from multidrop.control.outcome import Seen
 from multidrop.core import Message, build_reply
-from multidrop.drives import YD1000, InnovertIBD
 from multidrop.errors import DriveRefused
+from multidrop.families import YD1000, InnovertIBD
 from multidrop.sim import simulated
 
 

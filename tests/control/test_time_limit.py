@@ -15,8 +15,8 @@ from multidrop.drive import Direction, Drive, Script, read, wait, write
 from multidrop.drive.declare import reading, setting
 from multidrop.drive.table import Kept
 from multidrop.drive.verbs import verb
-from multidrop.drives import InvtCHE
 from multidrop.errors import Expired, Overtaken
+from multidrop.families import InvtCHE
 from multidrop.sim import simulated
 
 

@@ -24,8 +24,8 @@ from toy import Toy
 from multidrop.bus import Bus
 from multidrop.core import Field, NumberFormat, RowLayout, RowQueue, Status
 from multidrop.core.fork import only_here
-from multidrop.drives import InvtCHE
 from multidrop.errors import LineError, NoReply, Overtaken
+from multidrop.families import InvtCHE
 from multidrop.poller import Poller
 from multidrop.sim import MotorDrive, Simulator, Wire, simulated
 

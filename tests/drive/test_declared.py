@@ -16,7 +16,7 @@ from multidrop.drive.declaration_check import DeclarationError
 from multidrop.drive.declare import command, reading, setting
 from multidrop.drive.register import Register
 from multidrop.drive.table import COIL, HOLDING, INPUT, Table
-from multidrop.drives import DelixiNative
+from multidrop.families import DelixiNative
 
 
 class Run(IntEnum):

@@ -15,7 +15,7 @@ from multidrop.drive.declare import command, reading, setting
 from multidrop.drive.options import Option
 from multidrop.drive.table import HOLDING
 from multidrop.drive.verbs import VERBS, verb
-from multidrop.drives import InnovertIBD
+from multidrop.families import InnovertIBD
 
 WRONG: list[tuple[str, Any, str]] = [
     ("silence", "x", "silence = 'x' is no number of s from 0 to 1"),

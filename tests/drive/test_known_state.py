@@ -12,7 +12,7 @@ from multidrop.drive.declare import reading
 from multidrop.drive.script import Script, read
 from multidrop.drive.state import State
 from multidrop.drive.verbs import verb
-from multidrop.drives import MODELS
+from multidrop.families import MODELS
 
 RUNS, STANDS = State(Condition.RUNNING), State(Condition.STOPPED)
 

@@ -31,8 +31,8 @@ def nats(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cluster]:
 @pytest.fixture(scope="module")
 def fleet(nats: Cluster) -> Cluster:
     """Return them after `fleet init`."""
-    from multidrop.fleet.servers import paths_of
-    from multidrop.fleet.setup import set_up
+    from multidrop.fleet.servers.connections import paths_of
+    from multidrop.fleet.servers.setup import set_up
 
     async def main() -> None:
         paths = paths_of(nats.urls)

@@ -28,19 +28,22 @@ require_module("pyarrow")
 import multidrop.fleet  # noqa: E402
 from multidrop import Mastership, Poller, PollingFailed  # noqa: E402
 from multidrop.cli.support.fleet_tables import count_sentence, failing_lines  # noqa: E402
-from multidrop.fleet import compaction, fleet_lines, metrics_port, names  # noqa: E402
-from multidrop.fleet import forwarder as forwarder_module  # noqa: E402
 from multidrop.fleet import gateway as fleet_gateway  # noqa: E402
-from multidrop.fleet import spool as spool_module  # noqa: E402
-from multidrop.fleet.command_log import CommandLog  # noqa: E402
-from multidrop.fleet.command_subjects import CommandedLines, CommandSubjects  # noqa: E402
-from multidrop.fleet.command_words import CommandOutcome  # noqa: E402
-from multidrop.fleet.fleet_commands import FleetCommands  # noqa: E402
-from multidrop.fleet.fleet_lines import FleetLines  # noqa: E402
-from multidrop.fleet.forwarder import Forwarder  # noqa: E402
+from multidrop.fleet import metrics_port  # noqa: E402
+from multidrop.fleet.commands.fleet_commands import FleetCommands  # noqa: E402
+from multidrop.fleet.commands.log import CommandLog  # noqa: E402
+from multidrop.fleet.commands.subjects import CommandedLines, CommandSubjects  # noqa: E402
+from multidrop.fleet.commands.words import CommandOutcome  # noqa: E402
 from multidrop.fleet.gateway import FleetGateway  # noqa: E402
-from multidrop.fleet.polled_units import PolledUnits  # noqa: E402
-from multidrop.fleet.spool import Spool  # noqa: E402
+from multidrop.fleet.lines import fleet_lines  # noqa: E402
+from multidrop.fleet.lines.fleet_lines import FleetLines  # noqa: E402
+from multidrop.fleet.samples import compaction  # noqa: E402
+from multidrop.fleet.samples import forwarder as forwarder_module  # noqa: E402
+from multidrop.fleet.samples import spool as spool_module  # noqa: E402
+from multidrop.fleet.samples.forwarder import Forwarder  # noqa: E402
+from multidrop.fleet.samples.polled_units import PolledUnits  # noqa: E402
+from multidrop.fleet.samples.spool import Spool  # noqa: E402
+from multidrop.fleet.servers import names  # noqa: E402
 from multidrop.sim import Simulator, Wire, simulated  # noqa: E402
 from multidrop.supervisor import Ended, supervisor  # noqa: E402
 

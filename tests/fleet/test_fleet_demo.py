@@ -44,7 +44,7 @@ from multidrop.cli.fleet.demo.numbered_lines import (  # noqa: E402
     plant_file,
 )
 from multidrop.core import STATUSES, UNASKED  # noqa: E402
-from multidrop.drives import InnovertIBD  # noqa: E402
+from multidrop.families import InnovertIBD  # noqa: E402
 from multidrop.plant.loader import load_plant  # noqa: E402
 from multidrop.poller import Poller  # noqa: E402
 from multidrop.polling.batch import Row  # noqa: E402

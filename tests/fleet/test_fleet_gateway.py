@@ -22,9 +22,9 @@ require_module("nats")
 require_module("pyarrow")
 
 from multidrop.fleet import gateway as fleet_gateway  # noqa: E402
-from multidrop.fleet import names  # noqa: E402
-from multidrop.fleet.forwarder import ForwarderState  # noqa: E402
 from multidrop.fleet.gateway import FleetGateway  # noqa: E402
+from multidrop.fleet.samples.forwarder import ForwarderState  # noqa: E402
+from multidrop.fleet.servers import names  # noqa: E402
 
 PATIENCE_S = 60.0
 

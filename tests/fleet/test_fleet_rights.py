@@ -23,10 +23,10 @@ require_module("nkeys")
 from nats.aio.client import Client  # noqa: E402
 from secured_clusters import SecuredCluster, secured_cluster  # noqa: E402
 
-from multidrop.fleet.credentials import connect_options, inbox_of, public_key  # noqa: E402
 from multidrop.fleet.errors import MayNotSend, NoRight  # noqa: E402
-from multidrop.fleet.refusals import Denials  # noqa: E402
-from multidrop.fleet.rights import OTHERS, rights_of  # noqa: E402
+from multidrop.fleet.lines.refusals import Denials  # noqa: E402
+from multidrop.fleet.servers.credentials import connect_options, inbox_of, public_key  # noqa: E402
+from multidrop.fleet.servers.rights import OTHERS, rights_of  # noqa: E402
 
 GATEWAYS = ("gw-a", "gw-b")
 USERS = (*GATEWAYS, *OTHERS)
@@ -209,7 +209,7 @@ def test_secrets_are_in_no_file_for_all_and_for_no_other_eyes(as_written: Secure
 
 
 def test_a_gateway_that_comes_changes_no_key(tmp_path: Path) -> None:
-    from multidrop.fleet.server_files import write_files
+    from multidrop.fleet.servers.files import write_files
 
     urls = ["nats://a:4222", "nats://b:4222"]
 

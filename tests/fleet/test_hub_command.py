@@ -18,11 +18,11 @@ from terminals import closing_terminal
 
 from multidrop import History
 from multidrop.cli import main
-from multidrop.fleet import compaction, samples_stream
-from multidrop.fleet.forwarder import Forwarder
-from multidrop.fleet.hub import SampleHub
-from multidrop.fleet.samples_stream import connect, create_stream
-from multidrop.fleet.spool import Spool
+from multidrop.fleet.samples import compaction, samples_stream
+from multidrop.fleet.samples.forwarder import Forwarder
+from multidrop.fleet.samples.hub import SampleHub
+from multidrop.fleet.samples.samples_stream import connect, create_stream
+from multidrop.fleet.samples.spool import Spool
 
 PATIENCE_S = 60.0
 

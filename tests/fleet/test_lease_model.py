@@ -8,8 +8,8 @@ from typing import NamedTuple
 
 import pytest
 
-from multidrop.fleet import lease_rules
-from multidrop.fleet.lease_rules import SeenRevision, Terms
+from multidrop.fleet.leases import rules as lease_rules
+from multidrop.fleet.leases.rules import SeenRevision, Terms
 
 SMALL = Terms(lease=1, guard=2)
 WHOLE = Terms(lease=2, guard=2)

@@ -13,8 +13,7 @@ from tables import table
 
 require_module("nats")
 
-from multidrop.fleet.buckets import NONE_YET, Record  # noqa: E402
-from multidrop.fleet.ownership import (  # noqa: E402
+from multidrop.fleet.lines.ownership import (  # noqa: E402
     NEEDED,
     NOBODY,
     LineRecords,
@@ -22,6 +21,7 @@ from multidrop.fleet.ownership import (  # noqa: E402
     claim_of,
     owner_value,
 )
+from multidrop.fleet.servers.buckets import NONE_YET, Record  # noqa: E402
 
 BUCKETS = 3
 

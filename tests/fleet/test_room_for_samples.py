@@ -17,7 +17,7 @@ require_module("nats")
 
 from nats.aio.client import Client  # noqa: E402
 
-from multidrop.fleet.samples_stream import about, connect, create_stream, publish  # noqa: E402
+from multidrop.fleet.samples.samples_stream import about, connect, create_stream, publish  # noqa: E402
 
 MESSAGE = 500_000  # bytes
 PLANT = """

@@ -13,10 +13,10 @@ from peers import require_module
 
 require_module("nats")
 
-from multidrop.fleet.lease import Held, boottime_ns  # noqa: E402
-from multidrop.fleet.lease_rules import SECOND  # noqa: E402
-from multidrop.fleet.member import Member  # noqa: E402
-from multidrop.fleet.servers import paths_of  # noqa: E402
+from multidrop.fleet.leases.lease import Held, boottime_ns  # noqa: E402
+from multidrop.fleet.leases.member import Member  # noqa: E402
+from multidrop.fleet.leases.rules import SECOND  # noqa: E402
+from multidrop.fleet.servers.connections import paths_of  # noqa: E402
 
 
 def a_member() -> Member:

@@ -12,12 +12,16 @@ from peers import require_module
 
 require_module("nats")
 
-from multidrop.fleet import names, samples_stream, setup  # noqa: E402
-from multidrop.fleet.buckets import Bucket, Record, ask  # noqa: E402
 from multidrop.fleet.errors import FleetError, Unsure  # noqa: E402
-from multidrop.fleet.leaders import cluster_at, has_leader, led_clusters  # noqa: E402
-from multidrop.fleet.samples_stream import StreamError  # noqa: E402
-from multidrop.fleet.setup import check_buckets  # noqa: E402
+from multidrop.fleet.samples import samples_stream  # noqa: E402
+from multidrop.fleet.samples.samples_stream import StreamError  # noqa: E402
+from multidrop.fleet.servers import (  # noqa: E402
+    names,
+    setup,
+)
+from multidrop.fleet.servers.buckets import Bucket, Record, ask  # noqa: E402
+from multidrop.fleet.servers.leaders import cluster_at, has_leader, led_clusters  # noqa: E402
+from multidrop.fleet.servers.setup import check_buckets  # noqa: E402
 
 STRANGE = {
     "nothing": b"",

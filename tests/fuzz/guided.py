@@ -18,13 +18,13 @@ import atheris
 from readers import read
 
 import multidrop.capture
-import multidrop.drives.registry
-import multidrop.family_file
-import multidrop.fleet.message
-import multidrop.fleet.unpacked_size
-import multidrop.gateway.mbap
-import multidrop.gateway.modbus_server
-import multidrop.gateway.pdu
+import multidrop.families.files
+import multidrop.families.registry
+import multidrop.fleet.samples.message
+import multidrop.fleet.samples.unpacked_size
+import multidrop.gateway.modbus_server.mbap
+import multidrop.gateway.modbus_server.pdu
+import multidrop.gateway.modbus_server.server
 import multidrop.importers
 import multidrop.plant.model
 import multidrop.recording
@@ -33,9 +33,9 @@ import multidrop.toml_check
 from multidrop.capture import decoding
 
 PACKAGES: dict[str, tuple[types.ModuleType, ...]] = {  # of each reader's own; to instrument all takes seconds
-    "plant": (multidrop.family_file,),
-    "family": (multidrop.family_file,),
-    "import": (multidrop.family_file, multidrop.importers),
+    "plant": (multidrop.families.files,),
+    "family": (multidrop.families.files,),
+    "import": (multidrop.families.files, multidrop.importers),
     "arrows": (multidrop.recording,),
     "csv": (multidrop.recording,),
     "parquet": (multidrop.recording,),
@@ -44,13 +44,13 @@ PACKAGES: dict[str, tuple[types.ModuleType, ...]] = {  # of each reader's own; t
 MODULES = (  # and of several
     multidrop.plant.model,
     multidrop.toml_check,
-    multidrop.drives.registry,
+    multidrop.families.registry,
     multidrop.sim.faults,
-    multidrop.fleet.message,
-    multidrop.fleet.unpacked_size,
-    multidrop.gateway.mbap,
-    multidrop.gateway.modbus_server,
-    multidrop.gateway.pdu,
+    multidrop.fleet.samples.message,
+    multidrop.fleet.samples.unpacked_size,
+    multidrop.gateway.modbus_server.mbap,
+    multidrop.gateway.modbus_server.server,
+    multidrop.gateway.modbus_server.pdu,
     tomllib._parser,
 )
 

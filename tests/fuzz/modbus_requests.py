@@ -15,10 +15,10 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "support"))
 from controlled_loop import ControlledLoop
 from modbus_gateway import FakeCommands, FakeHub, FakeLine, plant_of
 
-from multidrop.drives import ErmanERG220, InvtCHE
-from multidrop.gateway.mbap import Garbage, MbapRequest, take_request
-from multidrop.gateway.modbus_server import ModbusServer
-from multidrop.gateway.modbus_settings import ModbusSettings
+from multidrop.families import ErmanERG220, InvtCHE
+from multidrop.gateway.modbus_server.mbap import Garbage, MbapRequest, take_request
+from multidrop.gateway.modbus_server.server import ModbusServer
+from multidrop.gateway.modbus_server.settings import ModbusSettings
 
 MOST = 260  # bytes of a frame
 UNITS = {1: InvtCHE(1, name="mill"), 2: ErmanERG220(2, name="well")}

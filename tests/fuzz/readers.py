@@ -19,9 +19,9 @@ from multidrop.core import Splitter
 from multidrop.drive.fact_check import UNIT_IDS
 from multidrop.drive.line_facts import SERIAL_ADDRESSES
 from multidrop.drive.register import Access
-from multidrop.family_file.errors import FamilyError
-from multidrop.family_file.loader import load_family
-from multidrop.fleet.message import MOST_ROWS, ROWS, MessageError, unpack
+from multidrop.families.files.errors import FamilyError
+from multidrop.families.files.loader import load_family
+from multidrop.fleet.samples.message import MOST_ROWS, ROWS, MessageError, unpack
 from multidrop.importers import SUFFIXES, ImportedDevice, family_text, plant_text, read_devices
 from multidrop.planning.blocks import blocks
 from multidrop.plant.loader import PlantError, load_plant

@@ -22,7 +22,7 @@ from readers import PLANT
 
 from multidrop.capture import CaptureWriter, Side
 from multidrop.core import Framing, Message
-from multidrop.fleet.message import RowBuffer
+from multidrop.fleet.samples.message import RowBuffer
 from multidrop.recording import open_writer
 
 EXCHANGES = [each for each in PRINTED if each.request is not None]

@@ -20,16 +20,16 @@ from tables import table
 
 from multidrop import BusError, Refused, can_show_fault, load_plant
 from multidrop.core import Columns, Field, Names, NumberFormat, RowLayout
-from multidrop.drives import MODELS
-from multidrop.drives.erman_er_g_220 import ErmanFault
 from multidrop.errors import Advice
-from multidrop.gateway.alarm_file import AlarmFile, alarm_in
-from multidrop.gateway.events import Alarm, Events
+from multidrop.families import MODELS
+from multidrop.families.erman_er_g_220 import ErmanFault
+from multidrop.gateway.command_results import in_words
 from multidrop.gateway.gateway import Gateway
-from multidrop.gateway.hub import RAN_NS, Hub, Shown
-from multidrop.gateway.rights import Right
+from multidrop.gateway.http.rights import Right
+from multidrop.gateway.live.alarm_file import AlarmFile, alarm_in
+from multidrop.gateway.live.events import Alarm, Events
+from multidrop.gateway.live.hub import RAN_NS, Hub, Shown
 from multidrop.gateway.settings import read_settings
-from multidrop.gateway.told import in_words
 from multidrop.polling.batch import Batch
 
 ERMAN = '["status", "output_frequency", "last_fault"]'
@@ -291,7 +291,7 @@ def test_a_line_that_is_no_alarm_is_left_out(change: Mapping[str, object]) -> No
 
 
 def test_a_long_file_is_written_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("multidrop.gateway.alarm_file.MOST_BYTES", 2000)
+    monkeypatch.setattr("multidrop.gateway.live.alarm_file.MOST_BYTES", 2000)
     path = tmp_path / "alarms.jsonl"
     kept = started(path)
     for _ in range(100):

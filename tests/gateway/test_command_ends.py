@@ -18,8 +18,8 @@ from tables import table
 
 from multidrop import Bus, InvtCHE, Ledger, Plant, Seen, Stopped, Unconfirmed
 from multidrop.gateway.commands import Commands, Told
-from multidrop.gateway.rights import Caller, May, Right
-from multidrop.gateway.views import look_at
+from multidrop.gateway.http.rights import Caller, May, Right
+from multidrop.gateway.live.views import look_at
 
 CALLER = Caller("anna", "http", "10.0.0.7", Right.WRITE)
 MAY = May(write=frozenset({"mill.setpoint"}), verbs=frozenset({"mill.start"}))

@@ -26,12 +26,14 @@ from tables import table
 
 from multidrop import Drive, PlantError
 from multidrop.control.audit_log import AuditLog
-from multidrop.gateway import drive_works, parts, request_fields
+from multidrop.gateway import drive_commands as drive_works
+from multidrop.gateway import parts
+from multidrop.gateway.command_results import Told
 from multidrop.gateway.command_threads import begin_stops
+from multidrop.gateway.http import request_fields
+from multidrop.gateway.http.rights import Caller, Right
 from multidrop.gateway.parts import Part
-from multidrop.gateway.rights import Caller, Right
 from multidrop.gateway.settings import read_settings
-from multidrop.gateway.told import Told
 
 MAY = """[serve.may]
 stop = "anyone"

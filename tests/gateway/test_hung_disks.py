@@ -18,8 +18,10 @@ from lines import PATIENCE, until
 
 from multidrop import History
 from multidrop.gateway import gateway as gateway_module
-from multidrop.gateway import historian, live_parts, reload, settings, views, web
-from multidrop.gateway.rights import Right
+from multidrop.gateway import historian, reload, settings
+from multidrop.gateway.http import routes as web
+from multidrop.gateway.http.rights import Right
+from multidrop.gateway.live import live_parts, views
 from multidrop.history import writer as writer_module
 
 SERVE = '[serve]\nlisten = "127.0.0.1:0"\n[serve.may]\nstop = "anyone"\nwrite = ["pump-1.setpoint"]\n'

@@ -17,7 +17,7 @@ from gateways import served
 from lines import PATIENCE, until
 from peers import require_program
 
-from multidrop.gateway.rights import Right
+from multidrop.gateway.http.rights import Right
 
 JOBS = """
 global: {{scrape_interval: 1s}}

@@ -18,10 +18,10 @@ from lines import HOST_LATE, PATIENCE, until
 
 import multidrop
 from multidrop import Batch, Bus, InvtCHE, LineError, Plant, load_plant
-from multidrop.gateway import side_reads
 from multidrop.gateway.clock import boottime_ns
 from multidrop.gateway.gateway import Gateway
-from multidrop.gateway.rights import Right, new_token
+from multidrop.gateway.http.rights import Right, new_token
+from multidrop.gateway.live import side_reads
 from multidrop.gateway.settings import ServeSettings, read_settings
 from multidrop.recording.segments import segments_of
 from multidrop.sim import Simulator, Wire, simulated

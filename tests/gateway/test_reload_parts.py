@@ -15,8 +15,8 @@ from lines import PATIENCE, until
 from modbus_gateway import RawClient
 from peers import require_module
 
-from multidrop.gateway import live_parts
-from multidrop.gateway.rights import Right
+from multidrop.gateway.http.rights import Right
+from multidrop.gateway.live import live_parts
 
 MODBUS = '[serve.modbus]\nlisten = "127.0.0.1:{}"\nunits = {{ pump-1 = {} }}\n'
 STATUS = 0x1001  # CHE100 manual v1.4, p. 117: 3 is "standby"

@@ -17,8 +17,8 @@ from histories import NOON, SECOND, batch
 from multidrop import Buckets, History, Plant, open_reader
 from multidrop.core.columns import Names
 from multidrop.gateway import historian
-from multidrop.gateway.exports import Exports
 from multidrop.gateway.historian import MOST_BUCKETS, HistorySettings, as_json, build
+from multidrop.gateway.http.exports import Exports
 
 MS = 1_000_000
 

@@ -15,7 +15,7 @@ from histories import DAY, METADATA, NOON, SECOND, batch, random_rows, record, r
 
 from multidrop import History, HistoryWriter, Poller, Seen, load_plant
 from multidrop.core.columns import Names
-from multidrop.drives import InnovertIBD
+from multidrop.families import InnovertIBD
 from multidrop.history import writer as writer_module
 from multidrop.history.folder import HistoryFile, file_name, listing, parquet_files, widest
 from multidrop.recording.append_file import AppendFile

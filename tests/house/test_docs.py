@@ -28,7 +28,7 @@ from tables import table
 
 from multidrop import core, load_plant
 from multidrop.cli import COMMANDS, main
-from multidrop.drives import MODELS, InnovertIBD
+from multidrop.families import MODELS, InnovertIBD
 from multidrop.sim import Simulator, Wire, simulated
 
 ROOT = Path(__file__).parents[2]
@@ -56,7 +56,7 @@ NOT_RUN = {
     ".venv/bin/python -m bench": "needs rivals and a quiet machine; .ci/run runs a benchmark",
     ".venv/bin/python -m sphinx": "is a test of its own, below",
     ".venv/bin/python docs/pictures/make.py": "takes a minute; a test below compares what does not change",
-    "mbpoll": "is another program: tests/modbus_server/test_masters.py runs it",
+    "mbpoll": "is another program: tests/gateway/modbus_server/test_masters.py runs it",
     "tshark": "is another program: tests/capture/test_capture.py runs it",
     "multidrop demo --web": "runs until it is told to end: tests/gateway/test_serve.py",
     "multidrop demo": "takes ten seconds: tests/cli and .ci/run run it",
@@ -70,9 +70,9 @@ NOT_RUN = {
     "multidrop fleet": "needs servers: tests/fleet/test_drills.py and test_fleet_command.py run it",
     "export MULTIDROP_NATS": "names servers: tests/support/fleet_drills.py does it",
     "multidrop hub nats://": "needs servers: tests/fleet/test_hub_command.py runs it",
-    "multidrop hub tls://": "needs servers: tests/fleet/test_secured_fleet.py runs it",
+    "multidrop hub tls://": "needs servers: tests/fleet/servers/test_secured_fleet.py runs it",
     "systemctl": "is another program: tests/gateway/test_serve.py sends the same signal",
-    "frame=$(curl": "is another program: tests/gateway/test_seen_frames.py runs it",
+    "frame=$(curl": "is another program: tests/gateway/live/test_seen_frames.py runs it",
     "start=$(echo": "the same",
     "curl": "is another program: tests/gateway/test_gateway_stops.py sends the same",
     "multidrop doctor": "is about a real adapter: tests/cli/test_doctor.py",

@@ -16,7 +16,7 @@ import pytest
 from lines import PATIENCE
 from sources import files, run_time_imports
 
-from multidrop.drives import MODELS
+from multidrop.families import MODELS
 
 ROOT = Path(__file__).parents[2]
 README = (ROOT / "README.md").read_text("utf-8")

@@ -48,12 +48,12 @@ FILES_TOUCHING_THE_SYSTEM = {
     "control/exit_hook.py",
     "control/latches.py",
     "gateway/clock.py",
-    "gateway/connections.py",
+    "gateway/http/connections.py",
     "gateway/gateway.py",
-    "gateway/listener.py",
-    "gateway/mqtt.py",
+    "gateway/http/listener.py",
+    "gateway/mqtt/part.py",
     "gateway/sd_notify.py",
-    "gateway/views.py",
+    "gateway/live/views.py",
 }
 
 

@@ -19,7 +19,7 @@ from ptys import linked_ptys
 
 from multidrop.bus import Bus
 from multidrop.cli import main
-from multidrop.family_file.loader import load_family
+from multidrop.families.files.loader import load_family
 from multidrop.plant.loader import load_plant
 from multidrop.poller import Poller
 from multidrop.polling.batch import Row

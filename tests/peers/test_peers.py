@@ -16,8 +16,8 @@ from ptys import linked_ptys
 
 from multidrop.bus import Bus
 from multidrop.cli import main
-from multidrop.drives.registry import find_model
 from multidrop.errors import DriveRefused, NoReply
+from multidrop.families.registry import find_model
 
 SERVERS = Path(__file__).parents[1] / "support" / "servers"
 DEVICE = f"{Path(__file__).parents[1] / 'support' / 'server_device.py'}:Device"

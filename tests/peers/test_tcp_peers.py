@@ -15,9 +15,9 @@ from peers import build_with_libmodbus, require_module, require_program
 
 from multidrop.bus import Bus
 from multidrop.cli import main
-from multidrop.drives import InnovertIBD, InvtCHE
-from multidrop.drives.registry import find_model
 from multidrop.errors import DriveRefused, NoReply
+from multidrop.families import InnovertIBD, InvtCHE
+from multidrop.families.registry import find_model
 from multidrop.plant.loader import load_plant
 from multidrop.poller import Poller
 from multidrop.sim import Simulator, Wire, simulated

@@ -16,7 +16,7 @@ from multidrop.drive.declare import command, reading, setting
 from multidrop.drive.register import Register
 from multidrop.drive.request import read_request, write_request
 from multidrop.drive.table import COIL, DISCRETE, HOLDING, INPUT, Table
-from multidrop.drives import MODELS
+from multidrop.families import MODELS
 from multidrop.planning.blocks import Block, blocks, plan, planned, sending
 from multidrop.planning.bus_time import gap, in_order, silence
 

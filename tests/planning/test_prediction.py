@@ -15,7 +15,7 @@ from multidrop.core import Peer, build_reply
 from multidrop.drive import Drive, Framing
 from multidrop.drive.declare import reading
 from multidrop.drive.table import HOLDING
-from multidrop.drives import MODELS, YD1000, ErmanERG220, InnovertIBD, InvtCHE
+from multidrop.families import MODELS, YD1000, ErmanERG220, InnovertIBD, InvtCHE
 from multidrop.planning import prediction
 from multidrop.planning.blocks import Planned, planned
 from multidrop.planning.bus_time import in_order

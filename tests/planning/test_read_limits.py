@@ -19,7 +19,7 @@ from multidrop.drive.declare import command, reading, setting
 from multidrop.drive.register import Register
 from multidrop.drive.request import write_request
 from multidrop.drive.table import COIL, DISCRETE, HOLDING, INPUT, Carrier, Table
-from multidrop.drives import MODELS
+from multidrop.families import MODELS
 from multidrop.planning.blocks import Block, blocks, planned, sending
 from multidrop.planning.bus_time import silence
 from multidrop.planning.prediction import predict

@@ -12,9 +12,9 @@ from multidrop.cli import main
 from multidrop.drive import Drive
 from multidrop.drive.declare import reading
 from multidrop.drive.table import HOLDING, INPUT
-from multidrop.drives import MODELS
-from multidrop.drives.registry import SHIPPED
-from multidrop.family_file.loader import load_family
+from multidrop.families import MODELS
+from multidrop.families.files.loader import load_family
+from multidrop.families.registry import SHIPPED
 from multidrop.planning.reading_gain import reading_gain
 
 SUPPORT = Path(__file__).parents[1] / "support"

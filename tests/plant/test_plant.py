@@ -14,7 +14,7 @@ from tables import table
 from multidrop.core import Echo
 from multidrop.drive import Framing
 from multidrop.drive.timing import Settings
-from multidrop.drives.yd1000 import YD1000
+from multidrop.families.yd1000 import YD1000
 from multidrop.plant.loader import PlantError, load_plant
 from multidrop.plant.model import Plant, Polled
 from multidrop.toml_check import parse_duration

@@ -19,8 +19,8 @@ from toy import Toy
 
 from multidrop.core import Echo
 from multidrop.drive import Drive
-from multidrop.drives import InnovertIBD, InvtCHE
 from multidrop.errors import LineError, NoSuchPort
+from multidrop.families import InnovertIBD, InvtCHE
 from multidrop.plant.loader import PlantError
 from multidrop.plant.model import Plant, PlantLine, PolledDrive
 from multidrop.poller import Poller

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from lines import until
 
-from multidrop.drives import YD1000
+from multidrop.families import YD1000
 from multidrop.plant.loader import load_plant
 from multidrop.poller import Poller
 from multidrop.sim import Simulator, Wire, simulated

@@ -14,8 +14,8 @@ from lines import line, plant, polled, rows_of, until
 from toy import Toy
 
 from multidrop.bus import Bus
-from multidrop.drives import InvtCHE
 from multidrop.errors import NoReply
+from multidrop.families import InvtCHE
 from multidrop.plant.model import PolledDrive
 from multidrop.poller import Poller
 from multidrop.polling.port_queue import AHEAD_NS

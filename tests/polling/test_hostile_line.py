@@ -23,7 +23,7 @@ from tables import table
 from variants import LINES, of_all_variants, of_one_variant
 
 from multidrop.drive import Drive
-from multidrop.drives import DelixiNative
+from multidrop.families import DelixiNative
 from multidrop.sim import Faults, simulated
 from multidrop.sim.faults import RATES
 

@@ -18,8 +18,8 @@ from multidrop.core import Framing, Message, build_reply, parse_request
 from multidrop.drive import Drive
 from multidrop.drive.declare import reading
 from multidrop.drive.table import HOLDING
-from multidrop.drives import InvtCHE
 from multidrop.errors import LineError, PollingFailed
+from multidrop.families import InvtCHE
 from multidrop.poller import Poller
 from multidrop.polling.polled_line import PolledLine
 from multidrop.sim import MotorDrive, Simulator, Wire, simulated

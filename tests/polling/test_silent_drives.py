@@ -7,7 +7,7 @@ from clocked_lines import ClockedLines, ClockedWire, S
 from lines import polled, rows_of
 from toy import Toy
 
-from multidrop.drives import InvtCHE
+from multidrop.families import InvtCHE
 from multidrop.polling.polled_line import PolledLine
 from multidrop.sim import Faults, simulated
 

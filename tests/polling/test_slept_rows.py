@@ -16,7 +16,7 @@ import pytest
 from c_programs import preloaded
 
 from multidrop.core import Message
-from multidrop.drives import InvtCHE
+from multidrop.families import InvtCHE
 from multidrop.sim import Simulator, Wire, simulated
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="CLOCK_BOOTTIME is Linux's")

@@ -31,8 +31,8 @@ from variants import LINES, of_all_variants, of_one_variant
 from multidrop.bus import Bus
 from multidrop.control.outcome import Effect
 from multidrop.core import Framing, Message
-from multidrop.drives import YD1000, DelixiModbus, DelixiNative, ErmanERG220, InnovertIBD, InvtCHE
 from multidrop.errors import BusError
+from multidrop.families import YD1000, DelixiModbus, DelixiNative, ErmanERG220, InnovertIBD, InvtCHE
 from multidrop.sim import EncodedDrive, Faults, MotorDrive, SimulatedDrive, simulated
 
 pytestmark = pytest.mark.story

@@ -30,8 +30,8 @@ from multidrop.bus import Bus
 from multidrop.control.outcome import Effect
 from multidrop.core import Framing, Message, Status, TransactionIds
 from multidrop.drive import Drive
-from multidrop.drives import YD1000, DelixiModbus, ErmanERG220, InnovertIBD, InvtCHE
 from multidrop.errors import BusError
+from multidrop.families import YD1000, DelixiModbus, ErmanERG220, InnovertIBD, InvtCHE
 from multidrop.sim import EncodedDrive, Faults, MotorDrive, SimulatedDrive, simulated
 
 pytestmark = pytest.mark.story

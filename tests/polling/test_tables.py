@@ -86,7 +86,7 @@ def test_no_library_is_imported_before_it_is_needed() -> None:
     late = {"pandas", "polars", "pyarrow", "numpy", "nanoarrow"}
     late |= {
         "importlib.metadata",
-        "multidrop.family_file.loader",
+        "multidrop.families.files.loader",
     }  # most plants name no family file, most commands write no capture
     assert late.isdisjoint(told.stdout.split())
 

@@ -17,14 +17,14 @@ from multidrop.drive.declare import command, setting
 from multidrop.drive.table import Kept
 from multidrop.drive.timing import Settings
 from multidrop.drive.verbs import verb
-from multidrop.drives import MODELS
-from multidrop.drives.delixi_modbus import DelixiModbus
-from multidrop.drives.delixi_native import DelixiNative
-from multidrop.drives.erman_er_g_220 import ErmanERG220
-from multidrop.drives.innovert_ibd import InnovertIBD
-from multidrop.drives.invt_che import InvtCHE
-from multidrop.drives.yd1000 import YD1000
 from multidrop.errors import LineError
+from multidrop.families import MODELS
+from multidrop.families.delixi_modbus import DelixiModbus
+from multidrop.families.delixi_native import DelixiNative
+from multidrop.families.erman_er_g_220 import ErmanERG220
+from multidrop.families.innovert_ibd import InnovertIBD
+from multidrop.families.invt_che import InvtCHE
+from multidrop.families.yd1000 import YD1000
 from multidrop.scan import Crowd, Found, Noise, Progress, Sweep, Untried, plant_text, scan, sweeps
 from multidrop.sim import SimulatedDrive, Wire, simulated
 from multidrop.sim.che import SimulatedCHE

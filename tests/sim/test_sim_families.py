@@ -14,12 +14,12 @@ from multidrop.core import Framing, Message, build_request, parse_reply
 from multidrop.drive import Drive
 from multidrop.drive.declare import setting
 from multidrop.drive.table import Carrier
-from multidrop.drives.delixi_modbus import DelixiModbus
-from multidrop.drives.delixi_native import PARAMETER, DelixiNative
-from multidrop.drives.erman_er_g_220 import ErmanERG220
-from multidrop.drives.innovert_ibd import InnovertIBD
-from multidrop.drives.invt_che import InvtCHE, parameter
-from multidrop.drives.yd1000 import YD1000
+from multidrop.families.delixi_modbus import DelixiModbus
+from multidrop.families.delixi_native import PARAMETER, DelixiNative
+from multidrop.families.erman_er_g_220 import ErmanERG220
+from multidrop.families.innovert_ibd import InnovertIBD
+from multidrop.families.invt_che import InvtCHE, parameter
+from multidrop.families.yd1000 import YD1000
 from multidrop.sim import EncodedDrive, MotorDrive, Wire, encoded, simulated
 from multidrop.sim.che import SimulatedCHE
 from multidrop.sim.delixi import SimulatedDelixiNative

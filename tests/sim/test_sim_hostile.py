@@ -15,8 +15,8 @@ from wire_time import timeline
 
 from multidrop.cli import main
 from multidrop.core import STATUSES, Message, Peer
-from multidrop.drives import YD1000
 from multidrop.errors import LineError, PortLost
+from multidrop.families import YD1000
 from multidrop.sim import Faults, FaultyWire, SimulatedDrive, Simulator, load_faults, simulated
 from multidrop.sim.faults import RATES
 from multidrop.toml_check import parse_duration

@@ -18,10 +18,10 @@ from raw_client import PATIENCE, opened, receive
 from tables import table
 
 from multidrop.core import Framing, Message, build_request, parse_reply, reply_length, set_settings
-from multidrop.drives.delixi_native import DelixiNative
-from multidrop.drives.erman_er_g_220 import ErmanERG220
-from multidrop.drives.innovert_ibd import InnovertIBD
-from multidrop.drives.invt_che import InvtCHE
+from multidrop.families.delixi_native import DelixiNative
+from multidrop.families.erman_er_g_220 import ErmanERG220
+from multidrop.families.innovert_ibd import InnovertIBD
+from multidrop.families.invt_che import InvtCHE
 from multidrop.sim import EncodedDrive, Simulator, Wire, encoded, serve, simulated
 
 READ = Message(1, 0x03, 0x3000, 2)  # of a CHE

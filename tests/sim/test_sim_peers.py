@@ -8,9 +8,9 @@ from peers import require_module, require_program
 from tables import table
 
 from multidrop.drive import Drive
-from multidrop.drives.erman_er_g_220 import ErmanERG220
-from multidrop.drives.innovert_ibd import InnovertIBD
-from multidrop.drives.invt_che import InvtCHE, parameter
+from multidrop.families.erman_er_g_220 import ErmanERG220
+from multidrop.families.innovert_ibd import InnovertIBD
+from multidrop.families.invt_che import InvtCHE, parameter
 from multidrop.sim import SimulatedDrive, Simulator, Wire, simulated
 
 

@@ -8,12 +8,12 @@ from tables import table
 from wire_time import Own, timeline
 
 from multidrop.drive import Drive
-from multidrop.drives.delixi_modbus import DelixiModbus
-from multidrop.drives.delixi_native import DelixiNative
-from multidrop.drives.erman_er_g_220 import ErmanERG220
-from multidrop.drives.innovert_ibd import InnovertIBD
-from multidrop.drives.invt_che import InvtCHE
-from multidrop.drives.yd1000 import YD1000
+from multidrop.families.delixi_modbus import DelixiModbus
+from multidrop.families.delixi_native import DelixiNative
+from multidrop.families.erman_er_g_220 import ErmanERG220
+from multidrop.families.innovert_ibd import InnovertIBD
+from multidrop.families.invt_che import InvtCHE
+from multidrop.families.yd1000 import YD1000
 from multidrop.sim import SimulatedDrive, Wire, simulated
 
 READ = checksums.rtu("01 03 00 01 00 01")

@@ -22,10 +22,10 @@ from peers import require_module, require_program
 
 from multidrop import Drive, InvtCHE, Plant, PlantLine, Polled, PolledDrive
 from multidrop.gateway.commands import Told
-from multidrop.gateway.hub import Shown
-from multidrop.gateway.kept_rows import Known
+from multidrop.gateway.http.rights import Caller, May
+from multidrop.gateway.live.hub import Shown
+from multidrop.gateway.live.kept_rows import Known
 from multidrop.gateway.parts import Inside
-from multidrop.gateway.rights import Caller, May
 
 PATIENCE_S = 30.0  # for an event that comes at once on an idle machine
 TRIALS = 5

@@ -14,12 +14,12 @@ from unittest.mock import patch
 from fleets import HandClock
 
 from multidrop import YD1000, Bus, read_audit, written_before
-from multidrop.fleet import command_desk
-from multidrop.fleet.command_desk import CommandDesk
-from multidrop.fleet.command_log import CommandLog
-from multidrop.fleet.command_words import CommandAnswer, CommandOutcome, Offered
-from multidrop.fleet.held_lines import HeldLines
-from multidrop.fleet.stop_desk import StopDesk
+from multidrop.fleet.commands import desk as command_desk
+from multidrop.fleet.commands.desk import CommandDesk
+from multidrop.fleet.commands.log import CommandLog
+from multidrop.fleet.commands.stop_desk import StopDesk
+from multidrop.fleet.commands.words import CommandAnswer, CommandOutcome, Offered
+from multidrop.fleet.lines.held_lines import HeldLines
 from multidrop.sim import SimulatedDrive, Simulator, Wire, simulated
 from multidrop.supervisor import supervisor
 

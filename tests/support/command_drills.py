@@ -24,9 +24,9 @@ from kills import kill_all
 from nats_clusters import Cluster, cluster
 
 from multidrop import YD1000, read_audit
-from multidrop.fleet.command_words import CommandAnswer, CommandOutcome, Offered
+from multidrop.fleet.commands.fleet_commands import FleetCommands
+from multidrop.fleet.commands.words import CommandAnswer, CommandOutcome, Offered
 from multidrop.fleet.errors import FleetError
-from multidrop.fleet.fleet_commands import FleetCommands
 from multidrop.sim import SimulatedDrive, Simulator, Wire, simulated
 
 GATEWAYS = ("gw-a", "gw-b", "gw-c")

@@ -11,7 +11,7 @@ from typing import IO
 
 from kills import BoundProcess
 
-from multidrop.drives.registry import find_model
+from multidrop.families.registry import find_model
 
 MULTIDROP = [sys.executable, "-m", "multidrop"]
 TOY = f"{Path(__file__).parents[1]}/support/toy.py:Toy"

@@ -21,11 +21,11 @@ from namespaces import Namespace
 from nats_clusters import Cluster, Node, cluster
 from serial_hall import SerialHall
 
-from multidrop.fleet import names
-from multidrop.fleet.buckets import ask
 from multidrop.fleet.errors import Conflict, FleetError
-from multidrop.fleet.lease_bucket import LeaseBucket
-from multidrop.fleet.servers import ServerPath
+from multidrop.fleet.leases.bucket import LeaseBucket
+from multidrop.fleet.servers import names
+from multidrop.fleet.servers.buckets import ask
+from multidrop.fleet.servers.connections import ServerPath
 
 GATEWAYS = ("gw-a", "gw-b", "gw-c")
 PATIENCE_S = 120.0

@@ -16,11 +16,11 @@ from typing import Any
 
 from nats_clusters import Cluster
 
-from multidrop.fleet import names
-from multidrop.fleet.buckets import Bucket
-from multidrop.fleet.plant_store import store
-from multidrop.fleet.servers import paths_of
-from multidrop.fleet.setup import set_up
+from multidrop.fleet.servers import names
+from multidrop.fleet.servers.buckets import Bucket
+from multidrop.fleet.servers.connections import paths_of
+from multidrop.fleet.servers.plant_store import store
+from multidrop.fleet.servers.setup import set_up
 
 PROGRAM = Path(__file__).with_name("member_process.py")
 PATIENCE_S = 240.0

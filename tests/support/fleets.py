@@ -6,9 +6,9 @@ import asyncio
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from multidrop.fleet.buckets import Record, WriteAnswers
 from multidrop.fleet.errors import Conflict, Unsure
-from multidrop.fleet.lease_rules import SECOND
+from multidrop.fleet.leases.rules import SECOND
+from multidrop.fleet.servers.buckets import Record, WriteAnswers
 
 
 class HandClock:

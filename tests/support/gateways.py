@@ -20,11 +20,12 @@ from kills import BoundProcess
 from lines import PATIENCE, until
 
 from multidrop import InvtCHE, Plant, load_plant
-from multidrop.gateway import frames, live_parts, reload
 from multidrop.gateway import gateway as gateway_module
+from multidrop.gateway import reload
 from multidrop.gateway import settings as settings_module
 from multidrop.gateway.gateway import Gateway
-from multidrop.gateway.rights import Right, Token, new_token
+from multidrop.gateway.http.rights import Right, Token, new_token
+from multidrop.gateway.live import frames, live_parts
 from multidrop.gateway.settings import ServeSettings, read_plant
 from multidrop.sim import SimulatedDrive, Simulator, Wire, simulated
 

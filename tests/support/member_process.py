@@ -14,10 +14,10 @@ import sys
 from time import monotonic
 from typing import Any
 
-from multidrop.fleet.lease import boottime_ns
-from multidrop.fleet.member import Member
-from multidrop.fleet.servers import paths_of
-from multidrop.fleet.setup import open_all
+from multidrop.fleet.leases.lease import boottime_ns
+from multidrop.fleet.leases.member import Member
+from multidrop.fleet.servers.connections import paths_of
+from multidrop.fleet.servers.setup import open_all
 
 LOOK_S = 0.02
 

@@ -14,10 +14,10 @@ from typing import NamedTuple
 
 from multidrop.drive import Drive
 from multidrop.gateway.commands import Told
-from multidrop.gateway.modbus_server import ModbusServer
-from multidrop.gateway.modbus_settings import ModbusSettings
-from multidrop.gateway.rights import Caller
-from multidrop.gateway.units import MAIN
+from multidrop.gateway.http.rights import Caller
+from multidrop.gateway.modbus_server.server import ModbusServer
+from multidrop.gateway.modbus_server.settings import ModbusSettings
+from multidrop.gateway.modbus_server.unit_ids import MAIN
 from multidrop.plant.model import Plant, PlantLine, Polled, PolledDrive
 
 PATIENCE = 30.0  # s, for what must come

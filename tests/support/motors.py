@@ -8,7 +8,7 @@ from own_fan import Fan
 
 from multidrop.core import Message
 from multidrop.drive import Drive
-from multidrop.drives import MODELS, YD1000, DelixiModbus, DelixiNative, ErmanERG220, InnovertIBD, InvtCHE
+from multidrop.families import MODELS, YD1000, DelixiModbus, DelixiNative, ErmanERG220, InnovertIBD, InvtCHE
 from multidrop.sim import MotorDrive
 from multidrop.sim.receiver import Frame
 

@@ -19,7 +19,7 @@ from typing import Any, TypeVar
 from namespaces import Namespace
 from peers import require_program
 
-from multidrop.fleet.server_files import PINGS
+from multidrop.fleet.servers.files import PINGS
 
 PATIENCE_S = 60.0
 ATTEMPTS = 4

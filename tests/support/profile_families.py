@@ -10,8 +10,8 @@ from multidrop.core import Message, NumberFormat
 from multidrop.drive import Drive
 from multidrop.drive.declare import command, reading, setting
 from multidrop.drive.table import Kept
-from multidrop.drives.registry import shipped_family
-from multidrop.profiles import CiA402, DanfossFC, Delta, Invt, Optidrive, Profidrive
+from multidrop.families.profiles import CiA402, DanfossFC, Delta, Invt, Optidrive, Profidrive
+from multidrop.families.registry import shipped_family
 
 
 class AbbProfile(IntEnum):

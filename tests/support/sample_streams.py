@@ -8,8 +8,8 @@ from contextlib import asynccontextmanager, suppress
 from nats.aio.client import Client
 from nats_clusters import Cluster
 
-from multidrop.fleet import samples_stream
-from multidrop.fleet.samples_stream import StreamError, connect, create_stream
+from multidrop.fleet.samples import samples_stream
+from multidrop.fleet.samples.samples_stream import StreamError, connect, create_stream
 
 
 @asynccontextmanager

@@ -16,9 +16,9 @@ from typing import Any
 from nats_clusters import PATIENCE_S, Cluster, Node, begun, server_program
 from peers import require_program
 
-from multidrop.fleet.accounts import STORE
-from multidrop.fleet.credentials import connect_options
-from multidrop.fleet.server_files import ROUTE_PORTS, TlsFiles, write_files
+from multidrop.fleet.servers.accounts import STORE
+from multidrop.fleet.servers.credentials import connect_options
+from multidrop.fleet.servers.files import ROUTE_PORTS, TlsFiles, write_files
 
 GATEWAYS = ("gw-a", "gw-b", "gw-c")
 Change = Callable[[str], str]  # of rights.conf

@@ -21,7 +21,7 @@ from typing import Any
 from kills import BoundProcess
 
 from multidrop import load_plant
-from multidrop.profiles.delta import DeltaControl
+from multidrop.families.profiles.delta import DeltaControl
 from multidrop.sim import MotorDrive, Wire, serve, simulated
 
 FAMILY = """[family]

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from spooled import numbered
 
-from multidrop.fleet.spool import Spool
+from multidrop.fleet.samples.spool import Spool
 
 EXCHANGES = 20  # of a batch
 

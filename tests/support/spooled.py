@@ -9,7 +9,7 @@ from typing import Any
 from completions import add_miss, add_rows, new_completion
 
 from multidrop.core import Columns, Field, Names, NumberFormat, RowLayout, Status
-from multidrop.fleet.message import unpack
+from multidrop.fleet.samples.message import unpack
 from multidrop.polling.batch import Batch
 
 NOON = 1_795_262_400_000_000_000  # 2026-11-21 12:00 UTC

@@ -14,7 +14,7 @@ from variants import REASONS
 from multidrop import poller
 from multidrop.core import Message, Status
 from multidrop.drive import Drive
-from multidrop.drives import YD1000
+from multidrop.families import YD1000
 from multidrop.planning import back_off
 from multidrop.plant.model import PolledDrive
 from multidrop.polling import polled_line

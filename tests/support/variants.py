@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from multidrop.core import Framing, Status
 from multidrop.drive import Drive
-from multidrop.drives import YD1000, DelixiModbus, DelixiNative, ErmanERG220, InnovertIBD, InvtCHE
+from multidrop.families import YD1000, DelixiModbus, DelixiNative, ErmanERG220, InnovertIBD, InvtCHE
 from multidrop.sim import EncodedDrive, Wire
 
 VARIANTS = (  # family, framing, baud rate of the fast line

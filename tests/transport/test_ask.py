@@ -16,8 +16,8 @@ from toy import Toy
 
 from multidrop.control.audit_log import read_audit
 from multidrop.core import Failure, Message
-from multidrop.drives import DelixiModbus, DelixiNative, InnovertIBD
 from multidrop.errors import BadReply, DriveRefused, Expired, NoReply, NotAttached
+from multidrop.families import DelixiModbus, DelixiNative, InnovertIBD
 from multidrop.poller import Poller
 from multidrop.sim import EncodedDrive, SimulatedDrive, Simulator, Wire, proof
 

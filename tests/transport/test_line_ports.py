@@ -22,8 +22,8 @@ from multidrop.bus import Bus
 from multidrop.capture import Capture, CaptureWriter, Decoding, Tapped
 from multidrop.core import Echo, Port, set_settings
 from multidrop.drive import Drive
-from multidrop.drives import MODELS
 from multidrop.errors import LineError, NoReply, Unconfirmed
+from multidrop.families import MODELS
 from multidrop.poller import Poller
 from multidrop.sim import Simulator, Wire, simulated
 from multidrop.transport import clock, open_port

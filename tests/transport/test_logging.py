@@ -16,7 +16,7 @@ from simulated_bus import one
 from toy import PatientToy
 
 from multidrop import Bus, LineError, Refused
-from multidrop.drives import InvtCHE
+from multidrop.families import InvtCHE
 from multidrop.sim import SimulatedDrive, Simulator, Wire
 from multidrop.transport import aside_log
 from multidrop.transport.aside_log import flush

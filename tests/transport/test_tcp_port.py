@@ -17,8 +17,8 @@ from multidrop.core import Framing, Message, build_reply, build_request, parse_r
 from multidrop.drive import Drive
 from multidrop.drive.declare import reading
 from multidrop.drive.table import HOLDING
-from multidrop.drives import YD1000, DelixiNative, InnovertIBD
 from multidrop.errors import BadReply, LineError, NoReply, NoSuchPort, PortLost, Refused
+from multidrop.families import YD1000, DelixiNative, InnovertIBD
 from multidrop.plant.loader import PlantError, load_plant
 from multidrop.poller import Poller
 from multidrop.sim import Simulator, Wire, simulated

@@ -12,8 +12,8 @@ from lines import line, plant, polled, rows_of, until
 from tables import table
 
 from multidrop import Poller
-from multidrop.drives import InnovertIBD
 from multidrop.errors import LineError, PortLost
+from multidrop.families import InnovertIBD
 from multidrop.sim import EncodedDrive, Simulator, Wire
 from multidrop.transport import open_port, port_identity, usb_adapter
 from multidrop.transport.line import Line

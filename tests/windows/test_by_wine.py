@@ -19,7 +19,7 @@ from kills import BoundProcess
 from motors import ReceivedRequests
 from wine_console import Console, Wine
 
-from multidrop.drives import InvtCHE
+from multidrop.families import InvtCHE
 from multidrop.recording import open_reader
 from multidrop.sim import MotorDrive, Simulator, Wire, simulated
 

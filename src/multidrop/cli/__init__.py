@@ -101,7 +101,7 @@ def _run_interruptible(words: list[str]) -> int:
     spell_out_unencodable()
     command = words[1] if words[0] == "fleet" and words[1:] else words[0]
     going_on = outliving_the_terminal() if command in STOPS else nullcontext()
-    with end_signals_interrupt(), going_on, logging_to(warn, "multidrop.drives.registry", logging.INFO):
+    with end_signals_interrupt(), going_on, logging_to(warn, "multidrop.families.registry", logging.INFO):
         return _run(words[0], words[1:])
 
 

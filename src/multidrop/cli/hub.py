@@ -20,7 +20,7 @@ from multidrop.cli.support.values import counted
 from multidrop.supervisor import supervisor
 
 if TYPE_CHECKING:
-    from multidrop.fleet.hub import HubState, SampleSink
+    from multidrop.fleet.samples.hub import HubState, SampleSink
 
 EVERY_S = 10.0
 LEVELS = dict.fromkeys(("multidrop.fleet", "multidrop.supervisor"), logging.INFO)
@@ -73,10 +73,10 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _sink(arguments: argparse.Namespace) -> SampleSink:
     if arguments.postgres:
-        from multidrop.fleet.postgres_sink import PostgresSink
+        from multidrop.fleet.samples.postgres_sink import PostgresSink
 
         return PostgresSink(arguments.postgres)
-    from multidrop.fleet.parquet_sink import ParquetSink
+    from multidrop.fleet.samples.parquet_sink import ParquetSink
 
     return ParquetSink(arguments.parquet)
 
@@ -89,9 +89,9 @@ async def _read_until_signal(
 
 
 async def _read(arguments: argparse.Namespace, sink: SampleSink, options: dict[str, Any]) -> HubState:
-    from multidrop.fleet.compaction import compact_for_ever
-    from multidrop.fleet.hub import SampleHub
-    from multidrop.fleet.samples_stream import close, connect
+    from multidrop.fleet.samples.compaction import compact_for_ever
+    from multidrop.fleet.samples.hub import SampleHub
+    from multidrop.fleet.samples.samples_stream import close, connect
     from multidrop.fleet.task_end import end_tasks
 
     client = await connect(arguments.servers, **options)

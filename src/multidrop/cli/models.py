@@ -15,8 +15,8 @@ from multidrop.cli.support.values import aligned, wrapped
 from multidrop.drive.family import Drive
 from multidrop.drive.read_limits import read_limit
 from multidrop.drive.register import Register
-from multidrop.drives import MODELS
-from multidrop.drives.registry import SHIPPED, find_model, shipped_family
+from multidrop.families import MODELS
+from multidrop.families.registry import SHIPPED, find_model, shipped_family
 from multidrop.plant.loader import load_plant
 
 

@@ -15,7 +15,7 @@ from multidrop.cli.support.arguments import add_json_argument
 from multidrop.cli.support.output import print_text
 from multidrop.cli.support.plants import add_plant_argument
 from multidrop.cli.support.values import Row, aligned, counted, shortened, wrapped
-from multidrop.drives.registry import is_users_own
+from multidrop.families.registry import is_users_own
 from multidrop.planning.prediction import Prediction, Rate, predict
 from multidrop.planning.reading_gain import reading_gain
 from multidrop.planning.suggestions import Suggestions, duration_text, suggest

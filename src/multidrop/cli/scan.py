@@ -28,8 +28,8 @@ from multidrop.drive.fact_check import UNIT_IDS
 from multidrop.drive.family import Drive
 from multidrop.drive.line_facts import SERIAL_ADDRESSES
 from multidrop.drive.network import speaks_tcp
-from multidrop.drives import MODELS
-from multidrop.drives.registry import find_model
+from multidrop.families import MODELS
+from multidrop.families.registry import find_model
 from multidrop.printable import plain_whole
 from multidrop.scan import (
     ADDRESSES,

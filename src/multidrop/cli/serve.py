@@ -24,7 +24,7 @@ from multidrop.cli.support.plants import add_port_option, plant_of
 from multidrop.cli.support.signals import on_end_signals, on_reload_signal, run_loop
 from multidrop.drive.known_state import can_show_fault
 from multidrop.drive.named_verbs import verbs_of
-from multidrop.drives import MODELS
+from multidrop.families import MODELS
 from multidrop.plant.loader import load_plant
 from multidrop.plant.model import Plant
 
@@ -126,8 +126,8 @@ def _demo_registers() -> list[str]:
 
 
 def _demo_settings(plant: Plant, folder: Path) -> ServeSettings:
+    from multidrop.gateway.http.rights import May, Right
     from multidrop.gateway.parts import PARTS, settings_class
-    from multidrop.gateway.rights import May, Right
     from multidrop.gateway.settings import ServeSettings
 
     drives = [polled.drive for line in plant.lines for polled in line.drives]
@@ -195,7 +195,7 @@ def _url(settings: ServeSettings, port: int) -> str:
 
 def _new_token(role: str | None, owner: str | None) -> int:
     """Print a line for the file of tokens, and on stderr the token itself, which is kept nowhere."""
-    from multidrop.gateway.rights import Right, new_token
+    from multidrop.gateway.http.rights import Right, new_token
 
     if not role or not owner:
         raise ValueError("a new token needs a role and a name: multidrop serve --new-token stop --for anna")

@@ -10,8 +10,8 @@ from multidrop.control.echo_check import EchoCheck
 from multidrop.core import PAUSE_NS
 from multidrop.drive.family import Drive
 from multidrop.drive.script import Read, Step, Wait, carry_out
-from multidrop.drives import MODELS
 from multidrop.errors import ANOTHER_FAMILY, BusError, CheckAgain, DriveRefused, Refused
+from multidrop.families import MODELS
 from multidrop.transport import clock
 from multidrop.transport.exchange import READ_ATTEMPTS, Exchanges
 

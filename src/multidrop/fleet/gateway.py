@@ -13,24 +13,24 @@ from typing import Any
 from nats.aio.msg import Msg
 
 from multidrop import Mastership, PollingFailed
-from multidrop.fleet import names
-from multidrop.fleet.command_log import CommandLog
-from multidrop.fleet.command_subjects import CommandedLines, CommandSubjects
+from multidrop.fleet.commands.log import CommandLog
+from multidrop.fleet.commands.subjects import CommandedLines, CommandSubjects
 from multidrop.fleet.errors import FleetError, NoRight
-from multidrop.fleet.fleet_lines import FleetLines
-from multidrop.fleet.forwarder import Forwarder
-from multidrop.fleet.held_lines import HeldLines
-from multidrop.fleet.lease_rules import SECOND, USUAL
-from multidrop.fleet.life_lock import LifeLock
-from multidrop.fleet.line_keeper import SILENT_S
-from multidrop.fleet.member import Member
-from multidrop.fleet.moves import TOLD
-from multidrop.fleet.polled_units import PolledUnits
-from multidrop.fleet.record_shapes import misshapen
-from multidrop.fleet.samples_stream import close, connect
-from multidrop.fleet.servers import ServerPath, paths_of
-from multidrop.fleet.setup import check_buckets, open_all
-from multidrop.fleet.spool import Spool
+from multidrop.fleet.leases.life_lock import LifeLock
+from multidrop.fleet.leases.member import Member
+from multidrop.fleet.leases.rules import SECOND, USUAL
+from multidrop.fleet.lines.fleet_lines import FleetLines
+from multidrop.fleet.lines.held_lines import HeldLines
+from multidrop.fleet.lines.line_keeper import SILENT_S
+from multidrop.fleet.lines.moves import TOLD
+from multidrop.fleet.lines.record_shapes import misshapen
+from multidrop.fleet.samples.forwarder import Forwarder
+from multidrop.fleet.samples.polled_units import PolledUnits
+from multidrop.fleet.samples.samples_stream import close, connect
+from multidrop.fleet.samples.spool import Spool
+from multidrop.fleet.servers import names
+from multidrop.fleet.servers.connections import ServerPath, paths_of
+from multidrop.fleet.servers.setup import check_buckets, open_all
 from multidrop.fleet.task_end import end_tasks
 from multidrop.supervisor import Ended, supervisor
 

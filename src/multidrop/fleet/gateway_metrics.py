@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
 
 from multidrop import MetricFamily
-from multidrop.fleet.member import MemberState
+from multidrop.fleet.leases.member import MemberState
 
 
 class _Figure(NamedTuple):

@@ -11,13 +11,13 @@ from types import NoneType
 from typing import Any
 
 from multidrop.fleet.errors import FleetError
-from multidrop.fleet.fleet_records import FleetRecords
 from multidrop.fleet.gateway import ask_gateway
-from multidrop.fleet.moves import move_of
-from multidrop.fleet.observer import BELIEVING
-from multidrop.fleet.ownership import owner_of
-from multidrop.fleet.servers import ServerPath
-from multidrop.fleet.setup import check_buckets
+from multidrop.fleet.leases.observer import BELIEVING
+from multidrop.fleet.lines.moves import move_of
+from multidrop.fleet.lines.ownership import owner_of
+from multidrop.fleet.servers.connections import ServerPath
+from multidrop.fleet.servers.fleet_records import FleetRecords
+from multidrop.fleet.servers.setup import check_buckets
 
 MOVES_SHOWN = 20
 MISSED_MS = 30 * 24 * 3600 * 1000  # for which a gateway that did not come back is told as missing

@@ -15,8 +15,8 @@ from multidrop import masked
 from multidrop.fleet.task_end import end_tasks
 
 if TYPE_CHECKING:
-    from multidrop.fleet.fleet_commands import FleetCommands
-    from multidrop.fleet.servers import ServerPath
+    from multidrop.fleet.commands.fleet_commands import FleetCommands
+    from multidrop.fleet.servers.connections import ServerPath
     from multidrop.fleet.watching import FleetWatch
 
 EXAMPLE = "nats://127.0.0.1:4222"
@@ -134,10 +134,10 @@ def build(settings: FleetSettings, inside: HasFolder) -> FleetPart:
 
     Raises ImportError without NATS' client, OSError or ValueError for files that are none.
     """
-    from multidrop.fleet.credentials import connect_options
-    from multidrop.fleet.fleet_commands import FleetCommands
+    from multidrop.fleet.commands.fleet_commands import FleetCommands
     from multidrop.fleet.overview import FleetView
-    from multidrop.fleet.servers import ServerPath
+    from multidrop.fleet.servers.connections import ServerPath
+    from multidrop.fleet.servers.credentials import connect_options
     from multidrop.fleet.watching import FleetWatch
 
     def options(credentials: str) -> dict[str, Any]:

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from multidrop import read_audit
-from multidrop.gateway.guard import Denied
+from multidrop.gateway.http.guard import Denied
 
 MOST_RECORDS = 200  # of an answer
 

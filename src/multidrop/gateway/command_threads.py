@@ -9,7 +9,7 @@ from functools import partial
 from typing import TypeVar
 
 from multidrop import noted_first, written_by
-from multidrop.gateway.rights import Caller
+from multidrop.gateway.http.rights import Caller
 from multidrop.supervisor import supervisor
 
 COMMAND_S = 60.0  # after which /health says that a command goes on: a stop is repeated for 30 s

@@ -26,12 +26,12 @@ from multidrop import (
     written_before,
 )
 from multidrop.gateway.clock import boottime_ns, monotonic_ns
+from multidrop.gateway.command_results import Told as Told
+from multidrop.gateway.command_results import as_one, denied, failed, not_listed, of_stop
 from multidrop.gateway.command_threads import begin_stop, begin_stops, in_thread
-from multidrop.gateway.drive_works import act_one, stop_by, stop_one, write_one
-from multidrop.gateway.rights import NEVER_THIS_WAY, Caller, May, Right
+from multidrop.gateway.drive_commands import act_one, stop_by, stop_one, write_one
+from multidrop.gateway.http.rights import NEVER_THIS_WAY, Caller, May, Right
 from multidrop.gateway.stops_amid_reload import ChangingLines, drives_of, names_of, stop_meant
-from multidrop.gateway.told import Told as Told
-from multidrop.gateway.told import as_one, denied, failed, not_listed, of_stop
 from multidrop.gateway.verb_rules import STOPPING, VERBS
 
 MOST_AGE_S = 5.0  # of a write or a verb that a network held up; a stop is never too old

@@ -18,27 +18,27 @@ import uvicorn
 
 import multidrop
 from multidrop import Batch, Bus, Ledger, LineError, Plant, Poller
-from multidrop.gateway.alarm_file import AlarmFile
 from multidrop.gateway.clock import boottime_ns, now_and_slept_ns, utc_ms
 from multidrop.gateway.commands import Commands
-from multidrop.gateway.connections import Connections, Watched, WatchedProtocol
-from multidrop.gateway.events import Alarm, Events
-from multidrop.gateway.frames import Frames, frame_of, lost_of
-from multidrop.gateway.guard import MOST_HEAD
-from multidrop.gateway.hub import SILENT, Hub
-from multidrop.gateway.identities import Identities
-from multidrop.gateway.lately import Lately
-from multidrop.gateway.listener import BACKLOG, listen
-from multidrop.gateway.live_parts import LiveParts
-from multidrop.gateway.newcomers import Newcomers
+from multidrop.gateway.http.connections import Connections, Watched, WatchedProtocol
+from multidrop.gateway.http.guard import MOST_HEAD
+from multidrop.gateway.http.identities import Identities
+from multidrop.gateway.http.listener import BACKLOG, listen
+from multidrop.gateway.http.rights import OwnNames, Tokens
+from multidrop.gateway.http.routes import make_app
+from multidrop.gateway.live.alarm_file import AlarmFile
+from multidrop.gateway.live.events import Alarm, Events
+from multidrop.gateway.live.frames import Frames, frame_of, lost_of
+from multidrop.gateway.live.hub import SILENT, Hub
+from multidrop.gateway.live.live_parts import LiveParts
+from multidrop.gateway.live.newcomers import Newcomers
+from multidrop.gateway.live.recent import Lately
+from multidrop.gateway.live.seen_frames import SeenFrames
+from multidrop.gateway.live.side_reads import SideReads
+from multidrop.gateway.live.views import troubles_of
 from multidrop.gateway.reload import ADOPTION_S, Read, Reload
-from multidrop.gateway.rights import OwnNames, Tokens
 from multidrop.gateway.sd_notify import Notifier
-from multidrop.gateway.seen_frames import SeenFrames
 from multidrop.gateway.settings import AUDIT_S, ServeSettings, check_writable
-from multidrop.gateway.side_reads import SideReads
-from multidrop.gateway.views import troubles_of
-from multidrop.gateway.web import make_app
 from multidrop.supervisor import Hung, in_time, supervisor
 
 TAKE_S = 0.1  # between looks for new rows: half of the time between two frames

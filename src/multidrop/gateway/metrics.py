@@ -9,8 +9,8 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 from multidrop import LineStatistics, MetricFamily
-from multidrop.gateway.frames import lost_of
-from multidrop.gateway.hub import FAULT, RUNS, SILENT, STANDS, UNKNOWN, Hub
+from multidrop.gateway.live.frames import lost_of
+from multidrop.gateway.live.hub import FAULT, RUNS, SILENT, STANDS, UNKNOWN, Hub
 
 Sample = tuple[str, Mapping[str, str], float]  # the name's suffix, labels, value
 STATES = (RUNS, STANDS, FAULT, SILENT, UNKNOWN)

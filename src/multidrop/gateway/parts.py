@@ -12,7 +12,7 @@ from typing import Any, NamedTuple, Protocol
 
 from multidrop import Batch, Plant
 from multidrop.gateway.commands import Commands
-from multidrop.gateway.hub import Hub
+from multidrop.gateway.live.hub import Hub
 
 
 class Part(NamedTuple):
@@ -27,8 +27,8 @@ class Part(NamedTuple):
 PARTS: Mapping[str, Part] = {
     "fleet": Part("multidrop.fleet.page_part", "FleetSettings", "build", "fleet"),
     "history": Part("multidrop.gateway.historian", "HistorySettings", "build", "history"),
-    "modbus": Part("multidrop.gateway.modbus_server", "ModbusSettings", "build", ""),
-    "mqtt": Part("multidrop.gateway.mqtt", "MqttSettings", "build", "mqtt"),
+    "modbus": Part("multidrop.gateway.modbus_server.server", "ModbusSettings", "build", ""),
+    "mqtt": Part("multidrop.gateway.mqtt.part", "MqttSettings", "build", "mqtt"),
 }
 
 # Registers past the table of a drive, by name: function, first address, number, and seconds it may wait.

@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import Any
 
 from multidrop import MAY_LISTS, Key, Plant, PlantError, TomlPlace, check_listed
+from multidrop.gateway.http.rights import May, Right, Token, is_loopback, read_tokens
 from multidrop.gateway.parts import PARTS, Part, settings_class
-from multidrop.gateway.rights import May, Right, Token, is_loopback, read_tokens
 from multidrop.supervisor import Hung, in_time
 
 LISTEN = "127.0.0.1:8750"

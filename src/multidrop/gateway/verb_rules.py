@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import NamedTuple
 
-from multidrop.gateway.rights import Right
+from multidrop.gateway.http.rights import Right
 
 
 class VerbRule(NamedTuple):

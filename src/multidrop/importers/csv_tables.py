@@ -11,7 +11,7 @@ import re
 from collections.abc import Mapping
 from fractions import Fraction
 
-from multidrop.family_file.addresses import Counting
+from multidrop.families.files.addresses import Counting
 from multidrop.importers import neuron
 from multidrop.importers.device import ImportedDevice, ImportedRegister, unit_address
 from multidrop.importers.modpoll import read_modpoll

@@ -12,7 +12,7 @@ from typing import Any
 
 from multidrop.drive.fact_check import UNIT_IDS
 from multidrop.drive.family import TAKEN_NAMES
-from multidrop.family_file.names import OF_ENUMERATIONS, unusable
+from multidrop.families.files.names import OF_ENUMERATIONS, unusable
 from multidrop.importers.line_settings import UNKNOWN_LINE, LineSettings
 
 WRITTEN = "it is written there; what a write does is not known here"

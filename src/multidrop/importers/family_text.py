@@ -7,8 +7,8 @@ from collections.abc import Iterator
 from typing import Any
 
 from multidrop.drive.line_facts import SERIAL_ADDRESSES
-from multidrop.family_file.addresses import sent_as
-from multidrop.family_file.csv_table import MOST_BYTES
+from multidrop.families.files.addresses import sent_as
+from multidrop.families.files.csv_table import MOST_BYTES
 from multidrop.importers.device import ImportedDevice, ImportedRegister
 from multidrop.importers.line_settings import UNKNOWN_HOST
 from multidrop.printable import printable

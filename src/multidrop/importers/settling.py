@@ -11,9 +11,9 @@ from multidrop.drive.family import TAKEN_NAMES, Drive
 from multidrop.drive.register import Access, Register
 from multidrop.drive.table import HOLDING
 from multidrop.drive.text import Text
-from multidrop.family_file.addresses import Counting
-from multidrop.family_file.registers import MOST_REGISTERS, Declared
-from multidrop.family_file.texts import MOST_TEXTS, texts_of
+from multidrop.families.files.addresses import Counting
+from multidrop.families.files.registers import MOST_REGISTERS, Declared
+from multidrop.families.files.texts import MOST_TEXTS, texts_of
 from multidrop.importers.device import ImportedDevice, ImportedRegister
 from multidrop.importers.family_text import entry_line
 from multidrop.toml_check import TomlPlace, parse_document

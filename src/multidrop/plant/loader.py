@@ -13,9 +13,9 @@ from multidrop.core import RS485, Echo, TransactionIds
 from multidrop.drive.family import Drive
 from multidrop.drive.network import check_port, check_settle, speaks_tcp
 from multidrop.drive.timing import Settings
-from multidrop.drives import MODELS
-from multidrop.drives.registry import find_model
-from multidrop.family_file.errors import FamilyError
+from multidrop.families import MODELS
+from multidrop.families.files.errors import FamilyError
+from multidrop.families.registry import find_model
 from multidrop.plant.drive_names import check_drive_name
 from multidrop.plant.model import Plant, PlantLine, Polled, PolledDrive
 from multidrop.toml_check import Key, TomlPlace, duration_of, read_document

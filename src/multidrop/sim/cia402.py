@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from multidrop.profiles.cia402 import CiA402Control, CiA402Status
+from multidrop.families.profiles.cia402 import CiA402Control, CiA402Status
 from multidrop.sim.profile_drive import ProfileDrive
 
 _COMMANDS = 0x8F  # bits 7 and 3 to 0

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from multidrop.profiles.danfoss_fc import DanfossControl, DanfossStatus
+from multidrop.families.profiles.danfoss_fc import DanfossControl, DanfossStatus
 from multidrop.sim.profile_drive import ProfileDrive
 
 

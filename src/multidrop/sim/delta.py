@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from multidrop.profiles.delta import (
+from multidrop.families.profiles.delta import (
     FORWARD,
     REVERSE,
     RUNNING,

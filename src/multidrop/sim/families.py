@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from multidrop.drive.family import Drive
-from multidrop.drives.delixi_modbus import DelixiModbus
-from multidrop.drives.delixi_native import DelixiNative
-from multidrop.drives.erman_er_g_220 import ErmanERG220
-from multidrop.drives.innovert_ibd import InnovertIBD
-from multidrop.drives.invt_che import InvtCHE
-from multidrop.drives.yd1000 import YD1000
-from multidrop.profiles import CiA402, DanfossFC, Delta, Invt, Optidrive, Profidrive
+from multidrop.families.delixi_modbus import DelixiModbus
+from multidrop.families.delixi_native import DelixiNative
+from multidrop.families.erman_er_g_220 import ErmanERG220
+from multidrop.families.innovert_ibd import InnovertIBD
+from multidrop.families.invt_che import InvtCHE
+from multidrop.families.profiles import CiA402, DanfossFC, Delta, Invt, Optidrive, Profidrive
+from multidrop.families.yd1000 import YD1000
 from multidrop.sim.che import SimulatedCHE
 from multidrop.sim.cia402 import SimulatedCiA402
 from multidrop.sim.danfoss_fc import SimulatedDanfossFC

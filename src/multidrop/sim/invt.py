@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from multidrop.profiles.invt import InvtControl, InvtStatus
+from multidrop.families.profiles.invt import InvtControl, InvtStatus
 from multidrop.sim.memory import MemoryCell
 from multidrop.sim.profile_drive import ProfileDrive
 from multidrop.sim.protocol import Reason, Refusal

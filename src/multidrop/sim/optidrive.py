@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from multidrop.profiles.optidrive import OptidriveControl, OptidriveStatus
+from multidrop.families.profiles.optidrive import OptidriveControl, OptidriveStatus
 from multidrop.sim.profile_drive import ProfileDrive
 
 

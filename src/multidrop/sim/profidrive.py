@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from multidrop.profiles.profidrive import ProfidriveControl, ProfidriveStatus
+from multidrop.families.profiles.profidrive import ProfidriveControl, ProfidriveStatus
 from multidrop.sim.profile_drive import ProfileDrive
 
 _NO_OFF = ProfidriveControl.NO_OFF2 | ProfidriveControl.NO_OFF3

@@ -17,10 +17,10 @@ from multidrop.cli.support.family_sheet import INDENT, sheet
 from multidrop.cli.support.output import print_text, warn
 from multidrop.cli.support.values import counted, wrapped
 from multidrop.drive.family import Drive
-from multidrop.drives import MODELS
-from multidrop.drives.registry import find_model
-from multidrop.family_file.errors import FamilyError
-from multidrop.family_file.loader import load_family
+from multidrop.families import MODELS
+from multidrop.families.files.errors import FamilyError
+from multidrop.families.files.loader import load_family
+from multidrop.families.registry import find_model
 from multidrop.plant.loader import PlantError, load_plant, port_or_address
 from multidrop.toml_check import read_document
 

@@ -45,8 +45,8 @@ from multidrop.core import (
 from multidrop.drive.family import Drive
 from multidrop.drive.network import speaks_tcp
 from multidrop.drive.timing import Settings
-from multidrop.drives.registry import find_model
 from multidrop.errors import LineError
+from multidrop.families.registry import find_model
 from multidrop.planning.blocks import first_block
 from multidrop.plant.model import Plant
 from multidrop.transport.line import Line

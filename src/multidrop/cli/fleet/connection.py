@@ -16,7 +16,7 @@ from multidrop.cli.support.signals import run_loop
 from multidrop.control.eeprom_ledger import default_path
 
 if TYPE_CHECKING:
-    from multidrop.fleet.servers import ServerPath
+    from multidrop.fleet.servers.connections import ServerPath
 
 STATE = "~/.local/state/multidrop/fleet"  # state_folder(), where XDG_STATE_HOME is not set
 
@@ -65,7 +65,7 @@ def run_with_paths(arguments: argparse.Namespace, work: Callable[[list[ServerPat
     """Run an action with three paths to the servers, which are closed afterwards."""
 
     async def with_paths() -> int:
-        from multidrop.fleet.servers import paths_of
+        from multidrop.fleet.servers.connections import paths_of
 
         urls = urls_of(arguments)
         paths = paths_of(urls, nats_options(arguments, urls))

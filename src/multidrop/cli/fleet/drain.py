@@ -14,7 +14,7 @@ from multidrop.cli.support.output import print_text
 from multidrop.cli.support.values import counted
 
 if TYPE_CHECKING:
-    from multidrop.fleet.servers import ServerPath
+    from multidrop.fleet.servers.connections import ServerPath
 
 DRAIN_S = 30.0
 
@@ -26,7 +26,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     require_fleet()
-    from multidrop.fleet.names import checked_name
+    from multidrop.fleet.servers.names import checked_name
 
     checked_name("gateway", arguments.gateway)
     return run_with_paths(arguments, partial(_drain, arguments))
@@ -34,7 +34,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 async def _drain(arguments: argparse.Namespace, paths: list[ServerPath]) -> int:
     from multidrop.fleet.gateway import ask_gateway
-    from multidrop.fleet.setup import check_buckets, open_all
+    from multidrop.fleet.servers.setup import check_buckets, open_all
 
     name = arguments.gateway
     await open_all(paths)

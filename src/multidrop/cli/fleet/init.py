@@ -14,8 +14,8 @@ from multidrop.cli.support.nats import nats_options
 from multidrop.cli.support.output import print_text, warn
 
 if TYPE_CHECKING:
-    from multidrop.fleet.buckets import Record
-    from multidrop.fleet.servers import ServerPath
+    from multidrop.fleet.servers.buckets import Record
+    from multidrop.fleet.servers.connections import ServerPath
 
 
 KEEP = "10 GB"
@@ -39,7 +39,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     require_fleet()
-    from multidrop.fleet.plant_store import read_plant
+    from multidrop.fleet.servers.plant_store import read_plant
     from multidrop.recording.retention import parse_size
 
     keep = parse_size(arguments.keep or KEEP)
@@ -50,11 +50,11 @@ def run(arguments: argparse.Namespace) -> int:
 async def _init(
     arguments: argparse.Namespace, records: dict[str, Record] | None, keep: int, paths: list[ServerPath]
 ) -> int:
-    from multidrop.fleet import names
-    from multidrop.fleet.buckets import Bucket
-    from multidrop.fleet.plant_store import store
-    from multidrop.fleet.samples_stream import close, connect, create_stream
-    from multidrop.fleet.setup import set_up
+    from multidrop.fleet.samples.samples_stream import close, connect, create_stream
+    from multidrop.fleet.servers import names
+    from multidrop.fleet.servers.buckets import Bucket
+    from multidrop.fleet.servers.plant_store import store
+    from multidrop.fleet.servers.setup import set_up
 
     made = await set_up(paths)
     urls = urls_of(arguments)

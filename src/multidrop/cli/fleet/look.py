@@ -23,7 +23,7 @@ from multidrop.cli.support.fleet_tables import (
 from multidrop.cli.support.output import print_text
 
 if TYPE_CHECKING:
-    from multidrop.fleet.servers import ServerPath
+    from multidrop.fleet.servers.connections import ServerPath
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -36,7 +36,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 async def _seen(paths: list[ServerPath]) -> dict[str, Any]:
     from multidrop.fleet.overview import FleetView
-    from multidrop.fleet.setup import open_all
+    from multidrop.fleet.servers.setup import open_all
 
     await open_all(paths)
     view = FleetView(next(one for one in paths if one.is_open))

@@ -13,7 +13,7 @@ from multidrop.cli.support.extras import require_extra
 from multidrop.cli.support.output import print_text, warn
 
 if TYPE_CHECKING:
-    from multidrop.fleet.server_files import TlsFiles
+    from multidrop.fleet.servers.files import TlsFiles
 
 FOLDER = Path("nats")
 
@@ -32,7 +32,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Write the files, and say where each belongs. Secrets are in the files alone, and never printed."""
     require_fleet()
     require_extra("nkeys", "fleet", "fleet rights")
-    from multidrop.fleet.server_files import write_files
+    from multidrop.fleet.servers.files import write_files
 
     gateways = [name.strip() for name in arguments.gateways.split(",") if name.strip()]
     if not gateways:
@@ -54,7 +54,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _tls(arguments: argparse.Namespace, urls: Sequence[str]) -> TlsFiles | None:
-    from multidrop.fleet.server_files import TlsFiles
+    from multidrop.fleet.servers.files import TlsFiles
 
     files = (arguments.cert, arguments.key, arguments.ca)
     secure = next((url for url in urls if url.startswith("tls:")), "TLS" if any(files) else None)

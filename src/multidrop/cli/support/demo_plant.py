@@ -17,8 +17,8 @@ from multidrop.bus import Bus
 from multidrop.cli import main
 from multidrop.cli.support.output import print_text
 from multidrop.cli.support.values import counted
-from multidrop.drives import MODELS
 from multidrop.errors import BadReply, Expired, NoReply, NotDone, Unconfirmed
+from multidrop.families import MODELS
 from multidrop.plant.model import PlantLine
 
 DRIVES = (  # name, model, framing

@@ -17,7 +17,7 @@ from multidrop.drive.register import Access, Register
 from multidrop.drive.table import Carrier, Kept, Table
 from multidrop.drive.text import Text
 from multidrop.drive.verbs import VERBS
-from multidrop.drives.registry import is_users_own
+from multidrop.families.registry import is_users_own
 from multidrop.planning.reading_gain import ReadingGain, reading_gain
 
 INDENT = 16  # of a family's facts

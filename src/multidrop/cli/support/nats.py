@@ -45,7 +45,7 @@ def nats_urls(given: str | None) -> list[str]:
 
 def nats_options(arguments: argparse.Namespace, urls: Sequence[str]) -> dict[str, Any]:
     """Return the options of a connection. Raises ValueError for a file that holds no key."""
-    from multidrop.fleet.credentials import connect_options
+    from multidrop.fleet.servers.credentials import connect_options
 
     logging.getLogger("asyncio").addFilter(_is_news)
     credentials = arguments.credentials or _named(CREDENTIALS)

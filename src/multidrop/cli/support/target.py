@@ -15,7 +15,7 @@ from multidrop.cli.support.plants import add_port_option, is_plant, plant_of
 from multidrop.core import RS485, Echo
 from multidrop.drive.family import Drive
 from multidrop.drive.network import check_port
-from multidrop.drives.registry import find_model
+from multidrop.families.registry import find_model
 from multidrop.plant.drive_names import drive_meant
 from multidrop.printable import plain_number, plain_whole
 

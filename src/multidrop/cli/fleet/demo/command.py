@@ -96,7 +96,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Show it all; 0 where every answer of the drives was found again."""
     require_fleet()
-    from multidrop.fleet.servers import OLDEST
+    from multidrop.fleet.servers.connections import OLDEST
 
     program = server_program(OLDEST)
     stage = Stage()
@@ -170,7 +170,7 @@ class Demo:
 
     async def _watch(self, over: asyncio.Event) -> None:
         from multidrop.fleet.overview import FleetView
-        from multidrop.fleet.servers import ServerPath
+        from multidrop.fleet.servers.connections import ServerPath
         from multidrop.fleet.watching import FleetWatch
 
         path = ServerPath(self._urls.split(","))

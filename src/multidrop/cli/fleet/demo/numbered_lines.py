@@ -13,7 +13,7 @@ import json
 import sys
 
 from multidrop.cli.support.output import print_text
-from multidrop.drives import InnovertIBD
+from multidrop.families import InnovertIBD
 from multidrop.sim import SimulatedDrive, Simulator, Wire, serve
 from multidrop.sim.memory import MemoryCell
 

@@ -1,0 +1,167 @@
+"""Delixi 9200 with RTU firmware (RTU, ASCII) and 9100-SC (ASCII): standard Modbus."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from enum import IntEnum
+from typing import Any
+
+from multidrop.drive import Framing, Refused
+from multidrop.drive.declare import command, setting
+from multidrop.drive.register import Register
+from multidrop.drive.script import Script, insist, read, write
+from multidrop.drive.state import Condition, Direction, State
+from multidrop.drive.table import HOLDING, Kept
+from multidrop.drive.verbs import verb
+from multidrop.families.delixi_parameters import KEYPAD, DelixiBaudrate, DelixiParameters, parameter
+
+
+class DelixiModbusControl(IntEnum):
+    """The words that this library sends: run or jog always with a direction, and never the toggle."""
+
+    NOTHING = 0x00
+    STOP = 0x01
+    FORWARD = 0x12
+    REVERSE = 0x22
+    JOG_FORWARD = 0x13
+    JOG_REVERSE = 0x23
+
+
+class DelixiModbusFormat(IntEnum):
+    """P04.29, in the firmware that speaks standard Modbus."""
+
+    ASCII_7N2 = 0
+    ASCII_7E1 = 1
+    ASCII_7O1 = 2
+    RTU_8N2 = 3
+    RTU_8E1 = 4
+    RTU_8O1 = 5
+
+
+class DelixiModbus(DelixiParameters, table=HOLDING):
+    """Delixi 9200 (RTU firmware) and 9100-SC; RS-485 communication protocol, part 2, standard Modbus.
+
+    The 9200 speaks RTU or ASCII by P04.29, the 9100-SC ASCII only; all others see `delixi-native`.
+    Where the document errs or is silent, the safest reading is taken:
+
+    - The address of a setpoint that is not stored is printed "xxH". The only one known is 0002H
+      (P00.02), which wears the EEPROM: it is written on change only, so do not ramp with it.
+    - Whether a run command without a direction keeps the old one is not stated: both are always
+      sent together. `start` without a direction goes forward from rest; while the motor turns it is
+      refused, because the direction cannot be read. The toggle of the direction is never sent.
+    - Whether a start ends a jog, and a jog a run, is not stated: one that was jogged is to be stopped before
+      a start, and one that turns before a jog.
+    - There is no fault reset, and reserved bits are not tried.
+    - There is no state word: an output frequency of 0 may be a stop, or a run at a setpoint of 0.
+    - "3800" bit/s is 4800; the fault "0C-xx" is OC-2, and 04 is OU.
+    - How many registers may be read at once is not stated: one. Nor are exceptions: any is a refusal.
+    - Timing is taken from part 3.
+
+    P00.00 = 2 takes commands from the line, P00.01 = 1 the setpoint from P00.02. Functions 03 and 06
+    only. Broadcasts may only be run commands.
+    """
+
+    model = "delixi-modbus"
+    title = "Delixi 9200/9100-SC (Modbus)"
+    manual = "Delixi inverters, RS-485 communication protocol, part 2, standard Modbus"
+
+    framings = (Framing.RTU, Framing.ASCII)
+    formats = {  # P04.29
+        Framing.RTU: ("8N2", "8E1", "8O1"),
+        Framing.ASCII: ("7N2", "7E1", "7O1"),
+    }
+    most_registers = {HOLDING: 1}  # in none of its examples more
+    exceptions = {}
+    broadcasts = True
+    identify_recognises = True
+    remote = "P00.00 must be 2 (RS-485), and P00.01 1 (digital setting)"
+
+    control = command(
+        0x2000,
+        DelixiModbusControl,
+        broadcast=(DelixiModbusControl.STOP,),
+        harmless=(DelixiModbusControl.NOTHING, DelixiModbusControl.STOP),
+        place="part 2, section 3: 2000H",
+    )
+    frequency = setting(
+        parameter(0, 2),
+        "Hz",
+        step=0.01,
+        kept=Kept.EEPROM,
+        place="P00.02",
+        note="Every write wears the EEPROM. Used if P00.01 = 1.",
+    )
+    format_setting = setting(parameter(4, 29), DelixiModbusFormat, never=KEYPAD, place="P04.29")
+
+    _jogged = False  # by this object, since it was last seen to stand
+
+    def known_counts(self) -> Mapping[Register[Any], tuple[int, int]]:
+        """Return P04.30, its address, P04.28, its baud rate, and a bus voltage that no address reaches."""
+        known = {self.address_setting: (self.address, self.address), self.dc_bus_voltage: (32, 0xFFFF)}
+        code = DelixiBaudrate.__members__.get(f"B{self.settings.baudrate}", self.address)
+        return known if code == self.address else known | {self.baudrate_setting: (code, code)}
+
+    @verb
+    def identify(self) -> Script[None]:
+        """Check that P04.30 is its address, P04.28 its baud rate, and P05.31 a fault code."""
+        yield from self._shows_its_line()
+        fault = yield from read(self.fault)
+        if not isinstance(fault, type(self.fault.decode(0))):
+            raise Refused(
+                f"{self.name} has {int(fault):04X}H as its present fault (P05.31), which no list explains: "
+                "it may be another make; look at its name plate"
+            )
+
+    @verb
+    def start(self, direction: Direction | None = None) -> Script[None]:
+        """Start at the setpoint in force; without a direction forward, and only from rest."""
+        if self._jogged and not (yield from self._stands()):
+            raise self._stop_first("may still jog, which a start may not end:")
+        forward = yield from self._forward(direction)
+        if (yield from read(self.frequency_source)) != 1:
+            raise Refused(f"{self.name} takes no setpoint from P00.02: set P00.01 to 1 on the keypad")
+        yield from self._setpoint_in_force()
+        self._jogged = False
+        yield from write(
+            self.control, DelixiModbusControl.FORWARD if forward else DelixiModbusControl.REVERSE
+        )
+        yield from self._started(direction)
+
+    @verb
+    def jog(self, direction: Direction | None = None) -> Script[None]:
+        """Turn slowly from rest until stopped; without a direction forward."""
+        forward = yield from self._forward(direction)
+        if not (yield from self._stands()):
+            raise self._stop_first("turns, and may go on through a jog:")
+        self._jogged = True
+        yield from write(
+            self.control, DelixiModbusControl.JOG_FORWARD if forward else DelixiModbusControl.JOG_REVERSE
+        )
+        yield from self._started(direction)
+
+    def _forward(self, direction: Direction | None) -> Script[bool]:
+        yield from self._may_start()
+        if direction is None and not (yield from self._stands()):
+            raise Refused(f"{self.name} turns, and cannot say which way: name the direction")
+        return direction is not Direction.REVERSE
+
+    @verb
+    def stop(self) -> Script[None]:
+        """Stop, which has happened when the output frequency is 0."""
+        yield from insist(self.control, DelixiModbusControl.STOP)
+        yield from self._stopped(self._stands, self._limit())
+
+    @verb
+    def set_frequency(self, hz: float) -> Script[None]:
+        """Write the stored setpoint, on change only."""
+        yield from self._hold(self.frequency, hz)
+
+    @verb
+    def state(self) -> Script[State]:
+        """Report the fault by name, or that the motor turns; at rest the state is unknown."""
+        fault = yield from read(self.fault)
+        if fault:
+            return State(Condition.FAULT, fault=self.fault.in_words(fault))
+        if (yield from self._stands()):
+            return State(Condition.UNKNOWN, note="output frequency 0: stopped, or running at a setpoint of 0")
+        return State(Condition.RUNNING)

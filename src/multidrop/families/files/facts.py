@@ -1,0 +1,196 @@
+"""The section [family]: what the manual says of the line and of the device as a whole."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from multidrop.core import Framing
+from multidrop.drive.fact_check import UNIT_IDS
+from multidrop.drive.line_facts import LONGEST_SILENCE
+from multidrop.drive.read_limits import LONGEST_INTERVAL, STANDARD_LIMITS
+from multidrop.drive.table import Table
+from multidrop.drive.timing import Settings
+from multidrop.families.files.addresses import TABLES, Counting
+from multidrop.families.files.register_keys import WRITES, shown
+from multidrop.toml_check import Key, TomlPlace, duration_of
+
+FAMILY_KEYS = {
+    "title": Key(str, 'title = "Eastron SDM630"', needed=True),
+    "manual": Key(str, 'manual = "SDM630 Modbus protocol, version 2"', needed=True),
+    "counts_from": Key(int, "counts_from = 0, or 1 where the manual's register 1 is sent as 0"),
+    "addresses": Key(list, "addresses = [1, 247]"),
+    "baudrates": Key(list, "baudrates = [9600, 19200]"),
+    "formats": Key((list, dict), 'formats = ["8N1", "8E1"], or { rtu = ["8N1"], ascii = ["7E1"] }'),
+    "framings": Key(list, 'framings = ["rtu"]'),
+    "together": Key(dict, "together = { holding = 80, input = 80 }"),
+    "gaps": Key(dict, "gaps = { input = [0x0000, 0x017F] }"),
+    "read_together": Key(list, 'read_together = [["energy_high", "energy_low"]]'),
+    "silence": Key(str, 'silence = "5 ms"'),
+    "least_interval": Key(str, 'least_interval = "100 ms"'),
+    "response_delay": Key(str, 'response_delay = "10 ms"'),
+    "response_timeout": Key(str, 'response_timeout = "500 ms"'),
+    "turnaround_delay": Key(str, 'turnaround_delay = "100 ms"'),
+    "remote": Key(str, 'remote = "F0-02 must be 2"'),
+    "line_parameters": Key(str, 'line_parameters = "F8-00 baud rate, F8-02 address"'),
+    "watchdog": Key(str, 'watchdog = "F8-04: stops after 5 s without a request; off from the factory"'),
+    "exceptions": Key(dict, 'exceptions = { 1 = "illegal function", 0x80 = "locked" }'),
+    "write": Key(str, 'write = "single" (function 06H) or "multiple" (10H)'),
+    "registers": Key(list, 'registers = ["meter.csv"]'),
+    "profile": Key(str, 'profile = "profidrive"'),
+    "note": Key(str, 'note = "Further facts."'),
+}
+_TEXTS = {"title": "title", "manual": "manual", "remote": "remote", "watchdog": "watchdog"}
+_TEXTS |= {"line_parameters": "line_parameters", "note": "__doc__"}
+_DURATIONS = ("silence", "least_interval", "response_delay", "response_timeout", "turnaround_delay")
+MOST_TOGETHER = {name: STANDARD_LIMITS[table.carrier] for name, table in TABLES.items()}
+LONGEST_WAIT = 10.0  # s; a stop of any drive on the line may have to wait for it
+_LONGEST = {"silence": LONGEST_SILENCE, "least_interval": LONGEST_INTERVAL}  # s
+
+
+def facts_of(given: Mapping[str, Any], counting: Counting, place: TomlPlace) -> dict[str, Any]:
+    """Return the attributes of the class; each wrong value is a sentence."""
+    facts: dict[str, Any] = {_TEXTS[key]: given[key] for key in _TEXTS if key in given}
+    for key in _DURATIONS:
+        seconds = duration_of(given, key, place)
+        most = _LONGEST.get(key, LONGEST_WAIT)
+        if seconds is not None and seconds > most:
+            place.wrong(f"{key} = {given[key]!r} is more than {most:g} s; write {FAMILY_KEYS[key].example}")
+        elif seconds is not None:
+            facts[key] = seconds
+    for key, make in _MAKERS.items():
+        if key in given and (made := place.attempt(_made, make, key, given[key])) is not None:
+            facts[key] = made
+    facts |= _by_table(given, counting, place)
+    if "formats" in facts:
+        facts["formats"] = _by_framing(facts["formats"], facts.get("framings", (Framing.RTU,)), place)
+    if given.get("write", WRITES[0]) not in WRITES:
+        place.wrong(f"write = {given['write']!r} is not right; write {FAMILY_KEYS['write'].example}")
+    return facts
+
+
+def _made(make: Callable[[Any], Any], key: str, value: Any) -> Any:
+    try:
+        return make(value)
+    except ValueError as mistake:
+        raise ValueError(f"{key} = {shown(value)}: {mistake}; write {FAMILY_KEYS[key].example}") from None
+
+
+def _is_whole(value: Any) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool)
+
+
+def _unit_addresses(value: list[Any]) -> range:
+    least, most = UNIT_IDS[0], UNIT_IDS[-1]
+    if len(value) != 2 or not all(map(_is_whole, value)) or not least <= value[0] <= value[1] <= most:
+        raise ValueError(
+            f"not the first and the last address, from 1 to 247 ({least} to {most} on Modbus TCP)"
+        )
+    return range(value[0], value[1] + 1)
+
+
+def _baudrates(value: list[Any]) -> tuple[int, ...]:
+    for each in value:
+        if not _is_whole(each):
+            raise ValueError(f"{shown(each)} is no baud rate")
+        Settings(each, "8N1")
+    return tuple(dict.fromkeys(value))
+
+
+def _formats(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {name: _formats(formats) for name, formats in value.items()}
+    if not isinstance(value, list) or not value:
+        raise ValueError(f"{shown(value)} is no list of formats")
+    for each in value:
+        if not isinstance(each, str):
+            raise ValueError(f"{shown(each)} is no format")
+        Settings(9600, each)
+    return tuple(dict.fromkeys(value))
+
+
+def _by_framing(formats: Any, framings: tuple[Framing, ...], place: TomlPlace) -> dict[Framing, Any]:
+    """Return the formats of each framing; an RTU frame has characters of 8 bits."""
+    found = dict.fromkeys(framings, formats)
+    if isinstance(formats, dict):
+        named = {str(framing): framing for framing in framings}
+        for name in [name for name in formats if name not in named]:
+            place.wrong(f"formats has {name!r}, which is none of its framings: {', '.join(named)}")
+        for name in [name for name in named if name not in formats]:
+            place.wrong(f'formats has none for {name}; add {name} = ["8N1"]')
+        found = {framing: formats.get(name, ("8N1",)) for name, framing in named.items()}
+    for format in found.get(Framing.RTU, ()):
+        if format[0] != "8":
+            place.wrong(f'formats has "{format}", and an RTU frame needs 8 data bits; write "8{format[1:]}"')
+    return found
+
+
+def _framings(value: list[Any]) -> tuple[Framing, ...]:
+    known = {str(framing): framing for framing in (Framing.RTU, Framing.ASCII)}
+    wrong = [each for each in value if not isinstance(each, str) or each.lower() not in known]
+    if wrong:
+        raise ValueError(f"{shown(wrong[0])} is none of {', '.join(known)}")
+    return tuple(dict.fromkeys(known[each.lower()] for each in value))
+
+
+def _exceptions(value: dict[str, Any]) -> dict[int, str]:
+    found = {}
+    for code, meaning in value.items():
+        digits = code[:-1] if code[-1:] in ("h", "H") else code
+        try:
+            number = int(digits, 16 if digits != code else 0) if code.isalnum() and code.isascii() else 0
+        except ValueError:
+            raise ValueError(f"{code!r} is no exception code") from None
+        if not 1 <= number <= 255 or not isinstance(meaning, str) or not meaning.isprintable():
+            raise ValueError(f"{code} = {shown(meaning)} is no code from 1 to 255 with its meaning")
+        found[number] = meaning
+    return found
+
+
+def _read_together(value: list[Any]) -> tuple[tuple[str, ...], ...]:
+    for group in value:
+        if not isinstance(group, list) or not group or not all(isinstance(name, str) for name in group):
+            raise ValueError(f"{shown(group)} is no list of registers' names")
+    return tuple(map(tuple, value))
+
+
+_MAKERS: Mapping[str, Callable[[Any], Any]] = {
+    "addresses": _unit_addresses,
+    "baudrates": _baudrates,
+    "formats": _formats,
+    "framings": _framings,
+    "exceptions": _exceptions,
+    "read_together": _read_together,
+}
+
+
+def _by_table(given: Mapping[str, Any], counting: Counting, place: TomlPlace) -> dict[str, Any]:
+    """Return how many registers of each table are read together, and across which gaps."""
+    most: dict[Table, int] = {}
+    gaps: dict[Table, range] = {}
+    for key in ("together", "gaps"):
+        for table, value in given.get(key, {}).items():
+            if table not in TABLES:
+                place.wrong(f"{key} has {table!r}, which is no table; write {', '.join(TABLES)}")
+            elif key == "together":
+                if _is_whole(value) and 1 <= value <= MOST_TOGETHER[table]:
+                    most[TABLES[table]] = value
+                else:
+                    most_of = f"1 to {MOST_TOGETHER[table]}"
+                    place.wrong(f"together: {table} = {shown(value)} is not {most_of} registers in one read")
+            elif (span := place.attempt(_gap, table, value, counting)) is not None:
+                gaps[TABLES[table]] = span
+    named: dict[str, Any] = {"most_registers": most, "readable_gaps": gaps}
+    return {key: value for key, value in named.items() if value}
+
+
+def _gap(table: str, value: Any, counting: Counting) -> range | None:
+    if not isinstance(value, list) or len(value) != 2:
+        raise ValueError(f"gaps: {table} = {shown(value)} is not its first and last address")
+    try:
+        first, last = (counting.address(end, table, table)[0] for end in value)
+    except ValueError as mistake:
+        raise ValueError(f"gaps: {table}: {mistake}") from None
+    if first > last:
+        raise ValueError(f"gaps: {table} = {shown(value)} is the wrong way round: the lowest comes first")
+    return range(first, last + 1)

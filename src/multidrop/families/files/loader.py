@@ -1,0 +1,233 @@
+"""Load a family from its file: every mistake is found before anything is made of it. No code is executed."""
+
+from __future__ import annotations
+
+import difflib
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from multidrop.drive.declaration_check import DeclarationError, declaration_errors
+from multidrop.drive.family import TAKEN_NAMES, Drive
+from multidrop.drive.register import Access
+from multidrop.families.files.addresses import Counting
+from multidrop.families.files.csv_table import MOST_BYTES, beside, declare_rows
+from multidrop.families.files.errors import FamilyError
+from multidrop.families.files.facts import FAMILY_KEYS, facts_of
+from multidrop.families.files.identity import identify_by, proofs_of
+from multidrop.families.files.options import options_of
+from multidrop.families.files.register_keys import shown
+from multidrop.families.files.registers import MOST_REGISTERS, Declared, defaults_of
+from multidrop.families.files.texts import texts_of
+from multidrop.toml_check import TomlPlace, parse_document
+
+SECTIONS = ("family", "default", *(access.value for access in Access), "text", "option", "identify")
+MOST_MISTAKES = 200
+MOST_CSV_FILES = 20
+
+
+@dataclass(frozen=True)
+class _Loaded:
+    """A family, and the bytes of the files that it was made of."""
+
+    files: Mapping[Path, bytes]
+    family: type[Drive]
+
+
+_loaded: dict[Path, _Loaded] = {}
+
+
+def load_family(path: Path | str) -> type[Drive]:
+    """Return the family that a TOML file declares: a subclass of `Drive`.
+
+    The same file is the same class as long as what it says stays the same. Its `model` is the file's name.
+    Raises FamilyError with all that is wrong with the file, and with the CSV files that it names.
+    """
+    path = Path(path)
+    place = TomlPlace(path)
+    whole = path.resolve()
+    known = _loaded.get(whole)
+    if known is not None and all(_same(file, data) for file, data in known.files.items()):
+        return known.family
+    files: dict[Path, bytes] = {}
+    data = place.attempt(_bytes, path, "family's file")
+    document = None if data is None else place.attempt(parse_document, data)
+    if data is None or document is None:
+        raise FamilyError(tuple(place.config_errors))
+    files[whole] = data
+    family = _family(document, path, place, files)
+    if family is None:
+        raise FamilyError(_at_most(place))
+    _loaded[whole] = _Loaded(files, family)
+    return family
+
+
+def _same(file: Path, data: bytes) -> bool:
+    try:
+        return _bytes(file, "family's file") == data
+    except ValueError:
+        return False
+
+
+def _bytes(path: Path, what: str) -> bytes:
+    """Return a file's bytes; ValueError, without the path, for what is no file or too long."""
+    try:
+        if not path.is_file():
+            other = "is no file, but a directory or a device; name a file" if path.exists() else ""
+            raise ValueError(other or "there is no such file")
+        with path.open("rb") as file:
+            data = file.read(MOST_BYTES + 1)
+    except OSError as failure:
+        raise ValueError(f"the {what} cannot be read: {failure.strerror}") from failure
+    if len(data) > MOST_BYTES:
+        raise ValueError(f"the {what} has more than {MOST_BYTES} bytes")
+    return data
+
+
+def _at_most(place: TomlPlace) -> tuple[str, ...]:
+    left = len(place.config_errors) - MOST_MISTAKES
+    if left > 0:
+        del place.config_errors[MOST_MISTAKES:]
+        place.wrong(f"{left} more mistakes are not told; mend these first")
+    return tuple(place.config_errors)
+
+
+# ---- the document ----
+
+
+def _family(
+    document: Mapping[str, Any], path: Path, place: TomlPlace, files: dict[Path, bytes]
+) -> type[Drive] | None:
+    """Return the class; None where anything is wrong."""
+    if "line" in document:
+        place.wrong("is a plant file, as its [[line]] says; name a drive of it, as PLANT.toml DRIVE")
+        return None
+    _check_sections(document, place)
+    of_family = place.within("[family]")
+    of_document = document.get("family", {})
+    given = of_family.check(of_document, FAMILY_KEYS)
+    counting = Counting(_counts_from(given, of_family))
+    facts = facts_of(given, counting, of_family)
+    defaults = defaults_of(document.get("default", {}), place.within("[default]"))
+    declared = Declared(counting, defaults, given.get("write", "single"))
+    for access in Access:
+        declared.section(access, document.get(access.value, {}), place)
+    _add_csv(given.get("registers", []), declared, path, of_family, files)
+    if counting.assumed and isinstance(of_document, dict) and "counts_from" not in of_document:
+        of_family.wrong(
+            f"'counts_from' is missing, and {shown(counting.assumed[0])} is a number; add counts_from = 0 "
+            "where the manual's numbers are sent as they are, or 1 where its register 1 is sent as 0"
+        )
+    texts = texts_of(document.get("text", {}), counting, declared.places, place)
+    options = options_of(document.get("option", {}), declared.places, place)
+    if not declared.places and not document.get("text") and not given.get("registers"):
+        place.wrong("declares no register; add [reading] and NAME = { at = 0x0010 }")
+    if len(declared.places) > MOST_REGISTERS:
+        place.wrong(f"declares more than {MOST_REGISTERS} registers; leave out those that nobody reads")
+        return None
+    namespace: dict[str, Any] = {
+        "__module__": __name__,
+        "model": path.name,
+        "declared_in": path.name,
+        "options": options,
+        "broadcasts": any(register.broadcast for register in declared.registers.values()),
+        **facts,
+        **declared.registers,
+        **texts,
+    }
+    if "identify" in document:
+        proofs = proofs_of(document["identify"], declared.registers, place)
+        namespace["identity_proofs"], namespace["identify"] = proofs, identify_by(proofs)
+    return _made(_base(given.get("profile"), of_family), namespace, declared, place)
+
+
+def _base(profile: str | None, place: TomlPlace) -> type[Drive]:
+    """Return the class that the family derives from: a profile's, which then has all of its verbs."""
+    if profile is None:
+        return Drive
+    from multidrop.families.profiles import PROFILES  # few files name one
+
+    if profile not in PROFILES:
+        near = difflib.get_close_matches(profile, PROFILES, n=1)
+        hint = f"did you mean {near[0]}?" if near else f"there are {', '.join(PROFILES)}"
+        place.wrong(f"profile = {shown(profile)} is not known; {hint}")
+    return PROFILES.get(profile, Drive)
+
+
+def _check_sections(document: Mapping[str, Any], place: TomlPlace) -> None:
+    sections = dict.fromkeys(SECTIONS)
+    if "verb" in document:
+        place.wrong("[verb] is not supported; name a profile, or write the drive as a Python class")
+        document = {name: table for name, table in document.items() if name != "verb"}
+    if unknown := {name: None for name in document if name not in SECTIONS}:
+        place.unknown(unknown, sections)
+    if "family" not in document:
+        place.wrong("has no [family]; add it, with the title and the manual")
+
+
+def _counts_from(given: Mapping[str, Any], place: TomlPlace) -> int | None:
+    number = given.get("counts_from")
+    if number not in (None, 0, 1):
+        place.wrong(f"counts_from = {number} is not right; write {FAMILY_KEYS['counts_from'].example}")
+        return None
+    return number
+
+
+def _add_csv(
+    names: list[Any], declared: Declared, path: Path, place: TomlPlace, files: dict[Path, bytes]
+) -> None:
+    if len(names) > MOST_CSV_FILES:
+        place.wrong(f"registers names {len(names)} files, and {MOST_CSV_FILES} are the most")
+        return
+    for name in names:
+        table = place.attempt(beside, path, name)
+        data = None if table is None else place.attempt(_named_bytes, table)
+        if table is not None and data is not None:
+            files[table.resolve()] = data
+            declare_rows(data, declared, place.of_file(table))
+
+
+def _named_bytes(table: Path) -> bytes:
+    try:
+        return _bytes(table, "table of registers")
+    except ValueError as mistake:
+        raise ValueError(f'registers = ["{table.name}"]: {mistake}') from None
+
+
+# ---- the class ----
+
+
+def _made(
+    base: type[Drive], namespace: dict[str, Any], declared: Declared, place: TomlPlace
+) -> type[Drive] | None:
+    """Return the class of this namespace; None where anything in the file is wrong."""
+    broken = declared.places.keys() - declared.registers.keys()
+    if place.config_errors:
+        bounds = {*namespace["options"], *broken}
+        _tell(declaration_errors(declared.registers, TAKEN_NAMES, bounds), declared, place)
+        roles = getattr(base, "role_mistakes", None)
+        mistakes = roles(declared.registers) if roles else []
+        _tell([one for one in mistakes if one.partition(":")[0] not in broken], declared, place)
+        return None
+    try:
+        return type(_class_name(place.path), (base,), namespace)
+    except DeclarationError as wrong:
+        _tell(wrong.mistakes, declared, place)
+        return None
+
+
+def _tell(mistakes: Any, declared: Declared, place: TomlPlace) -> None:
+    """Report mistakes of declarations at the places of their registers."""
+    for mistake in mistakes:
+        name, _, sentence = mistake.partition(": ")
+        if name in declared.places:
+            declared.places[name].wrong(sentence)
+        else:
+            place.within("[family]").wrong(mistake)
+
+
+def _class_name(path: Path) -> str:
+    name = "".join(word.capitalize() for word in re.findall(r"[A-Za-z0-9]+", path.stem))
+    return name if name[:1].isalpha() else f"Family{name}"

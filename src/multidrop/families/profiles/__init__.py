@@ -1,0 +1,37 @@
+"""Profiles: state machines that many makes share; a family adds the addresses of its registers.
+
+A family is a class that derives from one of these and declares the registers that the profile names, or a
+file with `profile = "…"`.
+"""
+
+from collections.abc import Mapping
+
+from multidrop.families.profiles.cia402 import CiA402
+from multidrop.families.profiles.danfoss_fc import DanfossFC
+from multidrop.families.profiles.delta import Delta
+from multidrop.families.profiles.invt import Invt
+from multidrop.families.profiles.optidrive import Optidrive
+from multidrop.families.profiles.profidrive import Profidrive
+from multidrop.families.profiles.profile import Profile
+from multidrop.families.profiles.role import Role
+
+__all__ = [
+    "PROFILES",
+    "CiA402",
+    "DanfossFC",
+    "Delta",
+    "Invt",
+    "Optidrive",
+    "Profidrive",
+    "Profile",
+    "Role",
+]
+
+PROFILES: Mapping[str, type[Profile]] = {
+    "profidrive": Profidrive,
+    "cia402": CiA402,
+    "danfoss-fc": DanfossFC,
+    "delta": Delta,
+    "invt": Invt,
+    "optidrive": Optidrive,
+}

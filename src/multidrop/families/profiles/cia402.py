@@ -1,0 +1,121 @@
+"""CiA 402 (IEC 61800-7-201): the control word of Schneider's Altivar, Lenze's i500 and others."""
+
+from __future__ import annotations
+
+from enum import IntFlag
+from functools import partial
+from typing import ClassVar
+
+from multidrop.drive import NotDone, Refused
+from multidrop.drive.register import Access
+from multidrop.drive.script import Script, insist, until
+from multidrop.drive.state import Condition, Direction
+from multidrop.families.profiles.profile import Profile
+from multidrop.families.profiles.role import COMMON, Role
+
+READY_TIME = 1.0  # s, for each step up to "switched on"
+
+
+class CiA402Control(IntFlag):
+    """6040H: bits 0 to 3 and 7 are the standard's; all others are each make's own."""
+
+    SWITCH_ON = 1 << 0
+    ENABLE_VOLTAGE = 1 << 1
+    NO_QUICK_STOP = 1 << 2
+    ENABLE_OPERATION = 1 << 3
+    RESET = 1 << 7  # from 0 to 1
+
+
+class CiA402Status(IntFlag):
+    """6041H: bits 0 to 7, 9 and 10 are the standard's."""
+
+    READY_TO_SWITCH_ON = 1 << 0
+    SWITCHED_ON = 1 << 1
+    OPERATION_ENABLED = 1 << 2
+    FAULT = 1 << 3
+    VOLTAGE_ENABLED = 1 << 4
+    NO_QUICK_STOP = 1 << 5
+    SWITCH_ON_DISABLED = 1 << 6
+    WARNING = 1 << 7
+    BIT_8 = 1 << 8
+    REMOTE = 1 << 9
+    AT_REFERENCE = 1 << 10
+    BIT_11 = 1 << 11
+    BIT_12 = 1 << 12
+    BIT_13 = 1 << 13
+    BIT_14 = 1 << 14
+    BIT_15 = 1 << 15
+
+
+DISABLE_VOLTAGE, SHUTDOWN, SWITCH_ON, ENABLE, RESET = 0x0000, 0x0006, 0x0007, 0x000F, 0x0087
+MASK, SHORT_MASK = 0x6F, 0x4F  # the bits that tell the states; without the quick stop's
+NOT_READY, SWITCH_ON_DISABLED, FAULT_REACTION, FAULT = 0x00, 0x40, 0x0F, 0x08  # under the short mask
+READY, SWITCHED_ON, ENABLED, QUICK_STOP = 0x21, 0x23, 0x27, 0x07  # under the mask
+_UP = ((SHUTDOWN, READY, "ready to be switched on"), (SWITCH_ON, SWITCHED_ON, "switched on"))
+
+
+class CiA402(Profile):
+    """The state machine of CiA 402: 6, 7, 15 start; 7 stops along the ramp; 0 coasts; bit 7 resets.
+
+    - The stop is "disable operation", 0007H, whose factory setting is the ramp, and which never starts: a
+      drive that is ready to be switched on is switched on by it and stands. "Shutdown", 0006H, coasts or
+      ramps by each drive's setting.
+    - The reset is 0080H with 0007H; without bit 3 it enables nothing.
+    - The standard has no direction for frequency drives. A family may declare a bit of its own,
+      `bits = { reverse = 11 }`; without it a direction is refused.
+    - The remote bit 9 must be set, which says that the drive takes the word from the line.
+    """
+
+    stop_word: ClassVar[int] = SWITCH_ON
+    coast_word: ClassVar[int | None] = DISABLE_VOLTAGE
+    reset_word: ClassVar[int] = RESET
+    roles = {
+        **COMMON,
+        "control": Role(
+            (Access.COMMAND,),
+            values=CiA402Control,
+            harmless=(DISABLE_VOLTAGE, SHUTDOWN, SWITCH_ON),
+            never_together=(CiA402Control.RESET | CiA402Control.ENABLE_OPERATION,),
+            extra=("reverse",),
+        ),
+        "status": Role((Access.READING,), values=CiA402Status),
+    }
+
+    def _impossible(self, status: int) -> str:
+        if status & SHORT_MASK in (NOT_READY, SWITCH_ON_DISABLED, FAULT_REACTION, FAULT):
+            return ""
+        known = status & MASK in (READY, SWITCHED_ON, ENABLED, QUICK_STOP)
+        return "" if known else "it is none of the states of CiA 402"
+
+    def _is_tripped(self, status: int) -> bool:
+        return bool(status & CiA402Status.FAULT)
+
+    def _turns(self, status: int) -> bool:
+        return bool(status & CiA402Status.OPERATION_ENABLED)
+
+    def _condition(self, status: int) -> Condition:
+        return Condition.DECELERATING if status & MASK == QUICK_STOP else super()._condition(status)
+
+    def _not_ready(self, status: int) -> str:
+        return "" if status & CiA402Status.REMOTE else "does not take its commands from the line"
+
+    def _start_word(self, direction: Direction | None, status: int) -> int:
+        reverse = {member.name: int(member) for member in self.control.values or ()}.get("REVERSE", 0)
+        if direction is not None and not reverse:
+            raise Refused(
+                f"{self.name}: the standard has no direction, and its family declares no bit for it; "
+                "start without a direction"
+            )
+        if direction is None and reverse and self._turns(status):
+            raise Refused(f"{self.name} turns, and cannot say which way: name the direction")
+        return ENABLE | reverse if direction is Direction.REVERSE else ENABLE
+
+    def _prepare(self, status: int) -> Script[None]:
+        for word, state, words in _UP:
+            yield from insist(self.control, self._word(word))
+            if not (yield from until(partial(self._is_in, state), limit=READY_TIME)):
+                why = f"after {READY_TIME:g} s it is not {words}"
+                raise NotDone(self.name, "the start", f"{why}; {self.remote}")
+
+    def _is_in(self, state: int) -> Script[bool]:
+        return (yield from self._status()) & MASK == state

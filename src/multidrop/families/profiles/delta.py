@@ -1,0 +1,135 @@
+"""Delta's words at 2000H, 2002H, 2100H and 2101H, which several makes have copied."""
+
+from __future__ import annotations
+
+from enum import IntEnum, IntFlag
+from typing import ClassVar
+
+from multidrop.drive.register import Access
+from multidrop.drive.script import Script, read, write
+from multidrop.drive.state import Condition, Direction
+from multidrop.drive.verbs import verb
+from multidrop.families.profiles.profile import Profile
+from multidrop.families.profiles.role import COMMON, READING, Role
+
+STOPPED, STOPPING, STANDBY, RUNNING = range(4)  # bits 1 and 0 of the status
+FORWARD, TO_FORWARD, TO_REVERSE, REVERSE = range(4)  # bits 4 and 3
+
+
+class DeltaControl(IntEnum):
+    """2000H: CP2000 manual p. 12.1-09-8, MS300 p. 788. Run and jog have a direction, never the toggle."""
+
+    NOTHING = 0x00
+    STOP = 0x01
+    FORWARD = 0x12
+    REVERSE = 0x22
+    JOG_FORWARD = 0x13
+    JOG_REVERSE = 0x23
+
+
+class DeltaReset(IntEnum):
+    """2002H: bit 1 clears a fault (MS300 manual p. 789). Bits 0 and 2, a fault and a block, are never set."""
+
+    NOTHING = 0
+    RESET = 2
+
+
+class DeltaStatus(IntFlag):
+    """2101H: MS300 manual p. 790, VFD-EL-W p. 4-83 and 4-84."""
+
+    RUN_LAMP_0 = 1 << 0
+    RUN_LAMP_1 = 1 << 1
+    JOGS = 1 << 2
+    REVERSE_LAMP_0 = 1 << 3
+    REVERSE_LAMP_1 = 1 << 4
+    BIT_5 = 1 << 5
+    BIT_6 = 1 << 6
+    BIT_7 = 1 << 7
+    REFERENCE_BY_LINE = 1 << 8
+    REFERENCE_BY_TERMINAL = 1 << 9
+    COMMANDED_BY_LINE = 1 << 10
+    LOCKED = 1 << 11
+    COPIES = 1 << 12
+    BIT_13 = 1 << 13
+    BIT_14 = 1 << 14
+    BIT_15 = 1 << 15
+
+
+RESERVED = 0xE000  # bits 13 to 15, of every manual
+
+
+class Delta(Profile):
+    """Delta's words: 1 stops, 12H and 22H run forward and in reverse, and a register of its own resets.
+
+    - `fault` is needed: the status shows no fault. Its low byte counts; the high byte of newer drives is a
+      warning.
+    - The direction is sent with every run, and the toggle of both bits never.
+    - 2002H holds its bits. It is written 2 once and 0 again, or a later fault would reset itself. Bit 2, the
+      base block, lets the motor go on where it was when it is taken back: a stop comes before.
+    - Bit 10 of the status says that the drive takes its commands from the line; a start needs it.
+    - There is no word that coasts.
+    """
+
+    stop_word: ClassVar[int] = DeltaControl.STOP
+    reset_word: ClassVar[int] = DeltaReset.RESET
+    reset_role: ClassVar[str] = "reset"
+    roles = {
+        **COMMON,
+        "control": Role((Access.COMMAND,), values=DeltaControl, harmless=(0, DeltaControl.STOP)),
+        "reset": Role((Access.COMMAND,), values=DeltaReset, harmless=()),
+        "status": Role((Access.READING,), values=DeltaStatus),
+        "fault": READING,
+    }
+
+    def _impossible(self, status: int) -> str:
+        return "its reserved bits are set" if status & RESERVED else ""
+
+    def _code(self) -> Script[int]:
+        return int((yield from read(self.register("fault")))) & 0xFF
+
+    def _tripped(self, status: int) -> Script[bool]:
+        return (yield from self._code()) != 0
+
+    def _fault(self) -> Script[str]:
+        register = self.register("fault")
+        code = yield from self._code()
+        return register.format(register.decode(code)) if register.values is not None else f"code {code}"
+
+    def _turns(self, status: int) -> bool:
+        return status & 3 != STOPPED
+
+    def _condition(self, status: int) -> Condition:
+        return Condition.DECELERATING if status & 3 == STOPPING else super()._condition(status)
+
+    def _not_ready(self, status: int) -> str:
+        return "" if status & DeltaStatus.COMMANDED_BY_LINE else "does not take its commands from the line"
+
+    def _direction(self, status: int) -> Direction | None:
+        shown = status >> 3 & 3
+        return Direction.REVERSE if shown in (TO_REVERSE, REVERSE) else Direction.FORWARD
+
+    def _turns_in(self, direction: Direction) -> Script[bool]:
+        """Return True if it turns so, and is not still about to: both lamps of the direction are alike."""
+        shown = (yield from self._status()) >> 3 & 3
+        return shown in (FORWARD, REVERSE) and (yield from super()._turns_in(direction))
+
+    def _reverse(self, direction: Direction | None, status: int) -> bool:
+        if direction is None:
+            return self._turns(status) and self._direction(status) is Direction.REVERSE
+        return direction is Direction.REVERSE
+
+    def _start_word(self, direction: Direction | None, status: int) -> int:
+        return DeltaControl.REVERSE if self._reverse(direction, status) else DeltaControl.FORWARD
+
+    @verb
+    def jog(self, direction: Direction | None = None) -> Script[None]:
+        """Turn slowly from rest until stopped; without a direction, forward."""
+        status = yield from self._status()
+        yield from self._may_jog(status)
+        reverse = self._reverse(direction, status)
+        word = DeltaControl.JOG_REVERSE if reverse else DeltaControl.JOG_FORWARD
+        yield from write(self.control, self._word(word))
+        yield from self._started(direction)
+
+    def _take_reset_back(self) -> Script[None]:
+        yield from write(self.register("reset"), DeltaReset.NOTHING)

@@ -1,0 +1,131 @@
+"""INVT's words 1, 2, 5, 7, which several makes have copied."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from contextlib import suppress
+from enum import IntEnum
+from typing import ClassVar
+
+from multidrop.drive import BusError, DriveRefused, Refused
+from multidrop.drive.register import Access
+from multidrop.drive.script import Script, insist, write
+from multidrop.drive.state import Condition, Direction
+from multidrop.drive.verbs import verb
+from multidrop.families.profiles.profile import Profile
+from multidrop.families.profiles.role import COMMON, Role
+
+
+class InvtControl(IntEnum):
+    """Goodrive100 manual p. 167, Goodrive350 p. 326: 2000H. The CHE has it at 1000H."""
+
+    FORWARD = 1
+    REVERSE = 2
+    JOG_FORWARD = 3
+    JOG_REVERSE = 4
+    STOP = 5
+    COAST = 6
+    RESET_FAULT = 7
+    STOP_JOG = 8
+
+
+class InvtStatus(IntEnum):
+    """Goodrive300 manual: 2100H."""
+
+    FORWARD = 1
+    REVERSE = 2
+    STANDBY = 3
+    FAULT = 4
+    POWER_OFF = 5
+
+
+_DIRECTIONS: Mapping[int, Direction] = {
+    InvtStatus.FORWARD: Direction.FORWARD,
+    InvtStatus.REVERSE: Direction.REVERSE,
+}
+
+
+class Invt(Profile):
+    """INVT's words: one number each for forward, reverse, jog, stop, coast and reset.
+
+    - Other makes have copied the words with 5 and 6 the other way round (both stop), and some with 5 for
+      reverse: compare the manual's list with `InvtControl`, word by word, before a family is declared.
+    - A stop may not end a jog, nor may a start: where the motor still turns after it, or the stop is refused,
+      or nobody says that it stands, STOP_JOG follows at once; one that was jogged is to be stopped before a
+      start.
+    """
+
+    stop_word: ClassVar[int] = InvtControl.STOP
+    coast_word: ClassVar[int | None] = InvtControl.COAST
+    reset_word: ClassVar[int] = InvtControl.RESET_FAULT
+    roles = {
+        **COMMON,
+        "control": Role(
+            (Access.COMMAND,),
+            values=InvtControl,
+            harmless=(InvtControl.STOP, InvtControl.COAST, InvtControl.STOP_JOG),
+        ),
+        "status": Role((Access.READING,), values=InvtStatus),
+    }
+
+    _jogged = False  # by this object, since it was last seen to stand
+
+    def _impossible(self, status: int) -> str:
+        return "" if status in tuple(InvtStatus) else "the profile has no such number"
+
+    def _is_tripped(self, status: int) -> bool:
+        return status == InvtStatus.FAULT
+
+    def _turns(self, status: int) -> bool:
+        return status not in (InvtStatus.STANDBY, InvtStatus.FAULT, InvtStatus.POWER_OFF)
+
+    def _not_ready(self, status: int) -> str:
+        return "has no mains" if status == InvtStatus.POWER_OFF else ""
+
+    def _direction(self, status: int) -> Direction | None:
+        return _DIRECTIONS.get(status)
+
+    def _condition(self, status: int) -> Condition:
+        return Condition.UNKNOWN if self._impossible(status) else super()._condition(status)
+
+    def _reverse(self, direction: Direction | None, status: int) -> bool:
+        return (direction or self._direction(status)) is Direction.REVERSE
+
+    def _start_word(self, direction: Direction | None, status: int) -> int:
+        return InvtControl.REVERSE if self._reverse(direction, status) else InvtControl.FORWARD
+
+    def _may_start(self, status: int) -> Script[None]:
+        yield from super()._may_start(status)
+        if self._jogged and not (yield from self._stands()):
+            raise self._stop_first("may still jog, which a start may not end:")
+        self._jogged = False
+
+    @verb
+    def jog(self, direction: Direction | None = None) -> Script[None]:
+        """Turn slowly from rest until stopped; without a direction, forward."""
+        status = yield from self._status()
+        yield from self._may_jog(status)
+        reverse = self._reverse(direction, status)
+        self._jogged = True
+        word = InvtControl.JOG_REVERSE if reverse else InvtControl.JOG_FORWARD
+        yield from write(self.control, self._word(word))
+        yield from self._started(direction)
+
+    def _stop_by(self, word: int) -> Script[None]:
+        try:
+            yield from self._send_stop(word)
+            may_jog = self._turns((yield from self._status()))
+        except Refused:  # another drive is there
+            raise
+        except BusError:  # one that is not heard may hear, and jog
+            with suppress(BusError):
+                yield from insist(self.control, self._word(InvtControl.STOP_JOG), attempts=1)
+            raise
+        if may_jog:
+            with suppress(DriveRefused):  # there may be no jog to stop
+                yield from insist(self.control, self._word(InvtControl.STOP_JOG))
+        yield from self._watch_stop()
+
+    def _take_reset_back(self) -> Script[None]:
+        """Do nothing: a word is carried out when it comes, and is not held."""
+        yield from ()

@@ -1,0 +1,95 @@
+"""Invertek Optidrive E3: a control word whose bits act one by one, sold under other names too."""
+
+from __future__ import annotations
+
+from enum import IntFlag
+from typing import ClassVar
+
+from multidrop.drive import Refused
+from multidrop.drive.register import Access
+from multidrop.drive.script import Script
+from multidrop.drive.state import Direction
+from multidrop.families.profiles.profile import Profile
+from multidrop.families.profiles.role import COMMON, Role
+
+
+class OptidriveControl(IntFlag):
+    """Register 1: ODE-3 user guide 1.00, p. 33. The Optidrive Plus has bits 1 and 2 the other way round."""
+
+    RUN = 1 << 0
+    RESET = 1 << 2
+    COAST = 1 << 3
+
+
+class OptidriveStatus(IntFlag):
+    """Register 6, low byte: E3 advanced technical manual, issue 05, p. 35; E3 IP66 guide 1.25, p. 48."""
+
+    RUNNING = 1 << 0
+    TRIPPED = 1 << 1
+    BIT_2 = 1 << 2
+    BIT_3 = 1 << 3
+    BIT_4 = 1 << 4
+    STANDBY = 1 << 5
+    READY = 1 << 6
+    BIT_7 = 1 << 7
+    CODE_0 = 1 << 8
+    CODE_1 = 1 << 9
+    CODE_2 = 1 << 10
+    CODE_3 = 1 << 11
+    CODE_4 = 1 << 12
+    CODE_5 = 1 << 13
+    CODE_6 = 1 << 14
+    CODE_7 = 1 << 15
+
+
+RESERVED = 0x9C  # bits 2, 3, 4 and 7 of the low byte
+STOP, COAST, RESET, START = 0x0000, 0x0008, 0x0004, 0x0001
+
+
+class Optidrive(Profile):
+    """Invertek's control word of the Optidrive E3: bit 0 runs while it is 1, bit 2 resets, bit 3 coasts.
+
+    - An Optidrive Plus 3GV has bit 1 for the reset and bit 2 for the second ramp: the same word means another
+      thing on another drive of this maker. Bit 1 is never sent.
+    - The first guide (1.00) prints register 6 with the code in its low and the state in its high byte, the
+      later ones as it is used here. A start needs bit 6, ready, which the first reading never shows, and no
+      drive counts as stopped while its output frequency is not 0: a drive of the first reading is refused.
+    - No guide says whether the reset acts by its edge: the bit is taken back, and a stop comes before.
+    - No bit is a direction: the setpoint's sign would be one, and is not written below 0.
+    """
+
+    stop_word: ClassVar[int] = STOP
+    coast_word: ClassVar[int | None] = COAST
+    reset_word: ClassVar[int] = RESET
+    roles = {
+        **COMMON,
+        "control": Role(
+            (Access.COMMAND,),
+            values=OptidriveControl,
+            harmless=(STOP, COAST),
+            never_together=(OptidriveControl.RESET | OptidriveControl.RUN,),
+        ),
+        "status": Role((Access.READING,), values=OptidriveStatus),
+    }
+
+    def _impossible(self, status: int) -> str:
+        return "its reserved bits are set" if status & RESERVED else ""
+
+    def _is_tripped(self, status: int) -> bool:
+        return bool(status & OptidriveStatus.TRIPPED)
+
+    def _fault(self) -> Script[str]:
+        """Return the trip's code, of the high byte, which the family may name in a register `fault`."""
+        named = yield from super()._fault()
+        return named or f"code {(yield from self._status()) >> 8}"
+
+    def _turns(self, status: int) -> bool:
+        return bool(status & OptidriveStatus.RUNNING)
+
+    def _not_ready(self, status: int) -> str:
+        return "" if status & (OptidriveStatus.READY | OptidriveStatus.RUNNING) else "is not ready to run"
+
+    def _start_word(self, direction: Direction | None, status: int) -> int:
+        if direction is not None:
+            raise Refused(f"{self.name}: no bit of its control word is a direction; start without one")
+        return START

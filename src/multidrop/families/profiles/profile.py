@@ -1,0 +1,301 @@
+"""Profile: a state machine that many makes share, over registers that each family declares by role."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from itertools import chain
+from typing import Any, ClassVar
+
+from multidrop.drive import ANOTHER_FAMILY, Advice, Drive, DriveRefused, NotDone, Refused, Unconfirmed
+from multidrop.drive.declaration_check import DeclarationError
+from multidrop.drive.options import Option
+from multidrop.drive.register import Register
+from multidrop.drive.script import Script, insist, read, until, write
+from multidrop.drive.state import Condition, Direction, State
+from multidrop.drive.verbs import verb
+from multidrop.families.profiles.role import PROOFS, Role, completed, errors_together, own_errors
+
+STOP_TIME = 60.0  # s; the deceleration ramp is a role of no profile
+RESET_TIME = 2.0  # s, after which a fault that was reset must be gone
+
+
+class Profile(Drive):
+    """Base of the profiles: verbs over roles; a family derives from a profile and declares the roles.
+
+    A role is a register with a fixed name. The family says its address, table, unit, step, memory and place
+    in the manual; the profile says its bits, and which of its counts are harmless. Every profile has these:
+
+    - `control` (a command), `status` (a reading), `reference` (a setting, or a command where it cannot be
+      read), in Hz, or in % of the option `maximum_frequency`; `output_frequency` (a reading);
+    - `fault` (a reading, not needed): shown by its names where it has some;
+    - `reference_in_force` (a reading, not needed): the setpoint as the drive shows it;
+    - `station` (a reading, not needed): a drive of the family has its own address there;
+    - `signature` (a reading of named values, not needed): a drive of the family has one of these there.
+
+    The verbs guarantee what the built-in families' verbs do. A stop is sent always, repeated until it is
+    confirmed, and watched until the drive stands. A start or a reset is written once. A start is refused in a
+    fault, in local control, and without a setpoint in force; a reset is refused while the motor turns, never
+    has a bit that runs it, and comes after a stop. `identify` only reads. A stop is withheld because of it
+    only if the status is another profile's, and `station` or `signature` another drive's: these two are
+    settings, and may not be in force yet.
+    """
+
+    roles: ClassVar[Mapping[str, Role]] = {}
+    stop_word: ClassVar[int]
+    coast_word: ClassVar[int | None] = None
+    reset_word: ClassVar[int]
+    reset_role: ClassVar[str] = "control"
+
+    setpoint_name = "reference"
+    options = {
+        "maximum_frequency": Option("Hz", (1, 3000), "the frequency that is 100 % of the reference"),
+        "stop_time": Option("s", (1, 3600), "longest time that a stop may take; 60 without it"),
+    }
+
+    control: ClassVar[Register[Any]]
+    status: ClassVar[Register[Any]]
+    reference: ClassVar[Register[float]]
+    output_frequency: ClassVar[Register[float]]
+
+    def __init_subclass__(cls) -> None:
+        """Complete the roles by the profile. Raises DeclarationError with all that is wrong with them."""
+        own = {name: register for name, register in vars(cls).items() if isinstance(register, Register)}
+        if own and (wrong := cls.role_mistakes(own)):
+            raise DeclarationError(cls.__name__, wrong)
+        for name, register in own.items():
+            if name in cls.roles:
+                whole = completed(cls.roles[name], register)
+                whole.__set_name__(cls, name)
+                setattr(cls, name, whole)
+        cls.options = {**Profile.options, **cls.options}
+        super().__init_subclass__()
+
+    @classmethod
+    def role_mistakes(cls, own: Mapping[str, Register[Any]]) -> list[str]:
+        """Return a sentence for each mistake in a family's own registers, and in them together with ours."""
+        taken = {*dir(Profile), *Profile.__annotations__} - {*dir(Drive)}
+        found = {name: own.get(name, getattr(cls, name, None)) for name in cls.roles}
+        singly = (own_errors(name, one, cls.roles, taken) for name, one in own.items())
+        return [*chain.from_iterable(singly), *errors_together(cls.roles, found)]
+
+    @classmethod
+    def readings(cls) -> tuple[Register[Any], ...]:
+        """Return the registers that are polled by default: not those that only tell the family."""
+        return tuple(one for one in super().readings() if one.name not in PROOFS)
+
+    # ---- for each profile ----
+
+    def _impossible(self, status: int) -> str:
+        """Return the reason why no drive of this profile shows this status; empty where one may."""
+        return ""
+
+    def _is_tripped(self, status: int) -> bool:
+        raise NotImplementedError
+
+    def _turns(self, status: int) -> bool:
+        """Return True where the status says that the motor gets voltage."""
+        raise NotImplementedError
+
+    def _not_ready(self, status: int) -> str:
+        """Return the reason why it cannot be started from the line; empty where it can."""
+        return ""
+
+    def _cannot_reset(self, status: int) -> str:
+        """Return the reason why a reset would do nothing, or harm; empty where it may be sent."""
+        return ""
+
+    def _direction(self, status: int) -> Direction | None:
+        """Return the direction that the status shows, None where it shows none."""
+        return None
+
+    def _start_word(self, direction: Direction | None, status: int) -> int:
+        raise NotImplementedError
+
+    def _prepare(self, status: int) -> Script[None]:
+        """Bring the drive to where the start word starts it, without moving the motor."""
+        yield from ()
+
+    def _condition(self, status: int) -> Condition:
+        """Return the condition of a drive that has no fault, by its status alone."""
+        return Condition.RUNNING if self._turns(status) else Condition.STOPPED
+
+    # ---- looks ----
+
+    def _status(self) -> Script[int]:
+        return int((yield from read(self.status)))
+
+    def _fault(self) -> Script[str]:
+        """Return the fault in words, empty where the family has no register for it."""
+        register = self.registers.get("fault")
+        return "" if register is None else register.format((yield from read(register)))
+
+    def _tripped(self, status: int) -> Script[bool]:
+        """Return True where the drive has a fault; most show it in their status."""
+        return self._is_tripped(status)
+        yield
+
+    def _stands(self) -> Script[bool]:
+        """Return True where neither the status nor the output frequency shows that the motor turns."""
+        status = yield from self._status()
+        if self._turns(status) and not (yield from self._tripped(status)):
+            return False
+        return (yield from read(self.output_frequency)) == 0
+
+    def _setpoint_in_force(self) -> Script[None]:
+        """Raise Refused unless the setpoint, as the drive shows it, is the one that was written and not 0."""
+        yield from super()._setpoint_in_force()
+        shown = self.registers.get("reference_in_force")
+        if shown is None:
+            return
+        held = yield from read(shown)
+        if held == 0:
+            why = f"the setpoint of {self.name} is 0:"
+        elif held != self.commanded and not self.reference.readable:
+            why = f"{self.name} follows {shown.format(held)}, which is not what it was told;"
+        else:
+            return
+        raise Refused(f"{why} call set_frequency before start", advice=Advice.call("set_frequency"))
+
+    # ---- verbs ----
+
+    @verb
+    def identify(self) -> Script[None]:
+        """Check that the status word is one of this profile, and `station` and `signature` if declared."""
+        wrong: list[str] = []
+        status = yield from self._status()
+        if impossible := self._impossible(status):
+            wrong.append(f"its status is {status:04X}H, and {impossible}")
+        station = self.registers.get("station")
+        if station is not None and (address := int((yield from read(station)))) != self.address:
+            wrong.append(f"it says that its address is {address}")
+        signature = self.registers.get("signature")
+        if signature is not None:
+            assert signature.values is not None
+            held = yield from read(signature)
+            if not isinstance(held, signature.values):
+                names = ", ".join(value.name for value in signature.values)
+                wrong.append(f"{signature.name} is {held:g}, and none of {names}")
+        if wrong:
+            kind = self.title or type(self).__name__
+            rule = ANOTHER_FAMILY if impossible and len(wrong) > 1 else ""
+            raise Refused(f"{self.name} is not known as {kind}: {'; '.join(wrong)}", rule=rule)
+
+    @verb
+    def start(self, direction: Direction | None = None) -> Script[None]:
+        """Start at the setpoint in force; without a direction, in the one it turns in, or forward."""
+        status = yield from self._status()
+        yield from self._may_start(status)
+        word = self._start_word(direction, status)
+        yield from self._setpoint_in_force()
+        if not self._turns(status):
+            yield from self._prepare(status)
+        yield from write(self.control, self._word(word))
+        yield from self._started(direction)
+
+    def _may_start(self, status: int) -> Script[None]:
+        """Raise Refused in a fault, in local control, and where the status shows another hindrance."""
+        if (yield from self._tripped(status)):
+            raise self._reset_first((yield from self._fault()))
+        if why := self._not_ready(status):
+            raise Refused(f"{self.name} {why}; {self.remote}")
+
+    def _may_jog(self, status: int) -> Script[None]:
+        """Raise Refused as before a start, and while the motor turns: no manual says what a jog does then."""
+        yield from self._may_start(status)
+        if self._turns(status):
+            raise self._stop_first("turns, and may go on through a jog:")
+
+    def _word(self, count: int) -> Any:
+        assert self.control.values is not None
+        return self.control.values(count)
+
+    @verb
+    def stop(self) -> Script[None]:
+        """Stop along the ramp; it has happened when the status says so and the output frequency is 0."""
+        yield from self._stop_by(self.stop_word)
+
+    @verb
+    def coast(self) -> Script[None]:
+        """Take the voltage off and let the motor run out."""
+        if self.coast_word is None:
+            raise self._unsupported("coast command")
+        yield from self._stop_by(self.coast_word)
+
+    def _stop_by(self, word: int) -> Script[None]:
+        yield from self._send_stop(word)
+        yield from self._watch_stop()
+
+    def _send_stop(self, word: int) -> Script[None]:
+        try:
+            yield from insist(self.control, self._word(word))
+        except DriveRefused:  # as some do in a fault, in which they stand already
+            if not (yield from self._stands()):
+                raise
+
+    def _watch_stop(self) -> Script[None]:
+        yield from self._stopped(self._stands, self._stop_limit())
+
+    def _stop_limit(self) -> float:
+        return self.option.get("stop_time", STOP_TIME)
+
+    @verb
+    def reset_fault(self) -> Script[None]:
+        """Reset a fault after a stop was commanded; never starts the motor. Sent once, then looked at."""
+        status = yield from self._status()
+        if not (yield from self._tripped(status)):
+            if not (yield from self._stands()):
+                raise Refused(f"{self.name} runs: it has no fault to reset")
+            return
+        if why := self._cannot_reset(status):
+            raise Refused(f"{self.name} {why}")
+        yield from insist(self.control, self._word(self.stop_word))  # no run command outlasts the fault
+        yield from self._pulse()
+        if not (yield from until(self._is_reset, limit=RESET_TIME)):
+            fault = (yield from self._fault()) or "it shows a fault"
+            raise NotDone(self.name, "the fault reset", f"the fault stands: {fault}")
+
+    def _pulse(self) -> Script[None]:
+        """Write the reset once, and take its bit back, so that it resets no later fault by itself."""
+        register: Register[Any] = self.register(self.reset_role)
+        assert register.values is not None
+        try:
+            yield from write(register, register.values(self.reset_word))
+        except (Unconfirmed, DriveRefused):
+            yield from self._take_reset_back()
+            raise
+        yield from self._take_reset_back()
+
+    def _take_reset_back(self) -> Script[None]:
+        yield from insist(self.control, self._word(self.stop_word))
+
+    def _is_reset(self) -> Script[bool]:
+        return not (yield from self._tripped((yield from self._status())))
+
+    @verb
+    def set_frequency(self, hz: float) -> Script[None]:
+        """Write the setpoint in Hz, or as the percentage of `maximum_frequency` that it is."""
+        most = self.option.get("maximum_frequency")
+        if self.reference.unit == "%" and most is None:
+            raise Refused(
+                f"{self.name} takes its setpoint in percent: declare maximum_frequency = HZ, which is 100 %",
+                advice=Advice.declare("maximum_frequency", "HZ"),
+            )
+        if hz < 0 or (most is not None and hz > most):
+            span = "below 0 Hz" if most is None or hz < 0 else f"above {most:g} Hz, its maximum_frequency"
+            raise ValueError(f"{hz:g} Hz is {span}: nothing is written to {self.name}")
+        value = hz / most * 100 if self.reference.unit == "%" and most is not None else hz
+        yield from self._hold(self.reference, value)
+
+    @verb
+    def state(self) -> Script[State]:
+        """Report the condition by the status, the direction where it is shown, and the fault by name."""
+        status = yield from self._status()
+        direction = self._direction(status)
+        if (yield from self._tripped(status)):
+            return State(Condition.FAULT, fault=(yield from self._fault()) or "it shows a fault")
+        condition = self._condition(status)
+        if condition is Condition.STOPPED and (yield from read(self.output_frequency)) != 0:
+            return State(Condition.DECELERATING, direction)
+        if condition is Condition.STOPPED:
+            return State(condition, note=self._not_ready(status))
+        return State(condition, direction)

@@ -1,0 +1,1 @@
+"""Commands and stops that reach drives through the gateway that polls them."""

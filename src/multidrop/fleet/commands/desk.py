@@ -1,0 +1,183 @@
+"""Command desk: carries out what a line's present master is asked for, each command once.
+
+A command is offered first and done when its token comes back, within a second of this machine's
+CLOCK_BOOTTIME. What is known of it is on the disk before it is sent, and after.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import time
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from functools import partial
+from typing import Any
+
+from multidrop import Unsupported, written_before, written_by
+from multidrop.fleet.commands.drive_commands import Prepared, prepare
+from multidrop.fleet.commands.log import CommandLog
+from multidrop.fleet.commands.offers import Offer, Offers
+from multidrop.fleet.commands.own_thread import in_own_thread
+from multidrop.fleet.commands.words import (
+    CommandAnswer,
+    CommandOutcome,
+    CommandRequest,
+    Offered,
+    read_command,
+    read_json,
+)
+from multidrop.fleet.leases.lease import boottime_ns
+from multidrop.fleet.lines.held_lines import HeldLine, HeldLines
+from multidrop.supervisor import supervisor
+
+HOLD_S = 0.5  # for which an answer waits for the end; after that it says "under way"
+AWAITED_S = 3.0  # by a line that is let go: a write and its reading back take less on most lines
+LOOK_S = 0.01
+MOST_WRITES = 8  # under way on a line, without stops
+WAY = "fleet"  # in the audit log
+
+_log = logging.getLogger("multidrop.fleet")
+
+
+class CommandDesk:
+    """Commands on the lines that this gateway holds; `subject` is where its tokens come back."""
+
+    def __init__(
+        self,
+        gateway: str,
+        subject: str,
+        lines: HeldLines,
+        log: CommandLog,
+        clock: Callable[[], int] = boottime_ns,
+    ) -> None:
+        self.gateway = gateway
+        self.subject = subject
+        self.offers = Offers(clock)
+        self._lines = lines
+        self._log = log
+        self._under_way: dict[str, int] = {}  # by line
+
+    # ---- an offer ----
+
+    def offer(self, line: str, data: bytes) -> Offered | CommandAnswer | None:
+        """Return an offer, a refusal, or None where we are not the line's master and must keep silent.
+
+        The first answer counts, and it must be the master's.
+        """
+        held = self._lines.for_command(line)
+        if held is None:
+            return None
+        try:
+            request = read_command(data)
+            offer = self.offers.make(request, _prepared(held, request), held)
+        except (ValueError, TypeError, OverflowError, Unsupported) as mistake:
+            return CommandAnswer(CommandOutcome.REFUSED, str(mistake), self.gateway)
+        return Offered(offer.token, self.subject, offer.prepared.text, self.gateway)
+
+    # ---- and doing it ----
+
+    async def do(self, data: bytes) -> CommandAnswer:
+        """Carry out what was offered, once; a copy of the message gets the same answer.
+
+        A message with `ask` in place of `do` asks what became of it. If nobody has told us to do it by then,
+        nobody can any more: the answer is certain.
+        """
+        try:
+            message = read_json(data)
+        except ValueError as mistake:
+            return CommandAnswer(CommandOutcome.REFUSED, str(mistake), self.gateway)
+        token = message.get("do", message.get("ask"))
+        offer = self.offers.find(token) if isinstance(token, str) else None
+        if offer is None:
+            sentence = "no offer with this token is known here, and nothing is sent for it now"
+            return CommandAnswer(CommandOutcome.UNKNOWN, sentence, self.gateway)
+        if "do" not in message:
+            self.offers.take_back(offer, "its asker asked what became of it before telling to do it")
+        elif self.offers.take(offer):
+            supervisor().start("command", self._carry_out(offer))
+        with suppress(TimeoutError):
+            await asyncio.wait_for(offer.over.wait(), HOLD_S)
+        found = offer.answer or CommandAnswer(CommandOutcome.UNDER_WAY, f"{offer.prepared.text}: under way")
+        return found._replace(gateway=self.gateway)
+
+    async def await_commands(self, line: str, may_wait: Callable[[], bool]) -> None:
+        """Wait until none is under way on a line that is about to be let go: none begins there any more.
+
+        For AWAITED_S at most, and only while `may_wait`.
+        """
+        loop = asyncio.get_running_loop()
+        ends = loop.time() + AWAITED_S
+        while self._under_way.get(line) and loop.time() < ends and may_wait():
+            await asyncio.sleep(LOOK_S)
+
+    async def _carry_out(self, offer: Offer) -> None:
+        line = offer.held.name
+        self._under_way[line] = self._under_way.get(line, 0) + 1
+        sentence = f"{offer.prepared.text}: it is not known whether it was sent, for the gateway failed"
+        answer = CommandAnswer(CommandOutcome.UNKNOWN, sentence)
+        try:
+            answer = await self._once(offer)
+        except Exception:
+            _log.exception("%s", offer.request.words)
+        finally:
+            self._under_way[line] -= 1
+            self.offers.end(offer, answer)
+
+    async def _once(self, offer: Offer) -> CommandAnswer:
+        why = self._why_not(offer)
+        if why:
+            return offer.unsent(why)
+        try:
+            await self._note(offer, "begun", {})
+        except OSError as failure:
+            return offer.unsent(f"the log of commands cannot be written: {failure}")
+        answer = await in_own_thread(partial(self._send, offer))
+        _log.info("%s, asked for by %s: %s", offer.request.words, offer.request.by, answer.text)
+        try:
+            await self._note(offer, "over", answer.as_json())
+        except OSError as failure:
+            _log.warning("the log of commands cannot be written: %s", failure)
+        return answer
+
+    def _send(self, offer: Offer) -> CommandAnswer:
+        """Send it on a thread of its own, unless it is too late: a process that stood still sends nothing."""
+        now_ns = time.monotonic_ns()  # before the other clock is read: a pause between them shortens the time
+        until_ns = now_ns + self.offers.left_ns(offer)
+        why = self._why_not(offer)
+        if why:
+            return offer.unsent(why)
+        with written_before(lambda: 0 if offer.why_void else until_ns), written_by(offer.request.by, WAY):
+            return offer.prepared.work()
+
+    def _why_not(self, offer: Offer) -> str:
+        """Return why it must not be sent now, or an empty text."""
+        line = offer.held.name
+        if offer.why_void:
+            return offer.why_void
+        if self._lines.for_command(line) is not offer.held:
+            return f"since the offer line {line} was let go, or its plant has changed"
+        if self._under_way[line] > MOST_WRITES:
+            return f"{MOST_WRITES} others are under way on line {line}"
+        return self.offers.why_late(offer)
+
+    async def _note(self, offer: Offer, step: str, more: Mapping[str, Any]) -> None:
+        request = offer.request
+        record = {"step": step, "id": request.id, "line": offer.held.name, "drive": request.drive}
+        await self._log.note(
+            record | {"what": offer.prepared.text, "by": request.by, **more, "gateway": self.gateway}
+        )
+
+
+def _prepared(held: HeldLine, request: CommandRequest) -> Prepared:
+    """Return what the request means. Raises ValueError for what the plant does not allow."""
+    drive = held.drive(request.drive)
+    if request.verb == "stop":
+        raise ValueError("a stop needs no offer: it goes to the line's own subject of stops")
+    kind = "write" if request.register else "verbs"
+    if request.entry not in held.may[kind]:
+        raise ValueError(
+            f'{request.entry} is not in the plant\'s list; add it to {kind} = ["{request.entry}"] of '
+            "[fleet.may], and run `multidrop fleet init` again"
+        )
+    return prepare(drive, request)

@@ -1,0 +1,300 @@
+"""FleetCommands: asks the present master of a line for a command, and finds out what became of it."""
+
+from __future__ import annotations
+
+import asyncio
+import difflib
+import json
+import logging
+import uuid
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Self
+
+from multidrop import drive_meant
+from multidrop.fleet.commands.log import open_log
+from multidrop.fleet.commands.stop_asking import HARD_WIRED, News, first_answer
+from multidrop.fleet.commands.words import (
+    NOBODY,
+    CommandAnswer,
+    CommandOutcome,
+    CommandRequest,
+    Offered,
+    StopRequest,
+    encode,
+    read_answer,
+    read_offer,
+    spelt,
+    worst,
+)
+from multidrop.fleet.errors import FleetError, NobodyThere, NotDelivered, Unsure
+from multidrop.fleet.servers import names
+from multidrop.fleet.servers.buckets import Bucket, Follower
+from multidrop.fleet.servers.connections import ServerPath, paths_of
+from multidrop.fleet.servers.setup import open_all
+from multidrop.fleet.task_end import end_tasks
+from multidrop.supervisor import Ended, reason_of
+
+LOST_S = 6.0  # without any answer, after which what became of a command stays unknown
+AGAIN_S = 0.2
+
+_log = logging.getLogger("multidrop.fleet")
+
+
+def _tell_nobody(answer: CommandAnswer) -> None:
+    """Do nothing: the answer at the end is enough."""
+
+
+class FleetCommands:
+    """Somebody who commands drives of a fleet.
+
+    `by` says who it is, for the logs of both sides; `log` is the file of this side. Each command is sent
+    once and never again; a stop is sent until a gateway answers. What cannot be noted in `log` is not sent,
+    but for stops. Raises FleetError where no server is reached.
+    """
+
+    def __init__(
+        self, urls: Sequence[str], *, by: str, log: Path, options: Mapping[str, Any] | None = None
+    ) -> None:
+        self.by = by
+        self._paths = paths_of(urls, options)
+        self._log = open_log(log)
+        self._keeping: list[asyncio.Task[None]] = []
+        self._plant = Follower(Bucket(names.PLANT, self._path))
+
+    async def __aenter__(self) -> Self:
+        try:
+            await open_all(self._paths)
+        except BaseException:
+            await self.close()
+            raise
+        self._keeping = [asyncio.create_task(path.keep()) for path in self._paths]
+        return self
+
+    async def stay(self) -> None:
+        """Stay connected until cancelled. Raises Ended if what keeps a connection has ended."""
+        ended, _ = await asyncio.wait(self._keeping, return_when=asyncio.FIRST_COMPLETED)
+        for task in ended:
+            failure = None if task.cancelled() else task.exception()
+            raise Ended(f"a connection to the fleet has ended: {reason_of(failure)}") from failure
+
+    async def __aexit__(self, *error: object) -> None:
+        await self.close()
+
+    async def close(self) -> None:
+        """Leave the servers."""
+        await end_tasks(*self._keeping)
+        for path in self._paths:
+            await path.close()
+        self._log.close()
+
+    # ---- commands ----
+
+    async def preview(self, request: CommandRequest) -> Offered | CommandAnswer:
+        """Return what a command would do, or why it would not be sent; nothing is done."""
+        return await self._offer(await self._line_of(request.drive), request)
+
+    async def write(self, drive: str, register: str, value: float | str) -> CommandAnswer:
+        """Write a register once; a choice by its name or its raw count.
+
+        Raises ValueError for a drive that is not in the plant, FleetError where the plant cannot be read.
+        """
+        return await self.carry_out(self.request(drive, register=register, value=value))
+
+    async def act(self, drive: str, verb: str, **options: object) -> CommandAnswer:
+        """Carry out a verb once, such as "start", direction="forward". Raises as `write`."""
+        return await self.carry_out(self.request(drive, verb=verb, options=options))
+
+    def request(self, drive: str, **what: Any) -> CommandRequest:
+        """Return a new command, for `preview` or `carry_out`."""
+        return CommandRequest(uuid.uuid4().hex, self.by, drive, **what)
+
+    async def carry_out(self, request: CommandRequest, agreed: str = "") -> CommandAnswer:
+        """Have a command carried out, once, and return what is known of it; raises as `write`.
+
+        `agreed` is the text of a preview that a person agreed to. Where it would differ now, nothing is sent.
+        """
+        line = await self._line_of(request.drive)
+        record = {"id": request.id, "line": line, "what": request.words, "by": request.by}
+        try:
+            await self._log.note({"step": "asked", **record})
+        except OSError as failure:
+            why = f"{request.words} was not sent: {self._log.path}: {failure.strerror or failure}"
+            return CommandAnswer(CommandOutcome.NOT_SENT, why)
+        offered = await self._offer(line, request)
+        if isinstance(offered, CommandAnswer):
+            answer = offered
+        elif agreed and offered.text != agreed:
+            why = f"{agreed} was not sent: the plant has changed, and it would be {offered.text} now"
+            answer = CommandAnswer(CommandOutcome.NOT_SENT, why)
+        else:
+            answer = await self._do(offered)
+        await self._note_end(record, answer)
+        return answer
+
+    async def _offer(self, line: str, request: CommandRequest) -> Offered | CommandAnswer:
+        """Ask on one path after another; an offer alone does nothing, so this may be asked again."""
+        why = ""
+        for path in self._paths:
+            try:
+                message = await path.request(names.command_subject(line), encode(request))
+                return read_offer(message.data)
+            except NobodyThere:
+                why = f"no gateway is master of line {line} now"
+            except Unsure:
+                why = f"the master of line {line} gives no answer"
+            except FleetError as failure:
+                why = why or str(failure)
+            except ValueError as mistake:
+                why = f"a gateway of line {line} answers no words of ours: {mistake}"
+        return CommandAnswer(CommandOutcome.NOT_SENT, f"{request.words} was not sent: {why}")
+
+    async def _do(self, offered: Offered) -> CommandAnswer:
+        """Tell it to be done, once; ask from then on what became of it."""
+        path = self._path()
+        try:
+            message = await path.request(offered.subject, json.dumps({"do": offered.token}).encode())
+            answer = read_answer(message.data)
+        except NotDelivered:
+            why = f"{offered.text} was not sent: {offered.gateway} is gone since its offer"
+            return CommandAnswer(CommandOutcome.NOT_SENT, why)
+        except (FleetError, ValueError):  # it may have been told
+            answer = CommandAnswer(CommandOutcome.UNDER_WAY, "")
+        asked = json.dumps({"ask": offered.token}).encode()
+        lost = (
+            f"{offered.text}: it is not known whether it was sent: {offered.gateway} gives no answer any more"
+        )
+        return await self._end_of(answer, offered.subject, asked, lost)
+
+    async def _end_of(
+        self, answer: CommandAnswer, subject: str, asked: bytes, lost: str, on_news: News = _tell_nobody
+    ) -> CommandAnswer:
+        """Ask on all paths in turn until it is over; unknown where nobody has answered for LOST_S."""
+        loop = asyncio.get_running_loop()
+        ends, at = loop.time() + LOST_S, 0
+        told = {""}
+        while answer.outcome is CommandOutcome.UNDER_WAY:
+            if answer.text not in told:
+                told.add(answer.text)
+                on_news(answer)
+            at += 1
+            try:
+                message = await self._paths[at % len(self._paths)].request(subject, asked)
+                answer = read_answer(message.data)
+                ends = loop.time() + LOST_S
+            except (FleetError, ValueError) as failure:
+                if loop.time() > ends:
+                    heard = f"; the last that was heard: {answer.text}" if answer.gateway else ""
+                    return CommandAnswer(CommandOutcome.UNKNOWN, f"{lost} ({failure}){heard}")
+                await asyncio.sleep(AGAIN_S)
+        return answer
+
+    # ---- stops ----
+
+    async def stop(
+        self,
+        drives: Sequence[str] | None = None,
+        *,
+        line: str = "",
+        on_news: News = _tell_nobody,
+        by: str = "",
+    ) -> CommandAnswer:
+        """Stop these drives, or all of the plant with None; the stops of many lines go side by side.
+
+        `by` names who asks, if that is somebody else than this object's `by`. With `line` the plant is not
+        looked at, and the drives are its. `on_news` is called in the loop with what is known of a stop that
+        is not over within half a second, and again when something else is. A drive that is not in the plant
+        is told as refused, and keeps no other's stop back. Raises ValueError where none of them is,
+        FleetError where the plant cannot be read; then no stop was sent.
+        """
+        drives = [drives] if isinstance(drives, str) else drives
+        wanted, unknown = await self._lines_of(drives, line)
+        asked = spelt(by or self.by) or NOBODY  # no name keeps a stop back
+        answers = await asyncio.gather(*(self._stop(one, wanted[one], on_news, asked) for one in wanted))
+        answers += unknown
+        if len(answers) == 1:
+            return answers[0]
+        text = "\n".join(answer.text for answer in answers) or "the plant has no lines"
+        found = {name: one for answer in answers for name, one in answer.drives.items()}
+        return CommandAnswer(worst(answers), text, drives=found)
+
+    async def _lines_of(
+        self, drives: Sequence[str] | None, line: str
+    ) -> tuple[dict[str, list[str] | None], list[CommandAnswer]]:
+        """Return the drives to stop by line, and an answer for each that is not in the plant."""
+        if line:
+            return {line: None if drives is None else list(drives)}, []
+        await self._read_plant(f"the stop was NOT sent; {HARD_WIRED}")
+        if drives is None:
+            return dict.fromkeys(self._described()), []
+        found: dict[str, list[str] | None] = {}
+        unknown: list[CommandAnswer] = []
+        there = [name for line in self._described().values() for name in line]
+        for drive in [drive_meant(drive, there) for drive in drives]:
+            try:
+                here = found.setdefault(self._find(drive), [])
+            except ValueError as mistake:
+                refused = CommandAnswer(CommandOutcome.REFUSED, f"no stop was sent: {mistake}")
+                unknown.append(refused._replace(drives={drive: refused}))
+            else:
+                assert here is not None
+                here.append(drive)
+        if unknown and not found:
+            raise ValueError(unknown[0].text)
+        return found, unknown
+
+    async def _stop(self, line: str, drives: list[str] | None, on_news: News, by: str) -> CommandAnswer:
+        """Send a stop until a gateway answers, and go on until it is over."""
+        request = StopRequest(uuid.uuid4().hex, by, None if drives is None else tuple(drives))
+        what = f"the stop of {', '.join(drives) if drives else f'all drives of line {line}'}"
+        record = {"id": request.id, "line": line, "what": what, "by": by}
+        noting = asyncio.create_task(self._note_end(record, None))
+        answer = await first_answer(self._paths, line, request, what, on_news)
+        lost = f"it is not known what became of {what}: its gateway gives no answer any more; {HARD_WIRED}"
+        answer = await self._end_of(answer, names.stop_subject(line), encode(request), lost, on_news)
+        await noting
+        await self._note_end(record, answer)
+        return answer
+
+    # ---- the plant, and the log ----
+
+    def _path(self) -> ServerPath:
+        return next((path for path in self._paths if path.is_open), self._paths[0])
+
+    def _described(self) -> dict[str, list[str]]:
+        """Return the names of each line's drives."""
+        found = {}
+        for name, record in self._plant.records.items():
+            line = record.value.get("line") if isinstance(record.value, dict) else None
+            drives = line.get("drive", []) if isinstance(line, dict) else None
+            if isinstance(drives, list):
+                found[name] = [str(drive.get("name")) for drive in drives if isinstance(drive, dict)]
+        return found
+
+    async def _line_of(self, drive: str) -> str:
+        await self._read_plant("nothing was sent")
+        return self._find(drive)
+
+    async def _read_plant(self, otherwise: str) -> None:
+        """Read what has changed of the plant. What was read before will do: the line's master checks."""
+        try:
+            await self._plant.look()
+        except FleetError as failure:
+            if not self._plant.records:
+                raise FleetError(f"{otherwise}: the fleet's plant cannot be read: {failure}") from None
+
+    def _find(self, drive: str) -> str:
+        lines = self._described()
+        for line, drives in lines.items():
+            if drive in drives:
+                return line
+        near = difflib.get_close_matches(drive, [name for names in lines.values() for name in names], n=2)
+        hint = f"did you mean {' or '.join(near)}?" if near else "`multidrop fleet lines` lists its lines"
+        raise ValueError(f"the fleet's plant has no drive {drive!r}; {hint}")
+
+    async def _note_end(self, record: Mapping[str, Any], answer: CommandAnswer | None) -> None:
+        more = {"step": "asked"} if answer is None else {"step": "over", **answer.as_json()}
+        try:
+            await self._log.note({**more, **record})
+        except OSError as failure:
+            _log.warning("not noted in %s: %s", self._log.path, failure.strerror or failure)

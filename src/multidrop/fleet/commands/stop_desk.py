@@ -1,0 +1,157 @@
+"""Stop desk: stops drives at once, for anybody who asks the line's present master.
+
+A stop needs neither an offer nor a list: to stop twice does no harm, and to wait may. It goes to the present
+master all the same, for nobody else may send on the line. It is sent first, and noted afterwards.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Mapping
+from functools import partial
+from hashlib import sha256
+from typing import Any
+
+from multidrop import Bus, Drive, RepeatedStops, drive_meant, written_by
+from multidrop.fleet.commands.desk import HOLD_S, WAY
+from multidrop.fleet.commands.drive_commands import answers_of_stops, stop_drive
+from multidrop.fleet.commands.log import CommandLog
+from multidrop.fleet.commands.offers import Offers
+from multidrop.fleet.commands.own_thread import Answers, StopWork, begin_stops
+from multidrop.fleet.commands.words import (
+    CommandAnswer,
+    CommandOutcome,
+    StopRequest,
+    read_stop,
+    spelt,
+    worst,
+)
+from multidrop.fleet.lines.held_lines import HeldLine, HeldLines
+from multidrop.supervisor import supervisor
+
+REMEMBERED = 1000  # stops, of which the oldest are forgotten
+CALLED = "a stop was called"
+
+_log = logging.getLogger("multidrop.fleet")
+
+
+class StopDesk:
+    """Stops on the lines that this gateway holds; each ends what was offered before it."""
+
+    def __init__(self, gateway: str, lines: HeldLines, offers: Offers, log: CommandLog) -> None:
+        self.gateway = gateway
+        self._lines = lines
+        self._offers = offers
+        self._log = log
+        self._stops: dict[tuple[int, object], asyncio.Task[CommandAnswer]] = {}  # by line and message
+        self._repeated = RepeatedStops(stop_drive)
+
+    async def stop(self, line: str, data: bytes) -> CommandAnswer | None:
+        """Stop drives of a line now; None where we are not its master and must keep silent.
+
+        Nothing in the message is a reason to send none. A copy of the message gets the answer of the same
+        stop; another message is another stop, and so is each without an id. The answer to one that is not
+        over soon is "under way", with what is known of it so far; the asker asks again.
+        Where we lost the line meanwhile, or let it go, we keep silent too, unless the motors stand: its next
+        master may have had a copy, and stops, or is asked next.
+        """
+        held = self._lines.for_stop(line)
+        if held is None:
+            return None
+        request, why_all = read_stop(data)
+        if why_all:
+            _log.warning("a stop is one of all drives of line %s, because %s", line, why_all)
+        if request.drives is not None:
+            request = request._replace(drives=tuple(drive_meant(one, held.drives) for one in request.drives))
+        key = (held.number, sha256(data).digest() if request.id else object())
+        if key not in self._stops:
+            self._stops[key] = supervisor().start("stop", self._stop_or_tell(held, request))
+            while len(self._stops) > REMEMBERED:
+                del self._stops[next(iter(self._stops))]
+        task = self._stops[key]
+        await asyncio.wait({task}, timeout=HOLD_S)
+        if not task.done():
+            return self._so_far(held, request)
+        answer = task.result()
+        is_ours = self._lines.for_stop(line) is held and not held.is_leaving
+        return answer if answer.is_done or is_ours else None
+
+    def _so_far(self, held: HeldLine, request: StopRequest) -> CommandAnswer:
+        names = held.drives if request.drives is None else request.drives
+        known = held.bus.stops_under_way()
+        drives = {
+            name: CommandAnswer(CommandOutcome.UNDER_WAY, known[name]) for name in names if name in known
+        }
+        text = "; ".join(answer.text for answer in drives.values())
+        text = text or f"line {held.name}: a stop is under way"
+        return CommandAnswer(CommandOutcome.UNDER_WAY, text, self.gateway, drives=drives)
+
+    async def _stop_or_tell(self, held: HeldLine, request: StopRequest) -> CommandAnswer:
+        """Stop them; a failure of ours is logged, and is the answer."""
+        try:
+            return await self._stop(held, request)
+        except Exception as failure:
+            _log.exception("a stop on line %s, asked for by %s", held.name, request.by)
+            text = f"it is not known whether the stop was sent: {type(failure).__name__}: {failure}"
+            return CommandAnswer(CommandOutcome.UNKNOWN, text, self.gateway)
+
+    async def _stop(self, held: HeldLine, request: StopRequest) -> CommandAnswer:
+        """Begin the stops of all drives side by side; of a drive whose stop is repeated, one more is sent."""
+        self._offers.void(held.name, request.drives, CALLED)
+        drives = held.drives
+        names = list(drives) if request.drives is None else list(dict.fromkeys(request.drives))
+        waited = self._begin(held.bus, drives, names, request.by)
+        printed = [spelt(name) for name in names]
+        _log.warning("stop of %s, asked for by %s", ", ".join(printed), request.by)
+        record = {"id": request.id, "line": held.name, "what": "stop", "drives": printed, "by": request.by}
+        self._note({"step": "begun", **record, "gateway": self.gateway})
+        there = f"line {held.name} has no such drive; it has {', '.join(drives) or 'none'}"
+        missing = CommandAnswer(CommandOutcome.REFUSED, f"no stop was sent: {there}")
+        found: Answers = {name: missing for name in names if name not in drives}
+        for answers in await asyncio.gather(*waited):
+            found |= answers
+        text = "; ".join(answer.text for answer in found.values()) or f"line {held.name} has no drives"
+        answer = CommandAnswer(worst(list(found.values())), text, self.gateway, drives=found)
+        self._note({"step": "over", **record, **answer.as_json()})
+        return answer
+
+    def _begin(
+        self, bus: Bus, drives: Mapping[str, Drive], names: list[str], by: str
+    ) -> list[asyncio.Future[Answers]]:
+        new, once = self._repeated.divided(drives[name] for name in names if name in drives)
+        whole: list[tuple[StopWork, list[Drive]]] = [(partial(_stop_line, bus), new)]
+        single = [(partial(stop_drive, drive), [drive]) for drive in new]
+        works = whole if drives and len(new) == len(drives) else single
+        begun = begin_stops([partial(_stopped_by, by, work) for work, _ in works])
+        for number, (_, stopped) in enumerate(works):  # the last one may be of several, without threads
+            self._repeated.note(stopped, begun[min(number, len(begun) - 1)])
+        again = partial(_begin_stop, by)
+        return [*begun, *(self._repeated.send_once(drive, again) for drive in once)]
+
+    def _note(self, record: Mapping[str, Any]) -> None:
+        """Note it, in the order of the calls, whoever waits for the stop."""
+        supervisor().start("note of a stop", self._write(record))
+
+    async def _write(self, record: Mapping[str, Any]) -> None:
+        try:
+            await self._log.note(record)
+        except Exception as failure:
+            _log.warning("a stop is not in the log of commands: %s", failure)
+
+
+def _begin_stop(by: str, work: StopWork) -> asyncio.Future[Answers]:
+    return begin_stops([partial(_stopped_by, by, work)])[0]
+
+
+def _stopped_by(by: str, work: StopWork, seconds: float | None) -> Answers:
+    with written_by(by, WAY):
+        return work(seconds)
+
+
+def _stop_line(bus: Bus, seconds: float | None) -> Answers:
+    try:
+        return answers_of_stops(bus.stop_all(seconds=seconds))
+    except Exception as failure:  # whatever it is: everybody must see it
+        text = f"it is not known whether the stop was sent: {type(failure).__name__}: {failure}"
+        return {drive.name: CommandAnswer(CommandOutcome.UNKNOWN, text) for drive in bus.drives}

@@ -1,0 +1,133 @@
+"""Command subjects: what a gateway hears of commands on NATS, on all of its paths, and answers.
+
+A line's subjects are heard while the line is polled, so that a server itself says where nobody is its master.
+Each message comes once on each path: the desks know copies by the asker's id. Nothing goes through a stream.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import logging
+import secrets
+from collections.abc import Awaitable, Callable, Coroutine, Sequence
+from contextlib import suppress
+from functools import partial
+from typing import Any
+
+from nats.aio.msg import Msg
+
+from multidrop.fleet.commands.desk import CommandDesk
+from multidrop.fleet.commands.log import CommandLog
+from multidrop.fleet.commands.stop_desk import StopDesk
+from multidrop.fleet.commands.words import CommandAnswer, Offered, encode
+from multidrop.fleet.lines.fleet_lines import FleetLines
+from multidrop.fleet.lines.held_lines import HeldLines
+from multidrop.fleet.servers import names
+from multidrop.fleet.servers.connections import ServerPath
+from multidrop.supervisor import supervisor
+
+_log = logging.getLogger("multidrop.fleet")
+Heard = Callable[[bytes], Awaitable[Offered | CommandAnswer | None]]
+
+
+class CommandSubjects:
+    """The desks of one run of a gateway, and the lines that they are open for."""
+
+    def __init__(self, gateway: str, paths: Sequence[ServerPath], lines: HeldLines, log: CommandLog) -> None:
+        self._paths = paths
+        self._lines = lines
+        self.desk = CommandDesk(gateway, names.do_subject(gateway, secrets.token_hex(8)), lines, log)
+        self._stops = StopDesk(gateway, lines, self.desk.offers, log)
+
+    async def begin(self) -> None:
+        """Hear the tokens of this run's offers."""
+        await self._hear(self.desk.subject, self.desk.do)
+
+    def open(self, line: str, description: Any) -> None:
+        """Take commands for a line from now on."""
+        self._lines.open(line, description)
+        self._change(self._hear(names.command_subject(line), partial(self._offer, line)))
+        self._change(self._hear(names.stop_subject(line), partial(self._stops.stop, line)))
+
+    def leave(self, line: str) -> None:
+        """Take stops alone from now on, and carry out nothing that was offered."""
+        self._lines.leave(line)
+        self._change(self._deafen(names.command_subject(line)))
+
+    def shut(self, line: str) -> None:
+        """Take nothing any more."""
+        self._lines.shut(line)
+        self._change(self._deafen(names.command_subject(line), names.stop_subject(line)))
+
+    async def _offer(self, line: str, data: bytes) -> Offered | CommandAnswer | None:
+        return self.desk.offer(line, data)
+
+    async def _hear(self, subject: str, heard: Heard) -> None:
+        async def take(message: Msg) -> None:
+            supervisor().start("answer", _answer(message, heard))  # none waits for another
+
+        await asyncio.gather(*(path.subscribe(subject, take) for path in self._paths))
+
+    async def _deafen(self, *subjects: str) -> None:
+        await asyncio.gather(*(path.unsubscribe(one) for path in self._paths for one in subjects))
+
+    def _change(self, work: Coroutine[Any, Any, None]) -> None:
+        """Begin to change which subjects are heard. If that fails, a stop might not be heard: it is fatal."""
+
+        async def change() -> None:
+            try:
+                await work
+            except Exception as failure:
+                supervisor().note_dead("commands", f"{type(failure).__name__}: {failure}", failure)
+
+        supervisor().start("subjects", change())
+
+
+async def _answer(message: Msg, heard: Heard) -> None:
+    try:
+        answer = await heard(message.data)
+    except Exception:
+        _log.exception("a message to %s", message.subject)
+        return
+    if answer is None or not names.is_inbox(message.reply):
+        return
+    data = json.dumps(answer.as_json()).encode() if isinstance(answer, CommandAnswer) else encode(answer)
+    with suppress(Exception):  # whoever asked may have gone
+        await message.respond(data)
+
+
+class CommandedLines:
+    """Lines that are open to commands as long as they are polled.
+
+    `may_wait` says whether the lease leaves time before a line must be closed.
+    """
+
+    def __init__(
+        self, lines: FleetLines, subjects: CommandSubjects, may_wait: Callable[[], bool] = lambda: False
+    ) -> None:
+        self._lines = lines
+        self._subjects = subjects
+        self._may_wait = may_wait
+
+    async def take(self, line: str, description: Any) -> None:
+        """Open the line, poll it and take commands; if that raises, it is not polled, and its port closed."""
+        await self._lines.take(line, description)
+        try:
+            self._subjects.open(line, description)
+        except BaseException:
+            await self.let_go(line)
+            raise
+
+    async def let_go(self, line: str) -> None:
+        """Take no commands any more, poll the line no more, and close it.
+
+        Its stops under way are waited for, and who asked for them is answered until then. So are commands,
+        for a moment: what one that was sent has done would never be known.
+        """
+        self._subjects.leave(line)
+        try:
+            await self._subjects.desk.await_commands(line, self._may_wait)
+            await self._lines.let_go(line)
+        finally:
+            self._subjects.shut(line)

@@ -1,0 +1,1 @@
+"""Sessions of gateways: leases on NATS, and the rules by which they end."""

@@ -1,0 +1,1 @@
+"""Which gateway polls which line: ownership, shares and hand-over."""

@@ -1,0 +1,80 @@
+"""Fleet lines: those that a gateway has taken, in one Poller that sends only while it is their master."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+from multidrop import Bus, Mastership, Plant, Poller, PollingFailed
+from multidrop.fleet.samples.polled_units import PolledUnits
+from multidrop.fleet.servers.buckets import Record
+from multidrop.fleet.servers.plant_store import line_of
+from multidrop.supervisor import for_a_future
+
+THREADS = 32
+
+
+class FleetLines:
+    """Takes lines into a poller and lets them go; both in threads, for both wait for ports."""
+
+    def __init__(self, mastership: Mastership, folder: Path, units: PolledUnits) -> None:
+        self.poller = Poller(Plant((), folder), mastership=mastership, audit=folder / "audit.jsonl")
+        self._folder = folder / "lines"
+        self._units = units
+        self._threads = ThreadPoolExecutor(THREADS, "multidrop line")
+
+    async def take(self, line: str, description: Any) -> None:
+        """Open the line and poll it; if that raises, it is not polled, and its port is closed.
+
+        Raises LineError where its port is not there, ValueError for a mistake in its description, and what
+        a user's own class raises.
+        """
+        await self._in_thread(self._take, Record(line, 0, description))
+
+    async def _in_thread(self, act: Callable[..., object], *details: object) -> None:
+        """Call it on one of the threads. What would end the loop, such as SystemExit, is a RuntimeError."""
+
+        def work() -> None:
+            try:
+                act(*details)
+            except (SystemExit, KeyboardInterrupt, GeneratorExit) as failure:
+                raise for_a_future(failure) from failure
+
+        await asyncio.get_running_loop().run_in_executor(self._threads, work)
+
+    def _take(self, record: Record) -> None:
+        line = line_of(record, self._folder)
+        polled = {drive.name for bus in self.poller.buses.values() for drive in bus.drives}
+        if not any(one.drive.name in polled for one in line.drives):  # else `add_line` refuses it
+            self._units.note(line, time.monotonic_ns())  # before the first of its rows
+        before = self.poller.buses.get(line.name)
+        try:
+            self.poller.add_line(line)
+        except BaseException:  # amid the work: another gateway may be its master before long
+            if self.poller.buses.get(line.name) is not before:
+                self.poller.remove_line(line.name)
+            raise
+
+    async def let_go(self, line: str) -> None:
+        """Poll the line no more, and close its port."""
+        await self._in_thread(self._let_go, line)
+
+    def _let_go(self, line: str) -> None:
+        try:
+            self.poller.remove_line(line)
+        except PollingFailed:  # of all lines: what is left is to close the port
+            self.poller.bus(line).close()
+
+    def bus(self, line: str) -> Bus:
+        return self.poller.bus(line)
+
+    async def close(self) -> None:
+        """Stop polling; the last rows are handed out. Raises PollingFailed if polling had failed."""
+        try:
+            await self._in_thread(self.poller.close)
+        finally:
+            self._threads.shutdown(wait=False)

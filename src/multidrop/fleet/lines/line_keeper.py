@@ -1,0 +1,261 @@
+"""Line keeper: the work on a gateway's lines, one thing at a time on each: claim, poll, let go, give away.
+
+A line is polled only while our present session has enough votes by its records, and while the lease is valid.
+Half a second before it runs out all lines are let go.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import time
+from collections.abc import Callable, Coroutine, Iterable, Iterator, Mapping, Sequence
+from itertools import islice
+from typing import Any, NamedTuple, Protocol
+
+from multidrop.fleet.leases.lease import Lease
+from multidrop.fleet.lines.owner_records import OwnerRecords
+from multidrop.fleet.lines.ownership import Claim
+from multidrop.fleet.lines.share_records import ShareRecords
+from multidrop.fleet.lines.unopened_lines import UnopenedLines
+
+_log = logging.getLogger("multidrop.fleet")
+
+SILENT_S = 0.5  # before the lease runs out: time for closing; the timer leaves guard / 2 more
+TAKE_AGAIN_S = 2.0  # after a line that could not be taken
+WRITTEN_AT_ONCE = 64  # records; more would keep the renewal of the lease waiting
+LINES_AT_ONCE = 32
+
+
+class Lines(Protocol):
+    """The lines that this gateway polls."""
+
+    async def take(self, line: str, description: Any) -> None:
+        """Open the line and poll it.
+
+        If that raises, nothing of the line is left open, and it is tried again.
+        """
+
+    async def let_go(self, line: str) -> None:
+        """Poll the line no more, and close it: when this returns nothing of ours is sent on it."""
+
+
+class TakenLine(NamedTuple):
+    """A line that is polled: the revision of its description, and since when (CLOCK_BOOTTIME, ns)."""
+
+    revision: int
+    since: int
+
+
+class LineKeeper:
+    """The lines that one gateway polls, and what is under way on each of them.
+
+    `on_change` is called when something is to be looked at anew. `why_lost` returns why the port of a polled
+    line is lost and could not be opened again; None where it is open.
+    """
+
+    def __init__(
+        self,
+        lines: Lines,
+        lease: Lease,
+        records: ShareRecords,
+        on_change: Callable[[], object],
+        *,
+        unopened: UnopenedLines | None = None,
+        why_lost: Callable[[str], str | None] = lambda line: None,
+    ) -> None:
+        self.lines = lines
+        self.polled: dict[str, TakenLine] = {}
+        self.troubles: dict[str, str] = {}  # lines that could not be taken, and why
+        self.lost: dict[str, str] = {}  # lines that nobody polls now, for their port is not there, and why
+        self.releasing: set[str] = set()  # ours, and to be given away
+        self.may_claim = True  # beside gateways with other rules nothing is
+        self._lease = lease
+        self._records = records
+        self._owners = OwnerRecords(lease, records, lambda: self.may_poll, self._take_new)
+        self._on_change = on_change
+        self._unopened = unopened or UnopenedLines(lambda: lease.clock())
+        self._why_lost = why_lost
+        self._is_leaving = False
+        self._at_work: dict[str, asyncio.Task[None]] = {}  # by line: it is taken, let go or claimed
+        self._tasks: set[asyncio.Task[None]] = set()
+        self._again_at: dict[str, float] = {}
+        self._failure: BaseException | None = None
+        self._has_failed = asyncio.Event()
+        self._openings = asyncio.Semaphore(LINES_AT_ONCE)
+
+    @property
+    def may_poll(self) -> bool:
+        """Say whether lines may be taken and kept: the lease leaves time to close them before it ends."""
+        return bool(self._lease.session) and self._lease.left_s > SILENT_S and not self._is_leaving
+
+    @property
+    def is_silent(self) -> bool:
+        """Say whether no line is open, or about to be."""
+        return not self.polled and not self._at_work
+
+    @property
+    def moves(self) -> int:
+        """Return how many lines were claimed and given away."""
+        return self._owners.moves
+
+    def is_mine(self, line: str) -> bool:
+        """Say whether the line is ours by its records, and was not given away."""
+        return self._owners.is_mine(line)
+
+    def claim_of(self, line: str) -> Claim | None:
+        """Return what is to be written for a line to be ours; None where nothing can be now."""
+        return None if line in self._at_work else self._owners.claim_of(line)
+
+    def may_stop(self, line: str) -> bool:
+        """Say whether this is the line's master now: a stop waits for no guard, here or in the engine."""
+        return self._lease.is_valid and self.is_mine(line) and line in self.polled
+
+    def may_command(self, line: str) -> bool:
+        """Say whether this is the line's master now, and the guard of the one before is over."""
+        if not self.may_stop(line):
+            return False
+        return self._lease.clock() - self.polled[line].since >= self._lease.terms.guard
+
+    async def fail(self) -> None:
+        """Wait for a line that cannot be let go, and raise its error: the process must end."""
+        await self._has_failed.wait()
+        assert self._failure is not None
+        raise self._failure
+
+    # ---- all lines ----
+
+    def claim(self, claims: Mapping[str, Claim]) -> None:
+        """Claim lines where any may be, each at the revisions of its records that were judged."""
+        free = claims.keys() - self._at_work.keys() if self.may_claim else ()
+        for lines in _some_at_once(free):
+            self._start(lines, self._owners.claim({line: claims[line] for line in lines}))
+
+    def reconcile(self) -> None:
+        """Let go of what is not ours any more, take what is, and give away what was let go.
+
+        Where a line is to stay after all, and nobody knows whether it was given away, it is claimed anew.
+        """
+        valid = self.may_poll
+        kept = {
+            line
+            for line in (self._owners.owned() if valid else ())
+            if line not in self.releasing and self._records.is_in_plant(line)
+        }
+        mine = {line: self._records.plant.records[line].revision for line in kept if self.is_mine(line)}
+        for line in self.troubles.keys() - mine.keys():
+            self._forget_trouble(line)
+        self._look_at_ports()
+        now = time.monotonic()
+        for line, polled in list(self.polled.items()):
+            if mine.get(line) != polled.revision and line not in self._at_work:
+                self._start([line], self._let_go(line))
+        for line in mine.keys() - self.polled.keys() - self._at_work.keys():
+            if now >= self._again_at.get(line, 0.0):
+                self._start([line], self._take(line))
+        if valid:
+            left = (self.releasing & self._owners.owned()) - self.polled.keys() - self._at_work.keys()
+            for lines in _some_at_once(left):
+                self._start(lines, self._owners.give_away(lines))
+            doubted = filter(self._owners.doubted, kept - mine.keys())
+            self.claim({line: claim for line in doubted if (claim := self.claim_of(line))})
+
+    def _look_at_ports(self) -> None:
+        """Note which ports of polled lines are lost: after a while others should take the lines."""
+        for line in self.polled.keys() - self._at_work.keys():
+            if why := self._why_lost(line):
+                if line not in self.lost:
+                    _log.warning("line %s is not polled, for its port is lost: %s", line, why)
+                self.lost[line] = why
+                self._unopened.lost(line)
+            else:
+                self._opened(line)
+
+    def _opened(self, line: str) -> None:
+        if self.lost.pop(line, None):
+            _log.warning("line %s is polled again", line)
+        self._unopened.opened(line)
+
+    def _not_ours(self, line: str) -> None:
+        self.lost.pop(line, None)
+        self._unopened.gone(line)
+
+    async def let_all_go(self) -> None:
+        """Let go of all lines, whatever is under way. Raises the error of a line that could not be."""
+        self._is_leaving = True
+        try:
+            while not self.is_silent:
+                if self._failure:
+                    raise self._failure
+                self.reconcile()
+                await asyncio.gather(*self._at_work.values(), return_exceptions=True)
+        finally:
+            self._is_leaving = False
+
+    # ---- one line ----
+
+    def _start(self, lines: Sequence[str], work: Coroutine[Any, Any, None]) -> None:
+        task = asyncio.create_task(work)
+        self._tasks.add(task)  # lines may be taken, and begin another one, before it is done
+        self._at_work |= dict.fromkeys(lines, task)
+        task.add_done_callback(lambda done: self._done(lines, done))
+
+    def _done(self, lines: Sequence[str], task: asyncio.Task[None]) -> None:
+        self._tasks.discard(task)
+        for line in lines:
+            if self._at_work.get(line) is task:  # else the next work on it has begun
+                del self._at_work[line]
+        self._on_change()
+        failure = None if task.cancelled() else task.exception()
+        if failure and not self._failure:
+            self._failure = failure  # a line that is not closed for certain
+            self._has_failed.set()
+
+    def _take_new(self, line: str) -> None:
+        if self._records.is_in_plant(line):
+            self._start([line], self._take(line))
+
+    async def _take(self, line: str) -> None:
+        record = self._records.plant.records[line]
+        async with self._openings:
+            if not (self.may_poll and self.is_mine(line)):
+                return
+            try:
+                await self.lines.take(line, record.value)
+            except Exception as failure:  # such as of a user's own class: it is this line's alone
+                is_foreseen = isinstance(failure, (OSError, ValueError))
+                why = str(failure) if is_foreseen else f"{type(failure).__name__}: {failure}"
+                told, self.troubles[line] = self.troubles.get(line), why
+                if isinstance(failure, OSError):
+                    self.lost[line] = str(failure)
+                    self._unopened.failed(line)
+                self._again_at[line] = time.monotonic() + TAKE_AGAIN_S
+                asyncio.get_running_loop().call_later(1.01 * TAKE_AGAIN_S, self._on_change)
+                if told != why:
+                    cause = None if is_foreseen else failure
+                    _log.warning(
+                        "line %s is not taken, and tried again and again: %s", line, why, exc_info=cause
+                    )
+            else:
+                if line in self.troubles:
+                    _log.warning("line %s is taken now", line)
+                    self._forget_trouble(line)
+                self.lost.pop(line, None)
+                self._unopened.opened(line)
+                self.polled[line] = TakenLine(record.revision, self._lease.clock())
+
+    def _forget_trouble(self, line: str) -> None:
+        del self.troubles[line], self._again_at[line]
+        self._not_ours(line)
+
+    async def _let_go(self, line: str) -> None:
+        await self.lines.let_go(line)
+        self.polled.pop(line, None)
+        self._not_ours(line)
+
+
+def _some_at_once(lines: Iterable[str]) -> Iterator[list[str]]:
+    """Return lines as many at a time as are written at once."""
+    left = iter(lines)
+    while some := list(islice(left, WRITTEN_AT_ONCE)):
+        yield some

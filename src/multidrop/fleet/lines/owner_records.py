@@ -1,0 +1,192 @@
+"""Owner records: which lines are ours, and what is written to claim them and to give them away.
+
+What is given away is not ours any more from the moment before it is sent: it may be stored, at any time,
+though nobody answered. It is ours again once newer records say so.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
+
+from multidrop.fleet.errors import FleetError
+from multidrop.fleet.leases.lease import Lease
+from multidrop.fleet.leases.rules import SECOND
+from multidrop.fleet.lines.ownership import (
+    NEEDED,
+    NOBODY,
+    Claim,
+    Owner,
+    claim_of,
+    owner_of,
+    owner_value,
+    turn_of,
+)
+from multidrop.fleet.lines.share_records import ShareRecords
+from multidrop.fleet.servers import names
+from multidrop.fleet.servers.buckets import Record, WriteAnswers
+from multidrop.fleet.task_end import end_tasks
+
+WRITERS = 2  # batches at a time in each bucket
+LAG_NS = SECOND  # two renewals
+SPARE_S = 0.15  # after one bucket has answered, before records are written in the spare one
+
+
+class OwnerRecords:
+    """The records of lines as far as they name us, in our present session.
+
+    Nothing is written while `may_write` says no; `on_mine` is called with each line that has become ours.
+    """
+
+    def __init__(
+        self,
+        lease: Lease,
+        records: ShareRecords,
+        may_write: Callable[[], bool],
+        on_mine: Callable[[str], object],
+    ) -> None:
+        self.moves = 0
+        self._lease = lease
+        self._records = records
+        self._may_write = may_write
+        self._on_mine = on_mine
+        self._offered: dict[tuple[str, str], int] = {}  # by line and bucket, the revision given away last
+        self._writing = {bucket: asyncio.Semaphore(WRITERS) for bucket in names.OWNERS}
+
+    @property
+    def _me(self) -> Owner:
+        return self._lease.name, self._lease.session
+
+    def is_mine(self, line: str) -> bool:
+        """Say whether we have enough votes by records that were not given away at their very revisions."""
+        me, votes = self._me, 0
+        for bucket, record in self._records.of(line).items():
+            if owner_of(record) == me and record and self._offered.get((line, bucket)) != record.revision:
+                votes += record.value["votes"]
+        return votes >= NEEDED
+
+    def doubted(self, line: str) -> set[str]:
+        """Return the buckets in which the line was given away, and nobody knows whether that was stored."""
+        return {
+            bucket
+            for bucket, record in self._records.of(line).items()
+            if record and self._offered.get((line, bucket)) == record.revision
+        }
+
+    def _naming_us(self, line: str) -> dict[str, Record]:
+        records = self._records.of(line)
+        return {
+            bucket: record for bucket, record in records.items() if record and owner_of(record) == self._me
+        }
+
+    def owned(self) -> set[str]:
+        """Return the lines of which one record at least names us."""
+        return self._records.owned_by(*self._me)
+
+    def claim_of(self, line: str) -> Claim | None:
+        """Return what is to be written for a line to be ours; None where nothing can be."""
+        is_over = self._records.observer.is_over
+        return claim_of(self._me, self._records.of(line), is_over, self.doubted(line), self._leaderless())
+
+    def _leaderless(self) -> set[str]:
+        """Return the bucket, if any, that may have no leader: its home's lease lags behind the two others."""
+        sent = [path.sent if path else 0 for path in self._lease.held]
+        since = sorted(sent)[1] - LAG_NS
+        return {bucket for bucket, moment in zip(names.OWNERS, sent, strict=True) if moment < since}
+
+    async def claim(self, claims: Mapping[str, Claim]) -> None:
+        """Write the first records of claims, and spare ones where a bucket takes much longer than another.
+
+        Where a claim was refused, answers that decide nothing any more are not waited for, and those of a
+        bucket that may have no leader never for long: it is to be tried again, by newer records.
+        """
+        now_ms, begun = time.time_ns() // 1_000_000, time.monotonic()
+        values = {
+            line: owner_value(self._me, claim.turn, now_ms, claim.votes) for line, claim in claims.items()
+        }
+        writes = self._write(
+            (bucket, Record(line, revision, values[line]))
+            for line, claim in claims.items()
+            for bucket, revision in claim.first.items()
+        )
+        refused: set[str] = set()
+        late = set(writes.values())
+        vain = {writes[bucket] for bucket in self._leaderless() & writes.keys()}
+        if hopeful := late - vain:
+            await asyncio.wait(hopeful, return_when=asyncio.FIRST_COMPLETED)
+        late = await self._decide(claims, late, refused, max(SPARE_S, time.monotonic() - begun))
+        spare = self._write(
+            (bucket, Record(line, revision, values[line]))
+            for line in claims.keys() - refused
+            if not self.is_mine(line)
+            for bucket, revision in claims[line].spare.items()
+        )
+        late = await self._decide(claims, (late - vain).union(spare.values()), refused)
+        if refused:
+            late, vain = set(), late | vain
+        await end_tasks(*vain)  # what was sent may still be stored, and is read then
+        await asyncio.gather(*late)
+
+    async def _decide(
+        self,
+        lines: Iterable[str],
+        writes: Iterable[asyncio.Task[set[str]]],
+        refused: set[str],
+        within_s: float | None = None,
+    ) -> set[asyncio.Task[set[str]]]:
+        """Wait until each line is ours or refused, and add the refused; return the writes not answered."""
+        late = set(writes)
+        with suppress(TimeoutError):
+            async with asyncio.timeout(within_s):
+                while late and not all(line in refused or self.is_mine(line) for line in lines):
+                    done, late = await asyncio.wait(late, return_when=asyncio.FIRST_COMPLETED)
+                    refused.update(*(write.result() for write in done))
+        return late
+
+    async def give_away(self, lines: Sequence[str]) -> None:
+        """Name nobody in each record of these lines that names us.
+
+        All of them are given away before one is sent: an answer to a late claim makes none ours meanwhile.
+        """
+        now_ms, nobody = time.time_ns() // 1_000_000, (NOBODY, 0)
+        given: list[tuple[str, Record]] = []
+        for line in lines:
+            ours = self._naming_us(line)
+            for bucket, record in ours.items():
+                self._offered[line, bucket] = record.revision
+                value = owner_value(nobody, turn_of(ours) + 1, now_ms, record.value["votes"])
+                given.append((bucket, record._replace(value=value)))
+        await asyncio.gather(*self._write(given).values())
+        self.moves += sum(not self._naming_us(line) for line in lines)
+
+    def _write(self, records: Iterable[tuple[str, Record]]) -> dict[str, asyncio.Task[set[str]]]:
+        """Begin to replace records, each in this bucket; a bucket's task returns the lines refused there."""
+        by_bucket: dict[str, list[Record]] = {}
+        for bucket, record in records:
+            by_bucket.setdefault(bucket, []).append(record)
+        return {
+            bucket: asyncio.create_task(self._write_in(bucket, some)) for bucket, some in by_bucket.items()
+        }
+
+    async def _write_in(self, bucket: str, records: Sequence[Record]) -> set[str]:
+        """Replace records: the server decides, by the revision of each. Lines that are ours now are taken."""
+        follower = self._records.owners[bucket]
+        async with self._writing[bucket]:
+            if not self._may_write():
+                return set()
+            written = WriteAnswers([], set())
+            try:
+                with suppress(FleetError):
+                    written = await follower.bucket.put_all(records)
+            finally:
+                stored = {record.key for record in written.stored}
+                self._records.doubt(bucket, {record.key for record in records} - stored)
+        for record in written.stored:
+            was_mine = self.is_mine(record.key)
+            follower.take(record)
+            if self.is_mine(record.key) and not was_mine:
+                self.moves += 1
+                self._on_mine(record.key)
+        return written.refused

@@ -1,0 +1,86 @@
+"""Unopened lines: those whose port this gateway could not open, so that others may try. Pure.
+
+A gateway that is cut off from a line, and not from NATS, names it in its lease after some failures. The line
+then goes to a gateway that has not named it. It comes back by trials, one line at a time and ever more
+rarely: during a failed trial nobody polls the line. A line that all gateways have named is polled by nobody
+anyway, so trials of it do not become rarer.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from multidrop.fleet.leases.rules import SECOND
+
+OPENINGS = 3  # that failed, before a line is named
+LOST_NS = 6 * SECOND  # for which a polled line's port is lost, before it is named
+FIRST_WAIT_NS, LAST_WAIT_NS = 120 * SECOND, 24 * 3600 * SECOND  # before a trial
+TRIAL_NS = 60 * SECOND  # after which a line that did not come back is tried no more
+MOST_BYTES = 8_000  # of names in a lease's record
+
+
+class UnopenedLines:
+    """The lines that others should take, by the openings that failed; times are of `clock`, in ns.
+
+    No more are named than fit into a lease's record: the others are tried here again and again.
+    """
+
+    def __init__(self, clock: Callable[[], int]) -> None:
+        self.hopeless: frozenset[str] = frozenset()  # lines that all gateways have named
+        self._clock = clock
+        self._failures: dict[str, int] = {}
+        self._lost_since: dict[str, int] = {}
+        self._named: dict[str, None] = {}  # in the order in which they are tried
+        self._wait_ns = FIRST_WAIT_NS
+        self._trial_at = 0
+        self._tried = ""
+        self._tried_since = 0
+
+    def failed(self, line: str) -> None:
+        """Note that the line's port could not be opened."""
+        self._failures[line] = self._failures.get(line, 0) + 1
+        if self._failures[line] >= OPENINGS:
+            self._name(line)
+
+    def lost(self, line: str) -> None:
+        """Note that the port of a polled line is lost, and was not opened again yet."""
+        since = self._lost_since.setdefault(line, self._clock())
+        if self._clock() - since >= LOST_NS:
+            self._name(line)
+
+    def opened(self, line: str) -> None:
+        """Note that the line's port is open."""
+        self._failures.pop(line, None)
+        self._lost_since.pop(line, None)
+        self._named.pop(line, None)
+        if line == self._tried:  # the way to the lines is there again: the others are tried without a wait
+            self._tried, self._wait_ns, self._trial_at = "", FIRST_WAIT_NS, self._clock()
+
+    def gone(self, line: str) -> None:
+        """Note that the line is another gateway's: what counted towards naming it is over."""
+        self._failures.pop(line, None)
+        self._lost_since.pop(line, None)
+
+    def named(self) -> frozenset[str]:
+        """Return the lines that others should take; ask often, for trials begin here."""
+        now = self._clock()
+        if self._tried and now - self._tried_since >= TRIAL_NS:
+            self._tried = ""
+        hopeless = [line for line in self._named if line in self.hopeless]
+        trial_at = min(self._trial_at, self._tried_since + FIRST_WAIT_NS) if hopeless else self._trial_at
+        if self._named and not self._tried and now >= trial_at:
+            self._tried, self._tried_since = next(iter(hopeless or self._named)), now
+            del self._named[self._tried]
+            self._trial_at = now + self._wait_ns
+        return frozenset(self._named)
+
+    def _name(self, line: str) -> None:
+        now = self._clock()
+        if line in self._named or sum(len(one) + 4 for one in (*self._named, line)) > MOST_BYTES:
+            return
+        if line == self._tried:
+            self._tried, self._wait_ns = "", min(2 * self._wait_ns, LAST_WAIT_NS)
+            self._trial_at = now + self._wait_ns
+        elif not self._named and not self._tried:
+            self._trial_at, self._tried_since = now + self._wait_ns, now
+        self._named[line] = None

@@ -1,0 +1,167 @@
+"""Forwarder: a spool's messages into the stream, in order, each once.
+
+One message is under way at a time, and says which place the last of its subject must have: the stream takes
+it there or not at all. After any doubt (start, time-out, refusal) the stream is asked for the last of the
+subject, and it goes on behind that. There is no offset file, and no window of time that duplicates outlive.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import time
+from contextlib import suppress
+from pathlib import Path
+from typing import NamedTuple
+
+from nats.aio.client import Client
+
+from multidrop.fleet.samples.samples_stream import (
+    DIGEST,
+    EXPECTED,
+    LOST,
+    SEQUENCE,
+    StreamError,
+    digest_of,
+    end_if_cancelled,
+    last_of,
+    publish,
+    subject_of,
+)
+from multidrop.fleet.samples.spool import Spool
+from multidrop.fleet.samples.spool_folder import StoredMessage
+
+AGAIN_S = 0.25  # between attempts at a stream that failed
+LOOKING_S = 1.0  # for a message that nobody announced
+SET_BACK = (
+    "the stream has message {} of the log {}, and the spool has {}: its folder was copied or set back; "
+    "move it away, and a new log begins"
+)
+
+_log = logging.getLogger("multidrop.fleet.samples.forwarder")
+
+
+class ForwarderState(NamedTuple):
+    """Messages that were sent since the start, the last sequence in the stream, and what is wrong now."""
+
+    sent: int
+    last: int | None  # None: the stream was not asked yet
+    trouble: str | None
+
+
+class NotOurLog(Exception):
+    """The stream has another message under a number of this log: the folder was copied, or set back."""
+
+
+class Forwarder:
+    """Sends the messages of a spool over this connection until cancelled: `await forwarder.run()`."""
+
+    def __init__(self, spool: Spool, client: Client) -> None:
+        self._spool, self._client = spool, client
+        self._subject = subject_of(spool.gateway, spool.log)
+        self._news = asyncio.Event()
+        self._sent = 0
+        self._last: int | None = None
+        self._trouble: str | None = None
+
+    def state(self) -> ForwarderState:
+        return ForwarderState(self._sent, self._last, self._trouble)
+
+    def lag_s(self) -> float | None:
+        """Return the age (s, by the system's clock) of the oldest message that the stream has not got.
+
+        0 where it has all; None where it was not asked yet, or the message is gone.
+        """
+        if self._last is None:
+            return None
+        stored = self._spool.following(self._last)
+        if stored is None:
+            return 0.0
+        with suppress(OSError):  # removed just now
+            return max(0.0, time.time() - stored.path.stat().st_mtime)
+        return None
+
+    async def run(self) -> None:
+        """Forward until cancelled; whatever goes wrong is told once, and tried again."""
+        loop = asyncio.get_running_loop()
+
+        def announce() -> None:
+            with suppress(RuntimeError):  # the loop is over
+                loop.call_soon_threadsafe(self._news.set)
+
+        self._spool.on_message = announce
+        while True:
+            try:
+                await self._forward()
+            except (StreamError, NotOurLog, OSError) as failure:
+                self._note(str(failure))
+            except Exception as failure:  # a mistake of ours, or a want of memory
+                self._note(f"{type(failure).__name__}: {failure}", failure)
+            await asyncio.sleep(AGAIN_S)
+
+    async def _forward(self) -> None:
+        """Ask where the stream is, and send what is behind that, until there is a doubt."""
+        place, sequence = await self._ask()
+        while True:
+            self._news.clear()
+            stored = self._spool.following(sequence)
+            if stored is None:
+                self._note(None)
+                with suppress(TimeoutError):
+                    await asyncio.wait_for(self._news.wait(), LOOKING_S)
+                end_if_cancelled()
+                continue
+            data = await asyncio.to_thread(_read, stored.path)
+            if data is None:  # removed meanwhile: the spool is full
+                continue
+            found = await publish(self._client, self._subject, data, self._headers(stored, data, place))
+            end_if_cancelled()
+            if found is None:  # an earlier attempt of ours came through
+                return
+            place, sequence = found, stored.sequence
+            self._sent += 1
+            self._have(sequence)
+            self._note(None)
+
+    async def _ask(self) -> tuple[int, int]:
+        """Return the place and the sequence of the last message that the stream has of this log."""
+        last = await last_of(self._client, self._subject)
+        end_if_cancelled()
+        if last is None or last.sequence == 0:  # the stream keeps no message for ever, and others' are none
+            sequence = self._last or 0
+            self._have(sequence)
+            return (last.place if last else 0), sequence
+        if last.sequence > self._spool.state().newest:
+            raise NotOurLog(SET_BACK.format(last.sequence, self._spool.log, "no such message"))
+        stored = self._spool.stored(last.sequence)
+        data = await asyncio.to_thread(_read, stored.path) if stored else None
+        if data is not None and digest_of(data) != last.digest:
+            raise NotOurLog(SET_BACK.format(last.sequence, self._spool.log, "another one"))
+        self._have(last.sequence)
+        return last.place, last.sequence
+
+    def _headers(self, stored: StoredMessage, data: bytes, place: int) -> dict[str, str]:
+        return {
+            EXPECTED: str(place),
+            SEQUENCE: str(stored.sequence),
+            DIGEST: digest_of(data),
+            LOST: str(self._spool.state().lost),
+        }
+
+    def _have(self, sequence: int) -> None:
+        self._last = sequence
+        self._spool.acknowledge(sequence)
+
+    def _note(self, trouble: str | None, cause: Exception | None = None) -> None:
+        if trouble and trouble != self._trouble:
+            _log.error("samples are not forwarded: %s", trouble, exc_info=cause)
+        if self._trouble and not trouble:
+            _log.warning("samples are forwarded again, behind message %s", self._last)
+        self._trouble = trouble
+
+
+def _read(path: Path) -> bytes | None:
+    try:
+        return path.read_bytes()
+    except FileNotFoundError:
+        return None

@@ -1,0 +1,203 @@
+"""Hub: reads the stream into a sink, which keeps the last message's place in the same commit as the rows.
+
+There is no consumer, and nothing is acknowledged to NATS: after any doubt the sink says where it is, and the
+stream is read on from there.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import time
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple, Protocol, TypeVar
+
+from multidrop.fleet.samples.batch_client import BatchClient
+from multidrop.fleet.samples.message import MessageError, unpack
+from multidrop.fleet.samples.sample_reader import StreamMessage, read_after
+from multidrop.fleet.samples.samples_stream import StreamAbout, StreamError, about, end_if_cancelled
+from multidrop.fleet.samples.sources import SourceCheck
+
+MOST_READ = 64  # messages in one answer
+MOST_READ_BYTES = 8 << 20
+MOST_ROWS = 1_000_000  # of one commit: 50 MB
+MOST_BYTES = 256 << 20  # of one commit, as they came and as rows; those of one answer come on top
+LOOKING_S = 0.2  # between questions to a stream that has nothing new
+AGAIN_S = 1.0  # after a failure
+BEHIND_S = 5.0  # for a server that answers, and has not yet all that its leader has
+
+T = TypeVar("T")
+_log = logging.getLogger("multidrop.fleet.samples.hub")
+
+
+class SinkError(OSError):
+    """A sink that cannot be written now, or is not this hub's. One sentence."""
+
+
+class NotThisHubs(SinkError):
+    """A sink of another stream, or of another hub: trying again is of no use."""
+
+
+class KeptPlace(NamedTuple):
+    """The place of the last message that a sink has, and the last sequence of each log."""
+
+    place: int
+    sources: Mapping[str, int]
+
+
+class Commit(NamedTuple):
+    """Rows that a sink takes with their place, or not at all."""
+
+    stream: str  # its identity
+    first: int  # places in the stream
+    last: int
+    sources: Mapping[str, int]
+    tables: Sequence[Any]  # pyarrow.Table of message.ROWS: none, or some, without rows or with
+    rows: int
+
+
+class SampleSink(Protocol):
+    """A store of rows. Methods run on a thread that waits; they raise SinkError."""
+
+    def begin(self, stream: str) -> KeptPlace:
+        """Return what is kept of this stream: at the start, and after each failure."""
+
+    def write(self, commit: Commit) -> None:
+        """Keep all of it, or nothing."""
+
+    def close(self) -> None:
+        """Let go of what is open."""
+
+
+async def _on_thread(act: Callable[..., T], *arguments: Any) -> T:
+    """Return act(*arguments), called on a thread. A cancelled caller waits for it too, to close a sink."""
+    done = asyncio.ensure_future(asyncio.to_thread(act, *arguments))
+    try:
+        return await asyncio.shield(done)
+    except asyncio.CancelledError:
+        await asyncio.wait([done])
+        raise
+
+
+class HubState(NamedTuple):
+    """Places in the stream, counts since the start, and what is wrong now, or None."""
+
+    place: int  # of the last message that is kept
+    behind: int  # messages in the stream that are not
+    rows: int
+    alarms: int
+    missing: int  # messages
+    doubled: int  # messages that were left out
+    trouble: str | None
+
+
+class SampleHub:
+    """Reads a stream into a sink: a commit each `every` s or million rows."""
+
+    def __init__(self, client: BatchClient, sink: SampleSink, *, every: float = 10.0) -> None:
+        self._client, self._sink, self._every = client, sink, every
+        self._sources = SourceCheck({})
+        self._place = self._end = self._rows = 0
+        self._trouble: str | None = None
+
+    def state(self) -> HubState:
+        found = self._sources
+        counts = self._rows, found.alarms, found.missing, found.doubled
+        return HubState(self._place, max(0, self._end - self._place), *counts, self._trouble)
+
+    async def run(self, *, once: bool = False) -> None:
+        """Read until cancelled, or until all is kept that the stream has now.
+
+        A stream or a sink that fails is told, and tried again each second. Raises NotThisHubs.
+        """
+        while True:
+            try:
+                await self._begin()
+                self._note(None)
+                while not (await self._commit(once) and once):
+                    pass
+            except NotThisHubs:
+                raise
+            except (StreamError, SinkError) as failure:
+                if once:
+                    raise
+                self._note(str(failure))
+                await asyncio.sleep(AGAIN_S)
+            else:
+                return
+
+    async def _begin(self) -> None:
+        found = await about(self._client)
+        end_if_cancelled()
+        kept = await _on_thread(self._sink.begin, found.created)
+        self._stream, self._place = found.created, kept.place
+        self._end = found.last if found.first <= found.last else kept.place  # else it was emptied
+        self._sources.last = dict(kept.sources)
+        self._check_end(found)
+        if found.first > kept.place + 1 and found.last > kept.place:
+            gone = f"messages {kept.place + 1} to {found.first - 1}"
+            self._sources.alarm(f"{gone} of the stream were removed before they were read")
+
+    def _check_end(self, found: StreamAbout) -> None:
+        if found.last < self._place:
+            raise NotThisHubs(
+                f"the stream ends at message {found.last}, and {self._place} are kept: it lost some; "
+                "begin a new folder or database"
+            )
+
+    async def _commit(self, once: bool) -> bool:
+        """Gather messages and keep them; True where all is kept that the stream had when it was asked for."""
+        messages: list[StreamMessage] = []
+        tables: list[Any] = []
+        rows, size, ends = 0, 0, None
+        is_end = False
+        patient_until = time.monotonic() + BEHIND_S
+        while rows < MOST_ROWS and size < MOST_BYTES and (ends is None or time.monotonic() < ends):
+            place = messages[-1].place if messages else self._place
+            found = await read_after(self._client, place, MOST_READ, MOST_READ_BYTES)
+            end_if_cancelled()
+            if not found:
+                if once and place >= self._end:
+                    is_end = True
+                    break
+                if once and not messages and time.monotonic() > patient_until:
+                    raise StreamError(f"messages {place + 1} to {self._end} of the stream are not given now")
+                await asyncio.sleep(LOOKING_S)
+                if not messages:
+                    self._check_end(await about(self._client))
+                    end_if_cancelled()
+                continue
+            ends = ends or time.monotonic() + self._every
+            messages += found
+            self._end = max(self._end, found[-1].place)
+            made = await _on_thread(self._tables, found)
+            tables += made
+            rows += sum(map(len, made))
+            size += sum(len(one.data) for one in found) + sum(one.get_total_buffer_size() for one in made)
+        if messages:
+            commit = Commit(
+                self._stream, self._place + 1, messages[-1].place, dict(self._sources.last), tables, rows
+            )
+            await _on_thread(self._sink.write, commit)
+            self._place = commit.last
+            self._rows += rows
+        return is_end
+
+    def _tables(self, messages: Sequence[StreamMessage]) -> list[Any]:
+        """Return the rows of the messages that are to be kept."""
+        found = []
+        for message in messages:
+            if self._sources.take(message):
+                try:
+                    found.append(unpack(message.data))
+                except MessageError as error:
+                    name = f"{message.gateway}.{message.log}"
+                    self._sources.alarm(f"{name}: message {message.sequence} is left out: {error}")
+        return found
+
+    def _note(self, trouble: str | None) -> None:
+        if trouble and trouble != self._trouble:
+            _log.error("nothing is kept: %s", trouble)
+        if self._trouble and not trouble:
+            _log.warning("samples are kept again, behind message %d", self._place)
+        self._trouble = trouble

@@ -1,0 +1,239 @@
+"""Messages: many rows as one Arrow IPC stream that any Arrow reader opens, two to three bytes a row.
+
+| column           | type                            | meaning                                               |
+|------------------|---------------------------------|-------------------------------------------------------|
+| `time`           | timestamp[ns, UTC]              | the request was sent                                  |
+| `clock_ns`       | int64                           | time - monotonic_ns: nearly the same in all rows      |
+| `uncertainty_us` | int32, null for a miss          | the value was taken between time and this much later  |
+| `drive`          | dictionary of utf8              | the drive's name                                      |
+| `register`       | dictionary of utf8              | the register's name                                   |
+| `value`          | float64, null for a miss        | in `unit`                                             |
+| `status`         | dictionary of utf8              | `ok`, or why there is no value                        |
+| `unit`           | dictionary of utf8, or null     | see below; null where nobody knows it                 |
+
+Rows are ordered by register, and for one register as they were polled: values that are alike lie side by
+side, and a time that ten registers share costs little more than one. Buffers are compressed by zstd-1;
+dictionaries hold the names of these rows alone. An uncertainty is rounded up to whole microseconds: the bound
+stays true, and its last ten bits are noise.
+
+A unit is that of the description under which the row was polled: "" for a number without one, "raw count" for
+one whose step is not known, "names of yd1000" where numbers stand for this family's names. Older messages
+have no such column.
+
+Whoever has a gateway's key may send other bytes as a message: none is unpacked that says of itself that it is
+larger than 4 MiB then, or that has columns of other types, which may grow when they are cast.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import takewhile
+from typing import Any, NamedTuple
+
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from multidrop import BatchColumns
+from multidrop.fleet.samples.polled_units import PolledUnits
+from multidrop.fleet.samples.unpacked_size import unpacked_size
+
+MOST_BYTES = 900_000  # of a message: NATS takes 1 MiB from the factory, its headers included
+MOST_ROWS = 1 << 16
+MOST_UNPACKED = 4 << 20  # bytes: 2.4 MB of rows, and names
+MOST_NAME = 1000  # bytes of a name, a status or a unit; PostgreSQL has an index of names
+MOST_SAID = 300  # characters of what is wrong with a message
+LONGEST_US = (1 << 31) - 1
+COMPRESSED = pa.ipc.IpcWriteOptions(compression=pa.Codec("zstd", 1))
+NAMED = pa.dictionary(pa.int32(), pa.utf8())  # of many messages together: more names than one has
+TIMES = pa.timestamp("ns", "UTC")
+ROWS = pa.schema(  # as `unpack` gives them, and as recordings have them
+    [
+        pa.field("time", TIMES, nullable=False),
+        pa.field("monotonic_ns", pa.int64(), nullable=False),
+        pa.field("uncertainty_ns", pa.int64()),
+        pa.field("drive", NAMED, nullable=False),
+        pa.field("register", NAMED, nullable=False),
+        pa.field("value", pa.float64()),
+        pa.field("status", NAMED, nullable=False),
+        pa.field("unit", NAMED),
+    ]
+)
+_TYPES: Mapping[str, Sequence[Any]] = {  # of what a message may have; names are dictionaries of utf8
+    "time": [TIMES],
+    "clock_ns": [pa.int64()],
+    "uncertainty_us": [pa.int32(), pa.int64()],
+    "value": [pa.float64()],
+}
+_KINDS = {"time": pa.int64(), "monotonic_ns": pa.int64(), "uncertainty_ns": pa.int64()}
+_KINDS |= {"drive": pa.uint16(), "register": pa.uint16(), "value": pa.float64(), "status": pa.uint16()}
+
+
+class MessageError(ValueError):
+    """Bytes that are no message."""
+
+
+class Packed(NamedTuple):
+    """A message, and the number of its rows."""
+
+    data: bytes
+    rows: int
+
+
+class RowBuffer:
+    """Rows of many batches of one poller, copied: its memory is free again at once."""
+
+    def __init__(self) -> None:
+        self.rows = 0
+        self._names: dict[str, tuple[str, ...]] = {"drive": (), "register": (), "status": ()}
+        self._columns = {name: bytearray() for name in _KINDS}
+
+    def add(self, columns: BatchColumns) -> bool:
+        """Copy the rows; False for those of another poller, whose codes stand for other names."""
+        names = {"drive": columns.drives, "register": columns.registers, "status": columns.statuses}
+        if any(not _continues(names[of], known) for of, known in self._names.items()):
+            return False
+        self._names = names
+        for name, copied in self._columns.items():
+            copied += getattr(columns, name).cast("B")
+        self.rows += len(columns.time)
+        return True
+
+    def messages(self, most: int = MOST_BYTES, units: PolledUnits | None = None) -> Iterator[Packed]:
+        """Yield the rows as messages of at most `most` bytes and 65536 rows."""
+        column = {
+            name: pa.Array.from_buffers(kind, self.rows, [None, pa.py_buffer(self._columns[name])])
+            for name, kind in _KINDS.items()
+        }
+        is_sample = pc.equal(column["status"], 0)
+        columns = {
+            "time": column["time"].cast(TIMES),
+            "clock_ns": pc.subtract(column["time"], column["monotonic_ns"]),
+            "uncertainty_us": _microseconds(pc.if_else(is_sample, column["uncertainty_ns"], None)),
+            "drive": column["drive"],
+            "register": column["register"],
+            "value": pc.if_else(is_sample, column["value"], None),
+            "status": column["status"],
+        }
+        columns["unit"], texts = _units(column, self._names, units or PolledUnits())
+        names = {**self._names, "unit": texts}
+        rows = pa.RecordBatch.from_pydict(columns)
+        for begin in range(0, self.rows, MOST_ROWS):
+            yield from _pieces(rows.slice(begin, MOST_ROWS), names, most)
+
+
+def _units(
+    column: Mapping[str, Any], names: Mapping[str, Sequence[str]], units: PolledUnits
+) -> tuple[Any, Sequence[str]]:
+    """Return the code of each row's unit, and the units."""
+    table = units.table(names["drive"], names["register"])
+    registers = pa.scalar(len(names["register"]), pa.uint32())
+    series = pc.add(pc.multiply(column["drive"].cast(pa.uint32()), registers), column["register"])
+    codes = table.newest.take(series)
+    oldest_ns = pc.min(column["monotonic_ns"]).as_py()
+    for change in takewhile(lambda change: change.until_ns > oldest_ns, table.changes):
+        is_its = pc.equal(series, pa.scalar(change.series, pa.uint32()))
+        is_before = pc.less(column["monotonic_ns"], change.until_ns)
+        codes = pc.if_else(pc.and_(is_its, is_before), pa.scalar(change.code, pa.uint16()), codes)
+    return codes, table.texts
+
+
+def _continues(names: tuple[str, ...], known: tuple[str, ...]) -> bool:
+    return names is known or names[: len(known)] == known
+
+
+def unpack(data: bytes | memoryview) -> Any:
+    """Return the rows of a message as a pyarrow.Table with the columns of `ROWS`. Raises MessageError."""
+    try:
+        table = _table(data)
+        table.validate(full=True)
+        columns = {name: table.column(name) for name in ("time", "clock_ns", "drive", "register", "status")}
+        columns["monotonic_ns"] = pc.subtract(columns["time"].cast(pa.int64()), columns.pop("clock_ns"))
+        uncertainty_us = table.column("uncertainty_us").cast(pa.int32()).cast(pa.int64())
+        columns["uncertainty_ns"] = pc.multiply(uncertainty_us, 1000)
+        columns["value"] = table.column("value")
+        is_told = "unit" in table.schema.names
+        columns["unit"] = table.column("unit") if is_told else pa.nulls(len(table), pa.utf8())
+        rows = pa.table([columns[name].cast(ROWS.field(name).type) for name in ROWS.names], schema=ROWS)
+        _check(rows)
+    except (pa.ArrowException, KeyError, TypeError, ValueError, OSError, MemoryError) as error:
+        first = (str(error) or type(error).__name__).splitlines()[0][:MOST_SAID]
+        raise MessageError(f"{len(data)} bytes are no message of samples: {first}") from error
+    return rows
+
+
+def _table(data: bytes | memoryview) -> Any:
+    """Return what is in a stream of ours. Raises ValueError before anything is unpacked that is none."""
+    size = unpacked_size(data)
+    if size > MOST_UNPACKED:
+        raise ValueError(f"it is {size} bytes when unpacked, and {MOST_UNPACKED} are the most")
+    with pa.ipc.open_stream(data) as reader:
+        for field in reader.schema:
+            if not _is_ours(field):
+                raise ValueError(f"its {field.name} is of another type")
+        batches = []
+        rows = 0
+        for batch in reader:
+            rows += len(batch)
+            if rows > MOST_ROWS:
+                raise ValueError(f"it has {rows} rows, and {MOST_ROWS} are the most")
+            batches.append(batch)
+        return pa.Table.from_batches(batches, reader.schema)
+
+
+def _is_ours(field: Any) -> bool:
+    if field.name in ("drive", "register", "status", "unit"):
+        return bool(pa.types.is_dictionary(field.type) and field.type.value_type == pa.utf8())
+    return field.type in _TYPES.get(field.name, ())
+
+
+def _check(rows: Any) -> None:
+    """Raise ValueError for rows that no sink takes: all that is behind such a message would never be kept."""
+    for field, column in zip(rows.schema, rows.columns, strict=True):
+        if not field.nullable and column.null_count:
+            raise ValueError(f"its {field.name} is missing in some rows")
+        if pa.types.is_dictionary(field.type):
+            for chunk in column.chunks:
+                _check_names(field.name, chunk.dictionary)
+
+
+def _check_names(kind: str, names: Any) -> None:
+    if names.null_count:
+        raise ValueError(f"one {kind} has no name")
+    if (pc.max(pc.binary_length(names)).as_py() or 0) > MOST_NAME:
+        raise ValueError(f"one {kind} is longer than {MOST_NAME} bytes")
+    if pc.any(pc.match_substring(names, "\0")).as_py():
+        raise ValueError(f"one {kind} has a NUL character")
+
+
+def _microseconds(ns: Any) -> Any:
+    up = pc.divide(pc.add(ns, 999), 1000)
+    return pc.min_element_wise(up, LONGEST_US, skip_nulls=False).cast(pa.int32())
+
+
+def _pieces(rows: Any, names: Mapping[str, Sequence[str]], most: int) -> Iterator[Packed]:
+    coded = _coded(rows, names)
+    data = _stream(coded)
+    if (len(data) <= most and coded.get_total_buffer_size() <= MOST_UNPACKED) or len(rows) < 2:
+        yield Packed(data, len(rows))
+        return
+    middle = len(rows) // 2
+    yield from _pieces(rows.slice(0, middle), names, most)
+    yield from _pieces(rows.slice(middle), names, most)
+
+
+def _coded(rows: Any, names: Mapping[str, Sequence[str]]) -> Any:
+    rows = rows.take(pc.array_sort_indices(rows.column("register")))
+    columns = {name: rows.column(name) for name in rows.schema.names}
+    for name, known in names.items():
+        used = columns[name].unique().drop_null().sort()
+        codes = pc.index_in(columns[name], value_set=used).cast(pa.uint16())
+        texts = pa.array([known[code] for code in used.to_pylist()], pa.utf8())
+        columns[name] = pa.DictionaryArray.from_arrays(codes, texts)
+    return pa.RecordBatch.from_pydict(columns)
+
+
+def _stream(rows: Any) -> bytes:
+    sink = pa.BufferOutputStream()
+    with pa.ipc.new_stream(sink, rows.schema, options=COMPRESSED) as writer:
+        writer.write_batch(rows)
+    return bytes(sink.getvalue())

@@ -1,0 +1,157 @@
+"""Samples as Parquet files, which are a history: `History(folder)` and DuckDB read them.
+
+| in the folder                           | what it holds                                             |
+|-----------------------------------------|-----------------------------------------------------------|
+| `rows/FIRST-LAST.BEGIN-END.parquet`     | all rows of these messages of the stream, by drive, time  |
+| `tens/FIRST-LAST.BEGIN-END.parquet`     | of these messages, ten seconds of a register in each row  |
+| `.hub.lock`                             | held by the process that writes here                      |
+
+A file has its name once it is whole and on the disk: that is the commit, of its rows and of LAST. The newest
+file says what each source's last message was, and must stay. BEGIN and END are UTC and enclose all times.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+from contextlib import suppress
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.parquet as pq
+
+from multidrop.fleet.file_lock import lock
+from multidrop.fleet.samples.hub import Commit, KeptPlace, NotThisHubs, SinkError
+from multidrop.fleet.samples.message import ROWS
+
+KEY = "multidrop"  # of the files' metadata, as of all recordings
+SECOND_NS = 1_000_000_000
+FORM = "%Y%m%dT%H%M%SZ"
+WRITTEN = {  # names are dictionaries already, and plain texts for who reads them
+    "compression": "zstd",
+    "compression_level": 1,
+    "store_schema": False,
+}
+OWN = {"rows", "tens", "damaged"}
+_NAME = re.compile(r"(\d{8,})-(\d{8,})\.(\d{8}T\d{6}Z)-(\d{8}T\d{6}Z)\.parquet")
+_EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
+
+
+class ParquetSink:
+    """Writes each commit as a file. Raises SinkError for a folder that cannot be written, or is another's."""
+
+    def __init__(self, folder: str | os.PathLike[str]) -> None:
+        self.folder = Path(folder)
+        self._rows = self.folder / "rows"
+        try:
+            self._rows.mkdir(parents=True, exist_ok=True)
+            self._lock = os.open(self.folder / ".hub.lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
+        except OSError as failure:
+            raise SinkError(f"the folder {self.folder} cannot be written: {failure.strerror}") from failure
+        try:
+            lock(self._lock)
+        except BlockingIOError:
+            self.close()
+            raise NotThisHubs(f"another hub writes into {self.folder}") from None
+        others = sorted(
+            one.name for one in self.folder.iterdir() if one.name not in OWN and one.name[0] != "."
+        )
+        if others:
+            self.close()
+            raise NotThisHubs(
+                f"{self.folder} is no folder of a hub: it holds {others[0]!r}; name an empty one"
+            )
+
+    def close(self) -> None:
+        if self._lock >= 0:
+            os.close(self._lock)
+            self._lock = -1
+
+    def begin(self, stream: str) -> KeptPlace:
+        """Return what the newest file says."""
+        try:
+            for part in self._rows.glob(".*.writing"):
+                part.unlink()
+            newest = max(self._files(), default=None)
+        except OSError as failure:
+            raise SinkError(f"the folder {self.folder} cannot be written: {failure.strerror}") from failure
+        if newest is None:
+            return KeptPlace(0, {})
+        last, path = newest
+        found = _metadata(path).get("hub")
+        if not isinstance(found, dict) or not isinstance(found.get("sources"), dict):
+            raise NotThisHubs(f"{path} was not written by a hub: name an empty folder")
+        if found.get("stream") != stream:
+            raise NotThisHubs(
+                f"{self.folder} holds samples of a stream that was made at {found.get('stream')}, "
+                f"and this one was made at {stream}: name another folder"
+            )
+        return KeptPlace(last, {str(name): int(number) for name, number in found["sources"].items()})
+
+    def _files(self) -> list[tuple[int, Path]]:
+        found = [(_NAME.fullmatch(path.name), path) for path in self._rows.iterdir()]
+        return [(int(match[2]), path) for match, path in found if match]
+
+    def write(self, commit: Commit) -> None:
+        """Write the rows into a file, which has its name once all of it is on the disk."""
+        table = _joined(commit)
+        path = self._rows / _name(commit, table)
+        part = path.with_name(f".{path.name}.writing")
+        try:
+            with part.open("xb") as file:
+                with pq.ParquetWriter(file, table.schema, **WRITTEN) as writer:
+                    writer.add_key_value_metadata({KEY: json.dumps(_about(commit))})
+                    writer.write_table(table)
+                file.flush()
+                os.fsync(file.fileno())
+            part.rename(path)
+            _sync(self._rows)
+        except OSError as failure:
+            with suppress(OSError):
+                part.unlink()
+            raise SinkError(f"{path} cannot be written: {failure.strerror or failure}") from failure
+
+
+def _joined(commit: Commit) -> Any:
+    """Return all rows, ordered by drive and time."""
+    if not commit.rows:
+        return ROWS.empty_table()
+    table = pa.concat_tables(commit.tables).unify_dictionaries().combine_chunks()
+    drives = table.column("drive").chunk(0)
+    ranks = pc.rank(drives.dictionary).cast(pa.int32()).take(drives.indices)
+    by_time = pc.array_sort_indices(table.column("time").chunk(0).cast(pa.int64()))
+    return table.take(by_time.take(pc.array_sort_indices(ranks.take(by_time))))  # the second is stable
+
+
+def _about(commit: Commit) -> dict[str, Any]:
+    return {"drives": {}, "hub": {"stream": commit.stream, "sources": commit.sources}}
+
+
+def _name(commit: Commit, table: Any) -> str:
+    times = pc.min_max(table.column("time").cast(pa.int64())).as_py()
+    begin, end = (times["min"] or 0) // SECOND_NS, -(-(times["max"] or 0) // SECOND_NS)
+    return f"{commit.first:08d}-{commit.last:08d}.{_text(begin)}-{_text(end)}.parquet"
+
+
+def _text(second: int) -> str:
+    return f"{_EPOCH + timedelta(seconds=second):{FORM}}"
+
+
+def _metadata(path: Path) -> dict[str, Any]:
+    try:
+        found = json.loads((pq.read_metadata(path).metadata or {}).get(KEY.encode(), b"{}"))
+    except (pa.ArrowException, ValueError, OSError) as error:
+        raise SinkError(f"{path} cannot be read: {error}") from error
+    return found if isinstance(found, dict) else {}
+
+
+def _sync(folder: Path) -> None:
+    file = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        os.fsync(file)
+    finally:
+        os.close(file)

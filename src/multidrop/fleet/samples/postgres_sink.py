@@ -1,0 +1,154 @@
+"""Samples in PostgreSQL: a row an exchange, with an array of its values.
+
+| table or view             | what it holds                                                             |
+|---------------------------|---------------------------------------------------------------------------|
+| `multidrop.samples`       | view: time, time_ns, uncertainty_us, drive, register, value, status, unit |
+| `multidrop.exchanges`     | a row an exchange: its values, and `misses`, null where all is ok         |
+| `multidrop.families`        | id and name                                                               |
+| `multidrop.register_sets` | id, names and units, in the order of the values                           |
+| `multidrop.hub`           | one row: the stream, the place of its last message here, the sources      |
+
+A row for each value would take four and a half times the disk. Rows come by COPY, in the transaction that
+moves the place on from where this hub left it. Where another hub has moved it, the transaction is refused.
+One hub at a time writes, and others wait for its end.
+A timestamptz has microseconds; `time_ns` is exact. The drive's monotonic clock is not kept.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from typing import Any
+
+import psycopg
+
+from multidrop.fleet.samples.exchange_rows import ExchangeRows, RegisterSet, copied, exchanges_of
+from multidrop.fleet.samples.hub import Commit, KeptPlace, NotThisHubs, SinkError
+
+ANSWER_S = 10  # to connect
+TABLES = """
+create schema if not exists multidrop;
+create table if not exists multidrop.hub (
+    id boolean primary key default true check (id),
+    stream text not null, place bigint not null, sources jsonb not null);
+create table if not exists multidrop.families (id serial primary key, name text unique not null);
+create table if not exists multidrop.register_sets (
+    id serial primary key, names text[] not null, units text[]);
+create table if not exists multidrop.exchanges (
+    time timestamptz not null, time_ns bigint not null, uncertainty_us integer, drive integer not null,
+    registers integer not null, values float8[] not null, misses text[]);
+create index if not exists exchanges_drive_time on multidrop.exchanges (drive, time);
+alter table multidrop.register_sets add column if not exists units text[];
+alter table multidrop.register_sets drop constraint if exists register_sets_names_key;
+create or replace view multidrop.samples as
+    select e.time, e.time_ns, e.uncertainty_us, d.name as drive, v.register, v.value,
+        coalesce(v.miss, 'ok') as status, v.unit
+    from multidrop.exchanges e
+    join multidrop.families d on d.id = e.drive
+    join multidrop.register_sets r on r.id = e.registers
+    cross join lateral unnest(r.names, e.values, e.misses, r.units) as v(register, value, miss, unit);
+"""
+HAS_UNITS = (  # what was made by an older hub has none
+    "select from information_schema.columns"
+    " where table_schema = 'multidrop' and table_name = 'samples' and column_name = 'unit'"
+)
+COPY = (
+    "copy multidrop.exchanges (time, time_ns, uncertainty_us, drive, registers, values, misses)"
+    " from stdin (format binary)"
+)
+# One hub has the database, while its connection lasts: a server that hears nothing of it ends that in 25 s.
+TAKEN = """
+set tcp_keepalives_idle = 10; set tcp_keepalives_interval = 5; set tcp_keepalives_count = 3;
+set lock_timeout = '3s'; select pg_advisory_lock(hashtext('multidrop hub that writes')); set lock_timeout = 0
+"""
+MOVE = "update multidrop.hub set place = %s, sources = %s where stream = %s and place = %s"
+
+
+class PostgresSink:
+    """Writes each commit as one transaction. `where` is a connection string, such as "dbname=plant"."""
+
+    def __init__(self, where: str) -> None:
+        self._where = where
+        self._connection: psycopg.Connection[Any] | None = None
+        self._drives: dict[str, int] = {}
+        self._sets: dict[RegisterSet, int] = {}
+
+    def close(self) -> None:
+        if self._connection:
+            self._connection.close()
+            self._connection = None
+
+    def begin(self, stream: str) -> KeptPlace:
+        """Connect anew, make what is missing, and return the row of `multidrop.hub`."""
+        self.close()
+        try:
+            self._connection = psycopg.connect(
+                self._where, connect_timeout=ANSWER_S, application_name="multidrop hub", autocommit=True
+            )
+            self._connection.execute(TAKEN)
+            self._drives, self._sets = {}, {}
+            with self._connection.transaction():
+                return self._begin(self._connection, stream)
+        except psycopg.errors.LockNotAvailable as failure:
+            raise SinkError("another hub writes into this database; this one waits for its end") from failure
+        except psycopg.Error as failure:
+            raise SinkError(f"PostgreSQL: {_sentence(failure)}") from failure
+
+    def _begin(self, connection: psycopg.Connection[Any], stream: str) -> KeptPlace:
+        if connection.execute(HAS_UNITS).fetchone() is None:
+            connection.execute(TABLES)
+        first = (
+            "insert into multidrop.hub (stream, place, sources) values (%s, 0, '{}') on conflict do nothing"
+        )
+        connection.execute(first, (stream,))
+        found = connection.execute("select stream, place, sources from multidrop.hub").fetchone()
+        assert found is not None
+        if found[0] != stream:
+            raise NotThisHubs(
+                f"the database holds samples of a stream that was made at {found[0]}, and this one was made "
+                f"at {stream}: name another database"
+            )
+        self._drives = dict(connection.execute("select name, id from multidrop.families").fetchall())
+        sets = connection.execute("select names, units, id from multidrop.register_sets").fetchall()
+        self._sets = {
+            RegisterSet(tuple(names), tuple(units or [None] * len(names))): number
+            for names, units, number in sets
+        }
+        return KeptPlace(found[1], found[2])
+
+    def write(self, commit: Commit) -> None:
+        """Move the place on and copy the rows, in one transaction."""
+        assert self._connection is not None
+        try:
+            with self._connection.transaction():
+                self._write(self._connection, commit)
+        except psycopg.Error as failure:
+            raise SinkError(f"PostgreSQL: {_sentence(failure)}") from failure
+
+    def _write(self, connection: psycopg.Connection[Any], commit: Commit) -> None:
+        moved = connection.execute(
+            MOVE, (commit.last, json.dumps(commit.sources), commit.stream, commit.first - 1)
+        )
+        if moved.rowcount != 1:
+            raise SinkError("another hub writes into this database: end one of them")
+        found: list[ExchangeRows] = [exchanges_of(table) for table in commit.tables]
+        self._name(connection, found)
+        with connection.cursor() as cursor, cursor.copy(COPY) as copy:
+            for piece in copied(found, self._drives, self._sets):
+                copy.write(piece)
+
+    def _name(self, connection: psycopg.Connection[Any], found: Sequence[ExchangeRows]) -> None:
+        """Give ids to names that have none."""
+        drives = sorted({name for one in found for name in one.drives} - self._drives.keys())
+        query = "insert into multidrop.families (name) select unnest(%s::text[]) returning name, id"
+        if drives:
+            self._drives |= dict(connection.execute(query, (drives,)).fetchall())
+        for asked in sorted({asked for one in found for asked in one.sets} - self._sets.keys(), key=str):
+            query = "insert into multidrop.register_sets (names, units) values (%s, %s) returning id"
+            made = connection.execute(query, (list(asked.names), list(asked.units))).fetchone()
+            assert made is not None
+            self._sets[asked] = made[0]
+
+
+def _sentence(failure: psycopg.Error) -> str:
+    return " ".join(str(failure).split()) or type(failure).__name__

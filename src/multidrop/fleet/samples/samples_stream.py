@@ -1,0 +1,239 @@
+"""The stream of all gateways' samples, by NATS JetStream's own API (ADR-31 for direct gets).
+
+A message has the subject `samples.<gateway>.<log id>`, its number in that log as the header
+`Multidrop-Sequence`, and a digest of its bytes. Nothing here keeps a state: the stream is asked.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import base64
+import hashlib
+import json
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
+from typing import Any, NamedTuple
+
+from nats.aio.client import Client
+from nats.errors import Error, NoRespondersError
+
+from multidrop import masked
+from multidrop.fleet.lines.refusals import failure_to_connect
+from multidrop.fleet.samples.batch_client import BatchClient
+from multidrop.fleet.servers.connections import OLDEST
+
+STREAM = "samples"
+SEQUENCE, DIGEST, LOST = "Multidrop-Sequence", "Multidrop-Digest", "Multidrop-Lost"
+BY_SERVER = "Nats-Stream"  # a header of each message that a server gives out of a stream
+EXPECTED = "Nats-Expected-Last-Subject-Sequence"
+ANSWER_S = 5.0  # for an answer: a new leader takes 4 to 9 s, so that is asked again
+NO_MESSAGE, NO_STREAM, WRONG_SEQUENCE = 10037, 10059, 10071  # error codes of JetStream
+SENTENCES = {  # and what others of them mean
+    NO_STREAM: f"there is no stream {STREAM!r}: make it by `multidrop fleet init`",
+    **dict.fromkeys(
+        (10005, 10047),
+        "the servers of NATS have no room for so many samples: keep less by `multidrop fleet init --keep`, "
+        "or raise max_file in their jetstream blocks",
+    ),
+}
+
+
+class StreamError(OSError):
+    """NATS is not reached, refuses, or has no such stream. One sentence."""
+
+
+class StreamAbout(NamedTuple):
+    """A stream's identity and extent: a stream that is made anew counts from 1 again."""
+
+    created: str
+    first: int
+    last: int
+
+
+class LastMessage(NamedTuple):
+    """The newest message of a subject: its place in the stream, its number in the log, its digest.
+
+    The number is 0 where it is none of a gateway, but an answer of a server that somebody had sent there.
+    """
+
+    place: int
+    sequence: int
+    digest: str
+
+
+def subject_of(gateway: str, log: str) -> str:
+    return f"{STREAM}.{gateway}.{log}"
+
+
+def digest_of(data: bytes) -> str:
+    return hashlib.blake2b(data, digest_size=16).hexdigest()
+
+
+def end_if_cancelled() -> None:
+    """Raise CancelledError again: `asyncio.wait_for` of 3.11 swallows one that meets an answer."""
+    task = asyncio.current_task()
+    if task and task.cancelling():
+        raise asyncio.CancelledError
+
+
+async def connect(servers: list[str], **options: Any) -> BatchClient:
+    """Return a connection that comes back by itself. Raises StreamError."""
+    client = BatchClient()
+    try:
+        async with asyncio.timeout(ANSWER_S):
+            await client.connect(
+                servers,
+                allow_reconnect=True,
+                max_reconnect_attempts=-1,
+                reconnect_time_wait=1,
+                ping_interval=2,
+                **{"error_cb": _ignore, **options},
+            )
+    except (Error, OSError, TimeoutError) as failure:
+        last = client.last_error or failure
+        await close(client)
+        raise StreamError(str(failure_to_connect(", ".join(servers), last))) from failure
+    version = client.connected_server_version
+    if (version.major, version.minor) < OLDEST:
+        await close(client)
+        raise StreamError(
+            f"the server of NATS at {masked(', '.join(servers))} is "
+            f"{version.major}.{version.minor}.{version.patch}: a fleet needs "
+            f"{'.'.join(map(str, OLDEST))} or newer"
+        )
+    return client
+
+
+async def close(client: Client) -> None:
+    """Close a connection, also of a client that is half connected, or whose servers are gone."""
+    with suppress(Exception):
+        async with asyncio.timeout(ANSWER_S):
+            await client.close()
+
+
+async def _ignore(_: Exception) -> None:
+    """Do nothing: whoever asked has the error too, and the client would log a traceback for each."""
+
+
+async def create_stream(client: Client, *, replicas: int = 3, most_bytes: int = -1) -> int:
+    """Make the stream where there is none, and return the most bytes that it keeps; -1 for no limit.
+
+    The oldest messages go when it has more than `most_bytes`. That much is reserved: a stream without a limit
+    fills the servers, and then no lease can be renewed. A stream that is there stays as it is.
+    """
+    config = {
+        "name": STREAM,
+        "subjects": [f"{STREAM}.*.*"],
+        "retention": "limits",
+        "discard": "old",
+        "storage": "file",
+        "num_replicas": replicas,
+        "max_bytes": most_bytes,
+        "allow_direct": True,
+        "deny_delete": True,
+    }
+    found = await _ask(client, f"STREAM.INFO.{STREAM}", {}, NO_STREAM)
+    if found is None:
+        found = await _ask(client, f"STREAM.CREATE.{STREAM}", config)
+    with _as_wanted():
+        return int(found["config"].get("max_bytes", -1))
+
+
+async def about(client: Client) -> StreamAbout:
+    """Return the stream's identity and extent. Raises StreamError."""
+    found = await _ask(client, f"STREAM.INFO.{STREAM}", {})
+    with _as_wanted():
+        config, state = found["config"], found["state"]
+        if not config.get("allow_direct"):
+            raise StreamError(f"the stream {STREAM!r} allows no direct gets: set allow_direct")
+        return StreamAbout(str(found["created"]), int(state["first_seq"]), int(state["last_seq"]))
+
+
+async def last_of(client: Client, subject: str) -> LastMessage | None:
+    """Return the newest message of a subject, by the stream's leader. Raises StreamError."""
+    found = await _ask(client, f"STREAM.MSG.GET.{STREAM}", {"last_by_subj": subject}, NO_MESSAGE)
+    if found is None:
+        return None
+    with _as_wanted():
+        message = found["message"]
+        lines = base64.b64decode(message.get("hdrs", "")).decode("utf-8", "replace").splitlines()
+        headers = {name.strip(): value.strip() for name, _, value in (line.partition(":") for line in lines)}
+        number = 0 if BY_SERVER in headers else number_of(headers.get(SEQUENCE))
+        return LastMessage(int(message["seq"]), number, headers.get(DIGEST, ""))
+
+
+async def publish(client: Client, subject: str, data: bytes, headers: dict[str, str]) -> int | None:
+    """Store a message, and return its place; None where the subject's last one is another than expected.
+
+    Raises StreamError: then it may be stored or not.
+    """
+    try:
+        answer = await client.request(subject, data, timeout=ANSWER_S, headers=headers)
+    except NoRespondersError as failure:
+        raise StreamError(f"no stream takes {subject}: it has no leader now, or there is none") from failure
+    except (Error, OSError, TimeoutError) as failure:
+        raise silent(client, failure) from failure
+    found = _parsed(answer.data)
+    if error := found.get("error"):
+        if error.get("err_code") == WRONG_SEQUENCE:
+            return None
+        raise StreamError(f"the stream {STREAM!r} refuses a message: {error.get('description')}")
+    with _as_wanted():
+        return int(found["seq"])
+
+
+def number_of(text: str | None) -> int:
+    """Return a header's number; 0 for one that is missing or none."""
+    return int(text) if text and text.isascii() and text.isdigit() and len(text) < 19 else 0
+
+
+async def _ask(client: Client, subject: str, what: Mapping[str, Any], *none: int) -> Any:
+    """Return the answer of JetStream's API; None for one of these errors."""
+    try:
+        answer = await client.request(f"$JS.API.{subject}", json.dumps(what).encode(), timeout=ANSWER_S)
+    except NoRespondersError as failure:
+        raise StreamError("the servers of NATS run without JetStream, or have no quorum now") from failure
+    except (Error, OSError, TimeoutError) as failure:
+        raise silent(client, failure) from failure
+    found = _parsed(answer.data)
+    error = found.get("error")
+    if not error:
+        return found
+    if error.get("err_code") in none:
+        return None
+    if sentence := SENTENCES.get(error.get("err_code")):
+        raise StreamError(sentence)
+    raise StreamError(f"NATS refuses {subject}: {error.get('description')}")
+
+
+def _parsed(data: bytes) -> dict[str, Any]:
+    try:
+        found = json.loads(data)
+    except (ValueError, RecursionError):
+        found = None
+    if not isinstance(found, dict) or not isinstance(found.get("error") or {}, dict):
+        raise StreamError("NATS answers something else than JSON")
+    return found
+
+
+@contextmanager
+def _as_wanted() -> Iterator[None]:
+    """Raise StreamError where an answer lacks what is taken from it."""
+    try:
+        yield
+    except (AttributeError, KeyError, TypeError, ValueError):
+        raise StreamError("NATS answers something else than it was asked for") from None
+
+
+def silent(client: Client, failure: Exception) -> StreamError:
+    """Return why nothing was answered: a server tells of missing rights beside the answer, not by it."""
+    last = client.last_error
+    if last and "permissions violation" in str(last).lower():
+        return StreamError(f"the rights of this connection do not suffice: {_text(last)}")
+    if not client.is_connected:
+        return StreamError(f"NATS is not reached: {_text(last or failure)}")
+    return StreamError(f"NATS did not answer within {ANSWER_S:.0f} s")
+
+
+def _text(failure: Exception) -> str:
+    return str(failure).removeprefix("nats: ") or type(failure).__name__

@@ -1,0 +1,1 @@
+"""The NATS servers of a fleet: connections, buckets, setup and rights."""

@@ -1,0 +1,261 @@
+"""Buckets: records by key, replaced only at a known revision, and followed without a consumer on a server."""
+
+from __future__ import annotations
+
+import asyncio
+import base64
+import json
+import logging
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from typing import Any, NamedTuple
+
+from multidrop.fleet.errors import Conflict, FleetError, Unsure
+from multidrop.fleet.lines.record_shapes import largest, parsed
+from multidrop.fleet.samples.batch_client import Request
+from multidrop.fleet.servers.connections import ServerPath
+
+NONE_YET = 0  # the revision of a key without a record
+BATCH = 1000  # records asked for at a time
+FOLLOW_S = 0.2  # between looks at a bucket
+MOST_STRANGE = 1000  # records of a bucket that are told of
+_WRONG_REVISION = (10071, 10164)
+_NO_MESSAGE = 10037
+_NO_STREAM = 10059
+_UNAVAILABLE = 10008  # there is no leader, and none can be elected
+
+_log = logging.getLogger("multidrop.fleet")
+
+
+class Record(NamedTuple):
+    """A key's newest value, and the sequence at which the server stored it.
+
+    The value is None for a record that was removed, and for one that is none of ours.
+    """
+
+    key: str
+    revision: int
+    value: Any
+
+
+class WriteAnswers(NamedTuple):
+    """The records that were replaced, at their new revisions, and the keys of those that had another one.
+
+    Any other may have been replaced or not: read it.
+    """
+
+    stored: list[Record]
+    refused: set[str]
+
+
+def bucket_settings(name: str, replicas: int) -> dict[str, Any]:
+    """Return the stream that a bucket is: the newest record of each subject, on disk, on so many servers.
+
+    Nobody removes records: neither by a request, nor by a header of a new one.
+    """
+    return {
+        "name": f"KV_{name}",
+        "subjects": [f"$KV.{name}.>"],
+        "max_msgs_per_subject": 1,
+        "discard": "new",
+        "storage": "file",
+        "num_replicas": replicas,
+        "allow_rollup_hdrs": False,
+        "deny_delete": True,
+        "deny_purge": True,
+        "max_msg_size": largest(name),
+        "allow_direct": True,
+        "max_bytes": -1,
+        "max_msgs": -1,
+        "max_age": 0,
+    }
+
+
+async def ask(path: ServerPath, subject: str, data: Mapping[str, Any] | None = None) -> dict[str, Any]:
+    """Return what JetStream says to a request about streams.
+
+    Raises FleetError with its own words for an error, Unsure where the servers cannot decide, or answer
+    something else.
+    """
+    message = await path.request(f"$JS.API.{subject}", json.dumps(data).encode() if data else b"")
+    said = _table(message.data)
+    error = said.get("error")
+    if error and error.get("err_code") == _UNAVAILABLE:
+        raise Unsure(f"{path.url} says: {error.get('description')}")
+    if error:
+        raise ServerError(error)
+    return said
+
+
+def _table(data: bytes) -> dict[str, Any]:
+    """Return the table that an answer is. Raises Unsure for anything else: nobody knows what was done."""
+    with suppress(ValueError, RecursionError):
+        found = json.loads(data)
+        if isinstance(found, dict) and isinstance(found.get("error") or {}, dict):
+            return found
+    raise Unsure("what NATS answers is no answer of JetStream")
+
+
+def _revision(said: Mapping[str, Any]) -> int:
+    """Return the sequence at which a record was stored. Raises Unsure where the answer has none."""
+    revision = said.get("seq")
+    if type(revision) is not int:
+        raise Unsure("what NATS answers has no sequence")
+    return revision
+
+
+class ServerError(FleetError):
+    """JetStream's refusal, with its code."""
+
+    def __init__(self, error: Mapping[str, Any]) -> None:
+        super().__init__(f"NATS refuses: {error.get('description', error)}")
+        self.code = error.get("err_code", 0)
+
+    @property
+    def is_missing(self) -> bool:
+        return self.code in (_NO_STREAM, _NO_MESSAGE)
+
+
+class Bucket:
+    """One bucket; the path on which it is reached is looked up each time."""
+
+    def __init__(self, name: str, path: Callable[[], ServerPath]) -> None:
+        self.name = name
+        self.path = path
+        self._strange: set[str] = set()  # keys whose record is none of ours, as was told
+
+    async def put(self, key: str, value: Any, revision: int) -> int:
+        """Replace the record at this very revision, and return the new one.
+
+        Raises Conflict where it has another, Unsure where it may or may not have been replaced.
+        """
+        message = await self.path().request(*self._put(Record(key, revision, value)))
+        said = _table(message.data)
+        error = said.get("error")
+        if not error:
+            return _revision(said)
+        if error.get("err_code") in _WRONG_REVISION:
+            raise Conflict(f"{self.name}.{key} has another revision than {revision}")
+        raise Unsure(f"NATS did not store {self.name}.{key}: {error.get('description')}")
+
+    async def put_all(self, records: Sequence[Record]) -> WriteAnswers:
+        """Replace records, each at the revision given with it.
+
+        All are sent one behind the other, and the server decides each by itself.
+        """
+        answers = await self.path().request_all([self._put(record) for record in records])
+        written = WriteAnswers([], set())
+        for record, answer in zip(records, answers, strict=True):
+            with suppress(Unsure):
+                said = _table(answer or b"")
+                if not said.get("error"):
+                    written.stored.append(record._replace(revision=_revision(said)))
+                elif said["error"].get("err_code") in _WRONG_REVISION:
+                    written.refused.add(record.key)
+        return written
+
+    def _put(self, record: Record) -> Request:
+        value = record.value
+        return Request(
+            self._subject(record.key),
+            b"" if value is None else json.dumps(value, separators=(",", ":")).encode(),
+            {
+                "Nats-Expected-Last-Subject-Sequence": str(record.revision),
+                "Nats-Expected-Last-Subject-Sequence-Subject": self._all_of(record.key),
+            },
+        )
+
+    async def get(self, key: str) -> Record:
+        """Return the record as the bucket's leader has it; revision 0 for none."""
+        wanted = {"last_by_subj": self._all_of(key)}
+        try:
+            said = await ask(self.path(), f"STREAM.MSG.GET.KV_{self.name}", wanted)
+        except ServerError as failure:
+            if failure.code == _NO_MESSAGE:
+                return Record(key, NONE_YET, None)
+            raise
+        try:
+            found = said["message"]
+            subject, data = str(found["subject"]), base64.b64decode(found.get("data", ""))
+        except (AttributeError, KeyError, TypeError, ValueError):
+            raise Unsure(f"what NATS answers of {self.name}.{key} is no record") from None
+        return self._record(subject, _revision(found), data)
+
+    async def changes(self, after: int) -> list[Record]:
+        """Return the records with a higher revision, as any of the servers has them: some may be old.
+
+        At most 1000 at a time, in order. Nothing is kept for it on a server.
+        """
+        wanted = {"seq": after + 1, "batch": BATCH, "next_by_subj": ">"}
+        subject = f"$JS.API.DIRECT.GET.KV_{self.name}"
+        messages = await self.path().collect(subject, json.dumps(wanted).encode())
+        return [self._record(*message) for message in messages]
+
+    async def newest(self, keys: Sequence[str]) -> list[Record]:
+        """Return the records of these keys, 1000 at most, as any of the servers has them: some may be old."""
+        wanted = {"multi_last": [self._all_of(key) for key in keys]}
+        subject = f"$JS.API.DIRECT.GET.KV_{self.name}"
+        messages = await self.path().collect(subject, json.dumps(wanted).encode())
+        return [self._record(*message) for message in messages]
+
+    def _subject(self, key: str) -> str:
+        """Return the subject on which a record is written."""
+        return f"$KV.{self.name}.{key}"
+
+    def _all_of(self, key: str) -> str:
+        """Return all subjects whose newest message is the key's record."""
+        return self._subject(key)
+
+    def _record(self, subject: str, revision: int, data: bytes) -> Record:
+        key = subject.removeprefix(f"$KV.{self.name}.")
+        return Record(key, revision, self._value(key, data))
+
+    def _value(self, key: str, data: bytes) -> Any:
+        """Return the value; None for what is none of ours, with one warning until a good one comes."""
+        value, mistake = parsed(self.name, key, data)
+        if not mistake:
+            self._strange.discard(key)
+        elif key not in self._strange and len(self._strange) < MOST_STRANGE:
+            self._strange.add(key)
+            _log.warning("the record %s of the bucket %s is left out: %s", key, self.name, mistake)
+        return value
+
+
+OnTake = Callable[[Record | None, Record], object]
+
+
+class Follower:
+    """The records of a bucket, by key, as far as they were read.
+
+    `on_take` is called with each record that is newer than the one known, which comes first.
+    """
+
+    def __init__(self, bucket: Bucket, on_take: OnTake = lambda *_: None) -> None:
+        self.bucket = bucket
+        self._on_take = on_take
+        self.records: dict[str, Record] = {}
+        self._after = 0
+
+    async def look(self) -> list[Record]:
+        """Read all that changed since, and return it."""
+        changed: list[Record] = []
+        while True:
+            found = await self.bucket.changes(self._after)
+            changed += [record for record in found if self.take(record)]
+            if found:
+                self._after = found[-1].revision
+            if len(found) < BATCH:
+                return changed
+
+    async def rest(self) -> None:
+        """Wait until the next look."""
+        await asyncio.sleep(FOLLOW_S)
+
+    def take(self, record: Record) -> bool:
+        """Keep a record unless a newer one is known."""
+        before = self.records.get(record.key)
+        if before is not None and before.revision >= record.revision:
+            return False
+        self.records[record.key] = record
+        self._on_take(before, record)
+        return True

@@ -1,0 +1,283 @@
+"""Connections to NATS: three paths, each at a server of its own as long as that one lives."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from typing import Any
+
+import nats
+from nats.aio.msg import Msg
+from nats.aio.subscription import Subscription
+from nats.errors import Error as NatsError
+
+from multidrop import masked
+from multidrop.fleet.errors import FleetError, NobodyThere, NotAdmitted, NotDelivered, TooOld, Unsure
+from multidrop.fleet.leases.rules import PATHS
+from multidrop.fleet.lines.refusals import Denials, failure_to_connect
+from multidrop.fleet.samples.batch_client import BatchClient, DirectGet, DirectMessage, Request
+from multidrop.fleet.servers.direct_gets import Spare, first_answer
+
+OLDEST = (2, 12)  # 2.9.10 grants one revision to several claimants (nats-server issue 4320)
+CONNECT_S = 1.0
+ANSWER_S = 1.0  # for a request; a lease is renewed twice a second
+PONG_S = 0.7  # a server that takes longer is left for another one
+KEEP_S = 1.0  # between looks at a connection
+# With 0 for attempts, nats-py knocks at a port where nobody listens until our own time-out.
+ONE_TRY = {"allow_reconnect": False, "max_reconnect_attempts": 1, "reconnect_time_wait": 0.05}
+
+_log = logging.getLogger("multidrop.fleet")
+
+
+class ServerPath:
+    """One connection, at its home where that server lives, else at any other."""
+
+    def __init__(self, urls: Sequence[str], options: Mapping[str, Any] | None = None) -> None:
+        self.urls = [masked(url) for url in urls]  # the first is home
+        self._full = dict(zip(self.urls, urls, strict=True))  # with users and passwords
+        self.url = ""  # where it is
+        self.others: Sequence[ServerPath] = ()  # of the same process
+        self.spare = Spare()  # of the same process too
+        self._options = options or {}
+        self._client: BatchClient | None = None
+        self._denials = Denials()
+        self._trouble = ""  # that was told
+        self._leaving: set[asyncio.Task[None]] = set()
+        self._wanted: dict[str, Callable[[Msg], Any]] = {}  # by subject
+        self._standing: dict[str, Subscription] = {}  # at the present server
+        self._changing = asyncio.Lock()
+
+    @property
+    def is_open(self) -> bool:
+        return self._client is not None and self._client.is_connected and self._client.is_reading
+
+    @property
+    def server_name(self) -> str:
+        """Return the name of the server where it is; "" for none."""
+        return str(self._client._server_info.get("server_name", "")) if self._client else ""
+
+    @property
+    def version(self) -> tuple[int, int]:
+        """Return the version of the server where it is."""
+        assert self._client is not None
+        found = self._client.connected_server_version
+        return found.major, found.minor
+
+    async def open(self) -> None:
+        """Connect to the first server that answers. Raises FleetError when none does."""
+        failures = []
+        for url in self.urls:
+            try:
+                await self._move(url)
+            except TooOld:
+                raise
+            except FleetError as failure:
+                failures.append(failure)
+            else:
+                return
+        refusals = [failure for failure in failures if isinstance(failure, NotAdmitted)]
+        raise refusals[0] if refusals else FleetError("; ".join(map(str, failures)))
+
+    async def keep(self) -> None:
+        """Go elsewhere from a server that does not answer, and come home again; for ever."""
+        while True:
+            try:
+                await self.look_after()
+                self._trouble = ""
+            except NotAdmitted as failure:
+                if self._trouble != str(failure):
+                    _log.warning("%s", failure)
+                self._trouble = str(failure)
+            except FleetError:
+                pass
+            await asyncio.sleep(KEEP_S)
+
+    async def look_after(self) -> None:
+        """Do once what `keep` does."""
+        if not self.is_open or not await self._answers():
+            self._leave()
+            await self.open()
+        elif self.url != self.urls[0]:
+            await self._move(self.urls[0])
+
+    async def _answers(self) -> bool:
+        assert self._client is not None
+        try:
+            await asyncio.wait_for(self._client.flush(), PONG_S)
+        except (NatsError, OSError, TimeoutError):
+            return False
+        return True
+
+    async def _move(self, url: str) -> None:
+        denials = Denials()
+        client = await connect(self._full[url], self._options, denials)
+        async with self._changing:
+            standing: dict[str, Subscription] = {}
+            try:
+                await self._bring(client, standing)
+            except (NatsError, OSError) as failure:
+                await _close(client)
+                raise FleetError(f"{url} was lost again at once: {failure}") from None
+            self._leave()
+            self._client, self.url, self._standing, self._denials = client, url, standing, denials
+
+    def _leave(self) -> None:
+        if self._client is not None:
+            task = asyncio.get_running_loop().create_task(_close(self._client))
+            self._leaving.add(task)
+            task.add_done_callback(self._leaving.discard)
+            self._client, self.url = None, ""
+
+    async def subscribe(self, subject: str, called: Callable[[Msg], Any]) -> None:
+        """Call a coroutine function with each message, wherever this path moves."""
+        self._wanted[subject] = called
+        await self._follow_wanted()
+
+    async def unsubscribe(self, subject: str) -> None:
+        """Take no more messages; nothing happens where none were taken."""
+        self._wanted.pop(subject, None)
+        await self._follow_wanted()
+
+    async def _follow_wanted(self) -> None:
+        async with self._changing:
+            if self._client is not None:
+                with suppress(NatsError, OSError):  # it is left soon, and all is brought to the next server
+                    await self._bring(self._client, self._standing)
+
+    async def _bring(self, client: BatchClient, standing: dict[str, Subscription]) -> None:
+        """Subscribe to all that is wanted there now, and to nothing else."""
+        while standing.keys() != self._wanted.keys():
+            for subject in self._wanted.keys() - standing.keys():
+                if called := self._wanted.get(subject):  # it may be unwanted by now
+                    standing[subject] = await client.subscribe(subject, cb=called)
+            for subject in standing.keys() - self._wanted.keys():
+                await standing.pop(subject).unsubscribe()
+
+    async def subscribe_or_raise(self, subject: str, called: Callable[[Msg], Any]) -> None:
+        """Subscribe. Raises NoRight where these credentials do not allow to hear it."""
+        with self._denials.raising(subject):
+            await self.subscribe(subject, called)
+            client = self._connected()
+            with suppress(NatsError, OSError, TimeoutError):
+                await client.flush()  # this ping may leave before what waits to be sent, the next does not
+                await client.flush()
+
+    async def request(
+        self,
+        subject: str,
+        data: bytes = b"",
+        headers: dict[str, str] | None = None,
+        answer_s: float = ANSWER_S,
+    ) -> Msg:
+        """Return the answer.
+
+        Raises Unsure where none comes in time, NoRight where it may not be asked or heard, and NotDelivered
+        where nobody was asked, for certain: that is NobodyThere where the server says so.
+        """
+        client, denials = self._connected(), self._denials
+        before = denials.of_request(subject)
+        try:
+            return await client.request(subject, data, answer_s, headers=headers)
+        except nats.errors.NoRespondersError:
+            raise NobodyThere(f"nobody answers {subject} at {self.url}") from None
+        except (NatsError, OSError, TimeoutError) as failure:
+            denials.check_request(subject, self._options.get("inbox_prefix", "_INBOX"), before)
+            raise Unsure(f"{self.url} gave no answer to {subject}: {failure}") from None
+
+    async def collect(self, subject: str, data: bytes) -> list[DirectMessage]:
+        """Return all messages that a direct get gives; the other paths are asked too where this one is slow.
+
+        Raises Unsure as `request` does.
+        """
+        ways = [self, *(other for other in self.others if other.is_open)]
+        return await first_answer(ways, Request(subject, data), self.spare)
+
+    async def gather(self, request: Request, get: DirectGet) -> None:
+        """Gather the messages of a direct get by this path alone. Raises Unsure as `request` does."""
+        client, denials = self._connected(), self._denials
+        before = denials.of_request(request.subject)
+        try:
+            await client.batch(request, get, ANSWER_S)
+        except (NatsError, OSError) as failure:
+            denials.check_request(request.subject, self._options.get("inbox_prefix", "_INBOX"), before)
+            raise Unsure(f"{self.url} gave no whole answer to {request.subject}: {failure}") from None
+
+    async def request_all(self, requests: Sequence[Request]) -> list[bytes | None]:
+        """Return the answer to each request, or None where it is unsure whether it was carried out."""
+        try:
+            return await self._connected().replies(requests, ANSWER_S)
+        except (NatsError, OSError) as failure:
+            raise Unsure(f"{self.url} was lost while {len(requests)} requests were sent: {failure}") from None
+
+    def _connected(self) -> BatchClient:
+        if self._client is None or not self._client.is_connected:
+            raise NotDelivered(f"no connection to {self.urls[0]}")
+        return self._client
+
+    async def close(self) -> None:
+        """Leave the server."""
+        self._leave()
+        await asyncio.gather(*self._leaving)
+
+
+async def connect(url: str, options: Mapping[str, Any], denials: Denials | None = None) -> BatchClient:
+    """Return a connection to this very server. Raises FleetError, in one sentence."""
+    refusals: list[Exception] = []
+    told = denials or Denials()
+
+    async def note(failure: Exception) -> None:
+        if not client.is_connected:
+            refusals.append(failure)
+        await told.note(failure)
+
+    client = BatchClient()
+    settings = {**ONE_TRY, "connect_timeout": CONNECT_S}
+    try:
+        await asyncio.wait_for(client.connect(url, error_cb=note, **{**options, **settings}), 2 * CONNECT_S)
+    except asyncio.CancelledError:
+        _cut(client)
+        raise
+    except (NatsError, OSError, TimeoutError, ValueError) as failure:
+        _cut(client)
+        raise failure_to_connect(url, refusals[-1] if refusals else failure) from None
+    found = client.connected_server_version
+    if (found.major, found.minor) < OLDEST:
+        await _close(client)
+        raise TooOld(
+            f"the NATS server at {masked(url)} is {found.major}.{found.minor}; a fleet needs "
+            f"{'.'.join(map(str, OLDEST))} or newer: older ones may give one lease to two gateways"
+        )
+    return client
+
+
+async def _close(client: BatchClient) -> None:
+    try:
+        with suppress(NatsError, OSError, TimeoutError):
+            await asyncio.wait_for(client.close(), CONNECT_S)
+    finally:
+        _cut(client)
+
+
+def _cut(client: BatchClient) -> None:
+    """Close the socket and end the subscriptions' tasks, which nats-py may leave behind.
+
+    It does so where it is cancelled, or the server is gone. The error of its reading task is ignored.
+    """
+    for subscription in client._subs.values():
+        subscription._stop_processing()
+    reading = client._reading_task
+    if reading is not None and reading.done() and not reading.cancelled():
+        reading.exception()
+    writer = getattr(client._transport, "_io_writer", None)
+    if writer is not None and writer.transport is not None:
+        writer.transport.abort()
+
+
+def paths_of(urls: Sequence[str], options: Mapping[str, Any] | None = None) -> list[ServerPath]:
+    """Return three paths: each has another of the servers as its home, where there are so many."""
+    paths = [ServerPath([*urls[at % len(urls) :], *urls[: at % len(urls)]], options) for at in range(PATHS)]
+    for path in paths:
+        path.others, path.spare = [other for other in paths if other is not path], paths[0].spare
+    return paths

@@ -1,0 +1,141 @@
+"""Server files: the configuration of a fleet's NATS servers, and a secret key for each user.
+
+    n1.conf, n2.conf …   a server each, with its route to the others; for that server alone
+    rights.conf          users by their public keys, their rights and their accounts; for all servers
+    keys/NAME.key        the secret key of a user; for its machine alone
+    keys/routes          the servers' own password, as the servers' files have it
+
+Keys that are there stay as they are, so that a new gateway changes no other one's. A user whose name is not
+given any more has no rights.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import secrets
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+from urllib.parse import urlsplit
+
+from multidrop import masked
+from multidrop.fleet.servers.accounts import accounts
+from multidrop.fleet.servers.credentials import new_seed, public_key
+from multidrop.fleet.servers.rights import rights_of
+
+CLUSTER = "multidrop"
+ROUTE_PORTS = 2000  # from a server's port to that of its routes: 4222 and 6222, as usual
+MOST_PORTS = 65535
+STORE = Path("/var/lib/nats")
+PINGS = 'ping_interval: "1s", ping_max: 2'  # of routes: a dead one is left after 3 s, and not after 60 to 90
+
+
+class TlsFiles(NamedTuple):
+    """Paths on a server: its certificate, the key of that, and the certificate that signed all servers'."""
+
+    cert: Path
+    key: Path
+    ca: Path
+
+
+class ServerAddress(NamedTuple):
+    """A server's name, and where it listens."""
+
+    name: str
+    host: str
+    port: int
+
+    @property
+    def routes(self) -> int:
+        """Return the port for the other servers."""
+        return self.port + ROUTE_PORTS
+
+
+def addresses_of(urls: Sequence[str]) -> list[ServerAddress]:
+    """Return the servers that these URLs name. Raises ValueError for one that has no usable port."""
+    found = []
+    for number, url in enumerate(urls, 1):
+        parts = urlsplit(url)
+        try:
+            port = parts.port or 4222
+        except ValueError:
+            port = MOST_PORTS
+        if not parts.hostname or port + ROUTE_PORTS > MOST_PORTS:
+            raise ValueError(f"{masked(url)} is no address of a NATS server: write nats://host:4222")
+        found.append(ServerAddress(f"n{number}", parts.hostname, port))
+    return found
+
+
+def write_files(
+    folder: Path, gateways: Sequence[str], urls: Sequence[str], tls: TlsFiles | None, store: Path = STORE
+) -> list[Path]:
+    """Write all files, and return their paths. Secrets are for their owner's eyes alone (mode 0600).
+
+    Raises ValueError for a mistake, before anything is written.
+    """
+    servers = addresses_of(urls)
+    rights = rights_of(gateways)
+    keys = folder / "keys"
+    seeds = {name: _kept(keys / f"{name}.key") or new_seed() for name in rights}
+    public = {name: _public(keys / f"{name}.key", seed) for name, seed in seeds.items()}
+    password = _kept(keys / "routes") or secrets.token_hex(32)
+    keys.mkdir(parents=True, exist_ok=True, mode=0o700)
+    written = {keys / f"{name}.key": seed for name, seed in seeds.items()}
+    written |= {keys / "routes": password}
+    written |= {folder / f"{one.name}.conf": _server(one, servers, password, tls, store) for one in servers}
+    for path, text in written.items():
+        _write_secret(path, text + "\n")
+    (folder / "rights.conf").write_text("\n".join(accounts(rights, public)) + "\n", "utf-8")
+    return [*written, folder / "rights.conf"]
+
+
+def _kept(path: Path) -> str:
+    return path.read_text("utf-8", "replace").strip() if path.exists() else ""
+
+
+def _public(path: Path, seed: str) -> str:
+    try:
+        return public_key(seed)
+    except ValueError:
+        raise ValueError(f"{path} is damaged: remove it, and its user gets another key") from None
+
+
+def _write_secret(path: Path, text: str) -> None:
+    """Write a file that nobody else may read at any moment."""
+    beside = path.with_name(path.name + ".new")
+    beside.unlink(missing_ok=True)
+    descriptor = os.open(beside, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
+    with os.fdopen(descriptor, "w", encoding="utf-8") as file:
+        file.write(text)
+    beside.replace(path)
+
+
+def _server(
+    one: ServerAddress, servers: Sequence[ServerAddress], password: str, tls: TlsFiles | None, store: Path
+) -> str:
+    lines = [
+        f"server_name: {one.name}",
+        f'listen: "{one.host}:{one.port}"',
+        f"jetstream {{ store_dir: {json.dumps(str(store / one.name))}, sync_interval: always }}",
+        "include rights.conf",
+    ]
+    if tls:
+        lines.append(f"tls {{ {_files(tls)}, handshake_first: true }}")
+    if len(servers) > 1:
+        user = f"{{ user: routes, password: {json.dumps(password)} }}"
+        routes = [f"nats-route://routes:{password}@{other.host}:{other.routes}" for other in servers]
+        lines += [
+            f'cluster {{ name: {CLUSTER}, listen: "{one.host}:{one.routes}"',
+            f"  authorization {user}",
+            f"  routes: {json.dumps(routes)}",
+            f"  {PINGS}",
+            *([f"  tls {{ {_files(tls)}, verify: true }}"] if tls else []),
+            "}",
+        ]
+    return "\n".join(lines)
+
+
+def _files(tls: TlsFiles) -> str:
+    named = {"cert_file": tls.cert, "key_file": tls.key, "ca_file": tls.ca}
+    return ", ".join(f"{name}: {json.dumps(str(path))}" for name, path in named.items())

@@ -1,0 +1,147 @@
+"""Plant store: a plant's lines in the bucket `plant`, by name, and their files; each with its revision.
+
+A line's record has the table of the plant file and the text of the family files that it names, so a gateway
+reads the lines that it polls, and no others.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import tomllib
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from multidrop import MAY_LISTS, Key, Plant, PlantError, PlantLine, TomlPlace, check_listed, load_plant
+from multidrop.fleet.servers import names
+from multidrop.fleet.servers.buckets import Bucket, Follower, Record
+
+AT_ONCE = 64
+SOCKETS = ("socket://", "tcp://")
+
+_FLEET = {"may": Key(dict, "[fleet.may], a table")}
+
+
+def read_plant(path: Path) -> tuple[Plant, dict[str, Any]]:
+    """Return the plant of a file, and the record of each line by its name.
+
+    Raises ValueError (PlantError for mistakes of the file) for what a fleet cannot poll: a port that only
+    one machine has, or that a thread serves; a line's name that no subject can have; a family in Python.
+    """
+    plant = load_plant(path)
+    document = tomllib.loads(path.read_text("utf-8"))
+    for line in plant.lines:
+        try:
+            names.checked_name("line", line.name)
+        except ValueError as mistake:
+            raise ValueError(f"{path}: {mistake}") from None
+        if not line.port.startswith(SOCKETS):
+            raise ValueError(
+                f"{path}: line {line.name} is at {line.port}: a fleet polls socket:// and tcp:// ports, "
+                "which every gateway reaches and can close at once, and no others"
+            )
+    may = _lists(document.get("fleet", {}), plant)
+    return plant, {table["name"]: _description(table, path.parent, may) for table in document["line"]}
+
+
+def _lists(table: Any, plant: Plant) -> dict[str, list[str]]:
+    """Return the lists of [fleet.may]: registers and verbs that may be commanded through the fleet."""
+    place = TomlPlace(plant.path, ("[fleet]",))
+    may = place.check(table, _FLEET).get("may", {})
+    inner = place.of_file(plant.path, "[fleet.may]")
+    found = {
+        key: [entry for entry in entries if inner.attempt(check_listed, plant, key, entry)]
+        for key, entries in inner.check(may, MAY_LISTS).items()
+    }
+    if place.config_errors:
+        raise PlantError(tuple(place.config_errors))
+    return found
+
+
+def _description(table: Mapping[str, Any], folder: Path, may: Mapping[str, Sequence[str]]) -> dict[str, Any]:
+    files: dict[str, str] = {}
+    for model in {drive["model"] for drive in table["drive"]}:
+        if ".py" in model:
+            raise ValueError(
+                f"line {table['name']}: the family {model} is a Python file, and gateways run none that "
+                "comes over the network; declare it in TOML"
+            )
+        if model.endswith(".toml"):
+            files |= _family_files(folder, model)
+    drives = {drive["name"] for drive in table["drive"]}
+    own = {
+        key: sorted(entry for entry in entries if entry.rpartition(".")[0] in drives)
+        for key, entries in may.items()
+    }
+    lists = {key: entries for key, entries in own.items() if entries}
+    return {"line": dict(table), "files": files} | ({"may": lists} if lists else {})
+
+
+def _family_files(folder: Path, model: str) -> dict[str, str]:
+    """Return a family's file, and the CSV tables beside it that it names."""
+    family = (folder / model).resolve()
+    text = family.read_text("utf-8")
+    found = {model: text}
+    for other in family.parent.glob("*.csv"):
+        if other.name in text:
+            found[str(Path(model).parent / other.name)] = other.read_text("utf-8")
+    if any(Path(name).is_absolute() or ".." in Path(name).parts for name in found):
+        raise ValueError(f"the family {model} must be in the plant file's folder, or below it")
+    return found
+
+
+async def store(bucket: Bucket, records: Mapping[str, Any]) -> dict[str, int]:
+    """Make these lines the plant, and return how many came, changed, went and stayed.
+
+    A line that is as before keeps its revision, and is polled on as if nothing had happened.
+    """
+    follower = Follower(bucket)
+    await follower.look()
+    before = {name: record for name, record in follower.records.items() if record.value is not None}
+    changed = [name for name in records if name in before and before[name].value != records[name]]
+    came = [name for name in records if name not in before]
+    gone = [name for name in before if name not in records]
+    limit = asyncio.Semaphore(AT_ONCE)
+
+    async def put(name: str) -> None:
+        async with limit:
+            known = follower.records.get(name)
+            await bucket.put(name, records.get(name), known.revision if known else 0)
+
+    await asyncio.gather(*(put(name) for name in (*changed, *came, *gone)))
+    kept = len(records) - len(changed) - len(came)
+    return {"new": len(came), "changed": len(changed), "removed": len(gone), "kept": kept}
+
+
+def line_of(record: Record, folder: Path) -> PlantLine:
+    """Return the line that a record describes; its files are written below the folder.
+
+    Raises ValueError for a record that is none.
+    """
+    value, home = record.value, folder / record.key
+    home.mkdir(parents=True, exist_ok=True)
+    for name, text in value["files"].items():
+        path = Path(name)
+        if path.is_absolute() or ".." in path.parts:
+            raise ValueError(f"line {record.key}: a file {name!r} outside of its folder")
+        (home / path).parent.mkdir(parents=True, exist_ok=True)
+        (home / path).write_text(text, "utf-8")
+    plant = home / "line.plant"  # no family file ends so
+    plant.write_text(f"line = [{_toml(value['line'])}]\n", "utf-8")
+    return load_plant(plant).lines[0]
+
+
+def _toml(value: Any) -> str:
+    """Return a value in TOML, in one line."""
+    if isinstance(value, dict):
+        return "{" + ", ".join(f"{_toml(str(key))} = {_toml(one)}" for key, one in value.items()) + "}"
+    if isinstance(value, list):
+        return "[" + ", ".join(map(_toml, value)) + "]"
+    if isinstance(value, str):
+        return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, (int, float)):
+        return repr(value)
+    raise ValueError(f"a plant file has no {type(value).__name__} such as {value!r}")

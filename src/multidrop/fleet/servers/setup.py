@@ -1,0 +1,246 @@
+"""Setup: makes a fleet's buckets and streams, after a trial of what the servers are good for."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import time
+from collections.abc import Mapping, Sequence
+from datetime import datetime
+from functools import partial
+from typing import Any
+
+from multidrop.fleet.errors import Conflict, FleetError, NobodyThere, NoRight, TooOld, Unsure
+from multidrop.fleet.leases.bucket import LeaseBucket
+from multidrop.fleet.servers import names
+from multidrop.fleet.servers.buckets import NONE_YET, Bucket, ServerError, ask, bucket_settings
+from multidrop.fleet.servers.cluster import Cluster, cluster_of
+from multidrop.fleet.servers.connections import ServerPath
+from multidrop.fleet.servers.leaders import bring_leaders_home, led_clusters
+
+CONTEST = "contest"
+ROUNDS = 40  # 2.9.10 fails in the first few of them
+CLAIMANTS = 6
+MOST_REPLICAS = 3
+WAIT_S = 10.0  # an election takes 4 to 9 s
+CLOCKS_APART_S = 10.0
+
+_log = logging.getLogger("multidrop.fleet")
+
+
+async def set_up(paths: Sequence[ServerPath]) -> dict[str, Any]:
+    """Make what is missing, and return what there is. Raises FleetError, in one sentence.
+
+    Buckets that are there stay as they are. To make some takes each of the servers.
+    """
+    await open_all(paths)
+    reached = min(MOST_REPLICAS, len({path.server_name for path in paths}))
+    replicas = await _kept_on(paths[0])
+    away = [path.urls[0] for path in paths if path.url != path.urls[0]]
+    if away and not replicas:
+        raise FleetError(
+            f"{away[0]} does not answer, and what is made now stays on the other servers for good: start it "
+            "first, or leave its address out"
+        )
+    replicas = replicas or reached
+    await _contest(paths, reached)
+    for bucket in names.BUCKETS:
+        await _create(paths[0], bucket_settings(bucket, replicas))
+    await _wait_for_plant(paths[0])
+    await bring_leaders_home(paths[0], await led_clusters(paths[0]))
+    servers = {path.server_name: ".".join(map(str, path.version)) for path in paths}
+    return {"servers": servers, "replicas": replicas, "buckets": list(names.BUCKETS)}
+
+
+async def open_all(paths: Sequence[ServerPath]) -> None:
+    """Connect all paths. Raises FleetError where none is reached, or a server is too old."""
+    results = await asyncio.gather(*(path.open() for path in paths), return_exceptions=True)
+    failures = [result for result in results if isinstance(result, Exception)]
+    too_old = [failure for failure in failures if isinstance(failure, TooOld)]
+    if too_old or len(failures) == len(paths):
+        raise (too_old or failures)[0]
+
+
+async def check_buckets(path: ServerPath) -> None:
+    """Raise FleetError where there is no fleet in these servers yet, or no quorum; an election is no lack."""
+    ends = asyncio.get_running_loop().time() + WAIT_S
+    for bucket in names.BUCKETS:
+        try:
+            info = await _led(path, bucket, ends)
+        except ServerError as failure:
+            if failure.is_missing:
+                raise FleetError(
+                    f"{path.url} has no bucket {bucket}: run `multidrop fleet init` first"
+                ) from None
+            raise
+        except NoRight:
+            raise
+        except FleetError as failure:
+            raise no_quorum(path, failure) from None
+    check_clock(path, info.get("ts"))
+
+
+async def _led(path: ServerPath, bucket: str, ends: float) -> dict[str, Any]:
+    """Return the state of a bucket once it has a leader: it has none while that moves home, or is elected."""
+    while True:
+        try:
+            info = await ask(path, f"STREAM.INFO.KV_{bucket}")
+            if (cluster_of(info) or Cluster(path.server_name)).leader:
+                return info
+            lack = Unsure(f"the bucket {bucket} has no leader")
+        except Unsure as failure:
+            lack = failure
+        if asyncio.get_running_loop().time() > ends:
+            raise lack
+        await asyncio.sleep(0.1)
+
+
+def check_clock(path: ServerPath, server_time: Any) -> None:
+    """Warn where this machine's clock and the server's are far apart: leases do not mind, samples do.
+
+    Raises Unsure for what is no time.
+    """
+    try:
+        apart = time.time() - datetime.fromisoformat(server_time).timestamp()
+    except (TypeError, ValueError, OverflowError):
+        raise Unsure(f"what {path.url} answers of a bucket has no time") from None
+    if abs(apart) > CLOCKS_APART_S:
+        _log.warning(
+            "this machine's clock is %.0f s %s that of %s: set it, for samples have its time",
+            *(abs(apart), "ahead of" if apart > 0 else "behind", path.url),
+        )
+
+
+def no_quorum(path: ServerPath, failure: Exception) -> FleetError:
+    """Return the sentence for servers that do not decide anything."""
+    if isinstance(failure, NobodyThere):
+        return FleetError(
+            f"no JetStream answers at {path.url}: the configuration of each server needs "
+            '`jetstream { store_dir: "/var/lib/nats" }`, and one that runs must read new rights twice'
+        )
+    return FleetError(
+        f"the NATS servers around {path.url} have no quorum: more than half of them must run and reach each "
+        f"other ({failure})"
+    )
+
+
+async def _kept_on(path: ServerPath) -> int:
+    """Return the least number of servers that keep a bucket; 0 where one is missing."""
+    kept = []
+    for bucket in names.BUCKETS:
+        info = await _info(path, f"KV_{bucket}")
+        if info is None:
+            return 0
+        cluster = cluster_of(info)
+        kept.append(1 + len(cluster.followers) if cluster else 1)
+    return min(kept)
+
+
+async def _info(path: ServerPath, stream: str) -> dict[str, Any] | None:
+    """Return the state of a stream, None where there is none; a leader is waited for."""
+    ends = asyncio.get_running_loop().time() + WAIT_S
+    while True:
+        try:
+            return await ask(path, f"STREAM.INFO.{stream}")
+        except ServerError as failure:
+            if failure.is_missing:
+                return None
+            raise
+        except NoRight:
+            raise
+        except FleetError as failure:
+            if asyncio.get_running_loop().time() > ends:
+                raise no_quorum(path, failure) from None
+            await asyncio.sleep(0.2)
+
+
+async def _create(path: ServerPath, settings: Mapping[str, Any]) -> None:
+    ends = asyncio.get_running_loop().time() + WAIT_S
+    while await _info(path, settings["name"]) is None:
+        await _try(path, f"STREAM.CREATE.{settings['name']}", ends, settings)
+
+
+async def _remove(path: ServerPath, stream: str) -> None:
+    ends = asyncio.get_running_loop().time() + WAIT_S
+    while await _info(path, stream) is not None:
+        await _try(path, f"STREAM.DELETE.{stream}", ends)
+
+
+async def _try(
+    path: ServerPath, subject: str, ends: float, settings: Mapping[str, Any] | None = None
+) -> None:
+    """Ask for a stream to be changed; before the end of the time a failure is no matter, but for rights."""
+    try:
+        await ask(path, subject, settings)
+    except ServerError:
+        if asyncio.get_running_loop().time() > ends:
+            raise
+        await asyncio.sleep(0.2)  # no leader yet, or it is under way
+    except NoRight:
+        raise
+    except FleetError as failure:
+        if asyncio.get_running_loop().time() > ends:
+            raise no_quorum(path, failure) from None
+
+
+async def _wait_for_plant(path: ServerPath) -> None:
+    """Wait until the plant can be read: for a moment no server answers for a new bucket."""
+    ends = asyncio.get_running_loop().time() + WAIT_S
+    while True:
+        try:
+            await Bucket(names.PLANT, partial(_itself, path)).changes(0)
+        except NoRight:
+            raise
+        except FleetError as failure:
+            if asyncio.get_running_loop().time() > ends:
+                raise no_quorum(path, failure) from None
+            await asyncio.sleep(0.2)
+        else:
+            return
+
+
+async def _contest(paths: Sequence[ServerPath], replicas: int) -> None:
+    """Let several claimants ask for the same revision, again and again: one alone may get it."""
+    settings = bucket_settings(CONTEST, replicas)
+    await _create(paths[0], settings)
+    try:
+        ways = [path for path in paths if path.is_open]
+        claimants = [
+            LeaseBucket(CONTEST, partial(_itself, ways[at % len(ways)]), f"claimant-{at}")
+            for at in range(CLAIMANTS)
+        ]
+        revision, unsure = NONE_YET, 0
+        while revision == NONE_YET or unsure < ROUNDS:
+            unsure += 1
+            claims = [_claim(claimant, revision) for claimant in claimants]
+            granted = [found for found in await asyncio.gather(*claims) if found is not None]
+            if len(granted) > 1:
+                raise FleetError(
+                    f"the NATS servers around {paths[0].url} gave one revision of a key to {len(granted)} of "
+                    f"{CLAIMANTS} claimants at once; no lease is safe there"
+                )
+            revision = granted[0] if granted else await _revision(claimants[0], paths[0])
+            if unsure > 2 * ROUNDS:
+                raise no_quorum(paths[0], Unsure("a key was never granted"))
+    finally:
+        await _remove(paths[0], settings["name"])
+
+
+def _itself(path: ServerPath) -> ServerPath:
+    return path
+
+
+async def _revision(claimant: LeaseBucket, path: ServerPath) -> int:
+    try:
+        return (await claimant.get(CONTEST)).revision
+    except NoRight:
+        raise
+    except FleetError as failure:
+        raise no_quorum(path, failure) from None
+
+
+async def _claim(claimant: LeaseBucket, revision: int) -> int | None:
+    try:
+        return await claimant.put(CONTEST, {}, revision)
+    except (Conflict, FleetError):
+        return None

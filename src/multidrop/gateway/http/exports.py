@@ -1,0 +1,106 @@
+"""Exports: files of the history for those who ask for them, few at a time.
+
+Each takes a thread while its next piece is made, and a file of Parquet takes room on the history's disk.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import AsyncIterator, Callable, Generator, Iterator, Sequence
+from datetime import UTC, datetime
+from functools import partial
+from typing import Protocol, TypeVar
+from urllib.parse import quote
+
+from starlette.responses import Response, StreamingResponse
+from starlette.types import Receive, Scope, Send
+
+from multidrop.gateway.http.guard import Denied
+from multidrop.supervisor import supervisor
+
+MOST_EXPORTS = 8  # under way
+PIECE_S = 600.0  # that a piece may take: the first one of Parquet has the whole file behind it
+R = TypeVar("R")
+MOST_NAME = 80  # characters of a series in a file's name
+FORBIDDEN = re.compile(r'[\x00-\x1f\x7f/\\:*?"<>|]')  # in the names of files
+KINDS = {"csv": "text/csv; charset=utf-8", "parquet": "application/vnd.apache.parquet"}
+
+
+class ExportingPart(Protocol):
+    """The part of the historian that is needed here."""
+
+    def export(self, names: Sequence[str], begin: int, end: int, kind: str) -> Iterator[bytes]:
+        """Return a file piece by piece; called, and gone through, in threads."""
+
+
+class Exports:
+    """The exports that are under way."""
+
+    def __init__(self) -> None:
+        self.under_way = 0
+
+    async def respond(
+        self, part: ExportingPart, names: Sequence[str], begin: int, end: int, kind: str
+    ) -> Response:
+        """Return a file of these series. Raises Denied if it cannot be made, or not now; Hung by the disk."""
+        if kind not in KINDS:
+            raise Denied(400, f"format = {kind[:20]!r} is neither csv nor parquet")
+        if self.under_way >= MOST_EXPORTS:
+            raise Denied(503, f"{MOST_EXPORTS} exports are under way: try again when one has ended")
+        self.under_way += 1
+        try:
+            pieces = await _in_thread(partial(part.export, names, begin, end, kind))
+        except BaseException as failure:
+            self.under_way -= 1
+            if isinstance(failure, ValueError):
+                raise Denied(400, str(failure)) from failure
+            raise
+        return _Export(self, pieces, kind, f"{_what(names)} {_moment(begin)} to {_moment(end)}.{kind}")
+
+
+class _Export(StreamingResponse):
+    """One export, until its client has all of it or is gone."""
+
+    def __init__(self, exports: Exports, pieces: Iterator[bytes], kind: str, name: str) -> None:
+        plain = name.encode("ascii", "replace").decode().replace("?", "_")
+        named = f"attachment; filename=\"{plain}\"; filename*=UTF-8''{quote(name)}"
+        super().__init__(_through(pieces), media_type=KINDS[kind], headers={"content-disposition": named})
+        self._exports = exports
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        try:
+            await super().__call__(scope, receive, send)
+        finally:
+            self._exports.under_way -= 1
+
+
+async def _through(pieces: Iterator[bytes]) -> AsyncIterator[bytes]:
+    """Yield the pieces, each made in a thread: a disk may hang."""
+    try:
+        while (piece := await _in_thread(partial(next, pieces, None))) is not None:
+            yield piece
+    finally:  # its client may be gone: what it had on the disk goes
+        if isinstance(pieces, Generator):
+            supervisor().thread("exports", PIECE_S, pieces.close)
+
+
+async def _in_thread(work: Callable[[], R]) -> R:
+    return await supervisor().within("exports", PIECE_S, work, most=MOST_EXPORTS)
+
+
+def _what(names: Sequence[str]) -> str:
+    """Return the drives of these series as a file's name may have them."""
+    drives = list(dict.fromkeys(name.rpartition(".")[0] for name in names))
+    if not drives:
+        return "all drives"
+    first = names[0] if len(names) == 1 else drives[0]
+    more = f" and {len(drives) - 1} more" if len(drives) > 1 else ""
+    return f"{FORBIDDEN.sub('_', first)[:MOST_NAME]}{more}"
+
+
+def _moment(ms: int) -> str:
+    """Return a time of UTC without the colons that some systems forbid in names."""
+    try:
+        return datetime.fromtimestamp(ms / 1000, UTC).strftime("%Y-%m-%dT%H-%M-%SZ")
+    except (ValueError, OverflowError, OSError):
+        return "a time"

@@ -1,0 +1,214 @@
+"""Guard: checks a request before any route sees it: the page it comes from, and its sender."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Mapping, Sequence
+from http.cookies import CookieError, SimpleCookie
+from typing import Any, NamedTuple
+
+from starlette.datastructures import Headers
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from multidrop.gateway.http.json_response import JsonResponse
+from multidrop.gateway.http.rights import SCHEMES, Caller, May, OwnNames, Right, Token, Tokens, is_loopback
+
+COOKIE = "multidrop"
+CSP = "default-src 'self'; base-uri 'none'; form-action 'none'; object-src 'none'; frame-ancestors 'none'"
+HEADERS = {  # of what is no page: short, since each frame has them
+    "content-security-policy": "default-src 'none'; frame-ancestors 'none'",
+    "cross-origin-resource-policy": "same-origin",
+    "x-content-type-options": "nosniff",
+    "cache-control": "no-store",
+}
+PAGE_HEADERS = HEADERS | {
+    "content-security-policy": CSP,
+    "cross-origin-opener-policy": "same-origin",
+    "x-frame-options": "DENY",
+    "referrer-policy": "no-referrer",
+    "cache-control": "no-cache",  # a page's file is asked for again, by its ETag
+}
+ANYONE = "anyone"
+WRONG = "the token is wrong"
+SHUT = "too many wrong tokens came from this address: try again in a minute"
+HAS_WRONG_TOKEN = "has_wrong_token"  # of a scope: a stop, which is sent all the same
+MOST_HEAD = 64 * 1024  # bytes before a request's body: a browser sends the cookies of all ports of a host
+
+
+def _raw(headers: Mapping[str, str]) -> list[tuple[bytes, bytes]]:
+    return [(name.encode("latin-1"), value.encode("latin-1")) for name, value in headers.items()]
+
+
+_RAW_HEADERS, _RAW_PAGE_HEADERS = _raw(HEADERS), _raw(PAGE_HEADERS)
+
+_log = logging.getLogger("multidrop.gateway")
+
+
+class Needed(NamedTuple):
+    """The method of a path, and the right that it needs; None: anybody may, and no token is asked for."""
+
+    method: str
+    right: Right | None
+
+
+class Denied(Exception):
+    """A request that is not served: its status, and a sentence."""
+
+    def __init__(self, status: int, sentence: str) -> None:
+        super().__init__(sentence)
+        self.status = status
+
+
+class Guard:
+    """Lets a request through to `app` with its caller in the scope's `caller`, or answers it."""
+
+    def __init__(
+        self,
+        app: ASGIApp,
+        *,
+        needed: Mapping[str, Needed],
+        names: OwnNames,
+        tokens: Tokens,
+        may: Callable[[], May],
+        behind_proxy: bool,
+        clock: Callable[[], float],
+    ) -> None:
+        self._app = app
+        self._needed = needed
+        self._names = names
+        self._tokens = tokens
+        self._may = may
+        self._behind_proxy = behind_proxy
+        self._clock = clock
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] != "http":
+            return  # uvicorn refuses a connection that nobody accepts
+
+        is_page = scope["path"] == "/" or scope["path"].startswith("/page/")
+        added = _RAW_PAGE_HEADERS if is_page else _RAW_HEADERS
+
+        async def send_with_headers(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                headers = message["headers"]
+                own = {name for name, _ in headers}
+                message["headers"] = [*headers, *(one for one in added if one[0] not in own)]
+            await send(message)
+
+        try:
+            scope["caller"] = self._check(scope)
+        except Denied as denied:
+            response = JsonResponse({"error": str(denied)}, denied.status)
+            if denied.status == 401:
+                response.headers["www-authenticate"] = "Bearer"
+                if COOKIE in Headers(scope=scope).get("cookie", ""):  # the next request is without it
+                    response.delete_cookie(COOKIE, httponly=True, samesite="strict")
+            await response(scope, receive, send_with_headers)
+            return
+        await self._app(scope, receive, send_with_headers)
+
+    def _check(self, scope: Scope) -> Caller:
+        headers = Headers(scope=scope)
+        hosts = headers.getlist("host")
+        if len(hosts) != 1 or not self._names.has_host(hosts[0]):
+            name = hosts[0] if hosts else ""
+            raise Denied(421, f"{name[:100]!r} is not this gateway; add it to names of [serve] if it is")
+        path: str = scope["path"]
+        needed = self._find(path)
+        if needed.right is not Right.STOP and _length(scope) > MOST_HEAD:
+            raise Denied(431, f"the headers are longer than {MOST_HEAD} bytes")
+        if scope["method"] != needed.method and (scope["method"], needed.method) != ("HEAD", "GET"):
+            raise Denied(405, f"{path[:100]!r} takes {needed.method} alone")
+        self._check_site(headers, hosts[0], needed, SCHEMES if self._behind_proxy else (scope["scheme"],))
+        if needed.right is None:
+            return Caller(ANYONE, "page", self.address(scope, headers), Right.LOOK)
+        return self._admit(scope, headers, needed.right)
+
+    def _find(self, path: str) -> Needed:
+        """Return what is needed for the longest listed prefix of a path."""
+        while path not in self._needed:
+            head, slash, _ = path.rstrip("/").rpartition("/")
+            if not slash:
+                return self._needed["/"]
+            path = f"{head}/"
+        return self._needed[path]
+
+    def _check_site(self, headers: Headers, host: str, needed: Needed, schemes: Sequence[str]) -> None:
+        """Refuse what another site's page sends: a browser says so, and nothing else has to."""
+        origin = headers.get("origin")
+        if origin is not None and not self._names.has_origin(origin, host, schemes):
+            raise Denied(403, f"a page of {origin[:100]!r} asks, which is not this gateway's")
+        site = headers.get("sec-fetch-site", "none")
+        is_page = needed == Needed("GET", None) and headers.get("sec-fetch-mode") == "navigate"
+        if site not in ("none", "same-origin") and not is_page:
+            raise Denied(403, "a page of another site asks")
+        if needed.method == "POST":
+            kind = headers.get("content-type", "").partition(";")[0].strip().lower()
+            if kind != "application/json":
+                raise Denied(415, "the body must be application/json")
+
+    def _admit(self, scope: Scope, headers: Headers, needed: Right) -> Caller:
+        """Return the caller of a request that needs this right.
+
+        A wrong token is refused, whatever its sender may do without one: all but a stop that anybody may
+        send. After several wrong ones from an address none from there is looked at for a while, but for a
+        stop, which nothing may hold back.
+        """
+        address = self.address(scope, headers)
+        local = is_loopback(address) and not self._behind_proxy
+        free = self._may().without_token(is_loopback=local)
+        secret, way = _secret(headers)
+        secret = secret if self._tokens else ""  # without any there is nothing to check it against
+        token: Token | None = None
+        is_shut = needed is not Right.STOP and self._tokens.is_shut(address, self._clock())
+        if secret and not is_shut:
+            token = self._tokens.find(secret)
+            if token is None and self._tokens.note_wrong(address, secret, self._clock()):
+                _log.warning("wrong token from %s", address)
+        if secret and token is None:
+            if needed is not Right.STOP or free is None or free < Right.STOP:
+                raise Denied(429, SHUT) if is_shut else Denied(401, WRONG)
+            scope[HAS_WRONG_TOKEN] = True
+        if token is not None and (free is None or token.right >= free):
+            caller = Caller(token.name, way, address, token.right)
+        elif free is not None:
+            caller = Caller(ANYONE, way, address, free)
+        else:
+            raise Denied(401, "a token is needed")
+        if caller.role >= needed:
+            return caller
+        if token is None:
+            raise Denied(401, f"this needs a token to {needed.name.lower()}")
+        raise Denied(
+            403, f"{caller.name} may {caller.role.name.lower()}, and this needs {needed.name.lower()}"
+        )
+
+    def address(self, scope: Scope, headers: Headers) -> str:
+        """Return the client's address; behind a proxy the one that it added last."""
+        client: Any = scope.get("client")
+        peer = str(client[0]) if client else ""
+        if not self._behind_proxy:
+            return peer
+        told = ",".join(headers.getlist("x-forwarded-for")).rpartition(",")[2].strip()
+        return told[:64] or peer
+
+
+def _length(scope: Scope) -> int:
+    """Return the bytes of a request's path, query and headers."""
+    words = sum(len(name) + len(value) for name, value in scope["headers"])
+    return words + len(scope["raw_path"]) + len(scope["query_string"])
+
+
+def _secret(headers: Headers) -> tuple[str, str]:
+    """Return the token that was sent, and who sent it: a program or the page."""
+    scheme, _, secret = headers.get("authorization", "").partition(" ")
+    if scheme.lower() == "bearer":
+        return secret.strip(), "http"
+    cookies: SimpleCookie = SimpleCookie()
+    try:
+        cookies.load(headers.get("cookie", ""))
+    except CookieError:
+        return "", "page"
+    found = cookies.get(COOKIE)
+    is_page = found is not None or "origin" in headers or "sec-fetch-site" in headers
+    return (found.value if found is not None else ""), "page" if is_page else "http"

@@ -1,0 +1,92 @@
+"""Fields of a request to the web server: its caller, its body, and texts and numbers in them."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import logging
+from collections.abc import Mapping
+from typing import Any
+
+from starlette.requests import ClientDisconnect, Request
+
+from multidrop import plain_whole
+from multidrop.gateway.http.guard import Denied
+from multidrop.gateway.http.rights import Caller
+
+MOST_BYTES = 64 * 1024  # of a body
+BODY_S = 10.0  # that it may take to come
+STOP_BODY_S = 3.0  # that a stop waits for it: a network that lost it sends it once or twice more
+
+_log = logging.getLogger("multidrop.gateway")
+
+
+def caller_of(request: Request) -> Caller:
+    caller: Caller = request.scope["caller"]
+    return caller
+
+
+async def body_of(request: Request, seconds: float | None = None) -> dict[str, Any]:
+    """Return the body's JSON object. Raises Denied for any other, and for one that is too long or late."""
+    data = bytearray()
+    seconds = BODY_S if seconds is None else seconds
+    try:
+        async with asyncio.timeout(seconds):
+            async for chunk in request.stream():
+                data += chunk
+                if len(data) > MOST_BYTES:
+                    raise Denied(413, f"the body is longer than {MOST_BYTES} bytes")
+    except ClientDisconnect:
+        raise Denied(400, "the client is gone") from None
+    except TimeoutError:
+        raise Denied(408, f"the body did not come within {seconds:g} s") from None
+    try:
+        found = json.loads(data)
+    except (ValueError, RecursionError):
+        raise Denied(400, "the body is not JSON") from None
+    if not isinstance(found, dict):
+        raise Denied(400, "the body is not a JSON object")
+    return found
+
+
+async def drives_to_stop(request: Request) -> list[str] | None:
+    """Return the drives that a stop names; None: all.
+
+    A stop needs no body: one that is late, cut off, too long, or no list of names, or one of none, asks for
+    all drives. To stop too many can be mended, and to stop none cannot.
+    """
+    try:
+        drives = (await body_of(request, STOP_BODY_S)).get("drives")
+    except Denied as unread:
+        _log.warning("a stop is one of all drives, because %s", unread)
+        return None
+    if isinstance(drives, str):
+        return [drives]
+    if drives is None:
+        return None
+    if isinstance(drives, list) and drives and all(isinstance(one, str) for one in drives):
+        return drives
+    _log.warning("a stop is one of all drives, because %.100r is no list of names", drives)
+    return None
+
+
+def text_in(body: Mapping[str, Any], key: str) -> str:
+    value = body.get(key)
+    if not isinstance(value, str) or not value:
+        raise Denied(400, f"{key} is missing, or is no text")
+    return value
+
+
+def frame_in(body: Mapping[str, Any]) -> int:
+    """Return the number of the frame that the sender of a command had seen."""
+    seen = body.get("seen")
+    if isinstance(seen, bool) or not isinstance(seen, int) or not 0 <= seen < 1 << 63:
+        raise Denied(400, "seen is missing, or no whole number: it is the n of the newest frame you have")
+    return seen
+
+
+def number_in(text: str, key: str) -> int:
+    try:
+        return plain_whole(text)
+    except ValueError:
+        raise Denied(400, f"{key} = {text[:40]!r} is no whole number") from None

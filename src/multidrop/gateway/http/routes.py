@@ -1,0 +1,355 @@
+"""Web: the routes, each behind the guard."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import AsyncIterator, Coroutine, Mapping
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from starlette.applications import Starlette
+from starlette.requests import Request
+from starlette.responses import FileResponse, PlainTextResponse, Response, StreamingResponse
+from starlette.routing import Mount, Route
+from starlette.staticfiles import StaticFiles
+from starlette.types import ASGIApp, Receive, Scope, Send
+
+from multidrop import Refused, expose_metrics
+from multidrop.gateway.audit import MOST_RECORDS, newest_records, time_asked
+from multidrop.gateway.clock import utc_ms
+from multidrop.gateway.commands import Admit, Told
+from multidrop.gateway.http.exports import Exports
+from multidrop.gateway.http.frame_route import FrameRoute
+from multidrop.gateway.http.guard import COOKIE, HAS_WRONG_TOKEN, SHUT, WRONG, Denied, Guard, Needed
+from multidrop.gateway.http.json_response import JsonResponse
+from multidrop.gateway.http.request_fields import (
+    body_of,
+    caller_of,
+    drives_to_stop,
+    frame_in,
+    number_in,
+    text_in,
+)
+from multidrop.gateway.http.rights import NEVER_THIS_WAY, NOT_ALLOWED, NOT_LISTED, Right
+from multidrop.gateway.live.descriptions import describe
+from multidrop.gateway.live.views import figures_of, health_of, look_at, look_at_lines
+from multidrop.gateway.metrics import families_of
+from multidrop.gateway.verb_rules import STOPPING
+from multidrop.supervisor import Hung, supervisor
+
+if TYPE_CHECKING:
+    from multidrop.gateway.gateway import Gateway
+
+PAGE = Path(__file__).parent / "page"
+MOST_QUERIES = 2  # of the audit log, at the same time
+AUDIT_S = 20.0  # that one may take
+COOKIE_S = 30 * 24 * 3600
+MOST_NOTE = 500  # characters beside an alarm
+HEAD_S = 0.5  # after which a stop's answer begins: its head confirms that the stop was taken
+UNBUFFERED = {"x-accel-buffering": "no"}  # a proxy passes the head on at once
+RIGHTS_RULES = (NOT_ALLOWED, NOT_LISTED, NEVER_THIS_WAY)
+
+NEEDED: Mapping[str, Needed] = {
+    "/": Needed("GET", None),
+    "/page/": Needed("GET", None),
+    "/api/": Needed("GET", Right.LOOK),
+    "/health": Needed("GET", Right.LOOK),
+    "/metrics": Needed("GET", Right.LOOK),
+    "/api/stop": Needed("POST", Right.STOP),
+    "/api/fleet/stop": Needed("POST", Right.STOP),
+    "/api/act": Needed("POST", Right.STOP),  # the verb's own right is looked at by Commands
+    "/api/acknowledge": Needed("POST", Right.STOP),
+    "/api/write": Needed("POST", Right.WRITE),
+    "/api/reload": Needed("POST", Right.WRITE),
+    "/api/token": Needed("POST", None),
+    "/api/forget": Needed("POST", None),
+}
+
+_log = logging.getLogger("multidrop.gateway")
+
+
+def make_app(gateway: Gateway) -> ASGIApp:
+    """Return the whole application."""
+    pages = _Pages(gateway)
+    routes = [
+        Route("/", pages.index),
+        Route("/api/plant", pages.plant),
+        Route("/api/drive/{name:path}", pages.drive),
+        Route("/api/lines", pages.lines),
+        Route("/api/fleet", pages.fleet),
+        Route("/api/history", pages.history),
+        Route("/api/export", pages.export),
+        Route("/api/audit", pages.audit),
+        Route("/api/alarms", pages.alarms),
+        Route("/health", pages.health),
+        Route("/metrics", pages.metrics),
+        Route("/api/stop", pages.stop, methods=["POST"]),
+        Route("/api/fleet/stop", pages.stop_fleet, methods=["POST"]),
+        Route("/api/write", pages.write, methods=["POST"]),
+        Route("/api/act", pages.act, methods=["POST"]),
+        Route("/api/acknowledge", pages.acknowledge, methods=["POST"]),
+        Route("/api/reload", pages.reload, methods=["POST"]),
+        Route("/api/token", pages.token, methods=["POST"]),
+        Route("/api/forget", pages.forget, methods=["POST"]),
+    ]
+    if PAGE.is_dir():
+        routes.append(Mount("/page", StaticFiles(directory=PAGE)))  # type: ignore[arg-type]
+    handlers: Any = {
+        Denied: _denied,
+        Hung: lambda request, failure: _error(503, str(failure)),
+        404: lambda request, failure: _error(404, "there is nothing here"),
+        500: lambda request, failure: _error(500, "this went wrong in the gateway; its log says why"),
+    }
+    others = Starlette(routes=routes, exception_handlers=handlers)
+    frames = FrameRoute(gateway.frames)
+
+    async def app(scope: Scope, receive: Receive, send: Send) -> None:
+        """Answer for frames before the router: they are asked for most often by far."""
+        await (frames if scope["path"] == "/api/frame" else others)(scope, receive, send)
+
+    return Guard(
+        app,
+        needed=NEEDED,
+        names=gateway.own_names,
+        tokens=gateway.tokens,
+        may=lambda: gateway.settings.may,
+        behind_proxy=gateway.settings.behind_proxy,
+        clock=lambda: gateway.guard_clock(),
+    )
+
+
+def _error(status: int, sentence: str) -> Response:
+    return JsonResponse({"error": sentence}, status)
+
+
+async def _denied(request: Request, failure: Exception) -> Response:
+    return _error(getattr(failure, "status", 400), str(failure))
+
+
+def _told(told: Told) -> dict[str, Any]:
+    return {"done": told.is_done, "text": told.text}
+
+
+def _answer(told: Told) -> Response:
+    """Return what became of a command: 403 where a right was missing, else 200 with what happened."""
+    is_denied = isinstance(told.error, Refused) and told.error.rule in RIGHTS_RULES
+    return JsonResponse(_told(told) | ({"error": told.text} if is_denied else {}), 403 if is_denied else 200)
+
+
+async def _answer_one(work: Coroutine[Any, Any, Told]) -> Response:
+    return _answer(await work)
+
+
+async def _answer_all(work: Coroutine[Any, Any, Mapping[str, Told]]) -> Response:
+    return JsonResponse({name: _told(one) for name, one in (await work).items()})
+
+
+async def _answer_fleet(work: Coroutine[Any, Any, Mapping[str, tuple[bool, str]]]) -> Response:
+    return JsonResponse({name: {"done": done, "text": text} for name, (done, text) in (await work).items()})
+
+
+async def _body_of(task: asyncio.Task[Response]) -> AsyncIterator[bytes]:
+    yield bytes((await asyncio.shield(task)).body)
+
+
+class _Pages:
+    """The routes' functions."""
+
+    def __init__(self, gateway: Gateway) -> None:
+        self._gateway = gateway
+        self._exports = Exports()
+
+    async def index(self, request: Request) -> Response:
+        page = PAGE / "index.html"
+        if not page.exists():
+            return _error(404, "this version of multidrop has no page; /api/plant and /metrics are there")
+        return FileResponse(page)
+
+    # ---- looks ----
+
+    async def plant(self, request: Request) -> Response:
+        gateway = self._gateway
+        described = describe(
+            gateway.hub,
+            gateway.settings.may,
+            caller_of(request).role,
+            revision=gateway.revision,
+            version=gateway.version,
+            is_demo=gateway.settings.is_demo,
+            has_file=gateway.reload.has_file,
+            mistakes=gateway.reload.mistakes,
+            has_fleet="fleet" in gateway.feeds,
+            can_stop_fleet=getattr(gateway.feeds.get("fleet"), "can_stop", False),
+        )
+        return JsonResponse(described)
+
+    async def drive(self, request: Request) -> Response:
+        try:
+            return JsonResponse(await look_at(self._gateway, request.path_params["name"]))
+        except ValueError as unknown:
+            return _error(404, str(unknown))
+
+    async def lines(self, request: Request) -> Response:
+        return JsonResponse(look_at_lines(self._gateway))
+
+    async def fleet(self, request: Request) -> Response:
+        part: Any = self._gateway.feeds.get("fleet")
+        if part is None:
+            return _error(404, "no fleet is looked at; add [serve.fleet] to the plant file")
+        return JsonResponse(part.told())
+
+    async def health(self, request: Request) -> Response:
+        health = health_of(self._gateway)
+        return JsonResponse(health, 503 if health["status"] == "failed" else 200)
+
+    async def metrics(self, request: Request) -> Response:
+        gateway = self._gateway
+        families = families_of(gateway.hub, gateway.lately.newest, figures_of(gateway))
+        kind, text = expose_metrics(families, request.headers.get("accept", ""))
+        return PlainTextResponse(text, headers={"content-type": kind, "vary": "accept"})
+
+    async def audit(self, request: Request) -> Response:
+        query = request.query_params
+        before, count = time_asked(query), number_in(query.get("count", str(MOST_RECORDS)), "count")
+        work = partial(newest_records, self._gateway.settings.audit, before, count)
+        return JsonResponse(await supervisor().within("audit queries", AUDIT_S, work, most=MOST_QUERIES))
+
+    async def alarms(self, request: Request) -> Response:
+        query = request.query_params
+        begin, end = (number_in(query.get(key, ""), key) for key in ("from", "to"))
+        events = self._gateway.events
+        found = [alarm.as_json() for alarm in events.between(begin, end)]
+        return JsonResponse({"alarms": found, "since": events.since})
+
+    async def acknowledge(self, request: Request) -> Response:
+        """Note that the caller has seen an alarm, with what he has to say of it."""
+        body = await body_of(request)
+        alarm, note = text_in(body, "alarm"), body.get("note", "")
+        if not isinstance(note, str) or len(note) > MOST_NOTE or not note.isprintable():
+            raise Denied(400, f"note is no text of at most {MOST_NOTE} printable characters")
+        try:
+            found = self._gateway.events.acknowledge(alarm, utc_ms(), caller_of(request).by, note.strip())
+        except KeyError:
+            raise Denied(404, "there is no such alarm; its list may have changed meanwhile") from None
+        self._gateway.frames.note_news()
+        return JsonResponse(found.as_json())
+
+    # ---- history ----
+
+    async def history(self, request: Request) -> Response:
+        part = self._history()
+        query = request.query_params
+        points = number_in(query.get("points", "800"), "points")
+        begin, end = (number_in(query.get(key, ""), key) for key in ("from", "to"))
+        try:
+            found = await part.series(query.getlist("series"), begin, end, points)
+        except ValueError as mistake:
+            return _error(400, str(mistake))
+        return Response(found, media_type="application/json")
+
+    async def export(self, request: Request) -> Response:
+        part, query = self._history(), request.query_params
+        begin, end = (number_in(query.get(key, ""), key) for key in ("from", "to"))
+        kind = query.get("format", "csv")
+        return await self._exports.respond(part, query.getlist("series"), begin, end, kind)
+
+    def _history(self) -> Any:
+        part = self._gateway.feeds.get("history")
+        if part is None:
+            raise Denied(404, "no history is kept; add [serve.history] to the plant file")
+        return part
+
+    # ---- commands ----
+
+    async def stop(self, request: Request) -> Response:
+        drives = await drives_to_stop(request)
+        stopping = self._gateway.commands.stop(drives, caller_of(request))
+        return await self._answer_stop(_answer_all(stopping))
+
+    async def stop_fleet(self, request: Request) -> Response:
+        """Stop all drives of the fleet, with the commander's key of `[serve.fleet]`."""
+        part: Any = self._gateway.feeds.get("fleet")
+        if part is None or not part.can_stop:
+            raise Denied(404, "no fleet is stopped from here; add commander to [serve.fleet]")
+        caller = caller_of(request)
+        _log.warning("stop of the whole fleet, asked for by %s", caller.by)
+        return await self._answer_stop(_answer_fleet(part.stop(caller.by)))
+
+    async def _answer_stop(self, work: Coroutine[Any, Any, Response]) -> Response:
+        """Return the answer to a stop, which goes on even if its client leaves.
+
+        The answer to a longer one begins after HEAD_S: a client without it knows that no stop was taken.
+        """
+        task = supervisor().start("stop", work)
+        await asyncio.wait({task}, timeout=HEAD_S)
+        if task.done():
+            return task.result()
+        return StreamingResponse(_body_of(task), media_type="application/json", headers=UNBUFFERED)
+
+    async def write(self, request: Request) -> Response:
+        body = await body_of(request)
+        value = body.get("value")
+        if isinstance(value, bool) or not isinstance(value, (int, float)):
+            raise Denied(400, "value is missing, or is no number")
+        drive, register = text_in(body, "drive"), text_in(body, "register")
+        caller = caller_of(request)
+        admit = self._admission(drive, (register, value, caller), body)
+        return _answer(await self._gateway.commands.write(drive, register, value, caller, admit))
+
+    async def act(self, request: Request) -> Response:
+        body = await body_of(request)
+        drive, verb = text_in(body, "drive"), text_in(body, "verb")
+        if HAS_WRONG_TOKEN in request.scope and verb not in STOPPING:
+            raise Denied(401, WRONG)
+        options = {} if verb in STOPPING else body.get("options", {})  # no wrong ones keep a stop back
+        if not isinstance(options, dict):
+            raise Denied(400, "options is no JSON object")
+        caller = caller_of(request)
+        admit = self._admission(drive, (verb, repr(options), caller), body)
+        acting = _answer_one(self._gateway.commands.act(drive, verb, options, caller, admit))
+        return await (self._answer_stop(acting) if verb in STOPPING else acting)
+
+    def _admission(self, drive: str, command: object, body: Mapping[str, Any]) -> Admit:
+        """Return what admits a command by the frame that its sender had seen; stops need none."""
+        frames = self._gateway.seen_frames
+        return lambda what: frames.admit(drive, what, (drive, command), frame_in(body))
+
+    async def reload(self, request: Request) -> Response:
+        if (await body_of(request)).get("confirm") is not True:
+            raise Denied(400, 'a reload changes what is polled: confirm it with {"confirm": true}')
+        told = await self._gateway.reload.carry_out(caller_of(request).by)
+        return JsonResponse(
+            {"done": told.is_done, "text": told.text, "mistakes": told.mistakes, "restart": told.restart}
+        )
+
+    # ---- tokens ----
+
+    async def token(self, request: Request) -> Response:
+        """Keep a token in a cookie that no script can read.
+
+        After several wrong ones from an address none is looked at for a while, but to send a stop.
+        """
+        gateway, caller = self._gateway, caller_of(request)
+        body = await body_of(request)
+        secret = text_in(body, "token")
+        is_shut = gateway.tokens.is_shut(caller.address, gateway.guard_clock())
+        if is_shut and body.get("to") != "stop":
+            raise Denied(429, SHUT)
+        token = gateway.tokens.find(secret)
+        if token is None:
+            gateway.tokens.note_wrong(caller.address, secret, gateway.guard_clock())
+            _log.warning("wrong token from %s", caller.address)
+            raise Denied(401, WRONG)
+        response = JsonResponse({"name": token.name, "role": token.right.name.lower()})
+        is_secure = gateway.settings.tls is not None or gateway.settings.behind_proxy
+        response.set_cookie(
+            COOKIE, secret, max_age=COOKIE_S, httponly=True, samesite="strict", secure=is_secure
+        )
+        return response
+
+    async def forget(self, request: Request) -> Response:
+        response = JsonResponse({})
+        response.delete_cookie(COOKIE, httponly=True, samesite="strict")
+        return response

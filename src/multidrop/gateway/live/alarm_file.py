@@ -1,0 +1,149 @@
+"""AlarmFile: keeps alarms on the disk. `run` has a thread of its own, so polling never waits for a disk."""
+
+from __future__ import annotations
+
+import json
+import threading
+import time
+from collections import deque
+from pathlib import Path
+from queue import Empty, Full, Queue
+from typing import Any
+
+from multidrop.gateway.live.events import KINDS, MOST_ENDED, Alarm
+
+MOST_WAITING = 10_000  # alarms that the disk has not taken yet
+MOST_BYTES = 4 << 20  # of the file, which is written anew with its newest alarms when it is longer
+SLOW_S = 10.0  # a disk that takes longer is reported
+CLOSE_S = 2.0
+
+
+class AlarmFile:
+    """The alarms in a file of JSON lines, the newest line of an alarm being the one that counts.
+
+    Nothing here waits for the disk or raises.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.past: list[Alarm] | None = None  # of earlier runs, once they are read
+        self._failure = ""
+        self._since = time.monotonic()  # when the disk began with what it is at; inf: it has nothing to do
+        self._waiting: Queue[Alarm | None] = Queue(MOST_WAITING)
+        self._ended = threading.Event()
+
+    @property
+    def trouble(self) -> str:
+        """Why alarms are not kept now; "" is well."""
+        if time.monotonic() - self._since > SLOW_S:
+            return f"alarms are not kept: {self.path} has not been written for {SLOW_S:g} s"
+        return f"alarms are not kept: {self._failure}" if self._failure else ""
+
+    def note(self, alarm: Alarm) -> None:
+        """Have an alarm written that began, ended or changed."""
+        try:
+            self._waiting.put_nowait(alarm)
+        except Full:
+            self._failure = f"{MOST_WAITING} wait for {self.path} already"
+
+    def close(self) -> None:
+        """Write what waits; a disk that hangs is left alone after CLOSE_S."""
+        try:
+            self._waiting.put_nowait(None)
+        except Full:
+            return
+        self._ended.wait(CLOSE_S)
+
+    # ---- on the thread ----
+
+    def run(self) -> None:
+        """Read the alarms of earlier runs, then write what is noted until `close`."""
+        try:
+            self._keep()
+        finally:
+            self._ended.set()
+
+    def _keep(self) -> None:
+        known: dict[str, Alarm] = {}
+        try:
+            known = _read(self.path)
+        except OSError as failure:
+            self._note_failure(failure)
+        self.past = list(known.values())
+        self._since = float("inf")
+        while alarms := self._taken():
+            self._since = time.monotonic()
+            changed = [alarm for alarm in alarms if alarm is not None]
+            known |= {alarm.id: alarm for alarm in changed}
+            known = _newest(known)
+            try:
+                self._write(changed, known)
+                self._failure = ""
+            except OSError as failure:
+                self._note_failure(failure)
+            self._since = float("inf")
+            if None in alarms:
+                return
+
+    def _note_failure(self, failure: OSError) -> None:
+        self._failure = f"{self.path}: {failure.strerror or failure}"
+
+    def _taken(self) -> list[Alarm | None]:
+        found = [self._waiting.get()]
+        while True:
+            try:
+                found.append(self._waiting.get_nowait())
+            except Empty:
+                return found
+
+    def _write(self, changed: list[Alarm], known: dict[str, Alarm]) -> None:
+        """Append what changed; after a failure, or in a file that is too long, write all that is known."""
+        is_whole = not self._failure and (not self.path.exists() or self.path.stat().st_size <= MOST_BYTES)
+        if is_whole:
+            with self.path.open("a", encoding="utf-8") as file:
+                file.writelines(map(_line, changed))
+            return
+        new = self.path.with_name(f"{self.path.name}.new")
+        new.write_text("".join(map(_line, known.values())), "utf-8")
+        new.replace(self.path)
+
+
+def _line(alarm: Alarm) -> str:
+    """Return a line of its own: one that a lost power truncated ends before it."""
+    return f"\n{json.dumps(alarm.as_json())}\n"
+
+
+def _newest(known: dict[str, Alarm]) -> dict[str, Alarm]:
+    """Return those that last, and the newest of the others."""
+    ended = [name for name, alarm in known.items() if alarm.ended is not None]
+    forgotten = {*ended[: max(0, len(ended) - MOST_ENDED)]}
+    return {name: alarm for name, alarm in known.items() if name not in forgotten}
+
+
+def _read(path: Path) -> dict[str, Alarm]:
+    found: dict[str, Alarm] = {}
+    try:
+        with path.open("rb") as file:
+            file.seek(max(0, path.stat().st_size - 2 * MOST_BYTES))
+            lines: deque[bytes] = deque(file.read(2 * MOST_BYTES).splitlines())
+    except FileNotFoundError:
+        return found
+    for line in lines:
+        if (alarm := alarm_in(line)) is not None:
+            found.pop(alarm.id, None)
+            found[alarm.id] = alarm
+    return _newest(found)
+
+
+def alarm_in(line: bytes) -> Alarm | None:
+    """Return the alarm of a line; None for one that is none, such as one that was truncated."""
+    try:
+        given: Any = json.loads(line)
+        alarm = Alarm(**{name: given[name] for name in Alarm._fields})
+    except (ValueError, TypeError, KeyError, RecursionError):
+        return None
+    texts = (alarm.drive, alarm.text, alarm.line, alarm.by, alarm.note)
+    times = [one for one in (alarm.ended, alarm.acknowledged) if one is not None]
+    is_right = all(isinstance(text, str) for text in texts) and alarm.kind in KINDS
+    is_timed = all(type(one) is int for one in (alarm.time, *times))
+    return alarm if is_right and is_timed else None

@@ -1,0 +1,128 @@
+"""Description of a plant for the page: lines, drives, registers, and what the caller may do. Pure."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from enum import Flag
+from typing import Any, cast
+
+from multidrop import Drive, PlantLine, PolledDrive, Register, verbs_of
+from multidrop.gateway.http.rights import May, Right
+from multidrop.gateway.live.hub import Hub
+
+FREQUENCIES = ("output_frequency", "motor_speed")
+CURRENTS = ("output_current",)
+
+
+def describe(
+    hub: Hub,
+    may: May,
+    right: Right | None,
+    *,
+    revision: int,
+    version: str,
+    is_demo: bool,
+    has_file: bool = False,
+    mistakes: Sequence[str] = (),
+    has_fleet: bool = False,
+    can_stop_fleet: bool = False,
+) -> dict[str, Any]:
+    """Return what GET /api/plant answers to a caller with this right."""
+    is_writer = right is Right.WRITE
+    return {
+        "revision": revision,
+        "version": version,
+        "name": hub.plant.path.name,
+        "demo": is_demo,
+        "file": has_file,  # that can be read again
+        "fleet": has_fleet,  # that /api/fleet tells of
+        "fleet_stop": can_stop_fleet,  # by /api/fleet/stop
+        "mistakes": list(mistakes),  # of the file, where the newest reload was refused
+        "may": {
+            "role": None if right is None else right.name.lower(),
+            "write": sorted(may.write) if is_writer else [],
+            "verbs": sorted(may.verbs) if is_writer else [],
+        },
+        "lines": [_line(hub, line) for line in hub.plant.lines],
+    }
+
+
+def _line(hub: Hub, line: PlantLine) -> dict[str, Any]:
+    speeds = dict.fromkeys(str(polled.drive.settings) for polled in line.drives)
+    return {
+        "name": line.name,
+        "port": line.port,
+        "speed": ", ".join(speeds),
+        "drives": [_drive(hub, polled) for polled in line.drives],
+    }
+
+
+def _drive(hub: Hub, polled: PolledDrive) -> dict[str, Any]:
+    drive = polled.drive
+    periods = {poll.register.name: poll.every or 0.0 for poll in polled.polls}
+    return {
+        "name": drive.name,
+        "family": drive.model or type(drive).__name__,
+        "title": drive.title,
+        "address": drive.address,
+        "speed": str(drive.settings),
+        "key": _key_registers(drive, periods),
+        "registers": [
+            _register(register)
+            | {"period_s": periods.get(register.name), "holds_s": hub.holds_s(drive.name, register.name)}
+            for register in drive.registers.values()
+        ],
+        "verbs": verbs_of(drive),
+    }
+
+
+def _key_registers(drive: Drive, periods: dict[str, float]) -> dict[str, str | None]:
+    """Return the registers that stand for all others: those that are polled first, and those that are not."""
+    wanted = {"frequency": FREQUENCIES, "current": CURRENTS, "setpoint": (drive.setpoint_name,)}
+    found: dict[str, str | None] = {}
+    for name, registers in wanted.items():
+        there = [one for one in registers if one in drive.registers]
+        found[name] = next((one for one in there if one in periods), next(iter(there), None))
+    return found
+
+
+def digits_of(register: Register[Any]) -> int | None:
+    """Return the digits behind the point; None where each value has its own, as of a float."""
+    return None if register.is_float or register.scale_register else register.decimals
+
+
+def _register(register: Register[Any]) -> dict[str, Any]:
+    values = register.values
+    least, most = _span(register)
+    kind = "number" if values is None else "bits" if issubclass(values, Flag) else "words"
+    members: list[Any] = [] if values is None else list(cast(Any, values))
+    words = {str(int(member)): register.in_words(member) for member in members}
+    return {
+        "name": register.name,
+        "unit": register.value_unit,
+        "digits": digits_of(register),
+        "kind": kind,
+        "words": words,
+        "access": register.access.value,
+        "place": register.place,
+        "note": register.note,
+        "least": least,
+        "most": most,
+        "at_least": register.at_least,  # registers whose values are limits too
+        "at_most": register.at_most,
+        "step": None if register.is_float else register.step,
+    }
+
+
+def _span(register: Register[Any]) -> tuple[float | None, float | None]:
+    """Return the least and the largest value that may be written: the manual's, or else what fits.
+
+    None: a float without a span, or named values.
+    """
+    if register.span is not None:
+        return register.span
+    if register.values is not None or register.is_float or not register.writable:
+        return None, None
+    ends = (register.coding.value_of(float(raw)) for raw in register.coding.raw_span)
+    least, most = sorted(ends)
+    return least, most

@@ -1,0 +1,227 @@
+"""Events: alarms of drives and of lines, each with its begin and end. Pure."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Collection, Iterable
+from typing import Any, NamedTuple
+
+from multidrop.gateway.live.hub import (
+    FAULT,
+    INCOMPLETE,
+    NOT_ASKED,
+    RUNS,
+    SILENT,
+    STANDS,
+    UNKNOWN,
+    UNNAMED,
+    Shown,
+)
+
+STOPPED, PORT = "stopped", "port"  # kinds beside "fault" and "silent"
+KINDS = (FAULT, STOPPED, PORT, SILENT)  # the gravest first
+UNCALLED = "the motor stopped, and no stop was called here"
+STANDS_MS = 2000  # for which a motor must stand: one that reverses passes 0 Hz
+MOST_ENDED = 1000  # that are remembered
+MOST_SHOWN = 20  # of them beside those that last
+LOST = ("port lost", "port refused its settings")  # statuses of all rows of a line that is not there
+
+
+class Alarm(NamedTuple):
+    """Something that is or was wrong with a drive or a line; times are UTC in ms."""
+
+    time: int
+    drive: str  # "" for a line's
+    text: str
+    ended: int | None
+    kind: str
+    line: str = ""
+    is_before: bool = False  # it may have begun before `time`, when it was first seen
+    acknowledged: int | None = None
+    by: str = ""  # who acknowledged it
+    note: str = ""
+
+    @property
+    def id(self) -> str:
+        """A name of its own, which is the same after a restart."""
+        return f"{self.time} {self.kind} {self.drive or self.line}"
+
+    def as_json(self) -> dict[str, Any]:
+        return {"id": self.id, **self._asdict()}
+
+
+class Events:
+    """Alarms that last, and the latest of those that are over.
+
+    `since` is the time (UTC, ms) from which all are known: none is of before it, and of later ones those that
+    ended first are forgotten. `note` is called with each alarm that began, ended or changed.
+    """
+
+    def __init__(self, since: int = 0, note: Callable[[Alarm], object] = lambda alarm: None) -> None:
+        self.since = since
+        self._note = note
+        self._lasting: dict[tuple[str, str, str], Alarm] = {}  # by line, drive and kind, the oldest first
+        self._ended: deque[Alarm] = deque(maxlen=MOST_ENDED)
+        self._known: set[tuple[str, str]] = set()  # lines and drives of which something was seen
+        self._runs: dict[str, int] = {}  # stops that were called before a drive's motor was seen to run
+        self._stands: dict[str, int] = {}  # since when a motor that ran has stood
+        self.begun = 0  # so far
+
+    # ---- what is seen ----
+
+    def look(self, time: int, drive: str, shown: Shown, stops: int | None = None) -> None:
+        """Note what a drive shows. A fault lasts until somebody sees it go, so while its drive is silent.
+
+        `stops` counts the commands that end a run of its motor; None: a stand means nothing now.
+        """
+        state, words = shown.state, shown.words
+        if state == SILENT:
+            if not (words or "").startswith(LOST):  # that is one alarm of its line
+                self._begin(time, "", drive, SILENT, words or "no reply")
+            return
+        if words == NOT_ASKED:
+            return
+        self._end(time, "", drive, SILENT)
+        if state == FAULT:
+            self._forget_run(drive)
+            self._end(time, "", drive, STOPPED)
+            self._begin(time, "", drive, FAULT, words or UNNAMED)
+        elif words != INCOMPLETE:
+            self._end(time, "", drive, FAULT)
+            self._look_at_run(time, drive, state, stops)
+            self._known.add(("", drive))
+
+    def _look_at_run(self, time: int, drive: str, state: str, stops: int | None) -> None:
+        """Raise an alarm for a motor that stopped without a command and stayed at rest for STANDS_MS."""
+        if state == RUNS:
+            self._runs.setdefault(drive, stops or 0)
+            self._stands.pop(drive, None)
+            self._end(time, "", drive, STOPPED)
+        elif state in (STANDS, UNKNOWN) and drive in self._runs:
+            since = self._stands.setdefault(drive, time)
+            is_called = stops != self._runs[drive]
+            if is_called or time - since >= STANDS_MS:
+                self._forget_run(drive)
+            if not is_called and time - since >= STANDS_MS:
+                self._begin(since, "", drive, STOPPED, UNCALLED)
+
+    def _forget_run(self, drive: str) -> None:
+        self._runs.pop(drive, None)
+        self._stands.pop(drive, None)
+
+    def look_at_line(self, time: int, line: str, lost: str | None) -> None:
+        """Note that a line's port is lost, and why, or with None that it is there."""
+        if lost is None:
+            self._end(time, line, "", PORT)
+        else:
+            self._begin(time, line, "", PORT, lost)
+
+    def note_there(self, line: str) -> None:
+        """Note that a line was seen to work: what is lost later was not lost before."""
+        self._known.add((line, ""))
+
+    def forget(self, name: str, time: int) -> None:
+        """End the alarms of a drive or a line that is no longer there."""
+        self._forget_run(name)
+        self._known -= {("", name), (name, "")}
+        for line, drive, kind in list(self._lasting):
+            if name in (line, drive):
+                self._end(time, line, drive, kind)
+
+    # ---- what a person does, and what a disk keeps ----
+
+    def acknowledge(self, id: str, time: int, by: str, note: str = "") -> Alarm:
+        """Note that somebody has seen an alarm; one of a motor that stopped is over then.
+
+        Raises KeyError for an unknown one.
+        """
+        found = next((one for one in (*self._lasting.values(), *self._ended) if one.id == id), None)
+        if found is None:
+            raise KeyError(id)
+        changed = found._replace(acknowledged=time, by=by, note=note)
+        if found.ended is None:
+            self._lasting[_key(found)] = changed
+        else:
+            self._ended[self._ended.index(found)] = changed
+        self._note(changed)
+        if changed.kind == STOPPED and changed.ended is None:
+            self._end(time, *_key(changed))
+        return changed
+
+    def restore(self, kept: Iterable[Alarm], time: int, names: Collection[str]) -> None:
+        """Take alarms of an earlier run; those of drives and lines that are not in `names` end now."""
+        kept = sorted(kept, key=lambda alarm: alarm.ended or alarm.time)
+        if kept:
+            self.since = min(self.since, *(alarm.time for alarm in kept))
+        newer = list(self._ended)
+        self._ended.clear()
+        self._ended.extend([alarm for alarm in kept if alarm.ended is not None])
+        self._ended.extend(newer)
+        for alarm in kept:
+            if alarm.ended is None:
+                self._take_up(alarm, time, names)
+
+    def _take_up(self, alarm: Alarm, time: int, names: Collection[str]) -> None:
+        """Let an alarm of an earlier run go on, if it is not known by now that it is over."""
+        key = _key(alarm)
+        present = self._lasting.get(key)
+        is_seen = key[:2] in self._known and present is None
+        if present is not None and present.is_before and present.text in (alarm.text, UNNAMED):
+            self._lasting[key] = alarm  # it is the same one
+        elif present is not None or is_seen or (alarm.drive or alarm.line) not in names:
+            self._ended.append(alarm._replace(ended=time))
+            self._note(self._ended[-1])
+        else:
+            self._lasting[key] = alarm
+
+    # ---- what is shown ----
+
+    def shown(self) -> list[Alarm]:
+        """Return those that last, the gravest kind first, and behind them the newest that ended."""
+        ended = [*self._ended][-MOST_SHOWN:]
+        return [*self.lasting, *sorted(ended, key=lambda alarm: -alarm.time)]
+
+    def between(self, begin: int, end: int) -> list[Alarm]:
+        """Return the alarms of a span of time, the newest first."""
+        found = [one for one in (*self._lasting.values(), *self._ended) if one.time <= end]
+        return sorted(
+            (one for one in found if one.ended is None or one.ended >= begin), key=lambda alarm: -alarm.time
+        )
+
+    @property
+    def lasting(self) -> list[Alarm]:
+        """The alarms that last: what nobody acknowledged first, then the gravest kind, then the newest."""
+        return sorted(
+            self._lasting.values(),
+            key=lambda alarm: (alarm.acknowledged is not None, KINDS.index(alarm.kind), -alarm.time),
+        )
+
+    # ---- begin and end ----
+
+    def _begin(self, time: int, line: str, drive: str, kind: str, text: str) -> None:
+        key = (line, drive, kind)
+        before = self._lasting.get(key)
+        is_before = key[:2] not in self._known
+        self._known.add(key[:2])
+        if before is not None and (text in (before.text, UNNAMED) or kind == SILENT):
+            return
+        if before is not None and (before.text == UNNAMED or kind == PORT):  # the same one, with its name now
+            self._lasting[key] = before._replace(text=text)
+            self._note(self._lasting[key])
+            return
+        self._end(time, *key)
+        self._lasting[key] = Alarm(time, drive, text, None, kind, line, is_before)
+        self.begun += 1
+        self._note(self._lasting[key])
+
+    def _end(self, time: int, line: str, drive: str, kind: str) -> None:
+        before = self._lasting.pop((line, drive, kind), None)
+        if before is not None:
+            if len(self._ended) == MOST_ENDED:
+                self.since = max(self.since, self._ended[0].ended or 0)
+            self._ended.append(before._replace(ended=time))
+            self._note(self._ended[-1])
+
+
+def _key(alarm: Alarm) -> tuple[str, str, str]:
+    return alarm.line, alarm.drive, alarm.kind

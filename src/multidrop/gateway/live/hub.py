@@ -1,0 +1,358 @@
+"""Hub: the newest row of every register of every drive, and what they say of the drive's state.
+
+Pure: rows and times come in. Rows have times of CLOCK_MONOTONIC, which stands still while the machine sleeps:
+what was read before it slept is old when it wakes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any, NamedTuple
+
+from multidrop import FAULT_RECORDS, Batch, Condition, Plant, PolledDrive, Register, StateReader
+from multidrop.gateway.live.kept_rows import FreshValues, Known, RegisterRows
+
+RUNS, STANDS, FAULT, SILENT, UNKNOWN = "runs", "stands", "fault", "silent", "unknown"
+UNNAMED = "it shows a fault"  # whose code is not known
+
+NOT_ASKED = "not asked lately"  # words of an unknown state: nothing is known of it at present,
+INCOMPLETE = "not all of it is known"  # or not all of what is polled is: a fault may be there all the same
+
+_STATES = {
+    Condition.STOPPED: STANDS,
+    Condition.RUNNING: RUNS,
+    Condition.ACCELERATING: RUNS,
+    Condition.DECELERATING: RUNS,
+    Condition.FAULT: FAULT,
+    Condition.UNKNOWN: UNKNOWN,
+}
+LEAST_SLEEP_NS = 100_000_000  # less is two clocks that were not read at once
+
+FAULT_REGISTER = "fault"
+RAN_NS = 3_000_000_000  # for which a motor must turn after its fault record changed, to have no fault
+_TURNING = ("output_frequency", "motor_speed")  # other than 0: the motor turns
+_ANSWERED = ("exception ", "no valid value")  # begin the statuses of misses that are replies all the same
+
+
+class Newest(NamedTuple):
+    """The newest row of one register of one drive."""
+
+    time: int  # UTC ns: the request was sent
+    monotonic_ns: int
+    value: float | None  # None: this row is a miss
+    status: str  # "ok", or the reason
+    holds_ns: int  # for which a value of this register is the present one
+
+
+class Shown(NamedTuple):
+    """A drive's state in one of five words, and its fault, or why it is silent, in more."""
+
+    state: str
+    words: str | None
+    note: str = ""  # what else the drive says, or why its state is unknown
+
+    @property
+    def fault(self) -> str | None:
+        """The fault that the drive shows, in its own words; None where it shows none."""
+        return self.words if self.state == FAULT else None
+
+    @property
+    def why_silent(self) -> str | None:
+        return self.words if self.state == SILENT else None
+
+
+class _Trip(NamedTuple):
+    """A fault that a drive told by a change of its fault record alone."""
+
+    words: str
+    at_ns: int
+
+
+class _Watched:
+    """One drive of the plant."""
+
+    def __init__(self, polled: PolledDrive, cycle_ns: int, since_ns: int) -> None:
+        self.polled = polled
+        self.since_ns = since_ns  # it has been asked for no longer
+        self.names = tuple(poll.register.name for poll in polled.polls)
+        self.cycle_ns = cycle_ns  # of its line, as planned
+        self.reader = StateReader(polled.drive)
+        self.record: float | None = None  # of its newest fault
+        self.trip: _Trip | None = None
+        self.cells: dict[str, RegisterRows] = {}
+
+    def cell(self, register: str) -> RegisterRows:
+        """Return the cell of a register, which is new where it was not known."""
+        if register not in self.cells:
+            every = next((poll.every for poll in self.polled.polls if poll.register.name == register), None)
+            least_ns = self.cycle_ns if every is None else max(self.cycle_ns, round(every * 1e9))
+            self.cells[register] = RegisterRows(least_ns, self.since_ns)
+        return self.cells[register]
+
+
+class Hub:
+    """The newest rows of a plant; `take` is given every batch.
+
+    `clock` returns CLOCK_MONOTONIC, and for how long the machine slept so far, both in ns.
+    """
+
+    def __init__(self, plant: Plant, clock: Callable[[], tuple[int, int]] = lambda: (0, 0)) -> None:
+        self.plant = plant
+        self._clock = clock
+        _, self._slept_ns = clock()
+        self._woke_ns = 0  # when a sleep was noticed, by the monotonic clock
+        self.time = 0  # of the newest row, UTC in ns
+        self.taken = 0  # batches
+        self.unopened: dict[str, str] = {}  # lines whose port could not be opened, and why
+        self._cells: dict[int, RegisterRows | None] = {}  # by both codes; None: no drive of the plant
+        self._statuses: tuple[str, ...] = ("ok",)
+        self._watched: dict[str, _Watched] = {}
+        self.adopt(plant)
+
+    def adopt(self, plant: Plant, planned: Mapping[str, Any] | None = None) -> None:
+        """Go on with another plant; what is known of drives that stay as they are is kept.
+
+        Rows that were asked for before and come later count for these alone: a name may be another's now.
+        `planned` is `plant.metadata()["planned"]`, for callers that have it: it takes seconds for hundreds
+        of lines.
+        """
+        before = self._watched
+        since_ns = self._clock()[0] if before else 0
+        self.plant = plant
+        self._cells = {}
+        self._watched = {}
+        planned = plant.metadata()["planned"] if planned is None else planned
+        for line in plant.lines:
+            cycle_ns = round(planned[line.name]["cycle_ms"] * 1e6)
+            for polled in line.drives:
+                known = before.get(polled.drive.name)
+                stays = known is not None and known.polled == polled
+                self._watched[polled.drive.name] = (
+                    known if known is not None and stays else _Watched(polled, cycle_ns, since_ns)
+                )
+
+    def take(self, batch: Batch) -> None:
+        """Note the newest rows of a batch: about 1 us for each."""
+        columns = batch.columns()
+        cells = self._cells
+        self._statuses = columns.statuses
+        rows = zip(
+            columns.time,
+            columns.monotonic_ns,
+            columns.drive,
+            columns.register,
+            columns.value,
+            columns.status,
+            strict=True,
+        )
+        for time, monotonic_ns, drive, register, value, status in rows:
+            key = drive << 16 | register
+            cell = cells.get(key)
+            if cell is None:
+                if key in cells:
+                    continue
+                cell = cells[key] = self._cell(columns.drives[drive], columns.registers[register])
+                if cell is None:
+                    continue
+            if monotonic_ns < cell.since_ns:
+                continue
+            row = (time, monotonic_ns, value, status)
+            if status == 0:
+                if cell.good is not None and cell.newest is cell.good:
+                    cell.intervals_ns = cell.intervals_ns[1], monotonic_ns - cell.good[1]
+                cell.good = row
+            cell.newest = row
+            if time > self.time:
+                self.time = time
+        self.taken += 1
+
+    def _cell(self, drive: str, register: str) -> RegisterRows | None:
+        watched = self._watched.get(drive)
+        return watched.cell(register) if watched else None
+
+    def now_ns(self) -> int:
+        """Return the present time, as rows have it (CLOCK_MONOTONIC)."""
+        return self._times()[0]
+
+    def woke_ns(self) -> int:
+        """Return when the latest sleep of the machine was noticed (CLOCK_MONOTONIC); 0 without one.
+
+        What was asked for before is no longer the present.
+        """
+        return self._times()[1]
+
+    def _times(self) -> tuple[int, int]:
+        """Return the present time, and when the latest sleep was noticed.
+
+        The clock is read at each look: this process may have stood still until just now.
+        """
+        now_ns, slept_ns = self._clock()
+        if slept_ns > self._slept_ns + LEAST_SLEEP_NS:
+            self._woke_ns = now_ns + 1
+        self._slept_ns = max(slept_ns, self._slept_ns)
+        return now_ns, self._woke_ns
+
+    # ---- values ----
+
+    def newest(self, drive: str, register: str) -> Newest | None:
+        """Return the newest row, which may be a miss; None when it was never asked."""
+        watched = self._watched.get(drive)
+        cell = watched.cells.get(register) if watched else None
+        if cell is None or cell.newest is None:
+            return None
+        time, monotonic_ns, value, status = cell.newest
+        good = None if status else value
+        return Newest(time, monotonic_ns, good, self._statuses[status], cell.holds_ns)
+
+    def polled(self, drive: str) -> tuple[Register[Any], ...]:
+        """Return the registers of a drive that are polled, in the plant file's order."""
+        watched = self._watched.get(drive)
+        return tuple(poll.register for poll in watched.polled.polls) if watched else ()
+
+    def holds_s(self, drive: str, register: str) -> float | None:
+        """Return for how long a value is the present one, in s; None where it is not polled."""
+        watched = self._watched[drive]
+        return watched.cell(register).holds_ns / 1e9 if register in watched.names else None
+
+    @property
+    def drives(self) -> Iterator[str]:
+        """The names of all drives, in the plant file's order."""
+        return iter(self._watched)
+
+    def known(self, drive: str) -> Iterator[Known]:
+        """Yield what is known of each polled register of a drive, in the plant file's order."""
+        watched = self._watched.get(drive)
+        if watched is None:
+            return
+        now_ns, woke_ns = self._times()
+        cells = watched.cells
+        for name in watched.names:
+            cell = cells.get(name)
+            if cell is None:
+                yield name, None, None, False
+            else:
+                yield name, cell.newest, cell.good, cell.is_fresh(now_ns, woke_ns)
+
+    def status(self, code: int) -> str:
+        """Return the words of a row's status."""
+        return self._statuses[code]
+
+    def answered_ns(self, drive: str) -> int | None:
+        """Return when its newest value was asked for, by the monotonic clock; None: it never answered."""
+        watched = self._watched.get(drive)
+        cells = watched.cells.values() if watched else ()
+        return max([cell.good[1] for cell in cells if cell.good], default=None)
+
+    def seen_at(self, drive: str) -> int | None:
+        """Return when the newest value of a drive was asked for, UTC in ns; None: it never answered."""
+        watched = self._watched.get(drive)
+        cells = watched.cells.values() if watched else ()
+        return max([cell.good[0] for cell in cells if cell.good], default=None)
+
+    # ---- what they say of the drive ----
+
+    def state(self, drive: str) -> str:
+        """Return "runs", "stands", "fault", "silent" or "unknown"."""
+        return self.seen(drive).state
+
+    def seen(self, drive: str) -> Shown:
+        """Return a drive's state, with its fault or the reason why it is silent."""
+        watched = self._watched.get(drive)
+        return Shown(UNKNOWN, None) if watched is None else self._look(watched)
+
+    def is_set_to_zero(self, drive: str) -> bool:
+        """Return True if a drive's setpoint is known to be 0: its motor may stand though it runs."""
+        watched = self._watched[drive]
+        setpoint = watched.polled.drive.setpoint_name
+        return bool(FreshValues(watched.cells, *self._times()).get(setpoint) == 0)
+
+    def note_reset(self, drive: str) -> None:
+        """Forget the fault that a drive's record told: it was reset."""
+        watched = self._watched.get(drive)
+        if watched is not None:
+            _forget_trip(watched)
+
+    def _look(self, watched: _Watched) -> Shown:
+        fresh = FreshValues(watched.cells, *self._times())
+        shown = self._shown(watched, fresh)
+        if FAULT_REGISTER not in watched.names:
+            _look_for_trip(watched)
+        if watched.trip is None or shown.state == SILENT:
+            return shown
+        if shown.state == RUNS and _turns_since(watched, watched.trip.at_ns + RAN_NS):
+            _forget_trip(watched)
+            return shown
+        return shown if shown.state == FAULT else Shown(FAULT, watched.trip.words, shown.note)
+
+    def _shown(self, watched: _Watched, fresh: FreshValues) -> Shown:
+        found = watched.reader.state(fresh)
+        if found is not None and found.condition is not Condition.UNKNOWN:
+            fault = found.fault or UNNAMED
+            words = fault if found.condition is Condition.FAULT else None
+            return Shown(_STATES[found.condition], words, found.note)
+        if not any(True for _ in fresh):
+            return self._unseen(watched)
+        if not watched.reader.has_state and fresh.get(FAULT_REGISTER):
+            register = watched.polled.drive.registers[FAULT_REGISTER]
+            return Shown(FAULT, _words(register, fresh[FAULT_REGISTER]))
+        is_turning = any(fresh.get(name) for name in _TURNING)  # 0 Hz may be a run at a setpoint of 0
+        if is_turning:
+            return Shown(RUNS, None)
+        note = found.note if found is not None else _lack(watched)
+        return Shown(UNKNOWN, INCOMPLETE if any(name not in fresh for name in watched.names) else None, note)
+
+    def _unseen(self, watched: _Watched) -> Shown:
+        """Tell a silent drive from one that refuses, and from one that was not asked lately."""
+        polls = watched.polled.polls
+        newest = [
+            cell.newest for poll in polls if (cell := watched.cells.get(poll.register.name)) and cell.newest
+        ]
+        misses = [row for row in newest if row[3] != 0]
+        if not misses or len(misses) < len(polls):
+            return Shown(UNKNOWN, NOT_ASKED)
+        reasons = [self._statuses[status] for _, _, _, status in sorted(misses, key=lambda row: -row[1])]
+        if any(reason.startswith(_ANSWERED) for reason in reasons):
+            return Shown(UNKNOWN, INCOMPLETE)
+        asked = next((reason for reason in reasons if not reason.startswith("not ")), reasons[0])
+        return Shown(SILENT, asked)
+
+
+def _lack(watched: _Watched) -> str:
+    """Return the reason why a drive's state cannot be worked out."""
+    reader = watched.reader
+    if not reader.has_state:
+        return "its family has no register for its state"
+    if not reader.lacks:
+        return "at rest its state takes two readings one after the other, which polled values are not"
+    return f"{reader.lacks} is {'not known' if reader.lacks in watched.names else 'not polled'}"
+
+
+def _look_for_trip(watched: _Watched) -> None:
+    """Note a fault that the drive's record tells by a change; a record from before polling may be past."""
+    name = next((name for name in FAULT_RECORDS if name in watched.names), "")
+    cell = watched.cells.get(name)
+    if cell is None or cell.good is None:
+        return
+    _, at_ns, value, _ = cell.good
+    before, watched.record = watched.record, value
+    if before is not None and value != before:
+        words = _words(watched.polled.drive.registers[name], value)
+        watched.trip = _Trip(words, at_ns) if value else None
+
+
+def _turns_since(watched: _Watched, since_ns: int) -> bool:
+    """Return True if all that tells that the motor turns was asked for after this time."""
+    cells = [cell for name in ("status", *_TURNING) if (cell := watched.cells.get(name)) and cell.good]
+    return all(cell.good[1] > since_ns for cell in cells if cell.good)
+
+
+def _forget_trip(watched: _Watched) -> None:
+    watched.trip = None
+    watched.reader = StateReader(watched.polled.drive)  # what it noted of the record is old too
+
+
+def _words(register: Register[Any], value: float) -> str:
+    """Return a value in words, or the number that it is with its register's name."""
+    if register.values is not None:
+        return register.in_words(register.decode(value))
+    return f"{register.name.replace('_', ' ')}: {register.format(value)}"

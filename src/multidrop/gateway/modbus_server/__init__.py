@@ -1,0 +1,1 @@
+"""The gateway as a Modbus TCP server for SCADA systems."""

@@ -1,0 +1,325 @@
+"""Modbus clients: the connections of Modbus TCP, on which requests come and answers go.
+
+What a client sent is read on whatever becomes of its answers: a stop waits neither for the requests before it
+nor until its client reads.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Awaitable, Callable
+from typing import Any, cast
+
+from multidrop.gateway.modbus_server.codes import ModbusCode
+from multidrop.gateway.modbus_server.mbap import (
+    Garbage,
+    MbapRequest,
+    function_of,
+    request_of,
+    take_frame,
+    take_request,
+)
+from multidrop.gateway.modbus_server.pdu import WRITES
+from multidrop.supervisor import supervisor
+
+SLICE = 64  # requests of a client that are answered before others have their turn,
+SLICE_S = 0.002  # or so much time,
+ROUND_S = 0.004  # or their share of this, if many have requests to be looked at: a stop waits for a round
+MOST_CLIENTS = 64  # beside each other, on one TCP port
+MOST_BEHIND = 1 << 18  # bytes of requests of one client that wait for their turn
+MOST_UNTAKEN = 1 << 18  # bytes of answers that a client does not take
+MOST_UNDER_WAY = 16  # requests of one client that wait for a line
+IDLE_S = 300.0  # without a request, after which a client is let go
+FORGETTABLE_S = 10.0  # the same, where a new client finds no place
+STALLED_S = 10.0  # for which a client takes none of its answers
+SWEEP_S = 1.0  # between looks at all clients
+
+_log = logging.getLogger("multidrop.gateway")
+
+
+# The frame of the answer, at once or later; None: the connection is closed without one. What comes later is
+# cancelled when the client is gone: shield what must be done all the same.
+Answer = bytes | Awaitable[bytes] | None
+
+
+class ModbusClient(asyncio.Protocol):
+    """One connection: each request is answered under its own transaction id, whenever it is done.
+
+    Requests that write are begun as they come, in their order; the others wait for their turn behind them.
+    """
+
+    def __init__(self, port: ModbusPort) -> None:
+        self._port = port
+        self._came = bytearray()  # that was not looked at yet
+        self._waiting = bytearray()  # frames whose turn has not come
+        self._under_way: set[asyncio.Future[bytes]] = set()
+        self._is_draining = False
+        self._is_refused = False  # it sent what closes its connection
+        self._has_ended = False  # the client sends no more, and may still read
+        self._has_lost_answers = False
+        self._stalled_since: float | None = None
+        self.last_request = port.clock()
+        self.address = ""
+        self.transport: asyncio.Transport | None = None
+
+    @property
+    def is_full(self) -> bool:
+        """True while as many of its requests wait for lines as one client may have."""
+        return len(self._under_way) >= MOST_UNDER_WAY
+
+    @property
+    def is_idle(self) -> bool:
+        """True while nothing of it is under way."""
+        return not self._under_way
+
+    # ---- what asyncio calls ----
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        self.transport = cast(asyncio.Transport, transport)
+        peer = transport.get_extra_info("peername")
+        self.address = str(peer[0]) if peer else ""
+        self._port.admit(self)
+
+    def connection_lost(self, error: Exception | None) -> None:
+        self.transport = None
+        self._came.clear()
+        self._waiting.clear()
+        self._port.share.note(self, is_busy=False)
+        self._port.forget(self)
+        for task in self._under_way:
+            asyncio.get_running_loop().call_soon(task.cancel)  # each has begun by then
+
+    def data_received(self, data: bytes) -> None:
+        if self._is_refused:
+            return
+        self._came += data
+        if not self._is_draining:
+            self._drain()
+
+    def eof_received(self) -> bool:
+        """Keep the connection for the answers that are not given yet."""
+        self._has_ended = True
+        return bool(self._under_way or self._waiting or self._is_draining)
+
+    def pause_writing(self) -> None:
+        """Let the requests wait of a client that does not take its answers; it is read on all the same."""
+        self._stalled_since = self._port.clock()
+
+    def resume_writing(self) -> None:
+        self._stalled_since = None
+        if not self._is_draining:
+            self._drain()
+
+    # ---- requests and answers ----
+
+    def _drain(self) -> None:
+        """Look at what came and answer some of it; let others have their turn before the rest."""
+        is_looked_at = self._look()
+        self._is_draining = self._answer_some() or not is_looked_at
+        self._port.share.note(self, is_busy=self._is_draining)
+        if self.transport is not None:
+            if is_looked_at:
+                self.transport.resume_reading()
+            else:
+                self.transport.pause_reading()
+        if self._is_draining:
+            asyncio.get_running_loop().call_soon(self._drain)
+        elif self._is_refused and not self._waiting:
+            self.close()
+        self._close_if_done()
+
+    def _look(self) -> bool:
+        """Begin what writes and let the rest wait; return False where more of it is to be looked at."""
+        begun = self._port.clock()
+        answers: list[bytes] = []
+        is_in_time = True
+        while self._came and is_in_time:
+            frame = self._next_frame()
+            if frame is None:
+                break
+            self.last_request = begun
+            if function_of(frame) in WRITES:
+                answers.append(self._answered(request_of(frame)))
+            elif len(self._waiting) + len(frame) <= MOST_BEHIND:
+                self._waiting += frame
+            else:
+                answers.append(request_of(frame).exception(ModbusCode.BUSY))
+            is_in_time = self._port.clock() - begun <= self._port.share.slice_s
+        self._write(b"".join(answers))
+        return is_in_time or not self._came
+
+    def _next_frame(self) -> bytes | None:
+        try:
+            return take_frame(self._came)
+        except Garbage as garbage:
+            _log.info("modbus client %s is closed: %s", self.address, garbage)
+            self._refuse()
+            return None
+
+    def _refuse(self) -> None:
+        """Take nothing more of this client."""
+        self._is_refused = True
+        self._came.clear()
+
+    def _answer_some(self) -> bool:
+        """Answer requests that wait; return True where more of them could be answered."""
+        begun = self._port.clock()
+        answers: list[bytes] = []
+        for _ in range(SLICE):
+            request = take_request(self._waiting) if self._stalled_since is None else None
+            if request is None:
+                break
+            answers.append(self._answered(request))
+            if self._port.clock() - begun > self._port.share.slice_s:
+                break
+        self._write(b"".join(answers))
+        return bool(self._waiting) and self._stalled_since is None
+
+    def _answered(self, request: MbapRequest) -> bytes:
+        """Return the answer to a request where it is known at once; b"" where it is not."""
+        answer = self._port.serve(request, self)
+        if isinstance(answer, bytes):
+            return answer
+        if answer is None:
+            self._refuse()
+            self._waiting.clear()
+        else:
+            self._begin(request, answer)
+        return b""
+
+    def _begin(self, request: MbapRequest, answer: Awaitable[bytes]) -> None:
+        task = supervisor().start("modbus answer", _awaited(answer))
+        self._under_way.add(task)
+        task.add_done_callback(lambda done: self._finish(request, done))
+
+    def _finish(self, request: MbapRequest, task: asyncio.Future[bytes]) -> None:
+        self._under_way.discard(task)
+        if not task.cancelled():
+            failure = task.exception()
+            if failure is not None:
+                _log.error("modbus request %s", request, exc_info=failure)
+            self._write(request.exception(ModbusCode.DEVICE_FAILURE) if failure else task.result())
+        self._close_if_done()
+
+    def _close_if_done(self) -> None:
+        if self._has_ended and not (self._under_way or self._waiting or self._is_draining):
+            self.close()
+
+    def _write(self, data: bytes) -> None:
+        """Write answers, or give them up where the client has not taken many others."""
+        if not data or self.transport is None or self.transport.is_closing():
+            return
+        if self._stalled_since is not None and self.transport.get_write_buffer_size() > MOST_UNTAKEN:
+            if not self._has_lost_answers:
+                _log.warning("modbus client %s takes none of its answers; some are given up", self.address)
+            self._has_lost_answers = True
+            return
+        self.transport.write(data)
+
+    def close(self) -> None:
+        """Close this connection once all that was written to it has left."""
+        if self.transport is not None:
+            self.transport.close()
+
+    def abort(self) -> None:
+        """Cut this connection at once."""
+        if self.transport is not None:
+            self.transport.abort()
+
+    def stalled_for(self, now: float) -> float:
+        """Return for how many seconds it has taken none of its answers."""
+        return 0.0 if self._stalled_since is None else now - self._stalled_since
+
+
+class RoundShare:
+    """The time of one round of the loop, divided among the clients of all ports that have requests left."""
+
+    def __init__(self) -> None:
+        self._busy: set[ModbusClient] = set()
+
+    def note(self, client: ModbusClient, *, is_busy: bool) -> None:
+        if is_busy:
+            self._busy.add(client)
+        else:
+            self._busy.discard(client)
+
+    @property
+    def slice_s(self) -> float:
+        """The seconds for which one client may be served at once."""
+        return min(SLICE_S, ROUND_S / max(1, len(self._busy)))
+
+
+async def _awaited(answer: Awaitable[bytes]) -> bytes:
+    return await answer
+
+
+class ModbusPort:
+    """One TCP port and its clients.
+
+    `serve` answers a request; `may_connect` says which addresses may come; `clock` is in seconds. Ports of
+    one server have the same `share`.
+    """
+
+    def __init__(
+        self,
+        serve: Callable[[MbapRequest, ModbusClient], Answer],
+        may_connect: Callable[[str], bool],
+        clock: Callable[[], float],
+        share: RoundShare | None = None,
+    ) -> None:
+        self.serve = serve
+        self.clock = clock
+        self.share = share or RoundShare()
+        self.clients: set[ModbusClient] = set()
+        self.refused = 0  # connections
+        self._may_connect = may_connect
+        self._server: asyncio.Server | None = None
+
+    async def open(self, listener: Any) -> None:
+        """Begin to accept clients on a listening socket."""
+        loop = asyncio.get_running_loop()
+        self._server = await loop.create_server(lambda: ModbusClient(self), sock=listener)
+
+    def admit(self, client: ModbusClient) -> None:
+        """Take a new client in; one that has been idle for long makes place where there is none."""
+        if not self._may_connect(client.address):
+            _log.warning("modbus client %s is refused: it is not among the clients", client.address)
+            self.refused += 1
+            client.abort()
+            return
+        if len(self.clients) >= MOST_CLIENTS and not self._make_place():
+            _log.warning("modbus client %s is refused: %d are connected", client.address, MOST_CLIENTS)
+            self.refused += 1
+            client.abort()
+            return
+        self.clients.add(client)
+
+    def _make_place(self) -> bool:
+        idle = [client for client in self.clients if client.is_idle]
+        oldest = min(idle, key=lambda client: client.last_request, default=None)
+        if oldest is None or self.clock() - oldest.last_request < FORGETTABLE_S:
+            return False
+        self.forget(oldest)
+        oldest.abort()
+        return True
+
+    def forget(self, client: ModbusClient) -> None:
+        """Remove a client that is gone."""
+        self.clients.discard(client)
+
+    def sweep(self) -> None:
+        """Let go of clients that have been idle for long, or that take none of their answers."""
+        now = self.clock()
+        for client in list(self.clients):
+            if client.stalled_for(now) >= STALLED_S:
+                client.abort()
+            elif client.is_idle and now - client.last_request >= IDLE_S:
+                client.close()
+
+    def close(self) -> None:
+        """Listen no more, and cut all connections."""
+        if self._server is not None:
+            self._server.close()
+        for client in list(self.clients):
+            client.abort()

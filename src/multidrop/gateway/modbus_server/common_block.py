@@ -1,0 +1,96 @@
+"""Common block: what every drive says of itself at the same addresses in the same units, whatever its family.
+
+All numbers of two words have their high word first. A value is there only while it is fresh; what is not
+known has a count of its own, so that it never reads as 0.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Protocol
+
+from multidrop import PolledDrive, Register
+from multidrop.gateway.modbus_server.words import NewestRow, is_fresh
+
+COMMON_LENGTH = 16  # words of the block
+STATE, FAULT, FREQUENCY, CURRENT, SETPOINT, AGE, STOP = 0, 1, 2, 4, 6, 8, 10  # words from its begin
+
+STATES = {"unknown": 0, "stands": 1, "runs": 2, "fault": 3, "silent": 4}
+NO_FAULT, FAULT_WITHOUT_NUMBER, FAULT_UNKNOWN = 0, 0xFFFE, 0xFFFF
+NO_NUMBER = -(1 << 31)  # 8000 0000H: it is not known, or does not fit
+NEVER, LONGEST_AGE = 0xFFFF_FFFF, 0xFFFF_FFFE  # ms
+
+_PER_UNIT = 100
+
+
+class CommonSource(Protocol):
+    """The part of the hub that the block needs."""
+
+    def newest(self, drive: str, register: str) -> NewestRow | None: ...
+    def answered_ns(self, drive: str) -> int | None: ...
+    def woke_ns(self) -> int: ...
+    def state(self, drive: str) -> str: ...
+
+
+class CommonBlock:
+    """The block of one drive; its words are made of rows when they are asked for."""
+
+    def __init__(self, polled: PolledDrive) -> None:
+        self._name = polled.drive.name
+        self._polled = {(poll.register.name, unit) for poll in polled.polls for unit in _units(poll.register)}
+        self._numbers = (
+            (FREQUENCY, "output_frequency", "Hz"),
+            (CURRENT, "output_current", "A"),
+            (SETPOINT, polled.drive.setpoint_name, None),
+        )
+
+    def words(self, hub: CommonSource, now_ns: int) -> list[int]:
+        """Return the words of this moment."""
+        state, woke_ns = hub.state(self._name), hub.woke_ns()
+        words = [0] * COMMON_LENGTH
+        words[STATE] = STATES.get(state, 0)
+        words[FAULT] = self._fault(hub, now_ns, woke_ns, state)
+        for at, name, unit in self._numbers:
+            value = self._fresh_value(hub, now_ns, woke_ns, name, unit)
+            words[at : at + 2] = _two_words(NO_NUMBER if value is None else _hundredths(value))
+        words[AGE : AGE + 2] = _two_words(self._age(hub, now_ns, woke_ns))
+        return words
+
+    def _fresh_value(
+        self, hub: CommonSource, now_ns: int, woke_ns: int, name: str, unit: str | None
+    ) -> float | None:
+        """Return the fresh value of a polled register, in this unit or its own; None where there is none."""
+        row = hub.newest(self._name, name) if (name, unit) in self._polled else None
+        return row.value if row and is_fresh(row, now_ns, woke_ns) else None
+
+    def _fault(self, hub: CommonSource, now_ns: int, woke_ns: int, state: str) -> int:
+        """Return the drive's own number of the fault that it shows."""
+        if state != "fault":
+            return NO_FAULT if state in ("stands", "runs") else FAULT_UNKNOWN
+        value = self._fresh_value(hub, now_ns, woke_ns, "fault", "")
+        if value is None or value != int(value) or not 0 < value < FAULT_WITHOUT_NUMBER:
+            return FAULT_WITHOUT_NUMBER
+        return int(value)
+
+    def _age(self, hub: CommonSource, now_ns: int, woke_ns: int) -> int:
+        """Return the ms since the newest value of the drive was asked for."""
+        newest = hub.answered_ns(self._name)
+        if newest is None:
+            return NEVER
+        if newest < woke_ns:  # nothing here counts the time for which the machine slept
+            return LONGEST_AGE
+        return min(max(now_ns - newest, 0) // 1_000_000, LONGEST_AGE)
+
+
+def _units(register: Register[Any]) -> tuple[str | None, ...]:
+    """Return how its unit may be asked for; None, for whichever it is, gives no raw counts."""
+    is_raw = register.values is None and register.step is None
+    return (register.value_unit,) if is_raw else (register.value_unit, None)
+
+
+def _hundredths(value: float) -> int:
+    count = value * _PER_UNIT
+    return round(count) if abs(count) < 1 << 31 else NO_NUMBER
+
+
+def _two_words(number: int) -> tuple[int, int]:
+    return number >> 16 & 0xFFFF, number & 0xFFFF

@@ -1,0 +1,214 @@
+"""Units: the unit id and TCP port under which Modbus clients reach each drive. Pure."""
+
+from __future__ import annotations
+
+import difflib
+from collections import defaultdict
+from collections.abc import Iterable, Iterator, Mapping
+from typing import Any, NamedTuple, Protocol
+
+from multidrop import Carrier, Plant, PolledDrive, Register
+from multidrop.gateway.modbus_server.common_block import CommonBlock
+from multidrop.gateway.modbus_server.pdu import WriteRequest
+from multidrop.gateway.modbus_server.words import DriveWords, reading_function
+
+MAIN = ""  # the TCP port of all lines that have none of their own
+UNITS = range(1, 248)  # 0 is a broadcast, and 248 to 255 are reserved
+LAST_UNIT = 255  # some devices have it all the same
+_WRITES = {Carrier.BIT: (0x05, 0x0F), Carrier.WORD: (0x06, 0x10)}
+_STOPS = ("stop", "coast", "emergency_stop")
+
+
+class StopWrite(NamedTuple):
+    """A write that is one of the drive's own ways to stop: its register and its count."""
+
+    register: str
+    raw: float
+
+
+class Unit:
+    """A drive as Modbus clients see it: what is there to read and to write, by address."""
+
+    def __init__(self, line: str, polled: PolledDrive) -> None:
+        self.line = line
+        self.drive = polled.drive
+        self.words = DriveWords(polled)
+        self.common = CommonBlock(polled)
+        self.stops = frozenset(_stop_writes(polled.drive))
+        self._readable: dict[int, set[int]] = {code: set() for code in range(5)}  # 0: by none
+        self._gaps: list[tuple[int, range]] = []
+        self._writable: dict[tuple[Carrier, int], Register[Any]] = {}
+        for register in self.drive.registers.values():
+            self._declare(register)
+        for text in self.drive.texts.values():
+            self._readable[reading_function(text.table)].update(
+                range(text.address, text.address + text.length)
+            )
+        for table, gap in self.drive.readable_gaps.items():
+            self._gaps.append((reading_function(table), gap))
+
+    def __repr__(self) -> str:
+        return f"<Unit {self.drive.name} on {self.line}>"
+
+    def _declare(self, register: Register[Any]) -> None:
+        table, addresses = register.table, range(register.address, register.address + register.words)
+        if register.readable:
+            self._readable[reading_function(table)].update(addresses)
+        if register.writable and table.write in _WRITES.get(table.carrier, ()):
+            self._writable[table.carrier, register.address] = register
+
+    def is_declared(self, function: int, addresses: range) -> bool:
+        """Return True where the family's document has all of these to be read."""
+        own = self._readable[function]
+        gaps = [gap for code, gap in self._gaps if code == function]
+        return all(at in own or any(at in gap for gap in gaps) for at in addresses)
+
+    def writable(self, carrier: Carrier, address: int) -> Register[Any] | None:
+        """Return the register that begins at this address and may be written; None where there is none."""
+        return self._writable.get((carrier, address))
+
+    def has_stop_in(self, written: WriteRequest, common_stop: int) -> bool:
+        """Return True where a stop is among what a request writes, or is the common block's."""
+        carrier, start, size, data = written
+        for at in range(size):
+            if carrier is Carrier.WORD and start + at == common_stop and data[2 * at : 2 * at + 2] != b"\0\0":
+                return True
+            register = self.writable(carrier, start + at)
+            if register is not None and at + register.words <= size:
+                raw = register.coding.raw_in(data, at)
+                if raw is not None and StopWrite(register.name, raw) in self.stops:
+                    return True
+        return False
+
+    def holding_addresses(self) -> set[int]:
+        """Return all addresses of words at which the family has something."""
+        written = {
+            at
+            for register in self.drive.registers.values()
+            if register.table.carrier is Carrier.WORD
+            for at in range(register.address, register.address + register.words)
+        }
+        return self._readable[3] | self._readable[4] | written
+
+
+def _stop_writes(drive: Any) -> Iterator[StopWrite]:
+    """Yield the first write of each verb that stops the motor, as the family's own scripts have it.
+
+    With it all others that the family calls harmless there, such as YD1000's 8000H; but for 0, which may be
+    no command at all.
+    """
+    for name in _STOPS:
+        try:
+            script = getattr(drive, name).script()
+            step = next(script, None)
+            script.close()
+            register, value = getattr(step, "register", None), getattr(step, "value", None)
+            if isinstance(register, Register) and value is not None:
+                counts = {register.encode(value), *filter(None, register.harmless or ())}
+                yield from (StopWrite(register.name, raw) for raw in counts)
+        except Exception:  # a family without this verb, or one whose script needs a bus
+            continue
+
+
+class UnitSettings(Protocol):
+    """The part of the settings that the units need."""
+
+    @property
+    def units(self) -> Mapping[str, int]: ...
+    @property
+    def ports(self) -> Mapping[str, int]: ...
+    @property
+    def common_addresses(self) -> range: ...
+
+
+class Units:
+    """All units of a plant, by TCP port (MAIN, or a line's name) and unit id.
+
+    A line that has a port of its own is reached there alone. Raises ValueError with a sentence for each
+    mistake, in lines, where a unit id would be two drives' or the settings name what is not there.
+    """
+
+    def __init__(self, plant: Plant, settings: UnitSettings) -> None:
+        self._units: dict[tuple[str, int], Unit] = {}
+        wrong = [*_unknown_names(plant, settings)]
+        for port, found in _by_port(plant, settings).items():
+            wrong += _clashes(port, found)
+            for number, units in found.items():
+                self._units[port, number] = units[0]
+                for unit in units:
+                    wrong += _overlap(unit, settings)
+        if wrong:
+            raise ValueError("\n".join(wrong))
+
+    def find(self, port: str, number: int) -> Unit | None:
+        """Return the unit of this number on a port; None where there is none."""
+        return self._units.get((port, number))
+
+    def __iter__(self) -> Iterator[tuple[str, int, Unit]]:
+        return ((port, number, unit) for (port, number), unit in self._units.items())
+
+
+def _by_port(plant: Plant, settings: UnitSettings) -> Mapping[str, Mapping[int, list[Unit]]]:
+    found: dict[str, dict[int, list[Unit]]] = defaultdict(lambda: defaultdict(list))
+    for line in plant.lines:
+        port = line.name if line.name in settings.ports else MAIN
+        for polled in line.drives:
+            number = settings.units.get(polled.drive.name, polled.drive.address)
+            found[port][number].append(Unit(line.name, polled))
+    return found
+
+
+def _clashes(port: str, units: Mapping[int, list[Unit]]) -> Iterator[str]:
+    """Yield a sentence for each unit id of two drives, or of none, and one with the ids that are free."""
+    where = "" if port == MAIN else f" on the port of line {port}"
+    wrong: list[str] = []  # drives
+    for number, found in sorted(units.items()):
+        names = " and ".join(f"{unit.drive.name} (line {unit.line})" for unit in found)
+        if not 1 <= number <= LAST_UNIT:
+            yield f"{names} cannot be unit {number}{where}, but 1 to {LAST_UNIT}"
+            wrong.append(found[-1].drive.name)
+        elif len(found) > 1:
+            yield f"unit {number}{where} would be {names}"
+            wrong.append(found[-1].drive.name)
+    if wrong:
+        free = [number for number in UNITS if number not in units]
+        example = f'units = {{ "{wrong[0]}" = {free[0] if free else 1} }}'
+        yield (
+            f"units gives a drive a number of its own, such as {example}, and ports gives a "
+            f"line a port of its own; free numbers{where}: {_ranges(free)}"
+        )
+
+
+def _ranges(numbers: Iterable[int]) -> str:
+    """Return numbers as "3 to 20, 22"."""
+    runs: list[list[int]] = []
+    for number in numbers:
+        if runs and number == runs[-1][-1] + 1:
+            runs[-1][1:] = [number]
+        else:
+            runs.append([number])
+    return ", ".join(" to ".join(str(end) for end in run) for run in runs) or "none"
+
+
+def _overlap(unit: Unit, settings: UnitSettings) -> Iterator[str]:
+    """Yield a sentence where the family has registers where the common block is."""
+    own = sorted(unit.holding_addresses() & set(settings.common_addresses))
+    if own:
+        yield (
+            f"{unit.drive.name} has registers of its own at {own[0]:04X}H, where the common "
+            f"block is: give that another place, such as common = 0xE000"
+        )
+
+
+def _unknown_names(plant: Plant, settings: UnitSettings) -> Iterator[str]:
+    drives = [polled.drive.name for line in plant.lines for polled in line.drives]
+    lines = [line.name for line in plant.lines]
+    for key, kind, given, known in (
+        ("units", "drive", settings.units, drives),
+        ("ports", "line", settings.ports, lines),
+    ):
+        for name in given:
+            if known and name not in known:
+                near = difflib.get_close_matches(name, known, n=2)
+                hint = f"did you mean {' or '.join(near)}?" if near else f"there are {', '.join(known)}"
+                yield f"{key}: there is no {kind} {name!r}; {hint}"

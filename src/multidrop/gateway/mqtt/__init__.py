@@ -1,0 +1,1 @@
+"""The gateway's MQTT interface: JSON topics, Home Assistant and Sparkplug."""

@@ -1,0 +1,206 @@
+"""Home Assistant's discovery messages (homeassistant/device/ID/config): one for each drive. Pure.
+
+Each component has its own state topic: one of the whole device would be the state of its numbers and buttons.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterable, Mapping
+from enum import Flag
+from typing import Any
+
+from multidrop import Access, Drive, Register
+from multidrop.gateway.live.descriptions import digits_of
+from multidrop.gateway.live.hub import FAULT, RUNS, SILENT, STANDS, UNKNOWN
+
+DISCOVERY = "homeassistant"
+CLASSES = {  # device_class of a unit
+    "Hz": "frequency",
+    "A": "current",
+    "V": "voltage",
+    "kW": "power",
+    "W": "power",
+    "kWh": "energy",
+    "°C": "temperature",
+    "h": "duration",
+    "s": "duration",
+}
+STATES = (RUNS, STANDS, FAULT, SILENT, UNKNOWN)
+OWN = ("problem", "running", "set", "value")  # ends of ids that are no register's alone
+MOST = 1e12  # of a number whose register says nothing of its span
+LEAST_STEP = 0.001  # that Home Assistant takes
+STALE_PERIODS = 3  # after which a sensor is unavailable
+# Home Assistant's own clock dates a command: one that a broker held up is refused.
+COMMAND = '{{"value": {{{{ {} }}}}, "time": {{{{ (now().timestamp() * 1000) | int }}}}}}'
+
+
+def discovery_topic(prefix: str, drive: str) -> str:
+    """Return the topic of a drive's configuration."""
+    return f"{DISCOVERY}/device/{object_id(prefix, drive)}/config"
+
+
+def object_id(prefix: str, drive: str) -> str:
+    """Return an id of the signs that Home Assistant takes; others are told by their code points.
+
+    The first - ends the prefix, so no other prefix and drive have this id.
+    """
+    return f"{_escaped(r'[^A-Za-z0-9]', prefix)}-{_escaped(r'[^A-Za-z0-9-]', drive)}"
+
+
+def _escaped(signs: str, name: str) -> str:
+    return re.sub(signs, lambda sign: f"_{ord(sign[0]):x}_", name)
+
+
+def discovery(
+    drive: Drive,
+    polled: Iterable[Register[Any]],
+    topics: Mapping[str, str],
+    *,
+    prefix: str,
+    version: str,
+    every_s: float,
+    writable: Iterable[str],
+    takes_commands: bool,
+    page: str = "",
+) -> bytes:
+    """Return the configuration of one drive: its state, a sensor for each polled register, and commands.
+
+    `topics` has those of the drive by what they are for, and `page` is the address of the gateway's page.
+    """
+    name = object_id(prefix, drive.name)
+    polled = list(polled)
+    from_state = {"state_topic": topics["state"]}
+    fresh = from_state | {"expire_after": max(2, round(STALE_PERIODS * every_s))}  # s; then unavailable
+    parts: dict[str, Any] = {"state": _state(name) | fresh}
+    parts |= {end: _binary(name, end, truth) | fresh for end, truth in BINARY.items()}
+    for register in polled:
+        parts[_unused(register.name, parts)] = _sensor(name, register) | fresh
+    if takes_commands:
+        for written in writable:
+            part = _written(name, drive.register(written), topics["set"])
+            if any(register.name == written for register in polled):
+                part |= from_state | {"value_template": _value_template(drive.register(written))}
+            parts[_unused(f"{written}_set", parts)] = part
+        parts[_unused("stop", parts)] = {
+            "p": "button",
+            "unique_id": f"{name}-stop",
+            "name": "Stop",
+            "command_topic": topics["stop"],
+            "payload_press": "stop",
+            "availability": [{"topic": topics["gateway"]}],  # also while the drive is silent
+        }
+    maker, space, _ = drive.title.partition(" ")
+    device = {"ids": name, "name": drive.name, "mdl": drive.title or type(drive).__name__}
+    device |= {"mf": maker} if space else {}
+    device |= {"cu": page} if page else {}
+    return json.dumps(
+        {
+            "dev": device,
+            "o": {"name": "multidrop", "sw": version},
+            "availability": [{"topic": topics["gateway"]}, {"topic": topics["available"]}],
+            "availability_mode": "all",
+            "cmps": parts,
+        },
+        ensure_ascii=False,
+    ).encode()
+
+
+# What a state means for each binary sensor; nothing is known in the others.
+BINARY = {
+    "problem": {RUNS: "OFF", STANDS: "OFF", FAULT: "ON"},
+    "running": {RUNS: "ON", STANDS: "OFF"},
+}
+
+
+def _unused(key: str, parts: Mapping[str, Any]) -> str:
+    """Return a component's key that none has yet: a register may be called "running"."""
+    return _unused(f"{key}_", parts) if key in parts else key
+
+
+def _state(name: str) -> dict[str, Any]:
+    return {
+        "p": "sensor",
+        "unique_id": f"{name}-state",
+        "name": "State",
+        "device_class": "enum",
+        "options": list(STATES),
+        "value_template": "{{ value_json.state }}",
+    }
+
+
+def _binary(name: str, end: str, truth: Mapping[str, str]) -> dict[str, Any]:
+    return {
+        "p": "binary_sensor",
+        "unique_id": f"{name}-{end}",
+        "name": end.capitalize(),
+        "device_class": end,
+        "value_template": f"{{{{ {json.dumps(truth)}.get(value_json.state, 'None') }}}}",
+    }
+
+
+def _sensor(name: str, register: Register[Any]) -> dict[str, Any]:
+    found: dict[str, Any] = {
+        "p": "sensor",
+        "unique_id": f"{name}-{register.name}" + ("-value" if register.name in OWN else ""),
+        "name": register.name.replace("_", " "),
+        "value_template": _value_template(register),
+    }
+    if register.access is not Access.READING or register.values is not None:
+        found["entity_category"] = "diagnostic"
+    if options := _choices(register):
+        found |= {"device_class": "enum", "options": list(options)}
+    if register.values is None and register.unit and register.step is not None:
+        found["unit_of_measurement"] = register.unit
+        if register.unit in CLASSES:
+            found["device_class"] = CLASSES[register.unit]
+        found["state_class"] = "total_increasing" if register.unit == "kWh" else "measurement"
+        if (digits := digits_of(register)) is not None:
+            found["suggested_display_precision"] = digits
+    return found
+
+
+def _written(name: str, register: Register[Any], topic: str) -> dict[str, Any]:
+    """Return the component that writes a register: a choice among names, or a number with its span."""
+    found: dict[str, Any] = {
+        "unique_id": f"{name}-{register.name}-set",
+        "name": f"{register.name.replace('_', ' ')} (set)",
+        "command_topic": f"{topic}/{register.name}",
+        "retain": False,
+    }
+    if register.access is not Access.COMMAND:
+        found["entity_category"] = "config"
+    if options := _choices(register):
+        raw = f"{json.dumps(options)}[value]"
+        return found | {"p": "select", "options": list(options), "command_template": COMMAND.format(raw)}
+    found |= {"p": "number", "mode": "box", "command_template": COMMAND.format("value")}
+    found["min"], found["max"] = _span(register)
+    found["step"] = LEAST_STEP if register.is_float else max(LEAST_STEP, abs(float(register.scale)))
+    if register.value_unit:
+        found["unit_of_measurement"] = register.value_unit
+    return found
+
+
+def _choices(register: Register[Any]) -> dict[str, int]:
+    """Return the raw counts of a register's choices by name; none for a number, and for bits."""
+    if register.values is None or issubclass(register.values, Flag):
+        return {}
+    return {member.name: member.value for member in register.values}
+
+
+def _value_template(register: Register[Any]) -> str:
+    """Return the template of a polled register's value; of a choice without a name nothing is known."""
+    value = f"value_json['values']['{register.name}']"
+    if names := list(_choices(register)):
+        return f"{{{{ {value} if {value} in {json.dumps(names)} else 'None' }}}}"
+    return f"{{{{ {value} }}}}"
+
+
+def _span(register: Register[Any]) -> tuple[float, float]:
+    """Return the least and the greatest number: without them Home Assistant takes 1 to 100."""
+    if register.span is not None:
+        return register.span
+    coding = register.coding
+    least, most = sorted(float(end * register.scale + coding.offset) for end in coding.raw_span)
+    return max(least, -MOST), min(most, MOST)

@@ -1,0 +1,265 @@
+"""Topics in JSON: PREFIX/DRIVE has a drive's newest values, and null for one that is not fresh.
+
+PREFIX/DRIVE/available and PREFIX/gateway say who is there; PREFIX/DRIVE/told says what became of a command.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections.abc import Callable, Mapping
+from functools import partial
+from typing import Any
+
+from multidrop import Plant, drive_meant
+from multidrop.gateway.commands import Told
+from multidrop.gateway.live.hub import SILENT
+from multidrop.gateway.mqtt.home_assistant import discovery, discovery_topic
+from multidrop.gateway.mqtt.outbox import Publication
+from multidrop.gateway.mqtt.retained_topics import OFFLINE, ONLINE, LeftBehind
+from multidrop.gateway.mqtt.settings import MqttSettings, fresh_values
+from multidrop.gateway.offers import Orders
+from multidrop.gateway.parts import Inside
+from multidrop.gateway.verb_rules import STOPPING
+
+EXAMPLES = {
+    "set": '{"value": 25.0, "time": UTC in ms}',
+    "act": '{"verb": "start", "drive": "pump-1", "time": UTC in ms}',
+}
+MOST_BYTES = 65_536  # of a write or a verb
+NOTHING = b""  # makes a broker forget what it kept of a topic
+
+_log = logging.getLogger("multidrop.gateway.mqtt.part")
+
+
+class JsonTopics:
+    """Messages in JSON, and Home Assistant's discovery of them."""
+
+    kind = "json"
+
+    def __init__(self, settings: MqttSettings, inside: Inside, utc_ms: Callable[[], int]) -> None:
+        self.outbox: Any = None
+        self._settings = settings
+        self._inside = inside
+        self._hub = inside.hub
+        self._plant = inside.plant
+        self._orders = Orders(inside.commands, settings.caller, utc_ms, self._tell)
+        self._available: dict[str, bytes] = {}
+        self._left: set[str] = set()  # drives of which the broker is to keep nothing
+        self._left_behind = LeftBehind(settings.prefix, home_assistant=settings.home_assistant)
+
+    def _topic(self, *levels: str) -> str:
+        return "/".join((self._settings.prefix, *levels))
+
+    @staticmethod
+    def _kept(topic: str, payload: bytes) -> Publication:
+        """Return a message that the broker keeps for those who come later."""
+        return Publication(topic, lambda: payload, is_retained=True)
+
+    # ---- a speaker ----
+
+    def will(self) -> Publication:
+        return self._kept(self._topic("gateway"), OFFLINE)
+
+    def topics(self) -> list[tuple[str, int]]:
+        kept = [(topic, 0) for topic in self._left_behind.topics()]
+        if not self._settings.commands:
+            return kept
+        once = [(self._topic("+", "set", "+"), 0), (self._topic("+", "act"), 0)]
+        return [(self._topic("+", "stop"), 1), (self._topic("stop"), 1), *once, *kept]
+
+    def connected(self) -> None:
+        self._available.clear()
+        self._left_behind.begin()
+        self.outbox.put(self._kept(self._topic("gateway"), ONLINE))
+        self._take_back()  # the connection may have broken before it was heard
+        if self._settings.home_assistant:
+            for drive in self._hub.drives:
+                self._discover(drive)
+        self.publish()
+
+    def received(self, topic: str, payload: bytes, *, is_retained: bool) -> None:
+        levels = topic.removeprefix(self._settings.prefix + "/").split("/")
+        is_stop = levels == ["stop"] or levels[1:] == ["stop"]
+        if not (is_stop or levels[1:] == ["act"] or (levels[1:2] == ["set"] and len(levels) == 3)):
+            if is_retained:
+                self._look_back(topic, payload)
+        elif not self._settings.commands:
+            _log.warning("the broker sent a command that nobody listens to: %.100r", topic)
+        elif is_stop:
+            self._orders.stop(None if levels == ["stop"] else [levels[0]])
+        else:
+            self._order(levels, payload, is_retained=is_retained)
+
+    def _look_back(self, topic: str, payload: bytes) -> None:
+        """Take back what the broker has kept since before of drives that are no more."""
+        for left in self._left_behind.hear(topic, payload, _drives(self._plant)):
+            self.outbox.put(self._kept(left, NOTHING))
+
+    def _order(self, levels: list[str], payload: bytes, *, is_retained: bool) -> None:
+        drive, *what = levels
+        try:
+            given = _read(payload)
+        except ValueError as mistake:
+            if what[0] == "act" and any(f'"{verb}"'.encode() in payload for verb in STOPPING):
+                self._orders.stop([drive])  # whatever is wrong with the rest
+            else:
+                self._refuse(drive, what, mistake)
+            return
+        try:
+            if what[0] == "act" and str(given.get("verb")) in STOPPING:
+                for one in self._to_stop(drive, given):
+                    self._orders.stop_by(one, given["verb"], {})  # it takes none: no wrong ones keep it back
+            elif is_retained:  # it comes at every connection
+                kept = "the broker had kept it; publish it without retain"
+                self._orders.refuse(drive, "/".join(what), kept)
+            elif what[0] == "set":
+                self._orders.write(drive, what[1], *_read_write(given))
+            else:
+                self._orders.act(drive, *_read_act(drive, given))
+        except ValueError as mistake:
+            self._refuse(drive, what, mistake)
+
+    def _refuse(self, drive: str, what: list[str], mistake: ValueError) -> None:
+        self._orders.refuse(drive, "/".join(what), f"it is no {EXAMPLES[what[0]]}: {mistake}")
+
+    def _to_stop(self, drive: str, given: Mapping[str, Any]) -> list[str]:
+        """Return the topic's drive and, where there is one, another one that the stop names.
+
+        To stop too many can be mended, and to stop none cannot.
+        """
+        named, there = given.get("drive"), _drives(self._plant)
+        other = drive_meant(named, there) if isinstance(named, str) else drive
+        return [drive, other] if other in there - {drive_meant(drive, there)} else [drive]
+
+    def adopt(self, plant: Plant) -> None:
+        """Go on with another plant: what the broker keeps of drives that left is taken back."""
+        self._left = (self._left | _drives(self._plant)) - _drives(plant)
+        self._plant = plant
+        self._take_back()
+
+    def _take_back(self) -> None:
+        for drive in sorted(self._left):
+            self._available.pop(drive, None)
+            topics = [self._topic(drive), self._topic(drive, "available")]
+            if self._settings.home_assistant:
+                topics.append(discovery_topic(self._settings.prefix, drive))
+            for topic in topics:
+                self.outbox.put(self._kept(topic, NOTHING))
+
+    # ---- what is said ----
+
+    def publish(self) -> None:
+        """Say the newest values of each drive."""
+        for drive in self._hub.drives:
+            self.outbox.put(Publication(self._topic(drive), partial(self._state, drive), is_retained=True))
+            available = OFFLINE if self._hub.state(drive) == SILENT else ONLINE
+            if self._available.get(drive) != available:
+                self._available[drive] = available
+                self.outbox.put(self._kept(self._topic(drive, "available"), available))
+
+    def pass_over(self) -> int:
+        """Return how many messages `publish` would have."""
+        return len(list(self._hub.drives))
+
+    def leave(self) -> None:
+        """Say that the gateway goes, and of each drive that nothing more comes.
+
+        One that the plant file has no more when the gateway begins again is never spoken of again.
+        """
+        self.outbox.put(self.will())
+        for drive in self._available:
+            self.outbox.put(self._kept(self._topic(drive, "available"), OFFLINE))
+        self._available.clear()
+
+    def _state(self, drive: str) -> bytes:
+        seen_ns = self._hub.seen_at(drive)
+        shown = self._hub.seen(drive)
+        said = {
+            "time": None if seen_ns is None else seen_ns // 1_000_000,
+            "state": shown.state,
+            "fault": shown.fault,
+            "values": fresh_values(self._hub, drive),
+        }
+        return json.dumps(said, ensure_ascii=False).encode()
+
+    def _tell(self, drive: str, what: str, told: Told) -> None:
+        said = json.dumps({"what": what, "done": told.is_done, "text": told.text}, ensure_ascii=False)
+        self.outbox.put(Publication(self._topic(drive, "told"), said.encode))
+
+    def _discover(self, name: str) -> None:
+        _, drive = self._plant.find_drive(name)
+        may = self._inside.commands.may.write
+        writable = [register for register in drive.registers if f"{name}.{register}" in may]
+        topics = {
+            "state": self._topic(name),
+            "gateway": self._topic("gateway"),
+            "available": self._topic(name, "available"),
+            "set": self._topic(name, "set"),
+            "stop": self._topic(name, "stop"),
+        }
+        said = discovery(
+            drive,
+            self._hub.polled(name),
+            topics,
+            prefix=self._settings.prefix,
+            version=self._inside.version,
+            every_s=self._settings.every_s,
+            writable=writable,
+            takes_commands=self._settings.commands,
+            page=self._inside.page,
+        )
+        self.outbox.put(self._kept(discovery_topic(self._settings.prefix, name), said))
+
+
+def _drives(plant: Plant) -> set[str]:
+    return {polled.drive.name for line in plant.lines for polled in line.drives}
+
+
+def _read_write(given: Mapping[str, Any]) -> tuple[float, int]:
+    """Return value and time of a write. Raises ValueError for what is none."""
+    _check_keys(given, "value", "time")
+    value = given["value"]
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        raise ValueError(f"value is {value!r}, and not a number")
+    return value, _time(given)
+
+
+def _read_act(drive: str, given: Mapping[str, Any]) -> tuple[str, dict[str, object], int]:
+    """Return verb, options and time. Raises ValueError for what is none, or names another drive."""
+    _check_keys(given, "verb", "drive", "time")
+    return str(given["verb"]), _options(drive, given), _time(given)
+
+
+def _options(drive: str, given: Mapping[str, Any]) -> dict[str, object]:
+    if given.get("drive", drive) != drive:
+        raise ValueError(f"it names drive {given['drive']!r}, and its topic {drive!r}")
+    options = given.get("options", {})
+    if not isinstance(options, dict):
+        raise ValueError("options is no table")
+    return options
+
+
+def _time(given: Mapping[str, Any]) -> int:
+    time: object = given["time"]
+    if isinstance(time, bool) or not isinstance(time, int):
+        raise ValueError("time is no whole number of ms")
+    return time
+
+
+def _read(payload: bytes) -> dict[str, Any]:
+    if len(payload) > MOST_BYTES:
+        raise ValueError(f"it has {len(payload)} bytes")
+    try:
+        given = json.loads(payload)
+    except RecursionError:
+        raise ValueError("it is nested too deeply") from None
+    if not isinstance(given, dict):
+        raise ValueError("it is no JSON object")
+    return given
+
+
+def _check_keys(given: Mapping[str, Any], *keys: str) -> None:
+    for key in keys:
+        if key not in given:
+            raise ValueError(f"{key} is missing")

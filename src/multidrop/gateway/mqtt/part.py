@@ -1,0 +1,94 @@
+"""MQTT: tells brokers what the drives say, and takes commands from them where the plant file lets it."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Awaitable, Callable
+from typing import Any
+
+from multidrop import Batch, MetricFamily, Plant
+from multidrop.gateway.clock import utc_ms
+from multidrop.gateway.metrics import counter
+from multidrop.gateway.mqtt.broker import Broker, parse_broker
+from multidrop.gateway.mqtt.json_topics import JsonTopics
+from multidrop.gateway.mqtt.settings import MqttSettings as MqttSettings
+from multidrop.gateway.mqtt.sparkplug_node import SparkplugNode
+from multidrop.gateway.parts import Feed, Inside
+
+
+def build(settings: MqttSettings, inside: Inside) -> Feed:
+    """Return the part. Raises ImportError without paho."""
+    speakers: list[Any] = [JsonTopics(settings, inside, utc_ms)]
+    if settings.sparkplug:
+        speakers.append(SparkplugNode(settings, inside, utc_ms))
+    return Mqtt(settings, inside, speakers)
+
+
+class Mqtt:
+    """The speakers of MQTT, each with a connection of its own, since a connection has only one will."""
+
+    def __init__(self, settings: MqttSettings, inside: Inside, speakers: list[Any]) -> None:
+        address, login = parse_broker(settings.broker), settings.login(inside.plant)
+        self._every = settings.every_s
+        self._speakers = speakers
+        self._brokers = []
+        for speaker in speakers:
+            name = f"{settings.prefix}/{inside.plant.path.stem}/{speaker.kind}"  # no other gateway's
+            broker = Broker(address, login, name, speaker)
+            speaker.outbox = broker.outbox
+            self._brokers.append(broker)
+
+    def take(self, batch: Batch) -> None:
+        """Do nothing: the hub has the newest rows."""
+
+    def adopt(self, plant: Plant) -> None:
+        """Go on with another plant: all drives are made known anew."""
+        for broker, speaker in zip(self._brokers, self._speakers, strict=True):
+            speaker.adopt(plant)
+            if broker.is_connected:
+                broker.begin_anew()
+
+    async def run(self, sleep: Callable[[float], Awaitable[object]] = asyncio.sleep) -> None:
+        """Publish every so many seconds, until cancelled."""
+        for broker in self._brokers:
+            broker.open()
+        while True:
+            for broker in self._brokers:
+                broker.publish()
+            await sleep(self._every)
+
+    async def close(self) -> None:
+        """Send the last messages and disconnect."""
+        for broker, speaker in zip(self._brokers, self._speakers, strict=True):
+            if broker.is_connected:
+                speaker.leave()
+            await broker.close()
+
+    def health(self) -> str:
+        """Return why a broker is not reached, or not told anything; "" is well."""
+        troubles = [broker.failure if broker.is_connected else broker.trouble for broker in self._brokers]
+        return next(filter(None, troubles), "")
+
+    def figures(self) -> list[MetricFamily]:
+        """Return messages sent and dropped since the start, and how many connections there are."""
+        outboxes = [broker.outbox for broker in self._brokers]
+        connected = sum(broker.is_connected for broker in self._brokers)
+        return [
+            counter(
+                "multidrop_mqtt_sent",
+                "Messages handed to connections to the broker.",
+                sum(outbox.sent for outbox in outboxes),
+            ),
+            counter(
+                "multidrop_mqtt_dropped",
+                "Messages replaced by newer ones before they were sent, made while there was no connection, "
+                "or not acknowledged when it broke.",
+                sum(outbox.dropped for outbox in outboxes),
+            ),
+            MetricFamily(
+                "multidrop_mqtt_connected",
+                "gauge",
+                "Connections to the broker that are up: one for JSON, and one more for Sparkplug.",
+                [("", {}, connected)],
+            ),
+        ]

@@ -1,0 +1,141 @@
+"""Settings of MQTT, the table [serve.mqtt] of a plant file, and the values that are said of a drive."""
+
+from __future__ import annotations
+
+import re
+import ssl
+from dataclasses import dataclass
+from math import isfinite
+from pathlib import Path
+from typing import Any
+
+from multidrop import Plant, Register, check_drive_name, parse_duration
+from multidrop.gateway.http.rights import Caller, Right
+from multidrop.gateway.live.hub import Hub
+from multidrop.gateway.mqtt.broker import Login, parse_broker
+
+LEVEL = re.compile(r"[^+#/\0]+")  # one level of a topic
+OTHERS = ("homeassistant", "spBv1.0")  # first levels of topics that are not ours: discovery and Sparkplug
+LEAST_EVERY_S, MOST_EVERY_S = 0.1, 3600.0
+
+
+@dataclass(frozen=True)
+class MqttSettings:
+    """The table [serve.mqtt]. Raises ValueError with a sentence in a line for each mistake."""
+
+    broker: str = "mqtt://localhost:1883"
+    prefix: str = "multidrop"
+    every: str = "1 s"  # between two messages of a drive
+    user: str = ""
+    password: str = ""  # a file that has it
+    authorities: str = ""  # a file of certificates, by which a broker of mqtts:// is known
+    home_assistant: bool = False
+    sparkplug: str = ""  # the group; "": no Sparkplug
+    node: str = ""  # the edge node's name; "": that of the plant file
+    commands: bool = False  # whoever may publish to the broker may then write what [serve.may] lists
+
+    def __post_init__(self) -> None:
+        wrong = []
+        try:
+            parse_broker(self.broker)
+        except ValueError as mistake:
+            wrong.append(str(mistake))
+        try:
+            is_right = LEAST_EVERY_S <= self.every_s <= MOST_EVERY_S
+        except ValueError:
+            is_right = False
+        if not is_right:
+            wrong.append(f'every = "{self.every}" is not "{LEAST_EVERY_S:g} s" to "{MOST_EVERY_S:g} s"')
+        if not all(LEVEL.fullmatch(level) for level in self.prefix.split("/")) or self.prefix[0] == "$":
+            wrong.append(f'prefix = "{self.prefix}" is no topic; write prefix = "multidrop"')
+        if self.prefix.split("/")[0] in OTHERS:
+            wrong.append(f'prefix = "{self.prefix}" is a topic of others; write prefix = "multidrop"')
+        if self.sparkplug == "STATE":
+            wrong.append('sparkplug = "STATE" is the topic of Sparkplug\'s hosts; name another group')
+        wrong += [
+            f'{key} = "{name}" is not one level of a topic: it has none of + # and /'
+            for key, name in (("sparkplug", self.sparkplug), ("node", self.node))
+            if name and not LEVEL.fullmatch(name)
+        ]
+        if wrong:
+            raise ValueError("\n".join(wrong))
+
+    @property
+    def every_s(self) -> float:
+        """Seconds between two messages of a drive."""
+        return parse_duration(self.every)
+
+    @property
+    def caller(self) -> Caller:
+        """The caller that stands for everybody who may publish to the broker."""
+        return Caller(self.user or "anyone", "mqtt", parse_broker(self.broker).host, Right.WRITE)
+
+    def check(self, plant: Plant) -> list[str]:
+        """Return a sentence for each file that cannot be read, and each drive that cannot be a topic."""
+        names = [polled.drive.name for line in plant.lines for polled in line.drives]
+        files = (("password", self.password), ("authorities", self.authorities))
+        return (
+            [
+                f'{key} = "{name}": there is no file {_beside(plant, name)}'
+                for key, name in files
+                if name and not _beside(plant, name).is_file()
+            ]
+            + [
+                f'authorities = "{self.authorities}": {path} has no certificates in PEM'
+                for path in [_beside(plant, self.authorities)]
+                if self.authorities and path.is_file() and not _has_certificates(path)
+            ]
+            + [
+                f"drive {name!r} cannot be a topic: give it a name without + # and /"
+                for name in names
+                if not LEVEL.fullmatch(name)
+            ]
+            + [mistake for mistake in map(_reserved, names) if mistake]  # a plant need not come from a file
+            + [
+                f'the plant file\'s name {plant.path.stem!r} cannot be an edge node; add node = "hall-1"'
+                for _ in self.sparkplug[:1]
+                if not self.node and not LEVEL.fullmatch(plant.path.stem)
+            ]
+        )
+
+    def login(self, plant: Plant) -> Login:
+        """Return user, password and certificates. Raises OSError where the password cannot be read."""
+        password = _beside(plant, self.password).read_text("utf-8").strip() if self.password else ""
+        return Login(self.user, password, str(_beside(plant, self.authorities)) if self.authorities else None)
+
+
+def _reserved(drive: str) -> str:
+    """Return why a drive cannot have this name; "" where it can."""
+    try:
+        check_drive_name(drive)
+    except ValueError as mistake:
+        return f"drive {drive!r}: {mistake}"
+    return ""
+
+
+def _has_certificates(path: Path) -> bool:
+    try:
+        ssl.create_default_context(cafile=str(path))
+    except OSError:  # as of text that is none
+        return False
+    return True
+
+
+def _beside(plant: Plant, name: str) -> Path:
+    """Return the path of a file that is named relative to the plant file."""
+    return plant.path.parent / name
+
+
+def shown(register: Register[Any], value: float) -> float | str:
+    """Return a number, or the name of a choice."""
+    return value if register.values is None else register.format(register.decode(value))
+
+
+def fresh_values(hub: Hub, drive: str) -> dict[str, float | str | None]:
+    """Return the values of a drive's polled registers; None for one that is not fresh, or no number."""
+    return {
+        name: shown(register, good[2])
+        if is_fresh and good is not None and newest is good and isfinite(good[2])
+        else None
+        for register, (name, newest, good, is_fresh) in zip(hub.polled(drive), hub.known(drive), strict=True)
+    }

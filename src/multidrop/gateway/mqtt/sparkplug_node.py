@@ -1,0 +1,241 @@
+"""Edge node of Sparkplug B: births, data by exception, deaths, and rebirth when it is asked for."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from typing import Any
+
+from multidrop import Plant, Register
+from multidrop.gateway.commands import Told
+from multidrop.gateway.live.hub import SILENT
+from multidrop.gateway.mqtt.outbox import Publication
+from multidrop.gateway.mqtt.settings import MqttSettings, fresh_values
+from multidrop.gateway.mqtt.sparkplug import (
+    BIRTH_DEATH,
+    NAMESPACE,
+    REBIRTH,
+    SEQUENCES,
+    DataType,
+    Given,
+    Metric,
+    payload,
+    read_command,
+)
+from multidrop.gateway.offers import Orders
+from multidrop.gateway.parts import Inside
+
+STATE, FAULT, STOP = "state", "fault", "Device Control/Stop"
+OWN = (STATE, FAULT)  # of all drives alike, in words
+REGISTERS = "registers/"  # begins the metric of a register with the name of one of those
+_log = logging.getLogger("multidrop.gateway.mqtt.part")
+Value = float | str | None
+
+
+class SparkplugNode:
+    """An edge node, each of whose devices is a drive; values are sent when they change."""
+
+    kind = "sparkplug"
+
+    def __init__(self, settings: MqttSettings, inside: Inside, utc_ms: Callable[[], int]) -> None:
+        self.outbox: Any = None
+        self._settings = settings
+        self._inside = inside
+        self._hub = inside.hub
+        self._plant = inside.plant
+        self._utc_ms = utc_ms
+        self._node = settings.node or inside.plant.path.stem
+        self._orders = Orders(inside.commands, settings.caller, utc_ms, self._tell)
+        self._birth = -1  # bdSeq
+        self._seq = 0
+        self._said: dict[str, dict[str, Value]] = {}  # by drive that is born
+        self._changed: dict[str, dict[str, Value]] = {}
+        self._aliases: dict[tuple[str, str], int] = {}
+
+    def _topic(self, kind: str, *device: str) -> str:
+        return "/".join((NAMESPACE, self._settings.sparkplug, kind, self._node, *device))
+
+    # ---- a speaker ----
+
+    def will(self) -> Publication:
+        self._birth = (self._birth + 1) % SEQUENCES
+        return Publication(self._topic("NDEATH"), self._death, qos=1)
+
+    def topics(self) -> list[tuple[str, int]]:
+        listened = [(self._topic("NCMD"), 1)]
+        return [*listened, (self._topic("DCMD", "+"), 1)] if self._settings.commands else listened
+
+    def connected(self) -> None:
+        self._said.clear()
+        self._changed.clear()
+        self.outbox.put(Publication(self._topic("NBIRTH"), self._node_birth, qos=0))
+        self.publish()
+
+    def received(self, topic: str, payload: bytes, *, is_retained: bool) -> None:
+        levels = topic.split("/")
+        if levels[2:3] != ["NCMD"] and not (levels[2:3] == ["DCMD"] and self._settings.commands):
+            _log.warning("the broker sent a command that nobody listens to: %.100r", topic)
+            return
+        try:
+            sent_ms, metrics = read_command(payload)
+        except ValueError as mistake:
+            _log.warning("a command on %s is no Sparkplug payload: %s", topic, mistake)
+            if levels[2] == "DCMD" and STOP.encode() in payload:  # whatever is wrong with the rest
+                self._orders.stop([levels[-1]])
+            return
+        if levels[2] == "NCMD":
+            if any(given.name == REBIRTH and given.value for given in metrics):
+                self.connected()
+            return
+        for given in metrics:
+            self._order(levels[-1], given, sent_ms, is_retained=is_retained)
+
+    def adopt(self, plant: Plant) -> None:
+        """Go on with another plant: devices that left are dead."""
+        self._plant = plant
+        there = {polled.drive.name for line in plant.lines for polled in line.drives}
+        for drive in [drive for drive in self._said if drive not in there]:
+            del self._said[drive]
+            self._begin_anew(drive, "DDEATH", self._device_death)
+
+    def publish(self) -> None:
+        """Say what changed of each drive, and which came and went."""
+        for drive in self._hub.drives:
+            if self._hub.state(drive) == SILENT:
+                if self._said.pop(drive, None) is not None:
+                    self._begin_anew(drive, "DDEATH", self._device_death)
+                continue
+            values = self._values(drive)
+            before = self._said.get(drive)
+            self._said[drive] = values
+            if before is None:
+                self._begin_anew(drive, "DBIRTH", self._device_birth)
+                continue
+            changed = {name: value for name, value in values.items() if value != before[name]}
+            if changed:
+                self._changed.setdefault(drive, {}).update(changed)
+                self._put(drive, "DDATA", self._data)
+
+    def pass_over(self) -> int:
+        """Return how many drives changed since the last call: each would have a message."""
+        values = {drive: self._values(drive) for drive in self._hub.drives}
+        changed = [drive for drive, found in values.items() if self._said.get(drive) != found]
+        self._said = values
+        return len(changed)
+
+    def leave(self) -> None:
+        """Say that the node goes: its will is not sent at a disconnect in good order."""
+        self.outbox.put(Publication(self._topic("NDEATH"), self._death, qos=1))
+
+    # ---- payloads, each made when it is sent: their numbers go up by one ----
+
+    def _begin_anew(self, drive: str, kind: str, make: Any) -> None:
+        """Say that a drive is born or dead, and drop all else that waited to be said of it."""
+        for other in {"DBIRTH", "DDATA", "DDEATH"} - {kind}:
+            self.outbox.withdraw(self._topic(other, drive))
+        self._put(drive, kind, make)
+
+    def _put(self, drive: str, kind: str, make: Any) -> None:
+        self.outbox.put(Publication(self._topic(kind, drive), lambda: make(drive), qos=0))
+
+    def _next(self) -> int:
+        self._seq = (self._seq + 1) % SEQUENCES
+        return self._seq
+
+    def _death(self) -> bytes:
+        now = self._utc_ms()
+        return payload(now, [Metric(DataType.INT64, self._birth, now, BIRTH_DEATH)], None)
+
+    def _node_birth(self) -> bytes:
+        self._seq, now = 0, self._utc_ms()
+        metrics = [
+            Metric(DataType.INT64, self._birth, now, BIRTH_DEATH),
+            Metric(DataType.BOOLEAN, False, now, REBIRTH),
+        ]
+        return payload(now, metrics, self._seq)
+
+    def _device_birth(self, drive: str) -> bytes:
+        now, values = self._utc_ms(), self._values(drive)
+        self._said[drive] = values
+        self._changed.pop(drive, None)
+        metrics = [
+            Metric(
+                *(self._datatype(drive, name), value, now, name, self._alias(drive, name)),
+                unit=self._unit(drive, name),
+            )
+            for name, value in values.items()
+        ]
+        if self._settings.commands:
+            metrics.append(Metric(DataType.BOOLEAN, False, now, STOP, self._alias(drive, STOP)))
+        return payload(now, metrics, self._next())
+
+    def _device_death(self, drive: str) -> bytes:
+        return payload(self._utc_ms(), [], self._next())
+
+    def _data(self, drive: str) -> bytes:
+        now = self._utc_ms()
+        metrics = [
+            Metric(self._datatype(drive, name), value, now, alias=self._alias(drive, name))
+            for name, value in self._changed.pop(drive, {}).items()
+        ]
+        return payload(now, metrics, self._next())
+
+    def _values(self, drive: str) -> dict[str, Value]:
+        shown = self._hub.seen(drive)
+        found: dict[str, Value] = {STATE: shown.state, FAULT: shown.fault}
+        found |= {_metric_of(name): value for name, value in fresh_values(self._hub, drive).items()}
+        for name in self._writable(drive):
+            found.setdefault(_metric_of(name), None)
+        return found
+
+    def _writable(self, drive: str) -> list[str]:
+        if not self._settings.commands:
+            return []
+        listed = self._inside.commands.may.write
+        return [name for name in self._registers(drive) if f"{drive}.{name}" in listed]
+
+    def _registers(self, drive: str) -> dict[str, Register[Any]]:
+        drives = [polled.drive for line in self._plant.lines for polled in line.drives]
+        return next((dict(one.registers) for one in drives if one.name == drive), {})
+
+    def _datatype(self, drive: str, name: str) -> DataType:
+        register = self._register(drive, name)
+        return DataType.DOUBLE if register and register.values is None else DataType.STRING
+
+    def _unit(self, drive: str, name: str) -> str:
+        register = self._register(drive, name)
+        return register.value_unit if register and register.values is None else ""
+
+    def _register(self, drive: str, name: str) -> Register[Any] | None:
+        """Return the register of a metric; None for those of all drives, which are in words."""
+        return None if name in OWN else self._registers(drive)[name.removeprefix(REGISTERS)]
+
+    def _alias(self, drive: str, name: str) -> int:
+        return self._aliases.setdefault((drive, name), len(self._aliases) + 1)
+
+    # ---- commands ----
+
+    def _order(self, drive: str, given: Given, sent_ms: int, *, is_retained: bool) -> None:
+        name = given.name or self._name_of(drive, given.alias)
+        register = name.removeprefix(REGISTERS)
+        is_writable = name not in OWN and register in self._writable(drive)
+        if name == STOP and given.value:
+            self._orders.stop([drive])
+        elif is_retained:
+            self._orders.refuse(drive, name, "the broker had kept it; publish it without retain")
+        elif not is_writable or not isinstance(given.value, (int, float)):
+            self._orders.refuse(drive, name, "it is no register that [serve.may] lists, and a number for it")
+        else:
+            self._orders.write(drive, register, float(given.value), sent_ms)
+
+    def _name_of(self, drive: str, alias: int | None) -> str:
+        known = {number: name for (owner, name), number in self._aliases.items() if owner == drive}
+        return known.get(alias or 0, f"alias {alias}")
+
+    def _tell(self, drive: str, what: str, told: Told) -> None:
+        (_log.info if told.is_done else _log.warning)("%s of %s: %s", what, drive, told.text)
+
+
+def _metric_of(register: str) -> str:
+    """Return the name of a register's metric."""
+    return f"{REGISTERS}{register}" if register in OWN else register

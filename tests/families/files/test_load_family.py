@@ -1,0 +1,484 @@
+"""Families from files: the class that is made, and every mistake with its place and what would be right."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from enum import IntFlag
+from pathlib import Path
+from typing import Any
+
+import pytest
+from families import METER, METER_CSV, Meter, write_meter
+from tables import table
+
+from multidrop import Drive, FamilyError, Kept, load_family
+from multidrop.core import NumberFormat
+from multidrop.drive.register import Register
+from multidrop.drive.table import HOLDING, INPUT
+from multidrop.families.files.facts import FAMILY_KEYS
+from multidrop.families.files.loader import SECTIONS
+from multidrop.families.files.register_keys import REGISTER_KEYS
+
+HEAD = '[family]\ntitle = "T"\nmanual = "M"\ncounts_from = 0\n'
+
+
+def family(folder: Path, text: str, name: str = "t.toml") -> type[Drive]:
+    path = folder / name
+    path.write_text(text, "utf-8")
+    return load_family(path)
+
+
+def mistakes(folder: Path, text: str) -> list[str]:
+    with pytest.raises(FamilyError) as wrong:
+        family(folder, text)
+    assert str(wrong.value) == "\n".join(wrong.value.mistakes)
+    return [mistake.removeprefix(f"{folder}{os.sep}") for mistake in wrong.value.mistakes]
+
+
+def facts(register: Register[Any]) -> dict[str, Any]:
+    """Return a register's facts; enumerations by what they name."""
+    found = {one.name: getattr(register, one.name) for one in dataclasses.fields(register)}
+    values = register.values
+    found["values"] = values and ({each.name: each.value for each in values}, values.__mro__[1])
+    return found
+
+
+# ---- the class ----
+
+
+def test_a_family_is_the_class_that_one_would_write(tmp_path: Path) -> None:
+    loaded = load_family(write_meter(tmp_path))
+    assert {name: facts(one) for name, one in loaded.registers.items()} == {
+        name: facts(one) for name, one in Meter.registers.items()
+    }
+    for name in ("title", "manual", "addresses", "baudrates", "formats", "framings", "silence", "exceptions"):
+        assert getattr(loaded, name) == getattr(Meter, name), name
+    for name in ("response_delay", "response_timeout", "options", "broadcasts"):
+        assert getattr(loaded, name) == getattr(Meter, name), name
+    assert [loaded.most_registers[table] for table in (INPUT, HOLDING)] == [40, 20]
+    assert loaded.readable_gaps[INPUT] == range(0, 16)
+    assert issubclass(loaded, Drive)
+    assert (loaded.__name__, loaded.model, loaded.declared_in) == ("Meter", "meter.toml", "meter.toml")
+
+
+def test_values_are_read_as_the_file_names_them(tmp_path: Path) -> None:
+    loaded = load_family(write_meter(tmp_path))
+    assert loaded.register("mode").format(loaded.register("mode").decode(1)) == "automatic"
+    alarms = loaded.register("alarms").decode(9)
+    assert isinstance(alarms, IntFlag)
+    assert loaded.register("alarms").format(alarms) == "hot|open"
+
+
+def test_the_same_file_is_the_same_class(tmp_path: Path) -> None:
+    path = write_meter(tmp_path)
+    first = load_family(path)
+    assert load_family(str(path)) is first
+    path.touch()
+    assert load_family(tmp_path / "." / "meter.toml") is first
+
+
+@pytest.mark.parametrize("name", ["meter.toml", "meter.csv"])
+def test_a_file_that_changed_is_another_class(tmp_path: Path, name: str) -> None:
+    first = load_family(write_meter(tmp_path))
+    before = (tmp_path / name).stat()
+    text = {"meter.toml": METER.replace("table 2", "table 3"), "meter.csv": METER_CSV.replace("all", "two")}
+    (tmp_path / name).write_text(text[name], "utf-8")
+    os.utime(tmp_path / name, ns=(before.st_atime_ns, before.st_mtime_ns))
+    again = load_family(tmp_path / "meter.toml")
+    assert again is not first
+    assert list(again.registers) == list(first.registers)
+
+
+def test_a_byte_order_mark_is_skipped(tmp_path: Path) -> None:
+    path = write_meter(tmp_path)
+    for file in (path, tmp_path / "meter.csv"):
+        file.write_bytes(b"\xef\xbb\xbf" + file.read_bytes())
+    assert load_family(path).title == "Meter M-1"
+
+
+def test_every_detail_of_a_register(tmp_path: Path) -> None:
+    text = (
+        HEAD
+        + """\
+[setting]
+low = { at = 1, unit = "Hz", step = "unknown" }
+high = { at = 2, unit = "Hz", step = 0.1, span = [0, 50], default = 10, at_least = "low", \
+kept = "ram", ram_address = 0x1002, while_running = true, moves = false, \
+place = "P", outside = "O", note = "N" }
+[command]
+control = { at = 3, bits = { on = 0, reset = 1 }, harmless = [0], broadcast = [0], never_together = [3] }
+"""
+    )
+    loaded = family(tmp_path, text)
+    high, control = loaded.register("high"), loaded.register("control")
+    assert loaded.register("low").step is None
+    assert (high.span, high.default, high.at_least, high.kept) == ((0, 50), 10, "low", Kept.RAM)
+    assert (high.ram_address, high.while_running, high.moves) == (0x1002, True, False)
+    assert (high.place, high.outside, high.note) == ("P", "O", "N")
+    assert (control.harmless, control.broadcast, control.never_together) == ((0,), (0,), (3,))
+    assert loaded.broadcasts
+
+
+def test_what_must_be_written_by_10h(tmp_path: Path) -> None:
+    loaded = family(
+        tmp_path, HEAD + 'write = "multiple"\n[setting]\na = { at = 1 }\nb = { at = 2, write = "single" }\n'
+    )
+    assert [loaded.register(name).table.write for name in "ab"] == [0x10, 0x06]
+
+
+def test_addresses_of_a_file_may_be_unit_ids_of_modbus_tcp(tmp_path: Path) -> None:
+    head = HEAD + "addresses = [0, 255]\n[reading]\nlevel = { at = 1 }\n"
+    loaded = family(tmp_path, head)
+    assert loaded.addresses == range(256)
+    for unit in (0, 248, 255):
+        loaded(unit).take_framing_of("tcp://10.0.0.7")
+        with pytest.raises(ValueError, match=rf"address {unit} is a unit id of Modbus TCP; on /dev/ttyUSB0"):
+            loaded(unit).take_framing_of("/dev/ttyUSB0")
+    assert any("addresses = [0, 256]" in one for one in mistakes(tmp_path, head.replace("255", "256")))
+
+
+# ---- mistakes ----
+
+TWENTY = """\
+[family]
+title = "Meter M-1"
+manuel = "Meter M-1, section 4"
+baudrates = [9600, "fast"]
+formats = ["7E1"]
+addresses = [1, 300]
+together = { holding = 200 }
+silence = "soon"
+registers = ["twenty.csv"]
+
+[default]
+tabel = "input"
+
+[reading]
+"speed 1" = { at = 0x0010 }
+speed = { at = 0x0010, stepp = 0.1 }
+voltage = { at = "40001", table = "input" }
+level = { at = 40002, unit = "V" }
+power = { at = "8192" }
+mode = { at = 0x0020, values = { off = 0, on = 0 } }
+flags = { at = 0x0021, bits = { a = 0, b = 99 } }
+both = { at = 0x0022, unit = "V", values = { off = 0 } }
+
+[setting]
+limit = { at = 0x0030, span = [50, 0] }
+target = { at = 0x0031, at_most = "limitt" }
+speed = { at = 0x0032 }
+gain = { at = 0x0033, while_running = "no" }
+"""
+TWENTY_CSV = "name;at;step;access\nan;1E10;0,1;reading\nbn;0x12;0.1;readings\n"
+TOLD = [
+    "twenty.toml: [family]: unknown key 'manuel'; did you mean 'manual'?",
+    "twenty.toml: [family]: silence = 'soon' is not a duration from 100 us to 24 h, such as \"50 ms\", "
+    '"2 s" or "1 min"',
+    "twenty.toml: [family]: addresses = [1, 300]: not the first and the last address, from 1 to 247 "
+    "(0 to 255 on Modbus TCP); write addresses = [1, 247]",
+    "twenty.toml: [family]: baudrates = [9600, 'fast']: 'fast' is no baud rate; "
+    "write baudrates = [9600, 19200]",
+    "twenty.toml: [family]: together: holding = 200 is not 1 to 125 registers in one read",
+    'twenty.toml: [family]: formats has "7E1", and an RTU frame needs 8 data bits; write "8E1"',
+    "twenty.toml: [default]: unknown key 'tabel'; did you mean 'table'?",
+    "twenty.toml: [reading] speed 1: 'speed 1' cannot be a register's name: it is not letters of a to z, "
+    "digits and _, after a letter; write speed_1",
+    "twenty.toml: [reading] speed: unknown key 'stepp'; did you mean 'step'?",
+    'twenty.toml: [reading] voltage: at: "40001" begins with 4, which is table holding, and table is '
+    '"input"; leave table out, or write the number that its table has',
+    "twenty.toml: [reading] level: at: 40002 may be the number 40002, or register 2 of table holding; write "
+    '"9C42H" for that number, or "40002" in quotes in the TOML file (in a CSV file without counts_from) '
+    "for that of the table",
+    'twenty.toml: [reading] power: at: "8192" may be decimal or hex; write 8192, or "8192H"',
+    "twenty.toml: [reading] mode: values: on and off are both 0; each has its own",
+    "twenty.toml: [reading] flags: bits: b = 99 is not a bit's number, 0 to 63",
+    "twenty.toml: [reading] both: values and unit are both given; a register has one of unit, values "
+    "and bits",
+    "twenty.toml: [setting] limit: span = [50, 0] is the wrong way round: the smallest comes first; "
+    "write span = [0, 50]",
+    "twenty.toml: [setting] speed: speed is declared twice, first in [reading] speed; "
+    "every register has its own name",
+    "twenty.toml: [setting] gain: while_running = 'no' is neither true nor false; "
+    "write while_running = false",
+    "twenty.csv: line 2, column step: '0,1' has a decimal comma; write 0.1",
+    "twenty.csv: line 2, an: at: 1E10 is a power of ten, which a spreadsheet makes of hex; write 1E10H",
+    "twenty.csv: line 3, column access: 'readings' is not known; write reading, setting, command",
+    "twenty.toml: [family]: 'counts_from' is missing, and 16 is a number; add counts_from = 0 where the "
+    "manual's numbers are sent as they are, or 1 where its register 1 is sent as 0",
+    "twenty.toml: [setting] target: its bound limitt is neither an option nor a number that can be read",
+]
+
+
+def test_more_than_twenty_mistakes_are_told_in_one_run(tmp_path: Path) -> None:
+    (tmp_path / "twenty.csv").write_text(TWENTY_CSV)
+    path = tmp_path / "twenty.toml"
+    path.write_text(TWENTY)
+    with pytest.raises(FamilyError) as wrong:
+        load_family(path)
+    assert [mistake.removeprefix(f"{tmp_path}{os.sep}") for mistake in wrong.value.mistakes] == TOLD
+    assert len(TOLD) > 20
+
+
+DEVICE = HEAD + "[reading]\ndevice = { at = 3 }\nspeed = { at = 4, unit = 'Hz', step = 0.1 }\n"
+
+
+@pytest.mark.parametrize(
+    ("section", "mistakes"),
+    [
+        ('[[identify]]\nregister = "speed"\nabove = 71.5', []),
+        ('[identify]\nregister = "device"\nis = [0x10A]', []),
+        (
+            '[[identify]]\nregister = "devise"\nis = [1]',
+            ["identify number 1: register = 'devise' is not a readable register of this file"],
+        ),
+        (
+            '[[identify]]\nregister = "device"',
+            ["identify number 1: says no value; add is = [0x010A], or above and below"],
+        ),
+        (
+            '[[identify]]\nregister = "device"\nis = ["x"]',
+            ["identify number 1: is = ['x'] is not right; write is = [0x010A]"],
+        ),
+        (
+            "[[identify]]\nis = [1]",
+            ["identify number 1: 'register' is missing; add register = \"device\""],
+        ),
+        (
+            "identify = 5",
+            ["identify number 1: 5 is not a table with register, is, above, below"],
+        ),
+        (
+            "[verb.stop]\nsteps = []",
+            ["[verb] is not supported; name a profile, or write the drive as a Python class"],
+        ),
+    ],
+)
+def test_identify_and_verb_sections_are_checked(tmp_path: Path, section: str, mistakes: list[str]) -> None:
+    first, rest = ("", DEVICE + section) if section.startswith("[") else (section + "\n", DEVICE)
+    (tmp_path / "t.toml").write_text(first + rest)
+    told: tuple[str, ...] = ()
+    try:
+        load_family(tmp_path / "t.toml")
+    except FamilyError as wrong:
+        told = wrong.mistakes
+    assert [mistake.partition("t.toml: ")[2] for mistake in told] == mistakes
+
+
+@table(
+    ("text", "told"),
+    [
+        ("", ["t.toml: has no [family]; add it, with the title and the manual"]),
+        ("[family", ["t.toml: is not TOML: "]),
+        (HEAD, ["t.toml: declares no register; add [reading] and NAME = { at = 0x0010 }"]),
+        (HEAD + "[readings]\na = { at = 1 }\n", ["t.toml: unknown key 'readings'; did you mean 'reading'?"]),
+        (
+            '[[line]]\nname = "L"\n',
+            ["is a plant file, as its [[line]] says; name a drive of it, as PLANT.toml DRIVE"],
+        ),
+        (HEAD + "[reading]\na = 5\n", ["t.toml: [reading] a: 5 is no register; write { at = 0x0010"]),
+        (HEAD + "[reading]\na = {}\n", ["t.toml: [reading] a: its address is missing; add at = 0x2000"]),
+        (
+            HEAD + "[reading]\nname = { at = 1 }\n",
+            ["t.toml: [reading] name: this is a name that every drive"],
+        ),
+        (
+            HEAD + "[reading]\nclass = { at = 1 }\n",
+            ["t.toml: [reading] class: 'class' cannot be a register's"],
+        ),
+        (HEAD + "[reading]\na = { at = 1, harmless = [0] }\n", ["[reading] a: a reading is never written"]),
+        (HEAD + '[setting]\na = { at = "30001" }\n', ["an input register cannot be written"]),
+        (
+            HEAD + "[setting]\na = { at = 1 }\nb = { at = 1, step = 2 }\n",
+            ["b: a is written at the same address"],
+        ),
+        (
+            HEAD + "[reading]\na = { at = 1, step = inf }\n",
+            ["step = inf is no finite number; write step = 0.1"],
+        ),
+        (HEAD + "[reading]\na = { at = 1, step = 0 }\n", ["step = 0 makes every value 0; write step = 0.1"]),
+        (HEAD + "[reading]\na = { at = 1, number_format = 'F31' }\n", ["number_format = 'F31' is not known"]),
+        (HEAD + "[reading]\na = { at = 1, values = {} }\n", ["values is empty; leave it out"]),
+        (
+            HEAD + "[reading]\na = { at = 1, bits = { real = 0 } }\n",
+            ["'real' is a name that all enumerations"],
+        ),
+        (
+            HEAD + "[reading]\na = { at = 1, bits = { On = 0, on = 1 } }\n",
+            ["on and On differ in capitals alone"],
+        ),
+        (
+            HEAD + "[option]\nx = { span = [2, 1], meaning = 'm' }\n[reading]\na = { at = 1 }\n",
+            ["span = [2, 1]"],
+        ),
+        (
+            HEAD + "[option]\nconfirmed = { span = [1, 2], meaning = 'm' }\n[reading]\na = { at = 1 }\n",
+            ["[option] confirmed: 'confirmed' cannot be an option's name: every drive has it"],
+        ),
+        (
+            HEAD + "gaps = { input = [9, 1] }\n[reading]\na = { at = 1 }\n",
+            ["gaps: input = [9, 1] is the wrong"],
+        ),
+        (HEAD + "silence = '2 s'\n[reading]\na = { at = 1 }\n", ["silence = '2 s' is more than 1 s"]),
+        (HEAD + "response_timeout = '11 s'\n[reading]\na = { at = 1 }\n", ["'11 s' is more than 10 s"]),
+        (HEAD + "[reading]\nstart = { at = 1 }\n", ["[reading] start: this is a name that every drive has"]),
+        (HEAD + "framings = ['tcp']\n[reading]\na = { at = 1 }\n", ["'tcp' is none of rtu, ascii"]),
+        (HEAD + "framings = ['delixi']\n[reading]\na = { at = 1 }\n", ["'delixi' is none of rtu, ascii"]),
+        (
+            HEAD + "exceptions = { 300 = 'x' }\n[reading]\na = { at = 1 }\n",
+            ["300 = 'x' is no code from 1 to 255"],
+        ),
+        (HEAD + "registers = ['/etc/passwd']\n", ["registers has '/etc/passwd', which is no CSV file"]),
+        (HEAD + "registers = ['/etc/x.csv']\n", ["a CSV file is beside the family's, or below it"]),
+        (HEAD + "registers = ['../x.csv']\n", ["a CSV file is beside the family's, or below it"]),
+        (HEAD + r"registers = ['C:\x.csv']" + "\n", ["a CSV file is beside the family's, or below it"]),
+        (HEAD + r"registers = ['C:x.csv']" + "\n", ["a CSV file is beside the family's, or below it"]),
+        (HEAD + r"registers = ['..\x.csv']" + "\n", ["a CSV file is beside the family's, or below it"]),
+        (HEAD + "registers = ['x.csv']\n", ['registers = ["x.csv"]: there is no such file']),
+        ("family = 3\n", ["[family]: 3 is not a table with title"]),
+        ("family = 3\nreading = 4\n", ["[reading] is no table"]),
+        (HEAD + "option = 3\n".join(["", ""]), ["declares no register"]),
+    ],
+)
+def test_a_mistake_is_told_with_its_place(tmp_path: Path, text: str, told: list[str]) -> None:
+    found = mistakes(tmp_path, text)
+    for sentence in told:
+        assert any(sentence in mistake for mistake in found), found
+
+
+@table(
+    ("data", "told"),
+    [
+        (b"", "c.csv: is empty; its first line names the columns"),
+        (
+            b"at,unit\n1,V\n",
+            "c.csv: line 1: no column is called 'name'; the first line names the columns: name",
+        ),
+        (b"name,adress\na,1\n", "c.csv: line 1: unknown key 'adress'"),
+        (b"name,at,at\na,1,2\n", "c.csv: line 1: two columns are called 'at'"),
+        (b"name,at\na,1,5\n", "c.csv: line 2: has 3 cells, and the first line has 2: a comma in a number"),
+        (b"name;at;step\na;1;0,1\n", "c.csv: line 2, column step: '0,1' has a decimal comma; write 0.1"),
+        (b'name,at,step\na,1,"1.000,5"\n', "column step: '1.000,5' has a decimal comma; write 1000.5"),
+        (
+            b"name,at,invalid\na,1,7FFF\n",
+            "column invalid: '7FFF' is no number; write it as 0.1, 10 or 0x7FFF",
+        ),
+        (b"name,at,harmless\na,1,1E10\n", "column harmless: '1E10' is no whole number; write 0x1E10"),
+        (b"name,at,values\na,1,off\n", "column values: 'off' is no name with its number; write off=0 | on=1"),
+        (b"name,at,moves\na,1,maybe\n", "column moves: 'maybe' is neither true nor false"),
+        (b'name,at\na,"1\n', "c.csv: line 2: is not CSV: "),
+        (b"name,at\n\xff,1\n", "c.csv: is not text in UTF-8, from byte 8 on; save it as CSV UTF-8"),
+        (b"\xff\xfen\0a\0", "c.csv: is not text in UTF-8, from byte 0 on"),
+        (b"name,at\na,1\na,2\n", "line 3, a: a is declared twice, first in line 2, a"),
+        (b"name,at\n\na b,1\n", "c.csv: line 3, a b: 'a b' cannot be a register's name"),
+    ],
+)
+def test_a_mistake_of_a_csv_file_has_its_line(tmp_path: Path, data: bytes, told: str) -> None:
+    (tmp_path / "c.csv").write_bytes(data)
+    found = mistakes(tmp_path, HEAD + 'registers = ["c.csv"]\n')
+    assert any(told in mistake for mistake in found), found
+
+
+@pytest.mark.parametrize(
+    "text", ["name;at;unit\na;0x10;V\n", "name\tat\tunit\na\t16\tV\n", 'Name,At,Unit\n"a","10H",V\n']
+)
+def test_a_csv_file_of_any_delimiter(tmp_path: Path, text: str) -> None:
+    (tmp_path / "c.csv").write_text(text)
+    loaded = family(tmp_path, HEAD + 'registers = ["c.csv"]\n')
+    assert (loaded.register("a").address, loaded.register("a").unit) == (16, "V")
+
+
+def test_a_csv_file_of_numbered_registers(tmp_path: Path) -> None:
+    (tmp_path / "c.csv").write_text("name,at\na,40001\nb,300010\nc,00001\nd,10002\n")
+    loaded = family(tmp_path, '[family]\ntitle = "T"\nmanual = "M"\nregisters = ["c.csv"]\n')
+    found = [(one.table.name, one.address) for one in loaded.registers.values()]
+    assert found == [("holding register", 0), ("input register", 9), ("coil", 0), ("discrete input", 1)]
+
+
+def test_all_cells_of_a_csv_file(tmp_path: Path) -> None:
+    (tmp_path / "c.csv").write_text(
+        "name,at,access,step,span,values,kept,while_running,harmless\n"
+        "a,1,setting,0.5,0 | 50,,eeprom,no,\n"
+        "b,2,command,,,off=0 | on=0x10,ram,,0 | 0x10\n"
+    )
+    loaded = family(tmp_path, HEAD + 'registers = ["c.csv"]\n')
+    a, b = loaded.register("a"), loaded.register("b")
+    assert (a.step, a.span, a.kept, a.while_running) == (0.5, (0, 50), Kept.EEPROM, False)
+    assert b.harmless == (0, 16)
+    assert b.values is not None
+    assert [(each.name, each.value) for each in b.values] == [("off", 0), ("on", 16)]
+
+
+def test_what_is_no_file(tmp_path: Path) -> None:
+    with pytest.raises(FamilyError, match="there is no such file"):
+        load_family(tmp_path / "none.toml")
+    for path in (tmp_path, Path("/dev/zero")):
+        with pytest.raises(FamilyError, match="is no file, but a directory or a device; name a file"):
+            load_family(path)
+
+
+def test_mistakes_are_bounded(tmp_path: Path) -> None:
+    text = HEAD + "[reading]\n" + "".join(f"a{number} = 5\n" for number in range(300))
+    found = mistakes(tmp_path, text)
+    assert (len(found), found[-1]) == (201, "t.toml: 100 more mistakes are not told; mend these first")
+
+
+def test_every_key_is_in_the_reference() -> None:
+    page = (Path(__file__).parents[3] / "docs" / "reference" / "family-file.md").read_text("utf-8")
+    missing = [key for key in (*FAMILY_KEYS, *REGISTER_KEYS) if f"`{key}`" not in page]
+    assert missing == []
+    assert [section for section in SECTIONS if f"[{section}]" not in page] == []
+
+
+def test_texts(tmp_path: Path) -> None:
+    entries = 'serial = { at = 0xFC00, length = 8, order = "BA" }\nkind = { at = "30011", length = 2 }\n'
+    loaded: Any = family(tmp_path, HEAD + "[text]\n" + entries)
+    assert (loaded.serial.address, loaded.serial.length, loaded.serial.order) == (0xFC00, 8, "BA")
+    assert (loaded.kind.table, loaded.kind.address) == (INPUT, 10)
+    assert list(loaded.texts) == ["serial", "kind"]
+
+
+@pytest.mark.parametrize(
+    ("entry", "told"),
+    [
+        ("a = { at = 1 }", "[text] a: 'length' is missing; add length = 8"),
+        ("a = { at = 1, length = 126 }", "a text of 126 registers: one request reads 1 to 125"),
+        ("a = { at = 1, length = 2, order = 'CDAB' }", "order = 'CDAB' of a text"),
+        (
+            "a = { at = '00001', length = 2 }",
+            "in holding or input registers, and 'coil' is neither",
+        ),
+        ("a = { at = 1, length = 2 }\n[reading]\na = { at = 1 }", "a register has this name too"),
+        ("name = { at = 1, length = 2 }", "[text] name: every drive has this name for something else"),
+    ],
+)
+def test_mistakes_of_texts(tmp_path: Path, entry: str, told: str) -> None:
+    found = mistakes(tmp_path, HEAD + "[text]\n" + entry + "\n")
+    assert any(told in mistake for mistake in found), found
+
+
+def test_details_of_a_number(tmp_path: Path) -> None:
+    text = (
+        HEAD
+        + """\
+[default]
+number_format = "F32"
+order = "CDAB"
+invalid = "NaN"
+[reading]
+power = { at = 1, unit = "W" }
+level = { at = 3, number_format = "I16", offset = -40, invalid = [0x7FFF, 0x8000], step = -0.1, order = "BA" }
+count = { at = 4, number_format = "U64", order = "DCBA", invalid = 0 }
+flag = { at = 8, number_format = "U16", part = "3", order = "ABCD" }
+field = { at = 8, number_format = "U16", part = "4-7", values = { off = 0, on = 1 }, order = "ABCD" }
+current = { at = 9, number_format = "U16", scale_register = "power_of_ten", order = "ABCD" }
+power_of_ten = { at = 10, number_format = "I16", order = "ABCD" }
+"""
+    )
+    found = family(tmp_path, text).registers
+    power, level, count = found["power"], found["level"], found["count"]
+    assert (power.order, len(power.invalid), power.invalid[0] != power.invalid[0]) == ("CDAB", 1, True)
+    assert (level.offset, level.step, level.invalid, level.order) == (-40, -0.1, (0x7FFF, 0x8000), "BA")
+    assert (count.number_format, count.order, count.invalid) == (NumberFormat.U64, "DCBA", (0,))
+    assert (found["flag"].part, found["field"].part) == ((3, 3), (4, 7))
+    assert found["current"].scaled_by is found["power_of_ten"]

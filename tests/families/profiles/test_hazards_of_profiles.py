@@ -1,0 +1,492 @@
+"""Hazards on the way to a motor, for a drive of every profile, before its simulation."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import suppress
+from typing import Any
+
+import pytest
+from examples import usually
+from profile_families import ALL, MAKE, SHIPPED_AS, STARTS
+from simulated_bus import SimulatedBus, is_write, one
+from tables import table
+
+from multidrop.control.ramp import ramp
+from multidrop.core import Framing, Message, build_reply
+from multidrop.drive import Condition, Direction, Drive
+from multidrop.errors import DriveRefused, NoReply, NotDone, Refused, Unconfirmed
+from multidrop.families import YD1000, InnovertIBD, InvtCHE
+from multidrop.families.profiles.invt import InvtControl
+from multidrop.sim import simulated
+
+FAULT = 4
+KIND = {**{name: name for name in MAKE}, **{f"shipped {name}": kind for name, kind in SHIPPED_AS.items()}}
+
+
+@pytest.fixture(params=ALL)
+def model(request: pytest.FixtureRequest) -> str:
+    return str(request.param)
+
+
+@pytest.fixture
+def line(monkeypatch: pytest.MonkeyPatch, model: str) -> Line:
+    return Line(monkeypatch, model)
+
+
+class Line:
+    """A simulated bus with one drive; `starts` are the requests that turn its motor."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, model: str) -> None:
+        self.is_start = STARTS[KIND[model]]
+        self.bus, self.drive, self.sim = one(monkeypatch, ALL[model](1))
+        self.sim.motor.acceleration_time = self.sim.motor.deceleration_time = 1.0
+
+    @property
+    def starts(self) -> list[Message]:
+        return [request for request, _ in self.bus.frames if self.starts_it(request)]
+
+    def starts_it(self, request: Message) -> bool:
+        return is_write(request) and self.is_start(request)
+
+    @property
+    def writes(self) -> list[Message]:
+        return [request for request, _ in self.bus.frames if is_write(request)]
+
+    def runs(self) -> None:
+        self.drive.set_frequency(20)
+        self.drive.start()
+        self.bus.sleep(2)
+        assert self.drive.state().condition is Condition.RUNNING
+
+
+def test_a_start_and_a_stop(line: Line) -> None:
+    line.runs()
+    assert len(line.starts) == 1
+    assert abs(line.sim.motor.target) == pytest.approx(20, abs=0.01)
+    line.drive.stop()
+    assert not line.sim.motor.energised
+    assert line.drive.state().condition is Condition.STOPPED
+    line.drive.start()  # the setpoint is still in force
+    assert len(line.starts) == 2
+    assert line.sim.motor.energised
+
+
+def test_a_start_whose_reply_is_lost_is_sent_once(line: Line) -> None:
+    line.drive.set_frequency(20)
+    line.bus.loses = line.starts_it
+    with pytest.raises(Unconfirmed, match="no reply"):
+        line.drive.start()
+    assert len(line.starts) == 1
+    assert line.sim.motor.energised  # it did happen, and the caller was told that it may have
+
+
+def test_a_start_that_never_arrives_is_sent_once(line: Line) -> None:
+    line.drive.set_frequency(20)
+    line.bus.deafens = line.starts_it
+    with pytest.raises(Unconfirmed):
+        line.drive.start()
+    assert len(line.starts) == 1
+    assert not line.sim.motor.energised
+
+
+@pytest.mark.parametrize("lost", usually(7, 1, 2, 3))
+@pytest.mark.parametrize("how", ["loses", "deafens"])
+def test_a_stop_whose_replies_are_lost(line: Line, lost: int, how: str) -> None:
+    """It is sent until it is confirmed and the motor stands."""
+    line.runs()
+    begun = len(line.writes)
+    setattr(line.bus, how, lambda request: is_write(request) and len(line.writes) <= begun + lost)
+    line.drive.stop()
+    stops = line.writes[begun:]
+    assert len(stops) > lost
+    of_a_jog = {InvtControl.STOP_JOG} if line.drive.control.values is InvtControl else set()
+    assert stops[0].data[-1] not in of_a_jog
+    assert all(stop == stops[0] or stop.data[-1] in of_a_jog for stop in stops[: lost + 1])
+    assert not any(line.starts_it(stop) for stop in stops)
+    assert not line.sim.motor.energised
+
+
+def test_a_stop_is_sent_to_a_drive_that_never_answers(line: Line) -> None:
+    line.bus.deafens = lambda request: True
+    with pytest.raises((NoReply, Unconfirmed)):
+        line.drive.stop(seconds=3)
+    assert len(line.writes) > 3
+    assert not line.starts
+
+
+def test_a_stop_is_watched(line: Line) -> None:
+    line.runs()
+    line.sim.motor.deceleration_time = 20.0
+    before = line.bus.seconds
+    line.drive.stop()
+    assert line.bus.seconds - before > 5
+    assert line.sim.motor.frequency == 0
+
+
+def test_a_trip_while_starting(line: Line, monkeypatch: pytest.MonkeyPatch) -> None:
+    line.drive.set_frequency(20)
+    monkeypatch.setattr(line.sim.motor, "run", lambda direction: line.sim.trip(FAULT))
+    with pytest.raises(NotDone, match="tripped"):
+        line.drive.start()
+    assert len(line.starts) == 1
+    assert line.drive.state().condition is Condition.FAULT
+    with pytest.raises(Refused, match="reset_fault"):
+        line.drive.start()
+    assert len(line.starts) == 1
+
+
+def test_a_reset_never_starts_the_motor(line: Line) -> None:
+    """Nor does it where the run command stood when the drive tripped, and the drive obeys its level."""
+    line.runs()
+    line.sim.trip(FAULT)
+    begun = len(line.writes)
+    line.drive.reset_fault()
+    assert line.sim.motor.fault == 0
+    assert not any(line.starts_it(request) for request in line.writes[begun:])
+    line.bus.sleep(5)
+    assert line.drive.state().condition is Condition.STOPPED
+    assert not line.sim.motor.energised
+    line.sim.trip(FAULT)  # a later fault stays: the reset does not stand
+    line.bus.sleep(1)
+    assert line.drive.state().condition is Condition.FAULT
+    line.drive.reset_fault()  # and can be reset again
+    line.drive.start()
+    assert line.sim.motor.energised
+
+
+@pytest.mark.parametrize("lost", range(4))
+def test_a_reset_whose_replies_are_lost_starts_nothing(line: Line, lost: int) -> None:
+    line.runs()
+    line.sim.trip(FAULT)
+    begun = len(line.writes)
+    line.bus.loses = lambda request: is_write(request) and len(line.writes) == begun + 1 + lost
+    with suppress(Unconfirmed):
+        line.drive.reset_fault()
+    line.bus.loses = lambda request: False
+    assert not any(line.starts_it(request) for request in line.writes[begun:])
+    where, word = line.drive.register(line.drive.reset_role).address, line.drive.reset_word
+    resets = [write for write in line.writes if write.start == where and write.data == word.to_bytes(2)]
+    assert len(resets) == 1
+    line.sim.motor.reset()
+    line.sim.trip(FAULT)
+    line.bus.sleep(1)
+    line.drive.state()
+    assert line.sim.motor.fault == FAULT  # no reset bit was left behind
+
+
+def test_a_reset_is_refused_while_the_motor_turns(line: Line) -> None:
+    line.runs()
+    begun = len(line.writes)
+    with pytest.raises(Refused, match="runs"):
+        line.drive.reset_fault()
+    assert line.writes[begun:] == []
+    assert line.sim.motor.energised
+
+
+def test_a_reset_without_a_fault_sends_nothing(line: Line) -> None:
+    line.drive.reset_fault()
+    assert line.writes == []
+
+
+def test_a_fault_that_stands_is_told(line: Line, monkeypatch: pytest.MonkeyPatch) -> None:
+    line.sim.trip(FAULT)
+    monkeypatch.setattr(line.sim.motor, "reset", lambda: None)
+    with pytest.raises(NotDone, match="the fault stands"):
+        line.drive.reset_fault()
+    assert not line.starts
+
+
+def test_a_start_in_a_fault_is_refused(line: Line) -> None:
+    line.drive.set_frequency(20)
+    line.sim.trip(FAULT)
+    begun = len(line.writes)
+    with pytest.raises(Refused, match=r"fault.*reset_fault"):
+        line.drive.start()
+    assert line.writes[begun:] == []
+
+
+def test_a_start_without_a_setpoint_is_refused(line: Line) -> None:
+    with pytest.raises(Refused, match="set_frequency"):
+        line.drive.start()
+    assert line.writes == []
+    line.drive.set_frequency(0)
+    with pytest.raises(Refused, match=r"setpoint .* is 0"):
+        line.drive.start()
+    assert not line.starts
+
+
+def test_a_power_cycle_forgets_the_setpoint(line: Line, model: str) -> None:
+    """The motor stays off, and the next start says so, where the drive shows its setpoint."""
+    line.runs()
+    line.sim.power_cycle()
+    line.bus.sleep(5)
+    assert not line.sim.motor.energised
+    assert line.drive.state().condition is Condition.STOPPED
+    begun = len(line.writes)
+    if KIND[model] == "danfoss-fc51":  # whose reference cannot be read
+        line.drive.start()
+        return
+    with pytest.raises(Refused, match="set_frequency"):
+        line.drive.start()
+    assert line.writes[begun:] == []
+    line.runs()
+    assert line.sim.motor.energised
+
+
+LOCAL = {
+    "abb-acs355": "local control",
+    "siemens-v20": "local control",
+    "schneider-atv320": "from the line",
+    "danfoss-fc51": "hand mode",
+    "delta-vfd-el": "from the line",
+}
+
+
+@pytest.mark.parametrize("model", LOCAL)
+def test_a_drive_in_local_control_is_not_started(model: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    line = Line(monkeypatch, model)
+    line.drive.set_frequency(20)
+    line.sim.is_local = True
+    begun = len(line.writes)
+    with pytest.raises(Refused, match=LOCAL[model]):
+        line.drive.start()
+    assert line.writes[begun:] == []
+
+
+OTHERS: dict[str, Callable[[int], Drive]] = {
+    "invt-che": lambda address: InvtCHE(address, maximum_frequency=50),
+    "innovert-ibd": InnovertIBD,
+    "yd1000": YD1000,
+    **MAKE,
+}
+
+
+@table("other", OTHERS)
+def test_a_drive_of_another_make_is_not_written_to(
+    model: str, other: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if other == KIND[model]:
+        return  # its own make
+    there = simulated(OTHERS[other](1))
+    bus = SimulatedBus(monkeypatch, there)
+    drive: Any = bus.attach(ALL[model](1))
+    for call in (lambda: drive.set_frequency(20), drive.start, drive.reset_fault):
+        with pytest.raises((Refused, NoReply, DriveRefused)):
+            call()
+    assert bus.frames
+    assert bus.written == []
+
+
+NO_DIRECTION = ("abb-acs355", "siemens-v20", "optidrive-e3")
+
+
+def test_a_direction_is_sent_or_refused(line: Line, model: str) -> None:
+    line.drive.set_frequency(20)
+    if KIND[model] in NO_DIRECTION:
+        with pytest.raises(Refused, match="direction"):
+            line.drive.start(Direction.REVERSE)
+        assert not line.starts
+        return
+    line.drive.start(Direction.REVERSE)
+    line.bus.sleep(2)
+    assert line.drive.state().condition is Condition.RUNNING
+    assert line.sim.motor.frequency == pytest.approx(-20, abs=0.01)
+    if KIND[model] in ("danfoss-fc51", "schneider-atv320"):  # whose status shows no direction
+        with pytest.raises(Refused, match="cannot say which way"):
+            line.drive.start()
+    else:
+        line.drive.start()  # does not turn it round
+        line.bus.sleep(3)
+        line.drive.state()
+        assert line.sim.motor.frequency == pytest.approx(-20, abs=0.01)
+    assert line.drive.state().condition is Condition.RUNNING
+
+
+def test_a_start_word_is_never_plainly_written(line: Line) -> None:
+    control = line.drive.control
+    for count in range(0x10000):
+        request = Message(1, 6, control.address, data=count.to_bytes(2))
+        if not line.is_start(request):
+            continue
+        with pytest.raises((Refused, TypeError)):
+            line.bus.bus.write(line.drive, control, control.decode(count))
+        if count > 0x900:
+            break
+    assert line.writes == []
+
+
+def test_what_is_harmless_starts_nothing_at_any_time(line: Line) -> None:
+    line.drive.set_frequency(20)
+    control = line.drive.control
+    for before in control.harmless:
+        for count in control.harmless:
+            line.bus.bus.write(line.drive, control, control.decode(before))
+            line.bus.bus.write(line.drive, control, control.decode(count))
+            line.bus.sleep(1)
+            assert not line.sim.motor.energised
+
+
+def test_a_frequency_out_of_range_is_refused(line: Line) -> None:
+    for hz in (-1, 5000):
+        with pytest.raises(ValueError, match="Hz"):
+            line.drive.set_frequency(hz)
+    assert line.writes == []
+
+
+def test_a_ramp_goes_on_from_the_setpoint_in_force(line: Line) -> None:
+    """In Hz, also where the reference is a percentage that cannot be read."""
+    line.drive.set_frequency(20)
+    begun = len(line.writes)
+    ramp(line.drive, 22, rate=1, every=1)
+    assert len(line.writes) - begun == 2
+    assert line.sim.motor.target == pytest.approx(22, abs=0.01)
+
+
+def test_a_jog_that_goes_on_through_a_stop_is_stopped_on_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    line = Line(monkeypatch, "invt-goodrive")
+    line.sim.jog_needs_own_stop = True
+    line.drive.option["stop_time"] = 3.0
+    line.drive.jog()
+    assert line.sim.motor.energised
+    line.drive.stop()
+    assert not line.sim.motor.energised
+    line.drive.set_frequency(20)
+    line.drive.start()
+    assert len(line.starts) == 2
+
+
+@pytest.mark.parametrize("is_refused", [False, True], ids=["not heard", "refused"])
+def test_a_jog_is_stopped_on_its_own_where_the_stop_is_not_confirmed(
+    monkeypatch: pytest.MonkeyPatch, is_refused: bool
+) -> None:
+    """Replies are lost, as where one wire is broken; or it has no word for a stop in a jog."""
+    line = Line(monkeypatch, "invt-goodrive")
+    line.sim.jog_needs_own_stop = True
+    line.drive.jog()
+    assert line.sim.motor.goal
+
+    def refuse(request: Message) -> bytes | None:
+        if not is_write(request) or request.data[-1] != InvtControl.STOP or not line.sim.motor.goal:
+            return None
+        return build_reply(Framing.RTU, Message(1, request.function, request.start, exception=4))
+
+    if is_refused:
+        line.bus.answers = refuse
+        line.drive.stop()
+    else:
+        line.bus.loses = lambda request: True
+        with pytest.raises(Unconfirmed):
+            line.drive.stop(seconds=20)
+    line.sim.pass_time(line.bus.seconds + 5)
+    assert not line.sim.motor.energised
+
+
+def test_no_stop_of_a_jog_is_sent_where_another_drive_is_there(monkeypatch: pytest.MonkeyPatch) -> None:
+    line = Line(monkeypatch, "invt-goodrive")
+    checked: list[Drive] = []
+
+    def withhold(drive: Drive) -> None:
+        checked.append(drive)
+        raise Refused("another family is there")
+
+    monkeypatch.setattr(line.bus.bus._writer.identity_check, "check_before_stop", withhold)
+    with pytest.raises(Refused, match="another family"):
+        line.drive.stop()
+    assert checked == [line.drive]
+    assert line.writes == []
+
+
+def test_a_cia402_drive_without_mains_is_not_started(monkeypatch: pytest.MonkeyPatch) -> None:
+    line = Line(monkeypatch, "schneider-atv320")
+    line.drive.set_frequency(20)
+    line.sim.stays_off = True
+    with pytest.raises(NotDone, match="not switched on"):
+        line.drive.start()
+    assert line.starts == []
+
+
+@pytest.mark.parametrize("name", ["off2", "off3"])
+def test_a_profidrive_is_not_started_through_an_off(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    line = Line(monkeypatch, "abb-acs355")
+    line.drive.set_frequency(20)
+    setattr(line.sim, name, True)
+    with pytest.raises(Refused, match=f"{name.upper()}.* is active from elsewhere"):
+        line.drive.start()
+    assert line.starts == []
+    setattr(line.sim, name, False)
+    line.drive.start()
+    assert line.sim.motor.energised
+
+
+def test_an_off2_in_a_run_is_told_and_not_overcome(monkeypatch: pytest.MonkeyPatch) -> None:
+    line = Line(monkeypatch, "siemens-v20")
+    line.runs()
+    line.bus.bus.write(line.drive, line.drive.control, line.drive.control.decode(0x047C))
+    assert not line.sim.motor.energised
+    assert line.drive.state().condition is Condition.STOPPED
+
+
+def test_a_locked_trip_is_not_reset(monkeypatch: pytest.MonkeyPatch) -> None:
+    line = Line(monkeypatch, "danfoss-fc51")
+    line.sim.trip(FAULT)
+    line.sim.is_locked = True
+    with pytest.raises(Refused, match="take its mains away"):
+        line.drive.reset_fault()
+    assert line.writes == []
+    line.sim.power_cycle()
+    line.runs()
+
+
+def test_an_optidrive_of_the_first_guide_is_never_started(monkeypatch: pytest.MonkeyPatch) -> None:
+    line = Line(monkeypatch, "optidrive-e3")
+    line.sim.is_first_reading = True
+    line.drive.set_frequency(20)
+    with pytest.raises(Refused, match="not ready to run"):
+        line.drive.start()
+    line.sim.motor.run(1)  # at its keypad
+    line.bus.sleep(2)
+    assert line.drive.state().condition is not Condition.STOPPED
+    line.drive.stop()
+    assert not line.sim.motor.energised
+    assert line.starts == []
+
+
+OF_ANOTHER = {  # what a drive of the family shows only while a setting is not in force yet, if at all
+    "status": 0x0241,  # of no state of PROFIdrive
+    "station": 7,
+    "signature": 1,
+}
+
+
+@pytest.mark.parametrize("first", OF_ANOTHER)
+@pytest.mark.parametrize("second", OF_ANOTHER)
+def test_a_stop_is_withheld_only_if_the_status_and_another_value_are_another_drive_s(
+    monkeypatch: pytest.MonkeyPatch, first: str, second: str
+) -> None:
+    """One make's stop is another's run, but one value alone proves nothing, nor do two stale settings."""
+    line = Line(monkeypatch, "abb-acs355")
+    shown = {line.drive.register(name).address: OF_ANOTHER[name] for name in (first, second)}
+
+    def show(request: Message) -> bytes | None:
+        if request.function != 3 or request.start not in shown:
+            return None
+        return build_reply(Framing.RTU, Message(1, 3, data=shown[request.start].to_bytes(2, "big")))
+
+    line.bus.answers = show
+    if first == second or "status" not in (first, second):
+        with suppress(Unconfirmed):
+            line.drive.stop(seconds=1)
+        assert line.writes
+    else:
+        with pytest.raises(Refused, match="no stop was sent"):
+            line.drive.stop(seconds=1)
+        assert line.writes == []
+
+
+def test_a_stop_of_a_drive_that_was_known_is_never_kept_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    line = Line(monkeypatch, "invt-goodrive")
+    line.runs()
+    line.sim["signature"] = 0x0101
+    line.drive.stop()
+    assert not line.sim.motor.energised

@@ -1,0 +1,234 @@
+"""A family of a profile: what it must declare, may not declare, and how its drives are told from others."""
+
+from __future__ import annotations
+
+from enum import IntEnum, IntFlag
+from typing import Any
+
+import pytest
+from profile_families import MAKE, Acs355, Atv320, Fc51, Goodrive, VfdEl
+from scripts import Wire
+from tables import table
+
+from multidrop.core import NumberFormat
+from multidrop.drive import Drive, DriveRefused, Refused
+from multidrop.drive.declaration_check import DeclarationError
+from multidrop.drive.declare import command, reading, setting
+from multidrop.drive.table import COIL
+from multidrop.drive.verbs import VERBS
+from multidrop.families.profiles import PROFILES, Delta, Profidrive
+
+every_profile = pytest.mark.parametrize("profile", PROFILES.values(), ids=PROFILES)
+
+
+@every_profile
+def test_a_profile_says_what_it_does(profile: type[Drive]) -> None:
+    assert profile.__doc__
+    assert len(profile.__doc__) > 400
+    assert profile.registers == {}
+    assert all(getattr(profile, name).__doc__ for name in (*VERBS, "identify"))
+
+
+@every_profile
+def test_no_harmless_word_is_a_start_or_a_reset(profile: Any) -> None:
+    harmless = profile.roles["control"].harmless
+    assert profile.stop_word in harmless
+    assert profile.coast_word is None or profile.coast_word in harmless
+    assert profile.reset_role != "control" or profile.reset_word not in harmless
+
+
+def test_the_profile_says_what_the_family_does_not() -> None:
+    control = Acs355.control
+    assert control.name == "control"
+    assert control is Acs355.registers["control"]
+    assert control.harmless == (0x047E, 0x047C, 0x0476)
+    assert control.place == "40001"
+    assert control.commands
+    assert not Acs355.reference.commands
+
+
+def test_a_family_may_add_the_bit_for_reverse_where_makes_differ() -> None:
+    assert Atv320.control.values(0x0800).name == "REVERSE"
+    with pytest.raises(DeclarationError) as wrong:
+
+        class Overlapping(Atv320):
+            control = command(1, IntFlag("Bits", {"reverse": 1 << 3}))
+
+    assert wrong.value.mistakes == ("control: bit 3 is ENABLE_OPERATION in this profile",)
+    with pytest.raises(DeclarationError, match="bits may only add reverse, and not jog"):
+
+        class Jogging(Atv320):
+            control = command(1, IntFlag("Bits", {"jog": 1 << 8}))
+
+
+def test_the_output_frequency_is_0_for_a_motor_that_stands_alone() -> None:
+    for frequency in (reading(0x60, "Hz", part=(0, 3)), reading(0x60, "Hz", offset=-50)):
+        with pytest.raises(DeclarationError, match="output_frequency: it is 0 where the motor stands alone"):
+            type("Half", (Atv320,), {"output_frequency": frequency})
+
+
+def test_nothing_beside_the_roles_is_harmless() -> None:
+    with pytest.raises(DeclarationError, match="sleeve: harmless counts are those of its control"):
+
+        class Sleeved(Atv320):
+            sleeve = command(0x50, harmless=(1,))
+
+
+def test_all_mistakes_of_a_family_are_told_at_once() -> None:
+    class Words(IntEnum):
+        RUN = 1
+
+    with pytest.raises(DeclarationError) as wrong:
+
+        class Bad(Delta):
+            control = setting(0x2000, Words, harmless=(2,))
+            status = reading(0x2101, step=0.1)
+            reference = setting(0x2001, "rpm", span=(-10, 10))
+            signature = reading(0x0000)
+            stop_word = reading(0x0001)  # type: ignore[assignment]
+
+    assert set(wrong.value.mistakes) == {
+        "control: in this profile it is a command, and not a setting",
+        "control: harmless is what the profile itself says; leave it out",
+        "control: its values are what the profile itself says; leave it out",
+        "status: it is one word of bits, without a unit and a step",
+        "reference: its unit is 'rpm'; this profile takes 'Hz' or '%'",
+        "reference: a reference below 0 may turn the motor the other way; its span begins at 0",
+        "stop_word: this is a name that every profile has for something else; call it otherwise",
+        "reset: this profile needs a register of this name, which is not declared",
+        "output_frequency: this profile needs a register of this name, which is not declared",
+        "fault: this profile needs a register of this name, which is not declared",
+        "signature: it needs names for the values that tell the family",
+    }
+
+
+def test_a_status_of_two_words_is_no_status() -> None:
+    with pytest.raises(DeclarationError, match="status: it is one word"):
+
+        class Wide(Profidrive):
+            control = command(0)
+            status = reading(3, number_format=NumberFormat.U32)
+            reference = setting(1, "Hz")
+            output_frequency = reading(5, "Hz")
+
+
+def test_a_control_word_that_is_a_coil_is_refused() -> None:
+    with pytest.raises(DeclarationError, match="control"):
+
+        class Coil(Profidrive):
+            control = command(0, table=COIL)
+            status = reading(3)
+            reference = setting(1, "Hz")
+            output_frequency = reading(5, "Hz")
+
+
+def test_a_reference_that_counts_backwards_is_refused() -> None:
+    with pytest.raises(DeclarationError, match="reference: a greater count is more of it"):
+
+        class Backwards(Acs355):
+            reference = setting(1, "%", step=-0.005, span=(0, 100), number_format=NumberFormat.I16)
+
+
+def test_a_signed_status_is_no_word_of_bits() -> None:
+    with pytest.raises(DeclarationError, match="status: it is one word of bits"):
+
+        class Signed(Acs355):
+            status = reading(3, number_format=NumberFormat.I16)
+
+
+def test_a_percentage_needs_to_know_of_what() -> None:
+    drive = Fc51(1)
+    wire = Wire(drive)
+    with pytest.raises(Refused, match="maximum_frequency = HZ") as refusal:
+        drive.set_frequency(20)
+    assert "--option maximum_frequency=HZ" in refusal.value.for_command_line()
+    assert wire.sent == []
+    with pytest.raises(ValueError, match="above 50 Hz"):
+        Fc51(1, maximum_frequency=50).set_frequency.script(51).send(None)
+
+
+# ---- identify ----
+
+WELL = {
+    "abb-acs355": {"status": 0x0231, "station": 1.0, "signature": 2},
+    "danfoss-fc51": {"status": 0x0607, "station": 1.0, "signature": 2},
+    "delta-vfd-el": {"status": 0x0500, "station": 1.0},
+    "invt-goodrive": {"status": 3, "signature": 0x010C},
+    "optidrive-e3": {"status": 0x0040, "signature": 3},
+    "schneider-atv320": {"status": 0x0250},
+    "siemens-v20": {"status": 0x0231},
+}
+
+
+def identify(model: str, **says: Any) -> Wire:
+    drive = MAKE[model](1)
+    said = {
+        name: drive.registers[name].decode(value) if not isinstance(value, Exception) else value
+        for name, value in {**WELL[model], **says}.items()
+    }
+    wire = Wire(drive, said)
+    drive.identify()
+    return wire
+
+
+@table("model", WELL)
+def test_a_drive_of_the_family_is_taken_for_one(model: str) -> None:
+    wire = identify(model)
+    assert set(wire.reads) == set(WELL[model])
+    assert wire.sent == []
+
+
+STRANGERS: list[tuple[str, dict[str, Any], str]] = [
+    ("abb-acs355", {"status": 0x0241}, "switched on and inhibited"),
+    ("abb-acs355", {"status": 0x0202}, "ready to operate and not to be switched on"),
+    ("abb-acs355", {"station": 7}, "says that its address is 7"),
+    ("abb-acs355", {"signature": 1}, "known as ABB ACS355: signature is 1, and none of DRV_LIM, DRV_FULL"),
+    ("danfoss-fc51", {"status": 0x0E08}, "run and be tripped"),
+    ("danfoss-fc51", {"signature": 0}, "signature"),
+    ("delta-vfd-el", {"status": 0x8000}, "reserved bits"),
+    ("delta-vfd-el", {"station": 12}, "address is 12"),
+    ("invt-goodrive", {"status": 0}, "no such number"),
+    ("invt-goodrive", {"signature": 0x0101}, "GD200L"),
+    ("optidrive-e3", {"status": 0x0080}, "reserved bits"),
+    ("optidrive-e3", {"signature": 0}, "none of MODBUS"),
+    ("schneider-atv320", {"status": 0x0202}, "none of the states"),
+]
+
+
+@table(("model", "says", "sentence"), STRANGERS)
+def test_a_drive_that_shows_something_else_is_refused(
+    model: str, says: dict[str, Any], sentence: str
+) -> None:
+    with pytest.raises(Refused, match=sentence):
+        identify(model, **says)
+
+
+def test_a_drive_that_refuses_a_role_is_no_drive_of_the_family() -> None:
+    with pytest.raises(DriveRefused):
+        identify("abb-acs355", signature=DriveRefused("abb", 2, "illegal address"))
+
+
+# ---- derived once more ----
+
+
+def test_a_family_may_be_derived_from() -> None:
+    class Longer(Acs355):
+        """Some more registers of the same drive."""
+
+        output_current = reading(103, "A", step=0.1)
+
+    assert Longer.control is Acs355.control
+    assert set(Longer.registers) == {*Acs355.registers, "output_current"}
+
+
+def test_a_shown_setpoint_has_the_unit_of_the_one_that_is_written() -> None:
+    with pytest.raises(DeclarationError, match=r"its unit is not that of reference, 'Hz'"):
+
+        class Mixed(VfdEl):
+            reference_in_force = reading(0x2102, "%", step=0.01)
+
+
+def test_an_unknown_state_is_not_taken_for_stopped() -> None:
+    drive = Goodrive(1)
+    Wire(drive, {"status": 9, "output_frequency": 0.0})
+    assert drive.state().condition.value == "unknown"

@@ -1,0 +1,418 @@
+"""Every family: declarations that hold together, and no verb that does what its document forbids."""
+
+from __future__ import annotations
+
+import ast
+import math
+import random
+from collections.abc import Callable
+from enum import Flag, IntFlag
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import pytest
+from examples import examples
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from tables import table
+
+import multidrop.drive
+import multidrop.families
+from multidrop.core import (
+    Message,
+    NumberFormat,
+    build_reply,
+    build_request,
+    parse_reply,
+    parse_request,
+    raw_value,
+)
+from multidrop.drive import Condition, Direction, Drive, State, Unsupported
+from multidrop.drive.declare import reading
+from multidrop.drive.register import Access, Register
+from multidrop.drive.request import write_request
+from multidrop.drive.table import Carrier
+from multidrop.drive.verbs import VERBS
+from multidrop.families import MODELS, DelixiModbus, DelixiNative
+from multidrop.families.invt_che import CHEStatus
+from multidrop.planning.blocks import blocks
+
+FAMILIES = list(MODELS.values())
+
+family = pytest.mark.parametrize("family", FAMILIES, ids=lambda each: each.model)
+
+
+def registers(wanted: Callable[[Register[Any]], object]) -> list[tuple[type[Drive], Register[Any]]]:
+    """Return each register of each family that is wanted."""
+    return [(family, each) for family in FAMILIES for each in family.registers.values() if wanted(each)]
+
+
+def told(one: type[Drive] | Register[Any]) -> str:
+    return one.name if isinstance(one, Register) else one.model
+
+
+def test_the_models_by_name() -> None:
+    assert list(MODELS) == [
+        "erman-er-g-220",
+        "invt-che",
+        "innovert-ibd",
+        "delixi-modbus",
+        "delixi-native",
+        "yd1000",
+    ]
+    assert all(name == each.model for name, each in MODELS.items())
+    assert len({family.title for family in FAMILIES}) == len(FAMILIES)
+
+
+@family
+def test_a_family_says_what_it_is(family: type[Drive]) -> None:
+    assert family.__doc__
+    assert len(family.__doc__) > 500
+    assert family.manual
+    assert family.title
+    assert family.watchdog
+    assert family(family.addresses[0]).name == f"{family.model}@{family.addresses[0]}"
+
+
+@family
+@table("given", [True, 1.0, None, "1", 0, 248, -1])
+def test_an_address_is_a_whole_number_that_the_family_has(family: type[Drive], given: object) -> None:
+    with pytest.raises(ValueError, match=rf"^address {given!r} is not one of "):
+        family(given)  # type: ignore[arg-type]
+
+
+TERMINALS = {  # as each document names them; CHE's does not
+    "erman-er-g-220": "485A and 485B",
+    "innovert-ibd": "RS+ and RS-",
+    "delixi-modbus": "SG+ and SG-",
+    "delixi-native": "SG+ and SG-",
+    "yd1000": "A and B",
+    "invt-che": "",
+}
+
+
+@family
+def test_a_family_names_its_terminals(family: type[Drive]) -> None:
+    assert family.line_terminals == TERMINALS[family.model]
+
+
+def test_a_framing_that_a_family_lacks_is_told_with_the_one_to_write() -> None:
+    with pytest.raises(
+        ValueError, match=r"^framing 'ascii' is not one of .*: delixi; write delixi, or leave"
+    ):
+        DelixiNative(1, framing="ascii")
+
+
+@pytest.mark.parametrize("family", [DelixiModbus, DelixiNative])
+def test_units_that_a_delixi_s_manual_does_not_print_are_said_to_be_inferred(family: type[Drive]) -> None:
+    of_p05 = [each for each in family.registers.values() if 501 <= each.address <= 510 and each.unit]
+    assert len(of_p05) == 7
+    assert all("unit is inferred" in each.note for each in of_p05)
+
+
+@family
+def test_a_framing_by_its_number_is_the_framing(family: type[Drive]) -> None:
+    first = family.framings[0]
+    assert family(1, framing=int(first)).framing is first  # type: ignore[arg-type]
+
+
+def test_the_class_of_all_families_is_none() -> None:
+    with pytest.raises(TypeError, match=r"^Drive is no family: take one, such as YD1000, or "):
+        Drive(1)
+
+
+@family
+@table("name", ["start", "jog"])
+@table("given", ["reverse", "forward", True, 25.0, CHEStatus.REVERSE])
+def test_a_direction_is_never_guessed(family: type[Drive], name: str, given: object) -> None:
+    """A word that is no Direction must not turn the motor the other way; nothing is sent."""
+    drive = family(family.addresses[0], name="pump")
+    drive.perform = pytest.fail
+    sentence = rf"^{name} of pump takes Direction\.FORWARD or Direction\.REVERSE, not "
+    for words, named in (((given,), {}), ((), {"direction": given})):
+        with pytest.raises(TypeError, match=sentence):
+            getattr(drive, name)(*words, **named)
+        with pytest.raises(TypeError, match=sentence):
+            getattr(drive, name).script(*words, **named)
+
+
+@family
+@table("given", ["25", None, True, Direction.FORWARD])
+def test_a_frequency_is_a_number(family: type[Drive], given: object) -> None:
+    drive = family(family.addresses[0], name="pump")
+    drive.perform = pytest.fail
+    with pytest.raises(TypeError, match=r"^set_frequency of pump takes a number in Hz, not "):
+        drive.set_frequency(given)  # type: ignore[arg-type]
+
+
+@family
+def test_a_register_is_not_called_as_a_verb_is(family: type[Drive]) -> None:
+    assert not set(family.registers) & set(VERBS)
+    assert not [name for name in family.registers if name in vars(Drive)]
+
+
+@family
+def test_verbs_have_docstrings(family: type[Drive]) -> None:
+    assert all(getattr(family, name).__doc__ for name in (*VERBS, "identify"))
+
+
+@family
+def test_no_two_registers_share_an_address(family: type[Drive]) -> None:
+    """But for a command and the reading that shows it."""
+    places = [
+        (register.table, register.address + at, register.access is Access.COMMAND)
+        for register in family.registers.values()
+        for at in range(register.words)
+    ]
+    assert len(places) == len(set(places))
+
+
+@family
+def test_every_framing_has_its_formats(family: type[Drive]) -> None:
+    assert set(family.formats) == set(family.framings)
+    for framing in family.framings:
+        for format in family.formats[framing]:
+            for baudrate in family.baudrates:
+                drive = family(1, framing=framing, format=format, baudrate=baudrate)
+                assert drive.response_timeout > drive.response_delay
+
+
+@family
+def test_limits_hold_for_tables_that_the_family_has(family: type[Drive]) -> None:
+    tables = {register.table for register in family.registers.values()}
+    assert {*family.most_registers, *family.readable_gaps} <= tables
+
+
+@family
+def test_each_register_says_where_it_comes_from(family: type[Drive]) -> None:
+    for name, register in family.registers.items():
+        assert register.place or register.outside, name
+        assert getattr(family, name) is register
+
+
+@table("family, register", registers(lambda each: each.span))
+def test_the_ends_of_the_span_can_be_encoded_and_nothing_beyond(
+    family: type[Drive], register: Register[Any]
+) -> None:
+    assert register.span
+    low, high = register.span
+    step = float(register.scale)
+    assert register.decode(register.encode(low)) == low
+    assert register.decode(register.encode(high)) == high
+    for beyond in (low - step, high + step, math.nan, math.inf):
+        with pytest.raises(ValueError, match=register.name):
+            register.encode(beyond)
+
+
+@table("family, register", registers(lambda each: each.span and each.default is not None))
+def test_the_default_is_inside_the_span(family: type[Drive], register: Register[Any]) -> None:
+    assert register.decode(register.encode(register.default)) == register.default
+
+
+@table("family, register", registers(lambda each: each.values))
+def test_names_go_to_the_wire_and_back(family: type[Drive], register: Register[Any]) -> None:
+    assert register.values
+    for member in register.values:
+        assert register.decode(register.encode(member)) is member
+        assert register.parse(register.format(member)) == member
+    if issubclass(register.values, IntFlag):
+        known = sum(member.value for member in register.values)
+        bits = 16 if register.words == 1 else 32
+        for at in range(bits):
+            if not known >> at & 1:
+                with pytest.raises(ValueError, match="reserved"):
+                    register.encode(register.values(1 << at))
+    else:
+        with pytest.raises(TypeError, match=register.name):
+            register.encode(max(value.value for value in register.values) + 1)
+
+
+@family
+def test_what_is_never_written_is_not_writable(family: type[Drive]) -> None:
+    assert not [register for register in family.registers.values() if register.never and register.writable]
+
+
+@table("family, register", registers(lambda each: each.broadcast))
+def test_a_broadcast_is_a_stop_or_a_setpoint_of_zero(family: type[Drive], register: Register[Any]) -> None:
+    for raw in register.broadcast:
+        assert family.broadcasts
+        value = register.decode(raw)
+        if isinstance(value, Flag):
+            assert {bit.name for bit in value} <= {"COMMAND_VALID", "FREQUENCY_VALID"}
+        else:
+            assert raw == 0 or value.name == "STOP"
+
+
+@family
+def test_an_unknown_scale_is_not_written(family: type[Drive]) -> None:
+    assert not [
+        register for register in family.registers.values() if register.step is None and register.writable
+    ]
+
+
+@pytest.mark.slow
+@table("family, register", registers(lambda each: not each.values))
+def test_a_raw_count_survives_its_value(family: type[Drive], register: Register[Any]) -> None:
+    low, high = (0, 1) if register.number_format is NumberFormat.BIT else (0, 0xFFFF)
+    if register.number_format is NumberFormat.I16:
+        low, high = -0x8000, 0x7FFF
+    if register.table.carrier is Carrier.LONG:
+        high = 0xFFFF_FFFF
+    if register.span is not None:
+        low, high = (int(Fraction(str(end)) / register.scale) for end in register.span)
+    chance = random.Random(register.name)
+    some = {chance.randint(low, high) for _ in range(20)}
+    for raw in {low, high, max(low, min(0, high)), *some}:
+        value = register.decode(raw)
+        assert register.encode(value) == raw
+        assert register.format(value).startswith(f"{value:.{register.decimals}f}")
+
+
+@pytest.mark.parametrize(("family", "register"), registers(lambda each: each.writable), ids=told)
+@settings(max_examples=examples(10))
+@given(data=st.data())
+def test_a_value_survives_the_wire(family: type[Drive], register: Register[Any], data: st.DataObject) -> None:
+    """Written in any framing, taken by the drive as it stands in the frame, and read back."""
+    drive = family(family.addresses[0], framing=data.draw(st.sampled_from(family.framings)))
+    value = data.draw(_values(register))
+    asked = write_request(drive, register, register.encode(value))
+    frame = build_request(drive.framing, asked)
+    used, taken = parse_request(drive.framing, frame)
+    assert taken is not None
+    assert (used, taken) == (len(frame), asked)
+    if register.table.carrier is Carrier.NUMBER:
+        kept = bytes(2) + taken.start.to_bytes(2, "big")
+    elif register.table.carrier is Carrier.BIT:
+        kept = bytes([taken.data[0] & 1])
+    else:
+        kept = taken.data
+    if register.readable:
+        (block,) = blocks(drive, [register])
+        answer = Message(drive.address, block.request.function, block.start, data=kept)
+        frame = build_reply(drive.framing, answer)
+        used, told = parse_reply(drive.framing, frame, block.request)
+        assert told is not None
+        assert (used, told.data) == (len(frame), kept)
+    assert register.decode(raw_value(kept, 0, register.number_format)) == value
+
+
+def _values(register: Register[Any]) -> st.SearchStrategy[Any]:
+    """Values that may be written."""
+    if register.values is not None:
+        members = [
+            value
+            for value in register.values
+            if not any(value & mask == mask for mask in register.never_together)
+        ]
+        return st.sampled_from(members)
+    low, high = 0, (1 << 16 * register.words) - 1
+    if register.number_format is NumberFormat.BIT:
+        high = 1
+    if register.number_format in (NumberFormat.I16, NumberFormat.I32):
+        low, high = -(high + 1) // 2, high // 2
+    if register.span is not None:
+        low, high = (int(Fraction(str(end)) / register.scale) for end in register.span)
+    return st.integers(low, high).map(register.decode)
+
+
+NUMBERS = registers(lambda each: each.values is None and each.writable)
+
+
+@pytest.mark.parametrize(("family", "register"), NUMBERS, ids=told)
+@settings(max_examples=examples(10))
+@given(data=st.data())
+def test_what_is_shown_can_be_typed(
+    family: type[Drive], register: Register[Any], data: st.DataObject
+) -> None:
+    value = data.draw(_values(register))
+    shown = register.format(value).removesuffix(register.unit).strip()
+    assert register.encode(register.parse(shown)) == register.encode(value)
+
+
+@pytest.mark.slow
+def test_drives_import_what_they_may() -> None:
+    for path in Path(multidrop.families.__file__).parent.glob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            assert not isinstance(node, ast.Import) or all(
+                not name.name.startswith("multidrop") for name in node.names
+            )
+            if isinstance(node, ast.ImportFrom) and node.module and node.module.startswith("multidrop"):
+                room = node.module.split(".")[1]
+                finds = {"family_file"} if path.name == "registry.py" else set()
+                assert room in {"drive", "register", "drives"} | finds, f"{path.name} imports {node.module}"
+
+
+def scripts_of(tree: ast.AST) -> set[str]:
+    """Return the names of functions that do nothing but where what they return is gone through."""
+    return {
+        node.name
+        for node in ast.walk(tree)
+        if isinstance(node, ast.FunctionDef)
+        and node.returns is not None
+        and ast.unparse(node.returns).startswith(("Script[", "Generator[", "Iterator["))
+    }
+
+
+def forgotten(tree: ast.AST, scripts: set[str]) -> list[int]:
+    """Return the lines at which such a function is called, and what it returns is thrown away."""
+    calls = [node.value for node in ast.walk(tree) if isinstance(node, ast.Expr)]
+    found = []
+    for call in calls:
+        if isinstance(call, ast.Call):
+            name = call.func.attr if isinstance(call.func, ast.Attribute) else ast.unparse(call.func)
+            if name in scripts:
+                found.append(call.lineno)
+    return found
+
+
+def test_no_part_of_a_verb_is_called_and_not_carried_out() -> None:
+    """Without `yield from` a script does nothing, and nobody says so."""
+    rooms = (Path(multidrop.families.__file__).parent, Path(multidrop.drive.__file__).parent)
+    trees = {path: ast.parse(path.read_text("utf-8")) for room in rooms for path in room.glob("*.py")}
+    scripts = {"script"}.union(*map(scripts_of, trees.values()))
+    assert {"read", "write", "insist", "wait", "until", "_started", "_stopped", "script"} <= scripts
+    assert {path.name: lines for path, tree in trees.items() if (lines := forgotten(tree, scripts))} == {}
+    carried_out = [
+        node
+        for tree in trees.values()
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Expr)
+        and isinstance(node.value, ast.YieldFrom)
+        and isinstance(node.value.value, ast.Call)
+    ]
+    assert len(carried_out) > 80
+    for node in carried_out:  # each would be found, were it forgotten
+        call = node.value.value  # type: ignore[attr-defined]
+        assert forgotten(ast.Module([ast.Expr(call)], []), scripts) == [call.lineno]
+
+
+def test_a_family_without_a_verb_says_so() -> None:
+    class Mute(Drive):
+        """Can only be read."""
+
+        speed = reading(0, "rpm")
+
+    with pytest.raises(ValueError, match=r"^Mute has no option 'rated_frequency'; its options: none$"):
+        Mute(1, rated_frequency=50)
+    for name in VERBS:
+        given = (5.0,) if name == "set_frequency" else ()
+        with pytest.raises(Unsupported, match="the document of Mute has no "):
+            next(getattr(Mute(1), name).script(*given))
+
+
+def test_a_state_is_told_with_all_that_is_known() -> None:
+    said = State(Condition.FAULT, Direction.REVERSE, "OVERCURRENT", "watchdog is off")
+    assert str(said) == "fault reverse (OVERCURRENT) - watchdog is off"
+    assert str(State(Condition.UNKNOWN)) == "unknown"
+
+
+@family
+def test_a_register_is_no_attribute_to_assign_to(family: type[Drive]) -> None:
+    drive = family(1)
+    name = next(iter(drive.registers))
+    with pytest.raises(
+        AttributeError, match=rf"^{name} is a register, which bus.write\(drive, drive.{name}, VALUE\)"
+    ):
+        setattr(drive, name, 1)
+    assert drive.register(name) is drive.registers[name]

@@ -1,0 +1,303 @@
+"""Delixi's own protocol: its tables, and what its verbs send. Frames as printed in part 3."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from delixi_tables import MONITORS
+from scripts import Wire, frame, rows, typed
+from simulated_bus import one
+from tables import table
+
+from multidrop.control.eeprom_ledger import Ledger
+from multidrop.drive import Condition, Direction, Framing, NotDone, Refused, State, Unconfirmed, Unsupported
+from multidrop.drive.declare import setting
+from multidrop.drive.table import Carrier, Kept
+from multidrop.errors import NoReply
+from multidrop.families.delixi_native import PARAMETER, PARAMETER_RAM, DelixiNative, DelixiNativeStatus
+from multidrop.families.delixi_parameters import DelixiBaudrate, DelixiFault, DelixiRunSource, parameter
+
+FORWARD = ":010200020000000005"  # printed
+FIFTY = ":0104000100001388A1"  # printed
+FIFTY_STORED = ":0106000200001388A4"  # printed
+STOP = ":010200010000000004"
+REVERSE = ":010200030000000006"
+RESET = ":010200040000000007"
+
+STANDING = {
+    "status": DelixiNativeStatus.STOPPED,
+    "output_frequency": 0.0,
+    "fault": DelixiFault.NONE,
+    "run_source": DelixiRunSource.LINE,
+    "address_setting": 1,
+    "baudrate_setting": DelixiBaudrate.B9600,
+}
+TURNS = {
+    FORWARD: {"status": DelixiNativeStatus.FORWARD, "output_frequency": 9.0},
+    REVERSE: {"status": DelixiNativeStatus.REVERSE, "output_frequency": 9.0},
+    STOP: {"status": DelixiNativeStatus.STOPPED, "output_frequency": 0.0},
+}
+
+TABLE = """
+00/02 0000 control             - DelixiNativeControl
+03/00 0000 status              - DelixiNativeStatus
+00/04 0001 frequency        0.01 Hz
+00/04 0007 pi_setpoint       0.1
+07/06 0002 stored_frequency 0.01 Hz
+"""
+
+
+def test_the_registers_are_those_of_part_3() -> None:
+    own = MONITORS.replace("DelixiModbusFormat", "DelixiNativeFormat")
+    shared = "\n".join(f"07/06 {line}" for line in own.strip().splitlines())
+    assert rows(DelixiNative) == typed(TABLE + shared)
+
+
+def test_what_carries_a_value() -> None:
+    carriers = {
+        register.table.write or register.table.read: register.table.carrier
+        for register in DelixiNative.registers.values()
+    }
+    assert carriers == {2: Carrier.NUMBER, 3: Carrier.NUMBER, 4: Carrier.LONG, 6: Carrier.LONG}
+    assert (PARAMETER_RAM.read, PARAMETER_RAM.write) == (7, 5)
+
+
+def test_the_line_and_its_limits() -> None:
+    assert DelixiNative(31).framing is Framing.DELIXI
+    assert DelixiNative.formats == {Framing.DELIXI: ("8N1", "8E1", "8O1")}
+    assert set(DelixiNative.exceptions) == {0xF0, 0xFC, 0xFD, 0xFE, 0xFF}
+    assert DelixiNative(1).needed_silence() == 0
+
+
+def test_formats_are_named_as_the_manual_has_them() -> None:
+    """P04.29 has other codes than in standard Modbus."""
+    assert [DelixiNative.format_setting.decode(raw).name for raw in range(3)] == ["N81", "E81", "O81"]
+
+
+def test_only_a_stop_is_broadcast_and_only_by_k_02() -> None:
+    broadcast = {name: each.broadcast for name, each in DelixiNative.registers.items() if each.broadcast}
+    assert broadcast == {"control": (1,)}
+
+
+def test_commands() -> None:
+    wire = Wire(DelixiNative(1), STANDING, turns=TURNS)
+    wire.drive.set_frequency(50)
+    wire.drive.start()
+    wire.drive.start(Direction.REVERSE)
+    wire.drive.stop()
+    wire.drive.reset_fault()
+    assert wire.sent == [FIFTY, FORWARD, REVERSE, STOP, RESET]
+
+
+def test_start_without_a_direction_does_not_turn_a_running_motor_round() -> None:
+    wire = Wire(DelixiNative(1), {**STANDING, **TURNS[REVERSE]}, turns=TURNS)
+    wire.drive.set_frequency(50)
+    wire.drive.start()
+    wire.drive.start(Direction.FORWARD)
+    assert wire.sent == [FIFTY, REVERSE, FORWARD]
+
+
+def test_start_without_a_known_setpoint_is_refused() -> None:
+    wire = Wire(DelixiNative(1), STANDING)
+    with pytest.raises(Refused, match="set_frequency"):
+        wire.drive.start()
+    assert wire.sent == []
+
+
+@table(
+    ("status", "sentence"),
+    [
+        (DelixiNativeStatus.UNDERVOLTAGE, r"a fault, UNDERVOLTAGE: .*reset_fault\(\)"),
+        (DelixiNativeStatus.FAULT, r"a fault, FAULT: .*reset_fault\(\)"),
+        (9, "says 0009H to K = 03, which is not explained"),
+    ],
+)
+def test_no_motor_is_started_that_could_run_later(status: int, sentence: str) -> None:
+    """P05.31 is 0 all the same: a run command without mains may wait for them."""
+    wire = Wire(DelixiNative(1), {**STANDING, "status": status})
+    wire.drive.set_frequency(50)
+    for direction in (None, *Direction):
+        with pytest.raises(Refused, match=sentence):
+            wire.drive.start(direction)
+    assert wire.sent == [FIFTY]
+
+
+@pytest.mark.parametrize(
+    ("says", "sentence"),
+    [
+        ({"run_source": DelixiRunSource.KEYPAD}, "is not commanded by the line"),
+        ({"fault": DelixiFault.OC_OVERCURRENT}, "has a fault, overcurrent .OC.: see to it"),
+    ],
+)
+def test_a_drive_that_would_not_obey_is_not_started(says: dict[str, object], sentence: str) -> None:
+    wire = Wire(DelixiNative(1), STANDING | says, turns=TURNS)
+    wire.drive.set_frequency(50)
+    with pytest.raises(Refused, match=sentence):
+        wire.drive.start()
+    assert wire.sent == [FIFTY]
+
+
+def test_a_start_that_is_not_seen_is_told_of() -> None:
+    wire = Wire(DelixiNative(1), STANDING)
+    wire.drive.set_frequency(50)
+    with pytest.raises(Unconfirmed, match="it is not seen to run; stop it, or it may start later"):
+        wire.drive.start()
+    assert wire.sent == [FIFTY, FORWARD]
+
+
+def test_the_stored_setpoint() -> None:
+    drive = DelixiNative(1)
+    assert frame(drive, DelixiNative.stored_frequency, 50) == FIFTY_STORED
+    assert DelixiNative.stored_frequency.kept is Kept.EEPROM
+    assert DelixiNative.frequency.kept is Kept.RAM
+
+
+def test_stop_waits_for_state_and_frequency() -> None:
+    wire = Wire(
+        DelixiNative(1),
+        {"status": [DelixiNativeStatus.REVERSE, DelixiNativeStatus.STOPPED], "output_frequency": [3.0, 0.0]},
+    )
+    wire.drive.stop()
+    assert wire.reads == ["status", "status", "output_frequency", "status", "output_frequency"]
+    wire = Wire(DelixiNative(1), {"status": DelixiNativeStatus.FORWARD})
+    with pytest.raises(Unconfirmed, match="60 s"):
+        wire.drive.stop()
+
+
+@table(
+    ("raw", "fault"),
+    [
+        (0x00, DelixiFault.NONE),
+        (0x09, DelixiFault.OL_OVERLOAD),
+        (0x0A, DelixiFault.EF_EXTERNAL),
+        (0x0E, DelixiFault.FLT_MODULE),
+        (0x10, DelixiFault.EF_EXTERNAL),
+        (0x11, DelixiFault.PARAMETER_WRITE),
+        (0x12, DelixiFault.VFOP_VF1_CHANNEL_BROKEN),
+        (0x13, DelixiFault.IFOP_VF2_CHANNEL_BROKEN),
+        (0x14, DelixiFault.FLT_MODULE),
+        (0x0F, 0x0F),
+        (0x15, 0x15),
+    ],
+)
+def test_faults_are_read_as_decimal_and_as_hex_digits(raw: int, fault: int) -> None:
+    decoded = DelixiNative.fault.decode(raw)
+    assert decoded == fault
+    assert isinstance(decoded, DelixiFault) == isinstance(fault, DelixiFault)
+
+
+@table(
+    ("says", "state"),
+    [
+        (STANDING, State(Condition.STOPPED)),
+        (
+            {"status": DelixiNativeStatus.FORWARD, "output_frequency": 9.0},
+            State(Condition.RUNNING, Direction.FORWARD),
+        ),
+        (
+            {"status": DelixiNativeStatus.REVERSE, "output_frequency": 9.0},
+            State(Condition.RUNNING, Direction.REVERSE),
+        ),
+        (
+            {"status": DelixiNativeStatus.FORWARD, "output_frequency": 0.0},  # never taken for stopped
+            State(Condition.RUNNING, Direction.FORWARD, note="output frequency 0"),
+        ),
+        (
+            {"status": DelixiNativeStatus.FAULT, "fault": DelixiFault.OC_OVERCURRENT},
+            State(Condition.FAULT, fault="overcurrent (OC)"),
+        ),
+        (
+            {"status": DelixiNativeStatus.UNDERVOLTAGE, "fault": DelixiFault.NONE},
+            State(Condition.FAULT, fault="undervoltage"),
+        ),
+        ({"status": 9}, State(Condition.UNKNOWN, note="K = 03 says 0009H, which is not explained")),
+    ],
+)
+def test_state(says: dict[str, object], state: State) -> None:
+    assert Wire(DelixiNative(1), says).drive.state() == state
+
+
+def test_identify_is_a_read() -> None:
+    wire = Wire(DelixiNative(1), STANDING)
+    wire.drive.identify()
+    assert (wire.reads, wire.sent) == (["address_setting", "baudrate_setting"], [])
+    with pytest.raises(NoReply):
+        Wire(DelixiNative(1), {"address_setting": NoReply("drive")}).drive.identify()
+    with pytest.raises(Refused, match=r"P04\.30"):
+        Wire(DelixiNative(2), STANDING).drive.identify()
+
+
+def test_a_subclass_keeps_its_tables_and_adds_its_own() -> None:
+    class Mine(DelixiNative):
+        """A Delixi whose owner has its list of parameters."""
+
+        acceleration_time = setting(parameter(0, 17), "s", step=0.1, table=PARAMETER_RAM)
+
+    assert Mine.output_current.table is DelixiNative.output_current.table
+    assert frame(Mine(1), Mine.acceleration_time, 20).startswith(":01050011000000C8")
+    assert set(Mine.registers) - set(DelixiNative.registers) == {"acceleration_time"}
+
+
+class Owned(DelixiNative):
+    """One parameter written by K = 05, which does not store it, and one by K = 06, which does."""
+
+    ramp = setting(parameter(0, 17), "s", step=0.1, table=PARAMETER_RAM)
+    stored_ramp = setting(parameter(0, 18), "s", step=0.1, table=PARAMETER)
+
+
+def test_the_function_code_says_whether_a_parameter_is_stored() -> None:
+    assert (Owned.ramp.kept, Owned.stored_ramp.kept) == (Kept.RAM, Kept.EEPROM)
+    kept = {name: each.kept for name, each in DelixiNative.registers.items() if each.writable}
+    assert kept == {
+        "control": Kept.RAM,
+        "frequency": Kept.RAM,
+        "pi_setpoint": Kept.RAM,
+        "stored_frequency": Kept.EEPROM,
+    }
+    with pytest.raises(ValueError, match="a 'parameter' is kept in EEPROM, not in RAM"):
+        setting(parameter(0, 17), "s", table=PARAMETER, kept=Kept.RAM)
+
+
+def test_what_is_not_stored_is_not_counted_and_what_is_waits_its_minute(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    ledger = Ledger(tmp_path / "wear", budget=1000)
+    line, drive, sim = one(monkeypatch, Owned(1), ledger=ledger)
+    for seconds in (1.0, 2.0, 3.0):
+        line.bus.write(drive, drive.ramp, seconds)
+    assert ledger.wear(line.seconds) == []
+    assert not sim.counters.eeprom_writes
+    line.bus.write(drive, drive.stored_ramp, 1.0)
+    with pytest.raises(Refused, match="less often"):
+        line.bus.write(drive, drive.stored_ramp, 2.0)
+    assert sim.counters.eeprom_writes == {"stored_ramp": 1}
+
+
+@pytest.mark.parametrize("name", ["coast", "emergency_stop", "jog"])
+def test_what_the_document_does_not_have(name: str) -> None:
+    with pytest.raises(Unsupported, match="Delixi"):
+        getattr(Wire(DelixiNative(1)).drive, name)()
+
+
+@pytest.mark.parametrize("status", [DelixiNativeStatus.FAULT, DelixiNativeStatus.UNDERVOLTAGE])
+def test_a_fault_that_stands_after_its_reset_is_told(status: DelixiNativeStatus) -> None:
+    wire = Wire(DelixiNative(1), {**STANDING, "status": status, "fault": DelixiFault.OC_OVERCURRENT})
+    with pytest.raises(NotDone, match=r"the fault reset.*the fault stands: overcurrent"):
+        wire.drive.reset_fault()
+    assert wire.sent == [RESET]  # once
+
+
+@table(
+    ("status", "hz"),
+    [
+        (DelixiNativeStatus.FORWARD, 12.0),
+        (DelixiNativeStatus.REVERSE, 12.0),
+        (DelixiNativeStatus.STOPPED, 0.01),
+    ],
+)
+def test_a_motor_that_turns_has_no_fault_to_reset(status: DelixiNativeStatus, hz: float) -> None:
+    wire = Wire(DelixiNative(1), {**STANDING, "status": status, "output_frequency": hz})
+    with pytest.raises(Refused, match="runs: it has no fault to reset"):
+        wire.drive.reset_fault()
+    assert wire.sent == []

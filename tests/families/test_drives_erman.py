@@ -1,0 +1,363 @@
+"""ERMAN ER-G-220-01(02): its table, and what its verbs send."""
+
+from __future__ import annotations
+
+import checksums
+import pytest
+from scripts import Wire, frame, rows, typed
+from simulated_bus import one
+from tables import table
+
+from multidrop.core import NumberFormat
+from multidrop.drive import Condition, Direction, DriveRefused, NotDone, Refused, Unconfirmed, Unsupported
+from multidrop.drive.table import COIL, HOLDING, INPUT, Kept
+from multidrop.errors import BadReply, NoReply
+from multidrop.families.erman_er_g_220 import Coil, ErmanERG220, ErmanFault, ErmanStatus, Modes
+
+START_ON = "01 05 00 00 FF 00 8C 3A"  # printed in section 7
+START_OFF = "01 05 00 00 00 00 CD CA"
+STOP_ON = "01 05 00 01 FF 00 DD FA"
+STOP_OFF = "01 05 00 01 00 00 9C 0A"
+EMERGENCY_ON = "01 05 00 02 FF 00 2D FA"
+RESET_ON = "01 05 00 09 FF 00 5C 38"
+RESET_OFF = "01 05 00 09 00 00 1D C8"
+FREQUENCY_28_5 = "01 06 00 02 01 1D E9 93"  # the example of function 06, with the right address
+
+STOPPED = {
+    "frequency": 25.0,
+    "status": ErmanStatus.STOPPED,
+    "output_frequency": 0.0,
+    "last_fault": ErmanFault(0),
+    "deceleration_time": 10.0,
+}
+
+TURNS = {START_ON: {"status": ErmanStatus.ACCELERATING}, STOP_ON: {"status": ErmanStatus.STOPPED}}
+
+TABLE = """
+01/05 0000 start_coil                - Coil
+01/05 0001 stop_coil                 - Coil
+01/05 0002 emergency_stop_coil       - Coil
+01/05 0009 fault_reset_coil          - Coil
+04/00 0001 output_frequency        0.1 Hz
+04/00 0003 output_current          0.1 A
+04/00 0005 dc_bus_voltage            1 V
+04/00 0006 heatsink_temperature      1 °C
+04/00 000C output_voltage            1 V
+04/00 0400 status                    - ErmanStatus
+04/00 0402 last_fault                - ErmanFault
+03/06 0001 control_register          - Modes
+03/06 0002 frequency               0.1 Hz
+03/06 0003 maximum_frequency       0.1 Hz
+03/06 0004 minimum_frequency       0.1 Hz
+03/06 000B carrier_frequency       0.1 kHz
+03/06 000C acceleration_time       0.1 s
+03/06 000D deceleration_time       0.1 s
+03/06 0015 braking_threshold         1 V
+01/05 0000 start_held                - Coil
+01/05 0001 stop_held                 - Coil
+01/05 0002 emergency_stop_held       - Coil
+01/05 0009 fault_reset_held          - Coil
+"""
+
+
+def test_the_registers_are_those_of_section_10() -> None:
+    assert rows(ErmanERG220) == typed(TABLE)
+
+
+def test_the_line_and_its_limits() -> None:
+    drive = ErmanERG220(1)
+    assert str(drive.settings) == "38400 8N1"
+    assert ErmanERG220.addresses == range(1, 32)
+    assert ErmanERG220.most_registers == {HOLDING: 88, INPUT: 17, COIL: 12}
+    assert ErmanERG220.readable_gaps == {HOLDING: range(0x59), INPUT: range(0x1000)}
+    assert set(ErmanERG220.exceptions) == {1, 2, 3, 4}
+    assert "read or write" in ErmanERG220.exceptions[3]  # 01 86 03 02 61, the printed error of function 06
+    assert "write" in drive.exception(4)
+    assert not ErmanERG220.broadcasts
+    for wrong in ({"baudrate": 9600}, {"format": "8E1"}):
+        with pytest.raises(ValueError, match=r"38400|8N1"):
+            ErmanERG220(1, **wrong)
+    with pytest.raises(ValueError, match="1 to 31"):
+        ErmanERG220(32)
+
+
+def test_bits() -> None:
+    assert [bit.value for bit in ErmanFault] == [1 << at for at in (0, 1, 2, 3, 4, 5, 6, 7, 10, 11)]
+    assert [bit.value for bit in Modes] == [1 << 0, 1 << 4, 1 << 8]
+    assert ErmanERG220.status.number_format is ErmanERG220.last_fault.number_format is NumberFormat.U32_EITHER
+    assert ErmanERG220.status.decode(0x22) is ErmanStatus.ACCELERATING_OVERLOADED
+    assert ErmanERG220.heatsink_temperature.number_format is NumberFormat.I16
+    assert all(register.kept is Kept.UNKNOWN for register in ErmanERG220.registers.values())
+
+
+def test_0001h_is_read_and_never_written() -> None:
+    assert ErmanERG220.control_register.readable
+    assert not ErmanERG220.control_register.writable
+
+
+def test_start_clears_both_stops_and_leaves_the_setpoint_alone() -> None:
+    wire = Wire(ErmanERG220(1), STOPPED, turns=TURNS)
+    wire.drive.start()
+    assert wire.sent == [STOP_OFF, frame(wire.drive, ErmanERG220.emergency_stop_coil, Coil.OFF), START_ON]
+
+
+def test_there_is_no_reverse() -> None:
+    wire = Wire(ErmanERG220(1), STOPPED, turns=TURNS)
+    with pytest.raises(Unsupported, match="reverse"):
+        wire.drive.start(Direction.REVERSE)
+    assert wire.sent == []
+    wire.drive.start(Direction.FORWARD)
+    assert wire.sent[-1] == START_ON
+
+
+def test_start_is_refused_while_a_fault_may_stand() -> None:
+    wire = Wire(ErmanERG220(1), {**STOPPED, "last_fault": ErmanFault.OVERHEAT}, turns=TURNS)
+    with pytest.raises(Refused, match=r"overheat.*reset_fault.*acknowledged_fault = 64"):
+        wire.drive.start()
+    assert wire.sent == []
+    wire.drive.reset_fault()
+    assert START_ON not in wire.sent
+    wire.drive.start()
+    assert wire.sent[-1] == START_ON
+    wire.says["last_fault"] = [ErmanFault.LOW_DC_VOLTAGE]
+    with pytest.raises(Refused, match="low DC voltage"):
+        wire.drive.start()
+
+
+@pytest.mark.parametrize("fault", ErmanFault)
+def test_no_fault_counts_as_dealt_with_by_itself(fault: ErmanFault) -> None:
+    wire = Wire(ErmanERG220(1), {**STOPPED, "last_fault": fault}, turns=TURNS)
+    with pytest.raises(Refused, match=f"acknowledged_fault = {int(fault)}"):
+        wire.drive.start()
+    assert wire.sent == []
+
+
+def test_a_fault_that_its_owner_has_dealt_with() -> None:
+    wire = Wire(
+        ErmanERG220(1, acknowledged_fault=64), {**STOPPED, "last_fault": ErmanFault.OVERHEAT}, turns=TURNS
+    )
+    wire.drive.start()
+    assert wire.sent[-1] == START_ON
+
+
+def test_stop_sets_stop_and_clears_start_and_waits() -> None:
+    wire = Wire(
+        ErmanERG220(1),
+        {
+            **STOPPED,
+            "status": [ErmanStatus.ACCELERATING, ErmanStatus.DECELERATING, ErmanStatus.STOPPED],
+            "output_frequency": [0.4, 0.0],
+        },
+    )
+    wire.drive.stop()
+    assert wire.sent == [STOP_ON, START_OFF]
+    assert wire.reads.count("status") == 4  # stopped, but 0.4 Hz at the third
+
+
+def test_stop_ends_in_an_emergency_stop_and_then_in_an_error() -> None:
+    wire = Wire(ErmanERG220(1), {**STOPPED, "status": ErmanStatus.RUNNING})
+    with pytest.raises(Unconfirmed, match="not seen to have stopped"):
+        wire.drive.stop()
+    assert wire.sent == [STOP_ON, START_OFF, EMERGENCY_ON]
+    assert 30 <= wire.seconds <= 31  # twice the deceleration time and 5 s
+
+
+@pytest.mark.parametrize(
+    "failure", [NoReply("drive"), BadReply("drive", "odd", b"\1"), DriveRefused("drive", 2, "")]
+)
+def test_stop_ends_in_an_emergency_stop_where_the_ramp_cannot_be_read(failure: Exception) -> None:
+    says = {**STOPPED, "deceleration_time": failure, "status": ErmanStatus.RUNNING}
+    stops = {EMERGENCY_ON: {"status": ErmanStatus.STOPPED}}
+    wire = Wire(ErmanERG220(1), says, turns=stops)
+    wire.drive.stop()
+    assert wire.sent == [STOP_ON, START_OFF, EMERGENCY_ON]
+    assert 30 <= wire.seconds <= 31
+    wire = Wire(ErmanERG220(1), says, turns=stops)
+    wire.drive.emergency_stop()
+    assert wire.sent == [EMERGENCY_ON, START_OFF]
+
+
+def test_start_is_written_off_though_nobody_confirms_the_stop() -> None:
+    lost = [Unconfirmed("drive", "stop", "no reply")] * 3
+    for stop in (STOP_ON, EMERGENCY_ON):
+        wire = Wire(ErmanERG220(1), STOPPED, {stop: lost})
+        with pytest.raises(Unconfirmed, match="no reply"):  # so that it is repeated as a whole
+            (wire.drive.stop if stop == STOP_ON else wire.drive.emergency_stop)()
+        assert wire.sent == [*[stop] * 3, START_OFF]
+        wire = Wire(ErmanERG220(1), STOPPED, {stop: lost, START_OFF: lost})
+        with pytest.raises(Unconfirmed, match="no reply"):  # once: the whole is repeated, the stop first
+            (wire.drive.stop if stop == STOP_ON else wire.drive.emergency_stop)()
+        assert wire.sent == [*[stop] * 3, START_OFF]
+
+
+def test_a_drive_that_refuses_its_stop_is_stopped_by_the_emergency_stop() -> None:
+    refusal = DriveRefused("drive", 3, "")
+    for refused, begun in ((STOP_ON, [STOP_ON] * 3), (START_OFF, [STOP_ON, *[START_OFF] * 3])):
+        wire = Wire(ErmanERG220(1), STOPPED, {refused: [refusal] * 3})
+        wire.drive.stop()
+        assert wire.sent == [*begun, EMERGENCY_ON, START_OFF]
+        assert wire.reads == ["deceleration_time", "status", "output_frequency"]  # it is watched once
+
+
+def test_stop_is_sent_again_when_its_answer_is_lost() -> None:
+    lost = Unconfirmed("drive", "stop", "no reply")
+    wire = Wire(ErmanERG220(1), STOPPED, {STOP_ON: [lost, DriveRefused("drive", 3, "")]})
+    wire.drive.stop()
+    assert wire.sent == [STOP_ON] * 3 + [START_OFF]
+    wire = Wire(ErmanERG220(1), STOPPED, {STOP_ON: [lost] * 3})
+    with pytest.raises(Unconfirmed, match="no reply"):
+        wire.drive.stop()
+
+
+def test_start_is_sent_once() -> None:
+    wire = Wire(ErmanERG220(1), STOPPED, {START_ON: [Unconfirmed("drive", "start", "no reply")]})
+    with pytest.raises(Unconfirmed):
+        wire.drive.start()
+    assert wire.sent.count(START_ON) == 1
+
+
+def test_start_needs_a_setpoint_that_is_still_there() -> None:
+    wire = Wire(
+        ErmanERG220(1), {**STOPPED, "frequency": 0.0, "maximum_frequency": 50.0, "minimum_frequency": 0.0}
+    )
+    with pytest.raises(Refused, match="set_frequency"):
+        wire.drive.start()
+    del wire.says["frequency"]
+    wire.drive.set_frequency(20)
+    wire.held["frequency"] = 30.0
+    sent = list(wire.sent)
+    with pytest.raises(Refused, match=r"holds 30\.0 Hz and not 20\.0 Hz"):
+        wire.drive.start()
+    assert wire.sent == sent
+
+
+def test_a_start_that_has_no_effect_is_unconfirmed_and_says_what_to_set() -> None:
+    wire = Wire(ErmanERG220(1), STOPPED)
+    with pytest.raises(Unconfirmed, match=r"to run; stop it, or it may start later; b\.001 must be 2"):
+        wire.drive.start()
+    assert wire.sent.count(START_ON) == 1
+
+
+def test_emergency_stop() -> None:
+    wire = Wire(ErmanERG220(1), STOPPED)
+    wire.drive.emergency_stop()
+    assert wire.sent == [EMERGENCY_ON, START_OFF]
+    wire = Wire(ErmanERG220(1), {**STOPPED, "status": ErmanStatus.RUNNING})
+    with pytest.raises(Unconfirmed):
+        wire.drive.emergency_stop()
+
+
+def test_reset_cannot_start_and_leaves_its_coil_off() -> None:
+    wire = Wire(ErmanERG220(1), STOPPED)
+    wire.drive.reset_fault()
+    assert wire.sent == [START_OFF, RESET_ON, RESET_OFF]
+    wire = Wire(ErmanERG220(1), STOPPED, {RESET_ON: [Unconfirmed("drive", "reset", "no reply")]})
+    with pytest.raises(Unconfirmed):
+        wire.drive.reset_fault()
+    assert wire.sent == [START_OFF, RESET_ON, RESET_OFF]
+    wire = Wire(ErmanERG220(1), {**STOPPED, "status": ErmanStatus.RUNNING_OVERLOADED})
+    with pytest.raises(Refused, match="runs"):
+        wire.drive.reset_fault()
+    assert wire.sent == []
+
+
+def test_the_setpoint_is_0002h_and_below_the_maximum() -> None:
+    wire = Wire(ErmanERG220(1), {"maximum_frequency": 50.0, "minimum_frequency": 5.0})
+    wire.drive.set_frequency(28.5)
+    assert wire.sent == [FREQUENCY_28_5]
+    with pytest.raises(Refused, match=r"50\.1 Hz is above maximum_frequency, which is 50 Hz .*b\.007"):
+        wire.drive.set_frequency(50.1)
+    with pytest.raises(Refused, match=r"4\.9 Hz is below minimum_frequency, which is 5 Hz"):
+        wire.drive.set_frequency(4.9)
+    with pytest.raises(ValueError, match="frequency"):
+        wire.drive.set_frequency(-1)
+    assert wire.sent == [FREQUENCY_28_5]
+    del wire.held["frequency"]
+    wire.says["frequency"] = [20.0]
+    with pytest.raises(NotDone, match=r"the drive holds 20\.0 Hz"):
+        wire.drive.set_frequency(28.5)
+
+
+@table(
+    ("status", "fault", "condition", "note"),
+    [
+        (0, 0, Condition.STOPPED, ""),
+        (1, 0, Condition.RUNNING, ""),
+        (2, 64, Condition.ACCELERATING, ""),
+        (3, 0, Condition.DECELERATING, ""),
+        (0x21, 0, Condition.RUNNING, "motor overloaded"),
+        (0x8001, 0, Condition.RUNNING, ""),  # reserved bits are not looked at
+        (
+            0,
+            0x0402,
+            Condition.STOPPED,
+            "last fault low DC voltage, system error, which may still be in force",
+        ),
+    ],
+)
+def test_state(status: int, fault: int, condition: Condition, note: str) -> None:
+    says = {"status": ErmanERG220.status.decode(status), "last_fault": ErmanERG220.last_fault.decode(fault)}
+    state = Wire(ErmanERG220(1), says).drive.state()
+    assert (state.condition, state.note, state.fault) == (condition, note, None)
+
+
+def test_a_last_fault_of_unnamed_bits_is_a_fault() -> None:
+    """Bits 8, 9 and 12 to 31 are reserved (section 10, state: 1026-1027)."""
+    wire = Wire(ErmanERG220(1), {**STOPPED, "last_fault": ErmanERG220.last_fault.decode(0x1100)}, turns=TURNS)
+    assert "last fault bit 8, bit 12" in wire.drive.state().note
+    with pytest.raises(Refused, match="may have a fault, bit 8, bit 12"):
+        wire.drive.start()
+    assert wire.sent == []
+
+
+def test_identify_refuses_the_models_03_and_04() -> None:
+    Wire(ErmanERG220(1), STOPPED).drive.identify()
+    with pytest.raises(Refused, match="0400H"):
+        Wire(ErmanERG220(1), {"status": DriveRefused("drive", 1, "")}).drive.identify()
+    with pytest.raises(NoReply):
+        Wire(ErmanERG220(1), {"status": NoReply("drive")}).drive.identify()
+
+
+@pytest.mark.parametrize("name", ["coast", "jog"])
+def test_what_the_document_does_not_have(name: str) -> None:
+    wire = Wire(ErmanERG220(1))
+    with pytest.raises(Unsupported, match="ERMAN"):
+        getattr(wire.drive, name)()
+    assert wire.sent == []
+
+
+def test_coils_are_read_one_byte_at_a_time_and_only_when_they_are_asked_for(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The order of two bytes would be doubtful (section 6, the example of function 01)."""
+    line, drive, _ = one(monkeypatch, ErmanERG220(1))
+    coils = [drive.start_held, drive.stop_held, drive.emergency_stop_held, drive.fault_reset_held]
+    assert not set(coils) & set(drive.readings())
+    held = line.bus.read_many(drive, coils)
+    assert held == dict.fromkeys((coil.name for coil in coils), Coil.OFF)
+    asked = [frame for request, frame in line.frames if request.function == 1]
+    assert asked == [
+        checksums.rtu(name).hex(" ").upper() for name in ("01 01 00 00 00 03", "01 01 00 09 00 01")
+    ]
+    drive.set_frequency(20)
+    drive.start()
+    assert line.bus.read(drive, drive.start_held) is Coil.ON
+    drive.stop()
+    assert line.bus.read(drive, drive.start_held) is Coil.OFF
+    assert line.bus.read(drive, drive.stop_held) is Coil.ON
+    for register in coils:
+        with pytest.raises(Refused, match="it is a reading"):
+            line.bus.write(drive, register, Coil.ON)
+
+
+def test_diagnostics_as_printed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Function 08 by raw (section 8), its error reply as printed and as it should be."""
+    line, drive, _ = one(monkeypatch, ErmanERG220(1))
+    assert line.bus.raw(drive, 0x08, 0x0000, b"\xa5\x37") == b"\xa5\x37"
+    asked, read = (frame for _, frame in line.frames)
+    assert asked == "01 08 00 00 A5 37 DA 8D"
+    assert read.startswith("01 04")  # that was a copy, as an adapter's echo is
+    for refusal in ("01 89 01 86 50", "01 88 01 87 C0"):
+        line.answers = lambda request, refusal=refusal: bytes.fromhex(refusal)  # type: ignore[misc]
+        with pytest.raises(DriveRefused, match="unknown command"):
+            line.bus.raw(drive, 0x08, 0x0000, b"\xa5\x37")

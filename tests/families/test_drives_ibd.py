@@ -1,0 +1,311 @@
+"""INNOVERT IBD: its table, and what its verbs send. Frames as printed in appendix 2."""
+
+from __future__ import annotations
+
+import checksums
+import pytest
+from scripts import Wire, frame, rows, typed
+from simulated_bus import one
+from tables import table
+
+from multidrop.drive import Condition, Direction, DriveRefused, Framing, Refused, Unconfirmed, Unsupported
+from multidrop.drive.table import HOLDING
+from multidrop.families.innovert_ibd import (
+    FrequencySource,
+    IBDBaudrate,
+    IBDControl,
+    IBDRunSource,
+    InnovertIBD,
+    Output,
+    Terminals,
+    parameter,
+)
+
+RUN = {Framing.RTU: "01 06 20 00 00 02 03 CB", Framing.ASCII: ":010620000002D7"}
+STOP = {Framing.RTU: "01 06 20 00 00 01 43 CA", Framing.ASCII: ":010620000001D8"}
+FIFTY = {Framing.RTU: "01 06 20 01 13 88 DE 9C", Framing.ASCII: ":0106200113883D"}
+RESET = "01 06 20 00 00 10 83 C6"
+ZERO = "01 06 20 01 00 00 D3 CA"
+
+BY_LINE = {"frequency_source": FrequencySource.LINE, "run_source": IBDRunSource.LINE}
+STANDING = {"motor_speed": 0.0, "output_current": 0.0, "deceleration_time": 8.0, "output_m01": 0, **BY_LINE}
+PROGRAMMED = {
+    "output_m01": Output.RUNNING,
+    "output_m02": Output.ACCELERATING,
+    "output_yabc": Output.DECELERATING,
+    "output_virtual": Output.FAULT,
+}
+
+TURNS = {each: {"output_current": 1.2} for each in RUN.values()} | {
+    each: {"output_current": 0.0} for each in STOP.values()
+}
+
+TABLE = """
+03/06 0003 output_current     0.1 A
+03/06 0004 motor_speed          ?
+03/06 0016 terminals            - Terminals
+03/06 0064 stored_frequency     ? Hz
+03/06 0065 frequency_source     - FrequencySource
+03/06 0066 run_source           - IBDRunSource
+03/06 006B acceleration_time  0.1 s
+03/06 006C deceleration_time  0.1 s
+03/06 0143 output_m01           - Output
+03/06 0144 output_m02           - Output
+03/06 0145 output_yabc          - Output
+03/06 0148 output_virtual       - Output
+03/06 0190 jog_frequency        ? Hz
+03/06 02BC baudrate_setting     - IBDBaudrate
+03/06 02BD format_setting       - IBDFormat
+03/06 02BE address_setting      1
+03/06 2000 control              - IBDControl
+03/06 2001 frequency         0.01 Hz
+"""
+
+
+def test_the_registers_are_those_of_appendix_2() -> None:
+    assert rows(InnovertIBD) == typed(TABLE)
+
+
+@table(
+    ("name", "address"),
+    [("PrA.03", 3), ("PrA.04", 4), ("Prb.00", 0x64), ("Prb.01", 0x65), ("Prb.07", 0x6B), ("Prb.08", 0x6C)],
+)
+def test_a_parameter_has_its_letter_and_number_as_address(name: str, address: int) -> None:
+    assert parameter(name) == address
+
+
+def test_the_line_and_its_limits() -> None:
+    assert str(InnovertIBD(240).settings) == "9600 8N1"
+    assert sorted(InnovertIBD.baudrates) == [4800, 9600, 19200, 38400]
+    assert InnovertIBD.formats == dict.fromkeys((Framing.RTU, Framing.ASCII), ("8N1", "8E1", "8O1"))
+    assert InnovertIBD.most_registers == {HOLDING: 4}
+    assert InnovertIBD(1).needed_silence() == 10e-3
+    assert InnovertIBD(1, framing="ascii").needed_silence() == 0
+    assert InnovertIBD(1).exception(2) == "a code that the document does not explain"
+
+
+def test_the_words_have_no_toggle_and_no_reserved_bit() -> None:
+    assert {each.value for each in IBDControl} == {0, 1, 2, 3, 6, 7, 0x0A, 0x0B, 0x10}
+
+
+def test_terminals() -> None:
+    assert [bit.value for bit in Terminals] == [1 << at for at in (*range(11), 13)]
+    printed = InnovertIBD.terminals.decode(0x1800)  # in the example, where bits 11 and 12 have no name
+    assert InnovertIBD.terminals.format(printed) == "bit 11, bit 12"
+
+
+@pytest.mark.parametrize("framing", InnovertIBD.framings)
+def test_printed_commands(framing: Framing) -> None:
+    wire = Wire(InnovertIBD(1, framing=framing), {**STANDING, "terminals": Terminals(0)}, turns=TURNS)
+    wire.drive.set_frequency(50)
+    wire.drive.start()
+    wire.drive.stop()
+    assert wire.sent == [FIFTY[framing], RUN[framing], STOP[framing]]
+
+
+def test_reset_and_zero() -> None:
+    wire = Wire(InnovertIBD(1), STANDING)
+    wire.drive.reset_fault()
+    wire.drive.set_frequency(0)
+    assert wire.sent == [STOP[Framing.RTU], RESET, ZERO]
+
+
+def test_no_run_command_outlasts_the_fault() -> None:
+    """In table 3 the word of the reset has no action in bits 1 and 0: a run of before may still be there."""
+    stop = STOP[Framing.RTU]
+    lost = [Unconfirmed("drive", "stop", "no reply")] * 3
+    wire = Wire(InnovertIBD(1), STANDING, {stop: lost})
+    with pytest.raises(Unconfirmed):
+        wire.drive.reset_fault()
+    assert wire.sent == [stop] * 3
+    for turning in ({"motor_speed": 120.0}, {"output_current": 0.4}):
+        wire = Wire(InnovertIBD(1), {**STANDING, **turning})
+        with pytest.raises(Refused, match="turns: it has no fault to reset"):
+            wire.drive.reset_fault()
+        assert wire.sent == []
+
+
+@pytest.mark.parametrize("direction", Direction)
+def test_a_direction_is_refused(direction: Direction) -> None:
+    wire = Wire(InnovertIBD(1))
+    for verb in (wire.drive.start, wire.drive.jog):
+        with pytest.raises(Refused, match="ambiguous"):
+            verb(direction)
+    assert wire.sent == []
+
+
+@pytest.mark.parametrize(("forward_bit", "forward", "reverse"), [(2, "06", "0A"), (3, "0A", "06")])
+def test_a_direction_that_was_tried_on_site(forward_bit: int, forward: str, reverse: str) -> None:
+    says = {**STANDING, "terminals": Terminals(0)}
+    drive = InnovertIBD(1, forward_bit=forward_bit)
+    words = [frame(drive, drive.control, IBDControl(int(each, 16))) for each in (forward, reverse, "02")]
+    wire = Wire(drive, says, turns=TURNS | {word: {"output_current": 0.4} for word in words})
+    wire.drive.set_frequency(50)
+    for direction in (Direction.FORWARD, Direction.REVERSE, None):
+        wire.drive.start(direction)
+        wire.drive.stop()
+    assert [each for each in wire.sent[1:] if each != STOP[Framing.RTU]] == words
+
+
+JOG = checksums.rtu("01 06 20 00 00 03").hex(" ").upper()  # table 3, bits 1 and 0
+
+
+def test_jog() -> None:
+    wire = Wire(InnovertIBD(1), {**STANDING, "terminals": Terminals(0)}, turns={JOG: {"output_current": 0.4}})
+    wire.drive.jog()
+    assert wire.sent == [JOG]
+
+
+@pytest.mark.parametrize(
+    "turning",
+    [{"motor_speed": 120.0}, {"output_current": 0.4}, {**PROGRAMMED, "terminals": Terminals.M01}],
+    ids=["speed", "current", "outputs"],
+)
+def test_a_motor_that_turns_may_jog_and_is_stopped_before_a_start(turning: dict[str, object]) -> None:
+    """A jog is left by a stop and a new start (table 3)."""
+    wire = Wire(InnovertIBD(1), {**STANDING, "terminals": Terminals(0), **turning})
+    wire.drive.set_frequency(50)
+    for verb in (wire.drive.start, wire.drive.jog):
+        with pytest.raises(Refused, match=r"turns, and a jog would go on through this: call stop\(\) first"):
+            verb()
+    assert wire.sent == [FIFTY[Framing.RTU]]
+
+
+def test_a_start_after_a_jog_is_at_the_setpoint(monkeypatch: pytest.MonkeyPatch) -> None:
+    line, drive, sim = one(monkeypatch, InnovertIBD(1))
+    drive.jog()
+    drive.set_frequency(50)
+    with pytest.raises(Refused, match=r"stop\(\) first"):
+        drive.start()
+    drive.stop()
+    drive.start()
+    sim.pass_time(line.seconds + 60)
+    assert sim.motor.frequency == 50
+
+
+@table(
+    ("says", "sentence"),
+    [
+        ({"frequency_source": FrequencySource.PARAMETER}, r"Prb\.01 to 5"),
+        ({"run_source": 1}, r"Prb\.02 to 2"),
+        ({**PROGRAMMED, "terminals": Terminals.VIRTUAL}, "fault"),
+        ({}, "set_frequency"),
+    ],
+)
+def test_start_is_refused(says: dict[str, object], sentence: str) -> None:
+    wire = Wire(InnovertIBD(1), {**STANDING, "terminals": Terminals(0), **says})
+    with pytest.raises(Refused, match=sentence):
+        wire.drive.start()
+    assert wire.sent == []
+
+
+def test_identity_is_its_own_address_or_its_owner_s_word() -> None:
+    says = {"baudrate_setting": IBDBaudrate.B9600, "address_setting": 1}
+    Wire(InnovertIBD(1), says).drive.identify()
+    for other in (
+        {"address_setting": 0},
+        {"baudrate_setting": 3},
+        {"address_setting": DriveRefused("it", 2, "")},
+    ):
+        with pytest.raises(Refused, match="confirmed = 1"):
+            Wire(InnovertIBD(1), {**says, **other}).drive.identify()
+        Wire(InnovertIBD(1, confirmed=1), {**says, **other}).drive.identify()
+
+
+def test_a_start_without_current_and_speed_is_told_of() -> None:
+    wire = Wire(InnovertIBD(1), STANDING | {"terminals": Terminals(0)})
+    wire.drive.set_frequency(50)
+    with pytest.raises(Unconfirmed, match="it is not seen to run; stop it, or it may start later"):
+        wire.drive.start()
+    assert wire.sent == [FIFTY[Framing.RTU], RUN[Framing.RTU]]
+
+
+SEEN = {
+    "output_current": 0.0,
+    "motor_speed": 0.0,
+    "acceleration_time": 10.0,
+    "run_source": IBDRunSource.LINE,
+    "terminals": 0x1800,
+}
+
+
+@pytest.mark.parametrize("name", SEEN)
+def test_a_drive_that_has_not_all_that_is_named_resembles_none(name: str) -> None:
+    def resembles(says: dict[str, object]) -> bool:
+        wire = Wire(InnovertIBD(1), says)
+        found = wire.run(wire.drive.resembles())
+        assert isinstance(found, bool)
+        return found
+
+    assert resembles(SEEN)
+    assert not resembles({**SEEN, name: DriveRefused("it", 2, "")})
+
+
+def test_stop_waits_until_neither_speed_nor_current_is_shown() -> None:
+    wire = Wire(
+        InnovertIBD(1),
+        {**STANDING, "motor_speed": [900.0, 300.0, 0.0], "output_current": [1.2, 0.0]},
+    )
+    wire.drive.stop()
+    assert wire.reads.count("motor_speed") == 4
+    wire = Wire(InnovertIBD(1), {**STANDING, "output_current": 0.1})
+    with pytest.raises(Unconfirmed, match="13 s"):
+        wire.drive.stop()
+
+
+def test_stop_goes_by_the_outputs_where_they_are_programmed() -> None:
+    says = {**STANDING, **PROGRAMMED, "terminals": [Terminals.M01 | Terminals.YABC, Terminals(0)]}
+    wire = Wire(InnovertIBD(1), says)
+    wire.drive.stop()
+    assert wire.reads.count("terminals") == 2
+    assert "motor_speed" not in wire.reads
+
+
+def test_the_setpoint_is_limited_by_the_owner() -> None:
+    wire = Wire(InnovertIBD(1, maximum_frequency=50))
+    with pytest.raises(Refused, match=r"50\.50 Hz is above maximum_frequency, which is 50 Hz"):
+        wire.drive.set_frequency(50.5)
+    with pytest.raises(ValueError, match="0 to 400 Hz"):
+        Wire(InnovertIBD(1)).drive.set_frequency(400.5)
+    assert wire.sent == []
+
+
+def test_the_state_is_unknown_unless_the_outputs_are_programmed() -> None:
+    refusal = DriveRefused("drive", 2, "")
+    for says in (
+        {**PROGRAMMED, "output_m01": 0},
+        {**PROGRAMMED, "output_virtual": Output.RUNNING},
+        {"output_m01": refusal},
+    ):
+        state = Wire(InnovertIBD(1), {"terminals": Terminals(0), **says}).drive.state()
+        assert state.condition is Condition.UNKNOWN
+        assert "Prd.23" in state.note
+
+
+@table(
+    ("raw", "condition"),
+    [
+        (0x1800, Condition.STOPPED),  # the reply that is printed, with its reserved bits
+        (0x1900, Condition.RUNNING),
+        (0x1B00, Condition.ACCELERATING),
+        (0x1D00, Condition.DECELERATING),
+        (0x3800, Condition.FAULT),
+        (0x3900, Condition.FAULT),
+    ],
+)
+def test_state_from_the_outputs(raw: int, condition: Condition) -> None:
+    says = {"terminals": InnovertIBD.terminals.decode(raw), **PROGRAMMED}
+    assert Wire(InnovertIBD(1), says).drive.state().condition is condition
+
+
+def test_what_is_never_written() -> None:
+    never = {name for name, each in InnovertIBD.registers.items() if each.never}
+    inferred = {name for name, each in InnovertIBD.registers.items() if 200 <= each.address < 0x2000}
+    assert inferred <= never
+    assert never - inferred == {"frequency_source", "run_source", "stored_frequency"}
+
+
+@pytest.mark.parametrize("name", ["coast", "emergency_stop"])
+def test_what_the_document_does_not_have(name: str) -> None:
+    with pytest.raises(Unsupported, match="IBD"):
+        getattr(Wire(InnovertIBD(1)).drive, name)()

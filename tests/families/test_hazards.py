@@ -1,0 +1,722 @@
+"""Hazards: what a naive client would send, and that this library sends the safe thing or refuses.
+
+A row for each collision of addresses between families, and for each place where a family's document
+errs or is silent, as far as that concerns a client. `naive` must never leave: what the document
+prints, where it prints a frame. `sends` is all that leaves instead, reads left out. Both are
+without their checksum.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import checksums
+import pytest
+from simulated_bus import SimulatedBus, one, text
+
+from multidrop.core import Framing, Message, NumberFormat, build_reply, build_request, parse_reply
+from multidrop.drive import Condition, Direction, Drive
+from multidrop.drive.table import HOLDING, Kept
+from multidrop.errors import BadReply, DriveRefused, NoReply, Refused, Unconfirmed, Unsupported
+from multidrop.families import YD1000, DelixiModbus, DelixiNative, ErmanERG220, InnovertIBD, InvtCHE
+from multidrop.families.delixi_native import DelixiNativeStatus
+from multidrop.families.erman_er_g_220 import ErmanFault, ErmanStatus, Modes
+from multidrop.families.innovert_ibd import FrequencySource
+from multidrop.families.invt_che import parameter
+from multidrop.families.yd1000 import YD1000Control
+
+
+def erman(**options: Any) -> Drive:
+    return ErmanERG220(1, **options)
+
+
+def che() -> Drive:
+    return InvtCHE(1, maximum_frequency=50)
+
+
+def ibd(**options: Any) -> Drive:
+    return InnovertIBD(1, **options)
+
+
+def delixi() -> Drive:
+    return DelixiModbus(1)
+
+
+def native() -> Drive:
+    return DelixiNative(1)
+
+
+def yd() -> Drive:
+    return YD1000(1)
+
+
+@dataclass(frozen=True)
+class Hazard:
+    """`do(line, drive, sim)` is what a user does; `shows` is set on the simulated drive before."""
+
+    place: str
+    drive: Callable[[], Drive]
+    do: Callable[[SimulatedBus, Any, Any], object]
+    naive: str
+    sends: tuple[str, ...] = ()
+    refuses: str = ""  # the sentence with which it is refused
+    error: type[Exception] = Refused
+    shows: Mapping[str, Any] = field(default_factory=dict)
+    turning: bool = False  # it was given a setpoint, started, and has run for a second
+
+
+def start(line: SimulatedBus, drive: Any, sim: Any) -> None:
+    drive.start()
+
+
+def run(line: SimulatedBus, drive: Any, sim: Any) -> None:
+    drive.set_frequency(20)
+    drive.start()
+
+
+def stop(line: SimulatedBus, drive: Any, sim: Any) -> None:
+    drive.stop()
+
+
+def reset(line: SimulatedBus, drive: Any, sim: Any) -> None:
+    drive.reset_fault()
+
+
+def direct(direction: Direction) -> Callable[[SimulatedBus, Any, Any], None]:
+    return lambda line, drive, sim: drive.start(direction)
+
+
+def frequency(hz: float) -> Callable[[SimulatedBus, Any, Any], None]:
+    return lambda line, drive, sim: drive.set_frequency(hz)
+
+
+def write(name: str, value: Any) -> Callable[[SimulatedBus, Any, Any], object]:
+    return lambda line, drive, sim: line.bus.write(drive, drive.register(name), value)
+
+
+def broadcast(name: str, value: Any) -> Callable[[SimulatedBus, Any, Any], object]:
+    return lambda line, drive, sim: line.bus.broadcast(drive.register(name), value)
+
+
+HAZARDS = [
+    # ---- section 0: one address, several meanings ----
+    Hazard(
+        "0.1: 2000H, Delixi's run forward is run and fault reset on an IBD",
+        ibd,
+        run,
+        naive="01 06 20 00 00 12",
+        sends=("01 06 20 01 07 D0", "01 06 20 00 00 02"),
+    ),
+    Hazard(
+        "0.1: 2000H, IBD's fault reset is a direction on a Delixi",
+        delixi,
+        reset,
+        naive="01 06 20 00 00 10",
+        refuses="no fault reset",
+        error=Unsupported,
+    ),
+    Hazard(
+        "0.1: 1000H, YD1000's words are no command of a CHE",
+        che,
+        stop,
+        naive="01 06 10 00 80 00",
+        sends=("01 06 10 00 00 05", "01 06 10 00 00 08"),
+        turning=True,
+    ),
+    Hazard(
+        "0.1: 1000H, CHE's stop does not stop a YD1000",
+        yd,
+        stop,
+        naive="01 06 10 00 00 05",
+        sends=("01 06 10 00 C0 00",),
+        turning=True,
+    ),
+    Hazard(
+        "0.1: 2000H, Goodrive's control is CHE's setpoint: identity first",
+        che,
+        frequency(25),
+        naive="01 06 20 00 13 88",
+        refuses="010AH",
+        shows={"device": 0x010A},
+    ),
+    Hazard(
+        "0.1: stop is 5 and coast 6 on a CHE, and elsewhere the other way round",
+        che,
+        lambda line, drive, sim: drive.coast(),
+        naive="01 06 10 00 00 05",
+        sends=("01 06 10 00 00 06",),
+        turning=True,
+    ),
+    Hazard(
+        "0.1: 0001H and 0002H are EEPROM parameters of a YD1000",
+        yd,
+        frequency(28.5),
+        naive="01 06 00 02 01 1D",
+        sends=("01 06 10 01 0B 22",),
+    ),
+    Hazard(
+        "0.2: change of direction is a toggle (IBD, bits 2 and 3)",
+        ibd,
+        direct(Direction.REVERSE),
+        naive="01 06 20 00 00 0E",
+        refuses="ambiguous",
+    ),
+    Hazard(
+        "0.6: reset and start in one frame (YD1000)",
+        yd,
+        write("control", YD1000Control.COMMAND_VALID | YD1000Control.RESET | YD1000Control.RUN),
+        naive="01 06 10 00 A4 00",
+        refuses="never written together",
+    ),
+    Hazard(
+        "0.7: only a stop and a setpoint of zero are broadcast",
+        ibd,
+        broadcast("frequency", 50.0),
+        naive="00 06 20 01 13 88",
+        refuses="no harmless broadcast",
+    ),
+    # ---- 1: ERMAN ----
+    Hazard(
+        "E3: the example of 06 writes the setpoint to 0001H",
+        erman,
+        frequency(28.5),
+        naive="01 06 00 01 01 1D",
+        sends=("01 06 00 02 01 1D",),
+    ),
+    Hazard(
+        "E3: 0001H is the control register",
+        erman,
+        write("control_register", Modes.CONTROL_TYPE),
+        naive="01 06 00 01 00 10",
+        refuses="never|not written",
+    ),
+    Hazard(
+        "E4, E6: the example of 0F resets and starts, and sets a reserved coil",
+        erman,
+        reset,
+        naive="01 0F 00 00 00 09 02 01 01",
+        sends=("01 05 00 00 00 00", "01 05 00 09 FF 00", "01 05 00 09 00 00"),
+    ),
+    Hazard(
+        "E5: the order of bytes in a reply to 01 is doubtful, so that one byte at most is asked for",
+        erman,
+        lambda line, drive, sim: line.bus.read_many(drive, [drive.start_held, drive.fault_reset_held]),
+        naive="01 01 00 00 00 0C",
+    ),
+    Hazard(
+        "E11: the last fault may be past or present: no start before it was seen to",
+        erman,
+        run,
+        naive="01 05 00 00 FF 00",
+        sends=("01 06 00 02 00 C8",),
+        refuses=r"overheat.*reset_fault",
+        shows={"last_fault": ErmanFault.OVERHEAT},
+    ),
+    Hazard(
+        "E17: start clears both stops first, and is one coil",
+        erman,
+        run,
+        naive="01 0F 00 00 00 0A 02 01 02",
+        sends=(
+            "01 06 00 02 00 C8",
+            "01 05 00 01 00 00",
+            "01 05 00 02 00 00",
+            "01 05 00 00 FF 00",
+        ),
+    ),
+    Hazard(
+        "E17: stop is stop on and start off, and is looked at",
+        erman,
+        stop,
+        naive="01 05 00 01 00 00",
+        sends=("01 05 00 01 FF 00", "01 05 00 00 00 00"),
+        turning=True,
+    ),
+    Hazard(
+        "E17: a motor that runs on after its ramp is stopped by the emergency stop",
+        erman,
+        stop,
+        naive="01 05 00 00 FF 00",
+        sends=("01 05 00 01 FF 00", "01 05 00 00 00 00", "01 05 00 02 FF 00"),
+        refuses="not seen to have stopped",
+        error=Unconfirmed,
+        shows={"status": ErmanStatus.RUNNING},
+    ),
+    Hazard(
+        "E18: nothing is broadcast, whose answers are doubtful",
+        erman,
+        broadcast("frequency", 0.0),
+        naive="00 06 00 02 00 00",
+        refuses="no harmless broadcast",
+    ),
+    # ---- 2: CHE ----
+    Hazard(
+        "I1: no ordinal is computed: P0.07 has no address here",
+        che,
+        lambda line, drive, sim: drive.register("acceleration_time"),
+        naive="01 06 80 0C 00 C8",
+        refuses="no register",
+        error=ValueError,
+    ),
+    Hazard(
+        "I5: the address of RAM keeps its bit 15",
+        lambda: Mine(1),
+        write("acceleration_time", 20.0),
+        naive="01 06 00 0C 00 C8",
+        sends=("01 06 80 0C 00 C8",),
+    ),
+    Hazard(
+        "2.7: the setpoint is per cent of the maximum frequency: 50 Hz of 50 Hz is not 5000",
+        che,
+        frequency(50),
+        naive="01 06 20 00 13 88",
+        sends=("01 06 20 00 27 10",),
+    ),
+    Hazard(
+        "2.7: a negative setpoint likely reverses",
+        che,
+        write("setpoint", -50.0),
+        naive="01 06 20 00 EC 78",
+        refuses="outside 0 to 100",
+    ),
+    Hazard(
+        "2.7: the setpoint goes before the start",
+        che,
+        start,
+        naive="01 06 10 00 00 01",
+        refuses="set_frequency",
+    ),
+    # ---- 3: IBD ----
+    Hazard(
+        "N1: what Prb.01 means is contradictory",
+        ibd,
+        write("frequency_source", FrequencySource.LINE),
+        naive="01 06 00 65 00 05",
+        refuses="contradictory",
+    ),
+    Hazard(
+        "N1: a drive that does not follow the line is not started",
+        ibd,
+        run,
+        naive="01 06 20 00 00 02",
+        sends=("01 06 20 01 07 D0",),
+        refuses=r"Prb\.01 to 5",
+        shows={"frequency_source": 3},
+    ),
+    Hazard(
+        "N2: which bit is forward is ambiguous",
+        ibd,
+        direct(Direction.FORWARD),
+        naive="01 06 20 00 00 0A",
+        refuses="ambiguous",
+    ),
+    Hazard(
+        "N7: the setpoint's range knows nothing of the drive's maximum",
+        lambda: ibd(maximum_frequency=60),
+        frequency(60.01),
+        naive="01 06 20 01 17 71",
+        refuses="above maximum_frequency",
+    ),
+    Hazard(
+        "N8: 2000H and 2001H may only be written",
+        ibd,
+        lambda line, drive, sim: line.bus.read(drive, drive.control),
+        naive="01 03 20 00 00 01",
+        refuses="cannot be read",
+        error=ValueError,
+    ),
+    Hazard(
+        "N10: a run turns the motor in the direction in force, and says no other",
+        ibd,
+        run,
+        naive="01 06 20 00 00 0A",
+        sends=("01 06 20 01 07 D0", "01 06 20 00 00 02"),
+    ),
+    # ---- 4: Delixi ----
+    Hazard(
+        "D4, D5: the only setpoint is in EEPROM: on change, and once a minute",
+        delixi,
+        lambda line, drive, sim: [drive.set_frequency(50), drive.set_frequency(50), drive.set_frequency(49)],
+        naive="01 06 00 02 13 24",
+        sends=("01 06 00 02 13 88",),
+        refuses="once in 60 s",
+    ),
+    Hazard(
+        "D5: no start when the setpoint is not taken from P00.02",
+        delixi,
+        run,
+        naive="01 06 20 00 00 12",
+        sends=("01 06 00 02 07 D0",),
+        refuses=r"P00\.01",
+        shows={"frequency_source": 0},
+    ),
+    Hazard(
+        "D12: standard Modbus has no fault reset, and reserved bits are not tried",
+        delixi,
+        reset,
+        naive="01 06 20 00 00 04",
+        refuses="no fault reset",
+        error=Unsupported,
+    ),
+    Hazard(
+        "D14: run goes with its direction, and never with the toggle",
+        delixi,
+        run,
+        naive="01 06 20 00 00 32",
+        sends=("01 06 00 02 07 D0", "01 06 20 00 00 12"),
+    ),
+    Hazard(
+        "D14: run without a direction may keep the old one or not",
+        delixi,
+        direct(Direction.REVERSE),
+        naive="01 06 20 00 00 02",
+        sends=("01 06 20 00 00 22",),
+        shows={"frequency": 20.0},
+    ),
+    Hazard(
+        "D17: a stored write is not broadcast",
+        native,
+        broadcast("stored_frequency", 0.0),
+        naive=":0006000200000000",
+        refuses="no harmless broadcast",
+    ),
+    Hazard(
+        "4.4: the setpoint in RAM, not the stored one",
+        native,
+        frequency(50),
+        naive=":0106000200001388",
+        sends=(":0104000100001388",),
+    ),
+    # ---- 5: YD1000 ----
+    Hazard(
+        "Y1: register numbers are hex digits: DEC is 0010H, not 000AH",
+        yd,
+        write("deceleration_time", 20.0),
+        naive="01 06 00 0A 00 C8",
+        sends=("01 06 00 10 00 C8",),
+    ),
+    Hazard(
+        "Y1: a drive whose 0802H is not its address is none",
+        yd,
+        run,
+        naive="01 06 10 00 C4 00",
+        refuses="0802H",
+        shows={"address_setting": 7},
+    ),
+    Hazard(
+        "Y7: 0007H initialises",
+        yd,
+        write("initialisation", 1),
+        naive="01 06 00 07 00 01",
+        refuses="panel only",
+    ),
+    Hazard(
+        "Y10: 0000H gives the command back to the panel, which may run it",
+        yd,
+        stop,
+        naive="01 06 10 00 00 00",
+        sends=("01 06 10 00 C0 00",),
+        turning=True,
+    ),
+    Hazard(
+        "Y10: nor can that be written plainly",
+        yd,
+        write("control", YD1000Control(0)),
+        naive="01 06 10 00 00 00",
+        refuses="commands the motor",
+    ),
+    Hazard(
+        "Y11: a reset never runs, is sent once and followed by the stop",
+        yd,
+        reset,
+        naive="01 06 10 00 E4 00",
+        sends=("01 06 10 00 E0 00", "01 06 10 00 C0 00"),
+    ),
+    Hazard(
+        "Y13: 0802H acts on the line at once",
+        yd,
+        write("address_setting", 2.0),
+        naive="01 06 08 02 00 02",
+        refuses="drive's end of the line",
+    ),
+    Hazard(
+        "0008H may be changed while the motor runs, and has the panel's direction",
+        yd,
+        write("panel_direction", 1.0),
+        naive="01 06 00 08 00 01",
+        refuses="belongs to the command over the motor",
+    ),
+    Hazard(
+        "what the bits of the preset speeds select is seen before the motor is started",
+        lambda: YD1000(1, preset_speed=4),
+        start,
+        naive="01 06 10 00 C4 01",
+        sends=("01 06 10 00 C0 00", "01 06 10 00 C0 02", "01 06 10 00 C0 00"),
+        refuses="does not take 12.5 Hz, preset speed 4",
+        shows={"preset_speed_4": 12.5, "reference_frequency": 0.0},
+    ),
+    Hazard(
+        "Y14: the emergency stop is not broadcast",
+        yd,
+        broadcast("control", YD1000Control.COMMAND_VALID | YD1000Control.EMERGENCY_STOP),
+        naive="00 06 10 00 90 00",
+        refuses="no harmless broadcast",
+    ),
+]
+
+
+class Mine(InvtCHE):
+    """A CHE whose owner has its manual."""
+
+    acceleration_time = parameter(12, "s", step=0.1, place="P0.07")
+
+
+@pytest.mark.parametrize("hazard", HAZARDS, ids=lambda each: each.place)
+def test_the_safe_thing_is_sent_or_nothing(monkeypatch: pytest.MonkeyPatch, hazard: Hazard) -> None:
+    line, drive, sim = one(monkeypatch, hazard.drive())
+    for name, value in hazard.shows.items():
+        sim[name] = value
+    if hazard.turning:
+        run(line, drive, sim)
+        line.sleep(1)
+        line.frames.clear()
+    if hazard.refuses:
+        with pytest.raises(hazard.error, match=hazard.refuses):
+            hazard.do(line, drive, sim)
+    else:
+        hazard.do(line, drive, sim)
+    assert tuple(map(body, line.written)) == hazard.sends
+    assert hazard.naive not in [body(frame) for _, frame in line.frames]
+
+
+def body(frame: str) -> str:
+    """Without its checksum."""
+    return frame[:-2] if frame.startswith(":") else frame[:-6]
+
+
+def test_y2_the_low_byte_of_the_checksum_goes_first(monkeypatch: pytest.MonkeyPatch) -> None:
+    line, drive, sim = one(monkeypatch, YD1000(1))
+    run(line, drive, sim)
+    assert line.written[-1] == "01 06 10 00 C4 00 DF CA"
+
+
+# ---- errata of what is read ----
+
+
+def reply_to(request: Message, frame: str) -> tuple[int, Message | None]:
+    return parse_reply(Framing.RTU, bytes.fromhex(frame), request)
+
+
+def test_e1_the_checksum_is_computed_and_not_copied(monkeypatch: pytest.MonkeyPatch) -> None:
+    line, drive, _ = one(monkeypatch, ErmanERG220(1))
+    line.bus.read_many(drive, [drive.output_frequency, drive.output_current, drive.dc_bus_voltage])
+    assert [frame for _, frame in line.frames] == ["01 04 00 01 00 05 61 C9"]
+
+
+def test_e2_a_reply_with_another_byte_count_is_no_reply(monkeypatch: pytest.MonkeyPatch) -> None:
+    printed = "01 04 10 01 F4 00 00 00 D6 00 00 02 32 0A 03"
+    line, drive, _ = one(monkeypatch, ErmanERG220(1))
+    line.answers = lambda request: bytes.fromhex(printed)
+    with pytest.raises(BadReply):
+        line.bus.read_many(drive, [drive.output_frequency, drive.output_current, drive.dc_bus_voltage])
+
+
+@pytest.mark.parametrize("code", [2, 3, 4])
+def test_e12_no_bad_address_is_a_device_failure(code: int) -> None:
+    assert "address" in ErmanERG220(1).exception(code)
+    assert "fail" not in ErmanERG220(1).exception(code)
+
+
+def test_e9_e10_the_state_is_one_number_in_either_word() -> None:
+    assert ErmanERG220.status.number_format is NumberFormat.U32_EITHER
+    assert [ErmanERG220.status.decode(number) for number in range(4)] == list(ErmanStatus)[:4]
+
+
+def test_e13_e16_no_diagnostics_and_nothing_beyond_the_tables() -> None:
+    assert {register.table.read for register in ErmanERG220.registers.values()} <= {1, 3, 4}
+    assert max(register.address for register in ErmanERG220.registers.values()) == 0x0402
+    assert all(
+        register.address <= 0x58 for register in ErmanERG220.registers.values() if register.table.read == 3
+    )
+
+
+def test_i4_a_fault_frame_for_a_damaged_request_is_asked_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    line, drive, _ = one(monkeypatch, InvtCHE(1))
+    damaged = build_reply(Framing.RTU, Message(1, 3, exception=0x11))
+    line.answers = lambda request: damaged if len(line.frames) == 1 else None
+    assert line.bus.read(drive, drive.output_frequency) == 0
+    assert len(line.frames) == 2
+
+
+def test_i2_e_identity_of_the_models_03_and_04(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Function 04 does not exist on them; its exception is an identity that is refused."""
+    line, drive, _ = one(monkeypatch, ErmanERG220(1))
+    refusal = build_reply(Framing.RTU, Message(1, 4, exception=1))
+    line.answers = lambda request: refusal if request.function == 4 else None
+    with pytest.raises(Refused, match="not an ER-G-220"):
+        drive.set_frequency(20)
+    assert line.written == []
+
+
+def test_e7_a_byte_count_of_coils_is_rounded_up() -> None:
+    request = Message(1, 1, 0, 12)
+    assert reply_to(request, "01 01 02 00 01 78 3C")[0] > 0  # as printed: 12 coils in 2 bytes
+    assert reply_to(request, checksums.rtu("01 01 01 00").hex())[0] <= 0  # as 12 / 8 would be
+
+
+def test_e8_the_state_s_reserved_registers_are_no_readings() -> None:
+    state = {register.address for register in ErmanERG220.registers.values() if register.table.read == 4}
+    assert not state & set(range(0x0007, 0x000C))
+
+
+def test_e14_08_has_a_subfunction_of_two_bytes() -> None:
+    printed = "01 08 00 00 A5 37 DA 8D"
+    assert build_request(Framing.RTU, Message(1, 8, 0x0000, data=b"\xa5\x37")).hex(" ").upper() == printed
+
+
+def test_i3_parity_and_stop_bits_are_the_user_s_to_say() -> None:
+    assert {"8N1", "8N2", "8E1", "8E2"} <= set(InvtCHE.formats[Framing.RTU])
+    assert InvtCHE(1, format="8E2").settings.format == "8E2"
+
+
+def test_i6_the_example_without_a_meaning_cannot_be_said() -> None:
+    assert not [register for register in InvtCHE.registers.values() if register.address == 0x0008]
+
+
+def test_n3_n6_at_most_four_registers_of_an_ibd(monkeypatch: pytest.MonkeyPatch) -> None:
+    line, drive, _ = one(monkeypatch, InnovertIBD(1))
+    line.bus.read_many(drive, [register for register in drive.registers.values() if register.readable])
+    assert max(request.count for request, _ in line.frames) <= 4
+    assert reply_to(Message(1, 3, 0x16, 1), "01 03 02 18 00 B2 44")[1] is not None
+
+
+def test_n9_without_its_outputs_an_ibd_is_never_said_to_have_stopped(monkeypatch: pytest.MonkeyPatch) -> None:
+    _, drive, sim = one(monkeypatch, InnovertIBD(1))
+    sim["output_m01"] = 0
+    assert drive.state().condition is Condition.UNKNOWN
+
+
+def test_d2_d15_running_is_running_and_a_changed_echo_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    _, drive, sim = one(monkeypatch, DelixiNative(1))
+    sim["status"] = DelixiNativeStatus.FORWARD
+    assert drive.state().condition is Condition.RUNNING
+    request = Message(1, 4, 1, data=b"\0\0\x13\x88")
+    swapped = build_reply(Framing.DELIXI, Message(1, 4, 1, data=b"\0\0\x88\x13"))
+    assert text(swapped)[-2:] == "A1"  # the sum does not see it
+    assert parse_reply(Framing.DELIXI, swapped, request)[0] < 0
+
+
+def test_d1_d3_d6_d9_what_is_misprinted_about_the_line() -> None:
+    assert 4800 in DelixiModbus.baudrates
+    assert 3800 not in DelixiModbus.baudrates
+    assert DelixiModbus.formats[Framing.ASCII][0] == "7N2"
+    assert DelixiNative.formats[Framing.DELIXI][0] == "8N1"
+    assert 0xF0 in DelixiNative.exceptions
+    assert DelixiModbus.response_timeout >= 0.08
+
+
+def test_d8_04_is_ou_which_the_standard_section_lost() -> None:
+    (ou,) = {drive.fault.decode(4) for drive in (DelixiModbus, DelixiNative)}
+    assert ou.name == "OU_OVERVOLTAGE"
+
+
+@pytest.mark.parametrize("code", [1, 2, 0x42])
+def test_d13_y15_any_exception_is_a_refusal(monkeypatch: pytest.MonkeyPatch, code: int) -> None:
+    for make in (delixi, yd):
+        line, drive, _ = one(monkeypatch, make())
+        refusal = build_reply(Framing.RTU, Message(1, 3, exception=code))
+        line.answers = lambda request, refusal=refusal: refusal
+        with pytest.raises(DriveRefused) as told:
+            line.bus.read(drive, drive.output_frequency)
+        assert told.value.code == code
+
+
+def test_d7_the_faults_10_to_14_in_both_spellings() -> None:
+    assert [DelixiNative.fault.decode(0x0A + at) for at in range(5)] == [
+        DelixiNative.fault.decode(0x10 + at) for at in range(5)
+    ]
+
+
+def test_y5_y6_only_two_functions_and_no_address_0() -> None:
+    assert {(register.table.read, register.table.write) for register in YD1000.registers.values()} == {(3, 6)}
+    assert YD1000.most_registers == {HOLDING: 1}
+    with pytest.raises(ValueError, match="1 to 63"):
+        YD1000(0)
+
+
+def test_y3_y4_frames_have_the_lengths_that_their_fields_make() -> None:
+    assert len(build_request(Framing.RTU, Message(1, 6, 0x1001, data=b"\x1f\x40"))) == 8
+    request = Message(1, 3, 0x1100, 1)
+    used, reply = reply_to(request, checksums.rtu("01 03 02 13 88").hex())
+    assert (used, reply and reply.data) == (7, b"\x13\x88")
+
+
+def test_y8_a_frozen_state_is_not_taken_for_running(monkeypatch: pytest.MonkeyPatch) -> None:
+    line, drive, sim = one(monkeypatch, YD1000(1))
+    run(line, drive, sim)
+    line.sleep(2)
+    drive.state()
+    sim.pass_time(line.seconds)
+    sim.trip(5)
+    assert line.bus.read(drive, drive.status)  # still says that it runs
+    assert drive.state().condition is Condition.FAULT
+    drive.stop()
+
+
+def test_y12_what_the_watchdog_does_is_read_for_no_factory_setting_is_stated(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    line, drive, sim = one(monkeypatch, YD1000(1))
+    assert "off" in line.bus.watchdog(drive)
+    sim["communication_timeout"] = 7
+    assert "7 s" in line.bus.watchdog(drive)
+    assert "from the factory is not stated" in YD1000.watchdog
+    assert drive.communication_timeout.default is None
+
+
+def test_0_8_what_wears_an_eeprom_is_declared() -> None:
+    for register in YD1000.registers.values():
+        in_ram = 0x1000 <= register.address <= 0x12FF
+        assert (register.kept is Kept.EEPROM) == (not in_ram) or register.access.value == "reading"
+
+
+# ---- an echo, and another family ----
+
+
+def test_0_3_an_adapter_s_echo_is_no_drive(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nothing but the request's copy ever comes: no write leaves, because no read is answered."""
+    line = SimulatedBus(monkeypatch)
+    drives = [line.attach(make) for make in (InvtCHE(1, maximum_frequency=50), ErmanERG220(2), YD1000(3))]
+    for drive in drives:
+        for script in (drive.set_frequency.script(20), drive.start.script(), drive.reset_fault.script()):
+            with pytest.raises(NoReply):
+                drive.perform(script)
+    assert line.written == []
+
+
+# ---- none is left out ----
+
+FAMILIES = {"E": 18, "I": 6, "N": 10, "D": 17, "Y": 15}
+OF_PRINT_ALONE = {
+    "E15": "headings, a date, a unit's name: nothing a client sends or reads",
+    "N4": "the number of a table, and a table that is missing",
+    "N5": "the name of a row",
+    "D10": "the texts of two rows; the document's examples show the usual frames, which tests/data holds",
+    "D11": "a skipped number, a lost letter, names that run together",
+    "D16": "a case that the document does not tell and no client can bring about",
+    "Y9": "references to sections that are missing, and spellings",
+}
+
+
+def test_every_erratum_has_its_row_or_a_reason_for_none() -> None:
+    told = [hazard.place for hazard in HAZARDS] + [
+        name.upper() for name in globals() if name.startswith("test_")
+    ]
+    for family, last in FAMILIES.items():
+        for number in range(1, last + 1):
+            erratum = f"{family}{number}"
+            shown = [record for record in told if re.search(rf"(^|[^A-Z0-9]){erratum}($|[^0-9])", record)]
+            assert bool(shown) != (erratum in OF_PRINT_ALONE), erratum

@@ -1,0 +1,318 @@
+"""Commands on real servers: to the present master alone, over three paths and carried out once."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
+from contextlib import ExitStack, asynccontextmanager, suppress
+from functools import partial
+from pathlib import Path
+
+import pytest
+from command_desks import LINE, MAY, Desks, desks
+from command_drills import CommandDrill, command_drill
+from nats_clusters import Cluster
+from peers import require_module
+
+require_module("nats")
+require_module("pyarrow")
+
+from multidrop.fleet.commands.fleet_commands import FleetCommands  # noqa: E402
+from multidrop.fleet.commands.subjects import CommandSubjects  # noqa: E402
+from multidrop.fleet.commands.words import CommandOutcome, Offered  # noqa: E402
+from multidrop.fleet.errors import NobodyThere, Unsure  # noqa: E402
+from multidrop.fleet.servers import names  # noqa: E402
+from multidrop.fleet.servers.buckets import Bucket  # noqa: E402
+from multidrop.fleet.servers.connections import ServerPath, paths_of  # noqa: E402
+from multidrop.fleet.servers.plant_store import store  # noqa: E402
+from multidrop.fleet.servers.setup import open_all  # noqa: E402
+from multidrop.supervisor import supervisor  # noqa: E402
+
+pytestmark = [pytest.mark.slow, pytest.mark.long]
+
+DONE, NOT_SENT, UNKNOWN = CommandOutcome.DONE, CommandOutcome.NOT_SENT, CommandOutcome.UNKNOWN
+UNDER_WAY = CommandOutcome.UNDER_WAY.value.encode()
+DESCRIPTION = {"line": {"name": LINE, "drive": [{"name": "pump"}]}, "files": {}, "may": MAY}
+PATIENCE_S = 30.0
+ATTEMPTS = 20
+
+
+class OnNats:
+    """One gateway's desks, on subjects of real servers."""
+
+    def __init__(self, cluster: Cluster, name: str, made: Desks) -> None:
+        self.made = made
+        self.paths = paths_of(cluster.urls)
+        self.subjects = CommandSubjects(name, self.paths, made.lines, made.log)
+
+    async def begin(self) -> None:
+        await open_all(self.paths)
+        await self.subjects.begin()
+
+    async def open(self) -> None:
+        self.subjects.open(LINE, DESCRIPTION)
+        await self._settled()
+
+    async def shut(self) -> None:
+        self.subjects.shut(LINE)
+        await self._settled()
+
+    async def _settled(self) -> None:
+        await asyncio.gather(*supervisor().started)
+        for path in self.paths:
+            assert path._client is not None
+            await path._client.flush()
+
+    async def die(self) -> None:
+        for path in self.paths:
+            await path.close()
+
+
+class Fleet:
+    """Two gateways and an asker."""
+
+    def __init__(self, cluster: Cluster, folder: Path, gateways: list[OnNats]) -> None:
+        self.one, self.other = gateways
+        self.asker = FleetCommands(cluster.urls, by="anna", log=folder / "asked.jsonl")
+
+    async def offered(self) -> Offered:
+        found = await self.asker.preview(self.asker.request("pump", register="frequency", value=20.0))
+        assert isinstance(found, Offered), found
+        return found
+
+    def writes(self) -> int:
+        return len(self.one.made.writes) + len(self.other.made.writes)
+
+
+@pytest.fixture
+def gateways(fleet: Cluster, tmp_path: Path) -> Iterator[list[OnNats]]:
+    with ExitStack() as stack:
+        folders = [tmp_path / name for name in ("gw-1", "gw-2")]
+        for folder in folders:
+            folder.mkdir()
+        made = [stack.enter_context(desks(folder)) for folder in folders]
+        yield [OnNats(fleet, folder.name, one) for folder, one in zip(folders, made, strict=True)]
+
+
+@asynccontextmanager
+async def running(cluster: Cluster, folder: Path, gateways: list[OnNats]) -> AsyncIterator[Fleet]:
+    for gateway in gateways:
+        await gateway.begin()
+    await store(Bucket(names.PLANT, lambda: gateways[0].paths[0]), {LINE: DESCRIPTION})
+    found = Fleet(cluster, folder, gateways)
+    try:
+        async with found.asker:
+            yield found
+    finally:
+        for gateway in gateways:
+            await gateway.die()
+
+
+Story = Callable[[Fleet], Awaitable[None]]
+
+
+@pytest.fixture
+def tell(fleet: Cluster, tmp_path: Path, gateways: list[OnNats]) -> Callable[[Story], None]:
+    async def main(story: Story) -> None:
+        async with running(fleet, tmp_path, gateways) as found:
+            await story(found)
+
+    return lambda story: asyncio.run(main(story))
+
+
+def test_a_command_comes_on_three_paths_and_is_one_frame(tell: Callable[[Story], None]) -> None:
+    async def story(fleet: Fleet) -> None:
+        await fleet.one.open()
+        answer = await fleet.asker.write("pump", "frequency", 20.0)
+        assert (answer.outcome, answer.held, answer.gateway) == (DONE, "20.00 Hz", "gw-1")
+        assert fleet.one.made.writes == [("frequency", 2000)]
+        assert fleet.other.made.writes == []
+        stopped = await fleet.asker.stop()
+        assert stopped.outcome is DONE
+        assert [name for name, _ in fleet.one.made.writes] == ["frequency", "control"]
+
+    tell(story)
+
+
+def test_without_a_master_nothing_is_sent_and_that_is_certain(tell: Callable[[Story], None]) -> None:
+    async def story(fleet: Fleet) -> None:
+        await fleet.one.open()
+        await fleet.one.shut()
+        answer = await fleet.asker.write("pump", "frequency", 20.0)
+        assert answer.outcome is NOT_SENT
+        assert f"no gateway is master of line {LINE}" in answer.text
+        stopped = await fleet.asker.stop(["pump"])
+        assert stopped.outcome is NOT_SENT
+        assert "use the hard-wired stop" in stopped.text
+        assert fleet.writes() == 0
+
+    tell(story)
+
+
+async def _moved(fleet: Fleet) -> None:
+    await fleet.one.shut()
+    await fleet.other.open()
+
+
+async def _moved_back(fleet: Fleet) -> None:
+    await fleet.one.shut()
+    await fleet.one.open()
+
+
+async def _is_unheard(path: ServerPath, subject: str) -> bool:
+    with suppress(Unsure):
+        try:
+            await path.request(subject, b"{}", answer_s=0.1)
+        except NobodyThere:
+            return True
+    return False
+
+
+async def _died(fleet: Fleet) -> None:
+    """Until all servers know that nobody hears its subject, what is asked there may be lost: unknown."""
+    await fleet.one.die()
+    async with asyncio.timeout(PATIENCE_S):
+        for path in fleet.asker._paths:
+            while not await _is_unheard(path, fleet.one.subjects.desk.subject):
+                pass
+    await fleet.other.open()
+
+
+async def _lost(fleet: Fleet) -> None:
+    fleet.one.made.is_master = False
+    await fleet.other.open()
+
+
+@pytest.mark.parametrize("deed", [_moved, _moved_back, _died, _lost])
+def test_a_line_that_moves_between_offer_and_do(
+    tell: Callable[[Story], None], deed: Callable[[Fleet], Awaitable[None]]
+) -> None:
+    async def story(fleet: Fleet) -> None:
+        await fleet.one.open()
+        offered = await fleet.offered()
+        await deed(fleet)
+        assert (await fleet.asker._do(offered)).outcome is NOT_SENT
+        assert fleet.writes() == 0
+
+    tell(story)
+
+
+def test_a_doubled_do_on_all_paths_at_once(tell: Callable[[Story], None]) -> None:
+    async def story(fleet: Fleet) -> None:
+        await fleet.one.open()
+        offered = await fleet.offered()
+        data = json.dumps({"do": offered.token}).encode()
+
+        async def told(path: ServerPath) -> bytes:
+            while UNDER_WAY in (answer := (await path.request(offered.subject, data)).data):
+                pass
+            return answer
+
+        found = await asyncio.gather(*(told(path) for path in fleet.asker._paths for _ in range(5)))
+        assert len(set(found)) == 1
+        assert fleet.one.made.writes == [("frequency", 2000)]
+
+    tell(story)
+
+
+def test_an_offer_is_of_no_use_to_another_gateway(tell: Callable[[Story], None]) -> None:
+    async def story(fleet: Fleet) -> None:
+        await fleet.one.open()
+        offered = await fleet.offered()
+        await _moved(fleet)
+        other = fleet.other.subjects.desk.subject
+        assert other != offered.subject
+        answer = await fleet.asker._do(offered._replace(subject=other))
+        assert answer.outcome is UNKNOWN
+        assert fleet.writes() == 0
+
+    tell(story)
+
+
+def test_what_a_path_hears_moves_with_it(fleet: Cluster) -> None:
+    async def main() -> None:
+        path, asker = (ServerPath(fleet.urls[number:]) for number in (0, 1))
+        heard: list[str] = []
+
+        async def take(subject: str, message: object) -> None:
+            heard.append(subject)
+
+        try:
+            await asyncio.gather(path.open(), asker.open())
+            for subject in ("test.a", "test.b", "test.c"):
+                await path.subscribe(subject, partial(take, subject))
+            await path.unsubscribe("test.a")
+            move = asyncio.create_task(path._move(fleet.urls[1]))
+            await path.unsubscribe("test.b")
+            await path.subscribe("test.d", partial(take, "test.d"))
+            await move
+            assert path._client is not None
+            assert asker._client is not None
+            await path._client.flush()
+            for subject in ("test.a", "test.b", "test.c", "test.d"):
+                await asker._client.publish(subject, b"")
+            await asker._client.flush()
+            await path._client.flush()
+            await asyncio.wait_for(_until(lambda: len(heard) >= 2), PATIENCE_S)
+            assert sorted(heard) == ["test.c", "test.d"]
+        finally:
+            await asyncio.gather(path.close(), asker.close())
+
+    asyncio.run(main())
+
+
+async def _until(met: Callable[[], bool]) -> None:
+    while not met():
+        await asyncio.sleep(0.01)
+
+
+# ---- real gateways ----
+
+
+@pytest.fixture(scope="module")
+def drill(tmp_path_factory: pytest.TempPathFactory) -> Iterator[CommandDrill]:
+    with command_drill(tmp_path_factory.mktemp("drill"), 4) as found:
+        asyncio.run(found.await_masters())
+        yield found
+
+
+def test_the_command_line_writes_and_stops(drill: CommandDrill) -> None:
+    before = drill.setpoints("drive-0")
+    for _ in range(ATTEMPTS):
+        done = drill.run("write", "drive-0", "frequency", "49.99", "--yes", "--json", "--by", "anna")
+        answer = json.loads(done.stdout)
+        if answer["outcome"] != "not sent":  # as it is where the machine is too busy for a second
+            break
+    assert done.returncode == 0, done.stderr
+    assert (answer["outcome"], answer["held"]) == ("done", "49.99 Hz")
+    assert drill.setpoints("drive-0") - before == {4999: 1}
+    assert "asked" in (drill.folder / "state/multidrop/fleet/commands.jsonl").read_text()
+    for words, sentence in (
+        (("write", "drive-0", "frequency", "10"), "There is no terminal to ask on: add --yes"),
+        (("start", "drive-0", "--yes"), "drive-0.start is not in the plant's list"),
+        (("emergency-stop", "drive-0"), "drive-0.emergency_stop is not in the plant's list"),
+        (("write", "drive-0", "acceleration_time", "10", "--yes"), "is not in the plant's list"),
+        (("write", "drive-0", "frequency", "-1", "--yes"), "frequency"),
+        (("write", "drive-9", "frequency", "1", "--yes"), "has no drive 'drive-9'"),
+        (("stop", "drive-9"), "has no drive 'drive-9'"),
+        (("stop", "drive-0", "--line", "line-9"), "the stop of drive-0 was NOT sent: no gateway is master"),
+    ):
+        refused = drill.run(*words)
+        assert refused.returncode in (1, 2)
+        assert sentence in refused.stderr
+    assert drill.setpoints("drive-0") - before == {4999: 1}
+    for words in (("drive-0",), ("drive-0", "drive-1"), ("--all",)):
+        stopped = drill.run("stop", *words)
+        assert stopped.returncode == 0, stopped.stderr
+    stops = [drill.stops(drive) for drive in drill.sims]
+    assert all(got >= asked for got, asked in zip(stops, (3, 2, 1, 1), strict=True)), stops  # or repeated
+
+
+def test_no_command_is_carried_out_twice_and_nobody_is_told_wrongly(drill: CommandDrill) -> None:
+    """`python -m bench.questions.fleet_commands --commands 6000` is the whole."""
+    before = {drive: drill.setpoints(drive) for drive in drill.sims}
+    found = asyncio.run(drill.ask(120, 15.0))
+    assert (found.twice, found.wrongly, found.unnoted) == (0, 0, 0)
+    assert found.deeds
+    assert sum((drill.setpoints(drive) - before[drive]).total() for drive in drill.sims) > 0

@@ -1,0 +1,408 @@
+"""Askers: what they are told is certain where it says so, and a command is sent once whatever is answered."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from collections.abc import Awaitable, Callable, Mapping, Sequence
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+from unittest.mock import patch
+
+import pytest
+from peers import require_module
+
+require_module("nats")
+
+from multidrop import read_audit  # noqa: E402
+from multidrop.fleet.commands import fleet_commands as asker_module  # noqa: E402
+from multidrop.fleet.commands import stop_asking  # noqa: E402
+from multidrop.fleet.commands.fleet_commands import FleetCommands  # noqa: E402
+from multidrop.fleet.commands.words import CommandAnswer, CommandOutcome  # noqa: E402
+from multidrop.fleet.errors import FleetError, MayNotSend, NobodyThere, NotDelivered, Unsure  # noqa: E402
+from multidrop.fleet.servers.buckets import Record  # noqa: E402
+
+DONE, NOT_SENT, UNKNOWN = CommandOutcome.DONE, CommandOutcome.NOT_SENT, CommandOutcome.UNKNOWN
+OFFER = {"token": "t", "subject": "do.gw-1.run", "text": "pump-1: frequency = 20.00 Hz", "gateway": "gw-1"}
+PLANT = {"hall-1": ["pump-1", "pump-2"], "hall-2": ["fan-1"]}
+Given = BaseException | Mapping[str, Any] | bytes
+
+
+def answer(outcome: str, text: str = "as it is") -> dict[str, str]:
+    return {"outcome": outcome, "text": text}
+
+
+class Said:
+    """A message that came back."""
+
+    def __init__(self, data: bytes) -> None:
+        self.data = data
+
+
+class ScriptedPath:
+    """A path with answers by what is asked: "cmd", "do", "ask" or "stop"; the last one stays."""
+
+    is_open = True
+
+    def __init__(self, **answers: Sequence[Given]) -> None:
+        self.answers = {kind: list(given) for kind, given in answers.items()}
+        self.asked: list[str] = []
+
+    async def request(self, subject: str, data: bytes) -> Said:
+        kind = subject.partition(".")[0]
+        if kind == "do":
+            kind = next(iter(json.loads(data)))
+        self.asked.append(kind)
+        given = self.answers[kind]
+        found = given.pop(0) if len(given) > 1 else given[0]
+        if isinstance(found, BaseException):
+            raise found
+        return Said(found if isinstance(found, bytes) else json.dumps(found).encode())
+
+    async def close(self) -> None:
+        """There is nothing to close."""
+
+
+class Plant:
+    """The plant's bucket, as far as it can be read."""
+
+    def __init__(self, failure: FleetError | None = None) -> None:
+        self._failure = failure
+        self.records = {
+            line: Record(line, 1, {"line": {"drive": [{"name": name} for name in drives]}})
+            for line, drives in PLANT.items()
+            if failure is None
+        }
+
+    async def look(self) -> None:
+        if self._failure:
+            raise self._failure
+
+
+def asked(
+    folder: Path,
+    path: ScriptedPath,
+    what: Callable[[FleetCommands], Awaitable[CommandAnswer]],
+    plant: Plant | None = None,
+    nobody_s: float = 0.01,
+) -> CommandAnswer:
+    """Return what an asker was told who has this one path."""
+
+    async def main() -> CommandAnswer:
+        asker = FleetCommands(["nats://nobody"], by="anna", log=folder / "asked.jsonl")
+        asker._paths = [path]  # type: ignore[list-item]
+        asker._plant = plant or Plant()  # type: ignore[assignment]
+        try:
+            return await what(asker)
+        finally:
+            await asker.close()
+
+    with ExitStack() as stack:
+        for module, name, seconds in ((asker_module, "LOST_S", 0.01), (stop_asking, "NOBODY_S", nobody_s)):
+            stack.enter_context(patch.object(module, name, seconds))
+            stack.enter_context(patch.object(module, "AGAIN_S", 0.0))
+        return asyncio.run(main())
+
+
+def write(asker: FleetCommands) -> Awaitable[CommandAnswer]:
+    return asker.write("pump-1", "frequency", 20.0)
+
+
+NOBODY, LOST, CUT = NobodyThere("nobody"), Unsure("no answer"), NotDelivered("no connection")
+NO_RIGHT = MayNotSend("no right")
+ANY = FleetError("no right")  # which does not say that nobody was asked
+UNDER_WAY, TAKEN_BACK, IT_IS_DONE = answer("under way"), answer("not sent"), answer("done")
+
+WRITES: dict[
+    str, tuple[ScriptedPath, CommandOutcome, int]
+] = {  # what is answered, what is told, how often it is sent
+    "done": (ScriptedPath(cmd=[OFFER], do=[IT_IS_DONE]), DONE, 1),
+    "no master": (ScriptedPath(cmd=[NOBODY]), NOT_SENT, 0),
+    "no connection": (ScriptedPath(cmd=[CUT]), NOT_SENT, 0),
+    "a silent master": (ScriptedPath(cmd=[LOST]), NOT_SENT, 0),
+    "a refusal": (ScriptedPath(cmd=[answer("refused")]), CommandOutcome.REFUSED, 0),
+    "words of nobody's": (ScriptedPath(cmd=[b"\xff"]), NOT_SENT, 0),
+    "the master is gone": (ScriptedPath(cmd=[OFFER], do=[NOBODY]), NOT_SENT, 1),
+    "cut before it left": (ScriptedPath(cmd=[OFFER], do=[CUT]), NOT_SENT, 1),
+    "the answer is lost, and then found": (
+        ScriptedPath(cmd=[OFFER], do=[LOST], ask=[LOST, IT_IS_DONE]),
+        DONE,
+        1,
+    ),
+    "the do is lost": (ScriptedPath(cmd=[OFFER], do=[LOST], ask=[TAKEN_BACK]), NOT_SENT, 1),
+    "it takes long": (
+        ScriptedPath(cmd=[OFFER], do=[UNDER_WAY], ask=[UNDER_WAY, UNDER_WAY, IT_IS_DONE]),
+        DONE,
+        1,
+    ),
+    "the master dies at it": (ScriptedPath(cmd=[OFFER], do=[UNDER_WAY], ask=[NOBODY]), UNKNOWN, 1),
+    "any other failure": (ScriptedPath(cmd=[OFFER], do=[ANY], ask=[ANY, IT_IS_DONE]), DONE, 1),
+    "any other failure of all": (ScriptedPath(cmd=[OFFER], do=[ANY], ask=[ANY]), UNKNOWN, 1),
+    "no right to ask": (ScriptedPath(cmd=[ANY]), NOT_SENT, 0),
+    "all is lost": (ScriptedPath(cmd=[OFFER], do=[LOST], ask=[LOST]), UNKNOWN, 1),
+    "an answer of nobody's": (ScriptedPath(cmd=[OFFER], do=[b"[]"], ask=[IT_IS_DONE]), DONE, 1),
+}
+
+
+@pytest.mark.parametrize("case", WRITES)
+def test_a_command_is_sent_once_and_its_outcome_is_as_certain_as_it_is(tmp_path: Path, case: str) -> None:
+    path, outcome, sent = WRITES[case]
+    told = asked(tmp_path, path, write)
+    assert told.outcome is outcome
+    assert told.text
+    assert path.asked.count("do") == sent
+    first, last = read_audit(tmp_path / "asked.jsonl")
+    assert (first["step"], first["by"]) == ("asked", "anna")
+    assert (last["step"], last["outcome"]) == ("over", outcome.value)
+
+
+def stop(asker: FleetCommands) -> Awaitable[CommandAnswer]:
+    return asker.stop(["pump-1"])
+
+
+STOPS: dict[str, tuple[ScriptedPath, CommandOutcome, str]] = {
+    "stopped": (ScriptedPath(stop=[IT_IS_DONE]), DONE, "as it is"),
+    "at length": (ScriptedPath(stop=[UNDER_WAY, UNDER_WAY, IT_IS_DONE]), DONE, "as it is"),
+    "no master": (
+        ScriptedPath(stop=[NOBODY]),
+        NOT_SENT,
+        "the stop of pump-1 was NOT sent: no gateway is master of line hall-1; use the hard-wired stop",
+    ),
+    "no right": (
+        ScriptedPath(stop=[NO_RIGHT, IT_IS_DONE]),
+        NOT_SENT,
+        "the stop of pump-1 was NOT sent: no right; use the hard-wired stop",
+    ),
+    "no server": (
+        ScriptedPath(stop=[CUT]),
+        NOT_SENT,
+        "the stop of pump-1 was NOT sent: no connection; use the hard-wired stop",
+    ),
+    "an answer that is lost": (ScriptedPath(stop=[LOST, IT_IS_DONE]), DONE, "as it is"),
+    "a master that dies, and the next one": (
+        ScriptedPath(stop=[UNDER_WAY, NOBODY, IT_IS_DONE]),
+        DONE,
+        "as it is",
+    ),
+    "silence": (
+        ScriptedPath(stop=[LOST]),
+        UNKNOWN,
+        "it is not known what became of the stop of pump-1: its gateway gives no answer any more; "
+        "use the hard-wired stop (no answer)",
+    ),
+    "any failure": (ScriptedPath(stop=[ANY]), UNKNOWN, "it is not known what became of the stop"),
+    "silence, then nobody": (ScriptedPath(stop=[LOST, NOBODY]), UNKNOWN, "it is not known what became of"),
+}
+
+
+@pytest.mark.parametrize("case", STOPS)
+def test_a_stop_is_sent_until_somebody_answers_and_told_at_once_where_nobody_can(
+    tmp_path: Path, case: str
+) -> None:
+    path, outcome, text = STOPS[case]
+    told = asked(tmp_path, path, stop)
+    assert told.outcome is outcome
+    assert told.text.startswith(text)
+
+
+def test_what_is_known_of_a_stop_meanwhile_is_told_once(tmp_path: Path) -> None:
+    sent, turning = answer("under way", "sent"), answer("under way", "still turning")
+    path = ScriptedPath(stop=[sent, sent, LOST, turning, sent, IT_IS_DONE])
+    told: list[CommandAnswer] = []
+    last = asked(tmp_path, path, lambda asker: asker.stop(["pump-1"], on_news=told.append))
+    assert [(news.outcome, news.text) for news in told] == [
+        (CommandOutcome.UNDER_WAY, "sent"),
+        (CommandOutcome.UNDER_WAY, "still turning"),
+    ]
+    assert last.outcome is DONE
+
+
+def test_that_a_line_has_no_master_yet_is_told_once_and_at_once(tmp_path: Path) -> None:
+    told: list[CommandAnswer] = []
+    path = ScriptedPath(stop=[NOBODY, NOBODY, CUT, IT_IS_DONE])
+    last = asked(tmp_path, path, lambda asker: asker.stop(["pump-1"], on_news=told.append), nobody_s=60.0)
+    assert last.outcome is DONE
+    yet = "the stop of pump-1 was NOT sent yet: {}; use the hard-wired stop"
+    assert [news.text for news in told] == [
+        yet.format("no gateway is master of line hall-1"),
+        yet.format("no connection"),
+    ]
+
+
+def test_who_hears_no_more_of_a_stop_is_told_what_was_heard_last(tmp_path: Path) -> None:
+    path = ScriptedPath(
+        stop=[{**answer("under way", "pump-1: the stop was sent"), "gateway": "gw-1"}, NOBODY]
+    )
+    last = asked(tmp_path, path, stop)
+    assert last.outcome is UNKNOWN
+    assert last.text.endswith("; the last that was heard: pump-1: the stop was sent")
+
+
+def test_who_hears_nothing_of_a_stop_is_told_so_before_it_is_given_up(tmp_path: Path) -> None:
+    told: list[CommandAnswer] = []
+    path = ScriptedPath(stop=[LOST])
+    last = asked(tmp_path, path, lambda asker: asker.stop(["pump-1"], on_news=told.append))
+    assert last.outcome is UNKNOWN
+    [news] = told
+    assert news.text == "the stop of pump-1: no gateway has answered yet; use the hard-wired stop"
+
+
+class HangingPath(ScriptedPath):
+    """A path whose server stands still."""
+
+    async def request(self, subject: str, data: bytes) -> Said:
+        self.asked.append(subject)
+        await asyncio.Event().wait()
+        raise AssertionError("it hangs")
+
+
+def test_a_stop_waits_for_no_path_that_hangs(tmp_path: Path) -> None:
+    hanging, path = HangingPath(), ScriptedPath(stop=[IT_IS_DONE])
+
+    async def stop_on_both(asker: FleetCommands) -> CommandAnswer:
+        asker._paths = [hanging, path]  # type: ignore[list-item]
+        return await asyncio.wait_for(asker.stop(["pump-1"]), 60)
+
+    assert asked(tmp_path, path, stop_on_both).outcome is DONE
+    assert hanging.asked == ["stop.hall-1"]
+
+
+@pytest.mark.parametrize("others", [[NOBODY, NOBODY], [NOBODY, CUT], [LOST, NOBODY]])
+def test_a_stop_is_unsent_for_certain_where_each_path_says_so(tmp_path: Path, others: list[Given]) -> None:
+    paths = [ScriptedPath(stop=[given]) for given in (NOBODY, *others)]
+
+    async def stop_on_all(asker: FleetCommands) -> CommandAnswer:
+        asker._paths = paths  # type: ignore[assignment]
+        return await asker.stop(["pump-1"])
+
+    told = asked(tmp_path, paths[0], stop_on_all)
+    assert told.outcome is (UNKNOWN if LOST in others else NOT_SENT)
+    assert [path.asked[:1] for path in paths] == [["stop"]] * 3
+
+
+def test_a_full_disk_keeps_a_command_back_and_no_stop(tmp_path: Path) -> None:
+    def full(*record: Any) -> None:
+        raise OSError(28, "No space left on device")
+
+    path = ScriptedPath(cmd=[OFFER], do=[IT_IS_DONE], stop=[IT_IS_DONE])
+    with patch("multidrop.fleet.commands.log.CommandLog._add", full):
+        told = asked(tmp_path, path, write)
+        assert told.outcome is NOT_SENT
+        assert "asked.jsonl: No space left on device" in told.text
+        assert asked(tmp_path, path, stop).outcome is DONE
+    assert path.asked == ["stop"]
+
+
+def test_a_log_that_cannot_be_opened_keeps_a_command_back_and_no_stop(tmp_path: Path) -> None:
+    path = ScriptedPath(cmd=[OFFER], do=[IT_IS_DONE], stop=[IT_IS_DONE])
+    (tmp_path / "asked.jsonl").mkdir()
+    told = asked(tmp_path, path, write)
+    assert told.outcome is NOT_SENT
+    assert told.text.endswith("asked.jsonl: Is a directory")
+    assert asked(tmp_path, path, stop).outcome is DONE
+    assert path.asked == ["stop"]
+
+
+def test_a_person_agreed_to_what_is_done_and_to_nothing_else(tmp_path: Path) -> None:
+    path = ScriptedPath(cmd=[OFFER], do=[IT_IS_DONE])
+
+    async def agreed(asker: FleetCommands) -> CommandAnswer:
+        request = asker.request("pump-1", register="frequency", value=20.0)
+        return await asker.carry_out(request, "pump-1: frequency = 2.00 Hz")
+
+    told = asked(tmp_path, path, agreed)
+    assert told.outcome is NOT_SENT
+    assert "the plant has changed, and it would be pump-1: frequency = 20.00 Hz now" in told.text
+    assert path.asked == ["cmd"]
+
+
+def test_all_lines_are_stopped_and_the_worst_is_told(tmp_path: Path) -> None:
+    path = ScriptedPath(stop=[{**IT_IS_DONE, "drives": {"pump-1": IT_IS_DONE}}, NOBODY])
+    told = asked(tmp_path, path, lambda asker: asker.stop())
+    assert told.outcome is NOT_SENT
+    assert "the stop of all drives of line hall-2 was NOT sent" in told.text
+    assert told.drives["pump-1"].outcome is DONE
+
+
+def test_drives_of_one_line_are_one_stop(tmp_path: Path) -> None:
+    path = ScriptedPath(stop=[IT_IS_DONE])
+    asked(tmp_path, path, lambda asker: asker.stop(["pump-1", "fan-1", "pump-2"]))
+    assert path.asked == ["stop", "stop"]
+
+
+def test_a_stop_finds_its_drive_by_another_spelling_and_a_command_does_not(tmp_path: Path) -> None:
+    """A u with two dots is one character (U+00FC) or two (U+0075 U+0308), by the keyboard."""
+    fan, spelt = "L\u00fcfter", "Lu\u0308fter"
+    plant = Plant()
+    plant.records["hall-3"] = Record("hall-3", 1, {"line": {"drive": [{"name": fan}]}})
+    path = ScriptedPath(stop=[IT_IS_DONE])
+    asked(tmp_path, path, lambda asker: asker.stop([spelt]), plant)
+    assert f"the stop of {fan}" in {note["what"] for note in read_audit(tmp_path / "asked.jsonl")}
+    with pytest.raises(ValueError, match="has no drive"):
+        asked(tmp_path, path, lambda asker: asker.write(spelt, "frequency", 20.0), plant)
+    assert path.asked == ["stop"]
+
+
+@pytest.mark.parametrize(
+    ("by", "noted"), [("\x1b[31m", r"\x1b[31m"), ("\ud800", r"\ud800"), ("", "somebody"), (None, "somebody")]
+)
+def test_a_stop_is_sent_whatever_its_asker_calls_himself(tmp_path: Path, by: Any, noted: str) -> None:
+    path = ScriptedPath(stop=[IT_IS_DONE])
+
+    async def stopped(asker: FleetCommands) -> CommandAnswer:
+        asker.by = by
+        return await asker.stop("pump-1")  # for ["pump-1"]: a text is a list of letters too
+
+    assert asked(tmp_path, path, stopped).outcome is DONE
+    assert path.asked == ["stop"]
+    assert {note["by"] for note in read_audit(tmp_path / "asked.jsonl")} == {noted}
+
+
+@pytest.mark.parametrize("what", [write, lambda asker: asker.stop(["pump-1"])])
+def test_a_plant_that_cannot_be_read(tmp_path: Path, what: Any) -> None:
+    with pytest.raises(FleetError, match="no server"):
+        asked(tmp_path, ScriptedPath(), what, Plant(FleetError("no server")))
+
+
+def test_a_plant_that_was_read_before_will_do(tmp_path: Path) -> None:
+    plant = Plant()
+    plant._failure = FleetError("no server")
+    path = ScriptedPath(cmd=[OFFER], do=[IT_IS_DONE], stop=[IT_IS_DONE])
+    assert asked(tmp_path, path, write, plant).outcome is DONE
+    assert asked(tmp_path, path, stop, plant).outcome is DONE
+
+
+def test_a_stop_needs_no_plant_where_its_line_is_named(tmp_path: Path) -> None:
+    path = ScriptedPath(stop=[IT_IS_DONE])
+    plant = Plant(FleetError("no server"))
+    told = asked(tmp_path, path, lambda asker: asker.stop(["pump-1"], line="hall-1"), plant)
+    assert told.outcome is DONE
+    with pytest.raises(
+        FleetError, match="the stop was NOT sent; use the hard-wired stop: the fleet's plant cannot"
+    ):
+        asked(tmp_path, path, stop, plant)
+
+
+def test_a_drive_that_the_plant_has_not_keeps_no_other_s_stop_back(tmp_path: Path) -> None:
+    path = ScriptedPath(stop=[{**IT_IS_DONE, "drives": {"pump-1": IT_IS_DONE}}])
+    told = asked(tmp_path, path, lambda asker: asker.stop(["pmp-2", "pump-1"]))
+    assert path.asked == ["stop"]
+    assert told.outcome is CommandOutcome.REFUSED
+    assert "no stop was sent: the fleet's plant has no drive 'pmp-2'; did you mean pump-2" in told.text
+    assert {name: one.outcome for name, one in told.drives.items()} == {
+        "pump-1": DONE,
+        "pmp-2": CommandOutcome.REFUSED,
+    }
+
+
+@pytest.mark.parametrize("what", ["write", "stop"])
+def test_a_drive_that_the_plant_has_not(tmp_path: Path, what: str) -> None:
+    path = ScriptedPath()
+    calls: dict[str, Callable[[FleetCommands], Awaitable[CommandAnswer]]] = {
+        "write": lambda asker: asker.write("pump1", "frequency", 20.0),
+        "stop": lambda asker: asker.stop(["pump1"]),
+    }
+    with pytest.raises(ValueError, match=r"has no drive 'pump1'; did you mean pump-\d or pump-\d\?"):
+        asked(tmp_path, path, calls[what])
+    assert path.asked == []

@@ -1,0 +1,199 @@
+"""Lease terms: which buckets are handed over while a server is silent, on servers that are not there."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Mapping
+from typing import Any
+
+import pytest
+from controlled_loop import run_controlled
+from peers import require_module
+
+require_module("nats")
+
+from multidrop.fleet.errors import Unsure  # noqa: E402
+from multidrop.fleet.leases.terms import EVERY_S, FOR_S, LeaseTerms  # noqa: E402
+from multidrop.fleet.servers import (  # noqa: E402
+    leaders,
+    names,
+)
+from multidrop.fleet.servers.leader_keeper import keep_leaders  # noqa: E402
+from multidrop.fleet.servers.leaders import SOON_S, bring_leaders_home, led_clusters  # noqa: E402
+
+SERVERS = ("n1", "n2", "n3")
+PATH: Any = None
+ASKS_S = 4.0  # after so long a server that hears nobody may ask for votes
+
+
+class Servers:
+    """Three servers; each bucket has a leader and a term."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.leaders = dict(zip((*names.LEASES, *names.OWNERS), 2 * SERVERS, strict=True))
+        self.terms = dict.fromkeys(names.LEASES, 1)
+        self.silent: set[str] = set()
+        self.unheard_ns = 0  # never, by this leader
+        self.lagging: set[str] = set()
+        self.stuck: set[str] = set()  # buckets that nobody leads after they were handed over
+        self.under_way = 0
+        self.now = 0.0
+        self.found = LeaseTerms(lambda: self.now)
+        monkeypatch.setattr(leaders, "ask", self.ask)
+
+    async def ask(self, path: Any, subject: str, data: Mapping[str, Any] | None = None) -> dict[str, Any]:
+        bucket = subject.rpartition("KV_")[2]
+        leader = self.leaders[bucket]
+        if not leader or leader in self.silent:
+            await asyncio.sleep(1.0)
+            raise Unsure("no answer")
+        if data is not None:
+            assert self.under_way == 0, "two buckets are without a leader"
+            self.under_way += 1
+            await asyncio.sleep(0.05)
+            self.under_way -= 1
+            self.leaders[bucket] = "" if bucket in self.stuck else data["placement"]["preferred"]
+            if bucket in self.terms:
+                self.terms[bucket] += 1
+            return {}
+        peers = [
+            {
+                "name": one,
+                "current": not {one} & (self.silent | self.lagging),
+                "active": self.unheard_ns if one in self.silent else 700_000_000,
+            }
+            for one in SERVERS
+            if one != leader
+        ]
+        return {"cluster": {"leader": leader, "replicas": peers}}
+
+    def pass_s(self, seconds: int) -> None:
+        """Keep ahead once a second."""
+
+        async def main() -> None:
+            for _ in range(seconds):
+                clusters = await led_clusters(PATH)
+                await self.found.keep_ahead(PATH, clusters)
+                self.now += 1
+
+        run_controlled(main())
+
+
+@pytest.fixture
+def servers(monkeypatch: pytest.MonkeyPatch) -> Servers:
+    return Servers(monkeypatch)
+
+
+def test_nothing_is_handed_over_while_all_servers_are_there(servers: Servers) -> None:
+    servers.pass_s(100)
+    assert set(servers.terms.values()) == {1}
+
+
+def test_nothing_is_handed_over_for_a_server_that_lags(servers: Servers) -> None:
+    servers.lagging = {"n3"}
+    servers.pass_s(10)
+    assert set(servers.terms.values()) == {1}
+
+
+@pytest.mark.parametrize(("unheard_ns", "is_due"), [(1_900_000_000, False), (2_100_000_000, True), (0, True)])
+def test_a_server_is_silent_when_it_was_not_heard_for_two_heartbeats(
+    servers: Servers, unheard_ns: int, is_due: bool
+) -> None:
+    servers.silent, servers.unheard_ns = {"n3"}, unheard_ns
+    servers.pass_s(1)
+    assert (servers.terms[names.LEASES[0]] > 1) is is_due
+
+
+def test_terms_grow_faster_than_a_silent_server_can_ask_for_votes(servers: Servers) -> None:
+    servers.silent = {"n3"}
+    for second in range(60):
+        servers.pass_s(1)
+        for bucket in names.LEASES[:2]:
+            assert servers.terms[bucket] > 1 + second // 4
+            assert servers.leaders[bucket] in ("n1", "n2")
+    assert servers.terms[names.LEASES[2]] == 1  # it has no leader that could hand it over
+    assert EVERY_S < ASKS_S
+
+
+def test_a_bucket_whose_leader_was_silent_is_kept_ahead_once_it_has_another(servers: Servers) -> None:
+    servers.silent = {"n3"}
+    servers.leaders[names.LEASES[2]] = "n1"
+    servers.pass_s(1)
+    assert servers.terms[names.LEASES[2]] == 2
+    assert servers.leaders[names.LEASES[2]] == "n2"
+
+
+def test_a_server_that_is_silent_for_long_is_left_alone_until_it_was_back(servers: Servers) -> None:
+    servers.silent = {"n3"}
+    servers.leaders[names.LEASES[2]] = "n1"
+    servers.pass_s(round(FOR_S) + 5)
+    before = dict(servers.terms)
+    servers.pass_s(20)
+    assert servers.terms == before
+    servers.silent = set()
+    servers.pass_s(1)
+    servers.silent = {"n3"}
+    servers.pass_s(1)
+    assert all(servers.terms[bucket] > before[bucket] for bucket in names.LEASES)
+
+
+def test_where_a_bucket_finds_no_leader_no_other_is_handed_over(servers: Servers) -> None:
+    servers.silent, servers.stuck = {"n3"}, set(names.LEASES)
+    servers.leaders[names.LEASES[2]] = "n1"
+    servers.pass_s(1)
+    assert sorted(servers.terms.values()) == [1, 1, 2]
+
+
+def test_one_server_alone_hands_nothing_over(servers: Servers) -> None:
+    servers.silent = {"n2", "n3"}
+    servers.pass_s(10)
+    assert set(servers.terms.values()) == {1}
+
+
+def test_a_leader_that_answers_nothing_holds_no_look_up(servers: Servers) -> None:
+    servers.silent = {"n2"}
+
+    async def main() -> None:
+        begun = asyncio.get_running_loop().time()
+        clusters = await led_clusters(PATH)
+        assert asyncio.get_running_loop().time() - begun == pytest.approx(SOON_S)
+        assert [cluster.leader for cluster in clusters.values()] == ["n1", "n3", "n1", "n3"]
+        assert await bring_leaders_home(PATH, clusters) == 0
+
+    run_controlled(main())
+
+
+@pytest.mark.parametrize("cut_after_s", [0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7])
+def test_terms_are_ahead_before_a_server_that_was_cut_off_asks_for_votes(
+    cut_after_s: float, servers: Servers
+) -> None:
+    """Its leaders answer nothing, and the others tell after 2 s that it is silent."""
+
+    async def main() -> None:
+        keeping = asyncio.create_task(
+            keep_leaders(lambda: PATH, lambda: True, asyncio.get_running_loop().time)
+        )
+        await asyncio.sleep(10 + cut_after_s)
+        servers.silent, servers.unheard_ns = {"n2"}, 1
+        await asyncio.sleep(2.0)
+        servers.unheard_ns = 2_000_000_000
+        await asyncio.sleep(ASKS_S - 2.0)
+        assert min(servers.terms["lease_0"], servers.terms["lease_2"]) > 1
+        keeping.cancel()
+
+    run_controlled(main())
+
+
+def test_leaders_come_home_once_they_can(servers: Servers) -> None:
+    """One that was handed over for a silent server is brought back when it is looked at again."""
+    servers.leaders |= {"lease_0": "n2", "own_2": "n1"}
+    servers.lagging = {"n1"}
+
+    async def main() -> None:
+        assert await bring_leaders_home(PATH, await led_clusters(PATH)) == 1
+        servers.lagging = set()
+        assert await bring_leaders_home(PATH, await led_clusters(PATH)) == 1
+        assert await bring_leaders_home(PATH, await led_clusters(PATH)) == 0
+
+    run_controlled(main())
+    assert list(servers.leaders.values()) == list(2 * SERVERS)

@@ -1,0 +1,430 @@
+"""Gateways' state machines on a real cluster, with lines that are not there."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+import time
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager, suppress
+from functools import partial
+from itertools import count
+
+import pytest
+from fleets import Hall, NotedMastership
+from nats_clusters import Cluster
+from peers import require_module
+
+require_module("nats")
+
+from multidrop.fleet.errors import Conflict  # noqa: E402
+from multidrop.fleet.leases import member as member_module  # noqa: E402
+from multidrop.fleet.leases import weak_session  # noqa: E402
+from multidrop.fleet.leases.bucket import LeaseBucket  # noqa: E402
+from multidrop.fleet.leases.lease import Lease, boottime_ns  # noqa: E402
+from multidrop.fleet.leases.member import Member, MemberState  # noqa: E402
+from multidrop.fleet.leases.rules import RULES, SECOND, USUAL, Terms  # noqa: E402
+from multidrop.fleet.lines import (  # noqa: E402
+    line_keeper,
+    releases,
+    unopened_lines,
+)
+from multidrop.fleet.servers import names  # noqa: E402
+from multidrop.fleet.servers.buckets import Bucket  # noqa: E402
+from multidrop.fleet.servers.cluster import Cluster as Servers  # noqa: E402
+from multidrop.fleet.servers.cluster import Replica  # noqa: E402
+from multidrop.fleet.servers.connections import paths_of  # noqa: E402
+from multidrop.fleet.servers.plant_store import store  # noqa: E402
+from multidrop.fleet.servers.setup import open_all  # noqa: E402
+
+LINES = [f"line-{at}" for at in range(30)]
+PATIENCE_S = 120.0
+LONG = USUAL._replace(lease=600 * SECOND)  # where no lease may run out, however busy the machine is
+
+pytestmark = [pytest.mark.slow, pytest.mark.long]
+
+
+@pytest.fixture(autouse=True)
+def _quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(member_module, "SETTLE_S", 1.0)
+
+
+async def until(condition: Callable[[], bool], what: str) -> float:
+    """Return how long it took (s)."""
+    begun = time.monotonic()
+    while not condition():
+        assert time.monotonic() - begun < PATIENCE_S, what
+        await asyncio.sleep(0.01)
+    return time.monotonic() - begun
+
+
+async def until_leaders_are_home(cluster: Cluster) -> None:
+    """Wait until each node leads one bucket of the leases."""
+    begun = time.monotonic()
+    wanted = [{f"KV_{bucket}"} for bucket in names.LEASES]
+    while True:
+        leads = [await asyncio.to_thread(node.leads) for node in cluster.nodes]
+        if all(one & set().union(*wanted) in wanted for one in leads):
+            return
+        assert time.monotonic() - begun < PATIENCE_S, leads
+        await asyncio.sleep(0.1)
+
+
+class Gateways:
+    """Members of one fleet, each with connections of its own."""
+
+    _names = count()
+
+    def __init__(self, cluster: Cluster, terms: Terms) -> None:
+        self.cluster = cluster
+        self.terms = terms
+        self.hall = Hall()
+        self.members: dict[str, Member] = {}
+        self.tasks: dict[str, asyncio.Task[None]] = {}
+
+    async def join(self, name: str) -> Member:
+        paths = paths_of(self.cluster.urls)
+        await open_all(paths)
+        mastership = NotedMastership(boottime_ns)
+        lines = self.hall.add(name, mastership)
+        member = Member(name, paths, lines, mastership, terms=self.terms)
+        self.members[name] = member
+        self.tasks[name] = asyncio.create_task(member.run())
+        return member
+
+    async def die(self, name: str) -> None:
+        """End it as SIGKILL does: it says nothing more, and its sockets are gone."""
+        member, task = self.members.pop(name), self.tasks.pop(name)
+        member._leave = _do_nothing  # type: ignore[method-assign]
+        task.cancel()
+        await asyncio.gather(task, return_exceptions=True)
+        for path in member.paths:
+            await path.close()
+        self.hall.gateways = [lines for lines in self.hall.gateways if lines.name != name]
+
+    async def leave(self, name: str) -> None:
+        member, task = self.members.pop(name), self.tasks.pop(name)
+        task.cancel()
+        await asyncio.gather(task, return_exceptions=True)
+        for path in member.paths:
+            await path.close()
+
+    def taken(self) -> dict[str, set[str]]:
+        return {name: set(member.polled) for name, member in self.members.items()}
+
+    def all_are_polled(self) -> bool:
+        return sorted(line for lines in self.taken().values() for line in lines) == sorted(LINES)
+
+    def are_shared(self) -> bool:
+        """Say whether each polls what the balance gives it, and all are there."""
+        return all(
+            set(member.wanted.values()) == set(self.members)
+            and {line for line, gateway in member.wanted.items() if gateway == member.name}
+            == set(member.polled)
+            for member in self.members.values()
+        )
+
+
+async def _do_nothing() -> None:
+    pass
+
+
+@asynccontextmanager
+async def gateways(cluster: Cluster, *members: str, terms: Terms = USUAL) -> AsyncIterator[Gateways]:
+    paths = paths_of(cluster.urls)
+    await open_all(paths)
+    bucket = Bucket(names.PLANT, lambda: paths[0])
+    await store(bucket, {line: {"line": {"name": line}, "files": {}} for line in LINES})
+    running = Gateways(cluster, terms)
+    try:
+        await asyncio.gather(*(running.join(name) for name in members))
+        await until(lambda: not members or running.all_are_polled(), "cold start")
+        yield running
+        assert running.hall.overlaps == []
+    finally:
+        await asyncio.gather(*(running.leave(name) for name in list(running.members)))
+        for path in paths:
+            await path.close()
+
+
+@asynccontextmanager
+async def other_version(cluster: Cluster, monkeypatch: pytest.MonkeyPatch) -> AsyncIterator[Lease]:
+    """Yield the lease of a gateway that says by other rules whose a line is."""
+    paths = paths_of(cluster.urls)
+    await open_all(paths)
+    buckets = [
+        LeaseBucket(bucket, partial(paths.__getitem__, at), "other") for at, bucket in enumerate(names.LEASES)
+    ]
+    mastership = NotedMastership(boottime_ns)
+    lease = Lease("other", buckets, mastership, terms=LONG, note=lambda: {"draining": False})
+    value = lease._value
+    monkeypatch.setattr(lease, "_value", lambda **ended: {**value(**ended), "rules": RULES + 1})
+    try:
+        yield lease
+    finally:
+        await lease.end()
+        for path in paths:
+            await path.close()
+
+
+def test_each_takes_its_share_and_a_dead_ones_lines_are_taken_over(fleet: Cluster) -> None:
+    async def main() -> None:
+        async with gateways(fleet, "a", "b", "c") as running:
+            await until(lambda: all(5 <= len(lines) <= 11 for lines in running.taken().values()), "shares")
+            dead = running.members["b"]
+            assert dead.polled
+            begun, left_s = time.monotonic(), dead.lease.left_s
+            await running.die("b")
+            await until(running.all_are_polled, "takeover")
+            assert time.monotonic() - begun > left_s
+            again = await running.join("b")
+            assert not again.polled
+            await until(lambda: len(again.polled) >= 5 and running.all_are_polled(), "it comes back")
+            assert again.lease.session >= 2  # more where the machine let it stand still
+
+    asyncio.run(main())
+
+
+class Ports:
+    """The ports of a member's lines, which may be cut."""
+
+    def __init__(self, member: Member) -> None:
+        self.is_cut = False
+        self._take = member.keeper.lines.take
+        member.keeper.lines.take = self.take  # type: ignore[method-assign]
+        member.keeper._why_lost = self.why_lost
+
+    def why_lost(self, line: str) -> str | None:
+        return f"{line}: No route to host" if self.is_cut else None
+
+    async def take(self, line: str, description: object) -> None:
+        if self.is_cut:
+            raise OSError(self.why_lost(line))
+        await self._take(line, description)
+
+
+def test_lines_that_a_gateway_cannot_open_go_to_others_and_come_back(
+    fleet: Cluster, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It is cut off from its lines, and not from the servers; its lease stays valid."""
+    monkeypatch.setattr(unopened_lines, "LOST_NS", SECOND // 2)
+    for wait in ("FIRST_WAIT_NS", "LAST_WAIT_NS"):
+        monkeypatch.setattr(unopened_lines, wait, SECOND)
+    monkeypatch.setattr(line_keeper, "TAKE_AGAIN_S", 0.1)
+
+    async def main() -> None:
+        async with gateways(fleet, "a", "b", "c", terms=LONG) as running:
+            await until(running.are_shared, "shares")
+            ports = {name: Ports(member) for name, member in running.members.items()}
+            a, b, c = running.members.values()
+            ports["a"].is_cut = True
+            await until(lambda: len(b.polled) + len(c.polled) == len(LINES), "others have those of a")
+            assert a.lease.is_valid
+            ports["b"].is_cut = True
+            await until(lambda: len(c.polled) == len(LINES), "c has all")
+            ports["c"].is_cut = True
+            await until(lambda: len(c.keeper.lost) > 1, "nobody polls")
+            ports["b"].is_cut = False
+            await until(lambda: len(b.polled) == len(LINES) and not b.keeper.lost, "b has all")
+            for one in ports.values():
+                one.is_cut = False
+            await until(running.are_shared, "all are home")
+            assert not any(member.keeper.lost for member in (a, b, c))
+
+    asyncio.run(main())
+
+
+def test_a_drained_gateway_gives_all_away_and_takes_none(fleet: Cluster) -> None:
+    async def main() -> None:
+        async with gateways(fleet, "a", "b", "c", terms=LONG) as running:
+            drained = running.members["c"]
+            drained.drain()
+            await until(lambda: not drained.polled and running.all_are_polled(), "drain")
+            assert drained.state is MemberState.DRAINING
+            assert drained.lease.is_valid
+            await asyncio.sleep(0.5)
+            assert not drained.polled
+
+    asyncio.run(main())
+
+
+def test_with_a_silent_server_only_a_drained_gateway_gives_lines_away(
+    fleet: Cluster, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    silent = Replica("n3", is_current=False, is_offline=True, active_ns=0)
+
+    async def maimed(*_: object) -> Servers:
+        return Servers("n1", (silent,))
+
+    async def main() -> None:
+        async with gateways(fleet, "a", "b", terms=LONG) as running:
+            await until(running.are_shared, "start")
+            monkeypatch.setattr(releases, "known_cluster", maimed)
+            joined, drained = await running.join("c"), running.members["b"]
+            await until(lambda: "c" in drained.wanted.values(), "its share")
+            await asyncio.sleep(1.0)
+            assert not joined.polled
+            drained.drain()
+            await until(lambda: not drained.polled and running.all_are_polled(), "drain")
+
+    monkeypatch.setattr(member_module, "WAIT_S", math.inf)
+    asyncio.run(main())
+
+
+def test_who_leaves_in_order_is_not_waited_for(fleet: Cluster) -> None:
+    async def main() -> None:
+        async with gateways(fleet, "a", "b", terms=LONG) as running:
+            await running.leave("a")
+            await until(running.all_are_polled, "leave")
+
+    asyncio.run(main())
+
+
+def test_lines_come_change_and_go_with_the_plant(fleet: Cluster) -> None:
+    async def main() -> None:
+        async with gateways(fleet, "a", terms=LONG) as running:
+            lines, member = running.hall.gateways[0], running.members["a"]
+            bucket = Bucket(names.PLANT, member.best)
+            records = {line: {"line": {"name": line}, "files": {}} for line in LINES}
+            records["line-1"] = {"line": {"name": "line-1", "port": "another"}, "files": {}}
+            del records["line-2"]
+            records["line-new"] = {"line": {"name": "line-new"}, "files": {}}
+            before = dict(member.polled)
+            told = await store(bucket, records)
+            assert told == {"new": 1, "changed": 1, "removed": 1, "kept": 28}
+            await until(lambda: lines.taken == set(records), "the lines of the other plant")
+            await until(lambda: member.polled["line-1"] != before["line-1"], "the changed line")
+            assert all(
+                member.polled[line] == before[line] for line in LINES if line not in ("line-1", "line-2")
+            )
+            owned = [name for one in member.records.owners.values() for name, record in one.records.items()]
+            assert "line-new" in owned
+            del records["line-new"]
+            await store(bucket, {line: {"line": {"name": line}, "files": {}} for line in LINES})
+            await until(running.all_are_polled, "the plant as before")
+
+    asyncio.run(main())
+
+
+def test_beside_gateways_with_other_rules_no_line_is_taken(
+    fleet: Cluster, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Neither when a gateway begins, nor where one with other rules comes to those that poll."""
+
+    async def main() -> None:
+        async with gateways(fleet, terms=LONG) as running, other_version(fleet, monkeypatch) as other:
+            await other.begin()
+            member = await running.join("a")
+            await until(lambda: "until other is stopped" in member.trouble, "a word about it")
+            await until(lambda: member.records.is_complete, "all records")
+            await asyncio.sleep(0.5)
+            assert member.lease.session == 0
+            await other.end()
+            await until(running.all_are_polled, "start")
+            await other.begin()
+            await until(lambda: "until other is stopped" in member.trouble, "a word about it")
+            bucket = Bucket(names.PLANT, member.best)
+            more = [*LINES, "line-new"]
+            await store(bucket, {line: {"line": {"name": line}, "files": {}} for line in more})
+            await until(lambda: "line-new" in member.wanted, "its share")
+            await asyncio.sleep(0.5)
+            assert running.all_are_polled()
+            await other.end()
+            await until(lambda: "line-new" in member.polled, "the new line")
+
+    asyncio.run(main())
+
+
+@pytest.mark.long
+def test_a_node_that_dies_costs_nothing(fleet: Cluster) -> None:
+    """Two of three paths are renewed as before while the third waits for another leader: 4 to 9 s."""
+
+    async def main() -> None:
+        async with gateways(fleet, "a", "b", terms=LONG) as running:
+            member = running.members["a"]
+            await until(running.are_shared, "shares")
+            await until_leaders_are_home(fleet)
+            before, moves = dict(member.polled), member.keeper.moves
+            leases = [one.lease for one in running.members.values()]
+            node = fleet.nodes[1]
+            [dead] = [at for at, bucket in enumerate(names.LEASES) if f"KV_{bucket}" in node.leads()]
+            node.kill()
+            killed = boottime_ns()
+            renewals: dict[tuple[Lease, int], set[int]] = {
+                (lease, path): set() for lease in leases for path in range(len(names.LEASES))
+            }
+
+            def is_led_again() -> bool:
+                for lease, path in renewals:
+                    held = lease.held[path]
+                    if held and held.sent > killed:
+                        renewals[lease, path].add(held.sent)
+                return all(renewals[lease, dead] for lease in leases)
+
+            await until(is_led_again, "another leader")
+            assert all(len(sent) > 2 for (_, path), sent in renewals.items() if path != dead)
+            assert (member.polled, member.keeper.moves) == (before, moves)
+            fleet.nodes[1].start()
+            await asyncio.to_thread(fleet.wait)
+            await until(lambda: all(path.url == path.urls[0] for path in member.paths), "home again")
+
+    asyncio.run(main())
+
+
+def test_who_lost_a_path_gives_the_session_up_one_after_another(
+    fleet: Cluster, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Else it would fall silent with the next server that dies."""
+    monkeypatch.setattr(weak_session, "WEAK_NS", 3600 * SECOND)
+
+    async def lose_a_path(member: Member) -> None:
+        other = LeaseBucket(names.LEASES[1], member.best, "other")
+        while not member.lease.is_weak:
+            record = await other.get(member.name)
+            with suppress(Conflict):  # it was renewed meanwhile
+                await other.put(member.name, {**record.value, "ended": True}, record.revision)
+            await member.lease.renew_once(1)
+
+    async def main() -> None:
+        async with gateways(fleet, "a", "b", terms=LONG) as running:
+            members = running.members
+            for member in members.values():
+                await lose_a_path(member)
+                assert "a new session begins soon" in member.trouble
+            monkeypatch.setattr(weak_session, "WEAK_NS", 0)
+            began = {name: member.lease.session for name, member in members.items()}
+            await until(lambda: members["a"].lease.session > began["a"], "a's new session")
+            assert members["b"].lease.session == began["b"]
+            await until(lambda: members["b"].lease.session > began["b"], "b's new session")
+            await until(lambda: all(None not in one.lease.held for one in members.values()), "all paths")
+            assert [member.trouble for member in members.values()] == ["", ""]
+            await until(running.are_shared, "shares")
+            assert running.hall.overlaps == []
+
+    asyncio.run(main())
+
+
+def test_without_servers_all_fall_silent_and_nobody_is_killed(
+    fleet: Cluster, caplog: pytest.LogCaptureFixture
+) -> None:
+    """The timer is called off after the lines were let go, and never set to the past."""
+
+    async def main() -> None:
+        async with gateways(fleet, "a", "b") as running:
+            await until(running.are_shared, "shares")  # or one has never had a lease, and no timer
+            with fleet.paused():
+                await until(lambda: not any(running.taken().values()), "silence")
+                masterships = [lines.mastership for lines in running.hall.gateways]
+                await until(lambda: all(one.ends > 0 for one in masterships), "the timer")
+                assert [one.events[-1] for one in masterships] == ["end", "end"]
+                members = running.members.values()
+                await until(lambda: not any(member.lease.is_valid for member in members), "the leases' end")
+                assert {member.state for member in members} == {MemberState.OUTSIDE}
+            await until(running.all_are_polled, "they come back")
+            await until(lambda: {member.state for member in members} == {MemberState.WORKING}, "work")
+            for name in ("a", "b"):
+                await until(
+                    lambda name=name: f"{name}: the lease is valid again" in caplog.messages, "a word"
+                )
+
+    asyncio.run(main())

@@ -1,0 +1,206 @@
+"""A line that is let go: its commands end at once, and its stops are answered until it is closed."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import threading
+import unittest.mock
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from command_desks import LINE, MAY, PATIENCE_S, desks
+from peers import require_module
+
+require_module("nats")
+
+from multidrop.fleet.commands import desk as command_desk  # noqa: E402
+from multidrop.fleet.commands.subjects import CommandedLines, CommandSubjects  # noqa: E402
+from multidrop.fleet.commands.words import CommandAnswer, CommandOutcome  # noqa: E402
+from multidrop.fleet.servers import names  # noqa: E402
+from multidrop.supervisor import supervisor  # noqa: E402
+
+
+class HeardPath:
+    """A path without a server: what is heard there, by subject."""
+
+    def __init__(self) -> None:
+        self.heard: dict[str, Callable[[Any], Any]] = {}
+
+    async def subscribe(self, subject: str, called: Callable[[Any], Any]) -> None:
+        self.heard[subject] = called
+
+    async def unsubscribe(self, subject: str) -> None:
+        self.heard.pop(subject, None)
+
+    async def ask(self, subject: str, **what: Any) -> dict[str, Any]:
+        """Return what is answered."""
+        answered: asyncio.Future[bytes] = asyncio.get_running_loop().create_future()
+
+        class Asked:
+            data = json.dumps({"id": "one", "by": "anna", **what}).encode()
+            reply = "_INBOX.anna.1"
+
+            async def respond(self, data: bytes) -> None:
+                answered.set_result(data)
+
+        await self.heard[subject](Asked())
+        found: dict[str, Any] = json.loads(await asyncio.wait_for(answered, 60))
+        return found
+
+
+class SlowLines:
+    """Lines that are closed when the test says so."""
+
+    def __init__(self) -> None:
+        self.closes = asyncio.Event()
+        self.is_going = False
+
+    async def take(self, line: str, description: Any) -> None:
+        """Nothing is to be opened."""
+
+    async def let_go(self, line: str) -> None:
+        self.is_going = True
+        await self.closes.wait()
+
+
+async def settled(subjects: CommandSubjects) -> None:
+    await asyncio.gather(*supervisor().started)
+
+
+def test_a_line_that_is_let_go_answers_for_its_stops_until_it_is_closed(tmp_path: Path) -> None:
+    async def main() -> None:
+        path, lines = HeardPath(), SlowLines()
+        subjects = CommandSubjects("gw-1", [path], made.lines, made.log)  # type: ignore[list-item]
+        commanded = CommandedLines(lines, subjects)  # type: ignore[arg-type]
+        await commanded.take(LINE, {"may": MAY})
+        await settled(subjects)
+        offered = made.offered()
+        going = asyncio.create_task(commanded.let_go(LINE))
+        await asyncio.sleep(0)
+        await settled(subjects)
+        assert path.heard.keys() == {names.stop_subject(LINE)}
+        assert made.ask(register="frequency", value=20.0) is None
+        assert "was let go" in (await made.do(offered)).text
+        while (told := await path.ask(names.stop_subject(LINE), drives=None))["outcome"] == "under way":
+            pass
+        assert told["outcome"] == "done"
+        lines.closes.set()
+        await going
+        await settled(subjects)
+        assert path.heard == {}
+        assert await made.stop() is None
+        assert made.written == {"control"}
+
+    with desks(tmp_path) as made:
+        asyncio.run(main())
+
+
+def test_a_stop_is_carried_out_and_answered_to_an_inbox_alone(tmp_path: Path) -> None:
+    """An answer that goes to a record of the plant would take its line from all gateways."""
+    answered: list[str] = []
+
+    async def main() -> None:
+        path = HeardPath()
+        subjects = CommandSubjects("gw-1", [path], made.lines, made.log)  # type: ignore[list-item]
+        subjects.open(LINE, {"may": MAY})
+        await settled(subjects)
+        for number, reply in enumerate(("$KV.plant.line-1", "", "_INBOX_UABC.1")):
+
+            async def respond(data: bytes, reply: str = reply) -> None:
+                answered.append(reply)
+
+            data = json.dumps({"id": f"stop {number}", "by": "anna", "drives": None}).encode()
+            await path.heard[names.stop_subject(LINE)](
+                SimpleNamespace(data=data, subject="", reply=reply, respond=respond)
+            )
+            await settled(subjects)
+            assert "control" in made.written
+
+    with desks(tmp_path) as made:
+        asyncio.run(main())
+    assert answered == ["_INBOX_UABC.1"]
+
+
+@pytest.mark.parametrize("may_wait", [True, False])
+def test_a_command_under_way_is_waited_for_where_the_lease_leaves_time(
+    tmp_path: Path, may_wait: bool
+) -> None:
+    """Its asker is told what came of it; else the line's end cuts its answer off."""
+    begun, go_on = threading.Event(), threading.Event()
+
+    async def main() -> None:
+        lines = SlowLines()
+        lines.closes.set()
+        subjects = CommandSubjects("gw-1", [HeardPath()], made.lines, made.log)  # type: ignore[list-item]
+        subjects.desk = made.desk
+        commanded = CommandedLines(lines, subjects, lambda: may_wait)  # type: ignore[arg-type]
+        await commanded.take(LINE, {"may": MAY})
+        first, second = made.offered(20.0), made.offered(30.0)
+        offer = made.desk.offers.find(first)
+        assert offer is not None
+        work = offer.prepared.work
+
+        def held_up() -> CommandAnswer:
+            begun.set()
+            assert go_on.wait(PATIENCE_S)
+            return work()
+
+        offer.prepared = offer.prepared._replace(work=held_up)
+        doing = asyncio.create_task(made.do(first))
+        await asyncio.to_thread(begun.wait, PATIENCE_S)
+        going = asyncio.create_task(commanded.let_go(LINE))
+        for _ in range(10):
+            await asyncio.sleep(0.002)
+        assert lines.is_going is not may_wait
+        assert (await made.do(second)).outcome is CommandOutcome.NOT_SENT  # nothing begins any more
+        go_on.set()
+        assert (await doing).outcome is CommandOutcome.DONE
+        await going
+        assert lines.is_going
+        assert [raw for name, raw in made.writes if name == "frequency"] == [2000]
+
+    with (
+        desks(tmp_path) as made,
+        unittest.mock.patch.object(command_desk, "AWAITED_S", PATIENCE_S),
+    ):
+        asyncio.run(main())
+
+
+class ClosedLines(SlowLines):
+    """Lines whose buses are closed some time before that is known."""
+
+    def __init__(self, close: Callable[[], None]) -> None:
+        super().__init__()
+        self._close = close
+        self.are_closed = asyncio.Event()
+
+    async def let_go(self, line: str) -> None:
+        await asyncio.to_thread(self._close)
+        self.are_closed.set()
+        await super().let_go(line)
+
+
+@pytest.mark.parametrize("drives", [None, ["pump"]])
+def test_a_stop_that_finds_its_line_closed_is_left_to_the_next_master(
+    tmp_path: Path, drives: list[str] | None
+) -> None:
+    """Its asker would believe a refusal, and ask nobody else."""
+
+    async def main() -> None:
+        lines = ClosedLines(made.bus(LINE).close)
+        subjects = CommandSubjects("gw-1", [HeardPath()], made.lines, made.log)  # type: ignore[list-item]
+        commanded = CommandedLines(lines, subjects)  # type: ignore[arg-type]
+        await commanded.take(LINE, {"may": MAY})
+        going = asyncio.create_task(commanded.let_go(LINE))
+        await lines.are_closed.wait()
+        assert await made.stop(drives=drives) is None
+        lines.closes.set()
+        await going
+        await settled(subjects)
+
+    with desks(tmp_path) as made:
+        asyncio.run(main())

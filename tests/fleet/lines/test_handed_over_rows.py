@@ -1,0 +1,121 @@
+"""Requests that are under way when a line is handed over: each of them has its row."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+from lines import until
+
+from multidrop import Mastership
+from multidrop.cli.fleet.demo.judgement import Answers, KeptRow, judge_drive
+from multidrop.cli.fleet.demo.numbered_lines import PORT, NumberedDrive, drive_name, plant_file
+from multidrop.core import UNASKED
+from multidrop.families import InnovertIBD
+from multidrop.plant.loader import load_plant
+from multidrop.plant.model import Plant, PlantLine
+from multidrop.poller import Poller
+from multidrop.polling.batch import Row
+from multidrop.sim import Simulator, Wire
+
+if sys.platform != "linux":
+    pytest.skip("masterships are Linux's", allow_module_level=True)
+
+SECOND = 1_000_000_000
+HOUR_NS = 3600 * SECOND
+
+
+@contextmanager
+def simulated_line(folder: Path, delay: float) -> Iterator[tuple[list[NumberedDrive], PlantLine]]:
+    """Give two drives that answer after so many seconds, and their line."""
+    drives = [
+        NumberedDrive(InnovertIBD(address=at, name=drive_name("line", at)), response_delay=delay)
+        for at in (1, 2)
+    ]
+    with Simulator([Wire(drives, name="line", port=PORT)]) as simulator:
+        path = folder / "plant.toml"
+        path.write_text(plant_file({"line": simulator.wires[0].path}))
+        yield drives, load_plant(path).lines[0]
+
+
+class Gateway:
+    """A poller with a mastership that holds, and all of its rows of values that were asked for."""
+
+    def __init__(self, folder: Path) -> None:
+        self.mastership = Mastership(guard_s=0.01)
+        self.mastership.extend(time.clock_gettime_ns(time.CLOCK_BOOTTIME) + HOUR_NS)
+        self.rows: list[Row] = []
+        self.poller = Poller(Plant((), folder), mastership=self.mastership)
+        self.poller.on_batch(lambda batch: self.rows.extend(row for row in batch if is_asked(row)))
+
+    def close(self) -> None:
+        self.poller.close()
+        self.mastership.end()
+
+
+def is_asked(row: Row) -> bool:
+    return not row.status.startswith(UNASKED)
+
+
+@pytest.fixture
+def gateways(tmp_path: Path) -> Iterator[list[Gateway]]:
+    made = [Gateway(tmp_path) for _ in range(2)]
+    for gateway in made:
+        gateway.poller.__enter__()
+    yield made
+    for gateway in made:
+        gateway.close()
+
+
+def hand_over(gateway: Gateway, drives: list[NumberedDrive], line: PlantLine) -> None:
+    """Poll until a drive has taken a request that it has not answered yet, and let the line go then."""
+    gateway.poller.add_line(line)
+    begun = sum(drive.answers for drive in drives)
+    until(lambda: sum(drive.answers for drive in drives) > begun)
+    gateway.poller.remove_line("line")
+
+
+def judge(drives: list[NumberedDrive], gateways: list[Gateway]) -> list[Answers]:
+    for gateway in gateways:
+        gateway.close()
+    rows = [row for gateway in gateways for row in gateway.rows]
+    return [
+        judge_drive(
+            [
+                KeptRow(row.time, None if row.value is None else round(row.value))
+                for row in rows
+                if row.drive == drive.drive.name
+            ],
+            drive.answers,
+            None,
+        )
+        for drive in drives
+    ]
+
+
+@pytest.mark.slow
+def test_a_line_goes_to_and_fro_with_a_request_under_way_each_time(
+    tmp_path: Path, gateways: list[Gateway]
+) -> None:
+    with simulated_line(tmp_path, delay=0.1) as (drives, line):
+        for turn in range(8):
+            hand_over(gateways[turn % 2], drives, line)
+        judged = judge(drives, gateways)
+    assert sum(one.answered for one in judged) >= 8
+    assert [(one.lost, one.doubled) for one in judged] == [(0, 0), (0, 0)]
+
+
+def test_a_request_that_is_not_waited_for_any_longer_says_so(
+    tmp_path: Path, gateways: list[Gateway], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("multidrop.polling.line_set.ENDING_NS", 0)
+    with simulated_line(tmp_path, delay=1.0) as (drives, line):
+        hand_over(gateways[0], drives, line)
+        hand_over(gateways[1], drives, line)
+        judged = judge(drives, gateways)
+    assert [(one.lost, one.doubled) for one in judged] == [(0, 0), (0, 0)]
+    assert {row.status for gateway in gateways for row in gateway.rows} == {"poll ended"}

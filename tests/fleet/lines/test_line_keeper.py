@@ -1,0 +1,613 @@
+"""The work on a gateway's lines, on records in memory."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Callable
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from fleets import GatedBucket, Hall, HandClock, MemoryBucket, NotedLines, NotedMastership
+from peers import require_module
+
+require_module("nats")
+
+from multidrop.fleet.leases.lease import Lease  # noqa: E402
+from multidrop.fleet.leases.rules import SECOND, USUAL  # noqa: E402
+from multidrop.fleet.lines import (  # noqa: E402
+    line_keeper,
+    owner_records,
+)
+from multidrop.fleet.lines.line_keeper import LineKeeper  # noqa: E402
+from multidrop.fleet.lines.ownership import owner_of, owner_value  # noqa: E402
+from multidrop.fleet.lines.share_records import ShareRecords  # noqa: E402
+from multidrop.fleet.servers import names  # noqa: E402
+from multidrop.fleet.servers.buckets import Record  # noqa: E402
+
+
+async def until(condition: Callable[[], bool]) -> None:
+    for _ in range(1000):
+        if condition():
+            return
+        await asyncio.sleep(0)
+    raise AssertionError("it does not come")
+
+
+class Trial:
+    """A gateway with a lease and one line of the plant."""
+
+    def __init__(self) -> None:
+        self.clock = HandClock()
+        self.mastership = NotedMastership(self.clock)
+        self.lines = NotedLines("a", self.mastership, Hall())
+        leases: list[Any] = [MemoryBucket(name) for name in names.LEASES]
+        self.lease = Lease("a", leases, self.mastership, clock=self.clock)
+        nowhere: Any = None
+        self.records = ShareRecords("a", lambda: nowhere, USUAL, lambda: None, self._is_mine)
+        for name in names.OWNERS:
+            bucket: Any = GatedBucket(name)
+            self.records.owners[name].bucket = bucket
+        self.buckets: list[Any] = [self.records.owners[name].bucket for name in names.owner_buckets("hall")]
+        self.records.plant.take(Record("hall", 1, {"line": {"name": "hall"}}))
+        self.keeper = LineKeeper(self.lines, self.lease, self.records, lambda: None)
+
+    def _is_mine(self, record: Record) -> bool:
+        return owner_of(record) == ("a", self.lease.session)
+
+    async def read(self) -> None:
+        """Read what the buckets have of the line."""
+        self.records.want(["hall"])
+        for follower in self.records.owners.values():
+            await follower.look()
+
+    async def read_and_begin(self) -> None:
+        assert await self.lease.try_to_begin()
+        await self.read()
+
+    async def claim(self) -> None:
+        await self.read_and_begin()
+        self.claim_now()
+        await until(lambda: "hall" in self.keeper.polled and not self.keeper._tasks)
+
+    async def is_polled(self) -> None:
+        """Wait until the line is polled, while time passes."""
+        while "hall" not in self.keeper.polled or self.keeper._at_work:
+            await asyncio.sleep(0.001)
+
+    async def is_at_rest(self) -> None:
+        """Wait until nothing is under way on the line, while time passes."""
+        while self.keeper._at_work:
+            await asyncio.sleep(0.001)
+
+    async def let_the_first_lag(self) -> None:
+        """Let a second pass, and renew all paths but the one with the home of the line's first bucket."""
+        self.clock.pass_s(1.001)
+        for path, name in enumerate(names.OWNERS):
+            if name != self.buckets[0].name:
+                await self.lease.renew_once(path)
+
+    def claim_now(self) -> None:
+        claim = self.keeper.claim_of("hall")
+        assert claim
+        self.keeper.claim({"hall": claim})
+
+    def owner(self) -> tuple[str, int] | None:
+        """Return the owner whom enough votes name, by what the gateway knows."""
+        record = self.records.owner("hall")
+        return owner_of(record) if record else None
+
+    def is_taken_by_another(self, *places: int) -> None:
+        """Read that these of the line's records name another gateway."""
+        for place in places:
+            bucket = names.owner_buckets("hall")[place]
+            known = self.records.of("hall")[bucket]
+            revision = known.revision + 1 if known else 1
+            self.records.owners[bucket].take(Record("hall", revision, owner_value(("b", 1), 9, 0)))
+
+
+class DeadTrial(Trial):
+    """The same with a line whose last master is over."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        for bucket in self.buckets[:2]:
+            bucket.store("hall", owner_value(("", 0), 1, 0))
+
+    async def claim_without_the_first(self) -> None:
+        """Claim the line while its first bucket holds what it is told up."""
+        await self.read_and_begin()
+        self.buckets[0].shut()
+        self.claim_now()
+        await asyncio.wait_for(self.is_polled(), 10)
+
+
+def test_a_claimed_line_takes_stops_at_once_and_commands_when_the_guard_is_over() -> None:
+    async def main() -> None:
+        trial = Trial()
+        await trial.claim()
+        assert trial.lines.taken == {"hall"}
+
+        def may() -> tuple[bool, bool]:
+            return trial.keeper.may_stop("hall"), trial.keeper.may_command("hall")
+
+        assert may() == (True, False)
+        trial.clock.pass_s(USUAL.guard / SECOND - 0.001)
+        assert may() == (True, False)
+        trial.clock.pass_s(0.001)
+        assert may() == (True, True)
+        trial.clock.pass_s(USUAL.lease / SECOND)
+        assert may() == (False, False)
+
+    asyncio.run(main())
+
+
+def test_a_line_that_another_has_by_its_record_takes_neither_stops_nor_commands() -> None:
+    """It is about to be let go, and its new master answers."""
+
+    async def main() -> None:
+        trial = Trial()
+        await trial.claim()
+        trial.clock.pass_s(1)
+        assert trial.keeper.may_command("hall")
+        trial.is_taken_by_another(0)
+        assert "hall" in trial.keeper.polled
+        assert not trial.keeper.may_stop("hall")
+        assert not trial.keeper.may_command("hall")
+
+    asyncio.run(main())
+
+
+def test_lines_are_let_go_while_there_is_time_to_close_them() -> None:
+    async def main() -> None:
+        trial = Trial()
+        await trial.claim()
+        trial.clock.pass_s(USUAL.lease / SECOND - line_keeper.SILENT_S - 0.001)
+        trial.keeper.reconcile()
+        assert trial.keeper.polled
+        assert not trial.keeper._at_work
+        trial.clock.pass_s(0.001)
+        assert trial.lease.is_valid
+        trial.keeper.reconcile()
+        await until(lambda: trial.keeper.is_silent)
+        assert trial.lines.taken == set()
+
+    asyncio.run(main())
+
+
+def test_what_waited_until_the_lease_was_over_is_neither_opened_nor_written() -> None:
+    async def main() -> None:
+        trial = Trial()
+        bucket = trial.buckets[0]
+        writing = trial.keeper._owners._writing[bucket.name] = asyncio.Semaphore(0)
+        openings = trial.keeper._openings = asyncio.Semaphore(0)
+        await trial.read_and_begin()
+        trial.claim_now()
+        await asyncio.sleep(0)
+        trial.clock.pass_s(USUAL.lease / SECOND)
+        writing.release()
+        await until(lambda: trial.keeper.is_silent)
+        assert bucket.records == {}
+        for path in range(3):
+            await trial.lease.renew_once(path)
+        trial.claim_now()
+        await until(lambda: bool(trial.records.owner("hall")))
+        trial.clock.pass_s(USUAL.lease / SECOND)
+        openings.release()
+        await until(lambda: trial.keeper.is_silent)
+        assert trial.lines.taken == set()
+
+    asyncio.run(main())
+
+
+def test_a_line_that_became_anothers_while_it_waited_is_not_opened() -> None:
+    async def main() -> None:
+        trial = Trial()
+        openings = trial.keeper._openings = asyncio.Semaphore(0)
+        await trial.read_and_begin()
+        trial.claim_now()
+        await until(lambda: bool(trial.records.owner("hall")))
+        trial.is_taken_by_another(0)
+        openings.release()
+        await until(lambda: trial.keeper.is_silent)
+        assert trial.lines.taken == set()
+
+    asyncio.run(main())
+
+
+def test_a_line_that_is_let_go_takes_no_stops() -> None:
+    async def main() -> None:
+        trial = Trial()
+        await trial.claim()
+        trial.keeper.releasing = {"hall"}
+        trial.keeper.reconcile()
+        await until(lambda: trial.keeper.is_silent)
+        assert trial.keeper.is_mine("hall")
+        assert not trial.keeper.may_stop("hall")
+
+    asyncio.run(main())
+
+
+def test_a_line_is_let_go_before_it_is_given_away() -> None:
+    async def main() -> None:
+        trial = Trial()
+        await trial.claim()
+        trial.keeper.releasing = {"hall"}
+        trial.keeper.reconcile()
+        assert trial.owner() == ("a", 1)
+        await until(lambda: trial.keeper.is_silent)
+        assert trial.lines.taken == set()
+        assert trial.owner() == ("a", 1)
+        trial.keeper.reconcile()
+        await until(lambda: trial.keeper.is_silent)
+        assert trial.owner() == ("", 0)
+
+    asyncio.run(main())
+
+
+def test_a_line_is_not_polled_again_while_it_may_have_been_given_away() -> None:
+    """A write that nobody answered may still be stored, at any time, until a newer record rules that out."""
+
+    async def main() -> None:
+        trial = Trial()
+        await trial.claim()
+        bucket = trial.buckets[0]
+        trial.keeper.releasing = {"hall"}
+        trial.keeper.reconcile()
+        await until(lambda: trial.keeper.is_silent)
+        for one in trial.buckets:
+            one.is_down = True
+        trial.keeper.reconcile()  # given away, and nobody answers
+        await until(lambda: trial.keeper.is_silent)
+        trial.keeper.releasing = set()  # it is to stay after all
+        for _ in range(3):
+            trial.keeper.reconcile()
+            await until(lambda: trial.keeper.is_silent)
+            assert trial.lines.taken == set()
+        for one in trial.buckets:
+            one.is_down = False
+        trial.keeper.reconcile()
+        await until(lambda: "hall" in trial.keeper.polled and not trial.keeper._at_work)
+        assert owner_of(bucket.records["hall"]) == ("a", 1)
+        assert bucket.revision("hall") == 2  # what was given away at 1 can be stored no more
+
+    asyncio.run(main())
+
+
+def owners(trial: Trial) -> list[tuple[str, int]]:
+    """Return whom the records name that are stored, in the order in which they are written."""
+    return [owner_of(bucket.records.get("hall")) for bucket in trial.buckets]
+
+
+ME, NOBODY = ("a", 1), ("", 0)
+
+
+def test_a_line_that_nobody_ever_had_is_claimed_by_one_record() -> None:
+    async def main() -> None:
+        trial = Trial()
+        await trial.claim()
+        assert owners(trial) == [ME, NOBODY, NOBODY]
+        assert trial.keeper.moves == 1
+
+    asyncio.run(main())
+
+
+def test_a_line_of_a_dead_master_is_claimed_by_two() -> None:
+    async def main() -> None:
+        trial = DeadTrial()
+        await trial.claim()
+        assert owners(trial) == [ME, ME, NOBODY]
+        assert trial.keeper.moves == 1
+
+    asyncio.run(main())
+
+
+@pytest.mark.parametrize("place", [0, 1])
+def test_a_bucket_without_a_leader_holds_no_claim_up(place: int) -> None:
+    async def main() -> None:
+        trial = DeadTrial()
+        await trial.read_and_begin()
+        trial.buckets[place].is_down = True
+        trial.claim_now()
+        await until(lambda: "hall" in trial.keeper.polled and not trial.keeper._at_work)
+        assert owners(trial)[place] == NOBODY
+        assert owners(trial).count(ME) == 2
+
+    asyncio.run(main())
+
+
+def test_a_bucket_that_answers_late_holds_no_claim_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(owner_records, "SPARE_S", 0.0)
+
+    async def main() -> None:
+        trial = DeadTrial()
+        await trial.claim_without_the_first()
+        assert owners(trial) == [NOBODY, ME, ME]
+        trial.buckets[0].open()
+        await until(lambda: not trial.keeper._tasks)
+        assert owners(trial) == [ME, ME, ME]
+        assert trial.keeper.moves == 1
+
+    asyncio.run(main())
+
+
+def test_a_refused_claim_waits_for_no_late_answer(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It is tried again at once, by newer records: a server that is cut off answers nothing for long."""
+    monkeypatch.setattr(owner_records, "SPARE_S", 100.0)
+
+    async def main() -> None:
+        trial = DeadTrial()
+        await trial.read_and_begin()
+        trial.buckets[1].store("hall", owner_value(("", 0), 2, 0))
+        trial.buckets[0].shut()
+        trial.claim_now()
+        await asyncio.wait_for(trial.is_at_rest(), 10)
+        assert owners(trial) == [NOBODY, NOBODY, NOBODY]
+        assert all(trial.records.owners[bucket.name]._doubted for bucket in trial.buckets[:2])
+        await trial.read()
+        trial.buckets[0].open()
+        trial.claim_now()
+        await asyncio.wait_for(trial.is_polled(), 10)
+        assert owners(trial) == [ME, ME, NOBODY]
+
+    asyncio.run(main())
+
+
+def test_a_bucket_whose_home_may_be_gone_is_written_last() -> None:
+    async def main() -> None:
+        trial = DeadTrial()
+        await trial.read_and_begin()
+        await trial.let_the_first_lag()
+        trial.claim_now()
+        await until(lambda: "hall" in trial.keeper.polled and not trial.keeper._at_work)
+        assert owners(trial) == [NOBODY, ME, ME]
+
+    asyncio.run(main())
+
+
+def test_where_all_leases_are_late_no_bucket_is_written_last() -> None:
+    """Servers that are busy are slow in all buckets."""
+
+    async def main() -> None:
+        trial = DeadTrial()
+        await trial.read_and_begin()
+        trial.clock.pass_s(1.5)
+        await trial.lease.renew_once(names.OWNERS.index(trial.buckets[2].name))
+        trial.claim_now()
+        await until(lambda: "hall" in trial.keeper.polled and not trial.keeper._at_work)
+        assert owners(trial) == [ME, ME, NOBODY]
+
+    asyncio.run(main())
+
+
+def test_a_bucket_whose_home_may_be_gone_is_not_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It was the only one left to be written as long as another was not read."""
+    monkeypatch.setattr(owner_records, "SPARE_S", 0.0)
+
+    async def main() -> None:
+        trial = Trial()
+        await trial.read_and_begin()
+        await trial.let_the_first_lag()
+        trial.buckets[0].shut()
+        trial.claim_now()
+        await asyncio.wait_for(trial.is_at_rest(), 10)
+        trial.buckets[0].open()
+        trial.claim_now()
+        await asyncio.wait_for(trial.is_polled(), 10)
+
+    asyncio.run(main())
+
+
+def test_where_another_was_first_nothing_more_is_written() -> None:
+    async def main() -> None:
+        trial = DeadTrial()
+        await trial.read_and_begin()
+        trial.buckets[1].store("hall", owner_value(("b", 1), 2, 0))
+        trial.claim_now()
+        await until(lambda: not trial.keeper._tasks)
+        assert owners(trial) == [ME, ("b", 1), NOBODY]
+        assert not trial.keeper.polled
+
+    asyncio.run(main())
+
+
+def test_a_late_answer_makes_no_line_ours_that_is_being_given_away(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It would be opened between the two records that give it away, and be another's in the next moment."""
+    monkeypatch.setattr(owner_records, "SPARE_S", 0.0)
+
+    async def main() -> None:
+        trial = DeadTrial()
+        await trial.claim_without_the_first()
+        trial.keeper.releasing = {"hall"}
+        trial.keeper.reconcile()
+        await until(lambda: not trial.keeper.polled and not trial.keeper._at_work)
+        writers = trial.keeper._owners._writing[trial.buckets[1].name]
+        async with writers, writers:  # all that may write there are at work
+            trial.keeper.reconcile()
+            await until(lambda: owners(trial) == [NOBODY, ME, NOBODY])
+            trial.buckets[0].open()
+            await until(lambda: owners(trial)[0] == ME)
+            for _ in range(100):
+                await asyncio.sleep(0)
+            assert not trial.keeper.is_mine("hall")
+            assert trial.lines.taken == set()
+        await until(lambda: not trial.keeper._tasks)
+        assert trial.lines.taken == set()
+        assert owners(trial) == [ME, NOBODY, NOBODY]
+        trial.keeper.reconcile()
+        await until(lambda: owners(trial) == [NOBODY] * 3)
+
+    asyncio.run(main())
+
+
+def test_an_answer_that_is_late_does_not_undo_the_giving_away() -> None:
+    """The record was read before its answer came, and given away at once."""
+
+    async def main() -> None:
+        trial = Trial()
+        await trial.read_and_begin()
+        bucket = trial.buckets[0] = GatedBucket(trial.buckets[0].name, answers=True)
+        trial.records.owners[bucket.name].bucket = bucket  # type: ignore[assignment]
+        bucket.shut()
+        trial.claim_now()
+        await asyncio.wait_for(bucket.arrived.wait(), 10)
+        trial.records.doubt(bucket.name, ["hall"])
+        await trial.read()
+        assert trial.keeper.is_mine("hall")
+        bucket.is_down = True
+        await trial.keeper._owners.give_away(["hall"])
+        bucket.open()
+        await until(lambda: not trial.keeper._tasks)
+        assert not trial.keeper.is_mine("hall")
+        assert trial.lines.taken == set()
+
+    asyncio.run(main())
+
+
+def test_what_was_given_away_in_doubt_is_claimed_anew_where_any_line_may_be() -> None:
+    async def main() -> None:
+        trial = Trial()
+        await trial.claim()
+        for bucket in trial.buckets:
+            bucket.is_down = True
+        trial.keeper.releasing = {"hall"}
+        for _ in range(2):  # it is let go first
+            trial.keeper.reconcile()
+            await until(lambda: not trial.keeper._tasks)
+        assert not trial.keeper.is_mine("hall")
+        for bucket in trial.buckets:
+            bucket.is_down = False
+        trial.keeper.releasing, trial.keeper.may_claim = set(), False
+        trial.keeper.reconcile()
+        await until(lambda: not trial.keeper._tasks)
+        assert not trial.keeper.is_mine("hall")
+        trial.keeper.may_claim = True
+        trial.keeper.reconcile()
+        await until(lambda: "hall" in trial.keeper.polled)
+
+    asyncio.run(main())
+
+
+def test_a_line_that_is_not_closed_for_certain_ends_the_gateway() -> None:
+    """Its session is not ended: the others wait for as long as if it had died."""
+
+    async def main() -> None:
+        trial = Trial()
+        await trial.claim()
+
+        async def fail(line: str) -> None:
+            raise RuntimeError("the port is stuck")
+
+        trial.lines.let_go = fail  # type: ignore[method-assign]
+        failing = asyncio.create_task(trial.keeper.fail())
+        with pytest.raises(RuntimeError, match="the port is stuck"):
+            await asyncio.wait_for(trial.keeper.let_all_go(), 10)
+        with pytest.raises(RuntimeError, match="the port is stuck"):
+            await asyncio.wait_for(failing, 10)
+        assert trial.keeper.polled
+
+    asyncio.run(main())
+
+
+def test_a_line_on_which_anything_fails_is_that_line_s_alone(caplog: pytest.LogCaptureFixture) -> None:
+    """Such as a user's own class: it is logged with its cause, and tried again."""
+
+    async def main() -> None:
+        trial = Trial()
+        take, failures = trial.lines.take, [ZeroDivisionError("of a user's class")]
+
+        async def fail(line: str, description: Any) -> None:
+            if failures:
+                raise failures.pop()
+            await take(line, description)
+
+        trial.lines.take = fail  # type: ignore[method-assign]
+        await trial.read_and_begin()
+        trial.claim_now()
+        await until(lambda: bool(trial.keeper.troubles))
+        assert trial.keeper.troubles == {"hall": "ZeroDivisionError: of a user's class"}
+        assert (trial.keeper.lost, trial.keeper._failure) == ({}, None)
+        await until(lambda: not trial.keeper._tasks)
+        trial.keeper._again_at["hall"] = 0.0
+        trial.keeper.reconcile()
+        await until(lambda: "hall" in trial.keeper.polled)
+        assert trial.keeper.troubles == {}
+
+    asyncio.run(main())
+    assert "Traceback" in caplog.text
+
+
+class BrokenLines(NotedLines):
+    """Lines whose port cannot be opened, for this reason; "" for none."""
+
+    why = "nothing listens there"
+
+    async def take(self, line: str, description: Any) -> None:
+        if self.why:
+            raise OSError(self.why)
+        await super().take(line, description)
+
+
+class BrokenTrial(Trial):
+    """The same with a port that cannot be opened."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        super().__init__()
+        self.now = 1000.0
+        clock = SimpleNamespace(monotonic=lambda: self.now, time_ns=lambda: 0)
+        monkeypatch.setattr(line_keeper, "time", clock)
+        self.broken = BrokenLines("a", self.mastership, Hall())
+        self.keeper.lines = self.broken
+
+    async def claim(self) -> None:
+        await self.read_and_begin()
+        self.claim_now()
+        await until(lambda: "hall" in self.keeper.troubles and not self.keeper._at_work)
+
+    async def try_again(self) -> None:
+        self.keeper.reconcile()
+        assert self.keeper.is_silent, "it is too early"
+        self.now += line_keeper.TAKE_AGAIN_S
+        self.keeper.reconcile()
+        assert not self.keeper.is_silent
+        await until(lambda: not self.keeper._at_work)
+
+
+def test_a_line_that_cannot_be_taken_is_told_once_for_each_reason_and_when_it_is(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.INFO)
+
+    async def main() -> None:
+        trial = BrokenTrial(monkeypatch)
+        await trial.claim()
+        await trial.try_again()
+        await trial.try_again()
+        trial.broken.why = "no route to host"
+        await trial.try_again()
+        assert trial.keeper.troubles == {"hall": "no route to host"}
+        trial.broken.why = ""
+        await trial.try_again()
+        assert trial.keeper.troubles == {}
+        assert "hall" in trial.keeper.polled
+
+    asyncio.run(main())
+    assert [message for message in caplog.messages if "line hall" in message] == [
+        "line hall is not taken, and tried again and again: nothing listens there",
+        "line hall is not taken, and tried again and again: no route to host",
+        "line hall is taken now",
+    ]
+
+
+def test_of_a_line_that_another_has_by_now_no_trouble_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    async def main() -> None:
+        trial = BrokenTrial(monkeypatch)
+        await trial.claim()
+        trial.keeper.releasing = {"hall"}
+        trial.keeper.reconcile()
+        assert trial.keeper.troubles == {}
+        await until(lambda: trial.keeper.is_silent)
+        assert trial.owner() == ("", 0)
+
+    asyncio.run(main())

@@ -1,0 +1,66 @@
+"""Moves: who had a line before is told where it was seen, and nowhere else."""
+
+from __future__ import annotations
+
+from peers import require_module
+
+require_module("nats")
+
+from multidrop.fleet.lines.moves import Move, Moves, move_of  # noqa: E402
+
+
+def told(*moves: Move) -> list[tuple[str | None, str]]:
+    """Return what is shown of these, in any order."""
+    found = Moves()
+    found.add(moves)
+    return [(move.before, move.after) for move in found.newest(100)]
+
+
+def move(turn: int, before: str | None, after: str, line: str = "hall-1") -> Move:
+    return Move(line, turn, 1000 * turn, before, after)
+
+
+FIRST = move(1, "", "gw-1")
+
+
+def test_the_newest_move_comes_first() -> None:
+    assert told(FIRST, move(2, "gw-1", "gw-2")) == [("gw-1", "gw-2"), ("", "gw-1")]
+
+
+def test_a_line_that_was_given_away_and_taken_has_moved_once() -> None:
+    moves = [FIRST, move(2, "gw-1", ""), move(3, "", "gw-2")]
+    assert told(*moves) == told(*reversed(moves)) == [("gw-1", "gw-2"), ("", "gw-1")]
+
+
+def test_a_line_that_was_given_away_and_is_nobodys() -> None:
+    assert told(FIRST, move(2, "gw-1", "")) == [("gw-1", ""), ("", "gw-1")]
+
+
+def test_a_move_that_another_saw_whole_is_taken_from_it() -> None:
+    assert told(move(2, None, "gw-2"), move(2, "gw-1", "gw-2")) == [("gw-1", "gw-2")]
+    assert told(move(2, "gw-1", "gw-2"), move(2, None, "gw-2")) == [("gw-1", "gw-2")]
+
+
+def test_a_line_that_one_gave_away_and_another_took_has_moved_once() -> None:
+    """Each sees its own half: a drained gateway follows no line any more, and the next began late."""
+    giver, taker = [FIRST, move(2, "gw-1", "")], [move(2, None, ""), move(3, "", "gw-2")]
+    back = [move_of(one.as_json()) for one in (*giver, *taker, *giver)]
+    assert told(*back) == [("gw-1", "gw-2"), ("", "gw-1")]
+
+
+def test_turns_of_other_lines_are_other_moves() -> None:
+    moves = told(move(2, "gw-1", ""), move(3, "", "gw-2", "hall-2"))
+    assert moves == [("", "gw-2"), ("gw-1", "")]
+
+
+def test_what_is_told_comes_back() -> None:
+    one = move(7, None, "gw-1")
+    assert move_of(one.as_json()) == one
+
+
+def test_the_newest_are_kept_of_very_many() -> None:
+    moves = Moves(most=10)
+    for turn in range(1000, 0, -1):  # a first look reads its buckets in no order of time
+        moves.add([move(turn, None, "gw-1", f"line-{turn}")])
+    assert [one.turn for one in moves.newest(10)] == list(range(1000, 990, -1))
+    assert len(moves.newest(1000)) <= 40

@@ -1,0 +1,115 @@
+"""Lines are let go for others only while these can claim them, and will be able to in the next moment."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import Any
+
+import pytest
+from peers import require_module
+
+require_module("nats")
+
+from multidrop.fleet.lines import releases  # noqa: E402
+from multidrop.fleet.lines.releases import WAIT_S, Releases  # noqa: E402
+from multidrop.fleet.servers import names  # noqa: E402
+from multidrop.fleet.servers.cluster import Cluster, Replica  # noqa: E402
+
+FIRST = {names.owner_buckets(line)[0]: line for line in (f"line-{at}" for at in range(30))}  # one of each
+LINES = set(FIRST.values())
+
+
+class Trial:
+    """Releases of a gateway, the buckets that have a leader, and those of which a server is silent."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.led = set(names.OWNERS)
+        self.maimed: set[str] = set()
+        self.asked: list[str] = []
+        self.changes = 0
+        self.now_s = 0.0
+        nowhere: Any = None
+        self.releases = Releases(lambda: nowhere, self.note, lambda: self.now_s)
+        monkeypatch.setattr(releases, "known_cluster", self.known_cluster)
+
+    def note(self) -> None:
+        self.changes += 1
+
+    async def known_cluster(self, path: Any, bucket: str) -> Cluster:
+        self.asked.append(bucket)
+        silent = Replica("n3", is_current=bucket not in self.maimed, is_offline=False, active_ns=0)
+        return Cluster("n1" if bucket in self.led else "", (silent,))
+
+    def look(self) -> None:
+        asyncio.run(self.releases.look())
+
+
+def test_lines_wait_until_two_buckets_are_known_to_have_a_leader(monkeypatch: pytest.MonkeyPatch) -> None:
+    trial = Trial(monkeypatch)
+    trial.led = {"own_1"}
+    assert trial.releases.due(LINES) == set()
+    trial.look()
+    assert trial.changes == 1
+    assert trial.releases.due(LINES) == set()
+    trial.led.add("own_2")
+    trial.look()
+    assert trial.changes == 2
+    assert trial.releases.due(LINES) == {FIRST["own_1"], FIRST["own_2"]}
+
+
+def test_nothing_is_asked_where_no_line_is_to_be_released_and_nothing_is_believed_later(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    trial = Trial(monkeypatch)
+    trial.look()
+    assert trial.asked == []
+    trial.releases.due(LINES)
+    trial.look()
+    assert trial.asked == [*names.OWNERS]
+    assert trial.releases.due(set()) == set()
+    trial.look()
+    trial.led.clear()
+    assert trial.releases.due(LINES) == set()
+
+
+def test_lines_wait_while_a_server_of_two_buckets_is_silent(monkeypatch: pytest.MonkeyPatch) -> None:
+    trial = Trial(monkeypatch)
+    trial.maimed = {"own_0", "own_1"}
+    trial.releases.due(LINES)
+    trial.look()
+    assert trial.releases.due(LINES) == set()
+    trial.maimed.remove("own_0")
+    trial.look()
+    assert trial.changes == 2
+    assert trial.releases.due(LINES) == LINES - {FIRST["own_1"]}
+
+
+def test_a_server_that_is_silent_for_long_is_not_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    trial = Trial(monkeypatch)
+    trial.maimed = {"own_0", "own_1"}
+    trial.releases.due(LINES)
+    trial.look()
+    trial.now_s = WAIT_S - 1
+    trial.look()
+    assert trial.releases.due(LINES) == set()
+    trial.now_s = WAIT_S
+    trial.look()
+    assert trial.releases.due(LINES) == LINES
+    trial.maimed.clear()  # it is heard, and silent again: it is waited for anew
+    trial.look()
+    trial.maimed = {"own_0", "own_1"}
+    trial.look()
+    assert trial.releases.due(LINES) == set()
+
+
+def test_who_is_in_haste_waits_for_leaders_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    trial = Trial(monkeypatch)
+    trial.maimed = set(names.OWNERS)
+    trial.led.remove("own_2")
+    trial.releases.due(LINES, 0)
+    trial.look()
+    assert trial.releases.due(LINES, 0) == LINES - {FIRST["own_2"]}
+    assert trial.releases.due(LINES) == set()
+    trial.led.remove("own_1")
+    trial.look()
+    assert trial.releases.due(LINES, 0) == set()

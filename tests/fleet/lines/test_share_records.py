@@ -1,0 +1,257 @@
+"""Records of a share's lines: what is asked of them, when, and that nothing is missed for good."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+from fleets import MemoryBucket
+from nats_clusters import Cluster, cluster
+from peers import require_module
+
+require_module("nats")
+
+from multidrop.fleet.errors import Unsure  # noqa: E402
+from multidrop.fleet.leases.rules import USUAL  # noqa: E402
+from multidrop.fleet.lines import share_records  # noqa: E402
+from multidrop.fleet.lines.ownership import NEEDED, owner_of, owner_value  # noqa: E402
+from multidrop.fleet.lines.share_records import ShareFollower, ShareRecords  # noqa: E402
+from multidrop.fleet.servers import (  # noqa: E402
+    buckets,
+    names,
+)
+from multidrop.fleet.servers.buckets import Bucket, Record  # noqa: E402
+from multidrop.fleet.servers.connections import paths_of  # noqa: E402
+from multidrop.fleet.servers.setup import set_up  # noqa: E402
+
+ME, OTHER, NOBODY = (owner_value(who, 1, 0) for who in (("a", 2), ("b", 1), ("", 0)))
+
+
+def is_mine(record: Record) -> bool:
+    return owner_of(record) == ("a", 2)
+
+
+class Trial:
+    """A bucket in memory, and what gateway a, in its session 2, knows of it."""
+
+    def __init__(self) -> None:
+        self.bucket = MemoryBucket()
+        made: Any = self.bucket
+        self.had: set[str] = set()
+        self.follower = ShareFollower(made, self.note, is_mine, self.had.__contains__)
+
+    def note(self, *_: object) -> None:
+        """Do what the records of a share do with each record."""
+        self.follower.look_anew()
+
+    def looked(self) -> list[str]:
+        """Look once, and return the lines that changed."""
+        return [record.key for record in asyncio.run(self.follower.look())]
+
+    def asks(self) -> bool:
+        """Say whether a look asks anything."""
+        before = self.bucket.asked
+        self.looked()
+        return self.bucket.asked > before
+
+
+def test_of_lines_that_are_free_or_ours_nothing_is_asked_again() -> None:
+    trial = Trial()
+    trial.bucket.store("mine", ME)
+    trial.bucket.store("free", NOBODY)
+    trial.bucket.store("another share's", OTHER)
+    assert not trial.asks()
+    trial.follower.want(["mine", "free", "never had"])
+    assert trial.looked() == ["free", "mine", "never had"]
+    assert trial.follower.records["never had"] == Record("never had", 0, None)
+    assert "another share's" not in trial.follower.records
+    assert not trial.asks()
+
+
+@pytest.mark.parametrize("value", [OTHER, owner_value(("a", 1), 1, 0)])
+def test_a_line_of_another_session_is_asked_for_until_it_is_not(value: Any) -> None:
+    trial = Trial()
+    trial.bucket.store("line", value)
+    trial.follower.want(["line"])
+    assert trial.looked() == ["line"]
+    assert trial.asks()
+    trial.bucket.store("line", NOBODY)
+    assert trial.looked() == ["line"]
+    assert not trial.asks()
+
+
+def test_of_a_line_that_we_have_by_other_records_nothing_is_asked() -> None:
+    trial = Trial()
+    trial.bucket.store("line", OTHER)
+    trial.follower.want(["line"])
+    trial.looked()
+    assert trial.asks()
+    trial.had.add("line")
+    trial.follower.look_anew()
+    assert not trial.asks()
+
+
+def test_a_doubted_line_is_asked_for_again_and_again_though_it_has_left_the_share(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The write that nobody answered may still be stored, when the bucket has a leader again."""
+    now = 1000.0
+    monkeypatch.setattr(share_records.time, "monotonic", lambda: now)
+    trial = Trial()
+    trial.follower.doubt(["line"])
+    assert trial.looked() == ["line"]
+    now += share_records.DOUBT_S - 1
+    trial.bucket.store("line", ME)
+    assert trial.looked() == ["line"]
+    now += 2
+    assert not trial.asks()
+
+
+def test_an_older_record_of_a_server_that_is_behind_changes_nothing() -> None:
+    trial = Trial()
+    trial.bucket.store("line", OTHER)
+    trial.follower.want(["line"])
+    trial.looked()
+    old = dict(trial.bucket.records)
+    trial.follower.take(Record("line", 9, ME))
+    trial.follower.doubt(["line"])
+    trial.bucket.records = old
+    assert trial.looked() == []
+    trial.bucket.records = {}
+    assert trial.looked() == []
+    assert is_mine(trial.follower.records["line"])
+
+
+def test_a_larger_share_is_asked_for_at_once() -> None:
+    async def main() -> None:
+        trial = Trial()
+        trial.follower.want(["line"])
+        await trial.follower.look()
+        resting = asyncio.create_task(trial.follower.rest())
+        trial.follower.want(["line", "another"])
+        for _ in range(5):  # turns of the loop, and no time
+            await asyncio.sleep(0)
+        assert resting.done()
+
+    asyncio.run(main())
+
+
+FIRST, SECOND, _ = names.owner_buckets("line")
+
+
+def followed() -> ShareRecords:
+    path: Any = None
+    return ShareRecords("a", lambda: path, USUAL, lambda: None, is_mine)
+
+
+def take(records: ShareRecords, revision: int, value: Any, *buckets: str) -> None:
+    for bucket in buckets:
+        records.owners[bucket].take(Record("line", revision, value))
+
+
+def moves_of(records: ShareRecords) -> list[tuple[str | None, str]]:
+    return [(move.before, move.after) for move in records.moves.newest(9)]
+
+
+def test_moves_are_told_with_the_master_before_once_two_records_say_so() -> None:
+    records = followed()
+    take(records, 1, owner_value(("b", 1), 1, 0, NEEDED), FIRST)
+    assert moves_of(records) == [("", "b")]
+    take(records, 2, owner_value(("a", 2), 2, 0), FIRST)
+    assert moves_of(records) == [("", "b")]
+    take(records, 3, owner_value(("a", 2), 2, 0), SECOND)
+    assert moves_of(records) == [("b", "a"), ("", "b")]
+
+
+def test_a_session_has_lines_of_which_one_record_names_it() -> None:
+    records = followed()
+    take(records, 1, OTHER, FIRST, SECOND)
+    take(records, 2, ME, FIRST)
+    assert records.owned_by("a", 2) == records.owned_by("b", 1) == {"line"}
+    take(records, 2, ME, SECOND)
+    assert records.owned_by("a", 2) == {"line"}
+    assert records.owned_by("b", 1) == set()
+
+
+def test_who_did_not_follow_a_line_does_not_say_whose_it_was() -> None:
+    """It was asked for in a cold start, or an hour ago, and was others' since then."""
+    records = followed()
+    take(records, 8, owner_value(("b", 1), 8, 0), FIRST, SECOND)
+    assert moves_of(records) == [(None, "b")]
+    take(records, 11, owner_value(("a", 2), 11, 0), FIRST, SECOND)
+    assert moves_of(records)[0] == (None, "a")
+    take(records, 12, owner_value(("", 0), 12, 0), FIRST, SECOND)  # we gave it away
+    assert moves_of(records)[0] == ("a", "")
+
+
+def test_a_line_that_is_claimed_anew_by_its_master_has_not_moved() -> None:
+    """Nobody knew whether it was given away."""
+    records = followed()
+    take(records, 1, owner_value(("a", 2), 1, 0), FIRST, SECOND)
+    take(records, 2, owner_value(("a", 2), 2, 0), FIRST, SECOND)
+    assert moves_of(records) == [("", "a")]
+    take(records, 3, owner_value(("b", 1), 3, 0), FIRST, SECOND)
+    assert moves_of(records) == [("a", "b"), ("", "a")]
+
+
+def test_of_sessions_that_have_no_line_any_more_nothing_is_kept() -> None:
+    records = followed()
+    for session in range(1, 1000):
+        take(records, session, owner_value(("b", session), session, 0), FIRST, SECOND)
+    take(records, 1000, owner_value(("b", 999), 1000, 0), FIRST, SECOND)
+    assert records.owned_by("b", 999) == {"line"}
+    assert len(records._owned) == 1
+
+
+def test_lines_that_were_read_before_a_failure_are_known(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The lines fill whole batches, and a server does not say that there are no more."""
+    monkeypatch.setattr(buckets, "BATCH", 2)
+    path: Any = None
+    records = ShareRecords("a", lambda: path, USUAL, lambda: None, is_mine)
+    bucket = MemoryBucket(names.PLANT)
+    records.plant.bucket = bucket  # type: ignore[assignment]
+    for name in ("line-1", "line-2"):
+        bucket.store(name, {"line": {"name": name}, "files": {}})
+    changes = bucket.changes
+
+    async def fail_at_the_end(after: int) -> list[Record]:
+        if after == 2:
+            raise Unsure("no answer")
+        return await changes(after)
+
+    bucket.changes = fail_at_the_end  # type: ignore[method-assign]
+    with pytest.raises(Unsure):
+        asyncio.run(records._look_at_plant())
+    assert records.lines() == ("line-1", "line-2")
+
+
+@pytest.fixture(scope="module")
+def one(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cluster]:
+    with cluster(tmp_path_factory.mktemp("nats"), 1) as running:
+        yield running
+
+
+@pytest.mark.long
+def test_servers_give_the_newest_records_of_many_lines(one: Cluster) -> None:
+    async def main() -> None:
+        path = paths_of(one.urls)[0]
+        await path.open()
+        await set_up([path])
+        bucket = Bucket("own_0", lambda: path)
+        lines = [f"line-{at}" for at in range(1200)]
+        stored, _ = await bucket.put_all([Record(line, 0, OTHER) for line in lines])
+        some = [record._replace(value=NOBODY) for record in stored[:10]]
+        again, refused = await bucket.put_all([*some, Record("line-20", 0, NOBODY)])
+        assert refused == {"line-20"}
+        follower = ShareFollower(bucket, lambda *_: follower.look_anew(), is_mine, lambda line: False)
+        follower.want([*lines[:1100], "never had"])
+        changed = await asyncio.wait_for(follower.look(), 60)
+        newest = {record.key: record for record in (*stored[:1100], *again)}
+        assert follower.records == {**newest, "never had": Record("never had", 0, None)}
+        assert len(changed) == 1101
+        assert len(await follower.look()) == 0
+        await path.close()
+
+    asyncio.run(main())

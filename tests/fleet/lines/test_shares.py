@@ -1,0 +1,73 @@
+"""Shares of a fleet's lines: made anew at once, or when no gateway comes or goes in a cold start."""
+
+from __future__ import annotations
+
+import asyncio
+from collections import Counter
+from typing import Any
+
+from fleets import Hall, HandClock, NotedMastership
+from peers import require_module
+
+require_module("nats")
+
+
+from multidrop.fleet.leases.member import SETTLE_S, Member  # noqa: E402
+from multidrop.fleet.leases.rules import RULES, SECOND  # noqa: E402
+from multidrop.fleet.lines.shares import QUIET_NS  # noqa: E402
+
+VALUE: dict[str, Any] = {"session": 1, "draining": False, "rules": RULES}
+LINES = tuple(f"line-{at}" for at in range(40))
+
+
+class Trial:
+    """Gateway a, whose session has just begun, with a clock of its own and no server."""
+
+    def __init__(self) -> None:
+        self.clock = HandClock()
+        mastership = NotedMastership(self.clock)
+        self.member = Member("a", [], Hall().add("a", mastership), mastership)
+        self.member.lease.clock = self.clock
+        self.member.lease.session = 1
+        self.member._settled_at = self.clock() + int(SETTLE_S * SECOND)
+        self.member.records._lines = LINES
+
+    def sees(self, *others: str) -> None:
+        """Look at these gateways, as it does before its session begins."""
+        self.member._see(dict.fromkeys(others, VALUE))
+
+    def shared_among(self, *others: str) -> set[str]:
+        """Step beside these gateways, and return who has lines by the balance now."""
+        asyncio.run(self.member._share_out(dict.fromkeys(others, VALUE)))
+        return set(Counter(self.member.wanted.values()))
+
+    def is_shared_with_those_who_come(self, *others: str) -> bool:
+        return self.shared_among(*others) == {"a", *others}
+
+
+def test_who_comes_back_shares_with_those_who_were_there_all_the_time() -> None:
+    trial = Trial()
+    trial.sees("b", "c")
+    trial.clock.pass_s(QUIET_NS / SECOND)
+    assert trial.is_shared_with_those_who_come("b", "c")
+
+
+def test_gateways_of_a_cold_start_are_shared_with_once_none_has_come_for_a_while() -> None:
+    """Else the first one would ask for the records of all lines, and the second for half of them."""
+    trial = Trial()
+    assert trial.shared_among("b") == set()
+    trial.clock.pass_s(QUIET_NS / SECOND - 0.01)
+    assert trial.shared_among("b") == set()
+    assert trial.shared_among("b", "c") == set()
+    trial.clock.pass_s(QUIET_NS / SECOND - 0.01)
+    assert trial.shared_among("b", "c") == set()
+    trial.clock.pass_s(0.02)
+    assert trial.is_shared_with_those_who_come("b", "c")
+
+
+def test_who_has_settled_shares_anew_at_once() -> None:
+    trial = Trial()
+    trial.clock.pass_s(SETTLE_S)
+    assert trial.is_shared_with_those_who_come("b", "c")
+    assert trial.is_shared_with_those_who_come("b")
+    assert trial.is_shared_with_those_who_come("b", "d")

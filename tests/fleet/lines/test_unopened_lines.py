@@ -1,0 +1,144 @@
+"""Lines that a gateway cannot open: when others should take them, and when it tries again."""
+
+from __future__ import annotations
+
+from fleets import HandClock
+from peers import require_module
+
+require_module("nats")
+
+from multidrop.fleet.leases.rules import SECOND  # noqa: E402
+from multidrop.fleet.lines.balance import assign, hand_over  # noqa: E402
+from multidrop.fleet.lines.unopened_lines import (  # noqa: E402
+    FIRST_WAIT_NS,
+    LAST_WAIT_NS,
+    LOST_NS,
+    MOST_BYTES,
+    OPENINGS,
+    TRIAL_NS,
+    UnopenedLines,
+)
+
+
+def failed(unopened: UnopenedLines, line: str) -> None:
+    for _ in range(OPENINGS):
+        unopened.failed(line)
+
+
+def test_a_line_is_named_after_some_failed_openings_in_a_row() -> None:
+    unopened = UnopenedLines(HandClock())
+    for _ in range(OPENINGS - 1):
+        unopened.failed("a")
+    unopened.opened("a")
+    for _ in range(OPENINGS - 1):
+        unopened.failed("a")
+    assert unopened.named() == frozenset()
+    unopened.failed("a")
+    assert unopened.named() == {"a"}
+    unopened.opened("a")
+    assert unopened.named() == frozenset()
+
+
+def test_a_polled_line_is_named_once_its_port_is_lost_for_long() -> None:
+    clock = HandClock()
+    unopened = UnopenedLines(clock)
+    unopened.lost("a")
+    clock.pass_s(LOST_NS / SECOND - 1)
+    unopened.lost("a")
+    unopened.opened("a")
+    unopened.lost("a")
+    clock.pass_s(LOST_NS / SECOND - 1)
+    unopened.lost("a")
+    assert unopened.named() == frozenset()
+    clock.pass_s(1)
+    unopened.lost("a")
+    assert unopened.named() == {"a"}
+
+
+def test_one_line_at_a_time_is_tried_again_and_ever_more_rarely() -> None:
+    clock = HandClock()
+    unopened = UnopenedLines(clock)
+    for line in "abc":
+        failed(unopened, line)
+    wait_s = FIRST_WAIT_NS / SECOND
+    for line in "abcab":
+        clock.pass_s(wait_s - 1)
+        assert unopened.named() == set("abc")
+        clock.pass_s(1)
+        assert unopened.named() == set("abc") - {line}
+        failed(unopened, line)
+        assert unopened.named() == set("abc")
+        wait_s = min(2 * wait_s, LAST_WAIT_NS / SECOND)
+
+
+def test_a_line_that_nobody_can_open_is_tried_first_and_as_often_as_before() -> None:
+    clock = HandClock()
+    unopened = UnopenedLines(clock)
+    for line in "abc":
+        failed(unopened, line)
+    unopened.hopeless = frozenset("b")
+    for _ in range(5):
+        clock.pass_s(FIRST_WAIT_NS / SECOND)
+        assert unopened.named() == {"a", "c"}
+        failed(unopened, "b")
+    unopened.hopeless = frozenset()
+    clock.pass_s(FIRST_WAIT_NS / SECOND)
+    assert unopened.named() == {"a", "b", "c"}
+
+
+def test_once_a_trial_ended_well_the_others_are_tried_without_a_wait() -> None:
+    clock = HandClock()
+    unopened = UnopenedLines(clock)
+    for line in "abc":
+        failed(unopened, line)
+    clock.pass_s(FIRST_WAIT_NS / SECOND)
+    for line, left in (("a", {"b", "c"}), ("b", {"c"}), ("c", set[str]())):
+        assert unopened.named() == left
+        unopened.opened(line)
+
+
+def test_a_line_that_does_not_come_back_ends_its_trial() -> None:
+    clock = HandClock()
+    unopened = UnopenedLines(clock)
+    failed(unopened, "a")
+    failed(unopened, "b")
+    clock.pass_s(FIRST_WAIT_NS / SECOND)
+    assert unopened.named() == {"b"}
+    clock.pass_s(max(TRIAL_NS, FIRST_WAIT_NS) / SECOND)
+    assert unopened.named() == frozenset()
+
+
+def test_no_more_are_named_than_a_lease_has_room_for() -> None:
+    unopened = UnopenedLines(HandClock())
+    for number in range(MOST_BYTES):
+        failed(unopened, f"line-{number}")
+    assert 0 < sum(len(line) + 4 for line in unopened.named()) <= MOST_BYTES
+
+
+# ---- who has them ----
+
+LINES = [f"line-{number}" for number in range(60)]
+SHARED = assign(LINES, ["a", "b", "c"])
+OF_A = {line for line, name in SHARED.items() if name == "a"}
+
+
+def test_only_named_lines_move_and_every_gateway_finds_the_same() -> None:
+    found = hand_over(SHARED, {"a": OF_A, "b": [], "c": []})
+    assert set(found.values()) == {"b", "c"}
+    assert {line for line in LINES if found[line] != SHARED[line]} == OF_A
+    assert found == hand_over(dict(reversed(SHARED.items())), {"c": [], "b": [], "a": sorted(OF_A)})
+
+
+def test_a_line_that_nobody_can_open_stays() -> None:
+    assert hand_over(SHARED, {"a": LINES, "b": LINES, "c": LINES}) == SHARED
+
+
+def test_a_line_goes_on_to_who_has_not_tried_it() -> None:
+    found = hand_over(SHARED, {"a": OF_A, "b": OF_A, "c": []})
+    assert {found[line] for line in OF_A} == {"c"}
+
+
+def test_a_gateway_that_does_not_say_what_it_cannot_open_is_given_nothing() -> None:
+    """One of another version would not take what is given away for it."""
+    assert hand_over(SHARED, {"a": OF_A}) == SHARED
+    assert set(hand_over(SHARED, {"a": OF_A, "c": []}).values()) == {"b", "c"}

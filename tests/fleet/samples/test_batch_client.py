@@ -1,0 +1,318 @@
+"""Many answers at once: what is believed of them, and what becomes of those that do not come."""
+
+from __future__ import annotations
+
+import asyncio
+import inspect
+from collections.abc import Awaitable, Callable, Iterator
+from typing import Any
+
+import pytest
+from nats_clusters import Cluster, cluster
+from peers import require_module
+from tables import table
+
+require_module("nats")
+
+from nats.aio.client import Client  # noqa: E402
+
+from multidrop.fleet.errors import Unsure  # noqa: E402
+from multidrop.fleet.samples import batch_client  # noqa: E402
+from multidrop.fleet.samples.batch_client import (  # noqa: E402
+    BatchClient,
+    DirectGet,
+    DirectMessage,
+    Request,
+    stored_message,
+)
+from multidrop.fleet.servers import direct_gets  # noqa: E402
+from multidrop.fleet.servers.buckets import Bucket, Record  # noqa: E402
+from multidrop.fleet.servers.connections import ServerPath, connect, paths_of  # noqa: E402
+from multidrop.fleet.servers.setup import set_up  # noqa: E402
+
+OWNER = {"gateway": "gw-9", "session": 1, "votes": 1, "turn": 1, "since": 0}
+SERVERS = (
+    b"Nats-Stream: KV_own_0\r\nNats-Subject: $KV.own_0.a\r\nNats-Sequence: 7\r\nNats-Last-Sequence: 0\r\n\r\n"
+)
+
+
+@pytest.fixture(scope="module")
+def one(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cluster]:
+    """Return one server with a fleet's buckets."""
+    with cluster(tmp_path_factory.mktemp("nats"), 1) as running:
+        _with_path(running, lambda path: set_up([path]))
+        yield running
+
+
+@pytest.fixture(params=["taken at once", "nats-py's own way", "another nats-py"])
+def way(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
+    """Let answers come as they do, and as they would with another nats-py; return a name of its own."""
+    if request.param == "nats-py's own way":
+        monkeypatch.delattr(BatchClient, "_process_msg")
+    elif request.param == "another nats-py":
+        process = Client._process_msg
+
+        async def with_more(self: Client, *arguments: Any) -> None:
+            await process(self, *arguments[:5])
+
+        monkeypatch.setattr(Client, "_process_msg", with_more)
+        monkeypatch.setattr(batch_client, "PROCESSED", 5)
+    return f"way-{request.param_index}"
+
+
+def test_nats_py_has_the_place_where_answers_are_taken() -> None:
+    """Answers go a way that costs more if this fails: find the new place, or name that nats-py too new."""
+    names = ["self", "sid", "subject", "reply", "data", "headers"]
+    assert list(inspect.signature(Client._process_msg).parameters) == names
+    assert inspect.iscoroutinefunction(Client._process_msg)
+
+
+def test_answers_are_taken_at_once(one: Cluster, monkeypatch: pytest.MonkeyPatch) -> None:
+    async def fail(self: BatchClient, message: object) -> None:
+        raise AssertionError("it came in nats-py's own way")
+
+    monkeypatch.setattr(BatchClient, "_take_message", fail)
+
+    async def main() -> None:
+        client = await connect(one.urls[0], {})
+        assert None not in await client.replies([Request("$JS.API.INFO", b"")], 30.0)
+        await client.close()
+
+    asyncio.run(main())
+
+
+def _with_path(running: Cluster, work: Callable[[ServerPath], Awaitable[None]]) -> None:
+    async def main() -> None:
+        path = paths_of(running.urls)[0]
+        await path.open()
+        try:
+            await asyncio.wait_for(work(path), 60)
+        finally:
+            await path.close()
+
+    asyncio.run(main())
+
+
+def _rested(path: ServerPath) -> None:
+    """Let a path have all there is to spare, as after some time at rest."""
+    for _ in range(round(direct_gets.MOST_SPARE / direct_gets.EARNED)):
+        path.spare.note(is_late=False)
+        path.spare.learn(0.01)
+
+
+@table(
+    "writers",
+    [
+        b"NATS/1.0\r\n",
+        b"NATS/1.0\r\nOf-Another: version\r\n",
+        b"NATS/1.0\r\nNats-Subject: $KV.own_0.other\r\nNats-Sequence: 9\r\n",
+        b"NATS/1.0 204 EOB\r\n",
+        b"NATS/1.0 404 No Messages\r\nNats-Sequence: none\r\n",
+    ],
+)
+def test_the_servers_headers_count_whatever_the_writer_has_sent(writers: bytes) -> None:
+    assert stored_message(writers + SERVERS, b"x") == DirectMessage("$KV.own_0.a", 7, b"x")
+
+
+@table(
+    "headers",
+    [
+        b"",
+        b"NATS/1.0 204 EOB\r\nNats-Pending: 0\r\nNats-Last-Sequence: 3\r\n\r\n",
+        b"NATS/1.0 404 Message Not Found\r\n\r\n",
+        b"NATS/1.0\r\nNats-Subject: a\r\nNats-Sequence: -1\r\n\r\n",
+    ],
+)
+def test_other_headers_are_of_no_stored_message(headers: bytes) -> None:
+    assert stored_message(headers, b"") is None
+
+
+def test_a_record_that_looks_like_the_end_hides_none_behind_it(one: Cluster, way: str) -> None:
+    async def work(path: ServerPath) -> None:
+        bucket = Bucket("own_0", lambda: path)
+        await bucket.put(f"{way}-a", OWNER, 0)
+        client = await connect(one.urls[0], {})
+        headers = b"NATS/1.0 204 EOB\r\nNats-Subject: $KV.own_0.x\r\nNats-Sequence: 1\r\n\r\n"
+        await client._send_command(
+            b"HPUB $KV.own_0.%s-b %d %d\r\n%s\r\n" % (way.encode(), len(headers), len(headers), headers)
+        )
+        await client.flush()
+        await client.close()
+        while f"{way}-b" not in [record.key for record in await bucket.changes(0)]:
+            await asyncio.sleep(0.05)  # nothing tells that it is stored
+        await bucket.put(f"{way}-c", OWNER, 0)
+        found = await bucket.changes(0)
+        keys = [record.key for record in found if record.key.startswith(way)]
+        assert keys == [f"{way}-a", f"{way}-b", f"{way}-c"]
+
+    _with_path(one, work)
+
+
+def test_each_of_many_records_is_replaced_at_its_own_revision_or_not(one: Cluster, way: str) -> None:
+    async def work(path: ServerPath) -> None:
+        bucket = Bucket("own_1", lambda: path)
+        a, b, c = f"{way}-a", f"{way}-b", f"{way}-c"
+        known = await bucket.put(b, OWNER, 0)
+        value = {**OWNER, "session": 2}
+        wanted = [Record(a, 0, value), Record(b, known + 5, value), Record(c, 0, value)]
+        stored, refused = await bucket.put_all(wanted)
+        assert [record.key for record in stored] == [a, c]
+        assert refused == {b}
+        found = {record.key: record for record in await bucket.changes(0)}
+        assert [found[a], found[c]] == stored
+        assert found[b] == Record(b, known, OWNER)
+        again = await bucket.put_all([record._replace(value=OWNER) for record in stored])
+        assert [record.key for record in again.stored] == [a, c]
+
+    _with_path(one, work)
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("way")
+def test_a_request_without_an_answer_is_told_from_those_that_have_one(one: Cluster) -> None:
+    async def main() -> None:
+        client = await connect(one.urls[0], {})
+        deaf = await client.subscribe("deaf")
+        mute = Request("deaf", b"")
+        nobody = Request("nobody.there", b"")
+        info = Request("$JS.API.INFO", b"")
+        found = await client.replies([mute, nobody, info], 0.2)
+        assert found[0] is None
+        assert found[1] == b""  # the server says so
+        assert found[2] is not None
+        assert found[2].startswith(b"{")
+        with pytest.raises(TimeoutError, match=r"nothing came for 0.2 s"):
+            await client.batch(mute, DirectGet(), 0.2)
+        with pytest.raises(OSError, match="it ended with 503"):
+            await client.batch(nobody, DirectGet(), 5.0)
+        assert client._takers == {}
+        await deaf.unsubscribe()
+        await client.close()
+
+    asyncio.run(main())
+
+
+@pytest.mark.parametrize(("deaf_to", "is_told"), [(0, True), (1, True), (4, True), (5, False)])
+def test_what_a_server_that_is_cut_off_got_is_asked_again(
+    one: Cluster, monkeypatch: pytest.MonkeyPatch, deaf_to: int, is_told: bool
+) -> None:
+    monkeypatch.setattr(direct_gets, "AGAIN_S", (0.1,) * 4 + (30.0 if is_told else 0.1,))
+
+    async def work(path: ServerPath) -> None:
+        path.others = []
+        _rested(path)
+        other = await connect(one.urls[0], {})
+        asked: list[str] = []
+
+        async def answer(message: Any) -> None:
+            asked.append(message.reply)
+            if len(asked) > deaf_to:
+                status = b"NATS/1.0 404 No Messages\r\n\r\n"
+                place = message.reply.encode()
+                await other._send_command(b"HPUB %s %d %d\r\n%s\r\n" % (place, *[len(status)] * 2, status))
+                await other.flush()
+
+        await other.subscribe("moody", cb=answer)
+        await other.flush()  # this ping may leave before the subscription, the next one does not
+        await other.flush()
+        if is_told:
+            assert await path.collect("moody", b"") == []
+        else:
+            with pytest.raises(Unsure, match="nothing came to moody"):
+                await path.collect("moody", b"")
+        assert len(asked) > deaf_to or not is_told
+        await other.close()
+
+    _with_path(one, work)
+
+
+def test_a_path_whose_server_is_cut_off_has_its_questions_asked_by_the_others(one: Cluster) -> None:
+    async def main() -> None:
+        paths = paths_of(one.urls)
+        await asyncio.gather(*(path.open() for path in paths))
+        asked: list[Request] = []
+
+        async def swallow(request: Request, get: DirectGet, silence_s: float) -> None:
+            asked.append(request)
+            await asyncio.Event().wait()
+
+        _rested(paths[0])
+        deaf = paths[0]._client
+        assert deaf
+        deaf.batch = swallow  # type: ignore[method-assign]
+        bucket = Bucket("plant", lambda: paths[0])
+        assert await asyncio.wait_for(bucket.changes(0), 60) == []
+        assert asked
+        await asyncio.gather(*(path.close() for path in paths))
+
+    asyncio.run(main())
+
+
+@pytest.mark.usefixtures("way")
+def test_an_answer_that_comes_too_late_is_none_to_another_request(one: Cluster) -> None:
+    async def main() -> None:
+        client, other = await connect(one.urls[0], {}), await connect(one.urls[0], {})
+        asked: asyncio.Queue[str] = asyncio.Queue()
+
+        async def keep(message: object) -> None:
+            asked.put_nowait(message.reply)  # type: ignore[attr-defined]
+
+        await other.subscribe("slow", cb=keep)
+        await other.flush()  # this ping may leave before the subscription, the next one does not
+        await other.flush()
+        assert await client.replies([Request("slow", b"first")], 0.2) == [None]
+        second = asyncio.create_task(client.replies([Request("slow", b"second")], 30.0))
+        first_inbox, second_inbox = (
+            await asyncio.wait_for(asked.get(), 30),
+            await asyncio.wait_for(asked.get(), 30),
+        )
+        await other.publish(first_inbox, b"late")
+        await other.publish(second_inbox, b"right")
+        assert await second == [b"right"]
+        for one_of in (client, other):
+            await one_of.close()
+
+    asyncio.run(main())
+
+
+def test_a_pong_that_comes_too_late_ends_no_reading(one: Cluster) -> None:
+    async def main() -> None:
+        client = await connect(one.urls[0], {})
+        given_up = asyncio.get_running_loop().create_future()
+        given_up.cancel()  # as a flush leaves it that timed out
+        await client._send_ping(given_up)
+        await client.flush(30)
+        assert client.is_reading
+        assert None not in await client.replies([Request("$JS.API.INFO", b"")], 30.0)
+        await client.close()
+
+    asyncio.run(main())
+
+
+def test_a_connection_that_is_not_read_any_more_is_left_for_a_new_one(one: Cluster) -> None:
+    async def work(path: ServerPath) -> None:
+        former = path._client
+        assert former
+        assert former._reading_task
+        former._reading_task.cancel()
+        await asyncio.wait([former._reading_task])
+        assert former.is_connected
+        assert not path.is_open
+        await path.look_after()
+        assert path.is_open
+        assert path._client is not former
+
+    _with_path(one, work)
+
+
+@pytest.mark.usefixtures("way")
+def test_other_messages_go_where_they_went(one: Cluster) -> None:
+    async def main() -> None:
+        client = await connect(one.urls[0], {})
+        assert isinstance(client, BatchClient)
+        await client.replies([Request("$JS.API.INFO", b"")], 5.0)
+        answer = await client.request("$JS.API.INFO", b"", 5.0, headers={"a": "b"})
+        assert answer.data.startswith(b"{")
+        await client.close()
+
+    asyncio.run(main())

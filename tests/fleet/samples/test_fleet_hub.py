@@ -1,0 +1,518 @@
+"""The hub: all rows of the stream in a sink, once, with their place; alarms for what is amiss."""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+import logging
+import os
+from collections.abc import Iterator, Mapping
+from contextlib import closing, suppress
+from pathlib import Path
+from typing import Any
+
+import pytest
+from nats.aio.client import Client
+from nats_clusters import Cluster, cluster
+from peers import require_module
+from postgres_clusters import Postgres, postgres
+from sample_streams import client_of
+from spooled import NOON, STEP, exchanges_in, numbered, rows_of
+
+from multidrop import History
+from multidrop.fleet.samples import hub as hub_module
+from multidrop.fleet.samples import samples_stream
+from multidrop.fleet.samples.batch_client import BatchClient
+from multidrop.fleet.samples.hub import (
+    Commit,
+    HubState,
+    KeptPlace,
+    NotThisHubs,
+    SampleHub,
+    SampleSink,
+    SinkError,
+)
+from multidrop.fleet.samples.message import RowBuffer, unpack
+from multidrop.fleet.samples.parquet_sink import ParquetSink
+from multidrop.fleet.samples.postgres_sink import PostgresSink
+from multidrop.fleet.samples.sample_reader import StreamMessage
+from multidrop.fleet.samples.samples_stream import StreamError, publish
+
+LOG = "00112233aabbccdd"
+PATIENCE_S = 60.0
+
+
+@pytest.fixture(scope="module")
+def running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cluster]:
+    with cluster(tmp_path_factory.mktemp("nats"), 1) as one:
+        yield one
+
+
+@pytest.fixture(scope="module")
+def database() -> Iterator[Postgres]:
+    with postgres() as one:
+        yield one
+
+
+@pytest.fixture
+def empty(database: Postgres) -> Postgres:
+    database.ask("drop schema if exists multidrop cascade")
+    return database
+
+
+@pytest.fixture(autouse=True)
+def soon(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(hub_module, "AGAIN_S", 0.02)
+    monkeypatch.setattr(hub_module, "LOOKING_S", 0.01)
+
+
+def message(first: int, count: int = 5) -> bytes:
+    buffer = RowBuffer()
+    assert buffer.add(numbered(first, count).columns())
+    (one,) = buffer.messages()
+    return one.data
+
+
+async def say(
+    client: Client, sequence: int, data: bytes, source: str = f"gateway-1.{LOG}", lost: int = 0
+) -> None:
+    headers = {samples_stream.SEQUENCE: str(sequence), samples_stream.LOST: str(lost)}
+    assert await publish(client, f"samples.{source}", data, headers)
+
+
+class Memory:
+    """A sink that keeps its commits, and fails when told, before or after it kept one."""
+
+    def __init__(self, fates: str = "") -> None:
+        self.commits: list[Commit] = []
+        self.fates = iter(fates)
+        self.begun = 0
+
+    def begin(self, stream: str) -> KeptPlace:
+        self.begun += 1
+        return (
+            KeptPlace(self.commits[-1].last, self.commits[-1].sources) if self.commits else KeptPlace(0, {})
+        )
+
+    def write(self, commit: Commit) -> None:
+        fate = next(self.fates, "ok")
+        if fate == "b":
+            raise SinkError("lost before")
+        assert commit.first == self.begin("").place + 1
+        self.commits.append(commit)
+        if fate == "a":
+            raise SinkError("lost afterwards")
+
+    def close(self) -> None:
+        pass
+
+    def rows(self) -> list[tuple[Any, ...]]:
+        return [row for commit in self.commits for table in commit.tables for row in rows_of(table)]
+
+
+async def read_all(client: Client, sink: SampleSink, place: int, every: float = 0.02) -> HubState:
+    """Run a hub until it has kept so much."""
+    hub = SampleHub(client, sink, every=every)
+    task = asyncio.create_task(hub.run())
+    try:
+        async with asyncio.timeout(PATIENCE_S):
+            while hub.state().place < place and not task.done():
+                await asyncio.sleep(0.005)
+    finally:
+        task.cancel()
+        with suppress(asyncio.CancelledError):
+            await task
+    return hub.state()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("is_behind_for", [3, 10_000], ids=["looks", "ever"])
+def test_a_server_that_is_behind_ends_no_reading_of_all(
+    running: Cluster, monkeypatch: pytest.MonkeyPatch, is_behind_for: int
+) -> None:
+    looks = itertools.count()
+    read_after = hub_module.read_after
+
+    async def late(client: BatchClient, place: int, *most: int) -> list[StreamMessage]:
+        return [] if next(looks) < is_behind_for else await read_after(client, place, *most)
+
+    monkeypatch.setattr(hub_module, "read_after", late)
+    monkeypatch.setattr(hub_module, "BEHIND_S", 0.2 if is_behind_for > 3 else PATIENCE_S)
+
+    async def live() -> list[tuple[Any, ...]]:
+        async with client_of(running) as client:
+            await say(client, 1, message(5))
+            sink = Memory()
+            await SampleHub(client, sink).run(once=True)
+            return sink.rows()
+
+    if is_behind_for > 3:
+        with pytest.raises(StreamError, match=r"messages 1 to 1 of the stream are not given now"):
+            asyncio.run(live())
+    else:
+        assert exchanges_in(asyncio.run(live())) == list(range(5, 10))
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("fates", ["", "bababb", "aaaa"])
+def test_after_any_failure_each_row_is_kept_once(running: Cluster, fates: str) -> None:
+    async def live() -> None:
+        async with client_of(running) as client:
+            for number in range(1, 31):
+                await say(client, number, message(number * 5))
+            sink = Memory(fates)
+            state = await read_all(client, sink, 30)
+        assert exchanges_in(sorted(sink.rows())) == list(range(5, 155))
+        assert state[:5] == (30, 0, 30 * 50 if not fates else state.rows, 0, 0)
+        assert sink.commits[-1].sources == {f"gateway-1.{LOG}": 30}
+
+    asyncio.run(live())
+
+
+@pytest.mark.slow
+def test_messages_of_several_answers(running: Cluster, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(hub_module, "MOST_READ", 3)
+
+    async def live() -> None:
+        async with client_of(running) as client:
+            for number in range(1, 12):
+                await say(client, number, message(number * 5))
+            sink = Memory()
+            hub = SampleHub(client, sink)
+            await hub.run(once=True)
+            assert hub.state().place == 11
+            assert exchanges_in(sorted(sink.rows())) == list(range(5, 60))
+
+    asyncio.run(live())
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("is_good", [True, False], ids=["rows", "garbage"])
+def test_a_commit_ends_where_it_has_much_in_memory(
+    running: Cluster, monkeypatch: pytest.MonkeyPatch, is_good: bool
+) -> None:
+    """Few rows may have long names, and what is left out was read too."""
+    monkeypatch.setattr(hub_module, "MOST_READ", 1)
+    monkeypatch.setattr(hub_module, "MOST_BYTES", 1000)
+    sink = Memory()
+
+    async def main() -> None:
+        async with client_of(running) as client:
+            for sequence in (1, 2, 3):
+                await say(client, sequence, message(sequence) if is_good else b"?" * 1000)
+            await read_all(client, sink, 3, every=3600.0)
+
+    asyncio.run(main())
+    assert [commit.last for commit in sink.commits] == [1, 2, 3]
+    assert len(sink.rows()) == (150 if is_good else 0)
+
+
+@pytest.mark.slow
+def test_what_is_missing_or_doubled_is_told_and_counted(
+    running: Cluster, caplog: pytest.LogCaptureFixture
+) -> None:
+    async def live() -> HubState:
+        async with client_of(running) as client:
+            for sequence, source in ((1, "a.x"), (3, "b.x"), (2, "a.x"), (5, "a.x"), (5, "a.x"), (4, "a.x")):
+                await say(client, sequence, message(sequence * 5), source)
+            await say(client, 6, b"no message", "a.x")
+            await say(client, 7, message(0), "a.x", lost=70)
+            await say(client, 8, message(5), "a.x", lost=70)
+            assert await publish(client, "samples.c.x", message(0), {})
+            sink = Memory()
+            state = await read_all(client, sink, 10)
+            assert sum(commit.rows for commit in sink.commits) == 6 * 50
+            assert sink.commits[-1].sources == {"a.x": 8, "b.x": 3}
+            return state
+
+    state = asyncio.run(live())
+    assert (state.alarms, state.missing, state.doubled) == (7, 4, 2)
+    told = [record.getMessage() for record in caplog.records if record.levelno == logging.ERROR]
+    assert told[:4] == [
+        "b.x: messages 1 to 2 are missing",
+        "a.x: messages 3 to 4 are missing",
+        "a.x: message 5 came again behind 5 and is left out",
+        "a.x: message 4 came again behind 5 and is left out",
+    ]
+    assert told[4].startswith("a.x: message 6 is left out: 10 bytes are no message of samples")
+    assert told[5:] == [
+        "a.x: its spool has lost 70 rows since it began",
+        "message 10 of the stream, by c.x, has no number and is left out",
+    ]
+
+
+def test_messages_that_the_stream_removed_are_told(
+    running: Cluster, caplog: pytest.LogCaptureFixture
+) -> None:
+    async def live() -> None:
+        async with client_of(running) as client:
+            for number in range(1, 6):
+                await say(client, number, message(number * 5))
+            await samples_stream._ask(client, "STREAM.PURGE.samples", {"seq": 4})
+            state = await read_all(client, Memory(), 5)
+            assert (state.alarms, state.missing) == (2, 3)
+
+    asyncio.run(live())
+    assert "messages 1 to 3 of the stream were removed before they were read" in caplog.text
+    assert f"gateway-1.{LOG}: messages 1 to 3 are missing" in caplog.text
+
+
+def test_a_stream_that_lost_its_end_is_refused(running: Cluster) -> None:
+    async def live() -> None:
+        async with client_of(running) as client:
+            await say(client, 1, message(0))
+            sink = Memory()
+            sink.commits.append(Commit("", 1, 5, {}, [], 0))
+            with pytest.raises(
+                NotThisHubs, match="the stream ends at message 1, and 5 are kept: it lost some"
+            ):
+                await SampleHub(client, sink).run()
+
+    asyncio.run(live())
+
+
+# ---- Parquet ----
+
+
+def kept_in_files(client: Client, folder: Path, place: int) -> Any:
+    async def live() -> HubState:
+        sink = ParquetSink(folder)
+        try:
+            return await read_all(client, sink, place)
+        finally:
+            sink.close()
+
+    return live()
+
+
+@pytest.mark.long
+def test_files_are_a_history_and_read_by_duckdb(running: Cluster, tmp_path: Path) -> None:
+    duckdb = require_module("duckdb")
+
+    async def live() -> None:
+        async with client_of(running) as client:
+            for number in range(1, 6):
+                await say(client, number, message(number * 5))
+            assert (await kept_in_files(client, tmp_path, 5)).rows == 250
+            for number in range(6, 9):
+                await say(client, number, message(number * 5))
+            assert (await kept_in_files(client, tmp_path, 8)).rows == 150
+
+    asyncio.run(live())
+    files = sorted((tmp_path / "rows").glob("*.parquet"))
+    ranges = [tuple(map(int, file.name.split(".")[0].split("-"))) for file in files]
+    assert ranges[0][0] == 1
+    assert ranges[-1][1] == 8
+    assert all(one[1] + 1 == other[0] for one, other in itertools.pairwise(ranges))
+    wanted = sorted(row[:7] for number in range(1, 9) for row in rows_of(unpack(message(number * 5))))
+    with History(tmp_path) as history:
+        found = [tuple(row) for rows in history.read() for row in rows]
+        assert sorted(found, key=lambda row: (row[0], row[4])) == sorted(
+            wanted, key=lambda row: (row[0], row[4])
+        )
+        buckets = history.buckets("pump-2.value_3", NOON, NOON + 60 * STEP, points=1)["pump-2.value_3"]
+    of = [row for row in wanted if row[3:5] == ("pump-2", "value_3")]
+    values = [row[5] for row in of if row[5] is not None]
+    assert (sum(buckets.n), sum(buckets.missed)) == (len(values), len(of) - len(values))
+    assert max(one for one in buckets.most if one is not None) == max(values)
+    ask = f"select count(*), count(value), sum(value) from '{tmp_path}/rows/*.parquet' where drive = 'pump-2'"
+    (told,) = duckdb.sql(ask).fetchall()
+    one_drive = [row[5] for row in wanted if row[3] == "pump-2"]
+    assert told == (len(one_drive), sum(v is not None for v in one_drive), sum(filter(None, one_drive)))
+
+
+def test_a_file_that_was_begun_is_no_commit(running: Cluster, tmp_path: Path) -> None:
+    """A killed hub leaves one: the rows are read again."""
+
+    async def live() -> None:
+        async with client_of(running) as client:
+            await say(client, 1, message(5))
+            await kept_in_files(client, tmp_path, 1)
+            part = tmp_path / "rows" / ".00000002-00000003.20261121T120000Z-20261121T120001Z.parquet.writing"
+            part.write_bytes(b"PAR1")
+            await say(client, 2, message(10))
+            state = await kept_in_files(client, tmp_path, 2)
+            assert (state.rows, state.alarms) == (50, 0)
+            assert not part.exists()
+
+    asyncio.run(live())
+
+
+def commit_of(
+    stream: str = "then", first: int = 1, last: int = 1, sources: Mapping[str, int] | None = None
+) -> Commit:
+    table = unpack(message(5))
+    return Commit(stream, first, last, sources or {"a.x": last}, [table], len(table))
+
+
+def test_a_commit_has_its_name_once_it_is_on_the_disk(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The order of calls to the system is what a power cut would show."""
+    calls: list[str] = []
+    really_synced, really_renamed = os.fsync, Path.rename
+
+    def fsync(file: int) -> None:
+        calls.append(f"fsync {Path(f'/proc/self/fd/{file}').readlink().name[:9]}")
+        really_synced(file)
+
+    def rename(path: Path, other: Path) -> Path:
+        calls.append(f"rename {path.name[:9]}")
+        return really_renamed(path, other)
+
+    with closing(ParquetSink(tmp_path)) as sink:
+        sink.begin("then")
+        monkeypatch.setattr(os, "fsync", fsync)
+        monkeypatch.setattr(Path, "rename", rename)
+        sink.write(commit_of())
+    assert calls == ["fsync .00000001", "rename .00000001", "fsync rows"]
+
+
+def test_a_folder_of_another_stream_or_program_is_refused(tmp_path: Path) -> None:
+    sink = ParquetSink(tmp_path)
+    assert sink.begin("then") == KeptPlace(0, {})
+    sink.write(commit_of())
+    assert sink.begin("then") == KeptPlace(1, {"a.x": 1})
+    with pytest.raises(
+        NotThisHubs, match="of a stream that was made at then, and this one was made at now: name"
+    ):
+        sink.begin("now")
+    with pytest.raises(NotThisHubs, match=f"another hub writes into {tmp_path}"):
+        ParquetSink(tmp_path)
+    sink.close()
+    (tmp_path / "rows.00000001.arrows").write_bytes(b"")
+    with pytest.raises(NotThisHubs, match=r"is no folder of a hub: it holds 'rows.00000001.arrows'"):
+        ParquetSink(tmp_path)
+
+
+def test_a_folder_that_cannot_be_written(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(SinkError, match="cannot be written: Not a directory"):
+        ParquetSink(tmp_path / "file")
+
+
+# ---- PostgreSQL ----
+
+SAMPLES = """select time_ns, uncertainty_us, drive, register, value, status,
+extract(epoch from time) * 1000000 from multidrop.samples order by time_ns, drive, register"""
+
+
+@pytest.mark.long
+def test_rows_come_back_from_postgresql(running: Cluster, empty: Postgres) -> None:
+    async def live() -> None:
+        async with client_of(running) as client:
+            for number in range(1, 6):
+                await say(client, number, message(number * 5))
+            sink = PostgresSink(empty.where)
+            state = await read_all(client, sink, 5)
+            assert (state.rows, state.alarms) == (250, 0)
+            sink.close()
+
+    asyncio.run(live())
+    wanted = sorted(row for number in range(1, 6) for row in rows_of(unpack(message(number * 5))))
+    told = [
+        (row[0], row[2] and row[2] // 1000, *row[3:7], row[0] // 1000)
+        for row in sorted(wanted, key=lambda row: (row[0], row[3], row[4]))
+    ]
+    assert empty.ask(SAMPLES) == told
+    assert empty.ask("select place, sources from multidrop.hub") == [(5, {f"gateway-1.{LOG}": 5})]
+    assert empty.ask("select count(*) from multidrop.exchanges") == [(25,)]
+
+
+@pytest.mark.long
+def test_values_that_are_missing_in_part(empty: Postgres) -> None:
+    sink = PostgresSink(empty.where)
+    sink.begin("then")
+    table = unpack(message(0, 1))
+    import pyarrow as pa
+
+    status = pa.DictionaryArray.from_arrays(
+        pa.array([0] * 9 + [1], pa.int32()), pa.array(["ok", "no valid value"])
+    )
+    values = pa.array([*map(float, range(9)), None])
+    for name, column in (("value", values), ("status", status)):
+        at = table.schema.get_field_index(name)
+        table = table.set_column(at, table.schema.field(at), column)
+    sink.write(Commit("then", 1, 1, {}, [table], 10))
+    sink.close()
+    found = empty.ask("select register, value, status from multidrop.samples")
+    assert found[:9] == [(f"value_{at + 1}", float(at), "ok") for at in range(9)]
+    assert found[9] == ("value_10", None, "no valid value")
+
+
+OF_AN_OLDER_HUB = """
+create schema multidrop;
+create table multidrop.register_sets (id serial primary key, names text[] unique not null);
+insert into multidrop.register_sets (names)
+    values (array(select 'value_' || n from generate_series(1, 10) n));
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("before", ["", OF_AN_OLDER_HUB])
+def test_samples_have_their_units(empty: Postgres, before: str) -> None:
+    import pyarrow as pa
+
+    empty.ask(f"{before} select 1")
+    sink = PostgresSink(empty.where)
+    sink.begin("then")
+    for number, units in enumerate((None, "V", "A"), 1):
+        table = unpack(message(5 * number, 1))
+        at = table.schema.get_field_index("unit")
+        texts = pa.array([units, *[None] * 9], pa.utf8()).dictionary_encode()
+        table = table.set_column(at, table.schema.field(at), texts)
+        sink.write(Commit("then", number, number, {}, [table], 10))
+    sink.close()
+    of_one = "select unit from multidrop.samples where register = 'value_1' order by time"
+    assert empty.ask(of_one) == [(None,), ("V",), ("A",)]
+    assert empty.ask("select count(*), count(unit) from multidrop.samples") == [(30, 2)]
+    assert empty.ask("select count(*) from multidrop.register_sets") == [(3,)]
+
+
+@pytest.mark.slow
+def test_a_second_hub_of_one_database_waits_for_the_end_of_the_first(empty: Postgres) -> None:
+    one, other = PostgresSink(empty.where), PostgresSink(empty.where)
+    assert one.begin("then") == KeptPlace(0, {})
+    with pytest.raises(SinkError, match="another hub writes into this database; this one waits for its end"):
+        other.begin("then")
+    one.write(commit_of())
+    assert one.begin("then") == KeptPlace(1, {"a.x": 1})  # as after a failure
+    one.close()
+    assert other.begin("then") == KeptPlace(1, {"a.x": 1})
+    with pytest.raises(
+        NotThisHubs, match="made at then, and this one was made at now: name another database"
+    ):
+        other.begin("now")
+    other.close()
+
+
+@pytest.mark.slow
+def test_rows_behind_a_place_that_another_hub_has_moved_are_refused(empty: Postgres) -> None:
+    """Behind a pooler several may have the same lock."""
+    sink = PostgresSink(empty.where)
+    sink.begin("then")
+    empty.ask("update multidrop.hub set place = 7 returning place")
+    for first in (1, 7, 9):  # behind it, and where messages would be passed over
+        with pytest.raises(SinkError, match="another hub writes into this database: end one of them"):
+            sink.write(commit_of(first=first, last=first))
+    sink.close()
+    assert empty.ask("select count(*) from multidrop.exchanges") == [(0,)]
+
+
+@pytest.mark.slow
+def test_no_database(empty: Postgres) -> None:
+    sink = PostgresSink(f"{empty.where} connect_timeout=2".replace(f"port={empty.port}", "port=1"))
+    with pytest.raises(SinkError, match=r"PostgreSQL: .*Connection refused"):
+        sink.begin("then")
+    with pytest.raises(SinkError, match=r'PostgreSQL: .*database "nope" does not exist'):
+        PostgresSink(empty.where.replace("dbname=postgres", "dbname=nope")).begin("then")
+
+
+@pytest.mark.long
+def test_rights_that_do_not_suffice(empty: Postgres) -> None:
+    empty.ask("drop role if exists reader; create role reader login")
+    sink = PostgresSink(empty.where.replace("user=multidrop", "user=reader"))
+    with pytest.raises(SinkError, match="PostgreSQL: permission denied for database postgres"):
+        sink.begin("then")
+    sink.close()
+    empty.ask("drop role reader")

@@ -1,0 +1,372 @@
+"""The forwarder against real servers: in order, each message once, whatever is lost on the way."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import random
+import re
+import socket
+from collections.abc import AsyncIterator, Iterator
+from contextlib import asynccontextmanager, suppress
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from nats.aio.client import Client
+from nats_clusters import Cluster, cluster, free_ports, old_server_program
+from sample_streams import client_of
+from spooled import exchanges_in, numbered, rows_of
+
+from multidrop.fleet.samples import forwarder as forwarder_module
+from multidrop.fleet.samples import samples_stream
+from multidrop.fleet.samples.forwarder import Forwarder
+from multidrop.fleet.samples.message import MOST_BYTES, unpack
+from multidrop.fleet.samples.sample_reader import StreamMessage, read_after
+from multidrop.fleet.samples.samples_stream import (
+    StreamError,
+    about,
+    connect,
+    create_stream,
+    digest_of,
+    last_of,
+    publish,
+    subject_of,
+)
+from multidrop.fleet.samples.spool import Spool
+
+PATIENCE_S = 30.0
+
+
+@pytest.fixture(scope="module")
+def running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cluster]:
+    with cluster(tmp_path_factory.mktemp("nats"), 1) as one:
+        yield one
+
+
+@pytest.fixture(autouse=True)
+def soon(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(forwarder_module, "AGAIN_S", 0.02)
+
+
+@asynccontextmanager
+async def forwarding(spool: Spool, client: Any) -> AsyncIterator[Forwarder]:
+    forwarder = Forwarder(spool, client)
+    task = asyncio.create_task(forwarder.run())
+    try:
+        yield forwarder
+    finally:
+        task.cancel()
+        with suppress(asyncio.CancelledError):
+            await task
+
+
+async def until(is_so: Any) -> None:
+    async with asyncio.timeout(PATIENCE_S):
+        while not is_so():
+            await asyncio.sleep(0.005)
+
+
+async def stored(client: Client) -> list[StreamMessage]:
+    """Return all messages of the stream."""
+    found: list[StreamMessage] = []
+    while more := await read_after(client, found[-1].place if found else 0, 3, 1 << 20):
+        found += more
+    return found
+
+
+def filled(folder: Path, messages: int) -> Spool:
+    spool = Spool(folder, "gateway-1")
+    for number in range(messages):
+        spool.append(numbered(number * 5, 5))
+        assert spool.sync(PATIENCE_S)
+    return spool
+
+
+def test_messages_are_in_the_stream_in_order(running: Cluster, tmp_path: Path) -> None:
+    async def live() -> None:
+        spool = filled(tmp_path / "spool", 7)
+        async with client_of(running) as client, forwarding(spool, client) as forwarder:
+            await until(lambda: forwarder.state().last == 7)
+            spool.append(numbered(35, 5))
+            assert await asyncio.to_thread(spool.sync, PATIENCE_S)
+            await until(lambda: forwarder.state().last == 8)
+            assert forwarder.state() == (8, 8, None)
+            assert spool.state().acknowledged == 8
+            found = await stored(client)
+        assert [(one.gateway, one.log, one.sequence, one.lost) for one in found] == [
+            ("gateway-1", spool.log, number, 0) for number in range(1, 9)
+        ]
+        rows = [row for one in found for row in rows_of(unpack(one.data))]
+        assert exchanges_in(rows) == list(range(40))
+        spool.close()
+
+    asyncio.run(live())
+
+
+def test_a_restarted_gateway_goes_on_behind_what_the_stream_has(running: Cluster, tmp_path: Path) -> None:
+    async def live() -> None:
+        async with client_of(running) as client:
+            for run in range(3):
+                spool = Spool(tmp_path / "spool", "gateway-1")
+                spool.append(numbered(run * 10, 10))
+                assert await asyncio.to_thread(spool.sync, PATIENCE_S)
+                async with forwarding(spool, client) as forwarder:
+                    await until(lambda forwarder=forwarder, run=run: forwarder.state().last == run + 1)
+                    assert forwarder.state().sent == 1
+                spool.close()
+            assert [one.sequence for one in await stored(client)] == [1, 2, 3]
+
+    asyncio.run(live())
+
+
+class Lossy:
+    """A client whose answers to messages are lost, before or after the stream has them."""
+
+    def __init__(self, client: Client, fates: str) -> None:
+        self._client, self._fates = client, iter(fates)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._client, name)
+
+    async def request(self, subject: str, data: bytes, **details: Any) -> Any:
+        fate = next(self._fates, "ok") if not subject.startswith("$JS") else "ok"
+        if fate == "b":  # lost before it was there
+            raise TimeoutError
+        if fate == "l":  # late: it arrives when it was said again
+            asyncio.get_running_loop().call_later(0.05, self._late, subject, data, details)
+            raise TimeoutError
+        answer = await self._client.request(subject, data, **details)
+        if fate == "a":  # the answer is lost
+            raise TimeoutError
+        return answer
+
+    def _late(self, subject: str, data: bytes, details: Any) -> None:
+        self.task = asyncio.create_task(self._client.publish(subject, data, headers=details["headers"]))
+
+
+@pytest.mark.parametrize("fates", ["aaaaaaa", "bbabab", "ababaaabb", "llaboabl", "alolalolb"])
+def test_after_any_doubt_each_message_is_there_once(running: Cluster, tmp_path: Path, fates: str) -> None:
+    async def live() -> None:
+        spool = filled(tmp_path / "spool", 6)
+        async with client_of(running) as client, forwarding(spool, Lossy(client, fates)) as forwarder:
+            await until(lambda: forwarder.state().last == 6)
+            await asyncio.sleep(0.1)  # for late ones to be refused
+            assert [one.sequence for one in await stored(client)] == [1, 2, 3, 4, 5, 6]
+        spool.close()
+
+    asyncio.run(live())
+
+
+def test_answers_of_servers_among_a_logs_messages_are_passed_over(running: Cluster, tmp_path: Path) -> None:
+    """Whoever asks a server anything may have its answer sent there: nothing is sent again, and nothing kept
+    back."""
+
+    async def live() -> None:
+        spool = filled(tmp_path / "spool", 2)
+        subject = subject_of("gateway-1", spool.log)
+        answers = [{}, {"Nats-Stream": "KV_own_0", samples_stream.SEQUENCE: "99"}]
+        async with client_of(running) as client, forwarding(spool, client) as forwarder:
+            await until(lambda: forwarder.state().last == 2)
+            for number, headers in enumerate(answers, 3):
+                assert await publish(client, subject, b"{}", headers)
+                spool.append(numbered(number * 5, 5))
+                assert await asyncio.to_thread(spool.sync, PATIENCE_S)
+                await until(lambda number=number: forwarder.state().last == number)
+            assert (forwarder.state().sent, spool.state().acknowledged) == (4, 4)
+            sequences = [one.sequence for one in await stored(client) if one.data != b"{}"]
+            assert sequences == [1, 2, 3, 4]
+        spool.close()
+
+    asyncio.run(live())
+
+
+class Refusing:
+    """A client to whose first messages the stream says that it has no room, as full servers do."""
+
+    def __init__(self, client: Client, times: int) -> None:
+        self._client, self.left = client, times
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._client, name)
+
+    async def request(self, subject: str, data: bytes, **details: Any) -> Any:
+        if self.left and not subject.startswith("$JS"):
+            self.left -= 1
+            return SimpleNamespace(data=b'{"error":{"err_code":10023,"description":"no room"}}')
+        return await self._client.request(subject, data, **details)
+
+
+def test_a_stream_that_refuses_is_told_of_once_until_it_takes_a_message(
+    running: Cluster, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    async def live() -> None:
+        spool = filled(tmp_path / "spool", 2)
+        async with client_of(running) as client, forwarding(spool, Refusing(client, 5)) as forwarder:
+            await until(lambda: forwarder.state().last == 2)
+            await until(lambda: forwarder.state().trouble is None)
+        spool.close()
+
+    asyncio.run(live())
+    assert [record.getMessage() for record in caplog.records] == [
+        "samples are not forwarded: the stream 'samples' refuses a message: no room",
+        "samples are forwarded again, behind message 1",
+    ]
+
+
+def test_messages_that_the_spool_dropped_are_passed_over(running: Cluster, tmp_path: Path) -> None:
+    async def live() -> None:
+        filled(tmp_path / "spool", 5).close()
+        spool = Spool(tmp_path / "spool", "gateway-1", most=1)
+        spool.append(numbered(25, 5))
+        assert await asyncio.to_thread(spool.sync, PATIENCE_S)
+        await until(lambda: spool.state().oldest == 6)
+        async with client_of(running) as client, forwarding(spool, client) as forwarder:
+            await until(lambda: forwarder.state().last == 6)
+            (found,) = await stored(client)
+        assert (found.sequence, found.lost) == (6, 250)
+        spool.close()
+
+    asyncio.run(live())
+
+
+def test_a_folder_that_was_set_back_is_told_and_sends_nothing(
+    running: Cluster, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    async def live() -> None:
+        spool = filled(tmp_path / "spool", 2)
+        async with client_of(running) as client:
+            async with forwarding(spool, client) as forwarder:
+                await until(lambda: forwarder.state().last == 2)
+            spool.close()
+            (tmp_path / "spool" / "000000000002-50.arrows").unlink()
+            spool = Spool(tmp_path / "spool", "gateway-1")
+            for number in (100, 200):  # first as long as the stream, and then longer
+                async with forwarding(spool, client) as forwarder:
+                    await until(lambda forwarder=forwarder: forwarder.state().trouble)
+                spool.append(numbered(number, 5))
+                assert await asyncio.to_thread(spool.sync, PATIENCE_S)
+            async with forwarding(spool, client) as forwarder:
+                await until(lambda: forwarder.state().trouble)
+            assert [one.sequence for one in await stored(client)] == [1, 2]
+            spool.close()
+
+    asyncio.run(live())
+    told = [record.getMessage() for record in caplog.records if record.levelno == logging.ERROR]
+    ends = ": its folder was copied or set back; move it away, and a new log begins"
+    assert len(told) == 3
+    assert all(sentence.endswith(ends) for sentence in told)
+    assert "the spool has no such message" in told[0]
+    assert "the spool has another one" in told[1]
+
+
+@pytest.mark.long
+def test_servers_that_are_away_for_a_while(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    async def live() -> None:
+        spool = filled(tmp_path / "spool", 3)
+        with cluster(tmp_path / "nats", 1) as servers:
+            async with client_of(servers) as client, forwarding(spool, client) as forwarder:
+                await until(lambda: forwarder.state().last == 3)
+                servers.nodes[0].kill()
+                spool.append(numbered(15, 5))
+                await until(lambda: forwarder.state().trouble)
+                servers.nodes[0].start()
+                await until(lambda: forwarder.state().last == 4)
+                assert [one.sequence for one in await stored(client)] == [1, 2, 3, 4]
+        spool.close()
+
+    asyncio.run(live())
+    told = [record.getMessage() for record in caplog.records if "forwarder" in record.name]
+    assert told[0].startswith("samples are not forwarded: ")
+    # The fourth may have come before the server was gone, and its answer not.
+    assert re.fullmatch("samples are forwarded again, behind message [34]", told[-1])
+
+
+def test_the_largest_message_comes_back(running: Cluster) -> None:
+    async def live() -> None:
+        async with client_of(running) as client:
+            data = random.Random(1).randbytes(MOST_BYTES)
+            headers = {samples_stream.SEQUENCE: "7", samples_stream.DIGEST: digest_of(data)}
+            for place in (1, 2, 3):
+                assert await publish(client, "samples.a.b", data, headers) == place
+            assert await last_of(client, "samples.a.b") == (3, 7, digest_of(data))
+            assert [one.data == data for one in await stored(client)] == [True] * 3
+
+    asyncio.run(live())
+
+
+# ---- mistakes ----
+
+
+@pytest.mark.slow
+def test_no_server(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(samples_stream, "ANSWER_S", 1.0)
+    (port,) = free_ports(1)
+    with pytest.raises(StreamError, match=f"no NATS server answers at nats://127.0.0.1:{port}: "):
+        asyncio.run(connect([f"nats://127.0.0.1:{port}"]))
+
+
+def test_a_server_that_says_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(samples_stream, "ANSWER_S", 0.2)
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        url = f"nats://127.0.0.1:{listener.getsockname()[1]}"
+        with pytest.raises(StreamError, match="no NATS server answers at"):
+            asyncio.run(connect([url]))
+
+
+def test_an_old_server(tmp_path: Path) -> None:
+    said = r"is 2\.\d+\.\d+: a fleet needs 2\.12 or newer"
+    with cluster(tmp_path, 1, old_server_program()) as servers, pytest.raises(StreamError, match=said):
+        asyncio.run(connect(servers.urls))
+
+
+@pytest.mark.slow
+def test_no_such_stream(running: Cluster, tmp_path: Path) -> None:
+    async def live() -> None:
+        async with client_of(running) as client:
+            await samples_stream._ask(client, "STREAM.DELETE.samples", {})
+            for asked in (about(client), last_of(client, "samples.a.b")):
+                with pytest.raises(StreamError, match="there is no stream 'samples': make it by"):
+                    await asked
+            with pytest.raises(StreamError, match="there is no stream 'samples', or it has no leader now"):
+                await read_after(client, 0, 10, 1000)
+            with pytest.raises(StreamError, match=r"no stream takes samples\.a\.b"):
+                await publish(client, subject_of("a", "b"), b"", {})
+            spool = filled(tmp_path / "spool", 1)
+            async with forwarding(spool, client) as forwarder:
+                await until(lambda: forwarder.state().trouble)
+                await create_stream(client, replicas=1)
+                await until(lambda: forwarder.state().last == 1)
+            spool.close()
+
+    asyncio.run(live())
+
+
+@pytest.mark.long
+def test_rights_that_do_not_suffice(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(samples_stream, "ANSWER_S", 1.0)
+    with cluster(tmp_path, 1) as servers:
+        path = tmp_path / "n1.conf"
+        servers.nodes[0].kill()
+        rights = (
+            '{ user: gateway-2, password: x, permissions: { publish: ["samples.gateway-2.>", "$JS.API.>"] } }'
+        )
+        path.write_text(path.read_text() + f"authorization {{ users: [ {rights} ] }}\n")
+        servers.nodes[0].start()
+        servers.wait()
+        url = servers.urls[0]
+
+        async def live() -> None:
+            with pytest.raises(StreamError, match="admits nobody who says this, or nothing, of himself"):
+                await connect([url], user="gateway-2", password="wrong")
+            client = await connect([url], user="gateway-2", password="x")
+            await create_stream(client, replicas=1)
+            assert await publish(client, subject_of("gateway-2", "b"), b"", {}) == 1
+            with pytest.raises(
+                StreamError, match=r"rights of this connection do not suffice: .*samples\.gateway-1"
+            ):
+                await publish(client, subject_of("gateway-1", "b"), b"", {})
+            await client.close()
+
+        asyncio.run(live())

@@ -1,0 +1,115 @@
+"""A long outage: the spool keeps what its limit allows, and all sides agree about the rest."""
+
+from __future__ import annotations
+
+import asyncio
+from pathlib import Path
+
+import pytest
+from nats_clusters import Cluster, cluster
+from peers import require_module
+from spooled import exchanges_in, numbered
+
+from multidrop import History
+from multidrop.fleet.samples.forwarder import Forwarder
+from multidrop.fleet.samples.hub import HubState, SampleHub
+from multidrop.fleet.samples.parquet_sink import ParquetSink
+from multidrop.fleet.samples.samples_stream import connect, create_stream
+from multidrop.fleet.samples.spool import Spool, SpoolState
+
+MESSAGES, EXCHANGES = 40, 5
+PATIENCE_S = 60.0
+
+
+async def forwarded(spool: Spool, servers: Cluster) -> None:
+    client = await connect(servers.urls)
+    forwarder = Forwarder(spool, client)
+    task = asyncio.create_task(forwarder.run())
+    async with asyncio.timeout(PATIENCE_S):
+        while forwarder.state().last != spool.state().newest:
+            await asyncio.sleep(0.01)
+    task.cancel()
+    await asyncio.wait([task])
+    await client.close()
+
+
+async def kept(folder: Path, servers: Cluster) -> HubState:
+    client = await connect(servers.urls)
+    sink = ParquetSink(folder)
+    hub = SampleHub(client, sink)
+    await hub.run(once=True)
+    sink.close()
+    await client.close()
+    return hub.state()
+
+
+def filled(folder: Path, first: int, most: int) -> Spool:
+    spool = Spool(folder, "gateway-1", most=most)
+    for number in range(first, first + MESSAGES):
+        spool.append(numbered(number * EXCHANGES, EXCHANGES))
+        assert spool.sync(PATIENCE_S)
+    return spool
+
+
+@pytest.fixture
+def most(tmp_path: Path) -> int:
+    """Return the bytes of about ten messages."""
+    spool = Spool(tmp_path / "one", "gateway-1")
+    spool.append(numbered(0, EXCHANGES))
+    assert spool.sync(PATIENCE_S)
+    spool.close()
+    return 10 * spool.state().stored
+
+
+def settled(spool: Spool, most: int) -> SpoolState:
+    while spool.state().stored > most:
+        pass
+    return spool.state()
+
+
+@pytest.mark.long
+def test_nats_is_away_for_longer_than_the_spool_can_keep(tmp_path: Path, most: int) -> None:
+    """Rows that are kept, and rows that the spool counts as lost, are all that there were."""
+    require_module("duckdb")
+    with cluster(tmp_path / "nats", 1) as servers:
+
+        async def live() -> tuple[HubState, SpoolState]:
+            client = await connect(servers.urls)
+            await create_stream(client, replicas=1)
+            await client.close()
+            spool = await asyncio.to_thread(filled, tmp_path / "spool", 0, most)
+            settled(spool, most)
+            await forwarded(spool, servers)
+            spool.close()
+            return await kept(tmp_path / "hub", servers), spool.state()
+
+        state, spooled = asyncio.run(live())
+    assert 8 <= 40 - state.missing <= 10
+    assert state.rows + spooled.lost == MESSAGES * EXCHANGES * 10
+    assert (state.alarms, state.doubled) == (2, 0)  # missing messages, and rows that the gateway says it lost
+    with History(tmp_path / "hub") as history:
+        rows = sorted(tuple(row) for batch in history.read() for row in batch)
+    assert exchanges_in(rows) == list(range(state.missing * EXCHANGES, MESSAGES * EXCHANGES))
+
+
+@pytest.mark.long
+def test_the_hub_is_away_and_the_spool_full_of_what_was_forwarded(tmp_path: Path, most: int) -> None:
+    """The stream has it: nothing is lost where the spool removes it."""
+    with cluster(tmp_path / "nats", 1) as servers:
+
+        async def live() -> tuple[HubState, SpoolState]:
+            client = await connect(servers.urls)
+            await create_stream(client, replicas=1)
+            await client.close()
+            for first in (0, 8, 16):  # fewer than the spool keeps, so that each time all of it is forwarded
+                spool = Spool(tmp_path / "spool", "gateway-1", most=most)
+                for number in range(first, first + 8):
+                    spool.append(numbered(number * EXCHANGES, EXCHANGES))
+                    assert await asyncio.to_thread(spool.sync, PATIENCE_S)
+                await forwarded(spool, servers)
+                spool.close()
+            return await kept(tmp_path / "hub", servers), spool.state()
+
+        state, spooled = asyncio.run(live())
+    assert spooled.oldest > 10
+    assert (state.rows, state.alarms, spooled.lost) == (24 * EXCHANGES * 10, 0, 0)

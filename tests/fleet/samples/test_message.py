@@ -1,0 +1,320 @@
+"""Messages: what any reader of Arrow finds in them, and bytes that are none."""
+
+from __future__ import annotations
+
+import random
+import struct
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from typing import Any
+
+import pyarrow as pa
+import pytest
+from batches import DRIVES, EXAMPLE, REGISTERS, SECOND, UTC_0, block, completion, example
+from completions import add_rows
+from spooled import numbered, rows_of
+from tables import table
+
+from multidrop import Batch
+from multidrop.core import Columns, Field, Names, NumberFormat, RowLayout
+from multidrop.fleet.samples.message import MOST_ROWS, MessageError, Packed, RowBuffer, unpack
+from multidrop.fleet.samples.unpacked_size import unpacked_size
+
+
+def packed(*batches: Batch, most: int = 900_000) -> list[Packed]:
+    buffer = RowBuffer()
+    for batch in batches:
+        assert buffer.add(batch.columns())
+    return list(buffer.messages(most))
+
+
+@pytest.mark.slow
+def test_the_rows_come_back() -> None:
+    (message,) = packed(example())
+    assert message.rows == len(EXAMPLE)
+    wanted = [(*row[:2], row[2] and 1000, *row[3:], None) for row in EXAMPLE]  # 7 ns, rounded up to 1 us
+    assert rows_of(unpack(message.data)) == sorted(wanted, key=lambda row: (row[0], row[3:5]))
+
+
+@pytest.mark.slow
+def test_pyarrow_alone_opens_it() -> None:
+    """By the table in the module's docstring, and no function of ours."""
+    (message,) = packed(example())
+    with pa.ipc.open_stream(message.data) as reader:
+        table = reader.read_all()
+    assert table.schema.names == [
+        "time",
+        "clock_ns",
+        "uncertainty_us",
+        "drive",
+        "register",
+        "value",
+        "status",
+        "unit",
+    ]
+    assert set(table.column("clock_ns").to_pylist()) == {UTC_0}
+    found = table.drop_columns(["time"]).to_pylist()  # pyarrow gives nanoseconds by pandas alone
+    assert [(row["register"], row["drive"], row["value"]) for row in found][:2] == [
+        ("output_frequency", "pump-1", 49.99),
+        ("output_frequency", 'fan, the "old" one', None),
+    ]
+    assert {row["status"] for row in found} == {row.status for row in EXAMPLE}
+    assert table.column("time").type == pa.timestamp("ns", "UTC")
+
+
+def test_values_are_kept_bit_for_bit() -> None:
+    numbers = [-0.0, 0.0, 1e300, 5e-324, 0.1, -1 / 3]
+    columns = Columns(len(numbers))
+    for at, number in enumerate(numbers):
+        found = completion((at + 1) * SECOND, first_ns=(at + 1) * SECOND + 1)
+        found.reply.data_len = 8
+        found.reply.data[0:8] = list(struct.pack(">d", number))
+        assert add_rows(columns, RowLayout(0, [Field(0, NumberFormat.F64, 0, 1.0, 1.0)]), found, UTC_0)
+    batch = Batch(columns, DRIVES, REGISTERS)
+    (message,) = packed(batch)
+    got = unpack(message.data).column("value").to_pylist()
+    assert struct.pack(f"{len(numbers)}d", *got) == bytes(batch.columns().value)
+    assert got == numbers
+
+
+@table(("ns", "told"), [(1, 1000), (1000, 1000), (1001, 2000), (3 * 10**12, (2**31 - 1) * 1000)])
+def test_an_uncertainty_is_rounded_up(ns: int, told: int) -> None:
+    """Fifty minutes are more than 32 bits of microseconds hold, and than any request lasts."""
+    columns = Columns(1)
+    assert add_rows(columns, block(0, 0), completion(SECOND, first_ns=SECOND + ns, words=(1,)), UTC_0)
+    (message,) = packed(Batch(columns, DRIVES, REGISTERS))
+    assert unpack(message.data).column("uncertainty_ns").to_pylist() == [told]
+
+
+@pytest.mark.long
+def test_a_message_is_no_larger_than_it_may_be() -> None:
+    found = packed(numbered(0, 2000), most=8_000)
+    assert len(found) > 2
+    assert all(len(message.data) <= 8_000 for message in found)
+    rows = [row for message in found for row in rows_of(unpack(message.data))]
+    assert sorted(rows, key=lambda row: (row[0], row[3:5])) == rows_of(
+        unpack(packed(numbered(0, 2000))[0].data)
+    )
+
+
+@pytest.mark.slow
+def test_a_message_has_no_more_rows_than_codes_have_room_for() -> None:
+    found = packed(*(numbered(first, 1000) for first in range(0, 7000, 1000)))
+    assert [message.rows for message in found] == [MOST_ROWS, 70_000 - MOST_ROWS]
+
+
+def test_rows_of_another_poller_are_not_mixed_in() -> None:
+    buffer = RowBuffer()
+    assert buffer.add(numbered(0, 10).columns())
+    assert not buffer.add(numbered(10, 10, Names(["fan-1", "fan-2", "fan-3", "fan-4"])).columns())
+    assert buffer.rows == 100
+    more = Names([f"pump-{number}" for number in range(1, 7)])
+    assert buffer.add(numbered(10, 10, more).columns())  # the same poller, which knows more drives
+
+
+@pytest.mark.long
+def test_damaged_bytes_end_in_a_sentence() -> None:
+    (message,) = packed(numbered(0, 40))
+    whole = unpack(message.data)
+    dice = random.Random(7)
+    for _ in range(300):
+        damaged = bytearray(message.data)
+        for _ in range(dice.randrange(1, 4)):
+            damaged[dice.randrange(len(damaged))] = dice.randrange(256)
+        with suppress(MessageError):  # and no other error
+            assert unpack(bytes(damaged)).schema == whole.schema
+    for length in range(0, len(message.data) - 8, 7):
+        with pytest.raises(MessageError, match=f"^{length} bytes are no message of samples"):
+            unpack(message.data[:length])
+    with pytest.raises(MessageError):
+        unpack(b"no Arrow at all")
+
+
+def named(*names: str | None) -> pa.DictionaryArray:
+    return pa.array(names, pa.utf8()).dictionary_encode()
+
+
+def times(*ns: int | None) -> pa.Array:
+    return pa.array(ns, pa.int64()).cast(pa.timestamp("ns", "UTC"))
+
+
+NAMELESS = pa.DictionaryArray.from_arrays(pa.array([0, 1], pa.int32()), pa.array(["a", None]))
+
+
+def written(options: pa.ipc.IpcWriteOptions | None = None, **other: pa.Array) -> bytes:
+    """Return a message of two rows as another writer than ours would write it, with these columns."""
+    columns = {
+        "time": times(UTC_0, UTC_0),
+        "clock_ns": pa.array([5, 5], pa.int64()),
+        "uncertainty_us": pa.array([1, 2], pa.int32()),
+        "drive": named("fan", "fan"),
+        "register": named("speed", "torque"),
+        "value": pa.array([1.0, 2.0]),
+        "status": named("ok", "ok"),
+        "unit": named("Hz", None),
+    }
+    rows = pa.RecordBatch.from_pydict(columns | other)
+    sink = pa.BufferOutputStream()
+    with pa.ipc.new_stream(sink, rows.schema, options=options) as writer:
+        writer.write_batch(rows)
+    return bytes(sink.getvalue())
+
+
+@table(
+    ("column", "rows", "said"),
+    [
+        ("time", times(None, UTC_0), "its time is missing in some rows"),
+        ("clock_ns", pa.array([None, 5], pa.int64()), "its monotonic_ns is missing in some rows"),
+        ("drive", named("fan", None), "its drive is missing in some rows"),
+        ("register", named(None, "speed"), "its register is missing in some rows"),
+        ("status", named("ok", None), "its status is missing in some rows"),
+        ("drive", NAMELESS, "one drive has no name"),
+        ("status", NAMELESS, "one status has no name"),
+        ("unit", NAMELESS, "one unit has no name"),
+        ("drive", named("fan\0", "fan"), "one drive has a NUL character"),
+        ("register", named("speed", "\0"), "one register has a NUL character"),
+        ("status", named("ok", "o\0k"), "one status has a NUL character"),
+        ("unit", named("Hz", "\0"), "one unit has a NUL character"),
+        ("drive", named("f" * 1001, "fan"), "one drive is longer than 1000 bytes"),
+        ("register", named("speed", "ü" * 501), "one register is longer than 1000 bytes"),
+        ("uncertainty_us", pa.array([1, 1 << 31], pa.int64()), "Integer value 2147483648 not in range"),
+    ],
+)
+def test_rows_that_no_store_takes_are_no_message(column: str, rows: pa.Array, said: str) -> None:
+    """A hub that could not keep one message would never come to those behind it, of all gateways."""
+    with pytest.raises(MessageError, match=f"bytes are no message of samples: {said}"):
+        unpack(written(**{column: rows}))
+
+
+def test_another_writers_rows_are_rows() -> None:
+    assert rows_of(unpack(written()))[0][3:] == ("fan", "speed", 1.0, "ok", "Hz")
+    assert len(unpack(written(drive=named("ü" * 500, "fan")))) == 2
+
+
+def alike(rows: int) -> dict[str, Any]:
+    """Return the columns of so many rows, all of which are the same."""
+    names = ("drive", "register", "status", "unit")
+    return {
+        "time": pa.repeat(times(UTC_0)[0], rows),
+        "clock_ns": pa.repeat(5, rows),
+        "uncertainty_us": pa.repeat(pa.scalar(1, pa.int32()), rows),
+        "value": pa.repeat(1.0, rows),
+        **{name: pa.repeat("a", rows).dictionary_encode() for name in names},
+    }
+
+
+@pytest.mark.slow
+def test_a_message_of_more_rows_than_ours_have_is_none() -> None:
+    many = MOST_ROWS + 1
+    columns = alike(many)
+    with pytest.raises(MessageError, match="it has 65537 rows, and 65536 are the most"):
+        unpack(written(**columns))
+
+
+BOMB = 1 << 28  # bytes
+ZSTD = pa.ipc.IpcWriteOptions(compression="zstd")
+OF_ONE_TEXT = {  # of so many rows: small as they are sent, and as they lie in memory, until they are cast
+    "unit": lambda rows: pa.RunEndEncodedArray.from_arrays([rows], pa.array(["f" * 9000])),
+    "value": lambda rows: pa.DictionaryArray.from_arrays(pa.repeat(0, rows), pa.array(["1" * 9000])),
+    "clock_ns": lambda rows: pa.RunEndEncodedArray.from_arrays([rows], pa.array([5])),
+}
+
+
+POOLS: list[pa.MemoryPool] = []  # what was allocated of one may outlive its test
+
+
+@pytest.fixture
+def most_allocated() -> Iterator[Callable[[], int]]:
+    """Return what tells how many bytes pyarrow had at most at a time since this began."""
+    before = pa.default_memory_pool()
+    pool = pa.proxy_memory_pool(pa.system_memory_pool())
+    POOLS.append(pool)
+    pa.set_memory_pool(pool)
+    yield lambda: int(pool.max_memory() or 0)
+    pa.set_memory_pool(before)
+
+
+def bomb(compression: str) -> bytes:
+    """Return a message with a large name of which only little is sent."""
+    options = pa.ipc.IpcWriteOptions(compression=compression)
+    data = written(options, drive=named("f" * BOMB, "fan"))
+    assert len(data) < BOMB / 200
+    return data
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("compression", ["zstd", "lz4"])
+def test_what_would_grow_beyond_measure_is_not_unpacked(
+    compression: str, most_allocated: Callable[[], int]
+) -> None:
+    data = bomb(compression)
+    before = most_allocated()
+    with pytest.raises(MessageError, match=r"it is 2684\d{5} bytes when unpacked, and 4194304 are the most"):
+        unpack(data)
+    assert most_allocated() - before < 1 << 20
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("column", OF_ONE_TEXT)
+def test_columns_that_would_grow_by_a_cast_are_no_message(
+    column: str, most_allocated: Callable[[], int]
+) -> None:
+    rows = 30_000
+    columns = alike(rows)
+    data = written(ZSTD, **(columns | {column: OF_ONE_TEXT[column](rows)}))
+    before = most_allocated()
+    with pytest.raises(MessageError, match=f"its {column} is of another type"):
+        unpack(data)
+    assert most_allocated() - before < 8 << 20
+
+
+def test_rows_that_take_no_bytes_are_counted_first(most_allocated: Callable[[], int]) -> None:
+    schema = pa.schema([("time", pa.null())])
+    rows = pa.RecordBatch.from_arrays([pa.Array.from_buffers(pa.null(), 1 << 30, [None])], schema=schema)
+    sink = pa.BufferOutputStream()
+    with pa.ipc.new_stream(sink, schema) as writer:
+        writer.write_batch(rows)
+    with pytest.raises(MessageError, match="its time is of another type"):
+        unpack(sink.getvalue())
+    assert most_allocated() < 1 << 20
+
+
+def test_an_older_version_of_the_format_is_no_message() -> None:
+    """It has another way to say that buffers are compressed."""
+    options = pa.ipc.IpcWriteOptions(metadata_version=pa.ipc.MetadataVersion.V4)
+    with pytest.raises(MessageError, match="it is in another version of the format"):
+        unpack(written(options))
+
+
+@pytest.mark.parametrize("options", [None, ZSTD, pa.ipc.IpcWriteOptions(compression="lz4")])
+def test_the_size_is_that_which_pyarrow_unpacks(options: pa.ipc.IpcWriteOptions | None) -> None:
+    """Texts of a kind are compressed, numbers by chance are not, and lists of nothing have no bytes."""
+    dice = random.Random(3)
+    data = written(
+        options,
+        drive=named("f" * 900, None),
+        value=pa.array([dice.random(), None]),
+        status=named("ok", "o" * 700),
+        unit=named(None, None),
+    )
+    with pa.ipc.open_stream(data) as reader:
+        (rows,) = list(reader)
+    names = ("drive", "register", "status", "unit")
+    buffers = [
+        *(buffer for name in rows.schema.names for buffer in rows.column(name).buffers()),
+        *(buffer for name in names for buffer in rows.column(name).dictionary.buffers()),
+    ]
+    assert unpacked_size(data) == sum(buffer.size for buffer in buffers if buffer)
+
+
+def test_a_message_is_split_before_it_is_too_large_to_be_unpacked() -> None:
+    """Long names of many drives take much more room than they are sent with."""
+    drives = Names([f"{number:0900d}" for number in range(6000)])
+    columns = Columns(6000)
+    for number in range(6000):
+        found = completion((number + 1) * SECOND, first_ns=(number + 1) * SECOND + 1, words=(1,))
+        assert add_rows(columns, block(number, 0), found, UTC_0)
+    messages = packed(Batch(columns, drives, REGISTERS))
+    assert sum(message.rows for message in messages) == 6000
+    assert len(messages) > 1
+    assert all(len(unpack(message.data)) == message.rows for message in messages)

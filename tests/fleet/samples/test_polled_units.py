@@ -1,0 +1,196 @@
+"""Units of a fleet's samples: each row has that of the description which it was polled under."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from peers import require_module
+from spooled import NOON, STEP, numbered
+
+import multidrop
+from multidrop import History, Mastership
+from multidrop.fleet.lines.fleet_lines import FleetLines
+from multidrop.fleet.samples import polled_units
+from multidrop.fleet.samples.hub import Commit
+from multidrop.fleet.samples.message import RowBuffer, unpack
+from multidrop.fleet.samples.parquet_sink import ParquetSink
+from multidrop.fleet.samples.polled_units import PolledUnits
+from multidrop.fleet.servers.buckets import Record
+from multidrop.fleet.servers.plant_store import line_of
+from multidrop.history import compact, quantities
+
+FAMILY = """
+[family]
+title = "A meter"
+manual = "none"
+baudrates = [9600]
+formats = ["8N1"]
+together = {{ input = 80 }}
+
+[reading]
+value_1 = {{ at = "30001", {load}, place = "table 1" }}
+value_2 = {{ at = "30002", values = {{ OFF = 0, ON = 1 }}, place = "table 1" }}
+value_3 = {{ at = "30003", place = "table 1" }}
+"""
+AMPERES = 'unit = "A", step = 0.1'
+
+
+def record(load: str) -> Record:
+    drive: dict[str, object] = {"name": "pump-1", "model": "meter.toml", "address": 1, "baudrate": 9600}
+    drive["poll"] = [{"register": f"value_{at}", "every": "1 s"} for at in (1, 2, 3)]
+    line = {"name": "line-1", "port": "socket://127.0.0.1:1", "drive": [drive]}
+    return Record("line-1", 1, {"line": line, "files": {"meter.toml": FAMILY.format(load=load)}})
+
+
+def changed(folder: Path) -> PolledUnits:
+    """Return units of a line whose first register is in volts up to exchange 20, and then in amperes."""
+    units = PolledUnits()
+    units.note(line_of(record('unit = "V"'), folder), 0)
+    units.note(line_of(record(AMPERES), folder), 20 * STEP)
+    return units
+
+
+def tables(units: PolledUnits | None, first: int = 0) -> list[pa.Table]:
+    buffer = RowBuffer()
+    assert buffer.add(numbered(first, 40).columns())
+    return [unpack(message.data) for message in buffer.messages(units=units)]
+
+
+def units_in(table: pa.Table, register: str) -> list[tuple[int, str | None]]:
+    """Return the exchanges of pump-1 in order, and the unit of this register in each."""
+    columns = [table.column(name).to_pylist() for name in ("drive", "register", "unit")]
+    times = table.column("time").cast("int64").to_pylist()
+    rows = zip(times, *columns, strict=True)
+    return sorted(((time - NOON) // STEP, unit) for time, *of, unit in rows if of == ["pump-1", register])
+
+
+def test_rows_keep_the_unit_that_they_were_polled_in(tmp_path: Path) -> None:
+    """Also those that are packed after the change, in one message with rows of the other unit."""
+    (table,) = tables(changed(tmp_path))
+    assert units_in(table, "value_1") == [(at, "V" if at < 20 else "A") for at in range(0, 40, 4)]
+    assert units_in(table, "value_2") == [(at, "names of meter.toml") for at in range(0, 40, 4)]
+    assert units_in(table, "value_3") == [(at, "") for at in range(0, 40, 4)]
+    assert units_in(table, "value_4") == [(at, None) for at in range(0, 40, 4)]  # nobody described it
+
+
+def test_a_message_of_before_has_unknown_units(tmp_path: Path) -> None:
+    buffer = RowBuffer()
+    assert buffer.add(numbered(0, 40).columns())
+    (message,) = buffer.messages(units=changed(tmp_path))
+    with pa.ipc.open_stream(message.data) as reader:
+        old = reader.read_all().drop_columns(["unit"])
+    sink = pa.BufferOutputStream()
+    with pa.ipc.new_stream(sink, old.schema) as writer:
+        writer.write_table(old)
+    table = unpack(bytes(sink.getvalue()))
+    assert table.column("unit").null_count == len(table) == 400
+
+
+def test_a_gateway_notes_the_units_of_a_line_that_it_takes(tmp_path: Path) -> None:
+    units = PolledUnits()
+    lines = FleetLines(Mastership(), tmp_path, units)
+    lines._take(record('unit = "V"'))
+    with pytest.raises(ValueError, match="line-1"):  # it is polled, and stays as it is
+        lines._take(record('unit = "kW"'))
+    lines.poller.remove_line("line-1")
+    before_ns = time.monotonic_ns()
+    lines._take(record(AMPERES))
+    lines.poller.close()
+    table = units.table(("pump-1",), ("value_1",))
+    [change] = table.changes
+    assert (table.texts[change.code], table.texts[table.newest[0].as_py()]) == ("V", "A")
+    assert before_ns < change.until_ns <= time.monotonic_ns()
+
+
+@pytest.mark.slow
+def test_merged_files_keep_the_units_beside_rows_without(tmp_path: Path) -> None:
+    require_module("duckdb")
+    sink = ParquetSink(tmp_path)
+    hour = 3600 * 10**9 // STEP
+    for at, units in ((0, None), (50, changed(tmp_path / "lines")), (hour, None)):
+        found = tables(units, at)
+        if at == 0:
+            found = [table.drop_columns(["unit"]) for table in found]
+        last = {0: 1, 50: 2}.get(at, 3)
+        sink.write(Commit("made", last, last, {"a.x": last}, found, 400))
+    sink.close()
+    assert compact.main([str(tmp_path), "--below", "0", "--merge-rows"]) == 0
+    merged, _ = sorted((tmp_path / "rows").glob("*.parquet"))
+    assert merged.name.startswith("00000001-00000002.")
+    found = dict(units_in(pq.read_table(merged), "value_1"))
+    assert {found[at] for at in range(0, 40, 4)} == {None}
+    assert {found[at] for at in range(52, 90, 4)} == {"A"}
+
+
+def test_units_have_the_words_of_a_history() -> None:
+    plant = {"drives": {"a": {"model": "meter.toml", "registers": {"b": {"values": {"ON": 1}}}}}}
+    assert quantities.units_of(plant) == {("a", "b"): "names of meter.toml"}
+    assert polled_units.RAW == quantities.RAW
+
+
+@pytest.fixture(params=["as they came", "merged"])
+def kept(tmp_path: Path, request: pytest.FixtureRequest) -> Path:
+    """The folder of a hub: with the change amid its first file, and rows of an older gateway behind it."""
+    require_module("duckdb")
+    folder, units = tmp_path / "kept", changed(tmp_path / "lines")
+    sink = ParquetSink(folder)
+    hour = 3600 * 10**9 // STEP
+    for at, first in enumerate((0, 40, 80, hour), 1):
+        found = tables(units, first)
+        if first == 40:
+            found = [table.drop_columns(["unit"]) for table in found]
+        sink.write(Commit("made", at, at, {"a.x": at}, found, 400))
+    sink.close()
+    if request.param == "merged":
+        assert compact.main([str(folder), "--below", "0", "--merge-rows"]) == 0
+        assert len(list((folder / "rows").iterdir())) == 2
+        assert pq.read_table(*(folder / "tens").glob("00000001-*")).column("unit").null_count
+    return folder
+
+
+BEGIN, BEFORE, END = NOON, NOON + 18 * STEP, NOON + 120 * STEP
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("points", [1, 120])
+def test_plots_of_a_hubs_folder_put_no_two_units_together(kept: Path, points: int) -> None:
+    with History(kept) as history:
+        found = history.buckets([f"pump-1.value_{at}" for at in (1, 2, 3, 4)], BEGIN, END, points)
+        before = history.buckets("pump-1.value_1", BEGIN, BEFORE, points)["pump-1.value_1"]
+    told = {name[-7:]: (sum(one.n), one.unit, one.left_out) for name, one in found.items()}
+    assert told == {
+        "value_1": (25, "A", ("V",)),
+        "value_2": (30, "names of meter.toml", ()),
+        "value_3": (30, "", ()),
+        "value_4": (30, None, ()),
+    }
+    assert (sum(before.n), before.unit, before.left_out) == (5, "V", ())
+
+
+@pytest.mark.long
+def test_rows_of_a_hubs_folder_have_a_column_for_each_unit(kept: Path, tmp_path: Path) -> None:
+    with History(kept) as history:
+        rows = history.read("pump-1.value_1", BEGIN, END)
+        about = rows.metadata["drives"]["pump-1"]["registers"]
+        assert {name: one["unit"] for name, one in about.items()} == {"value_1": "A", "value_1 [V]": "V"}
+        history.export(tmp_path / "out.parquet", "pump-1.value_1", BEGIN, END)
+        everything = history.read(None, BEGIN, END)
+        about = everything.metadata["drives"]["pump-1"]["registers"]
+        assert about["value_2"]["unit"] == "names of meter.toml"
+        for found in (rows, multidrop.read(tmp_path / "out.parquet"), everything):
+            columns: dict[str, set[int]] = {}
+            for batch in found:
+                for row in batch:
+                    if row.drive == "pump-1" and "value_1" in row.register.split(" "):
+                        columns.setdefault(row.register, set()).add((row.time - NOON) // STEP)
+            assert (max(columns["value_1 [V]"]), min(columns["value_1"])) == (16, 20)
+
+
+@pytest.mark.slow
+def test_a_file_of_a_hub_is_read_by_its_folder(kept: Path) -> None:
+    with pytest.raises(ValueError, match="a file of `multidrop hub`: read its folder by"):
+        multidrop.read(min((kept / "rows").iterdir()))

@@ -1,0 +1,415 @@
+"""The spool: what a poller gave it is on the disk, whatever happens, and what is lost is counted."""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import random
+import shutil
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import spool_filler
+from disks import full_at, read_only_directory
+from examples import usually
+from kills import BoundProcess
+from lines import until
+from spooled import exchanges_in, numbered, rows_in, rows_of
+
+from multidrop.fleet.samples import spool as spool_module
+from multidrop.fleet.samples.message import unpack
+from multidrop.fleet.samples.spool import Spool
+from multidrop.fleet.samples.spool_folder import SpoolError, SpoolFolder
+
+GATEWAY = "gateway-1"
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    return tmp_path / "spool"
+
+
+@pytest.fixture
+def spool(folder: Path) -> Iterator[Spool]:
+    opened = Spool(folder, GATEWAY)
+    yield opened
+    opened.close()
+
+
+def filled(folder: Path, messages: int, exchanges: int = 5) -> None:
+    """Store messages of so many exchanges each."""
+    spool = Spool(folder, GATEWAY)
+    for number in range(messages):
+        spool.append(numbered(number * exchanges, exchanges))
+        assert spool.sync(30.0)
+    spool.close()
+
+
+def test_rows_are_in_files_when_sync_returns(spool: Spool, folder: Path) -> None:
+    spool.append(numbered(0, 30))
+    assert spool.sync(30.0)
+    assert exchanges_in(rows_in(folder)) == list(range(30))
+    state = spool.state()
+    assert (state.written, state.lost, state.waiting, state.oldest, state.newest) == (300, 0, 0, 1, 1)
+    assert state.stored == sum(file.stat().st_size for file in folder.glob("*.arrows"))
+
+
+@pytest.mark.slow
+def test_a_second_of_rows_is_a_message_without_being_asked(spool: Spool, folder: Path) -> None:
+    spool.append(numbered(0, 3))
+    until(lambda: spool.state().written == 30)
+    assert [file.name for file in folder.glob("*.arrows")] == ["000000000001-30.arrows"]
+
+
+def test_16384_rows_are_a_message_at_once(
+    spool: Spool, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(spool_module, "ENOUGH_S", 3600.0)
+    spool.append(numbered(0, 3))
+    assert spool.state().written == 0
+    spool.append(numbered(3, 1640))
+    until(lambda: spool.state().written == 16430)
+    assert len(list(folder.glob("*.arrows"))) == 1
+
+
+def test_the_log_goes_on_behind_its_newest_message(folder: Path) -> None:
+    filled(folder, 3)
+    log = json.loads((folder / "spool.json").read_text())["log"]
+    spool = Spool(folder, GATEWAY)
+    assert (spool.log, spool.state().newest) == (log, 3)
+    spool.append(numbered(15, 5))
+    spool.close()
+    assert sorted(file.name[:12] for file in folder.glob("*.arrows")) == [f"{at:012d}" for at in range(1, 5)]
+    assert exchanges_in(rows_in(folder)) == list(range(20))
+
+
+def test_a_new_folder_is_a_new_log(tmp_path: Path) -> None:
+    logs = set()
+    for name in ("a", "b"):
+        filled(tmp_path / name, 1)
+        logs.add(json.loads((tmp_path / name / "spool.json").read_text())["log"])
+    assert len(logs) == 2
+
+
+# ---- power cuts ----
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("step", usually(83, 1))
+def test_a_newest_file_cut_at_every_byte_loses_nothing_that_was_stored_before(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, step: int
+) -> None:
+    """A disk that kept the name and not the bytes leaves it so; a file without its name is there too."""
+    whole = tmp_path / "whole"
+    filled(whole, 3, exchanges=2)
+    newest = max(whole.glob("*.arrows"))
+    data = newest.read_bytes()
+    before = rows_in(whole)
+    ends = [size for size in range(0, len(data), step) if _is_whole(data[:size])]
+    assert all(size >= len(data) - 8 for size in ends)  # an end marker is no row
+    for size in range(0, len(data), step):
+        folder = tmp_path / "cut"
+        shutil.copytree(whole, folder)
+        (folder / newest.name).write_bytes(data[:size])
+        (folder / ".000000000004-20.arrows.tmp").write_bytes(data[:size])
+        spool = Spool(folder, GATEWAY)
+        spool.append(numbered(6, 2))
+        spool.close()
+        found = rows_in(folder)
+        lost = before[40:] if size not in ends else []
+        assert [row for row in before if row not in found] == lost
+        assert exchanges_in(found)[-2:] == [6, 7]
+        assert not list(folder.glob(".*.tmp"))
+        assert (folder / "000000000004-20.arrows").exists()  # the number of the cut one is not given again
+        assert list(folder.glob("*.damaged")) == (
+            [] if size in ends else [folder / "000000000003-20.damaged"]
+        )
+        assert ("000000000003-20.arrows is damaged" in caplog.text) == (size not in ends)
+        caplog.clear()
+        shutil.rmtree(folder)
+
+
+def test_the_number_of_a_message_that_was_put_away_is_not_given_again_after_any_start(folder: Path) -> None:
+    """The stream may have had it whole: another one of this number would be taken for its copy."""
+    filled(folder, 2, exchanges=2)
+    newest = max(folder.glob("*.arrows"))
+    newest.write_bytes(newest.read_bytes()[:100])
+    for _ in range(2):
+        Spool(folder, GATEWAY).close()
+        assert [path.name for path in folder.glob("*.damaged")] == ["000000000002-20.damaged"]
+    spool = Spool(folder, GATEWAY)
+    assert spool.state().newest == 2
+    spool.append(numbered(4, 2))
+    spool.close()
+    assert sorted(path.name for path in folder.glob("*.arrows")) == [
+        "000000000001-20.arrows",
+        "000000000003-20.arrows",
+    ]
+
+
+def _is_whole(data: bytes) -> bool:
+    try:
+        return len(unpack(data)) == 20
+    except ValueError:
+        return False
+
+
+def test_nothing_has_its_name_before_it_is_on_the_disk(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The order of calls to the system is what a power cut would show."""
+    calls: list[str] = []
+    names: dict[int, str] = {}
+    really: dict[str, Any] = {name: getattr(os, name) for name in ("open", "write", "fsync", "rename")}
+
+    def opened(path: object, *details: int) -> int:
+        number = int(really["open"](path, *details))
+        names[number] = Path(str(path)).name
+        return number
+
+    def noted(call: str) -> object:
+        def act(first: object, *others: object) -> object:
+            of = names.get(first, "") if isinstance(first, int) else Path(str(first)).name
+            calls.append(f"{call} {of}")
+            return really[call](first, *others)
+
+        return act
+
+    files = SpoolFolder(folder, GATEWAY, "fleet")
+    monkeypatch.setattr(os, "open", opened)
+    for call in ("write", "fsync", "rename"):
+        monkeypatch.setattr(os, call, noted(call))
+    files.write(b"data", 1)
+    monkeypatch.undo()
+    part = ".000000000001-1.arrows.tmp"
+    assert calls == [f"write {part}", f"fsync {part}", f"rename {part}", f"fsync {folder.name}"]
+    files.close()
+
+
+@pytest.mark.long
+@pytest.mark.slow
+@pytest.mark.parametrize(("kills", "longest_s"), usually((2, 0.1), (12, 0.6)))
+def test_kills_at_any_moment(folder: Path, kills: int, longest_s: float) -> None:
+    """Each run has numbers of its own; what it was told is there, in order, without a hole, once."""
+    dice = random.Random(kills)
+    support = Path(spool_filler.__file__).parents[1]
+    told = []
+    for run in range(kills):
+        words = [sys.executable, spool_filler.__file__, str(folder), str(run * 1_000_000)]
+        here = {**os.environ, "PYTHONPATH": str(support)}
+        with BoundProcess(words, stdout=subprocess.PIPE, text=True, env=here) as child:
+            assert child.stdout is not None
+            least = [int(child.stdout.readline()) for _ in range(2)][1]  # none yet, and the first that are
+            time.sleep(dice.uniform(0, longest_s))
+            child.kill()
+            said = child.stdout.read().split("\n")[:-1]
+        told.append(int(said[-1]) if said else least)
+    found = exchanges_in(rows_in(folder))
+    for run, count in enumerate(told):
+        numbers = [number % 1_000_000 for number in found if number // 1_000_000 == run]
+        assert numbers == list(range(len(numbers)))
+        assert len(numbers) >= count
+    assert min(told) > 0
+    assert not list(folder.glob("*.damaged"))
+
+
+# ---- bounds ----
+
+
+def test_the_oldest_are_removed_at_the_limit_and_those_not_forwarded_are_counted_and_told(
+    folder: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    filled(folder, 1)
+    size = next(folder.glob("*.arrows")).stat().st_size
+    spool = Spool(folder, GATEWAY, most=size * 5)
+    for number in range(1, 4):
+        spool.append(numbered(number * 5, 5))
+        assert spool.sync(30.0)
+    spool.acknowledge(3)
+    for number in range(4, 12):
+        spool.append(numbered(number * 5, 5))
+        assert spool.sync(30.0)
+    until(lambda: spool.state().stored <= size * 5)
+    spool.close()
+    state = spool.state()
+    left = sorted(int(file.name[:12]) for file in folder.glob("*.arrows"))
+    assert left == list(range(state.oldest, 13))
+    assert state.oldest >= 7
+    assert state.lost == (state.oldest - 1 - 3) * 50  # the first three were forwarded
+    assert [record.levelno for record in caplog.records] == [logging.ERROR]
+    assert "the spool is full at" in caplog.text
+
+
+def test_what_was_removed_before_the_stream_was_asked_counts_when_it_answers(folder: Path) -> None:
+    filled(folder, 6)
+    spool = Spool(folder, GATEWAY, most=1)  # the newest stays
+    spool.append(numbered(30, 5))
+    assert spool.sync(30.0)
+    until(lambda: spool.state().oldest == 7)
+    assert spool.state().lost == 0
+    spool.acknowledge(2)
+    assert spool.state().lost == 4 * 50
+    spool.acknowledge(7)
+    assert spool.state().lost == 4 * 50
+    spool.close()
+
+
+@pytest.mark.slow
+def test_a_full_disk_is_told_and_holds_nobody_up(
+    folder: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(spool_module, "AGAIN_S", 0.01)
+    monkeypatch.setattr(spool_module, "MOST_WAITING", 1000)
+    spool = Spool(folder, GATEWAY)
+    with full_at(100):
+        spool.append(numbered(0, 100))
+        until(lambda: spool.state().trouble is not None)
+        begun = time.monotonic()
+        for number in range(1, 6):
+            spool.append(numbered(100 * number, 100))
+        assert time.monotonic() - begun < 1.0
+        assert not spool.sync(0.05)
+        state = spool.state()
+        assert (state.written, state.lost, state.waiting) == (0, 5000, 1000)
+        assert "File too large" in str(state.trouble)
+    assert spool.sync(30.0)
+    until(lambda: spool.state().trouble is None)
+    spool.append(numbered(600, 10))
+    assert spool.sync(30.0)
+    spool.close()
+    assert exchanges_in(rows_in(folder)) == [*range(100), *range(600, 610)]
+    assert not list(folder.glob(".*.tmp"))
+    told = [record.getMessage() for record in caplog.records]
+    assert [told[0].partition(": ")[0], told[-1]] == [
+        f"the spool {folder} takes nothing",
+        f"the spool {folder} takes rows again; 5000 were lost so far",
+    ]
+
+
+@pytest.mark.slow
+def test_a_full_disk_takes_what_was_forwarded_first(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(spool_module, "AGAIN_S", 0.01)
+    filled(folder, 3)
+    spool = Spool(folder, GATEWAY)
+    spool.acknowledge(2)
+    with full_at(100):
+        spool.append(numbered(15, 5))
+        until(lambda: spool.state().oldest == 3)
+        until(lambda: spool.state().trouble is not None)
+    assert spool.sync(30.0)
+    spool.close()
+    assert exchanges_in(rows_in(folder)) == list(range(10, 20))
+    assert spool.state().lost == 0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("acknowledged", "left"), [(None, [1, 2, 3]), (0, [1, 2, 3]), (1, [2, 3]), (3, [3])])
+def test_a_full_disk_takes_neither_what_the_stream_lacks_nor_the_newest_which_says_what_comes_next(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, acknowledged: int | None, left: list[int]
+) -> None:
+    monkeypatch.setattr(spool_module, "AGAIN_S", 0.001)
+    filled(folder, 3)
+    spool = Spool(folder, GATEWAY)
+    if acknowledged is not None:
+        spool.acknowledge(acknowledged)
+    attempts, really = [0], spool._remove_acknowledged
+
+    def counted() -> None:
+        really()
+        attempts[0] += 1
+
+    monkeypatch.setattr(spool, "_remove_acknowledged", counted)
+    with full_at(100):
+        spool.append(numbered(15, 5))
+        until(lambda: attempts[0] > 5)
+        assert [int(path.name[:12]) for path in sorted(folder.glob("*.arrows"))] == left
+    assert spool.sync(30.0)
+    spool.close()
+    assert (spool.state().newest, spool.state().lost) == (4, 0)
+
+
+def test_a_disk_that_stands_still_holds_nobody_up(spool: Spool, monkeypatch: pytest.MonkeyPatch) -> None:
+    goes_on, stands = threading.Event(), threading.Event()
+    really = os.fsync
+
+    def fsync(file: int) -> None:
+        stands.set()
+        goes_on.wait(30.0)
+        really(file)
+
+    monkeypatch.setattr(os, "fsync", fsync)
+    monkeypatch.setattr(spool_module, "MOST_WAITING", 500)
+    spool.append(numbered(0, 40))
+    assert not spool.sync(0.0)
+    assert stands.wait(30.0)
+    for number in range(1, 4):
+        spool.append(numbered(40 * number, 40))
+    assert spool.state().lost == 3 * 400
+    assert spool.following(0) is None
+    goes_on.set()
+    assert spool.sync(30.0)
+
+
+# ---- mistakes ----
+
+
+def test_two_processes_do_not_write_one_spool(spool: Spool, folder: Path) -> None:
+    with pytest.raises(SpoolError, match=f"the spool {folder} is being written by another process"):
+        Spool(folder, GATEWAY)
+
+
+def test_a_folder_of_something_else_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "report.txt").write_text("mine")
+    with pytest.raises(SpoolError, match=r"is no spool: it holds 'report.txt' and no spool.json"):
+        Spool(tmp_path, GATEWAY)
+    assert {path.name for path in tmp_path.iterdir()} == {"report.txt", ".spool.lock"}
+
+
+def test_another_gateways_spool_is_refused(folder: Path) -> None:
+    filled(folder, 1)
+    with pytest.raises(
+        SpoolError,
+        match="is the spool of gateway 'gateway-1' in fleet 'fleet', not of 'gateway-2' in 'fleet'",
+    ):
+        Spool(folder, "gateway-2")
+    with pytest.raises(SpoolError, match="not of 'gateway-1' in 'plant-7'"):
+        Spool(folder, GATEWAY, fleet="plant-7")
+
+
+@pytest.mark.parametrize(
+    "text", ["", "[]", "{", '{"format": "multidrop spool 9"}', '{"format": "multidrop spool 1"}']
+)
+def test_a_head_that_is_none(folder: Path, text: str) -> None:
+    folder.mkdir()
+    (folder / "spool.json").write_text(text)
+    with pytest.raises(SpoolError, match=r"spool.json is not the head of a spool of this version"):
+        Spool(folder, GATEWAY)
+
+
+def test_a_folder_that_cannot_be_written() -> None:
+    with (
+        read_only_directory() as path,
+        pytest.raises(SpoolError, match=f"the spool {path} cannot be written: Permission denied"),
+    ):
+        Spool(path, GATEWAY)
+
+
+@pytest.mark.parametrize("name", ["", "a.b", "a b", "*", ">", "ä", "a/b"])
+def test_a_name_that_no_subject_may_have(folder: Path, name: str) -> None:
+    with pytest.raises(ValueError, match="may have letters, digits, _ and - alone"):
+        Spool(folder, name)
+
+
+def test_a_batch_comes_back_as_it_was(spool: Spool, folder: Path) -> None:
+    batch = numbered(0, 20)
+    spool.append(batch)
+    assert spool.sync(30.0)
+    wanted = [(*row[:2], row[2] and -(-row[2] // 1000) * 1000, *row[3:], None) for row in batch]
+    stored = spool.following(0)
+    assert stored is not None
+    assert rows_of(unpack(stored.path.read_bytes())) == sorted(wanted, key=lambda row: (row[0], row[3:5]))

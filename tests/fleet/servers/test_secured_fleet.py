@@ -1,0 +1,450 @@
+"""A whole fleet with the rights that `fleet rights` writes, and a sentence where they do not suffice."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import ssl
+import subprocess
+import sys
+import time
+import urllib.request
+from collections.abc import Callable, Iterator
+from contextlib import closing, suppress
+from pathlib import Path
+
+import pytest
+from commands import Run
+from nats_clusters import cluster
+from peers import require_module
+
+require_module("nats")
+require_module("nkeys")
+require_module("pyarrow")
+
+from secured_clusters import (  # noqa: E402
+    GATEWAYS,
+    SecuredCluster,
+    SecuredNode,
+    certificates,
+    in_one_account,
+    secured_cluster,
+)
+from secured_fleets import PATIENCE_S, SecuredFleet, multidrop, secured_fleet, until  # noqa: E402
+from spooled import numbered  # noqa: E402
+
+from multidrop.fleet.errors import Conflict  # noqa: E402
+from multidrop.fleet.leases.bucket import LeaseBucket  # noqa: E402
+from multidrop.fleet.samples.sample_reader import StreamMessage, read_after  # noqa: E402
+from multidrop.fleet.samples.samples_stream import (  # noqa: E402
+    DIGEST,
+    LOST,
+    SEQUENCE,
+    connect,
+    digest_of,
+    publish,
+    subject_of,
+)
+from multidrop.fleet.samples.sources import SourceCheck  # noqa: E402
+from multidrop.fleet.samples.spool import Spool  # noqa: E402
+from multidrop.fleet.servers import names  # noqa: E402
+from multidrop.fleet.servers.connections import paths_of  # noqa: E402
+
+AN_HOUR_AHEAD = """
+import time
+seconds, ns = time.time, time.time_ns
+time.time, time.time_ns = lambda: seconds() + 3600, lambda: ns() + 3600 * 10**9
+"""
+LINE = """
+[[line]]
+name = "hall-1"
+port = "socket://127.0.0.1:4001"
+[[line.drive]]
+name = "pump-1"
+model = "innovert-ibd"
+address = 1
+"""
+
+
+@pytest.fixture(scope="module")
+def servers(tmp_path_factory: pytest.TempPathFactory) -> Iterator[SecuredCluster]:
+    """Return one server with a fleet's buckets, and rights."""
+    folder = tmp_path_factory.mktemp("nats")
+    (folder / "plant.toml").write_text(LINE)
+    with secured_cluster(folder, 1) as running:
+        made = multidrop(running, "operator", "fleet", "init", str(folder / "plant.toml"))
+        assert made.returncode == 0, made.stderr
+        yield running
+
+
+def told(servers: SecuredCluster, user: str, *words: str) -> str:
+    """Return the one sentence that a command ends with."""
+    said = multidrop(servers, user, *words)
+    assert said.returncode == 1, said
+    [line] = said.stderr.splitlines()
+    return line
+
+
+@pytest.mark.slow  # the longest file of its room begins at once
+@pytest.mark.long
+def test_a_route_to_a_server_that_is_silent_is_left_soon(tmp_path: Path) -> None:
+    """By itself NATS takes a minute and more, and hands that server questions for so long."""
+
+    def routes(node: SecuredNode) -> int:
+        with urllib.request.urlopen(f"http://127.0.0.1:{node.monitor}/routez", timeout=5) as answer:
+            return int(json.load(answer)["num_routes"])
+
+    with secured_cluster(tmp_path, 2) as running:
+        one, other = running.nodes
+        until(lambda: routes(one) > 0, "there are routes")
+        begun = time.monotonic()
+        other.pause()
+        until(lambda: routes(one) == 0, "its routes are left")
+        assert time.monotonic() - begun < 30
+        other.go_on()
+        until(lambda: routes(one) > 0, "there are routes again")
+
+
+NO_RIGHT = "these credentials do not allow to "
+NOT_SENT = f"the stop of drive-line-0 was NOT sent: {NO_RIGHT}publish to stop.line-0"
+NOT_THEIRS = [
+    ("viewer", ["fleet", "init"], NO_RIGHT + "publish to $JS.API.STREAM.INFO.KV_contest"),
+    ("hub", ["fleet", "status"], NO_RIGHT + "publish to $JS.API.STREAM.INFO.KV_lease_0"),
+    ("viewer", ["fleet", "drain", "gw-a"], NO_RIGHT + "publish to gateway.gw-a.drain"),
+    ("gw-a", ["fleet", "serve", "gw-b"], NO_RIGHT + "listen to gateway.gw-b.*"),
+    ("viewer", ["hub", "--parquet", "{folder}", "--once"], "the rights of this connection do not suffice"),
+]
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(("user", "words", "sentence"), NOT_THEIRS)
+def test_what_is_not_ones_right_is_one_sentence(
+    servers: SecuredCluster, tmp_path: Path, user: str, words: list[str], sentence: str
+) -> None:
+    filled = [word.replace("{folder}", str(tmp_path / "hub")) for word in words]
+    if words[0] == "hub":
+        filled = [*filled[:1], *servers.urls, *filled[1:]]
+    if "serve" in words:
+        filled += ["--folder", str(tmp_path / "gateway")]
+    assert sentence.lower() in told(servers, user, *filled).lower()
+
+
+@pytest.mark.slow
+def test_a_stored_message_that_is_asked_for_into_anothers_samples_is_left_out(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Servers with an account for all send what is asked for wherever its asker says, with its headers."""
+
+    async def main(servers: SecuredCluster) -> None:
+        made = multidrop(servers, "operator", "fleet", "init")
+        assert made.returncode == 0, made.stderr
+        with closing(Spool(tmp_path / "spool", "gw-b")) as spool:
+            spool.append(numbered(0, 10))
+            assert spool.sync(PATIENCE_S)
+            stored = spool.following(0)
+            assert stored
+            data, subject = stored.path.read_bytes(), subject_of("gw-b", spool.log)
+        gateway = await connect(servers.urls, **servers.options("gw-a"))
+        headers = {SEQUENCE: "1", DIGEST: digest_of(data), LOST: "0"}
+        assert await publish(gateway, "$KV.own_0.any", data, headers)
+        wanted = json.dumps({"last_by_subj": "$KV.own_0.any"}).encode()
+        await gateway.publish("$JS.API.DIRECT.GET.KV_own_0", wanted, reply=subject)
+        await gateway.flush()
+        await gateway.close()
+        client = await connect(servers.urls, **servers.options("hub"))
+        found: list[StreamMessage] = []
+        async with asyncio.timeout(PATIENCE_S):
+            while not found:
+                found = await read_after(client, 0, 10, 1 << 20)
+        await client.close()
+        [message] = found
+        assert (message.gateway, message.data, message.sequence) == ("gw-b", data, 0)
+        assert not SourceCheck({}).take(message)
+
+    with secured_cluster(tmp_path / "nats", 1, change=in_one_account) as servers:
+        asyncio.run(asyncio.wait_for(main(servers), PATIENCE_S))
+    assert "has no number and is left out" in caplog.text
+
+
+def other_ca(servers: SecuredCluster, folder: Path) -> list[str]:
+    return ["--ca", str(certificates(folder / "other").ca)]
+
+
+def no_key(servers: SecuredCluster, folder: Path) -> list[str]:
+    return ["--credentials", str(folder / "none.key")]
+
+
+def damaged_key(servers: SecuredCluster, folder: Path) -> list[str]:
+    (folder / "hub.key").write_text("SUDDENLY")
+    return ["--credentials", str(folder / "hub.key")]
+
+
+def strange_key(servers: SecuredCluster, folder: Path) -> list[str]:
+    (folder / "hub.key").write_bytes(b"\xff\x00 password")
+    return ["--credentials", str(folder / "hub.key")]
+
+
+def strange_ca(servers: SecuredCluster, folder: Path) -> list[str]:
+    (folder / "ca.pem").write_text("no certificate")
+    return ["--ca", str(folder / "ca.pem")]
+
+
+def unknown_key(servers: SecuredCluster, folder: Path) -> list[str]:
+    from multidrop.fleet.servers.credentials import new_seed
+
+    (folder / "stranger.key").write_text(new_seed())
+    return ["--credentials", str(folder / "stranger.key")]
+
+
+MISTAKES: dict[str, tuple[Callable[[SecuredCluster, Path], list[str]], int, str]] = {
+    "another authority": (other_ca, 1, "cannot be believed (unable to get local issuer certificate)"),
+    "no such key": (no_key, 2, "none.key: No such file or directory"),
+    "a damaged key": (damaged_key, 2, "hub.key is damaged: it is no key that `fleet rights` wrote"),
+    "something else": (strange_key, 2, "hub.key has no credentials: name a key of `fleet rights`"),
+    "no certificate": (strange_ca, 2, "ca.pem has no certificate: it must be a PEM file"),
+    "an unknown key": (unknown_key, 1, "admits nobody who says this, or nothing, of himself"),
+}
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("command", ["status", "hub"])
+@pytest.mark.parametrize("mistake", MISTAKES)
+def test_mistaken_credentials_are_one_sentence(
+    servers: SecuredCluster,
+    run: Run,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    mistake: str,
+    command: str,
+) -> None:
+    from multidrop.fleet.samples import samples_stream
+
+    monkeypatch.setattr(samples_stream, "ANSWER_S", 0.5)
+    for name, value in servers.environment("viewer").items():
+        if name.startswith("MULTIDROP_"):
+            monkeypatch.setenv(name, value)
+    make, status, sentence = MISTAKES[mistake]
+    start = {"status": ["fleet", "status"], "hub": ["hub", *servers.urls, "--parquet", str(tmp_path / "h")]}
+    ended, out, err = run(*start[command], *make(servers, tmp_path))
+    assert (ended, out) == (status, "")
+    [line] = err.splitlines()
+    assert sentence in line
+    assert status == 1 or not (tmp_path / "h").exists()  # a mistake of the call makes no folder
+
+
+@pytest.mark.long
+@pytest.mark.slow
+def test_nothing_is_said_to_a_server_that_does_not_begin_with_tls(
+    run: Run, servers: SecuredCluster, tmp_path: Path
+) -> None:
+    """Else whoever is between could read on, and pass our answer to the server's question on as his own."""
+    with cluster(tmp_path / "plain", 1) as plain:
+        url = plain.urls[0].replace("nats://", "tls://")
+        key, ca = str(servers.key("viewer")), str(servers.tls.ca)
+        status, _, err = run("fleet", "status", "--nats", url, "--credentials", key, "--ca", ca)
+        assert status == 1
+        assert "does not begin with TLS, which these options demand" in err
+        status, _, err = run("fleet", "status", "--nats", plain.urls[0], "--ca", ca)
+        assert "does not begin with TLS, which these options demand" in err
+
+
+@pytest.mark.long
+def test_a_server_that_begins_with_tls_is_not_met_in_the_clear(run: Run, servers: SecuredCluster) -> None:
+    status, _, err = run("fleet", "status", "--nats", servers.urls[0].replace("tls://", "nats://"))
+    assert status == 1
+    assert "it said nothing in time; one that begins with TLS is named with tls://" in err
+
+
+@pytest.mark.long
+def test_a_context_for_tls_believes_this_authority_alone(servers: SecuredCluster) -> None:
+    context = servers.options("hub")["tls"]
+    assert context.verify_mode is ssl.CERT_REQUIRED
+    assert context.check_hostname
+    assert len(context.get_ca_certs()) == 1
+
+
+# ---- a whole fleet ----
+
+
+def assert_told_while_it_goes_on(fleet: SecuredFleet) -> None:
+    """A stop that the drive refuses is repeated; who asked for it hears so, and then how it ended."""
+    fleet.hall.refusing.add("line-1")
+    asker = subprocess.Popen(
+        [sys.executable, "-m", "multidrop", "fleet", "stop", "drive-line-1"],
+        env=fleet.servers.environment("commander"),
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    assert asker.stderr
+    told = asker.stderr.readline()
+    while "the stop was sent" not in told:  # the machine may be too busy to send it in half a second
+        assert told.startswith("under way: "), told
+        told = asker.stderr.readline()
+    assert told.startswith("under way: drive-line-1: the stop was sent, and is not confirmed yet")
+    assert asker.poll() is None
+    fleet.hall.refusing.clear()
+    out, err = asker.communicate(timeout=PATIENCE_S)
+    assert out.startswith("done: drive-line-1: stopped after "), (out, err)
+
+
+@pytest.mark.long
+def test_all_works_with_the_rights_as_written(tmp_path: Path) -> None:
+    """Cold start, a dead gateway's lines, a drain, the hub, and no denial in anybody's log."""
+    with secured_fleet(tmp_path) as fleet:
+        fleet.wait_for_polling()
+        until(lambda: all(one["lines"] for one in fleet.status()["gateways"].values()), "shares")
+        assert set(fleet.status("commander")["gateways"]) == set(GATEWAYS)
+        for user, told in (("commander", "drive-line-0"), ("viewer", NOT_SENT)):
+            said = multidrop(fleet.servers, user, "fleet", "stop", "drive-line-0")
+            assert told in said.stdout + said.stderr
+            assert ("do not allow" in said.stdout + said.stderr) is (user == "viewer"), said
+        assert_told_while_it_goes_on(fleet)
+        assert "drive-line-0" in "".join(path.read_text() for path in tmp_path.glob("gw-*/commands.jsonl"))
+        fleet.running["gw-a"].kill()
+        until(lambda: "gw-a" not in fleet.status()["gateways"], "its end")
+        fleet.wait_for_polling()
+        drained = multidrop(fleet.servers, "operator", "fleet", "drain", "gw-b")
+        assert (drained.returncode, drained.stderr) == (0, "")
+        fleet.wait_for_polling()
+        fleet.running["gw-c"].terminate()
+        fleet.running["gw-c"].wait(PATIENCE_S)
+        words = ["--parquet", str(tmp_path / "hub"), "--once", "--json"]
+        kept = json.loads(multidrop(fleet.servers, "hub", "hub", *fleet.servers.urls, *words).stdout)
+        assert kept["rows"] > 100
+        assert kept["alarms"] == 0
+        assert fleet.hall.overlaps() == 0
+        for name in GATEWAYS:
+            assert "do not allow" not in fleet.log(name)
+            assert "Traceback" not in fleet.log(name)
+
+
+@pytest.mark.long
+def test_a_key_that_is_taken_away_is_told_of_and_its_lines_go_on(tmp_path: Path) -> None:
+    """The servers read their rights again, and end the connections of who has none any more."""
+    with secured_fleet(tmp_path, 1, ("gw-a", "gw-b")) as fleet:
+        fleet.wait_for_polling()
+        fleet.servers.give_rights_to(["gw-b"])
+        until(lambda: "admits nobody who says this" in fleet.log("gw-a"), "the sentence")
+        until(lambda: "no line is polled" in fleet.log("gw-a"), "silence")
+        fleet.wait_for_polling()
+        assert fleet.running["gw-a"].poll() is None  # and tries again
+        assert fleet.log("gw-a").count("admits nobody") < 10  # each connection says it once
+
+
+@pytest.mark.long
+def test_a_gateway_that_comes_shares_the_lines_and_ends_nobodys_session(tmp_path: Path) -> None:
+    """The servers read its rights while all others go on, and commands find it.
+
+    NATS 2.15 gives an account that it reads while it runs what others offer it when it reads that once more.
+    """
+    with secured_fleet(tmp_path, 3, ("gw-a", "gw-b")) as fleet:
+        fleet.wait_for_polling()
+        fleet.servers.give_rights_to(["gw-a", "gw-b", "gw-c"])
+        fleet.servers.reload()
+        fleet.start("gw-c")
+        until(lambda: bool(fleet.status()["gateways"].get("gw-c", {}).get("lines")), "its share")
+        fleet.wait_for_polling()
+        taken = fleet.status()["gateways"]
+        assert [taken[name]["session"] for name in GATEWAYS] == [1, 1, 1]
+        for number in range(6):
+            said = multidrop(fleet.servers, "commander", "fleet", "stop", f"drive-line-{number}")
+            assert said.returncode == 0, said
+        assert (tmp_path / "gw-c" / "commands.jsonl").read_text().count("drive-line-") > 0
+        assert fleet.hall.overlaps() == 0
+        for name in GATEWAYS:
+            assert "do not allow" not in fleet.log(name)
+
+
+@pytest.mark.long
+def test_a_gateway_in_wrong_hands_makes_lines_silent_and_no_more(tmp_path: Path) -> None:
+    """Somebody with the key of gw-c ends the others' sessions again and again; they begin new ones."""
+    with secured_fleet(tmp_path, 1) as fleet:
+        fleet.wait_for_polling()
+        fleet.running["gw-c"].kill()
+        until(lambda: "gw-c" not in fleet.status()["gateways"], "its end")
+        fleet.wait_for_polling()
+
+        async def end_all() -> None:
+            path = paths_of(fleet.servers.urls, fleet.servers.options("gw-c"))[0]
+            await path.open()
+            for name in ("gw-a", "gw-b", "gw-a"):
+                for at in names.LEASES:
+                    bucket = LeaseBucket(at, lambda: path, "gw-c")
+                    record = await bucket.get(name)
+                    while True:
+                        with suppress(Conflict):
+                            await bucket.put(name, {**record.value, "ended": True}, record.revision)
+                            break
+                        record = await bucket.get(name)
+                await asyncio.sleep(5.0)
+            await path.close()
+
+        asyncio.run(asyncio.wait_for(end_all(), PATIENCE_S))
+        assert "was ended by another" in fleet.log("gw-a")
+        assert "was ended by another" in fleet.log("gw-b")
+        fleet.wait_for_polling()
+        assert fleet.hall.overlaps() == 0
+
+
+# ---- bad surroundings ----
+
+
+@pytest.mark.long
+def test_clocks_an_hour_apart_are_told_of_and_change_nothing(tmp_path: Path) -> None:
+    """One of two gateways is an hour ahead; each takes over what the other leaves."""
+    (tmp_path / "ahead").mkdir()
+    (tmp_path / "ahead" / "sitecustomize.py").write_text(AN_HOUR_AHEAD)
+    ahead = {"gw-a": {"PYTHONPATH": str(tmp_path / "ahead")}, "gw-b": {}}
+    with secured_fleet(tmp_path, 1, ("gw-a", "gw-b"), ahead) as fleet:
+        until(lambda: "this machine's clock is 3600 s ahead of that of tls://" in fleet.log("gw-a"), "a word")
+
+        def are_two() -> bool:
+            return [one["lines"] > 0 for one in fleet.status()["gateways"].values()] == [True, True]
+
+        until(are_two, "both")
+        for name in ("gw-b", "gw-a"):
+            fleet.running[name].kill()
+            until(lambda name=name: name not in fleet.status()["gateways"], "its end")  # type: ignore[misc]
+            fleet.wait_for_polling()
+            fleet.start(name, **ahead[name])
+            until(
+                lambda: [bool(one["lines"]) for one in fleet.status()["gateways"].values()] == [1, 1], "both"
+            )
+        assert "this machine's clock" not in fleet.log("gw-b")
+        assert fleet.hall.overlaps() == 0
+
+
+@pytest.mark.long
+def test_two_gateways_of_one_name_on_two_machines(tmp_path: Path) -> None:
+    """The second one has another folder, as on another machine: it waits, says so, and goes on alone."""
+    with secured_fleet(tmp_path, 1, ("gw-a",)) as fleet:
+        fleet.wait_for_polling()
+        fleet.start("gw-a", "second")
+        sentence = "gw-a does not poll: a gateway called gw-a is registered on"
+        until(lambda: sentence in fleet.log("second"), "the sentence")
+        assert fleet.status()["gateways"]["gw-a"]["session"] == 1
+        fleet.running["gw-a"].kill()
+        until(lambda: fleet.status()["gateways"].get("gw-a", {}).get("session") == 2, "the second one")
+        fleet.wait_for_polling()
+        assert fleet.log("second").count(sentence) == 1
+        assert fleet.hall.overlaps() == 0
+
+
+@pytest.mark.long
+def test_without_a_quorum_each_command_is_one_sentence(tmp_path: Path) -> None:
+    with secured_fleet(tmp_path, 3, ("gw-a",)) as fleet:
+        fleet.wait_for_polling()
+        fleet.running["gw-a"].terminate()
+        fleet.running["gw-a"].wait(PATIENCE_S)
+        for node in fleet.servers.nodes[1:]:
+            node.kill()
+        kept = str(tmp_path / "gw-a")
+        for user, words in (
+            ("viewer", ["status"]),
+            ("operator", ["drain", "gw-a"]),
+            ("gw-a", ["serve", "gw-a", "--folder", kept]),
+        ):
+            assert "have no quorum: more than half of them must run" in told(
+                fleet.servers, user, "fleet", *words
+            )

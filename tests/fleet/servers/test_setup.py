@@ -1,0 +1,329 @@
+"""`fleet init` on real servers: what it makes, and what it refuses."""
+
+from __future__ import annotations
+
+import asyncio
+import re
+import subprocess
+import time
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from nats_clusters import Cluster, cluster, free_ports, old_server_program, server_program
+from tables import table
+
+from multidrop.fleet.errors import FleetError, Unsure
+from multidrop.fleet.leases import bucket as lease_bucket
+from multidrop.fleet.samples.batch_client import DirectMessage
+from multidrop.fleet.servers import connections as servers
+from multidrop.fleet.servers import names, setup
+from multidrop.fleet.servers.buckets import ask
+from multidrop.fleet.servers.connections import ServerPath, paths_of
+from multidrop.fleet.servers.leaders import have_leaders
+
+
+async def _init(urls: list[str]) -> dict[str, object]:
+    paths = paths_of(urls)
+    try:
+        return await setup.set_up(paths)
+    finally:
+        for path in paths:
+            await path.close()
+
+
+@pytest.mark.slow
+def test_buckets_are_made_on_all_three_servers(nats: Cluster) -> None:
+    made = asyncio.run(_init(nats.urls))
+    assert made["replicas"] == 3
+    assert set(made["servers"]) == {"n1", "n2", "n3"}
+    assert asyncio.run(_init(nats.urls)) == made  # a second time changes nothing
+
+
+@pytest.mark.slow
+def test_each_path_is_at_a_server_of_its_own_and_so_is_each_leader(fleet: Cluster) -> None:
+    async def main() -> None:
+        paths = paths_of(fleet.urls)
+        await setup.open_all(paths)
+        assert [path.server_name for path in paths] == ["n1", "n2", "n3"]
+        ends = time.monotonic() + 20
+        while True:
+            await setup.bring_leaders_home(paths[0], await setup.led_clusters(paths[0]))
+            infos = [await ask(paths[0], f"STREAM.INFO.KV_lease_{at}") for at in range(3)]
+            leaders = [info["cluster"].get("leader") for info in infos]
+            if leaders == ["n1", "n2", "n3"]:
+                break
+            assert time.monotonic() < ends, leaders
+            await asyncio.sleep(0.2)
+        for path in paths:
+            await path.close()
+
+    asyncio.run(main())
+
+
+class Deaf:
+    """A path on which the leaders of some buckets of lines' masters say this, or nothing."""
+
+    server_name = "n1"
+
+    def __init__(self, said: bytes | None, *buckets: str) -> None:
+        self.said = said
+        self.buckets = buckets
+
+    async def request(self, subject: str, data: bytes) -> SimpleNamespace:
+        if not subject.endswith(self.buckets):
+            return SimpleNamespace(data=b'{"cluster":{"leader":"n1"}}')
+        if self.said is None:
+            raise Unsure("no answer")
+        return SimpleNamespace(data=self.said)
+
+
+@table(
+    ("said", "has"),
+    [(b'{"cluster":{"leader":"n2"}}', True), (b"{}", True), (b'{"cluster":{}}', False), (None, False)],
+)
+def test_lines_can_be_claimed_while_two_of_three_buckets_have_a_leader(said: bytes | None, has: bool) -> None:
+    for bucket in names.OWNERS:
+        one: Any = Deaf(said, bucket)
+        assert asyncio.run(have_leaders(one))
+        two: Any = Deaf(said, *(other for other in names.OWNERS if other != bucket))
+        assert asyncio.run(have_leaders(two)) is has
+
+
+def test_no_server_is_one_sentence() -> None:
+    [port] = free_ports(1)
+    with pytest.raises(FleetError, match=f"no NATS server answers at nats://127.0.0.1:{port}") as failure:
+        asyncio.run(_init([f"nats://127.0.0.1:{port}"]))
+    assert "\n" not in str(failure.value)
+
+
+def test_an_old_server_is_refused(tmp_path: Path) -> None:
+    sentence = r"is 2\.\d+; a fleet needs 2\.12 or newer"
+    with cluster(tmp_path, 1, old_server_program()) as old, pytest.raises(FleetError, match=sentence):
+        asyncio.run(_init(old.urls))
+
+
+@pytest.mark.slow
+def test_a_cluster_that_grants_a_key_twice_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """An old server does, even if its version is not looked at."""
+    monkeypatch.setattr(servers, "OLDEST", (0, 0))
+    with cluster(tmp_path, 3, old_server_program()) as old:
+        sentence = re.escape("claimants at once; no lease is safe there")
+        with pytest.raises(FleetError, match=sentence):
+            asyncio.run(_init(old.urls))
+
+
+def test_servers_that_do_not_look_at_all_writers_records_are_refused(
+    nats: Cluster, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Such ones would give a lease to its gateway and to who ends it. Some answers may come too late."""
+    monkeypatch.setattr(lease_bucket.LeaseBucket, "_all_of", lease_bucket.LeaseBucket._subject)
+    with pytest.raises(FleetError, match=r"gave one revision of a key to [2-6] of 6 claimants at once"):
+        asyncio.run(_init(nats.urls))
+
+
+@table(("is_carried_out",), [(True,), (False,)])
+def test_a_removal_that_nobody_answers_is_looked_after(
+    is_carried_out: bool, nats: Cluster, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A busy leader may be late with its answer to the end of the contest."""
+    removals = []
+
+    async def ask_in_vain(path: ServerPath, subject: str, data: Any = None) -> dict[str, Any]:
+        if subject.startswith("STREAM.DELETE"):
+            removals.append(subject)
+            if len(removals) == 1:
+                if is_carried_out:
+                    await ask(path, subject, data)
+                raise Unsure("no answer")
+        return await ask(path, subject, data)
+
+    monkeypatch.setattr(setup, "ask", ask_in_vain)
+    asyncio.run(_init(nats.urls))
+    assert removals == ["STREAM.DELETE.KV_contest"] * (1 if is_carried_out else 2)
+
+
+@pytest.mark.long
+@pytest.mark.slow
+def test_a_server_that_is_down_is_waited_for_at_first_and_not_later(tmp_path: Path) -> None:
+    """Buckets made without it would stay on two servers, of which each one's death ends all polling."""
+    with cluster(tmp_path, 3) as three:
+        down = next(node for node in three.nodes if not node.leads_servers())
+        others = [node for node in three.nodes if node is not down]
+        down.kill()
+        with pytest.raises(FleetError, match=f"^{down.url} does not answer, and what is made now"):
+            asyncio.run(_init(three.urls))
+        down.start()
+        three.wait()
+        assert asyncio.run(_init(three.urls))["replicas"] == 3
+        down.kill()
+        ends = time.monotonic() + 60
+        while not {f"KV_{name}" for name in names.BUCKETS} <= set().union(*(one.leads() for one in others)):
+            assert time.monotonic() < ends
+            time.sleep(0.1)
+        assert asyncio.run(_init(three.urls))["replicas"] == 3  # a plant may be stored meanwhile
+
+
+@pytest.mark.long
+@pytest.mark.slow
+def test_no_quorum_is_one_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(setup, "WAIT_S", 1.0)
+    with cluster(tmp_path, 3) as three:
+        for node in three.nodes[1:]:
+            node.kill()
+        with pytest.raises(FleetError, match="have no quorum: more than half of them must run"):
+            asyncio.run(_init(three.urls[:1]))
+
+
+NO_LEADER = (
+    b'{"error":{"code":503,"err_code":10008,"description":"JetStream system temporarily unavailable"}}'
+)
+
+
+@pytest.mark.slow
+def test_servers_that_say_that_they_cannot_decide_have_no_quorum(
+    nats: Cluster, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(setup, "WAIT_S", 0.5)
+
+    async def refuse(self: ServerPath, subject: str, *rest: object) -> SimpleNamespace:
+        return SimpleNamespace(data=NO_LEADER)
+
+    monkeypatch.setattr(ServerPath, "request", refuse)
+    with pytest.raises(FleetError, match=r"have no quorum: .* \(nats:.* says: JetStream system temporarily"):
+        asyncio.run(_init(nats.urls))
+
+
+@pytest.mark.slow
+def test_a_plant_that_cannot_be_read_yet_is_waited_for(
+    nats: Cluster, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A direct get of a bucket that was made just now may find nobody."""
+    collect, failures = ServerPath.collect, [Unsure("it ended with 503")] * 2
+
+    async def fail_at_first(self: ServerPath, subject: str, data: bytes) -> list[DirectMessage]:
+        if failures:
+            raise failures.pop()
+        return await collect(self, subject, data)
+
+    monkeypatch.setattr(ServerPath, "collect", fail_at_first)
+    assert asyncio.run(_init(nats.urls))["replicas"] == 3
+    assert failures == []
+
+
+@pytest.mark.slow
+def test_a_server_without_jetstream_is_one_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(setup, "WAIT_S", 0.5)
+    [port] = free_ports(1)
+    command = [server_program(), "-a", "127.0.0.1", "-p", str(port)]
+    with (tmp_path / "log").open("wb") as log, subprocess.Popen(command, stdout=log, stderr=log) as server:
+        try:
+            ends = time.monotonic() + 60
+            while b"Server is ready" not in (tmp_path / "log").read_bytes():
+                assert time.monotonic() < ends
+                time.sleep(0.02)
+            with pytest.raises(FleetError, match=r"no JetStream answers at nats:.* needs `jetstream"):
+                asyncio.run(_init([f"nats://127.0.0.1:{port}"]))
+        finally:
+            server.kill()
+
+
+@pytest.mark.slow
+def test_a_bucket_without_a_leader_is_no_quorum(fleet: Cluster, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A server that is alone answers some seconds after the others' death, and names no leader."""
+    told = setup.ask
+
+    async def without_leader(path: ServerPath, subject: str) -> dict[str, Any]:
+        info = await told(path, subject)
+        info["cluster"].pop("leader", None)
+        return info
+
+    monkeypatch.setattr(setup, "ask", without_leader)
+    monkeypatch.setattr(setup, "WAIT_S", 0.2)
+    with pytest.raises(FleetError, match=r"have no quorum: .*the bucket lease_0 has no leader"):
+        asyncio.run(_check(fleet))
+
+
+@pytest.mark.slow
+def test_a_leader_that_is_being_elected_is_waited_for(
+    fleet: Cluster, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nobody answers for a bucket whose leader has died, and most of the servers may be there."""
+    told, silent = setup.ask, ["STREAM.INFO.KV_lease_1"] * 3
+
+    async def silent_at_first(path: ServerPath, subject: str) -> dict[str, Any]:
+        if subject in silent:
+            silent.remove(subject)
+            raise Unsure("no answer")
+        return await told(path, subject)
+
+    monkeypatch.setattr(setup, "ask", silent_at_first)
+    asyncio.run(_check(fleet))
+    assert silent == []
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(("ahead_s", "words"), [(3600, "is 3600 s ahead of"), (-3600, "is 3600 s behind")])
+def test_a_clock_an_hour_away_is_told_of(
+    fleet: Cluster,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+    ahead_s: float,
+    words: str,
+) -> None:
+    asyncio.run(_check(fleet))
+    assert caplog.messages == []
+    real = time.time
+    monkeypatch.setattr(setup.time, "time", lambda: real() + ahead_s)
+    asyncio.run(_check(fleet))
+    [said] = caplog.messages
+    assert words in said
+    assert said.endswith("set it, for samples have its time")
+
+
+async def _check(fleet: Cluster) -> None:
+    path = paths_of(fleet.urls)[0]
+    await path.open()
+    await setup.check_buckets(path)
+    await path.close()
+
+
+@pytest.mark.long
+def test_a_path_goes_elsewhere_and_comes_home(tmp_path: Path) -> None:
+    with cluster(tmp_path, 3) as three:
+
+        async def main() -> None:
+            path = paths_of(three.urls)[1]
+            await path.open()
+            assert path.server_name == "n2"
+            three.nodes[1].pause()
+            await path.look_after()
+            assert path.server_name == "n3"
+            three.nodes[1].go_on()
+            await path.look_after()
+            assert path.server_name == "n2"
+            three.nodes[1].kill()
+            while path.is_open:
+                await asyncio.sleep(0.01)
+            await path.look_after()
+            assert path.server_name == "n3"
+            await path.close()
+
+        asyncio.run(main())
+
+
+@pytest.mark.long
+def test_a_home_that_is_silent_keeps_nobody_waiting_for_ever(tmp_path: Path) -> None:
+    with cluster(tmp_path, 2) as two:
+        two.nodes[0].pause()
+
+        async def main() -> None:
+            path = paths_of(two.urls)[0]
+            await path.open()
+            assert path.server_name == "n2"
+            await path.close()
+
+        asyncio.run(main())

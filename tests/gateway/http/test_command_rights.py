@@ -1,0 +1,117 @@
+"""The rights that Commands looks at itself: no way in has to, and none is let off."""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+from typing import Any, NoReturn
+
+import pytest
+from lines import PATIENCE
+from modbus_gateway import plant_of
+
+from multidrop import Drive, InvtCHE, Plant, Refused
+from multidrop.gateway import commands
+from multidrop.gateway.commands import BUSY, Commands, Told
+from multidrop.gateway.http.rights import NEVER_THIS_WAY, NOT_ALLOWED, NOT_LISTED, Caller, May, Right
+from multidrop.gateway.verb_rules import STOPPING, VERBS
+
+ALL = May(write=frozenset({"mill.setpoint"}), verbs=frozenset(f"mill.{verb}" for verb in VERBS))
+WAYS = ("page", "http", "mqtt", "modbus")
+
+
+class GuardedLines:
+    """One drive; whoever reaches its line did so without the right to."""
+
+    plant: Plant = plant_of(("hall", InvtCHE(1, name="mill")), polled=False)
+
+    def bus(self, line: str) -> NoReturn:
+        raise AssertionError("a command that nobody may send came to the line")
+
+    @property
+    def plant_now(self) -> Plant:
+        return self.plant
+
+    plant_coming = None
+
+
+def rules_of(may: May, way: str, role: Right) -> dict[str, str | None]:
+    """Return the rule by which each command is refused; None where it passed all rights."""
+    caller = Caller("anna", way, "10.0.0.7", role)
+
+    async def carried_out() -> dict[str, Any]:
+        control = Commands(GuardedLines(), may)  # type: ignore[arg-type]
+        told: dict[str, Any] = {verb: await control.act("mill", verb, {}, caller) for verb in VERBS}
+        told["write"] = await control.write("mill", "setpoint", 10.0, caller)
+        stopped = await control.stop(["mill"], caller)
+        return told | {"stop all": stopped["mill"]}
+
+    return {
+        what: told.error.rule if isinstance(told.error, Refused) else None
+        for what, told in asyncio.run(carried_out()).items()
+    }
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_who_may_only_look_sends_nothing_by_any_way(way: str) -> None:
+    by_verb = NEVER_THIS_WAY if way == "modbus" else NOT_ALLOWED
+    expected = dict.fromkeys(VERBS, by_verb) | {"write": NOT_ALLOWED, "stop all": NOT_ALLOWED}
+    assert rules_of(ALL, way, Right.LOOK) == expected
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_who_may_stop_stops_and_does_nothing_else(way: str) -> None:
+    rules = rules_of(ALL, way, Right.STOP)
+    moving = [rules[verb] for verb in VERBS if verb not in STOPPING]
+    assert {*moving} == {NEVER_THIS_WAY if way == "modbus" else NOT_ALLOWED}
+    assert rules["write"] == NOT_ALLOWED
+    assert rules["stop all"] not in (NOT_ALLOWED, NOT_LISTED)
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_what_is_not_listed_is_refused_to_writers_too(way: str) -> None:
+    rules = rules_of(May(), way, Right.WRITE)
+    listed = {verb: rules[verb] for verb in VERBS if verb != "stop"}
+    assert {*listed.values()} == {NEVER_THIS_WAY if way == "modbus" else NOT_LISTED}
+    assert rules["write"] == NOT_LISTED
+    assert rules["stop all"] not in (NOT_ALLOWED, NOT_LISTED)
+
+
+def test_no_verb_comes_by_modbus_though_it_is_listed() -> None:
+    """Nobody is asked there whether he means it."""
+    rules = rules_of(ALL, "modbus", Right.WRITE)
+    assert {rules[verb] for verb in VERBS} == {NEVER_THIS_WAY}
+
+
+def test_a_line_has_a_few_writes_under_way_and_takes_any_stop(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each has a thread, and a line that stands still would have any number of them."""
+    go_on = threading.Event()
+
+    def slow(drive: Drive, **command: object) -> Told:
+        assert go_on.wait(PATIENCE)
+        return Told(True, "done")
+
+    async def carry_out() -> None:
+        control = Commands(GuardedLines(), ALL)  # type: ignore[arg-type]
+        writer = Caller("anna", "http", "10.0.0.7", Right.WRITE)
+        some = [asyncio.ensure_future(control.write("mill", "setpoint", at, writer)) for at in range(8)]
+        await asyncio.sleep(0)  # each has begun
+        for further in (
+            control.write("mill", "setpoint", 9.0, writer),
+            control.act("mill", "start", {}, writer),
+        ):
+            told = await further
+            assert isinstance(told.error, Refused)
+            assert told.error.rule == BUSY
+        stopped = await control.stop(["mill"], writer)
+        assert not isinstance(stopped["mill"].error, Refused)
+        go_on.set()
+        await asyncio.gather(*some)
+        assert (await control.write("mill", "setpoint", 9.0, writer)).is_done  # there is room again
+
+    for work in ("write_one", "act_one"):
+        monkeypatch.setattr(commands, work, slow)
+    try:
+        asyncio.run(carry_out())
+    finally:
+        go_on.set()

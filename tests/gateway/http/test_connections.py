@@ -1,0 +1,351 @@
+"""Connections of slow and silent clients: they keep nobody out, and end."""
+
+from __future__ import annotations
+
+import asyncio
+import http.client
+import json
+import resource
+import socket
+import ssl
+import threading
+from collections import deque
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack, closing, contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+from clocks import Clock
+from examples import usually
+from gateways import certificate, get, served, serving, simulated_plant
+from lines import PATIENCE, until
+
+from multidrop.gateway import gateway as gateway_module
+from multidrop.gateway.http import connections, request_fields
+from multidrop.gateway.http import routes as web
+from multidrop.gateway.http.connections import (
+    AGAIN_S,
+    FIRST_S,
+    FRESH_S,
+    MOST_OPEN,
+    STALLED_S,
+    Connections,
+    Turns,
+)
+from multidrop.gateway.http.guard import MOST_HEAD
+from multidrop.gateway.http.listener import BACKLOG
+from multidrop.gateway.http.rights import digest
+
+HEAD = b"POST /api/act HTTP/1.1\r\nhost: localhost\r\ncontent-type: application/json\r\n"
+SLOW = [b"", b"POST /api/act HTTP/1.1\r\nhost: loc", HEAD + b"content-length: 100\r\n\r\n{"]
+DESCRIPTORS = MOST_OPEN + 4 * BACKLOG  # fewer than the slow clients and the rest would take
+
+
+@contextmanager
+def slow_clients(port: int, sent: bytes) -> Iterator[list[socket.socket]]:
+    """500 connections that say this, and no more."""
+    with ExitStack() as stack:
+        found = []
+        for _ in range(500):
+            client = stack.enter_context(closing(socket.create_connection(("127.0.0.1", port), PATIENCE)))
+            if sent:
+                client.sendall(sent)
+            found.append(client)
+        yield found
+
+
+def descriptors(pid: int) -> int:
+    return sum(1 for _ in Path(f"/proc/{pid}/fd").iterdir())
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("sent", usually(*SLOW), ids=["silent", "headers", "body"])
+@pytest.mark.parametrize("way", usually("http", "https"))
+def test_a_stop_gets_in_beside_500_slow_clients(tmp_path: Path, sent: bytes, way: str) -> None:
+    certificate(tmp_path, "own")
+    (tmp_path / "tokens").write_text(f"anna stop {digest('secret')}\n")
+    keys = 'certificate = "own.pem"\nkey = "own.key"\ntokens = "tokens"\n' if way == "https" else ""
+    serve = f'[serve]\nlisten = "127.0.0.1:0"\n{keys}[serve.may]\nstop = "anyone"\n'
+    with simulated_plant(tmp_path, serve) as path, serving(path) as (process, url):
+        resource.prlimit(process.pid, resource.RLIMIT_NOFILE, (DESCRIPTORS, DESCRIPTORS))
+        port = int(url.rstrip("/").rpartition(":")[2])
+
+        def connection() -> http.client.HTTPConnection:
+            if way == "http":
+                return http.client.HTTPConnection("127.0.0.1", port, timeout=PATIENCE)
+            context = ssl.create_default_context(cafile=str(tmp_path / "own.pem"))
+            return http.client.HTTPSConnection("localhost", port, timeout=PATIENCE, context=context)
+
+        with closing(connection()) as viewer:
+            get(viewer, "/api/frame")
+            with slow_clients(port, sent), closing(connection()) as stopper:
+                stopper.request("POST", "/api/stop", "{}", {"content-type": "application/json"})
+                told = json.loads(stopper.getresponse().read())
+                assert [one["done"] for one in told.values()] == [True, True]
+                assert descriptors(process.pid) < DESCRIPTORS
+            process.terminate()
+            assert "Traceback" not in process.communicate(timeout=PATIENCE)[1]
+
+
+def test_a_slow_body_is_ended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(request_fields, "BODY_S", 0.1)
+    with (
+        served(tmp_path, '[serve.may]\nstop = "anyone"\n') as gateway,
+        socket.create_connection(("127.0.0.1", gateway.gateway.port), PATIENCE) as client,
+    ):
+        client.sendall(SLOW[2])
+        assert client.recv(1000).startswith(b"HTTP/1.1 408 ")
+        assert gateway.get("/api/plant").status == 200
+
+
+@pytest.mark.slow
+def test_slow_headers_are_ended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(connections, "FIRST_S", 0.1)
+    with (
+        served(tmp_path) as gateway,
+        socket.create_connection(("127.0.0.1", gateway.gateway.port), PATIENCE) as client,
+    ):
+        client.sendall(SLOW[1])
+        assert client.recv(1000) == b""
+        assert gateway.get("/api/plant").status == 200
+
+
+def test_long_headers_are_refused_and_no_stop_is(tmp_path: Path) -> None:
+    with served(tmp_path, '[serve.may]\nstop = "anyone"\n') as gateway:
+        cookie = "a=" + "b" * MOST_HEAD
+        assert gateway.get("/api/plant", cookie=cookie).status == 431
+        assert gateway.get("/api/plant", cookie=cookie[: MOST_HEAD // 2]).status == 200
+        assert gateway.post("/api/stop", {}, cookie=cookie).status == 200
+
+
+def test_headers_in_pieces_are_taken_up_to_a_length(tmp_path: Path) -> None:
+    with served(tmp_path) as gateway:
+        address = "127.0.0.1", gateway.gateway.port
+        head = b"GET /api/plant HTTP/1.1\r\nhost: localhost:%d\r\ncookie: " % address[1]
+        with socket.create_connection(address, PATIENCE) as client:
+            client.sendall(head + b"b" * (MOST_HEAD // 2))
+            assert gateway.get("/page/icon.svg").status == 200  # it read that piece before
+            client.sendall(b"\r\n\r\n")
+            assert client.recv(1000).startswith(b"HTTP/1.1 200 ")
+        with socket.create_connection(address, PATIENCE) as client:
+            client.sendall(head + b"b" * MOST_HEAD)
+            assert client.recv(1000).startswith(b"HTTP/1.1 400 ")
+
+
+@pytest.fixture
+def clock() -> Clock:
+    return Clock()
+
+
+@pytest.fixture
+def pairs() -> Iterator[list[tuple[socket.socket, socket.socket]]]:
+    with ExitStack() as stack:
+        found = [socket.socketpair() for _ in range(MOST_OPEN + 2)]
+        for pair in found:
+            for end in pair:
+                stack.enter_context(end)
+        yield found
+
+
+def is_ended(pair: tuple[socket.socket, socket.socket]) -> bool:
+    pair[0].setblocking(False)
+    try:
+        return pair[0].recv(1) == b""
+    except BlockingIOError:
+        return False
+
+
+def test_the_first_request_and_later_ones_have_their_time(
+    clock: Clock, pairs: list[tuple[socket.socket, socket.socket]]
+) -> None:
+    connections = Connections(clock)
+    for n in range(4):
+        connections.add(pairs[n][1], ("10.0.0.1", n, 0, 0))
+    connections.begin(("10.0.0.1", 1))
+    connections.begin(("10.0.0.1", 2))
+    connections.finish(("10.0.0.1", 2))
+    pairs[3][1].close()
+    clock.now += FIRST_S - 1
+    connections.sweep()
+    assert (len(connections), connections.ended) == (3, 0)
+    clock.now += 2
+    connections.sweep()
+    assert [is_ended(pair) for pair in pairs[:3]] == [True, False, False]
+    clock.now += AGAIN_S
+    connections.sweep()
+    assert [is_ended(pair) for pair in pairs[1:3]] == [False, True]
+    assert (len(connections), connections.ended) == (1, 2)
+    connections.finish(("10.0.0.9", 9))  # nobody knows it: nothing happens
+    assert len(connections) == 1
+
+
+def test_the_one_that_was_idle_for_longest_makes_room(
+    clock: Clock, pairs: list[tuple[socket.socket, socket.socket]]
+) -> None:
+    connections = Connections(clock)
+    for n in range(MOST_OPEN):
+        connections.add(pairs[n][1], ("10.0.0.1", n))
+    connections.begin(("10.0.0.1", 0))  # a request is under way
+    connections.begin(("10.0.0.1", 1))
+    connections.finish(("10.0.0.1", 1))  # idle since now
+    connections.add(pairs[MOST_OPEN][1], ("10.0.0.2", 1))
+    assert [n for n, pair in enumerate(pairs) if is_ended(pair)] == [2]
+    for n in range(MOST_OPEN):
+        connections.begin(("10.0.0.1", n))
+    connections.begin(("10.0.0.2", 1))
+    connections.add(pairs[MOST_OPEN + 1][1], ("10.0.0.2", 2))
+    assert len(connections) == MOST_OPEN
+    assert not is_ended(pairs[MOST_OPEN + 1])  # the newest one is never the one that goes
+
+
+def test_a_new_connection_is_given_time_for_its_request_beside_busy_ones(
+    clock: Clock, pairs: list[tuple[socket.socket, socket.socket]]
+) -> None:
+    """It may bring a stop: the next one that comes must not end it."""
+    connections = Connections(clock)
+    for n in range(MOST_OPEN):
+        connections.add(pairs[n][1], ("10.0.0.1", n))
+        connections.begin(("10.0.0.1", n))
+    for n in (MOST_OPEN, MOST_OPEN + 1):
+        connections.add(pairs[n][1], ("10.0.0.1", n))
+    assert [n for n, pair in enumerate(pairs) if is_ended(pair)] == [0, 1]
+
+
+@pytest.mark.parametrize("is_stalled", [False, True], ids=["sends ahead", "reads nothing"])
+def test_a_greedy_client_goes_before_those_that_are_idle_and_a_stop_goes_last(
+    clock: Clock, pairs: list[tuple[socket.socket, socket.socket]], is_stalled: bool
+) -> None:
+    connections = Connections(clock)
+    for n in range(MOST_OPEN):
+        connections.add(pairs[n][1], ("10.0.0.1", n))
+    assert connections.is_stop(("10.0.0.1", 0), "/api/stop")
+    if is_stalled:
+        connections.note_stall(("10.0.0.1", 7), is_stalled=True)
+        clock.now += FRESH_S + 0.1
+    else:
+        connections.note_greed(("10.0.0.1", 7), is_greedy=True)
+    assert not connections.is_stop(("10.0.0.1", 5), "/api/plant")
+    connections.add(pairs[MOST_OPEN][1], ("10.0.0.2", 0))
+    assert [n for n, pair in enumerate(pairs) if is_ended(pair)] == [7]
+    connections.add(pairs[MOST_OPEN + 1][1], ("10.0.0.2", 1))
+    assert [n for n, pair in enumerate(pairs) if is_ended(pair)] == [1, 7]
+    assert len(connections) == MOST_OPEN
+
+
+def test_who_takes_none_of_its_answers_for_long_is_ended(
+    clock: Clock, pairs: list[tuple[socket.socket, socket.socket]]
+) -> None:
+    connections = Connections(clock)
+    for n in range(2):
+        connections.add(pairs[n][1], ("10.0.0.1", n))
+        connections.begin(("10.0.0.1", n))
+        connections.note_stall(("10.0.0.1", n), is_stalled=True)
+    connections.note_stall(("10.0.0.1", 1), is_stalled=False)
+    clock.now += STALLED_S + 0.1
+    connections.sweep()
+    assert [is_ended(pair) for pair in pairs[:2]] == [True, False]
+
+
+def test_one_request_has_its_turn_in_a_round_and_stops_come_first() -> None:
+    order: list[str] = []
+
+    async def take(turns: Turns, name: str, waiting: deque[asyncio.Future[None]]) -> None:
+        await turns.wait(waiting)
+        order.append(name)
+
+    async def live() -> None:
+        turns = Turns()
+        reads = [asyncio.create_task(take(turns, f"read {n}", turns.others)) for n in range(4)]
+        await asyncio.sleep(0)
+        assert order == ["read 0"]
+        stop = asyncio.create_task(take(turns, "stop", turns.stops))
+        reads[1].cancel()
+        await asyncio.gather(stop, *reads, return_exceptions=True)
+        assert order == ["read 0", "read 2", "stop", "read 3"]  # read 2 had its turn when it came
+        await take(turns, "later", turns.others)  # nobody else waits
+
+    asyncio.run(live())
+    assert order[-1] == "later"
+
+
+def test_a_stop_is_taken_ahead_of_reads_that_came_before(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """100 clients that send 20 requests each, all at once, and read nothing."""
+    order: list[str] = []
+    come, go_on = threading.Event(), threading.Event()
+    described = web.describe
+
+    def describe(*given: Any, **more: Any) -> Any:
+        order.append("read")
+        return described(*given, **more)
+
+    def stand_still() -> None:
+        come.set()
+        assert go_on.wait(PATIENCE)
+
+    monkeypatch.setattr(web, "describe", describe)
+    with served(tmp_path, '[serve.may]\nstop = "anyone"\n') as gateway, ExitStack() as stack:
+        carry_out, address = gateway.gateway.commands.stop, ("127.0.0.1", gateway.gateway.port)
+
+        async def stop(*given: Any) -> Any:
+            order.append("stop")
+            return await carry_out(*given)
+
+        monkeypatch.setattr(gateway.gateway.commands, "stop", stop)
+        clients = [stack.enter_context(socket.create_connection(address, PATIENCE)) for _ in range(101)]
+        until(lambda: len(gateway.gateway.connections) == 101)
+        gateway.loop.call_soon_threadsafe(stand_still)
+        assert come.wait(PATIENCE)
+        for client in clients[:100]:
+            client.sendall(b"GET /api/plant HTTP/1.1\r\nhost: localhost\r\n\r\n" * 20)
+        body = b"content-type: application/json\r\ncontent-length: 2\r\n\r\n{}"
+        clients[100].sendall(b"POST /api/stop HTTP/1.1\r\nhost: localhost\r\n" + body)
+        go_on.set()
+        assert clients[100].recv(1000).startswith(b"HTTP/1.1 200 ")
+        until(lambda: len(order) > 1000)
+    assert order.index("stop") < 10
+
+
+def test_a_request_that_outlasts_the_gateway_is_answered(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(gateway_module, "GRACE_S", 0)
+    entered = threading.Event()
+
+    async def stop(*given: Any) -> None:
+        entered.set()
+        await asyncio.Event().wait()
+
+    with (
+        served(tmp_path, '[serve.may]\nstop = "anyone"\n') as gateway,
+        ThreadPoolExecutor(1) as client,
+    ):
+        monkeypatch.setattr(gateway.gateway.commands, "stop", stop)
+        answer = client.submit(gateway.post, "/api/stop")
+        assert entered.wait(PATIENCE)
+        gateway.loop.call_soon_threadsafe(gateway.gateway.end)
+        assert (answer.result(PATIENCE).status, answer.result().json) == (503, {"error": connections.ENDS})
+    assert "Traceback" not in caplog.text
+
+
+def test_a_client_that_sends_ahead_is_known_until_it_has_its_answers(tmp_path: Path) -> None:
+    go_on = asyncio.Event()
+
+    async def after(n: int) -> None:
+        await go_on.wait()
+
+    with served(tmp_path) as gateway:
+        gateway.gateway.frames.after = after  # type: ignore[method-assign]
+        address = "127.0.0.1", gateway.gateway.port
+        with socket.create_connection(address, PATIENCE) as client:
+            connections, ours = gateway.gateway.connections, client.getsockname()
+            client.sendall(b"GET /api/frame HTTP/1.1\r\nhost: localhost\r\n\r\n")
+            until(lambda: ours in connections._open and connections._open[ours].is_busy)
+            assert not connections._open[ours].is_greedy
+            client.sendall(b"GET /api/plant HTTP/1.1\r\nhost: localhost\r\n\r\n")
+            until(lambda: connections._open[ours].is_greedy)
+            gateway.loop.call_soon_threadsafe(go_on.set)
+            until(lambda: not connections._open[ours].is_greedy)

@@ -1,0 +1,354 @@
+"""The right of every caller for every route, by one table, over HTTP; and pages that are not ours."""
+
+from __future__ import annotations
+
+import http.client
+from collections.abc import Iterator
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+from gateways import Served, served
+from lines import PATIENCE, until
+
+from multidrop.gateway.http.rights import MOST_WRONG, SCHEMES, OwnNames, Right
+
+MAY = '[serve.may]\nwrite = ["pump-1.setpoint"]\nverbs = ["pump-1.start", "pump-1.reset_fault"]\n'
+LOOPBACK_STOPS = MAY.replace("[serve.may]", '[serve.may]\nstop = "anyone"')
+CLOSED = MAY.replace("[serve.may]", '[serve]\ntokens = "tokens"\n[serve.may]\nlook = "token"')
+
+TOKENS = MAY.replace("[serve.may]", '[serve]\ntokens = "tokens"\n[serve.may]')
+OPEN = TOKENS.replace("[serve.may]", '[serve.may]\nlook = "anyone"')
+
+LOOKS = ("/api/plant", "/api/frame", "/api/lines", "/api/audit", "/api/drive/pump-1", "/health", "/metrics")
+STOP = ("/api/stop", {"drives": ["pump-1"]})
+WRITE = ("/api/write", {"drive": "pump-1", "register": "setpoint", "value": 50.0})
+UNLISTED_WRITE = ("/api/write", {"drive": "pump-2", "register": "setpoint", "value": 50.0})
+RESET = ("/api/act", {"drive": "pump-1", "verb": "reset_fault", "options": {}})
+UNLISTED_VERB = ("/api/act", {"drive": "pump-1", "verb": "jog", "options": {}})
+STOP_VERB = ("/api/act", {"drive": "pump-2", "verb": "stop", "options": {}})
+ACTS = (STOP, WRITE, UNLISTED_WRITE, RESET, UNLISTED_VERB, STOP_VERB)
+
+LOCAL, OTHER = "127.0.0.1", "10.0.0.7"  # as a proxy tells them
+# By the settings, and where the caller is: the answers to looks, and to ACTS in their order, for each right.
+TABLE = {
+    (MAY, LOCAL): [
+        (None, 200, (401, 401, 401, 401, 401, 401)),
+        (Right.LOOK, 200, (403, 403, 403, 403, 403, 403)),
+        (Right.STOP, 200, (200, 403, 403, 403, 403, 200)),
+        (Right.WRITE, 200, (200, 200, 403, 200, 403, 200)),
+    ],
+    (MAY, OTHER): [
+        (None, 200, (401, 401, 401, 401, 401, 401)),
+        (Right.STOP, 200, (200, 403, 403, 403, 403, 200)),
+        (Right.WRITE, 200, (200, 200, 403, 200, 403, 200)),
+    ],
+    (LOOPBACK_STOPS, LOCAL): [
+        (None, 200, (200, 401, 401, 403, 403, 200)),
+        (Right.LOOK, 200, (200, 403, 403, 403, 403, 200)),
+        (Right.WRITE, 200, (200, 200, 403, 200, 403, 200)),
+    ],
+    (LOOPBACK_STOPS, OTHER): [
+        (None, 200, (401, 401, 401, 401, 401, 401)),
+        (Right.STOP, 200, (200, 403, 403, 403, 403, 200)),
+    ],
+    (CLOSED, LOCAL): [
+        (None, 401, (401, 401, 401, 401, 401, 401)),
+        (Right.LOOK, 200, (403, 403, 403, 403, 403, 403)),
+    ],
+    (CLOSED, OTHER): [
+        (None, 401, (401, 401, 401, 401, 401, 401)),
+        (Right.WRITE, 200, (200, 200, 403, 200, 403, 200)),
+    ],
+    (TOKENS, LOCAL): [
+        (None, 401, (401, 401, 401, 401, 401, 401)),
+        (Right.LOOK, 200, (403, 403, 403, 403, 403, 403)),
+    ],
+    (TOKENS, OTHER): [(None, 401, (401, 401, 401, 401, 401, 401))],
+    (OPEN, OTHER): [(None, 200, (401, 401, 401, 401, 401, 401))],
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("serve", "address"), TABLE)
+def test_each_caller_may_what_the_table_says(tmp_path: Path, serve: str, address: str) -> None:
+    with served(tmp_path, serve, behind_proxy=address is OTHER) as gateway:
+        until(lambda: gateway.gateway.hub.taken > 0)
+        for right, look, acts in TABLE[serve, address]:
+            headers = {} if right is None else {"authorization": gateway.bearer(right)}
+            if address is OTHER:
+                headers["x_forwarded_for"] = f"127.0.0.1, {address}"  # the first is what it says of itself
+            looks = {path: gateway.get(path, **headers).status for path in LOOKS}
+            assert looks == dict.fromkeys(LOOKS, look), right
+            assert tuple(gateway.command(path, body, **headers).status for path, body in ACTS) == acts, right
+            assert gateway.get("/", **headers).status in (200, 404)  # the page itself is nobody's secret
+
+
+@pytest.mark.parametrize("way", ["authorization", "cookie"])
+def test_a_wrong_token_is_refused_whatever_anybody_may(tmp_path: Path, way: str) -> None:
+    wrong = {way: {"authorization": "Bearer wrong", "cookie": "multidrop=wrong"}[way]}
+    with served(tmp_path, LOOPBACK_STOPS) as gateway:
+        until(lambda: gateway.gateway.hub.taken > 0)
+        for path in LOOKS:
+            assert gateway.get(path).status == 200
+            answer = gateway.get(path, **wrong)
+            assert (answer.status, answer.json["error"]) == (401, "the token is wrong")
+            assert ("multidrop=" in answer.headers.get("set-cookie", "")) == (way == "cookie")
+        for path, body in (WRITE, RESET, UNLISTED_VERB):
+            assert gateway.post(path, {**body, "seen": 1}, **wrong).status == 401
+        assert gateway.gateway.commands.called == 0
+        for path, body in (STOP, STOP_VERB):  # which anybody may send
+            assert gateway.post(path, body, **wrong).status == 200
+        assert gateway.gateway.commands.called == 2
+        for at in range(MOST_WRONG):
+            gateway.get("/health", authorization=f"Bearer wrong-{at}")
+        for path in LOOKS:  # none is looked at any more, and none is taken for none
+            assert gateway.get(path, **wrong).status == 429
+            assert gateway.get(path, authorization=gateway.bearer(Right.WRITE)).status == 429
+            assert gateway.get(path).status == 200
+
+
+def test_a_token_is_not_checked_where_there_are_none(tmp_path: Path) -> None:
+    with served(tmp_path, LOOPBACK_STOPS, tokens=()) as gateway:
+        until(lambda: gateway.gateway.hub.taken > 0)
+        for path in LOOKS:
+            assert gateway.get(path, authorization="Bearer any").status == 200
+        assert gateway.post(WRITE[0], {**WRITE[1], "seen": 1}, authorization="Bearer any").status == 401
+
+
+def test_a_wrong_token_that_comes_again_is_logged_once(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    with served(tmp_path) as gateway:
+        for _ in range(3):
+            assert gateway.get("/api/plant", cookie="multidrop=taken-away").status == 401
+    assert caplog.text.count("wrong token from 127.0.0.1") == 1
+
+
+@pytest.fixture(scope="module")
+def open_gateway(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
+    """Everybody on this machine may stop."""
+    with served(tmp_path_factory.mktemp("open"), LOOPBACK_STOPS, names=("plant.example",)) as gateway:
+        until(lambda: gateway.gateway.hub.taken > 0)
+        yield gateway
+
+
+FOREIGN = {
+    "another name, such as a rebound one": ({"host": "evil.test"}, 421),
+    "another name with our port": ({"host": "evil.test:8750"}, 421),
+    "no host name": ({"host": "plant.example/x"}, 421),
+    "an empty name": ({"host": ""}, 421),
+    "a page of another site": ({"origin": "http://evil.test"}, 403),
+    "the same port with TLS, which we have not": ({"host": "localhost", "origin": "https://localhost"}, 403),
+    "another port of this machine": ({"origin": "http://localhost:1"}, 403),
+    "a file, or a sandboxed frame": ({"origin": "null"}, 403),
+    "a script of another site": ({"sec_fetch_site": "cross-site"}, 403),
+    "a script of another port": ({"sec_fetch_site": "same-site"}, 403),
+    "a form": ({"content_type": "application/x-www-form-urlencoded"}, 415),
+    "a form that looks like text": ({"content_type": "text/plain"}, 415),
+}
+
+
+@pytest.mark.parametrize("case", FOREIGN)
+def test_pages_that_are_not_ours_send_no_frame(open_gateway: Served, case: str) -> None:
+    headers, status = FOREIGN[case]
+    before = open_gateway.gateway.commands.called
+    assert open_gateway.post(*STOP, **headers).status == status
+    assert open_gateway.gateway.commands.called == before
+
+
+ORIGINS = {  # with the host that was asked, and how: is it a page of ours?
+    ("https://plant.example", "plant.example", ("https",)): True,
+    ("https://plant.example:443", "plant.example", ("https",)): True,
+    ("https://plant.example:8443", "plant.example:8443", ("https",)): True,
+    ("http://plant.example", "plant.example", ("https",)): False,  # port 80, and we have 443
+    ("https://plant.example", "plant.example", ("http",)): False,
+    ("https://plant.example", "plant.example", SCHEMES): True,  # behind a proxy that has TLS
+    ("http://plant.example", "plant.example:443", SCHEMES): False,
+    ("https://plant.example.evil.test", "plant.example", ("https",)): False,
+    ("https://evil.test", "evil.test", ("https",)): False,
+    ("https:plant.example", "plant.example", ("https",)): False,
+    ("https://anna@plant.example", "plant.example", ("https",)): False,
+    ("null", "plant.example", SCHEMES): False,
+}
+
+
+@pytest.mark.parametrize("case", ORIGINS)
+def test_a_page_of_ours_has_our_scheme_host_and_port(case: tuple[str, str, tuple[str, ...]]) -> None:
+    origin, host, schemes = case
+    names = OwnNames(["plant.example"], "0.0.0.0", 443)
+    assert names.has_origin(origin, host, schemes) is ORIGINS[case]
+
+
+def test_our_own_page_and_programs_do(open_gateway: Served) -> None:
+    port = open_gateway.gateway.port
+    before = open_gateway.gateway.commands.called
+    for headers in (
+        {},
+        {"host": f"localhost:{port}", "origin": f"http://localhost:{port}", "sec_fetch_site": "same-origin"},
+        {"host": "plant.example", "origin": "http://plant.example"},
+        {"host": f"[::1]:{port}"},
+    ):
+        assert open_gateway.post(*STOP, **headers).json["pump-1"]["done"] is True
+    assert open_gateway.gateway.commands.called == before + 4
+
+
+def test_two_host_headers(open_gateway: Served) -> None:
+    connection = http.client.HTTPConnection("127.0.0.1", open_gateway.gateway.port)
+    connection.putrequest("GET", "/health", skip_host=True)
+    connection.putheader("host", "localhost")
+    connection.putheader("host", "evil.test")
+    connection.endheaders()
+    assert connection.getresponse().status in (400, 421)
+    connection.close()
+
+
+@pytest.mark.parametrize("path", ["/", "/api/plant", "/api/nothing", "/metrics", "/api/stop"])
+def test_no_answer_lets_itself_be_framed_or_guessed_at(open_gateway: Served, path: str) -> None:
+    headers = open_gateway.get(path).headers
+    if path == "/":
+        policy = "default-src 'self'; base-uri 'none'; form-action 'none'; object-src 'none'"
+        assert headers["content-security-policy"] == f"{policy}; frame-ancestors 'none'"
+        assert headers["cross-origin-opener-policy"] == "same-origin"
+    else:
+        assert headers["content-security-policy"] == "default-src 'none'; frame-ancestors 'none'"
+    assert headers["cross-origin-resource-policy"] == "same-origin"
+    assert headers["x-content-type-options"] == "nosniff"
+    assert "server" not in headers
+    assert headers["cache-control"] == ("no-cache" if path == "/" else "no-store")
+
+
+def test_methods_and_bodies(open_gateway: Served) -> None:
+    post, get = open_gateway.post, open_gateway.get
+    assert get("/api/stop").status == 405
+    assert post("/api/plant").status == 405
+    assert open_gateway.request("PUT", "/api/stop").status == 405
+    assert open_gateway.request("OPTIONS", "/api/stop").status == 405
+    assert post("/api/act", b"no json").json == {"error": "the body is not JSON"}
+    assert post("/api/act", b"[" * 50_000).status == 400
+    assert post("/api/act", b"[]").json == {"error": "the body is not a JSON object"}
+    assert post("/api/act", b" " * 70_000).status == 413
+    assert get("/api/nothing").json == {"error": "there is nothing here"}
+    assert get("/api/drive/pump-9").status == 404
+    assert get("/api/frame?after=x").status == 400
+    assert get("/api/history?series=pump-1.setpoint&from=0&to=1").status == 404
+    writer = {"authorization": open_gateway.bearer(Right.WRITE)}
+    assert (
+        post("/api/write", {"drive": "pump-1", "register": "setpoint", "value": True}, **writer).status == 400
+    )
+    assert post("/api/write", {"drive": "", "register": "setpoint", "value": 1}, **writer).status == 400
+    assert post("/api/act", {"drive": "pump-1", "verb": "start", "options": []}, **writer).status == 400
+
+
+def test_texts_that_are_no_unicode_are_answered_like_others(open_gateway: Served) -> None:
+    post, writer = open_gateway.post, {"authorization": open_gateway.bearer(Right.WRITE)}
+    odd = "\ud800"
+    assert post("/api/token", {"token": odd}).status == 401
+    for named in ({"drive": odd, "register": "setpoint"}, {"drive": "pump-1", "register": odd}):
+        answer = open_gateway.command("/api/write", {**named, "value": 1.0}, **writer)
+        assert answer.status == 403
+        assert odd in answer.json["error"]
+    unknown = open_gateway.command("/api/act", {"drive": odd, "verb": "coast"}, **writer)
+    assert odd in unknown.json["error"]
+
+
+def test_the_page_keeps_its_token_where_no_script_sees_it(open_gateway: Served) -> None:
+    told = open_gateway.post("/api/token", {"token": open_gateway.secrets[Right.WRITE]})
+    assert told.json == {"name": "writer", "role": "write"}
+    cookie = told.headers["set-cookie"]
+    assert {"HttpOnly", "SameSite=strict", "Path=/"} <= {part.strip() for part in cookie.split(";")}
+    assert "Secure" not in cookie  # no TLS here
+    kept = cookie.partition(";")[0]
+    assert open_gateway.get("/api/plant", cookie=kept).json["may"]["role"] == "write"
+    assert open_gateway.command(*WRITE, cookie=kept).status == 200
+    gone = open_gateway.post("/api/forget", cookie=kept).headers["set-cookie"]
+    assert 'multidrop=""' in gone
+    assert "Max-Age=0" in gone
+
+
+def test_wrong_tokens_are_looked_at_five_times_a_minute(tmp_path: Path) -> None:
+    """Neither a right token on another address nor any stop is held up by them."""
+    now = [1000.0]
+    with served(tmp_path, CLOSED, behind_proxy=True) as gateway:
+        gateway.gateway.tokens.find("")  # the table is there
+        guard_clock(gateway, now)
+        anna = {"x_forwarded_for": "10.0.0.1"}
+        wrong = {**anna, "authorization": "Bearer wrong"}
+        right = {**anna, "authorization": gateway.bearer(Right.STOP)}
+        for at in range(MOST_WRONG):
+            assert gateway.get("/api/plant", **anna, authorization=f"Bearer wrong-{at}").status == 401
+        assert gateway.get("/api/plant", **wrong).status == 429
+        assert gateway.get("/api/plant", **right).status == 429  # not even looked at
+        assert gateway.post("/api/token", {"token": gateway.secrets[Right.STOP]}, **anna).status == 429
+        assert gateway.post(*STOP, **right).json["pump-1"]["done"] is True
+        assert gateway.post(*STOP, **wrong).status == 401
+        signed = {"token": gateway.secrets[Right.STOP], "to": "stop"}  # which a stop from the page needs
+        assert gateway.post("/api/token", signed, **anna).status == 200
+        assert gateway.post("/api/token", {**signed, "token": "wrong"}, **anna).status == 401
+        elsewhere = {"x_forwarded_for": "10.0.0.2", "authorization": gateway.bearer(Right.STOP)}
+        assert gateway.get("/api/plant", **elsewhere).status == 200
+        now[0] += 60.0
+        assert gateway.get("/api/plant", **right).status == 200
+
+
+@pytest.mark.parametrize("told", [{}, {"x_forwarded_for": "127.0.0.1"}, {"x_forwarded_for": "10.0.0.7, ::1"}])
+def test_nobody_behind_a_proxy_counts_as_being_here(tmp_path: Path, told: dict[str, str]) -> None:
+    """It is on this machine itself, and may be wrong about its clients."""
+    with served(tmp_path, LOOPBACK_STOPS, behind_proxy=True) as gateway:
+        assert gateway.post(*STOP, **told).status == 401
+        assert gateway.get("/api/plant", **told).json["may"]["role"] == "look"
+        assert gateway.gateway.commands.called == 0
+
+
+def test_nobody_behind_a_proxy_is_shut_out_in_the_name_of_another_address(tmp_path: Path) -> None:
+    """A proxy such as HAProxy adds a header of its own behind the one that its client sent."""
+    with served(tmp_path, CLOSED, behind_proxy=True) as gateway:
+        for at in range(MOST_WRONG):
+            connection = http.client.HTTPConnection("127.0.0.1", gateway.gateway.port, timeout=PATIENCE)
+            with closing(connection):
+                connection.putrequest("GET", "/api/plant")
+                for address in ("10.0.0.1", "10.0.0.66"):
+                    connection.putheader("x-forwarded-for", address)
+                connection.putheader("authorization", f"Bearer wrong-{at}")
+                connection.endheaders()
+                assert connection.getresponse().status == 401
+        anna = {"x_forwarded_for": "10.0.0.1", "authorization": gateway.bearer(Right.STOP)}
+        assert gateway.get("/api/plant", **anna).status == 200
+        assert gateway.get("/api/plant", **anna | {"x_forwarded_for": "10.0.0.66"}).status == 429
+
+
+def test_a_token_that_was_taken_away_shuts_nobody_out(tmp_path: Path) -> None:
+    """A browser goes on sending its cookie with every frame."""
+    with served(tmp_path, CLOSED) as gateway:
+        old = {"cookie": "multidrop=taken-away"}
+        for _ in range(2 * MOST_WRONG):
+            assert gateway.get("/api/frame", **old).status == 401
+        assert gateway.post(*STOP, **old).status == 401
+        signed = gateway.post("/api/token", {"token": gateway.secrets[Right.STOP]}, **old)
+        assert signed.status == 200
+        kept = signed.headers["set-cookie"].partition(";")[0]
+        assert gateway.post(*STOP, cookie=kept).json["pump-1"]["done"] is True
+
+
+def guard_clock(gateway: Served, now: list[float]) -> None:
+    """Let the guard see this time."""
+    gateway.gateway.guard_clock = lambda: now[0]
+
+
+@pytest.mark.slow
+def test_the_audit_log_says_who_and_by_which_way(tmp_path: Path) -> None:
+    with served(tmp_path, LOOPBACK_STOPS) as gateway:
+        until(lambda: gateway.gateway.hub.taken > 0)
+        writer = {"authorization": gateway.bearer(Right.WRITE)}
+        assert gateway.command(*WRITE, **writer).json["done"] is True
+        assert gateway.post(*STOP, origin=f"http://127.0.0.1:{gateway.gateway.port}").status == 200
+        records = gateway.get("/api/audit").json["entries"]
+        written = [(one["drive"], one["by"], one["way"]) for one in records[-2:]]  # called, done
+        assert written == [("pump-1", "writer", "http from 127.0.0.1")] * 2
+        assert {(one["by"], one["way"]) for one in records[:-2]} == {("anyone", "page from 127.0.0.1")}
+        oldest = records[-1]["time"]
+        assert gateway.get(f"/api/audit?before={oldest}").json == {"entries": [], "more": False}
+        assert gateway.get(f"/api/audit?before={oldest[:10]}").json == {"entries": [], "more": False}
+        for wrong in ("tomorrow", "", "2026-11-22T09:30%2B03:00"):
+            assert gateway.get(f"/api/audit?before={wrong}").status == 400
+        assert gateway.get("/api/audit?count=1").json == {"entries": records[:1], "more": True}

@@ -1,0 +1,277 @@
+"""Frames: made once for all viewers, five a second at most, whole or as what changed; none is queued."""
+
+from __future__ import annotations
+
+import asyncio
+import gzip
+import json
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from clocks import Clock
+from gateways import written
+from hypothesis import given
+from hypothesis import strategies as st
+
+from multidrop.gateway.gateway import Gateway
+from multidrop.gateway.http.frame_route import FrameRoute
+from multidrop.gateway.live import frames as module
+from multidrop.gateway.live.frames import REMEMBERED, WHOLE, Encoded, Frames, changes
+from multidrop.gateway.settings import ServeSettings
+
+
+@pytest.fixture
+def clock() -> Clock:
+    return Clock()
+
+
+@pytest.fixture
+def made() -> list[int]:
+    return []
+
+
+@pytest.fixture
+def frames(clock: Clock, made: list[int]) -> Frames:
+    def make(n: int) -> dict[str, Any]:
+        made.append(n)
+        return {"n": n, "revision": 1}
+
+    return Frames(make, clock)
+
+
+def test_a_hundred_viewers_share_one_frame(frames: Frames, clock: Clock, made: list[int]) -> None:
+    async def watch() -> None:
+        first = await frames.after(-1)
+        assert first is not None
+        viewers = [asyncio.create_task(frames.after(first.n)) for _ in range(100)]
+        await asyncio.sleep(0)
+        assert frames.viewers == 100
+        clock.now += 0.25
+        frames.note_news()
+        found = await asyncio.gather(*viewers)
+        assert {id(one) for one in found} == {id(found[0])}
+        assert found[0] is not None
+        assert json.loads(gzip.decompress(found[0].gzipped)) == told(found[0]) == {"n": 2, "since": 1}
+        assert frames.viewers == 0
+
+    asyncio.run(watch())
+    assert made == [1, 2]
+
+
+def test_what_changed_is_found_once_for_all_who_have_the_same_frame(
+    frames: Frames, clock: Clock, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    compared: list[int] = []
+
+    def compare(before: dict[str, Any], now: dict[str, Any]) -> dict[str, Any]:
+        compared.append(before["n"])
+        return changes(before, now)
+
+    monkeypatch.setattr(module, "changes", compare)
+
+    async def watch() -> None:
+        first = await frames.after(WHOLE)
+        assert first is not None
+        viewers = [asyncio.create_task(frames.after(first.n)) for _ in range(5)]
+        await asyncio.sleep(0)
+        clock.now += 0.25
+        frames.note_news()
+        assert [told(frame) for frame in await asyncio.gather(*viewers)] == [{"n": 2, "since": 1}] * 5
+
+    asyncio.run(watch())
+    assert compared == [1]
+
+
+def test_five_frames_a_second_at_most(frames: Frames, clock: Clock, made: list[int]) -> None:
+    async def watch() -> None:
+        seen = -1
+        for _ in range(1000):  # 10 s of news every 10 ms
+            clock.now += 0.01
+            viewer = asyncio.create_task(frames.after(seen))
+            await asyncio.sleep(0)
+            frames.note_news()
+            await asyncio.sleep(0)
+            if viewer.done() and (frame := viewer.result()):
+                seen = frame.n
+            else:
+                viewer.cancel()
+                await asyncio.gather(viewer, return_exceptions=True)
+
+    asyncio.run(watch())
+    assert 45 <= len(made) <= 51
+
+
+def test_news_that_come_too_soon_are_not_forgotten(frames: Frames, clock: Clock) -> None:
+    """Nothing else has to happen for them to be seen."""
+
+    async def watch() -> None:
+        first = await frames.after(-1)
+        assert first is not None
+        frames.note_news()
+        viewer = asyncio.create_task(frames.after(first.n))
+        await asyncio.sleep(0)
+        assert not viewer.done()
+        clock.now += 0.25
+        second = await viewer
+        assert second is not None
+        assert second.n == 2
+
+    asyncio.run(watch())
+
+
+def test_nothing_is_made_for_nobody(frames: Frames, clock: Clock, made: list[int]) -> None:
+    for _ in range(100):
+        clock.now += 1.0
+        frames.note_news()
+    assert made == []
+
+
+def test_a_viewer_who_comes_late_gets_the_newest_and_no_other(frames: Frames, clock: Clock) -> None:
+    async def watch() -> None:
+        first = await frames.after(-1)
+        assert first is not None
+        for _ in range(50):  # it does not ask meanwhile
+            clock.now += 0.25
+            frames.note_news()
+            await frames.after(-1)
+        late = await frames.after(first.n)
+        assert late is not None
+        assert late.n == 51
+        assert told(late) == {"n": 51, "revision": 1}
+        other = await frames.after(900)  # seen of an earlier process
+        assert other is late
+
+    asyncio.run(watch())
+
+
+def told(frame: Encoded | None) -> dict[str, Any]:
+    assert frame is not None
+    found: dict[str, Any] = json.loads(frame.plain)
+    return found
+
+
+def merged(before: dict[str, Any], now: dict[str, Any]) -> dict[str, Any]:
+    """Return an object with the values of another one in place of its own, and so on in the objects in it."""
+    both = {key: merged(before[key], value) for key, value in now.items() if isinstance(value, dict)}
+    return {**before, **now, **both}
+
+
+values = st.none() | st.integers(0, 2) | st.lists(st.none() | st.integers(0, 2), max_size=2)
+drives = st.fixed_dictionaries(
+    {
+        "state": st.sampled_from(["runs", "stands"]),
+        "values": st.fixed_dictionaries({"a": values, "b": values}),
+    }
+)
+plants = st.fixed_dictionaries(
+    {"drives": st.fixed_dictionaries({"pump": drives, "fan": drives}), "c": values}
+)
+
+
+@given(plants, plants)
+def test_what_changed_makes_the_newer_one_of_the_older_and_says_nothing_else(
+    before: dict[str, Any], now: dict[str, Any]
+) -> None:
+    said = changes(before, now)
+    assert merged(before, said) == now
+    assert changes(before, merged(before, said)) == said
+    assert changes(now, now) == {}
+
+
+@pytest.mark.slow
+@given(st.lists(st.tuples(plants, st.integers(0, 9)), min_size=2, max_size=12), st.integers(0, 2**32))
+def test_each_viewer_has_the_newest_whole_however_late_it_comes(
+    pictures: list[tuple[dict[str, Any], int]], begin: int
+) -> None:
+    """A second number says for how many frames a viewer stays away; there is another plant in the middle."""
+    clock, whole = Clock(), dict[int, dict[str, Any]]()
+
+    def make(n: int) -> dict[str, Any]:
+        at = n - begin - 1
+        whole[n] = {"n": n, "revision": 2 * at // len(pictures), **pictures[at][0]}
+        return whole[n]
+
+    async def watch() -> None:
+        frames = Frames(make, clock, begin)
+        has: dict[int, dict[str, Any]] = {}  # of each viewer: it comes again after so many frames
+        for turn, _ in enumerate(pictures):
+            clock.now += 0.25
+            frames.note_news()
+            for every in {away + 1 for _, away in pictures}:
+                if turn % every:
+                    continue
+                mine = has.get(every)
+                news = told(await frames.after(WHOLE if mine is None else mine["n"]))
+                since = news.pop("since", None)
+                if since is None:
+                    has[every] = news
+                else:
+                    assert mine is not None
+                    assert since == mine["n"] > news["n"] - REMEMBERED
+                    has[every] = merged(mine, news)
+                assert has[every] == whole[max(whole)]
+
+    asyncio.run(watch())
+
+
+def test_a_viewer_waits_and_is_let_go(frames: Frames, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "WAIT_S", 0.01)
+    monkeypatch.setattr(module, "MOST_VIEWERS", 2)
+
+    async def watch() -> None:
+        first = await frames.after(-1)
+        assert first is not None
+        assert await frames.after(first.n) is None
+        monkeypatch.setattr(module, "WAIT_S", 1000.0)
+        waiting = [asyncio.create_task(frames.after(first.n)) for _ in range(3)]
+        await asyncio.sleep(0)
+        assert [one.done() for one in waiting] == [False, False, True]
+        with pytest.raises(OverflowError, match="2 viewers wait already"):
+            await waiting.pop()
+        frames.close()
+        assert await asyncio.gather(*waiting) == [None, None]
+        assert await frames.after(first.n) is None
+
+    asyncio.run(watch())
+
+
+def test_a_viewer_too_many_is_told_so(frames: Frames, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "MOST_VIEWERS", 0)
+    sent: list[Any] = []
+
+    async def send(message: Any) -> None:
+        sent.append(message)
+
+    async def watch() -> None:
+        first = await frames.after(WHOLE)
+        assert first is not None
+        scope = {"type": "http", "query_string": f"after={first.n}".encode(), "headers": []}
+        await FrameRoute(frames)(scope, None, send)  # type: ignore[arg-type]
+
+    asyncio.run(watch())
+    assert [one.get("status") for one in sent] == [503, None]
+    assert json.loads(sent[1]["body"]) == {"error": "0 viewers wait already"}
+
+
+def test_a_frame_is_made_of_what_was_just_looked_at(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The drives are gone through once in 0.2 s, for alarms and for the frame: of rows from just before."""
+    gateway = Gateway(written(tmp_path), ServeSettings(port=0))
+    gateway.listener.close()
+    done: list[str] = []
+    monkeypatch.setattr(gateway, "_look_for_events", lambda: done.append("alarms"))
+    monkeypatch.setattr(gateway.frames, "note_news", lambda: done.append("frame"))
+    monkeypatch.setattr(gateway.hub, "take", lambda batch: None)
+    for now, batches, expected in (
+        (10.0, ["rows"], ["alarms", "frame"]),
+        (10.1, ["rows"], []),
+        (10.21, [], ["alarms", "frame"]),
+        (10.31, [], []),
+        (10.42, [], ["alarms"]),
+    ):
+        monkeypatch.setattr(gateway, "clock", lambda now=now: now)
+        poller: Any = SimpleNamespace(take=lambda batches=batches: batches.pop() if batches else None)
+        gateway.hand_out(poller)
+        assert done == expected, now
+        done.clear()

@@ -1,0 +1,382 @@
+"""Newest rows and drives' states, from rows of the core; alarms from states."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from batches import SECOND, UTC_0, completion
+from completions import add_miss, add_rows
+from gateways import written
+from hypothesis import given
+from hypothesis import strategies as st
+
+from multidrop import load_plant
+from multidrop.core import Columns, Field, Names, NumberFormat, RowLayout, Status
+from multidrop.gateway.live.events import Events
+from multidrop.gateway.live.frames import frame_of, lost_of
+from multidrop.gateway.live.hub import INCOMPLETE, LEAST_SLEEP_NS, NOT_ASKED, Hub, Newest, Shown
+from multidrop.gateway.live.recent import Lately
+from multidrop.gateway.mqtt.settings import fresh_values
+from multidrop.polling.batch import Batch
+
+REGISTERS = ("status", "output_frequency", "output_current", "fault")
+STATUS, FREQUENCY, CURRENT, FAULT = range(4)
+FORWARD, STANDBY, TRIPPED = 1, 3, 4
+PERIOD = SECOND // 10
+DRIVES = ("pump-1", "pump-2", "pump-9")
+
+
+class HubClock:
+    """The present time, by the clock that rows have, and for how long the machine slept; both in ns."""
+
+    def __init__(self) -> None:
+        self.now_ns = 10 * PERIOD
+        self.slept_ns = 0
+
+    def __call__(self) -> tuple[int, int]:
+        return self.now_ns, self.slept_ns
+
+
+@pytest.fixture
+def clock() -> HubClock:
+    return HubClock()
+
+
+@pytest.fixture
+def hub(tmp_path: Path, clock: HubClock) -> Hub:
+    return Hub(written(tmp_path), clock)
+
+
+def rows(*found: tuple[int, int, int | Status], drive: str = "pump-1") -> Batch:
+    """Rows of a drive: time in periods, register, and its raw count or a status."""
+    columns = Columns(len(found))
+    for at, register, said in found:
+        layout = RowLayout(DRIVES.index(drive), [Field(0, NumberFormat.U16, register, 1.0, 1.0)])
+        if isinstance(said, Status):
+            assert add_miss(columns, layout, said, at * PERIOD, UTC_0)
+        else:
+            assert add_rows(columns, layout, completion(at * PERIOD, words=(said,)), UTC_0)
+    return Batch(columns, Names(DRIVES), Names(REGISTERS))
+
+
+def all_of(at: int, status: int, frequency: int = 0, fault: int = 0) -> Batch:
+    return rows((at, STATUS, status), (at, FREQUENCY, frequency), (at, CURRENT, 0), (at, FAULT, fault))
+
+
+def is_fresh(hub: Hub) -> bool:
+    """Return True where the frequency of the first pump is that of now, though a miss came after it."""
+    return next(fresh for name, _, _, fresh in hub.known("pump-1") if name == "output_frequency")
+
+
+def test_nothing_is_known_before_it_was_asked(hub: Hub) -> None:
+    assert hub.newest("pump-1", "status") is None
+    assert {good for _, _, good, _ in hub.known("pump-1")} == {None}
+    assert hub.state("pump-1") == "unknown"
+    assert hub.seen_at("pump-1") is None
+    assert hub.newest("pump-9", "status") is None
+    assert hub.state("pump-9") == "unknown"
+
+
+def test_a_miss_is_newest_and_the_value_before_it_is_the_last_good_one(hub: Hub) -> None:
+    hub.take(rows((10, FREQUENCY, 25), (11, FREQUENCY, Status.NO_REPLY)))
+    sent, missed = 10 * PERIOD, 11 * PERIOD
+    good = next(good for name, _, good, _ in hub.known("pump-1") if name == "output_frequency")
+    assert good == (UTC_0 + sent, sent, 25.0, 0)
+    assert hub.newest("pump-1", "output_frequency") == Newest(UTC_0 + missed, missed, None, "no reply", 10**9)
+    assert is_fresh(hub)
+
+
+@pytest.mark.parametrize(
+    ("status", "frequency", "state"),
+    [(FORWARD, 25, "runs"), (FORWARD, 0, "runs"), (STANDBY, 0, "stands"), (2, 25, "runs"), (9, 0, "unknown")],
+)
+def test_a_state_is_what_the_family_makes_of_its_registers(
+    hub: Hub, status: int, frequency: int, state: str
+) -> None:
+    hub.take(all_of(10, status, frequency))
+    assert hub.state("pump-1") == state
+    assert hub.seen("pump-1").fault is None
+
+
+def test_a_fault_has_the_drives_words(hub: Hub) -> None:
+    hub.take(all_of(10, TRIPPED, fault=4))
+    assert hub.state("pump-1") == "fault"
+    assert hub.seen("pump-1").fault == "overcurrent while accelerating (OC1)"
+    assert hub.seen("pump-1").why_silent is None
+    assert hub.state("pump-2") == "unknown"
+
+
+def test_a_status_alone_shows_a_fault(hub: Hub) -> None:
+    hub.take(rows((10, STATUS, TRIPPED), (10, FREQUENCY, 0)))
+    assert hub.seen("pump-1") == Shown("fault", "it shows a fault")
+    hub.take(rows((11, FAULT, 4)))
+    assert hub.seen("pump-1").fault == "overcurrent while accelerating (OC1)"
+
+
+def test_one_lost_reply_is_no_silence_and_many_are(hub: Hub, clock: HubClock) -> None:
+    hub.take(all_of(10, FORWARD, 25))
+    for at in range(11, 20):
+        hub.take(rows(*((at, register, Status.NO_REPLY) for register in range(4))))
+        clock.now_ns = at * PERIOD
+        assert hub.state("pump-1") == "runs", at
+    hub.take(rows(*((21, register, Status.NO_REPLY) for register in range(4))))
+    hub.take(rows(*((22, register, Status.NOT_ASKED) for register in range(4))))
+    clock.now_ns = 22 * PERIOD
+    assert hub.seen("pump-1") == Shown("silent", "not asked: drive is silent")
+    assert hub.seen("pump-1").why_silent == "not asked: drive is silent"
+    assert hub.seen("pump-1").fault is None
+    assert hub.seen_at("pump-1") == UTC_0 + 10 * PERIOD
+    hub.take(all_of(23, STANDBY))
+    assert hub.state("pump-1") == "stands"
+
+
+def test_a_drive_that_refuses_is_not_silent(hub: Hub) -> None:
+    columns = Columns(4)
+    for register in range(4):
+        layout = RowLayout(0, [Field(0, NumberFormat.U16, register, 1.0, 1.0)])
+        assert add_rows(columns, layout, completion(SECOND, exception=6), UTC_0)
+    hub.take(Batch(columns, Names(DRIVES), Names(REGISTERS)))
+    assert hub.state("pump-1") == "unknown"
+
+
+def test_a_line_is_lost_where_all_its_newest_rows_say_so(hub: Hub, clock: HubClock) -> None:
+    hub.take(all_of(10, FORWARD, 25))
+    assert lost_of(hub, "hall") is None
+    hub.take(rows(*((30, register, Status.LINE_LOST) for register in range(3))))
+    assert lost_of(hub, "hall") is None
+    hub.take(rows((31, FAULT, Status.LINE_LOST)))
+    assert lost_of(hub, "hall") == "port lost"
+    clock.now_ns = 31 * PERIOD
+    assert hub.seen("pump-1") == Shown("silent", "port lost")
+
+
+def test_values_grow_old_where_nothing_comes(hub: Hub, clock: HubClock) -> None:
+    """Neither a row, nor a turn of the gateway's loop: the process may have stood still until just now."""
+    hub.take(all_of(10, FORWARD, 25))
+    clock.now_ns += SECOND
+    assert is_fresh(hub)
+    assert hub.state("pump-1") == "runs"
+    clock.now_ns += 1
+    assert not is_fresh(hub)
+    assert hub.seen("pump-1") == Shown("unknown", NOT_ASKED)
+
+
+def test_what_was_read_before_the_machine_slept_is_not_fresh(hub: Hub, clock: HubClock) -> None:
+    """The monotonic clock, and so each row's age by it, stood still meanwhile."""
+    hub.take(all_of(10, FORWARD, 25))
+    assert hub.state("pump-1") == "runs"
+    clock.now_ns, clock.slept_ns = 11 * PERIOD + 1, 8 * 3600 * SECOND  # no row, and no look, in between
+    assert not is_fresh(hub)
+    assert hub.seen("pump-1") == Shown("unknown", NOT_ASKED)
+    assert not any(fresh for *_, fresh in hub.known("pump-1"))
+    hub.take(all_of(11, FORWARD, 25))  # just before it slept, and not taken until now
+    assert not is_fresh(hub)
+    clock.now_ns = 12 * PERIOD
+    hub.take(all_of(12, FORWARD, 25))
+    assert is_fresh(hub)
+    assert hub.state("pump-1") == "runs"
+
+
+def test_a_machine_that_slept_before_it_began_is_awake(tmp_path: Path) -> None:
+    hub = Hub(written(tmp_path), lambda: (20 * PERIOD, 8 * 3600 * SECOND))
+    hub.take(all_of(19, FORWARD, 25))
+    assert is_fresh(hub)
+    assert hub.woke_ns() == 0
+
+
+def test_two_clocks_that_are_not_read_at_once_are_no_sleep(tmp_path: Path) -> None:
+    slept = [0]
+    hub = Hub(written(tmp_path), lambda: (20 * PERIOD, slept[0]))
+    hub.take(all_of(19, FORWARD, 25))
+    for slept[0] in (-SECOND, 0, -PERIOD, LEAST_SLEEP_NS):
+        assert is_fresh(hub)
+
+
+def test_what_is_read_seldom_is_fresh_for_longer(tmp_path: Path, clock: HubClock) -> None:
+    path = written(tmp_path).path
+    path.write_text(path.read_text().replace("100 ms", "10 s"))
+    hub = Hub(load_plant(path), clock)
+    hub.take(all_of(10, FORWARD, 25))
+    clock.now_ns = (10 + 300) * PERIOD
+    assert is_fresh(hub)
+    clock.now_ns += 1
+    assert not is_fresh(hub)
+
+
+@pytest.mark.slow
+def test_what_an_overfull_line_reads_holds_until_three_rounds_are_over(
+    tmp_path: Path, clock: HubClock
+) -> None:
+    path = written(tmp_path, "", *(f"pump-{n}" for n in range(1, 31))).path
+    path.write_text(path.read_text().replace("baudrate = 38400", "baudrate = 1200"))
+    hub = Hub(load_plant(path), clock)
+    cycle_s = hub.plant.metadata()["planned"]["hall"]["cycle_ms"] / 1000
+    assert cycle_s > 1  # where 0.1 s are asked for
+    hub.take(all_of(10, FORWARD, 25))
+    row = hub.newest("pump-1", "output_frequency")
+    assert row is not None
+    assert hub.holds_s("pump-1", "output_frequency") == row.holds_ns / SECOND == pytest.approx(3 * cycle_s)
+    assert is_fresh(hub)
+    clock.now_ns += row.holds_ns + 1
+    assert not is_fresh(hub)
+
+
+def holds_s(hub: Hub, register: str = "output_frequency") -> float:
+    row = hub.newest("pump-1", register)
+    assert row is not None
+    assert hub.holds_s("pump-1", register) == row.holds_ns / SECOND
+    return row.holds_ns / SECOND
+
+
+def test_one_long_pause_lets_no_value_hold_for_longer(hub: Hub, clock: HubClock) -> None:
+    """A poller that stood still for a minute reads once, and stands still again."""
+    for at in (8, 9, 10, 610):
+        hub.take(all_of(at, FORWARD, 25))
+    assert holds_s(hub) == 1
+    clock.now_ns = 610 * PERIOD + SECOND + 1
+    assert not is_fresh(hub)
+    assert hub.seen("pump-1") == Shown("unknown", NOT_ASKED)
+
+
+def test_what_a_line_that_is_slower_than_planned_reads_holds_for_three_of_its_rounds(hub: Hub) -> None:
+    for at in (0, 50, 90, 150):
+        hub.take(all_of(at, FORWARD, 25))
+    assert holds_s(hub) == pytest.approx(3 * 4)  # the shorter one of the latest two rounds
+    hub.take(all_of(151, FORWARD, 25))
+    assert holds_s(hub) == 1
+
+
+def test_rows_of_a_drive_that_is_gone_are_dropped(hub: Hub) -> None:
+    hub.take(rows((10, STATUS, FORWARD), drive="pump-9"))
+    assert "pump-9" not in list(hub.drives)
+
+
+def test_a_plant_that_is_taken_over_keeps_what_is_known(hub: Hub) -> None:
+    hub.take(all_of(10, FORWARD, 25))
+    hub.adopt(hub.plant)
+    assert hub.state("pump-1") == "runs"
+
+
+def test_a_late_row_of_the_drive_that_had_a_name_is_no_value_of_the_one_that_has_it(tmp_path: Path) -> None:
+    now = [0]
+    hub = Hub(written(tmp_path, "", "pump-1", "pump-2"), lambda: (now[0], 0))
+    now[0] = 20 * PERIOD
+    hub.adopt(written(tmp_path, "", "pump-2", "pump-1"))  # each at the other's address
+    hub.take(all_of(19, FORWARD, 25))
+    assert hub.newest("pump-1", "output_frequency") is None
+    hub.take(all_of(21, STANDBY))
+    hub.take(rows((19, STATUS, FORWARD)))
+    assert hub.state("pump-1") == "stands"
+
+
+SHOWN = st.sampled_from(
+    [
+        Shown("runs", None),
+        Shown("fault", "a"),
+        Shown("fault", "b"),
+        Shown("silent", "x"),
+        Shown("unknown", None),
+        Shown("unknown", NOT_ASKED),
+        Shown("unknown", INCOMPLETE),
+    ]
+)
+
+
+@given(st.lists(SHOWN, max_size=30))
+def test_alarms_begin_and_end_once(shown: list[Shown]) -> None:
+    """Compared with a plain reading of the rules, one state after another."""
+    events = Events()
+    fault: str | None = None
+    silent = False
+    for time, one in enumerate(shown):
+        events.look(time, "pump-1", one)
+        if one.state == "silent":
+            silent = True
+        elif one.words != NOT_ASKED:
+            silent = False
+            if one.words != INCOMPLETE:
+                fault = one.words if one.state == "fault" else None
+        lasting = {alarm.text for alarm in events.lasting}
+        assert lasting == ({fault} - {None}) | ({"x"} if silent else set())
+    found = events.between(0, len(shown))
+    assert [alarm.time for alarm in found] == sorted((alarm.time for alarm in found), reverse=True)
+    assert all(alarm.ended is None or alarm.ended > alarm.time for alarm in found)
+    assert len([alarm for alarm in found if alarm.ended is None]) == len(events.lasting)
+
+
+@pytest.mark.parametrize(("status", "is_over"), [(STANDBY, True), (9, True), (TRIPPED, False)])
+def test_a_fault_lasts_while_only_some_of_its_drive_is_known(
+    hub: Hub, clock: HubClock, status: int, is_over: bool
+) -> None:
+    """A busy line misses its status for a second, and reads its current: nobody saw the fault go."""
+    events = Events()
+
+    def look() -> list[tuple[int, int | None]]:
+        events.look(clock.now_ns // PERIOD, "pump-1", hub.seen("pump-1"))
+        return [(one.time, one.ended) for one in events.between(0, 999)]
+
+    hub.take(all_of(10, TRIPPED, fault=4))
+    assert look() == [(10, None)]
+    clock.now_ns = 30 * PERIOD
+    hub.take(rows((30, STATUS, Status.NO_REPLY), (30, FREQUENCY, 0), (30, CURRENT, 0), (30, FAULT, 4)))
+    assert hub.seen("pump-1") == Shown("unknown", INCOMPLETE, "status is not known")
+    assert look() == [(10, None)]
+    clock.now_ns = 31 * PERIOD
+    hub.take(all_of(31, status, fault=4))
+    assert look() == [(10, 31 if is_over else None)]
+
+
+def test_a_fault_that_gets_its_name_goes_on() -> None:
+    events = Events()
+    for time, words in enumerate(("it shows a fault", "overcurrent", "it shows a fault"), 1):
+        events.look(time, "pump-1", Shown("fault", words))
+    assert [(one.time, one.text, one.ended) for one in events.shown()] == [(1, "overcurrent", None)]
+
+
+def test_ended_alarms_are_bounded() -> None:
+    events = Events(since=7)
+    for time in range(4000):
+        events.look(time, "pump-1", Shown("fault", "a") if time % 2 else Shown("runs", None))
+        assert time > 100 or events.since == 7
+    assert len(events.between(0, 9999)) <= 1001
+    oldest = events.between(0, 9999)[-1]
+    assert events.since == oldest.time - 1  # when the one before it, which is forgotten, ended
+    assert events.begun == 2000
+    assert len(events.shown()) <= 21
+
+
+def test_a_frame_gives_no_value_that_is_overdue_or_was_missed_since(hub: Hub, clock: HubClock) -> None:
+    hub.take(rows((10, FREQUENCY, 25), (10, CURRENT, 12), (11, CURRENT, Status.NO_REPLY)))
+    for now, frequency, current in (
+        (12, [25.0], [None, "no reply", 12.0]),  # a miss is told at once
+        (25, [None, "overdue", 25.0], [None, "no reply", 12.0]),
+    ):
+        clock.now_ns = now * PERIOD
+        frame = frame_of(hub, Events(), Lately(hub.plant), {}, n=1, revision=1, time_ns=UTC_0 + clock.now_ns)
+        told = frame["drives"]["pump-1"]["values"]
+        assert [*told["output_frequency"][:1], *told["output_frequency"][2:4]] == frequency
+        assert [*told["output_current"][:1], *told["output_current"][2:4]] == current
+        assert told["fault"] == (None, told["fault"][1], "not asked yet")
+        said = {"status": None, "output_frequency": frequency[0], "output_current": None, "fault": None}
+        assert fresh_values(hub, "pump-1") == said  # by MQTT
+
+
+def test_an_age_is_right_though_a_clock_was_set_back_or_slept(hub: Hub, clock: HubClock) -> None:
+    """One that is too short would make the last value of a silent drive a new one."""
+    hub.take(rows((10, FREQUENCY, 25), (20, FREQUENCY, Status.NO_REPLY)))
+    asked_ns = UTC_0 + 10 * PERIOD
+    hour_ns = 3600 * SECOND
+    for told, utc_ns, now_ns, age_ms in (
+        ("as it is", asked_ns + 50 * PERIOD, 60 * PERIOD, 5_000),
+        ("UTC was set back", asked_ns - hour_ns, 60 * PERIOD, 5_000),
+        ("the machine slept", asked_ns + hour_ns, 60 * PERIOD, 3_600_000),
+    ):
+        clock.now_ns = now_ns
+        lately = Lately(hub.plant)
+        frame = frame_of(hub, Events(), lately, {}, n=1, revision=1, time_ns=utc_ns)
+        pump = frame["drives"]["pump-1"]
+        now, missed, status, last, then = pump["values"]["output_frequency"]
+        assert (now, status, last) == (None, "no reply", 25.0), told
+        assert pump["ages_ms"][then] == pump["ages_ms"][pump["seen"]] == age_ms, told
+        assert pump["ages_ms"][missed] == age_ms - 1_000, told

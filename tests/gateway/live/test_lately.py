@@ -1,0 +1,84 @@
+"""Figures of the last hour: made of readings, of which only the newest are kept."""
+
+from __future__ import annotations
+
+import weakref
+from collections import Counter
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from gateways import written
+
+from multidrop.core import Counters, Status
+from multidrop.gateway.live.hub import Hub
+from multidrop.gateway.live.recent import MINUTES, Lately
+from multidrop.gateway.live.views import look_at_lines
+from multidrop.gateway.metrics import Figures, families_of
+from multidrop.transport.statistics import LineStatistics, line_statistics
+
+MINUTE_MS = 60_000
+
+
+def reading(seconds: int, *, per_s: int = 10) -> LineStatistics:
+    """A line's statistics after so many seconds of samples, with a miss each 30 s."""
+    missed = Counter({int(Status.NO_REPLY): seconds // 30})
+    counters = Counters()._replace(values=seconds * per_s, sent=seconds * per_s, missed=missed)
+    return line_statistics(float(seconds), {"pump-1": counters}, None)
+
+
+@pytest.fixture
+def lately(tmp_path: Path) -> Lately:
+    return Lately(written(tmp_path))
+
+
+@pytest.mark.slow
+def test_an_hour_of_minutes_and_no_hour_of_readings(lately: Lately) -> None:
+    alive: list[weakref.ref[LineStatistics]] = []
+    for second in range(0, 70 * 60 + 31, 5):
+        found = reading(second)
+        alive.append(weakref.ref(found))
+        lately.tick(float(second), second * 1000, {"hall": found})
+    del found
+    hour = lately.hour("hall")
+    assert len(hour) == MINUTES
+    assert [one["time"] for one in hour] == [minute * MINUTE_MS for minute in range(11, 71)]
+    assert all(one["asked"] == 602 and one["misses"] == {"no reply": 2} for one in hour[:-1])
+    assert hour[-1] == {"time": 70 * MINUTE_MS, "asked": 301, "misses": {"no reply": 1}}
+    assert sum(one() is not None for one in alive) < 10
+    assert lately.hour("roof") == []
+
+
+def test_figures_of_a_line_are_those_of_the_last_seconds(lately: Lately) -> None:
+    for second in range(200):
+        lately.tick(float(second), second * 1000, {"hall": reading(second)})
+        if second == 100:
+            assert lately.line("hall")["misses"] == 3
+    assert lately.line("hall")["rate"] == 10.0
+    assert lately.drive_figures("pump-1")["missed"] == pytest.approx(2 / 600, abs=1e-3)
+    assert lately.line("roof")["rate"] is None
+
+
+def test_what_no_reply_said_and_no_reading_is_not_known_and_never_0(lately: Lately, tmp_path: Path) -> None:
+    assert lately.line("hall")["misses"] is None
+    for second in range(100):
+        lately.tick(float(second), second * 1000, {"hall": reading(second)})  # no reply has a delay
+    assert lately.line("hall")["p99"] is None
+    plant = written(tmp_path)
+    gateway: Any = SimpleNamespace(plant=plant, hub=Hub(plant), lately=lately)
+    drive = look_at_lines(gateway)["hall"]["drives"]["pump-1"]
+    assert (drive["p50"], drive["p99"]) == (None, None)
+    families = families_of(gateway.hub, lately.newest, Figures("0", 0, 0, 0, {}, []))
+    (delays,) = [one for one in families if one.name == "multidrop_response_delay_seconds"]
+    assert delays.samples == [("_count", {"line": "hall", "drive": "pump-1"}, 0.0)]
+
+
+def test_another_line_of_a_name_is_not_set_against_the_one_before(lately: Lately) -> None:
+    """A reading of it may come while its plant is being adopted."""
+    lately.tick(100.0, 100_000, {"hall": replace(reading(100), epoch=1)})
+    lately.tick(101.0, 101_000, {"hall": replace(reading(1), epoch=2)})
+    assert (lately.line("hall")["rate"], lately.line("hall")["used"]) == (None, None)
+    lately.tick(106.0, 106_000, {"hall": replace(reading(6), epoch=2)})
+    assert lately.line("hall")["rate"] == 10.0

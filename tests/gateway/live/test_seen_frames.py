@@ -1,0 +1,298 @@
+"""Commands that the network holds up or doubles: none is carried out when nobody means it any more."""
+
+from __future__ import annotations
+
+import json
+import re
+import socket
+import subprocess
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from gateways import Served, served
+from lines import PATIENCE, until
+from peers import require_program
+
+from multidrop import Drive, Refused
+from multidrop.gateway import commands as commands_module
+from multidrop.gateway.clock import boottime_ns
+from multidrop.gateway.commands import Told
+from multidrop.gateway.http.rights import Right
+from multidrop.gateway.live.seen_frames import (
+    ANOTHER_PLANT,
+    DOUBLED,
+    MOST_AGE_NS,
+    OVERTAKEN,
+    TOO_LATE,
+    SeenFrames,
+)
+
+MAY = """[serve.may]
+stop = "anyone"
+write = ["pump-1.setpoint"]
+verbs = ["pump-1.start", "pump-1.jog", "pump-1.reset_fault", "pump-1.set_frequency", "pump-1.coast"]
+"""
+START = {"drive": "pump-1", "verb": "start", "options": {}}
+WRITE = {"drive": "pump-1", "register": "setpoint", "value": 50.0}
+
+
+class Times:
+    """A clock that a test sets, and the stops that were called."""
+
+    def __init__(self) -> None:
+        self.now_ns = 10**12
+        self.stopped: dict[str, int] = {}
+        self.frames = SeenFrames(lambda: self.now_ns, self.stopped.get)
+
+    def rule(self, seen: int, drive: str = "pump-1", command: object = "start") -> str:
+        """Return the rule that a command breaks; "" for one that may be sent."""
+        try:
+            self.frames.admit(drive, f"{drive}.{command}", command, seen)
+        except Refused as refused:
+            return str(refused.rule)
+        return ""
+
+
+@pytest.fixture
+def times() -> Times:
+    return Times()
+
+
+def test_a_command_may_be_sent_until_its_frame_is_too_old(times: Times) -> None:
+    times.frames.note(7)
+    made_ns = times.now_ns
+    times.now_ns += MOST_AGE_NS
+    assert times.frames.admit("pump-1", "start", "start", 7) == made_ns + MOST_AGE_NS
+    times.now_ns += 1
+    assert times.rule(7, command="jog") == TOO_LATE
+
+
+def test_frames_that_nobody_had_yet_and_those_of_another_process(times: Times) -> None:
+    times.frames.note(7)
+    assert [times.rule(seen) for seen in (8, 6, -1, 0)] == [TOO_LATE] * 4
+
+
+def test_what_a_stop_overtook_counts_for_its_drive_alone(times: Times) -> None:
+    times.frames.note(7)
+    times.stopped["pump-1"] = times.now_ns  # the frame may be older: in doubt nothing is sent
+    assert times.rule(7) == OVERTAKEN
+    assert times.rule(7, "pump-2") == ""
+    times.now_ns += 1
+    times.frames.note(8)
+    assert times.rule(8) == ""
+
+
+def test_frames_of_another_plant_count_for_nothing(times: Times) -> None:
+    times.frames.note(7)
+    times.frames.begin_anew()
+    assert times.rule(7) == times.rule(7, "pump-2") == ANOTHER_PLANT
+    times.frames.note(8)
+    assert times.rule(8) == ""
+    assert times.rule(7) == ANOTHER_PLANT
+
+
+def test_a_command_comes_once_for_each_frame(times: Times) -> None:
+    times.frames.note(7)
+    assert [times.rule(7, command=one) for one in ("start", "jog", "start")] == ["", "", DOUBLED]
+    times.frames.note(8)
+    assert times.rule(8) == ""
+
+
+def test_old_frames_take_no_memory(times: Times) -> None:
+    for n in range(1000):
+        times.now_ns += 200_000_000
+        times.frames.note(n)
+        times.rule(n)
+    assert len(times.frames._made) == len(times.frames._came) == 26
+
+
+# ---- through the gateway ----
+
+
+@contextmanager
+def held_up(gateway: Served, path: str, body: object) -> Iterator[socket.socket]:
+    """A request of which the last byte has not come yet."""
+    data = json.dumps(body).encode()
+    head = (
+        f"POST {path} HTTP/1.1\r\nhost: localhost\r\ncontent-type: application/json\r\n"
+        f"authorization: {gateway.bearer(Right.WRITE)}\r\ncontent-length: {len(data)}\r\n\r\n"
+    )
+    with socket.create_connection(("127.0.0.1", gateway.gateway.port), PATIENCE) as client:
+        client.sendall(head.encode() + data[:-1])
+        yield client
+
+
+def answer(client: socket.socket, last: bytes = b"}") -> str:
+    """Let the last byte come, and return what the gateway says of the command."""
+    client.sendall(last)
+    with client.makefile("rb") as received:
+        assert received.readline().startswith(b"HTTP/1.1 200 ")
+        length = next(
+            int(line.partition(b":")[2]) for line in received if line.startswith(b"content-length:")
+        )
+        while received.readline().strip():
+            pass
+        told = json.loads(received.read(length))
+    return str(told.get("text") or told["pump-1"]["text"])
+
+
+def pass_time(gateway: Served, ns: int) -> None:
+    """Let the gateway be so much later, for frames and commands."""
+    gateway.gateway.seen_frames.clock = lambda: boottime_ns() + ns
+
+
+def commands(gateway: Served) -> list[tuple[str, float]]:
+    """Return what was written to the drive so far."""
+    return [(write.name, write.raw) for write in gateway.sims["pump-1"].counters.writes]
+
+
+@pytest.mark.parametrize(("path", "body"), [("/api/act", START), ("/api/write", WRITE)])
+def test_a_command_that_was_held_up_for_too_long_is_not_sent(
+    tmp_path: Path, path: str, body: dict[str, object]
+) -> None:
+    with served(tmp_path, MAY) as gateway:
+        seen = gateway.frame_number()
+        with held_up(gateway, path, {**body, "seen": seen}) as client:
+            pass_time(gateway, MOST_AGE_NS)
+            told = answer(client)
+        assert told.endswith(f"frame {seen} is none of the last 5 s: look again, and confirm it anew")
+        assert told.startswith("pump-1.")
+        assert commands(gateway) == []
+
+
+def test_a_stop_that_was_held_up_as_long_is_sent(tmp_path: Path) -> None:
+    with served(tmp_path, MAY) as gateway:
+        assert gateway.command("/api/write", WRITE, authorization=gateway.bearer(Right.WRITE)).json["done"]
+        assert gateway.command("/api/act", START, authorization=gateway.bearer(Right.WRITE)).json["done"]
+        motor = gateway.sims["pump-1"].motor  # type: ignore[attr-defined]
+        assert motor.goal
+        with held_up(gateway, "/api/stop", {"drives": None}) as client:
+            pass_time(gateway, 10 * MOST_AGE_NS)
+            assert "seen to stand" in answer(client)
+        assert not motor.goal
+
+
+def test_a_start_of_a_frame_before_a_stop_is_not_sent(tmp_path: Path) -> None:
+    """A proxy that sends a start again, or lets a stop overtake it, starts nothing."""
+    writer = {}
+    with served(tmp_path, MAY) as gateway:
+        writer["authorization"] = gateway.bearer(Right.WRITE)
+        seen = gateway.frame_number()
+        start = {**START, "seen": seen}
+        assert gateway.post("/api/write", {**WRITE, "seen": seen}, **writer).json["done"] is True
+        assert gateway.post("/api/act", start, **writer).json["done"] is True
+        doubled = gateway.post("/api/act", start, **writer).json["text"]
+        assert "came a second time" in doubled
+        assert gateway.post("/api/stop", {"drives": ["pump-1"]}).json["pump-1"]["done"] is True
+        sent = commands(gateway)
+        overtaken = gateway.post("/api/act", start, **writer).json["text"]
+        assert overtaken == (
+            f"pump-1.start was not sent: a stop was called after frame {seen}: "
+            "look again, and confirm it anew"
+        )
+        assert commands(gateway) == sent
+        assert gateway.command("/api/act", START, **writer).json["done"] is True
+
+
+def test_a_command_that_waits_for_its_thread_until_it_is_too_late_is_not_sent(tmp_path: Path) -> None:
+    begun: list[threading.Thread] = []
+
+    class Late(threading.Thread):
+        def start(self) -> None:
+            begun.append(self)
+
+    with served(tmp_path, MAY) as gateway:
+        gateway.gateway.seen_frames.clock = lambda: boottime_ns() - MOST_AGE_NS + 50_000_000
+        start = {**START, "seen": gateway.frame_number()}
+        gateway.gateway.seen_frames.clock = lambda: 0  # it came at once
+        with pytest.MonkeyPatch.context() as patch, held_up(gateway, "/api/act", start) as client:
+            patch.setattr("multidrop.supervisor.threading", SimpleNamespace(Thread=Late))
+            client.sendall(b"}")
+            until(lambda: begun)
+            due_ns = boottime_ns() + 50_000_000
+            until(lambda: boottime_ns() > due_ns)
+            threading.Thread.start(begun[0])
+            assert "start was not sent: its turn did not come" in answer(client, b"")
+        assert commands(gateway) == []
+
+
+def test_a_stop_that_is_called_as_a_start_begins_ends_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with served(tmp_path, MAY) as gateway:
+        act = commands_module.act_one
+
+        def act_after_a_stop(drive: Drive, **given: Any) -> Told:
+            gateway.gateway.commands._note_stop([drive.name])
+            return act(drive, **given)
+
+        monkeypatch.setattr(commands_module, "act_one", act_after_a_stop)
+        told = gateway.command("/api/act", START, authorization=gateway.bearer(Right.WRITE)).json
+        assert (told["done"], "start was not sent" in told["text"]) == (False, True)
+        assert commands(gateway) == []
+
+
+@pytest.mark.slow
+def test_a_frame_of_a_gateway_that_was_started_again_is_none_of_its_own(tmp_path: Path) -> None:
+    with served(tmp_path, MAY) as gateway:
+        seen = gateway.frame_number()
+    with served(tmp_path, MAY) as gateway:
+        assert gateway.frame_number() != seen
+        body = {**START, "seen": seen}
+        told = gateway.post("/api/act", body, authorization=gateway.bearer(Right.WRITE)).json
+        assert (told["done"], "none of the last 5 s" in told["text"]) == (False, True)
+        assert commands(gateway) == []
+
+
+@pytest.mark.parametrize("verb", ["start", "jog", "reset_fault", "set_frequency"])
+def test_what_may_move_a_motor_says_what_was_seen(tmp_path: Path, verb: str) -> None:
+    with served(tmp_path, MAY) as gateway:
+        writer = {"authorization": gateway.bearer(Right.WRITE)}
+        options = {"hz": 20.0} if verb == "set_frequency" else {}
+        body = {"drive": "pump-1", "verb": verb, "options": options}
+        for wrong in ({}, {"seen": None}, {"seen": "7"}, {"seen": True}, {"seen": 1.5}, {"seen": 10**300}):
+            found = gateway.post("/api/act", {**body, **wrong}, **writer)
+            assert (found.status, found.json["error"].partition(",")[0]) == (400, "seen is missing")
+            assert gateway.post("/api/write", {**WRITE, **wrong}, **writer).status == 400
+        assert commands(gateway) == []
+        assert gateway.gateway.commands.called == 0
+
+
+def test_a_stop_by_any_verb_says_nothing_of_what_was_seen(tmp_path: Path) -> None:
+    with served(tmp_path, MAY) as gateway:
+        for verb in ("stop", "coast"):
+            told = gateway.post("/api/act", {"drive": "pump-1", "verb": verb, "options": {}}).json
+            assert told["done"] is True
+
+
+@pytest.mark.slow
+def test_a_start_from_a_shell_as_the_documentation_has_it(tmp_path: Path) -> None:
+    for program in ("curl", "jq"):
+        require_program(program)
+    page = (Path(__file__).parents[3] / "docs/howto/serve.md").read_text("utf-8")
+    block = next(text for text in re.findall(r"```sh\n(.*?)```", page, re.DOTALL) if "jq" in text)
+    with served(tmp_path, MAY) as gateway:
+        assert gateway.command("/api/write", WRITE, authorization=gateway.bearer(Right.WRITE)).json["done"]
+        login = f"authorization: {gateway.bearer(Right.WRITE)}\ncontent-type: application/json\n"
+        (tmp_path / "login").write_text(login)
+        script = block.replace("localhost:8750", f"localhost:{gateway.gateway.port}")
+        ran = subprocess.run(["sh", "-c", script], cwd=tmp_path, stdout=subprocess.PIPE, check=True)
+        assert json.loads(ran.stdout) == {"done": True, "text": "pump-1: start is done"}
+
+
+def test_frames_count_the_stops_of_each_drive(tmp_path: Path) -> None:
+    with served(tmp_path, MAY) as gateway:
+
+        def stops() -> list[int]:
+            return [gateway.frame()["drives"][name]["stops"] for name in ("pump-1", "pump-2")]
+
+        assert stops() == [0, 0]
+        gateway.post("/api/stop", {"drives": ["pump-1"]})
+        until(lambda: stops() == [1, 0])
+        gateway.post("/api/stop")
+        until(lambda: stops() == [2, 1])

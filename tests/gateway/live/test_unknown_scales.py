@@ -1,0 +1,116 @@
+"""Registers whose documents state no scale: raw counts are nowhere given as amperes, volts or hertz."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+
+import pytest
+from lines import line, plant, polled
+
+from multidrop import Drive, NumberFormat, reading, setting
+from multidrop.families import MODELS, DelixiModbus, InvtCHE
+from multidrop.gateway.http.rights import May
+from multidrop.gateway.live.descriptions import describe
+from multidrop.gateway.live.hub import Hub, Newest
+from multidrop.gateway.live.kept_rows import Known
+from multidrop.gateway.metrics import Figures, families_of
+from multidrop.gateway.modbus_server.common_block import CURRENT, FREQUENCY, NO_NUMBER, SETPOINT, CommonBlock
+from multidrop.gateway.mqtt.home_assistant import discovery
+
+FIGURES = Figures("1", 0, 0, 0, {}, [])
+
+
+class FullHub(Hub):
+    """A hub to which each polled register said 25 just now."""
+
+    def newest(self, drive: str, register: str) -> Newest | None:
+        return Newest(1, 1, 25.0, "ok", 1)
+
+    def known(self, drive: str) -> Iterator[Known]:
+        for register in self.polled(drive):
+            yield register.name, (1, 1, 25.0, 0), (1, 1, 25.0, 0), True
+
+
+class Fan(Drive):
+    """A user's own, whose manual gives a unit and no scale."""
+
+    pressure = setting(1, "Pa", step=None, moves=False)
+
+
+def number(words: list[int], at: int) -> int:
+    return int.from_bytes(bytes([*divmod(words[at], 256), *divmod(words[at + 1], 256)]), "big", signed=True)
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_the_page_has_a_unit_for_what_has_a_scale_alone(model: str) -> None:
+    drive = MODELS[model](1)
+    told = describe(
+        Hub(plant(line("/dev/null", polled(drive, drive.readings())))),
+        May(),
+        None,
+        revision=1,
+        version="1",
+        is_demo=False,
+    )
+    for register in told["lines"][0]["drives"][0]["registers"]:
+        known = drive.registers[register["name"]]
+        assert register["unit"] == ("raw count" if known.step is None else known.unit)
+        if known.writable and known.values is None:  # a dialog has a span for each
+            assert register["least"] < register["most"], known.name
+            known.encode(register["least"])
+            known.encode(register["most"])
+            assert (register["at_least"], register["at_most"]) == (known.at_least, known.at_most)
+
+
+def test_the_common_block_has_no_number_for_a_raw_count() -> None:
+    delixi, che = DelixiModbus(1, name="fan"), InvtCHE(2, name="pump", maximum_frequency=50)
+    names = ("output_frequency", "output_current")
+    drives = [polled(drive, [drive.registers[name] for name in names]) for drive in (delixi, che)]
+    hub = FullHub(plant(line("/dev/null", *drives)))
+    (fan, pump) = (CommonBlock(each).words(hub, 1) for each in drives)
+    assert [number(fan, at) for at in (FREQUENCY, CURRENT, SETPOINT)] == [2500, NO_NUMBER, NO_NUMBER]
+    assert [number(pump, at) for at in (FREQUENCY, CURRENT, SETPOINT)] == [2500, 2500, NO_NUMBER]
+
+
+def test_a_metric_of_raw_counts_says_so() -> None:
+    drive = DelixiModbus(1, name="fan")
+    hub = FullHub(plant(line("/dev/null", polled(drive, [drive.output_frequency, drive.output_current]))))
+    (values,) = (family for family in families_of(hub, {}, FIGURES) if family.name == "multidrop_value")
+    assert [labels["unit"] for _, labels, _ in values.samples] == ["Hz", "raw count"]
+
+
+def test_home_assistant_writes_raw_counts_as_what_they_are() -> None:
+    topics = dict.fromkeys(("set", "stop", "state", "gateway", "available"), "topic")
+    details = {"prefix": "", "version": "1", "every_s": 1.0, "writable": ["pressure"], "takes_commands": True}
+    found = json.loads(discovery(Fan(1), [Fan.pressure], topics, **details))  # type: ignore[arg-type]
+    assert found["cmps"]["pressure_set"]["unit_of_measurement"] == "raw count"
+    assert "unit_of_measurement" not in found["cmps"]["pressure"]
+
+
+class Transmitter(Drive):
+    """A user's own, of whose numbers each has its own digits."""
+
+    pressure = setting(1, "Pa", number_format=NumberFormat.F32, moves=False)
+    level = setting(3, "m", step=0.01, moves=False)
+    power = reading(4, "W", scale_register="power_scale")
+    power_scale = reading(5, number_format=NumberFormat.I16)
+
+
+def test_the_page_knows_no_digits_of_a_float() -> None:
+    hub = Hub(plant(line("/dev/null", polled(Transmitter(1), Transmitter.readings()))))
+    told = describe(hub, May(), None, revision=1, version="1", is_demo=False)
+    registers = {each["name"]: each for each in told["lines"][0]["drives"][0]["registers"]}
+    assert [registers[name]["digits"] for name in ("pressure", "level", "power")] == [None, 2, None]
+    assert [registers[name]["step"] for name in ("pressure", "level")] == [None, 0.01]
+
+
+def test_home_assistant_rounds_no_float() -> None:
+    topics = dict.fromkeys(("set", "stop", "state", "gateway", "available"), "topic")
+    details = {"prefix": "", "version": "1", "every_s": 1.0, "writable": ["pressure", "level"]}
+    drive = Transmitter(1, name="tank")
+    said = json.loads(discovery(drive, drive.registers.values(), topics, takes_commands=True, **details))
+    parts = said["cmps"]
+    shown = [parts[name].get("suggested_display_precision") for name in ("pressure", "level", "power")]
+    assert shown == [None, 2, None]
+    assert [parts[f"{name}_set"]["step"] for name in ("pressure", "level")] == [0.001, 0.01]

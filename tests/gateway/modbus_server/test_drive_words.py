@@ -1,0 +1,253 @@
+"""Words made again of rows: those that the drive sent, bit for bit, or none.
+
+The rows are what the core makes of the bytes; the bytes are drawn here, and no encoder of ours is asked.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+from enum import IntEnum
+from typing import Any, NamedTuple
+
+import pytest
+from batches import UTC_0, completion
+from completions import add_rows
+from examples import PART
+from hypothesis import example, given
+from hypothesis import strategies as st
+from tables import table
+
+from multidrop.core import Columns, Names, NumberFormat, RowLayout
+from multidrop.drive import Drive
+from multidrop.drive.declare import reading
+from multidrop.drive.register import Register
+from multidrop.drive.row_field import row_field
+from multidrop.drive.table import COIL, DISCRETE, HOLDING, INPUT
+from multidrop.gateway.modbus_server.words import DriveWords, Lack, exact_data
+from multidrop.plant.model import Polled, PolledDrive
+from multidrop.polling.batch import Batch
+
+BYTES = {
+    NumberFormat.U16: 2,
+    NumberFormat.I16: 2,
+    NumberFormat.BCD16: 2,
+    NumberFormat.I8: 2,
+    NumberFormat.F16: 2,
+    NumberFormat.U32: 4,
+    NumberFormat.I32: 4,
+    NumberFormat.U32_EITHER: 4,
+    NumberFormat.F32: 4,
+    NumberFormat.BCD32: 4,
+    NumberFormat.U64: 8,
+    NumberFormat.I64: 8,
+    NumberFormat.F64: 8,
+}
+ORDERS = ["ABCD", "CDAB", "BADC", "DCBA"]
+STEPS = [1, 0.1, 0.01, 0.001, 10, -1, -0.1, 2.5, 0.05, 60, -0.25, 0.0333]
+OFFSETS = [0, -40, 273.15, 0.5, 1000, -0.01]
+WHOLE = [NumberFormat.U16, NumberFormat.I16, NumberFormat.U32, NumberFormat.I32]
+
+
+def declared(**details: Any) -> Register[Any]:
+    family = type("Meter", (Drive,), {"level": reading(0, "m", **details)})
+    return family.registers["level"]
+
+
+def value_of(register: Register[Any], data: bytes) -> float | None:
+    """Return the value that the core's row has of these bytes; None for a miss."""
+    words = struct.unpack(f">{len(data) // 2}H", data)
+    columns = Columns(1)
+    assert add_rows(
+        columns, RowLayout(0, [row_field(register, 0, 0)]), completion(5, first_ns=9, words=words), UTC_0
+    )
+    (row,) = Batch(columns, Names(["meter"]), Names(["level"]))
+    return row.value
+
+
+@st.composite
+def sent(draw: st.DrawFn) -> tuple[NumberFormat, str, float, float, bytes]:
+    number_format = draw(st.sampled_from([*BYTES]))
+    size = BYTES[number_format]
+    data = draw(st.binary(min_size=size, max_size=size))
+    order = draw(st.sampled_from(ORDERS if size > 2 else ["AB", "BA"]))
+    if number_format is NumberFormat.U32_EITHER:
+        order = "ABCD"
+    return number_format, order, draw(st.sampled_from(STEPS)), draw(st.sampled_from(OFFSETS)), data
+
+
+@given(sent())
+@example((NumberFormat.F32, "ABCD", 1, 0, b"\x80\0\0\0"))  # -0.0: a row says 0.0
+@example((NumberFormat.F32, "ABCD", 1, 0, bytes(4)))
+@example((NumberFormat.F32, "ABCD", 1, 0, b"\x7f\x80\0\0"))  # infinity
+@example((NumberFormat.F32, "ABCD", 1, 0, b"\0\0\0\x01"))  # the least that there is
+@example((NumberFormat.U64, "ABCD", 1, 0, (2**53 + 1).to_bytes(8)))  # no float64 is this number
+@example((NumberFormat.U64, "ABCD", 0.1, 0, (2**53 + 1).to_bytes(8)))
+@example((NumberFormat.U64, "ABCD", 60, 0, (2**53 + 1).to_bytes(8)))  # nor is its count the core's
+@example((NumberFormat.I64, "ABCD", 1, 0, (-(2**53) - 1).to_bytes(8, signed=True)))
+@example((NumberFormat.F64, "ABCD", 0.1, 0, struct.pack(">d", 0.30000000000000004)))
+@example((NumberFormat.F64, "ABCD", 1, 1000, struct.pack(">d", 1e-20)))  # the offset swallows it
+@example((NumberFormat.F32, "ABCD", 1, 273.15, struct.pack(">f", 1e-20)))
+def test_words_are_the_drive_s_own_or_none(case: tuple[NumberFormat, str, float, float, bytes]) -> None:
+    number_format, order, step, offset, data = case
+    register = declared(number_format=number_format, order=order, step=step, offset=offset)
+    value = value_of(register, data)
+    if value is not None:
+        assert exact_data(register, value) in (data, None)
+
+
+@given(st.sampled_from(WHOLE), st.sampled_from(STEPS), st.sampled_from(OFFSETS), st.data())
+def test_whole_counts_always_have_words(
+    number_format: NumberFormat, step: float, offset: float, data: st.DataObject
+) -> None:
+    size = BYTES[number_format]
+    order = data.draw(st.sampled_from(ORDERS if size > 2 else ["AB", "BA"]))
+    raw = data.draw(st.binary(min_size=size, max_size=size))
+    register = declared(number_format=number_format, order=order, step=step, offset=offset)
+    value = value_of(register, raw)
+    assert value is not None
+    assert exact_data(register, value) == raw
+
+
+@pytest.mark.slow
+def test_every_count_of_a_word_has_words() -> None:
+    """Every seventh by default."""
+    for step in (0.1, 0.01, -0.25):
+        register = declared(step=step)
+        for raw in range(0, 0x10000, 2 * PART - 1):
+            value = raw * round(step * 100) / 100
+            assert exact_data(register, value) == raw.to_bytes(2)
+
+
+@given(st.floats(width=32, allow_nan=False).filter(bool), st.sampled_from(ORDERS))
+def test_floats_have_words_but_for_zero(number: float, order: str) -> None:
+    register = declared(number_format=NumberFormat.F32, order=order)
+    data = struct.pack(">f", number)
+    places = {"ABCD": (0, 1, 2, 3), "CDAB": (2, 3, 0, 1), "BADC": (1, 0, 3, 2), "DCBA": (3, 2, 1, 0)}[order]
+    on_the_wire = bytes(data[at] for at in places)
+    value = value_of(register, on_the_wire)
+    assert value == number
+    assert exact_data(register, number) == on_the_wire
+    assert exact_data(register, 0.0) is None
+
+
+@table("value", [math.inf, -math.inf, math.nan, 1e300, 0.3, -1, 65536, 2**70])
+def test_a_value_that_no_count_has_is_not_rounded(value: float) -> None:
+    assert exact_data(declared(), value) is None
+
+
+@table(
+    "details",
+    [
+        {"part": (0, 3)},
+        {"number_format": NumberFormat.I8},
+        {"number_format": NumberFormat.U32_EITHER},
+        {"invalid": 5},  # the count that means no value
+    ],
+)
+def test_what_leaves_bits_open_has_no_words(details: dict[str, Any]) -> None:
+    assert exact_data(declared(**details), 5.0) is None
+
+
+def test_a_register_that_another_scales_has_no_words() -> None:
+    family = type(
+        "Scaled",
+        (Drive,),
+        {
+            "level": reading(0, "m", scale_register="power"),
+            "power": reading(1, number_format=NumberFormat.I16),
+        },
+    )
+    assert exact_data(family.registers["level"], 5.0) is None
+    assert exact_data(family.registers["power"], -2.0) == b"\xff\xfe"
+
+
+# ---- ranges ----
+
+
+class Status(IntEnum):
+    STANDS = 3
+
+
+class Meter(Drive):
+    """A device with all that may stand beside each other."""
+
+    speed = reading(0, "rpm")
+    energy = reading(1, "kWh", number_format=NumberFormat.U32, order="CDAB", step=0.1)
+    status = reading(3, Status)
+    low = reading(4, part=(0, 7))
+    level = reading(5, "m", number_format=NumberFormat.F32)
+    again = reading(0, "Hz", step=0.01, table=HOLDING)
+    pressure = reading(0, "bar", table=INPUT)
+    relay = reading(7, table=COIL)
+    door = reading(8, table=DISCRETE)
+    unpolled = reading(9)
+
+
+S = 1_000_000_000
+
+
+class FakeRow(NamedTuple):
+    monotonic_ns: int
+    value: float | None
+    holds_ns: int = S
+
+
+NOW = 100 * S
+ROWS = {
+    "speed": FakeRow(NOW - S // 2, 1450.0),
+    "energy": FakeRow(NOW, 0x0001_0002 / 10),
+    "status": FakeRow(NOW, 3.0),
+    "low": FakeRow(NOW, 7.0),
+    "level": FakeRow(NOW, 1.5),
+    "again": FakeRow(NOW - S, 14.5),
+    "pressure": FakeRow(NOW, 12.0),
+    "relay": FakeRow(NOW, 1.0),
+    "door": FakeRow(NOW, 0.0),
+}
+
+
+def cached() -> DriveWords:
+    polls = tuple(Polled(Meter.registers[name], 0.1) for name in ROWS)
+    return DriveWords(PolledDrive(Meter(1), polls))
+
+
+def read(function: int, start: int, count: int, *, since_ns: int = 0, **changed: FakeRow) -> list[int] | Lack:
+    rows = {**ROWS, **changed}
+    return cached().read(function, range(start, start + count), rows.get, NOW, since_ns)
+
+
+def test_a_range_is_of_words_as_the_drive_has_them() -> None:
+    assert read(3, 0, 4) == [1450, 0x0002, 0x0001, 3]
+    assert read(3, 2, 1) == [0x0001]  # half of a number
+    assert read(4, 0, 1) == [12]
+    assert read(3, 5, 2) == [0x3FC0, 0]
+    assert read(1, 7, 1) == [1]
+    assert read(2, 8, 1) == [0]
+
+
+def test_one_word_that_is_not_known_leaves_the_range_out() -> None:
+    assert read(3, 3, 2) is Lack.UNPOLLED  # a part of a word
+    assert read(3, 9, 1) is Lack.UNPOLLED
+    assert read(4, 0, 2) is Lack.UNPOLLED
+    assert read(1, 0, 1) is Lack.UNPOLLED
+    assert read(3, 5, 2, level=FakeRow(NOW, 0.0)) is Lack.UNPOLLED  # +0 and -0
+
+
+def test_a_row_that_is_old_or_a_miss_leaves_the_range_out() -> None:
+    assert read(3, 0, 4, status=FakeRow(NOW, None)) is Lack.STALE
+    assert read(3, 0, 4, status=FakeRow(NOW - S, 3.0)) == [1450, 2, 1, 3]
+    assert read(3, 0, 4, status=FakeRow(NOW - S - 1, 3.0)) is Lack.STALE
+    assert read(3, 3, 1, status=FakeRow(NOW - 6 * S, 3.0, 6 * S)) == [3]
+    assert read(3, 3, 1, status=FakeRow(NOW - 6 * S - 1, 3.0, 6 * S)) is Lack.STALE
+    assert cached().read(3, range(1), lambda name: None, NOW) is Lack.STALE
+
+
+def test_rows_from_before_a_write_do_not_count() -> None:
+    assert read(3, 1, 1, since_ns=NOW) == [2]
+    assert read(3, 1, 1, since_ns=NOW + 1) is Lack.STALE
+
+
+def test_of_two_registers_at_an_address_the_newer_row_counts() -> None:
+    assert read(3, 0, 1, again=FakeRow(NOW, 14.49)) == [1449]
+    assert read(3, 0, 1, speed=FakeRow(NOW, None)) == [1450]

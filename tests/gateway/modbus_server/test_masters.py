@@ -1,0 +1,274 @@
+"""mbpoll, libmodbus and pyModbusTCP read and write drives through the gateway: the drives' own words, bit for
+bit, as the simulated drives hold them.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import random
+import struct
+from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
+from time import monotonic, sleep
+from typing import Any, NamedTuple
+
+import pytest
+from examples import usually
+from lines import until
+from modbus_gateway import in_thread
+from modbus_masters import Master, master_of
+
+from multidrop import Batch, Bus, BusError, Carrier, Plant, Poller, load_plant
+from multidrop.gateway.commands import Commands
+from multidrop.gateway.http.rights import May
+from multidrop.gateway.live.hub import Hub
+from multidrop.gateway.modbus_server.server import ModbusServer
+from multidrop.gateway.modbus_server.settings import ModbusSettings
+from multidrop.gateway.modbus_server.unit_ids import MAIN
+from multidrop.sim import SimulatedDrive, Simulator, Wire, simulated
+
+MASTERS = ["pyModbusTCP", "mbpoll", "libmodbus"]
+METER = Path(__file__).parents[2] / "data" / "families" / "sdm630.toml"
+MODELS = ["innovert-ibd", "invt-che", "delixi-modbus", "yd1000", "erman-er-g-220", str(METER)]
+COMMANDED = 7  # the unit that is written to
+SETPOINT, CONTROL, STOP = 0x2000, 0x1000, 5  # of a CHE: CHE100 manual v1.4, p. 117
+PATIENCE = 60.0  # s
+
+
+class Lines(NamedTuple):
+    """A poller, as commands see it."""
+
+    plant: Plant
+    poller: Poller
+
+    def bus(self, line: str) -> Bus:
+        return self.poller.bus(line)
+
+    @property
+    def plant_now(self) -> Plant:
+        return self.plant
+
+    @property
+    def plant_coming(self) -> None:
+        return None  # nothing is reloaded
+
+    async def ask(self, drive: str, function: int, start: int, count: int, expiry: float) -> list[int]:
+        line, known = self.plant.find_drive(drive)
+        data = await asyncio.to_thread(self.bus(line.name).ask, known, function, start, count, expiry=expiry)
+        if function < 3:
+            return [data[bit // 8] >> bit % 8 & 1 for bit in range(count)]
+        return list(struct.unpack(f">{count}H", data))
+
+
+class Rig(NamedTuple):
+    """The gateway, the drives behind it by unit, and the poller."""
+
+    server: ModbusServer
+    drives: dict[int, SimulatedDrive]
+    lines: Lines
+
+    @property
+    def port(self) -> int:
+        return self.server.ports[MAIN]
+
+
+def plant_text(ports: list[str]) -> str:
+    """The plant file: half of the drives on each line, and some registers that are not polled."""
+    models = [*MODELS, "invt-che"]
+    text = ""
+    for at, port in enumerate(ports):
+        text += f'[[line]]\nname = "line-{at}"\nport = "{port}"\n'
+        for unit, model in enumerate(models, 1):
+            if unit % 2 == at:
+                text += f'[[line.drive]]\nname = "drive-{unit}"\nmodel = "{model}"\naddress = {unit}\n'
+                text += 'every = "200 ms"\n'
+    return text
+
+
+@pytest.fixture(scope="module")
+def rig(tmp_path_factory: pytest.TempPathFactory, _patient_module: None) -> Iterator[Rig]:
+    folder = tmp_path_factory.mktemp("rig")
+    (folder / "plant.toml").write_text(plant_text(["/dev/ttyUSB0", "/dev/ttyUSB1"]))
+    declared = load_plant(folder / "plant.toml")
+    known = {polled.drive.address: polled.drive for line in declared.lines for polled in line.drives}
+    drives = {
+        unit: simulated(drive) if unit == COMMANDED else SimulatedDrive(drive)
+        for unit, drive in known.items()
+    }
+    chance = random.Random(20261122)
+    for unit, drive in drives.items():
+        if unit != COMMANDED:
+            fill(drive, chance)
+    wires = [Wire([drive for unit, drive in drives.items() if unit % 2 == at], unpaced=True) for at in (0, 1)]
+    with Simulator(wires) as line:
+        plant = declared.with_ports({f"line-{at}": wire.path for at, wire in enumerate(line.wires)})
+        hub = Hub(plant)
+        with Poller(plant) as poller:
+            lines = Lines(plant, poller)
+            commands = Commands(lines, May(write=frozenset({f"drive-{COMMANDED}.setpoint"})))
+            settings = ModbusSettings(listen="127.0.0.1:0", may="write")
+
+            def make() -> ModbusServer:
+                loop = asyncio.get_running_loop()
+
+                def feed(batch: Batch) -> None:
+                    with suppress(RuntimeError):  # at the end, when the loop is closed
+                        loop.call_soon_threadsafe(hub.take, batch)
+
+                poller.on_batch(feed, every=0.02)
+                return ModbusServer(plant, hub, commands, settings, lines.ask)
+
+            with in_thread(make) as server:
+                yield Rig(server, drives, lines)
+
+
+def fill(drive: SimulatedDrive, chance: random.Random) -> None:
+    """Give each word any bits, half of them few, as small numbers are; but what a document knows."""
+    for register in drive.drive.registers.values():
+        for cell in drive.memory.of(register):
+            top = 1 if register.table.carrier is Carrier.BIT else 0xFFFF
+            cell.raw = min(chance.choice([chance.randint(0, top), chance.randint(1, 20)]), top)
+    for register, (least, _) in drive.drive.known_counts().items():
+        (cell,) = drive.memory.of(register)
+        cell.raw = least
+
+
+class Chunk(NamedTuple):
+    """Neighbouring readable addresses of a unit, and what is there."""
+
+    unit: int
+    function: int
+    start: int
+    words: list[int]
+
+    @property
+    def next_place(self) -> tuple[int, int, int]:
+        return self.unit, self.function, self.start + len(self.words)
+
+
+def chunks(rig: Rig) -> list[Chunk]:
+    """All that the families declare to be readable, in pieces; the numbers are the simulated memory's."""
+    found: list[Chunk] = []
+    for unit, drive in rig.drives.items():
+        readable: set[tuple[int, int]] = set()
+        for register in drive.drive.registers.values():
+            if register.readable and register.table.read is not None:
+                readable |= {
+                    (register.table.read, at)
+                    for at in range(register.address, register.address + register.words)
+                }
+        for function, address in sorted(readable):
+            cell = drive.memory.readable(function, address)
+            assert cell is not None
+            last = found[-1] if found else None
+            place = unit, function, address
+            if last and len(last.words) < drive.most.get(function, 1) and last.next_place == place:
+                last.words.append(cell.raw)
+            else:
+                found.append(Chunk(*place, [cell.raw]))
+    return [chunk for chunk in found if chunk.unit != COMMANDED]
+
+
+def patiently(ask: Any, *numbers: int) -> Any:
+    """Ask again where the line's share is used up, or a busy machine lost a reply."""
+    end = monotonic() + PATIENCE
+    while (found := ask(*numbers)) in (6, 11) and monotonic() < end:
+        sleep(0.1)
+    return found
+
+
+@pytest.fixture(params=usually(*MASTERS))
+def master(request: pytest.FixtureRequest, rig: Rig, tmp_path: Path) -> Iterator[Master]:
+    with master_of(request.param, rig.port, tmp_path) as found:
+        yield found
+
+
+@pytest.mark.slow
+@pytest.mark.long
+def test_all_words_are_the_drives_own(rig: Rig, master: Master) -> None:
+    before = rig.server.answered.copy()
+    asked = chunks(rig)
+    assert len(asked) > 40
+    wrong = [
+        (chunk, found)
+        for chunk in asked
+        if (found := patiently(master.read, chunk.unit, chunk.function, chunk.start, len(chunk.words)))
+        != chunk.words
+    ]
+    assert wrong == []
+    assert rig.server.answered["cached"] - before["cached"] > 10
+    assert rig.server.answered["passed"] - before["passed"] > 10
+
+
+@pytest.mark.long
+@pytest.mark.slow
+def test_words_from_rows_are_those_that_the_line_has(rig: Rig, master: Master) -> None:
+    """Every polled register that is whole is answered without the line, and as the line itself answers."""
+    before = rig.server.answered["cached"]
+    asked = 0
+    for unit, drive in rig.drives.items():
+        polled = [register for register in drive.drive.readings() if not register.commands]
+        for register in polled[:6]:
+            direct = direct_words(rig.lines.bus(f"line-{unit % 2}"), drive, register)
+            found = patiently(master.read, unit, register.table.read, register.address, register.words)
+            assert found == direct, (unit, register.name)
+            asked += 1
+    frequency = rig.drives[2].drive.register("output_frequency").address  # whole, and polled: in the cache
+    until(
+        lambda: (
+            patiently(master.read, 2, 3, frequency, 1) and rig.server.answered["cached"] - before > asked / 2
+        )
+    )
+
+
+def direct_words(bus: Bus, drive: SimulatedDrive, register: Any) -> list[int]:
+    """Return what the line itself has; asked again where a busy machine lost the reply."""
+    end = monotonic() + PATIENCE
+    data = b""
+    while not data:
+        try:
+            data = bus.ask(drive.drive, register.table.read, register.address, register.words, expiry=30)
+        except BusError:
+            assert monotonic() < end
+    if register.table.carrier is Carrier.BIT:
+        return [data[0] & 1]
+    return list(struct.unpack(f">{register.words}H", data))
+
+
+@pytest.mark.slow
+def test_a_setpoint_is_written_and_read_back(
+    rig: Rig, master: Master, request: pytest.FixtureRequest
+) -> None:
+    value = 3000 + 100 * MASTERS.index(request.node.callspec.params["master"])
+    assert patiently(master.write, COMMANDED, 6, SETPOINT, value) == 0
+    drive = rig.drives[COMMANDED]
+    assert [one.raw for one in drive.counters.writes if one.name == "setpoint"][-1] == value
+    assert patiently(master.read, COMMANDED, 3, SETPOINT, 1) == [value]
+
+
+def test_exceptions_are_told(rig: Rig, master: Master) -> None:
+    writes = len(rig.drives[COMMANDED].counters.writes)
+    assert patiently(master.write, COMMANDED, 6, SETPOINT, 60000) == 3  # over its span
+    assert patiently(master.write, COMMANDED, 6, CONTROL, 1) == 3  # FORWARD
+    assert patiently(master.write, 1, 6, 0x0002, 1) == 2  # not a register that can be written
+    assert patiently(master.write, 4, 6, 0x2000, 1) == 2
+    assert master.read(99, 3, 0, 1) == 10
+    assert len(rig.drives[COMMANDED].counters.writes) == writes
+
+
+def test_a_motor_is_stopped(rig: Rig, master: Master) -> None:
+    drive = rig.drives[COMMANDED]
+    for address, value in ((CONTROL, STOP), (0xF00A, 1)):
+        drive.counters.writes.clear()
+        assert master.write(COMMANDED, 6, address, value) in (0, 5)  # done, or goes on
+        until(lambda: drive.counters.writes)
+        assert [(one.name, one.raw) for one in drive.counters.writes][-1] == ("control", STOP)
+
+
+def test_the_common_block_is_the_same_for_all(rig: Rig, master: Master) -> None:
+    for unit in rig.drives:
+        found = patiently(master.read, unit, 3, 0xF000, 11)
+        assert isinstance(found, list)
+        assert found[0] in range(5)
+        assert found[10] == 0

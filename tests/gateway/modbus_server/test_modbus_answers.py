@@ -1,0 +1,637 @@
+"""The answer to each request: values, every exception code, and what of it reaches a drive."""
+
+from __future__ import annotations
+
+import asyncio
+import struct
+import threading
+import time
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+from lines import until
+from modbus_gateway import Gateway, plant_of, request, serving
+
+from multidrop import (
+    COIL,
+    BadReply,
+    BusError,
+    Drive,
+    DriveRefused,
+    Expired,
+    Kept,
+    NoReply,
+    NotAttached,
+    NotDone,
+    NotMaster,
+    NumberFormat,
+    Overtaken,
+    PortLost,
+    Refused,
+    Unconfirmed,
+    Unsupported,
+    reading,
+    setting,
+)
+from multidrop.families import DelixiNative, ErmanERG220, InnovertIBD, InvtCHE
+from multidrop.gateway.commands import BUSY, Told
+from multidrop.gateway.http.rights import NOT_ALLOWED, NOT_LISTED, Caller, Right
+from multidrop.gateway.modbus_server.server import MOST_STOPS
+from multidrop.gateway.modbus_server.settings import ModbusSettings
+from multidrop.gateway.mqtt.throttle import PassingBusy
+
+CHE_OUTPUT_VOLTAGE, CHE_SETPOINT, CHE_CONTROL = 0x3003, 0x2000, 0x1000  # CHE100 manual v1.4, p. 117
+IBD_CONTROL, IBD_STOP = 0x2000, 1
+BLOCK = 0xF000
+
+
+class Meter(Drive):
+    """A device of a user's own."""
+
+    level = reading(0, "m", step=0.1)
+    energy = setting(2, "kWh", number_format=NumberFormat.U32, order="CDAB", span=(0, 4e9), kept=Kept.RAM)
+    relay = setting(5, table=COIL)
+
+
+def plant() -> Any:
+    return plant_of(
+        ("hall", InvtCHE(1, name="mill")),
+        ("hall", Meter(2, name="meter")),
+        ("hall", InnovertIBD(3, name="pump")),
+        ("hall", DelixiNative(4, name="belt")),
+    )
+
+
+@pytest.fixture
+def gateway() -> Iterator[Gateway]:
+    """A server whose clients may write, with values of the mill and the meter."""
+    with serving(plant(), ModbusSettings(listen="127.0.0.1:0", may="write")) as found:
+        found.hub.values.update(
+            {("mill", "output_voltage"): 231.0, ("meter", "level"): 12.5, ("meter", "relay"): 1.0}
+        )
+        yield found
+
+
+def code(gateway: Gateway, unit: int, function: int, *words: int, data: bytes = b"") -> int | None:
+    with gateway.client() as client:
+        return client.ask(unit, function, *words, data=data).code
+
+
+# ---- reads ----
+
+
+def test_a_polled_value_costs_the_line_nothing(gateway: Gateway) -> None:
+    with gateway.client() as client:
+        assert client.ask(1, 3, CHE_OUTPUT_VOLTAGE, 1).words == [231]
+        assert client.ask(2, 3, 0, 1).words == [125]
+        assert client.ask(2, 1, 5, 1).data == b"\x01\x01"
+    assert gateway.line.asked == []
+
+
+@pytest.mark.parametrize("why", ["a miss", "old", "never asked", "from before the machine slept"])
+def test_what_is_not_fresh_is_asked_of_the_drive(gateway: Gateway, why: str) -> None:
+    key = "mill", "output_voltage"
+    if why == "a miss":
+        gateway.hub.values[key] = None
+    elif why == "old":
+        gateway.hub.ages[key] = 60.0
+    elif why == "from before the machine slept":
+        gateway.hub.woken_ns = time.monotonic_ns() + 3600 * 10**9
+    else:
+        del gateway.hub.values[key]
+    with gateway.client() as client:
+        assert client.ask(1, 3, CHE_OUTPUT_VOLTAGE, 1).words == [CHE_OUTPUT_VOLTAGE]
+    assert gateway.line.asked == [("mill", 3, CHE_OUTPUT_VOLTAGE, 1)]
+
+
+def test_bits_that_are_passed_are_packed_the_first_one_lowest() -> None:
+    with (
+        serving(plant(), ModbusSettings(listen="127.0.0.1:0", passing="any")) as gateway,
+        gateway.client() as client,
+    ):
+        assert client.ask(2, 2, 1, 10).data == bytes([2, 0b01010101, 0b01])  # odd addresses are 1
+
+
+def test_only_what_is_declared_is_passed(gateway: Gateway) -> None:
+    assert code(gateway, 1, 3, 0x7000, 1) == 2
+    assert code(gateway, 1, 4, CHE_OUTPUT_VOLTAGE, 1) == 2  # another table
+    assert code(gateway, 4, 3, 0, 1) == 2  # no Modbus behind this one
+    assert gateway.line.asked == []
+
+
+def test_with_any_all_addresses_are_passed() -> None:
+    with serving(plant(), ModbusSettings(listen="127.0.0.1:0", passing="any")) as gateway:
+        assert code(gateway, 1, 4, 0x7000, 2) is None
+        assert gateway.line.asked == [("mill", 4, 0x7000, 2)]
+
+
+def test_with_off_the_line_is_never_asked() -> None:
+    with serving(plant(), ModbusSettings(listen="127.0.0.1:0", passing="off")) as gateway:
+        gateway.hub.values["mill", "output_voltage"] = 231.0
+        assert code(gateway, 1, 3, CHE_OUTPUT_VOLTAGE, 1) is None
+        gateway.hub.values["mill", "output_voltage"] = None
+        assert code(gateway, 1, 3, CHE_OUTPUT_VOLTAGE, 1) == 0x0B
+        assert code(gateway, 1, 3, 0x7000, 1) == 2
+        assert gateway.line.asked == []
+
+
+def test_a_silent_drive_costs_the_others_no_time(gateway: Gateway) -> None:
+    gateway.hub.values["mill", "output_voltage"] = None
+    gateway.hub.states["mill"] = "silent"
+    assert code(gateway, 1, 3, CHE_OUTPUT_VOLTAGE, 1) == 0x0B
+    assert gateway.line.asked == []
+
+
+def test_a_value_from_before_a_write_is_not_given_after_it(gateway: Gateway) -> None:
+    gateway.hub.values["mill", "setpoint"] = 10.0
+    gateway.hub.ages["mill", "output_voltage"] = 0.2
+    with gateway.client() as client:
+        assert client.ask(1, 6, CHE_SETPOINT, 5000).code is None
+        assert client.ask(1, 3, CHE_OUTPUT_VOLTAGE, 1).words == [CHE_OUTPUT_VOLTAGE]  # passed
+        gateway.hub.ages["mill", "output_voltage"] = 0.0
+        assert client.ask(1, 3, CHE_OUTPUT_VOLTAGE, 1).words == [231]
+
+
+def test_a_value_from_before_a_write_is_not_given_after_a_reload(gateway: Gateway) -> None:
+    """Nor is one from before a command that came by another way."""
+    gateway.hub.ages["mill", "output_voltage"] = 0.2
+    with gateway.client() as client:
+        assert client.ask(1, 3, CHE_OUTPUT_VOLTAGE, 1).words == [231]
+        gateway.commands.ended["mill"] = time.monotonic_ns()
+        gateway.server.adopt(plant())
+        assert client.ask(1, 3, CHE_OUTPUT_VOLTAGE, 1).words == [CHE_OUTPUT_VOLTAGE]  # passed
+
+
+@pytest.mark.parametrize("function", [1, 2, 3, 4])
+@pytest.mark.parametrize(
+    ("start", "count", "expected"),
+    [(0, 0, 3), (0, 2001, 3), (0xFFFF, 2, 2), (0x7000, 1, 2)],
+)
+def test_a_range_that_cannot_be(
+    gateway: Gateway, function: int, start: int, count: int, expected: int
+) -> None:
+    assert code(gateway, 1, function, start, count) == expected
+
+
+def test_126_words_are_one_too_many(gateway: Gateway) -> None:
+    assert code(gateway, 1, 3, 0, 126) == 3
+
+
+@pytest.mark.parametrize("function", [1, 3, 5, 6])
+@pytest.mark.parametrize("data", [b"", b"\0", b"\0\0\0", b"\0\0\0\1\0"])
+def test_a_request_of_another_length_is_no_value(gateway: Gateway, function: int, data: bytes) -> None:
+    assert code(gateway, 1, function, data=data) == 3
+
+
+@pytest.mark.parametrize("function", [0, 7, 8, 11, 17, 20, 22, 23, 43, 0x41, 0x80, 0x83, 0xFF])
+def test_other_functions_are_not_offered(gateway: Gateway, function: int) -> None:
+    with gateway.client() as client:
+        client.send(request(1, 1, function, 0, 1))
+        reply = client.receive()
+        assert reply is not None
+        assert (reply.function, reply.data) == (function | 0x80, b"\x01")
+    assert (gateway.line.asked, gateway.commands.written, gateway.commands.stopped) == ([], [], [])
+
+
+def test_an_unknown_unit_is_no_path(gateway: Gateway) -> None:
+    for unit in (5, 247, 255):
+        assert code(gateway, unit, 3, 0, 1) == 0x0A
+        assert code(gateway, unit, 6, 0, 1) == 0x0A
+
+
+@pytest.mark.parametrize("function", [3, 5, 6, 16, 8])
+def test_a_broadcast_is_closed_without_an_answer_and_goes_nowhere(gateway: Gateway, function: int) -> None:
+    with gateway.client() as client:
+        client.send(request(1, 0, function, BLOCK + 10, 1))
+        assert client.receive() is None
+    assert (gateway.line.asked, gateway.commands.written, gateway.commands.stopped) == ([], [], [])
+
+
+# ---- what becomes of reads that are passed ----
+
+FAILURES = [
+    (NoReply("mill"), 0x0B),
+    (BadReply("mill", "wrong checksum", b"\1"), 0x0B),
+    (PortLost("/dev/ttyUSB0", "vanished"), 0x0A),
+    (NotMaster("mill", "/dev/ttyUSB0"), 0x0A),
+    (NotAttached("mill is on no bus"), 0x0A),
+    (Expired("mill", "a read", 1.0), 0x06),
+    (PassingBusy("the line was not free for it"), 0x06),
+    (Unsupported("the document of mill has no such thing"), 0x01),
+    (DriveRefused("mill", 2, "illegal address"), 0x02),
+    (DriveRefused("mill", 0x11, "password"), 0x11),
+    (ValueError("count = 100 is not from 1 to 16"), 0x03),
+    (BusError("whatever"), 0x04),
+]
+
+
+@pytest.mark.parametrize(("failure", "expected"), FAILURES, ids=lambda one: type(one).__name__)
+def test_a_failure_on_the_line_has_its_code(gateway: Gateway, failure: Exception, expected: int) -> None:
+    gateway.hub.values.clear()
+    gateway.line.failure = failure
+    assert code(gateway, 1, 3, CHE_OUTPUT_VOLTAGE, 1) == expected
+
+
+@pytest.mark.slow
+def test_reads_that_find_the_queue_full_are_busy(gateway: Gateway) -> None:
+    gateway.hub.values.clear()
+    gateway.line.seconds = 0.6  # three times what may be used at once
+    with gateway.client() as client:
+        client.send(b"".join(request(number, 1, 3, CHE_OUTPUT_VOLTAGE, 1) for number in range(12)))
+        replies = [client.receive() for _ in range(12)]
+    codes = {reply.transaction: reply.code for reply in replies if reply is not None}
+    assert codes == {0: None, **dict.fromkeys(range(1, 12), 6)}
+    assert len(gateway.line.asked) == 1  # the share is used up for 2 s, and the others expire
+
+
+# ---- writes ----
+
+
+def test_a_write_goes_through_commands_and_is_echoed(gateway: Gateway) -> None:
+    with gateway.client() as client:
+        assert client.ask(1, 6, CHE_SETPOINT, 5000).data == bytes.fromhex("20 00 13 88")
+        reply = client.ask(1, 16, CHE_SETPOINT, 1, data=bytes.fromhex("02 13 88"))
+        assert reply.data == bytes.fromhex("20 00 00 01")
+        assert client.ask(2, 5, 5, 0xFF00).data == bytes.fromhex("00 05 FF 00")
+        assert client.ask(2, 15, 5, 1, data=b"\x01\x00").data == bytes.fromhex("00 05 00 01")
+        reply = client.ask(2, 16, 2, 2, data=bytes.fromhex("04 00 02 00 01"))  # CDAB
+        assert reply.data == bytes.fromhex("00 02 00 02")
+    caller = Caller("anyone", "modbus", "127.0.0.1", Right.WRITE)
+    assert gateway.commands.written == [
+        ("mill", "setpoint", 50.0, caller),
+        ("mill", "setpoint", 50.0, caller),
+        ("meter", "relay", 1.0, caller),
+        ("meter", "relay", 0.0, caller),
+        ("meter", "energy", 0x0001_0002, caller),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("function", "words", "data", "expected"),
+    [
+        (6, (0x7000, 1), b"", 2),  # nothing is there
+        (6, (0, 1), b"", 2),  # it is a reading
+        (6, (2, 1), b"", 3),  # half a register
+        (6, (3, 1), b"", 2),  # its other half
+        (16, (2, 1), b"\2\0\1", 3),
+        (16, (2, 3), b"\6" + bytes(6), 3),  # more than one register
+        (16, (2, 2), b"\4\0\0\0", 3),  # not as many bytes as it says
+        (16, (2, 2), b"\2\0\0\0\0", 3),
+        (16, (2, 0), b"\0", 3),
+        (16, (2, 124), b"\xf8" + bytes(247), 3),
+        (16, (0xFFFF, 2), b"\4" + bytes(4), 2),
+        (5, (5, 0x0001), b"", 3),
+        (5, (5, 0xFF01), b"", 3),
+        (5, (6, 0xFF00), b"", 2),
+        (15, (5, 2), b"\1\3", 3),
+        (15, (5, 1), b"\2\0\0", 3),
+    ],
+)
+def test_what_no_write_can_say_goes_nowhere(
+    gateway: Gateway, function: int, words: tuple[int, ...], data: bytes, expected: int
+) -> None:
+    assert code(gateway, 2, function, *words, data=data) == expected
+    assert gateway.commands.written == []
+
+
+OUTCOMES = [
+    (Refused("no", rule=NOT_LISTED), 2),
+    (Refused("no", rule=NOT_ALLOWED), 1),
+    (Refused("no", rule=BUSY), 6),
+    (Refused("no", rule="it was written 1000 times in a year", is_budget=True), 6),
+    (Refused("no", rule="50.1 Hz is above the upper limit"), 3),
+    (Expired("mill", "setpoint", 1.0), 6),
+    (Overtaken("mill", "setpoint", "a stop was called"), 6),
+    (Unconfirmed("mill", "setpoint", "no reply"), 0x0B),
+    (NoReply("mill"), 0x0B),
+    (NotDone("mill", "setpoint", "it holds 49"), 4),
+    (BusError("mill: setpoint was taken as 49"), 4),  # an Outcome of Effect.TAKEN_AS
+    (DriveRefused("mill", 6, "busy"), 6),
+    (DriveRefused("mill", 4, "failure"), 4),
+    (PortLost("/dev/ttyUSB0", "vanished"), 0x0A),
+]
+
+
+@pytest.mark.parametrize(("failure", "expected"), OUTCOMES, ids=lambda one: str(one)[:40])
+def test_what_became_of_a_write_has_its_code(gateway: Gateway, failure: Any, expected: int) -> None:
+    gateway.commands.told = Told(False, str(failure), failure)
+    assert code(gateway, 1, 6, CHE_SETPOINT, 5000) == expected
+
+
+def test_a_read_only_gateway_says_so() -> None:
+    with serving(plant(), ModbusSettings(listen="127.0.0.1:0")) as gateway:
+        for function, words in (
+            (5, (5, 0xFF00)),
+            (6, (CHE_SETPOINT, 1)),
+            (6, (CHE_CONTROL, 5)),
+            (6, (BLOCK + 10, 1)),
+        ):
+            assert code(gateway, 1, function, *words) == 1
+        assert (gateway.commands.written, gateway.commands.stopped) == ([], [])
+
+
+def test_clients_that_may_stop_may_do_nothing_else() -> None:
+    with serving(plant(), ModbusSettings(listen="127.0.0.1:0", may="stop")) as gateway:
+        for address, value in ((CHE_SETPOINT, 5000), (CHE_CONTROL, 1), (0x7000, 1)):
+            assert code(gateway, 1, 6, address, value) == 1
+        assert gateway.commands.stopped == []
+        assert code(gateway, 1, 6, CHE_CONTROL, 5) is None
+        assert gateway.commands.stopped == [(["mill"], Caller("anyone", "modbus", "127.0.0.1", Right.STOP))]
+        assert gateway.commands.written == []
+
+
+# ---- stops ----
+
+
+@pytest.mark.parametrize("value", [v for v in range(20) if v not in (5, 6, 8)])
+def test_of_a_control_register_only_a_stop_is_taken(gateway: Gateway, value: int) -> None:
+    assert code(gateway, 1, 6, CHE_CONTROL, value) == 3
+    assert (gateway.commands.written, gateway.commands.stopped) == ([], [])
+
+
+def test_every_way_to_say_stop_goes_to_commands(gateway: Gateway) -> None:
+    with gateway.client() as client:
+        assert client.ask(1, 6, CHE_CONTROL, 5).data == bytes.fromhex("10 00 00 05")
+        assert client.ask(1, 16, CHE_CONTROL, 1, data=bytes.fromhex("02 00 05")).code is None
+        assert client.ask(1, 6, CHE_CONTROL, 6).code is None  # coast
+        assert client.ask(1, 6, CHE_CONTROL, 8).code is None  # jog stop
+        assert client.ask(3, 6, IBD_CONTROL, IBD_STOP).code is None
+        assert client.ask(3, 6, IBD_CONTROL, 0).code == 3  # "no command" stops nothing
+        for yes in (1, 2, 0xFF00, 0xFFFF):  # as masters say it
+            assert client.ask(4, 6, BLOCK + 10, yes).code is None  # Delixi's own protocol, all the same
+    stopped = [drives for drives, _ in gateway.commands.stopped]
+    assert stopped == [["mill"]] * 4 + [["pump"]] + [["belt"]] * 4
+
+
+@pytest.mark.parametrize(
+    ("function", "words", "data", "expected"),
+    [
+        (6, (BLOCK + 10, 0), b"", 3),
+        (6, (BLOCK, 1), b"", 2),
+        (16, (BLOCK + 10, 2), b"\4\0\0\0\1", 3),
+        (16, (BLOCK + 9, 2), b"\4\0\1\0\0", 2),
+        (16, (BLOCK + 11, 1), b"\2\0\1", 2),
+    ],
+)
+def test_anything_else_in_the_common_block_is_no_stop(
+    gateway: Gateway, function: int, words: tuple[int, ...], data: bytes, expected: int
+) -> None:
+    assert code(gateway, 1, function, *words, data=data) == expected
+    assert gateway.commands.stopped == []
+
+
+MIXED = {  # addresses, and words as the manuals and the common block have them
+    "the stop first": (1, CHE_CONTROL, (5, 0)),
+    "amid others": (1, CHE_CONTROL - 1, (7, 5, 7)),
+    "a coast": (1, CHE_CONTROL, (6, 1)),
+    "with a setpoint": (3, IBD_CONTROL, (IBD_STOP, 5000)),
+    "the common block's": (4, BLOCK + 10, (1, 1)),
+    "behind the common block's state": (4, BLOCK + 9, (1, 0xFF00)),
+    "a whole block of 16": (4, BLOCK, (*[0] * 10, 1, *[0] * 5)),
+}
+
+
+@pytest.mark.parametrize("mixed", MIXED)
+@pytest.mark.parametrize("may", ["stop", "write"])
+def test_a_stop_among_other_words_is_sent_and_nothing_else(mixed: str, may: str) -> None:
+    unit, address, words = MIXED[mixed]
+    data = struct.pack(f">B{len(words)}H", 2 * len(words), *words)
+    with serving(plant(), ModbusSettings(listen="127.0.0.1:0", may=may)) as gateway:
+        for _ in range(MOST_STOPS + 1):
+            assert code(gateway, unit, 16, address, len(words), data=data) == 3
+        until(lambda: bool(gateway.commands.stopped))  # the answer does not wait for it
+        names = {1: "mill", 3: "pump", 4: "belt"}
+        assert {str(drives) for drives, _ in gateway.commands.stopped} == {f"['{names[unit]}']"}
+        assert gateway.commands.written == []
+
+
+def test_a_stop_among_other_coils_is_sent_and_nothing_else() -> None:
+    """Start off, stop on, emergency stop off: the ER-G-220's coils 0 to 2 (section 10)."""
+    drives = plant_of(("hall", ErmanERG220(1, name="mixer")))
+    with serving(drives, ModbusSettings(listen="127.0.0.1:0", may="write")) as gateway:
+        assert code(gateway, 1, 15, 0, 3, data=b"\1\1") == 3  # start alone
+        assert gateway.commands.stopped == []
+        assert code(gateway, 1, 15, 0, 3, data=b"\1\2") == 3
+        until(lambda: bool(gateway.commands.stopped))  # the answer does not wait for it
+        assert [drives for drives, _ in gateway.commands.stopped] == [["mixer"]]
+        assert gateway.commands.written == []
+
+
+@pytest.mark.parametrize(
+    ("address", "words"), [(CHE_CONTROL, (1, 5)), (CHE_CONTROL - 1, (5, 1)), (CHE_SETPOINT, (5, 5))]
+)
+def test_words_of_which_none_is_a_stop_go_nowhere(
+    gateway: Gateway, address: int, words: tuple[int, ...]
+) -> None:
+    data = struct.pack(f">B{len(words)}H", 2 * len(words), *words)
+    assert code(gateway, 1, 16, address, len(words), data=data) in (2, 3)
+    assert (gateway.commands.written, gateway.commands.stopped) == ([], [])
+
+
+def test_a_read_only_gateway_takes_no_stop_among_other_words() -> None:
+    with serving(plant(), ModbusSettings(listen="127.0.0.1:0")) as gateway:
+        assert code(gateway, 1, 16, CHE_CONTROL, 2, data=b"\4\0\5\0\0") == 1
+        assert gateway.commands.stopped == []
+
+
+def stop_slowly(gateway: Gateway, seconds: float) -> threading.Event:
+    """Have stops take so long; return what is set when one has ended."""
+    ended = threading.Event()
+
+    async def slowly() -> Told:
+        await asyncio.sleep(seconds)
+        ended.set()
+        return Told(True, "stopped")
+
+    gateway.commands.told = slowly
+    return ended
+
+
+@pytest.mark.slow
+def test_a_stop_that_takes_long_is_acknowledged_and_goes_on(gateway: Gateway) -> None:
+    ended = stop_slowly(gateway, 1.0)
+    with gateway.client() as client:
+        assert client.ask(1, 6, CHE_CONTROL, 5).code == 5
+    assert ended.wait(30)
+
+
+def test_a_stop_is_carried_out_though_its_client_is_gone(gateway: Gateway) -> None:
+    ended = stop_slowly(gateway, 0.2)
+    with gateway.client() as client:
+        client.send(request(1, 1, 6, CHE_CONTROL, 5))
+        client.send(b"\xff" * 20)  # and is closed for it
+        client.receive()
+    assert ended.wait(30)
+
+
+def test_a_stop_waits_for_nothing_that_its_client_asked_before(gateway: Gateway) -> None:
+    """Sixteen writes hang; the stop behind them is called at once."""
+    stopped = threading.Event()
+    hang = threading.Event()
+
+    async def hanging() -> Told:
+        if gateway.commands.stopped:
+            stopped.set()
+            return Told(True, "stopped")
+        while not hang.is_set():
+            await asyncio.sleep(0.01)
+        return Told(True, "written")
+
+    gateway.commands.told = hanging
+    with gateway.client() as client:
+        for number in range(16):
+            client.send(request(number, 1, 6, CHE_SETPOINT, number))
+        client.send(request(16, 1, 6, CHE_SETPOINT, 1))
+        reply = client.receive()
+        assert reply is not None
+        assert (reply.transaction, reply.code) == (16, 6)
+        client.send(request(17, 1, 6, CHE_CONTROL, 5))
+        reply = client.receive()
+        assert reply is not None
+        assert (reply.transaction, reply.code) == (17, None)
+        assert stopped.is_set()
+        hang.set()
+        assert {reply.transaction for _ in range(16) if (reply := client.receive())} == set(range(16))
+
+
+def test_a_flood_of_stops_is_bounded_and_each_is_answered(gateway: Gateway) -> None:
+    release = threading.Event()
+
+    async def hanging() -> Told:
+        while not release.is_set():
+            await asyncio.sleep(0.01)
+        return Told(True, "stopped")
+
+    gateway.commands.told = hanging
+    with gateway.client() as client:
+        for number in range(100):
+            client.send(request(number, 1, 6, CHE_CONTROL, 5))
+        codes = [reply.code for _ in range(100) if (reply := client.receive())]
+        assert codes == [5] * 100
+        assert len(gateway.commands.stopped) == MOST_STOPS
+        release.set()
+
+
+@pytest.mark.parametrize(
+    ("failure", "expected"),
+    [(BusError("not seen to stand"), 0x0B), (NoReply("mill"), 0x0B), (PortLost("/dev/x", "gone"), 0x0A)],
+)
+def test_a_stop_that_failed_says_so(gateway: Gateway, failure: BusError, expected: int) -> None:
+    gateway.commands.told = Told(False, str(failure), failure)
+    assert code(gateway, 1, 6, CHE_CONTROL, 5) == expected
+
+
+def test_a_stop_that_fails_beyond_all_rules_is_told_too(
+    gateway: Gateway, caplog: pytest.LogCaptureFixture
+) -> None:
+    async def fails() -> Told:
+        raise RuntimeError("a mistake of ours")
+
+    gateway.commands.told = fails
+    assert code(gateway, 1, 6, CHE_CONTROL, 5) == 0x0B
+    assert "a mistake of ours" in caplog.text
+
+
+def test_a_reply_of_another_length_is_none(gateway: Gateway, monkeypatch: pytest.MonkeyPatch) -> None:
+    async def short(*request: object) -> list[int]:
+        return [1]
+
+    gateway.hub.values.clear()
+    monkeypatch.setattr(gateway.server, "_ask", short)
+    assert code(gateway, 1, 3, CHE_OUTPUT_VOLTAGE, 2) == 0x0B
+
+
+# ---- the common block ----
+
+
+def block(gateway: Gateway, unit: int = 1, function: int = 3) -> list[int]:
+    with gateway.client() as client:
+        return client.ask(unit, function, BLOCK, 11).words
+
+
+UNKNOWN = [0x8000, 0]
+
+
+def test_the_common_block_of_a_drive_that_runs(gateway: Gateway) -> None:
+    gateway.hub.states["mill"] = "runs"
+    gateway.hub.values.update(
+        {("mill", "output_frequency"): 49.99, ("mill", "output_current"): 12.3, ("mill", "setpoint"): -5.0}
+    )
+    gateway.hub.ages = dict.fromkeys(gateway.hub.values, 0.5)
+    for function in (3, 4):
+        found = block(gateway, function=function)
+        assert found[:8] == [2, 0, 0, 4999, 0, 1230, 0xFFFF, 0xFFFF - 499]
+        assert found[8] == 0
+        assert 250 <= found[9] < 5000  # ms; the hub looks at the clock a little after the server
+        assert found[10] == 0
+    assert gateway.line.asked == []
+
+
+def test_large_numbers_have_both_words(gateway: Gateway) -> None:
+    gateway.hub.values["mill", "output_frequency"] = 1500.0
+    assert block(gateway)[2:4] == [2, 0x49F0]  # 150000
+
+
+def test_what_is_not_known_is_never_0(gateway: Gateway) -> None:
+    gateway.hub.values.clear()
+    assert block(gateway) == [0, 0xFFFF, *UNKNOWN, *UNKNOWN, *UNKNOWN, 0xFFFF, 0xFFFF, 0]
+    gateway.hub.states["mill"] = "silent"
+    gateway.hub.values["mill", "output_frequency"] = 49.99
+    gateway.hub.ages["mill", "output_frequency"] = 70.0
+    found = block(gateway)
+    assert found[:4] == [4, 0xFFFF, *UNKNOWN]
+    assert 69_990 <= found[8] << 16 | found[9] < 80_000
+
+
+def test_what_was_read_before_the_machine_slept_is_not_known(gateway: Gateway) -> None:
+    gateway.hub.values["mill", "output_frequency"] = 49.99
+    gateway.hub.woken_ns = time.monotonic_ns() + 3600 * 10**9
+    found = block(gateway)
+    assert found[2:4] == UNKNOWN
+    assert found[8:10] == [0xFFFF, 0xFFFE]  # ms, at least
+
+
+@pytest.mark.parametrize(("number", "expected"), [(5.0, 5), (None, 0xFFFE), (0.0, 0xFFFE)])
+def test_a_fault_has_the_drive_s_number(gateway: Gateway, number: float | None, expected: int) -> None:
+    gateway.hub.states["mill"] = "fault"
+    gateway.hub.values["mill", "fault"] = number
+    assert block(gateway)[:2] == [3, expected]
+
+
+def test_a_part_of_the_block_may_be_read_and_nothing_across_its_ends(gateway: Gateway) -> None:
+    gateway.hub.states["mill"] = "stands"
+    with gateway.client() as client:
+        assert client.ask(1, 3, BLOCK, 1).words == [1]
+        assert client.ask(1, 3, BLOCK, 16).code is None
+        assert client.ask(1, 3, BLOCK - 1, 2).code == 2
+        assert client.ask(1, 3, BLOCK + 15, 2).code == 2
+        assert client.ask(1, 3, BLOCK - 1, 18).code == 2
+
+
+def test_every_family_has_the_block(gateway: Gateway) -> None:
+    for unit, drive in enumerate(("mill", "meter", "pump", "belt"), 1):
+        gateway.hub.states[drive] = "runs"
+        assert block(gateway, unit)[0] == 2
+
+
+# ---- ports of lines, and a plant that changes ----
+
+
+def test_a_line_may_have_a_port_of_its_own() -> None:
+    found = plant_of(("hall", InvtCHE(1, name="mill")), ("yard", Meter(1, name="meter")))
+    with serving(found, ModbusSettings(listen="127.0.0.1:0", ports={"yard": 0})) as gateway:
+        gateway.hub.values.update({("mill", "output_voltage"): 231.0, ("meter", "level"): 12.5})
+        with gateway.client() as main, gateway.client("yard") as yard:
+            assert main.ask(1, 3, CHE_OUTPUT_VOLTAGE, 1).words == [231]
+            assert yard.ask(1, 3, 0, 1).words == [125]
+
+
+def test_another_plant_is_taken_or_the_old_one_goes_on(gateway: Gateway) -> None:
+    with gateway.client() as client:
+        with pytest.raises(ValueError, match="unit 1 would be"):
+            gateway.server.adopt(plant_of(("hall", InvtCHE(1, name="a")), ("yard", InvtCHE(1, name="b"))))
+        assert client.ask(1, 3, CHE_OUTPUT_VOLTAGE, 1).words == [231]
+        gateway.server.adopt(plant_of(("hall", Meter(9, name="meter"))))
+        assert client.ask(1, 3, CHE_OUTPUT_VOLTAGE, 1).code == 0x0A
+        assert client.ask(9, 3, 0, 1).words == [125]

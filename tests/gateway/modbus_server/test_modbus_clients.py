@@ -1,0 +1,438 @@
+"""Modbus clients: each has its own answers alone, and its stops wait neither for requests nor for answers."""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+import struct
+import threading
+from collections.abc import Awaitable, Callable
+from typing import cast
+
+import pytest
+from controlled_loop import ControlledLoop, run_controlled
+from modbus_gateway import DONE, PATIENCE, RawClient, plant_of, request, serving
+
+from multidrop.families import InvtCHE
+from multidrop.gateway.commands import Told
+from multidrop.gateway.modbus_server import clients as modbus_clients
+from multidrop.gateway.modbus_server.clients import ModbusClient, ModbusPort
+from multidrop.gateway.modbus_server.mbap import MbapRequest, take_request
+from multidrop.gateway.modbus_server.settings import ModbusSettings
+
+UNREAD = 150_000  # requests whose answers are more than the sockets of both sides hold
+
+# ---- connections ----
+
+
+class FakeTransport(asyncio.Transport):
+    """A connection that keeps what is written to it."""
+
+    def __init__(self, address: str = "127.0.0.1") -> None:
+        super().__init__({"peername": (address, 40000)})
+        self.written = bytearray()
+        self.taken = 0  # bytes of it that left
+        self.is_reading = True  # type: ignore[assignment, method-assign]
+        self.ended = ""
+
+    def write(self, data: bytes) -> None:  # type: ignore[override]
+        self.written += data
+
+    def get_write_buffer_size(self) -> int:
+        return len(self.written) - self.taken
+
+    def is_closing(self) -> bool:
+        return bool(self.ended)
+
+    def pause_reading(self) -> None:
+        self.is_reading = False  # type: ignore[assignment, method-assign]
+
+    def resume_reading(self) -> None:
+        self.is_reading = True  # type: ignore[assignment, method-assign]
+
+    def close(self) -> None:
+        self.ended = self.ended or "closed"
+
+    def abort(self) -> None:
+        self.ended = self.ended or "aborted"
+
+
+def words(found: MbapRequest, client: ModbusClient) -> bytes:
+    return found.reply(b"\x02\0\x05")
+
+
+def connected(port: ModbusPort, address: str = "127.0.0.1") -> tuple[ModbusClient, FakeTransport]:
+    client, transport = ModbusClient(port), FakeTransport(address)
+    client.connection_made(transport)
+    return client, transport
+
+
+def port_of(
+    serve: Callable[[MbapRequest, ModbusClient], bytes | Awaitable[bytes] | None] = words,
+) -> ModbusPort:
+    return ModbusPort(serve, lambda address: not address.startswith("10."), asyncio.get_running_loop().time)
+
+
+def transactions(written: bytes) -> list[int]:
+    buffer, found = bytearray(written), []
+    while taken := take_request(buffer):
+        found.append(taken.transaction)
+    return found
+
+
+def test_answers_come_under_their_own_ids_in_the_order_in_which_they_are_done() -> None:
+    async def main() -> None:
+        async def slow(found: MbapRequest) -> bytes:
+            await asyncio.sleep(found.transaction)
+            return found.reply(bytes([found.transaction]))
+
+        client, transport = connected(port_of(lambda found, _: slow(found)))
+        client.data_received(b"".join(request(number, 1, 3, 0, 1) for number in (3, 1, 2)))
+        await asyncio.sleep(5)
+        assert transactions(transport.written) == [1, 2, 3]
+        assert [transport.written[at + 8] for at in (0, 9, 18)] == [1, 2, 3]
+
+    run_controlled(main())
+
+
+def test_a_failure_of_ours_is_answered_all_the_same(caplog: pytest.LogCaptureFixture) -> None:
+    async def main() -> None:
+        async def fails(found: MbapRequest) -> bytes:
+            raise RuntimeError("a mistake of ours")
+
+        client, transport = connected(port_of(lambda found, _: fails(found)))
+        client.data_received(request(9, 1, 3, 0, 1))
+        await asyncio.sleep(1)
+        assert transport.written == bytes.fromhex("00 09 00 00 00 03 01 83 04")
+
+    run_controlled(main())
+    assert "a mistake of ours" in caplog.text
+
+
+def test_a_client_s_flood_lets_others_have_their_turn() -> None:
+    async def main() -> None:
+        port = port_of()
+        flood, flooded = connected(port)
+        other, answered = connected(port)
+        flood.data_received(b"".join(request(number, 1, 3, 0, 1) for number in range(1000)))
+        assert len(transactions(flooded.written)) == modbus_clients.SLICE
+        other.data_received(request(1, 1, 3, 0, 1))
+        assert transactions(answered.written) == [1]
+        await asyncio.sleep(1)
+        assert transactions(flooded.written) == list(range(1000))
+
+    run_controlled(main())
+
+
+def slowly(found: MbapRequest, _: ModbusClient) -> bytes:
+    """Answer after half a millisecond of the loop's clock."""
+    cast(ControlledLoop, asyncio.get_running_loop()).passing.now += 0.0005
+    return found.reply(b"")
+
+
+def test_many_clients_share_the_time_that_one_of_them_had() -> None:
+    """A stop, by whichever way it comes, waits until all of them had their turn."""
+
+    async def main() -> None:
+        share = modbus_clients.RoundShare()
+        clock = cast(ControlledLoop, asyncio.get_running_loop()).passing
+        ports = [ModbusPort(slowly, lambda _: True, lambda: clock.now, share) for _ in range(2)]
+        block = b"".join(request(number, 1, 3, 0, 1) for number in range(100))
+        clients = [connected(port) for port in ports for _ in range(30)]
+        for client, _ in clients:
+            client.data_received(block)
+        begun = clock.now
+        for client, _ in clients:  # a round
+            client._drain()
+        assert clock.now - begun < 60 * 2 * modbus_clients.SLICE_S / 3
+        for client, transport in clients:
+            while client._waiting:
+                client._drain()
+            assert transactions(transport.written) == list(range(100))
+        assert share.slice_s == modbus_clients.SLICE_S
+
+    run_controlled(main())
+
+
+def test_requests_that_take_long_to_answer_let_others_have_their_turn_sooner() -> None:
+    async def main() -> None:
+        client, transport = connected(port_of(slowly))
+        client.data_received(b"".join(request(number, 1, 3, 0, 125) for number in range(100)))
+        assert len(transactions(transport.written)) < 10
+        await asyncio.sleep(1)
+        assert transactions(transport.written) == list(range(100))
+
+    run_controlled(main())
+
+
+def test_garbage_closes_its_client_after_the_answers_before_it() -> None:
+    async def main() -> None:
+        port = port_of()
+        client, transport = connected(port)
+        _, other = connected(port)
+        client.data_received(request(1, 1, 3, 0, 1) + b"GET / HTTP/1.1\r\n" + request(2, 1, 3, 0, 1))
+        assert transactions(transport.written) == [1]
+        assert (transport.ended, other.ended) == ("closed", "")
+
+    run_controlled(main())
+
+
+def test_a_client_that_takes_no_answers_is_cut_after_a_while() -> None:
+    async def main() -> None:
+        port = port_of()
+        client, transport = connected(port)
+        client.pause_writing()
+        await asyncio.sleep(modbus_clients.STALLED_S - 0.1)
+        port.sweep()
+        assert not transport.ended
+        await asyncio.sleep(0.2)
+        port.sweep()
+        assert transport.ended == "aborted"
+
+        client, transport = connected(port)
+        client.pause_writing()
+        client.resume_writing()
+        await asyncio.sleep(modbus_clients.STALLED_S + 1)
+        port.sweep()
+        assert not transport.ended
+
+    run_controlled(main())
+
+
+def reads(first: int, end: int) -> bytes:
+    return b"".join(request(number, 1, 3, 0, 1) for number in range(first, end))
+
+
+READ_SIZE = len(reads(0, 1))
+
+
+def writes(first: int, end: int) -> bytes:
+    return b"".join(request(number, 1, 6, 0xF00A, 1) for number in range(first, end))
+
+
+@pytest.mark.parametrize("is_stalled", [False, True])
+def test_writes_are_begun_as_they_come_and_in_their_order(is_stalled: bool) -> None:
+    async def main() -> None:
+        begun: list[int] = []
+
+        def noted(found: MbapRequest, _: ModbusClient) -> bytes:
+            begun.append(found.transaction)
+            return found.reply(b"")
+
+        client, transport = connected(port_of(noted))
+        if is_stalled:
+            client.pause_writing()
+        client.data_received(reads(0, 500) + writes(500, 502))
+        assert begun[:2] == [500, 501]
+        assert len(begun) == (2 if is_stalled else 2 + modbus_clients.SLICE)
+        client.resume_writing()
+        await asyncio.sleep(1)
+        assert begun == transactions(transport.written) == [500, 501, *range(500)]
+
+    run_controlled(main())
+
+
+def test_what_came_is_looked_at_for_a_while_before_others_have_their_turn() -> None:
+    async def main() -> None:
+        client, transport = connected(port_of(slowly))
+        client.data_received(writes(0, 100))
+        assert len(transactions(transport.written)) < 10
+        assert not transport.is_reading
+        await asyncio.sleep(1)
+        assert transactions(transport.written) == list(range(100))
+        assert transport.is_reading
+
+    run_controlled(main())
+
+
+def test_a_client_that_takes_no_answers_is_read_on_and_fills_no_memory(
+    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(modbus_clients, "MOST_UNTAKEN", 4096)
+    monkeypatch.setattr(modbus_clients, "MOST_BEHIND", 1000 * READ_SIZE)
+
+    async def main() -> None:
+        begun = 0
+
+        def noted(found: MbapRequest, _: ModbusClient) -> bytes:
+            nonlocal begun
+            begun += found.function == 6
+            return words(found, client)
+
+        client, transport = connected(port_of(noted))
+        client.pause_writing()
+        for first in range(0, 6000, 1000):
+            client.data_received(reads(first, first + 500) + writes(first + 500, first + 1000))
+        await asyncio.sleep(1)
+        assert (begun, transport.is_reading) == (3000, True)
+        kept = len(transport.written)
+        assert kept < modbus_clients.MOST_UNTAKEN + 500 * len(request(1, 1, 6, 0, 1))
+        transport.taken = kept
+        client.resume_writing()
+        await asyncio.sleep(1)
+        answered = transactions(transport.written[kept:])
+        assert answered == [*range(500), *range(1000, 1500)]  # as many as wait for their turn
+        client.data_received(reads(7, 8))
+        assert transactions(transport.written)[-1] == 7
+
+    run_controlled(main())
+    assert caplog.text.count("takes none of its answers") == 1
+
+
+def test_a_client_that_asks_for_more_than_can_wait_is_told_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(modbus_clients, "MOST_BEHIND", 1000 * READ_SIZE)
+
+    async def main() -> None:
+        client, transport = connected(port_of())
+        client.data_received(reads(0, 1002))
+        await asyncio.sleep(1)
+        busy, rest = transport.written[:18], transport.written[18:]
+        assert busy == bytes.fromhex("03 E8 00 00 00 03 01 83 06 03 E9 00 00 00 03 01 83 06")
+        assert transactions(rest) == list(range(1000))
+
+    run_controlled(main())
+
+
+def test_an_idle_client_is_let_go_and_one_that_waits_for_an_answer_is_not() -> None:
+    async def main() -> None:
+        never = asyncio.get_running_loop().create_future()
+        port = port_of(lambda found, _: never if found.transaction == 9 else found.reply(b""))
+        connections = [connected(port) for _ in range(3)]
+        connections[1][0].data_received(request(9, 1, 3, 0, 1))
+        await asyncio.sleep(modbus_clients.IDLE_S - 1)
+        connections[2][0].data_received(request(1, 1, 3, 0, 1))
+        await asyncio.sleep(2)
+        port.sweep()
+        assert [transport.ended for _, transport in connections] == ["closed", "", ""]
+        never.cancel()
+
+    run_controlled(main())
+
+
+def test_a_client_too_many_takes_the_place_of_the_one_that_is_idle_longest() -> None:
+    async def main() -> None:
+        port = port_of()
+        found = []
+        for _ in range(modbus_clients.MOST_CLIENTS):
+            found.append(connected(port)[1])
+            await asyncio.sleep(0.1)
+        refused = connected(port)[1]
+        assert refused.ended == "aborted"  # nobody is idle for 10 s
+        await asyncio.sleep(modbus_clients.FORGETTABLE_S - 6.35)
+        assert not connected(port)[1].ended
+        assert [transport.ended for transport in found[:2]] == ["aborted", ""]
+        assert len(port.clients) == modbus_clients.MOST_CLIENTS
+        assert port.refused == 1
+
+    run_controlled(main())
+
+
+def test_who_is_not_named_is_refused() -> None:
+    async def main() -> None:
+        port = port_of()
+        assert connected(port, "10.0.0.1")[1].ended == "aborted"
+        assert not port.clients
+
+    run_controlled(main())
+
+
+def test_what_is_under_way_for_a_client_that_is_gone_is_cancelled_once_it_began() -> None:
+    async def main() -> None:
+        happened = []
+
+        async def slow(found: MbapRequest) -> bytes:
+            happened.append("begun")
+            try:
+                await asyncio.sleep(10)
+            except asyncio.CancelledError:
+                happened.append("cancelled")
+                raise
+            return b""
+
+        port = port_of(lambda found, _: slow(found))
+        client, transport = connected(port)
+        client.data_received(request(1, 1, 3, 0, 1))
+        client.connection_lost(None)
+        await asyncio.sleep(1)
+        assert happened == ["begun", "cancelled"]
+        assert (transport.written, port.clients) == (b"", set())
+
+    run_controlled(main())
+
+
+def test_a_client_that_sends_no_more_still_gets_its_answers() -> None:
+    async def main() -> None:
+        async def slow(found: MbapRequest) -> bytes:
+            await asyncio.sleep(1)
+            return found.reply(b"")
+
+        client, transport = connected(port_of(lambda found, _: slow(found)))
+        client.data_received(request(5, 1, 3, 0, 1))
+        assert client.eof_received() is True
+        await asyncio.sleep(2)
+        assert transactions(transport.written) == [5]
+        assert transport.ended == "closed"
+        assert connected(port_of())[0].eof_received() is False
+
+    run_controlled(main())
+
+
+# ---- over real sockets ----
+
+
+def test_garbage_of_one_client_is_nothing_to_another() -> None:
+    plant = plant_of(("hall", InvtCHE(1, name="mill")))
+    with serving(plant, ModbusSettings(listen="127.0.0.1:0")) as gateway, gateway.client() as good:
+        gateway.hub.values["mill", "output_voltage"] = 231.0
+        for junk in (
+            b"\xff" * 300,
+            b"GET / HTTP/1.1\r\nHost: x\r\n\r\n",
+            bytes(64),
+            b"\0\1\0\0\0\6\0\3\0\0\0\1",
+        ):
+            with gateway.client() as bad:
+                bad.send(junk)
+                assert bad.receive() is None
+            assert good.ask(1, 3, 0x3003, 1).words == [231]
+
+
+def test_a_reset_connection_is_only_gone() -> None:
+    plant = plant_of(("hall", InvtCHE(1, name="mill")))
+    with serving(plant, ModbusSettings(listen="127.0.0.1:0")) as gateway, gateway.client() as good:
+        gateway.hub.values["mill", "output_voltage"] = 231.0
+        for _ in range(20):
+            with RawClient(gateway.server.ports[""]) as bad:
+                bad.send(request(1, 1, 3, 0x3003, 1) * 50)
+                bad.socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+        assert good.ask(1, 3, 0x3003, 1).words == [231]
+
+
+def test_a_port_that_is_taken_is_told_in_one_sentence() -> None:
+    plant = plant_of(("hall", InvtCHE(1, name="mill")))
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        number = cast(int, taken.getsockname()[1])
+        with (
+            pytest.raises(OSError, match=rf"127.0.0.1:{number} cannot be had: another program listens there"),
+            serving(plant, ModbusSettings(listen=f"127.0.0.1:{number}")),
+        ):
+            pass
+
+
+def test_a_stop_waits_neither_for_earlier_requests_nor_for_a_client_that_reads() -> None:
+    plant = plant_of(("hall", InvtCHE(1, name="mill")))
+    with serving(plant, ModbusSettings(listen="127.0.0.1:0", may="stop")) as gateway:
+        stopped = threading.Event()
+
+        async def stop() -> Told:
+            stopped.set()
+            return DONE
+
+        gateway.commands.told = stop
+        with socket.socket() as client:
+            client.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+            client.settimeout(PATIENCE)
+            client.connect(("127.0.0.1", gateway.server.ports[""]))
+            for _ in range(UNREAD // 1000):
+                client.sendall(b"".join(request(number, 1, 3, 0xF000, 16) for number in range(1000)))
+            client.sendall(request(1, 1, 6, 0xF00A, 1))
+            assert stopped.wait(PATIENCE)

@@ -1,0 +1,52 @@
+"""The table [serve.modbus]: its mistakes, and the clients that may connect."""
+
+from __future__ import annotations
+
+import pytest
+from tables import table
+
+from multidrop.gateway.modbus_server.settings import ModbusSettings
+
+
+@table(
+    ("settings", "sentence"),
+    [
+        ({"listen": "1502"}, "is not ADDRESS:PORT"),
+        ({"listen": "example.org:1502"}, "is not ADDRESS:PORT"),
+        ({"listen": "127.0.0.1:70000"}, "a port is 1 to 65535"),
+        ({"listen": "0.0.0.0:1502"}, "lets other machines in, and Modbus knows no tokens"),
+        ({"listen": "[::]:1502"}, "lets other machines in"),
+        ({"passing": "all"}, "passing = 'all' is none of off, declared, any"),
+        ({"may": "root"}, "may = 'root' is none of look, stop, write"),
+        ({"units": {"pump": 0}}, "pump = 0 is no unit id"),
+        ({"units": {"pump": True}}, "pump = True is no unit id"),
+        ({"ports": {"hall": 1502}}, "hall = 1502 is that of listen already"),
+        ({"ports": {"hall": "x"}}, "hall = 'x' is no port"),
+        ({"clients": ("10.0.0.0/33",)}, "'10.0.0.0/33' is neither an address nor a network"),
+        ({"common": 0xFFF8}, "is no address"),
+    ],
+)
+def test_a_mistake_in_the_settings_is_told_in_a_sentence(settings: dict[str, object], sentence: str) -> None:
+    with pytest.raises(ValueError, match=r"^\w+") as mistake:
+        ModbusSettings(**settings)  # type: ignore[arg-type]
+    assert sentence in str(mistake.value)
+
+
+def test_all_mistakes_are_told_at_once() -> None:
+    with pytest.raises(ValueError, match="listen") as mistake:
+        ModbusSettings(listen="x", passing="all", may="root", clients=("y",))
+    assert len(str(mistake.value).splitlines()) == 4
+
+
+def test_clients_are_this_machine_s_or_those_that_are_named() -> None:
+    alone = ModbusSettings()
+    assert [alone.may_connect(address) for address in ("127.0.0.1", "::1", "10.0.0.5")] == [True, True, False]
+    named = ModbusSettings(listen="0.0.0.0:1502", clients=("10.0.0.0/24", "fe80::1"))
+    for address, may in (
+        ("10.0.0.5", True),
+        ("::ffff:10.0.0.5", True),
+        ("10.0.1.5", False),
+        ("fe80::1%eth0", True),
+        ("127.0.0.1", False),
+    ):
+        assert named.may_connect(address) is may

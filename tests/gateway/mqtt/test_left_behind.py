@@ -1,0 +1,160 @@
+"""Leftovers at a broker: the next gateway takes back what a killed one left there, and nothing else."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import pytest
+from brokers import FAN, Broker, Listener, Running, inside, mosquitto, publish, without_fan
+from peers import require_module
+from tables import table
+
+from multidrop.gateway.mqtt.home_assistant import discovery_topic
+from multidrop.gateway.mqtt.part import MqttSettings, build
+from multidrop.gateway.mqtt.retained_topics import MOST_DISCOVERY, MOST_KEPT, LeftBehind
+
+GATEWAY = "works/gateway", b"offline"
+THERE = {"pump-1"}
+
+
+def heard(*messages: tuple[str, bytes], prefix: str = "works") -> list[str]:
+    """Return what is taken back after these were kept, by a gateway of one pump."""
+    left_behind = LeftBehind(prefix, home_assistant=True)
+    return [topic for message in messages for topic in left_behind.hear(*message, THERE)]
+
+
+def configuration(state_topic: object) -> bytes:
+    return json.dumps({"state_topic": state_topic}).encode()
+
+
+def test_a_drive_that_is_no_more_is_taken_back_whatever_comes_first() -> None:
+    messages = [
+        ("works/old fan/available", b"online"),
+        ("homeassistant/device/works-old_20_fan/config", configuration("works/old fan")),
+    ]
+    expected = ["works/old fan", *(topic for topic, _ in messages)]
+    assert heard(GATEWAY, *messages) == expected
+    assert heard(*messages, GATEWAY) == expected
+
+
+def test_what_is_kept_of_drives_that_are_there_stays() -> None:
+    mine = [
+        ("works/pump-1/available", b"online"),
+        ("homeassistant/device/works-pump-1/config", configuration("works/pump-1")),
+    ]
+    assert heard(GATEWAY, *mine) == []
+    back = LeftBehind("works", home_assistant=True)
+    assert back.hear("works/old/available", b"offline", THERE) == []
+    assert back.hear(*GATEWAY, {*THERE, "old"}) == []  # it was adopted meanwhile
+
+
+def test_while_another_gateway_has_this_prefix_nothing_is_taken_back() -> None:
+    old = ("works/old/available", b"online")
+    assert heard(("works/gateway", b"online"), old) == []
+    assert heard(old) == []
+
+
+@table(
+    ("topic", "payload"),
+    [
+        ("works/available", b"online"),
+        ("works//available", b"online"),
+        ("works/a/b/available", b"online"),
+        ("workshop/old/available", b"online"),
+        ("elsewhere/old/available", b"online"),
+        (
+            "works/old/available",
+            b'{"state": "runs"}',
+        ),  # of prefix works/old and its drive "available"
+        ("works/old/available", b""),
+        ("works/old", b"online"),
+        ("available", b"online"),
+        ("", b"offline"),
+        ("homeassistant/device/works-old/config", b"online"),
+        ("homeassistant/device/works-old/config", configuration("other/old")),
+        (
+            "homeassistant/device/works-hall-fan/config",
+            configuration("works-hall/fan"),
+        ),  # its prefix
+        ("homeassistant/device/works-old/config", configuration("works/new")),
+        ("homeassistant/device/works-old/config", configuration(["works/old"])),
+        ("homeassistant/device/works-old/config", b"[" * 100_000),
+        ("homeassistant/device/works-old/config", configuration("works/old") + b" " * MOST_DISCOVERY),
+        ("homeassistant/device/works-old/other", configuration("works/old")),
+        ("homeassistant/sensor/works-old/config", configuration("works/old")),
+    ],
+)
+def test_no_topic_but_those_of_drives_of_this_prefix_is_taken_back(topic: str, payload: bytes) -> None:
+    assert heard(GATEWAY, (topic, payload)) == []
+
+
+def test_a_broker_without_end_is_heard_for_a_while() -> None:
+    drives = [(f"works/{number}/available", b"online") for number in range(10 * MOST_KEPT)]
+    assert len(heard(GATEWAY, *drives)) == 2 * MOST_KEPT
+    left_behind = LeftBehind("works", home_assistant=True)
+    for topic, payload in [*drives, *drives]:
+        left_behind.hear(topic, payload, THERE)
+    assert len(left_behind.hear(*GATEWAY, THERE)) == 2 * MOST_KEPT
+    left_behind.begin()
+    assert len([*left_behind.hear(*GATEWAY, THERE), *left_behind.hear(*drives[-1], THERE)]) == 2
+
+
+# ---- through a broker ----
+
+
+@pytest.fixture
+def broker(tmp_path: Path) -> Iterator[Broker]:
+    require_module("paho.mqtt.client")
+    with mosquitto(tmp_path) as broker:
+        yield broker
+
+
+def kept_at(broker: Broker) -> set[str]:
+    """Return the topics of which the broker keeps something."""
+    listener = Listener(broker)
+    publish(broker, "the/end", b"x", "-q", "1")
+    listener.wait_for(lambda received: received.topic == "the/end")
+    listener.close()
+    return {received.topic for received in listener.all if received.is_retained}
+
+
+def live_and_die(broker: Broker, folder: Path, listener: Listener) -> None:
+    """Let a gateway with pump and fan tell all that it has to, and take its connection away for ever."""
+    part: Any = build(MqttSettings(broker.address, home_assistant=True), inside(folder))
+    with closing(Running(part)) as running:
+        listener.wait_for(lambda one: one.topic == "multidrop/pump-1/available")
+        listener.wait_for(lambda one: one.topic == f"multidrop/{FAN.name}/available")
+        part._brokers[0]._client.reconnect_delay_set(3600, 3600)
+        running.cut(0)
+        listener.wait_for(lambda one: (one.topic, one.payload) == ("multidrop/gateway", b"offline"))
+
+
+def test_a_gateway_takes_back_what_a_killed_one_left(broker: Broker, tmp_path: Path) -> None:
+    for topic in ("elsewhere/old/available", "multidrop/hall/old/available"):
+        publish(broker, topic, b"online", "-r")
+    foreign = discovery_topic("multidrop", "old")
+    publish(broker, foreign, configuration("elsewhere/old"), "-r")
+    listener = Listener(broker)
+    try:
+        live_and_die(broker, tmp_path, listener)
+        fan = f"multidrop/{FAN.name}"
+        topics = {fan, f"{fan}/available", discovery_topic("multidrop", FAN.name)}
+        assert topics < kept_at(broker)
+        known: Any = inside(tmp_path)
+        less = without_fan(known)
+        part = build(MqttSettings(broker.address, home_assistant=True), known._replace(plant=less))
+        with closing(Running(part)):
+            waited = set(topics)
+            while waited:
+                waited.discard(listener.wait_for(lambda one: one.topic in waited and not one.payload).topic)
+            assert kept_at(broker) == {
+                *("elsewhere/old/available", "multidrop/hall/old/available", foreign),
+                *("multidrop/gateway", "multidrop/pump-1", "multidrop/pump-1/available"),
+                discovery_topic("multidrop", "pump-1"),
+            }
+    finally:
+        listener.close()

@@ -1,0 +1,899 @@
+"""MQTT through a real broker, heard and commanded by mosquitto's own clients."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import signal
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from datetime import UTC, datetime
+from enum import IntEnum
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from brokers import (
+    FAN,
+    Broker,
+    Listener,
+    Published,
+    Running,
+    free_port,
+    inside,
+    mosquitto,
+    publish,
+    without_fan,
+)
+from examples import in_turn
+from gateways import certificate, served
+from lines import until
+from peers import require_module
+
+from multidrop import RESERVED_NAMES, Drive, InvtCHE, PolledDrive
+from multidrop.drive.declare import reading, setting
+from multidrop.families import MODELS
+from multidrop.gateway.clock import boottime_ns
+from multidrop.gateway.commands import Told
+from multidrop.gateway.mqtt.home_assistant import discovery, discovery_topic
+from multidrop.gateway.mqtt.json_topics import JsonTopics
+from multidrop.gateway.mqtt.outbox import MOST_UNDER_WAY
+from multidrop.gateway.mqtt.part import MqttSettings, build
+
+Start = Callable[..., tuple[Any, Running]]
+
+STOPS = ["coast", "emergency_stop", "stop"]
+
+
+@pytest.fixture
+def broker(tmp_path: Path) -> Iterator[Broker]:
+    with mosquitto(tmp_path) as broker:
+        yield broker
+
+
+@pytest.fixture
+def listener(broker: Broker) -> Iterator[Listener]:
+    listener = Listener(broker)
+    yield listener
+    listener.close()
+
+
+@pytest.fixture
+def start(broker: Broker, tmp_path: Path) -> Iterator[Start]:
+    require_module("paho.mqtt.client")
+    running: list[Running] = []
+
+    def start(**settings: Any) -> tuple[Any, Running]:
+        known = inside(tmp_path)
+        part = build(MqttSettings(broker.address, **settings), known)
+        running.append(Running(part))
+        return known, running[-1]
+
+    yield start
+    for one in running:
+        one.close()
+
+
+def has(topic: str, payload: bytes | None = None) -> Callable[[Published], bool]:
+    return lambda received: received.topic == topic and payload in (None, received.payload)
+
+
+def json_of(received: Published) -> Any:
+    return json.loads(received.payload)
+
+
+def now_ms() -> int:
+    return time.time_ns() // 1_000_000
+
+
+def test_a_drive_s_newest_values_are_kept_for_who_comes_later(
+    broker: Broker, listener: Listener, start: Start
+) -> None:
+    start()
+    listener.wait_for(has("multidrop/gateway", b"online"))
+    listener.wait_for(has(f"multidrop/{FAN.name}/available", b"online"))
+    later = Listener(broker)
+    said = later.wait_for(has("multidrop/pump-1"))
+    later.close()
+    assert said.is_retained
+    assert json_of(said) == {
+        "time": 7,
+        "state": "runs",
+        "fault": None,
+        "values": {"output_frequency": 49.5, "status": "FORWARD"},
+    }
+
+
+def test_a_value_that_is_not_fresh_is_null_and_a_silent_drive_is_offline(
+    listener: Listener, start: Start
+) -> None:
+    known, running = start()
+    listener.wait_for(has("multidrop/pump-1/available", b"online"))
+    known.hub.values[("pump-1", "output_frequency")] = None
+    known.hub.states["pump-1"] = "silent"
+    running.step()
+    listener.wait_for(has("multidrop/pump-1/available", b"offline"))
+    said = [received for received in listener.all if received.topic == "multidrop/pump-1"][-1]
+    assert json_of(said)["values"]["output_frequency"] is None
+
+
+@pytest.mark.slow
+def test_the_broker_says_that_the_gateway_is_gone(listener: Listener, start: Start) -> None:
+    _, running = start()
+    listener.wait_for(has("multidrop/gateway", b"online"))
+    running.cut(0)
+    listener.wait_for(has("multidrop/gateway", b"offline"))
+    listener.wait_for(has("multidrop/gateway", b"online"))
+
+
+def test_who_comes_later_hears_that_the_gateway_is_gone(
+    broker: Broker, listener: Listener, start: Start
+) -> None:
+    _, running = start()
+    listener.wait_for(has("multidrop/gateway", b"online"))
+    running._part._brokers[0]._client.reconnect_delay_set(3600, 3600)
+    running.cut(0)
+    listener.wait_for(has("multidrop/gateway", b"offline"))
+    later = Listener(broker)
+    try:
+        assert later.wait_for(has("multidrop/gateway")) == ("multidrop/gateway", True, b"offline")
+    finally:
+        later.close()
+
+
+def test_what_there_was_to_say_without_a_connection_is_counted(tmp_path: Path) -> None:
+    require_module("paho.mqtt.client")
+    part: Any = build(MqttSettings(f"mqtt://127.0.0.1:{free_port()}", sparkplug="works"), inside(tmp_path))
+    running = Running(part)
+    try:
+        of_json, of_sparkplug = (broker.outbox for broker in part._brokers)
+        assert (of_json.dropped, of_sparkplug.dropped) == (2, 2)  # of two drives
+        running.step()
+        assert (of_json.dropped, of_sparkplug.dropped) == (4, 2)  # nothing changed
+        part._speakers[0]._hub.values["pump-1", "output_frequency"] = 1.0
+        running.step()
+        assert (of_json.dropped, of_sparkplug.dropped) == (6, 3)
+        (dropped,) = (one for one in part.figures() if one.name == "multidrop_mqtt_dropped")
+        assert [value for _, _, value in dropped.samples] == [9]
+    finally:
+        running.close()
+
+
+def test_it_says_goodbye(broker: Broker, listener: Listener, tmp_path: Path) -> None:
+    require_module("paho.mqtt.client")
+    running = Running(build(MqttSettings(broker.address), inside(tmp_path)))
+    listener.wait_for(has("multidrop/gateway", b"online"))
+    running.close()
+    listener.wait_for(has("multidrop/gateway", b"offline"))
+    for drive in ("pump-1", FAN.name):  # the next plant file may have it no more
+        listener.wait_for(has(f"multidrop/{drive}/available", b"offline"))
+
+
+def test_who_can_say_nothing_is_away_and_still_stops(
+    broker: Broker, listener: Listener, start: Start
+) -> None:
+    """The values that the broker keeps would pass for the present, for it has a connection."""
+    known, running = start(commands=True)
+    listener.wait_for(has("multidrop/gateway", b"online"))
+    state = known.hub.states.pop("pump-1")
+    running.step()
+    listener.wait_for(has("multidrop/gateway", b"offline"))
+    assert running._part.health() == "nothing can be said: KeyError: 'pump-1'"
+    running.step()  # once is enough
+    publish(broker, "multidrop/pump-1/stop", b"now")
+    listener.wait_for(has("multidrop/pump-1/told"))
+    assert known.commands.noted == [("stop", ["pump-1"])]
+    known.hub.states["pump-1"] = state
+    running.step()
+    listener.wait_for(has("multidrop/gateway", b"online"))
+    listener.wait_for(has("multidrop/pump-1/available", b"online"))
+    assert running._part.health() == ""
+    said = [one.payload for one in listener.all if one.topic == "multidrop/gateway"]
+    assert said == [b"online", b"offline", b"online"]
+
+
+@pytest.mark.slow
+def test_who_can_say_nothing_is_away_on_a_new_connection_too(listener: Listener, start: Start) -> None:
+    known, running = start()
+    listener.wait_for(has("multidrop/gateway", b"online"))
+    state = known.hub.states.pop("pump-1")
+    running.cut(0)
+    for said in (b"offline", b"online", b"offline"):  # by the will, by the new connection, and at once
+        listener.wait_for(has("multidrop/gateway", said))
+    known.hub.states["pump-1"] = state
+    running.step()
+    listener.wait_for(has("multidrop/gateway", b"online"))
+    listener.wait_for(has("multidrop/pump-1/available", b"online"))
+
+
+@pytest.mark.slow
+def test_a_broker_that_stands_still_holds_up_nothing(
+    broker: Broker, listener: Listener, start: Start
+) -> None:
+    known, running = start()
+    listener.wait_for(has(f"multidrop/{FAN.name}/available", b"online"))
+    broker.signal(signal.SIGSTOP)
+    [connection] = running._part._brokers
+    for round in range(500):
+        known.hub.values[("pump-1", "output_frequency")] = float(round)
+        running.step()
+    assert len(connection.outbox._under_way) <= MOST_UNDER_WAY
+    assert len(connection.outbox._waiting) <= 4
+    broker.signal(signal.SIGCONT)
+    listener.wait_for(
+        lambda received: (
+            received.topic == "multidrop/pump-1" and json_of(received)["values"]["output_frequency"] == 499.0
+        )
+    )
+    figures = {family.name: list(family.samples) for family in running._part.figures()}
+    assert figures["multidrop_mqtt_dropped"][0][2] > 0
+
+
+@pytest.mark.slow
+def test_a_broker_that_comes_back_is_told_anew(broker: Broker, listener: Listener, start: Start) -> None:
+    start()
+    listener.wait_for(has("multidrop/gateway", b"online"))
+    broker.kill()
+    broker.start()
+    again = Listener(broker)
+    again.wait_for(has("multidrop/gateway", b"online"))
+    again.wait_for(has("multidrop/pump-1"))
+    again.close()
+
+
+# ---- commands ----
+
+
+def told(listener: Listener, drive: str = "pump-1") -> Any:
+    return json_of(listener.wait_for(has(f"multidrop/{drive}/told")))
+
+
+def write_of(value: object, time_ms: int) -> bytes:
+    return json.dumps({"value": value, "time": time_ms}).encode()
+
+
+def test_a_fresh_write_is_carried_out_once(broker: Broker, listener: Listener, start: Start) -> None:
+    known, _ = start(commands=True)
+    listener.wait_for(has("multidrop/gateway", b"online"))
+    fresh = write_of(25, now_ms())
+    publish(broker, "multidrop/pump-1/set/setpoint", fresh)
+    assert told(listener) == {"what": "setpoint = 25", "done": True, "text": "done"}
+    publish(broker, "multidrop/pump-1/set/setpoint", fresh)
+    assert told(listener)["text"] == "not sent: it came a second time"
+    assert known.commands.noted == [("write", "pump-1", "setpoint", 25)]
+
+
+@pytest.mark.parametrize("age_ms", [60_000, -60_000])
+def test_a_command_that_was_held_up_is_not_carried_out(
+    broker: Broker, listener: Listener, start: Start, age_ms: int
+) -> None:
+    known, _ = start(commands=True)
+    listener.wait_for(has("multidrop/gateway", b"online"))
+    sent_ms = now_ms() - age_ms
+    publish(broker, "multidrop/pump-1/set/setpoint", write_of(25, sent_ms))
+    assert "s ago by the clocks of sender and gateway" in told(listener)["text"]
+    act = json.dumps({"verb": "start", "drive": "pump-1", "time": sent_ms}).encode()
+    publish(broker, "multidrop/pump-1/act", act)
+    assert "s ago by the clocks of sender and gateway" in told(listener)["text"]
+    assert known.commands.noted == []
+
+
+@pytest.mark.parametrize("topic", ["multidrop/pump-1/set/setpoint", "multidrop/pump-1/act"])
+def test_a_command_that_the_broker_keeps_is_not_carried_out(
+    broker: Broker, listener: Listener, start: Start, topic: str
+) -> None:
+    sent = {"value": 25, "verb": "start", "drive": "pump-1", "time": now_ms() + 1000}
+    publish(broker, topic, json.dumps(sent).encode(), "-r")
+    known, _ = start(commands=True)
+    assert told(listener)["text"].startswith("not sent: the broker had kept it")
+    assert known.commands.noted == []
+
+
+@pytest.mark.slow
+def test_a_stop_is_always_carried_out(broker: Broker, listener: Listener, start: Start) -> None:
+    publish(broker, "multidrop/pump-1/stop", b"stop", "-r")
+    known, _ = start(commands=True)
+    assert told(listener)["what"] == "stop"
+    publish(broker, "multidrop/stop", b"whatever")
+    assert told(listener)["what"] == "stop"
+    publish(broker, f"multidrop/{FAN.name}/stop", b"stop", "-q", "1")
+    assert told(listener, FAN.name)["what"] == "stop"
+    assert known.commands.noted[-3:] == [("stop", ["pump-1"]), ("stop", None), ("stop", [FAN.name])]
+
+
+@pytest.mark.parametrize(
+    ("topic", "payload", "stopped"),
+    [
+        ("pump-1/stop", b"x" * 70_000, ["pump-1"]),
+        ("stop", b"\xff" * 70_000, None),
+        ("pump-1/act", b'{"verb": "stop", "drive": "pump-1", "time": 17', ["pump-1"]),
+        ("pump-1/act", b'{"verb": "coast", "note": "' + b"x" * 70_000 + b'"}', ["pump-1"]),
+        ("pump-1/act", b'["emergency_stop", "\xff"]', ["pump-1"]),
+    ],
+    ids=range(5),
+)
+def test_no_payload_keeps_a_stop_back(
+    broker: Broker, listener: Listener, start: Start, topic: str, payload: bytes, stopped: list[str] | None
+) -> None:
+    """Neither one of any length, nor one that was cut off or is no text."""
+    known, _ = start(commands=True)
+    listener.wait_for(has("multidrop/gateway", b"online"))
+    publish(broker, f"multidrop/{topic}", payload)
+    assert told(listener)["what"] == "stop"
+    assert known.commands.noted == [("stop", stopped)]
+
+
+@pytest.mark.parametrize(
+    ("more", "verb"),
+    in_turn(
+        [
+            {"time": 1},
+            {"time": 10**15},
+            {"time": "now"},
+            {"drive": "pump-1"},
+            {},
+            {"options": None},
+            {"options": [1]},
+        ],
+        STOPS,
+    ),
+)
+def test_a_stop_by_a_verb_is_carried_out_whenever_it_was_sent(
+    broker: Broker, listener: Listener, start: Start, verb: str, more: dict[str, Any]
+) -> None:
+    known, _ = start(commands=True)
+    listener.wait_for(has("multidrop/gateway", b"online"))
+    known.commands.stopped_at["pump-1"] = known.commands.plant_ns = boottime_ns()
+    for _ in range(2):
+        publish(broker, "multidrop/pump-1/act", json.dumps({"verb": verb, **more}).encode())
+        assert told(listener) == {"what": verb, "done": True, "text": "done"}
+    assert known.commands.noted == [("act", "pump-1", verb, {})] * 2
+
+
+def test_a_stop_by_a_verb_that_the_broker_keeps_is_carried_out(
+    broker: Broker, listener: Listener, start: Start
+) -> None:
+    publish(broker, "multidrop/pump-1/act", b'{"verb": "coast", "drive": "pump-1", "time": 1}', "-r")
+    known, _ = start(commands=True)
+    assert told(listener)["done"]
+    assert known.commands.noted == [("act", "pump-1", "coast", {})]
+
+
+@pytest.mark.parametrize(
+    ("named", "verb"),
+    in_turn([FAN.name, "no-such-drive", "pump-1", 7, ["pump-1"], {}, None, "", "#", "pump-1/+"], STOPS),
+)
+def test_a_stop_by_a_verb_stops_its_topic_s_drive_and_another_one_that_it_names(
+    broker: Broker, listener: Listener, start: Start, verb: str, named: object
+) -> None:
+    known, _ = start(commands=True)
+    listener.wait_for(has("multidrop/gateway", b"online"))
+    publish(broker, "multidrop/pump-1/act", json.dumps({"verb": verb, "drive": named, "time": 1}).encode())
+    assert told(listener)["done"]
+    others = [("act", FAN.name, verb, {})] if named == FAN.name else []
+    if others:
+        assert told(listener, FAN.name)["done"]
+    assert known.commands.noted == [("act", "pump-1", verb, {}), *others]
+
+
+@pytest.mark.parametrize(
+    ("topic", "named", "stopped"),
+    [
+        ("pump-1", "Lu\u0308fter", ["pump-1", "L\u00fcfter"]),
+        ("Lu\u0308fter", "L\u00fcfter", ["Lu\u0308fter"]),  # one drive: Commands finds it
+        ("L\u00fcfter", "Lu\u0308fter", ["L\u00fcfter"]),
+    ],
+)
+def test_a_stop_by_a_verb_may_name_its_drives_in_another_spelling(
+    tmp_path: Path, topic: str, named: str, stopped: list[str]
+) -> None:
+    known = inside(tmp_path, InvtCHE(2, name="L\u00fcfter"))
+
+    async def receive() -> None:
+        topics = JsonTopics(MqttSettings("mqtt://localhost", commands=True), known, now_ms)
+        topics.outbox = SimpleNamespace(put=lambda publication: None)
+        order = json.dumps({"verb": "coast", "drive": named}).encode()
+        topics.received(f"multidrop/{topic}/act", order, is_retained=False)
+        while len(known.commands.noted) < len(stopped):
+            await asyncio.sleep(0)
+
+    asyncio.run(receive())
+    assert known.commands.noted == [("act", drive, "coast", {}) for drive in stopped]
+
+
+def test_what_is_no_verb_or_starts_a_motor_under_two_names_is_refused(
+    broker: Broker, listener: Listener, start: Start
+) -> None:
+    known, _ = start(commands=True)
+    listener.wait_for(has("multidrop/gateway", b"online"))
+    order = {"verb": "start", "drive": FAN.name, "time": now_ms()}
+    publish(broker, "multidrop/pump-1/act", json.dumps(order).encode())
+    assert f"it names drive '{FAN.name}'" in told(listener)["text"]
+    publish(broker, "multidrop/pump-1/act", b'{"verb": ["coast"], "drive": "pump-1", "time": 1}')
+    assert not told(listener)["done"]
+    assert known.commands.noted == []
+
+
+def test_a_command_that_may_be_older_than_a_reload_is_not_carried_out(
+    broker: Broker, listener: Listener, start: Start
+) -> None:
+    """Its drive's name may be that of another one now."""
+    known, _ = start(commands=True)
+    listener.wait_for(has("multidrop/gateway", b"online"))
+    sent_ms = now_ms()
+    for after_ms, text in ((1900, "not sent: it may have been sent before the plant"), (2500, "done")):
+        known.commands.plant_ns = boottime_ns() - after_ms * 1_000_000
+        publish(broker, "multidrop/pump-1/set/setpoint", write_of(25, sent_ms))
+        assert told(listener)["text"].startswith(text)
+
+
+@pytest.mark.parametrize(("after_ms", "is_taken"), [(-3000, False), (0, False), (1900, False), (2500, True)])
+def test_a_command_that_may_be_older_than_a_stop_is_not_carried_out(
+    broker: Broker, listener: Listener, start: Start, after_ms: int, is_taken: bool
+) -> None:
+    """A broker that held it up gives it after the stop; its sender's clock may be fast by 2 s."""
+    known, _ = start(commands=True)
+    listener.wait_for(has("multidrop/gateway", b"online"))
+    sent_ms = now_ms()
+    known.commands.stopped_at["pump-1"] = boottime_ns() - after_ms * 1_000_000
+    for topic, payload in (
+        ("act", {"verb": "start", "drive": "pump-1", "time": sent_ms}),
+        ("set/setpoint", {"value": 25, "time": sent_ms}),
+    ):
+        publish(broker, f"multidrop/pump-1/{topic}", json.dumps(payload).encode())
+        assert told(listener)["text"].startswith(
+            "done" if is_taken else "not sent: it may have been sent before"
+        )
+    act = {"verb": "emergency_stop", "drive": "pump-1", "time": sent_ms}
+    publish(broker, "multidrop/pump-1/act", json.dumps(act).encode())
+    assert told(listener)["text"] == "done"
+    assert len(known.commands.noted) == (3 if is_taken else 1)
+
+
+def test_a_verb_names_its_drive_again(broker: Broker, listener: Listener, start: Start) -> None:
+    known, _ = start(commands=True)
+    listener.wait_for(has("multidrop/gateway", b"online"))
+    act = {"verb": "start", "drive": "pump-1", "options": {"direction": "forward"}, "time": now_ms()}
+    publish(broker, f"multidrop/{FAN.name}/act", json.dumps(act).encode())
+    assert "it names drive 'pump-1'" in told(listener, FAN.name)["text"]
+    publish(broker, "multidrop/pump-1/act", json.dumps(act).encode())
+    assert told(listener)["done"]
+    assert known.commands.noted == [("act", "pump-1", "start", {"direction": "forward"})]
+
+
+@pytest.mark.parametrize(
+    ("payload", "why"),
+    [
+        (b"25", "it is no JSON object"),
+        (b'{"value": 25}', "time is missing"),
+        (b'{"time": 25}', "value is missing"),
+        (b'{"value": "25", "time": 1}', "value is '25', and not a number"),
+        (b'{"value": true, "time": 1}', "value is True, and not a number"),
+        (b'{"value": 25, "time": "1"}', "time is no whole number of ms"),
+        (b"\xc3\x28", "codec"),
+        (b"[" * 60_000, "nested too deeply"),
+        (b'{"value": 25, "time": 1}' + b" " * 70_000, "it has 70024 bytes"),
+    ],
+)
+def test_what_is_no_command_is_told(
+    broker: Broker, listener: Listener, start: Start, payload: bytes, why: str
+) -> None:
+    known, _ = start(commands=True)
+    listener.wait_for(has("multidrop/gateway", b"online"))
+    publish(broker, "multidrop/pump-1/set/setpoint", payload)
+    assert why in told(listener)["text"]
+    assert known.commands.noted == []
+
+
+@pytest.mark.parametrize(("drive", "verb"), [("pump-1", "\ud800"), ("x" * 65_521, "")])
+def test_an_answer_that_cannot_be_sent_costs_the_others_nothing(
+    broker: Broker, listener: Listener, start: Start, drive: str, verb: str
+) -> None:
+    """A verb that is no UTF-8, and a topic whose answer's would be too long: 65,536 bytes."""
+    known, running = start(commands=True)
+    listener.wait_for(has("multidrop/gateway", b"online"))
+    outbox = running._part._brokers[0].outbox
+    before = outbox.dropped
+    command = {"verb": verb, "drive": "pump-1", "time": now_ms()}
+    publish(broker, f"multidrop/{drive}/act", json.dumps(command).encode())
+    until(lambda: outbox.dropped > before)
+    known.hub.values[("pump-1", "output_frequency")] = 50.0
+    running.step()
+    listener.wait_for(
+        lambda one: one.topic == "multidrop/pump-1" and json_of(one)["values"]["output_frequency"] == 50.0
+    )
+
+
+def test_a_number_without_end_is_null(listener: Listener, start: Start) -> None:
+    """JSON has none: who reads the message would lose all other values with it."""
+    known, running = start()
+    listener.wait_for(has("multidrop/pump-1"))
+    known.hub.values[("pump-1", "output_frequency")] = float("inf")
+    running.step()
+    said = listener.wait_for(lambda one: one.topic == "multidrop/pump-1" and b"49.5" not in one.payload)
+    assert b'"output_frequency": null' in said.payload
+
+
+def test_without_the_key_nothing_is_listened_to(broker: Broker, listener: Listener, start: Start) -> None:
+    known, running = start()
+    listener.wait_for(has("multidrop/gateway", b"online"))
+    publish(broker, "multidrop/stop", b"stop", "-q", "1")
+    listener.wait_for(has("multidrop/stop"))
+    running.step()
+    listener.wait_for(has("multidrop/pump-1"))
+    assert known.commands.noted == []
+
+
+def test_without_the_key_only_a_rebirth_is_asked_for(tmp_path: Path) -> None:
+    require_module("paho.mqtt.client")
+    part: Any = build(MqttSettings(sparkplug="works", node="line"), inside(tmp_path))
+    assert [speaker.topics() for speaker in part._speakers] == [
+        [("multidrop/gateway", 0), ("multidrop/+/available", 0)],  # what was kept of drives that are no more
+        [("spBv1.0/works/NCMD/line", 1)],
+    ]
+
+
+@pytest.mark.parametrize("is_retained", [False, True])
+def test_without_the_key_a_broker_s_commands_are_nobody_s(tmp_path: Path, is_retained: bool) -> None:
+    """It may send what nobody asked it for."""
+    require_module("paho.mqtt.client")
+    known = inside(tmp_path)
+    part: Any = build(MqttSettings(sparkplug="works", node="line"), known)
+    stop = {"verb": "stop", "time": now_ms()}
+
+    async def receive() -> None:
+        for topic, payload in (
+            ("multidrop/stop", b"stop"),
+            ("multidrop/pump-1/stop", b"stop"),
+            ("multidrop/pump-1/act", json.dumps(stop).encode()),
+            ("multidrop/pump-1/set/setpoint", write_of(12.5, now_ms())),
+            ("multidrop", b"stop"),
+            ("elsewhere", b""),
+        ):
+            part._speakers[0].received(topic, payload, is_retained=is_retained)
+        for topic in ("spBv1.0/works/DCMD/line/pump-1", "spBv1.0", "multidrop/stop"):
+            part._speakers[1].received(topic, b"Device Control/Stop", is_retained=is_retained)
+        await asyncio.sleep(0)
+
+    asyncio.run(receive())
+    assert known.commands.noted == []
+
+
+# ---- Home Assistant ----
+
+
+def test_home_assistant_is_told_of_each_drive(broker: Broker, listener: Listener, start: Start) -> None:
+    start(home_assistant=True, commands=True, every="2 s")
+    said = listener.wait_for(has("homeassistant/device/multidrop-pump-1/config"))
+    found = json_of(said)
+    assert found["availability"] == [{"topic": "multidrop/gateway"}, {"topic": "multidrop/pump-1/available"}]
+    parts = found["cmps"]
+    assert set(parts) == {
+        *("state", "problem", "running", "output_frequency", "status", "setpoint_set", "stop")
+    }
+    assert len({part["unique_id"] for part in parts.values()}) == len(parts)
+    sensor = parts["output_frequency"]
+    assert (sensor["unit_of_measurement"], sensor["device_class"]) == ("Hz", "frequency")
+    assert sensor["expire_after"] == parts["state"]["expire_after"] == 6
+    assert "unit_of_measurement" not in parts["status"]
+    assert parts["setpoint_set"]["command_topic"] == "multidrop/pump-1/set/setpoint"
+
+
+def test_its_command_template_makes_a_fresh_write(broker: Broker, listener: Listener, start: Start) -> None:
+    jinja2 = require_module("jinja2")
+    known, _ = start(home_assistant=True, commands=True)
+    said = listener.wait_for(has("homeassistant/device/multidrop-pump-1/config"))
+    part = json_of(said)["cmps"]["setpoint_set"]
+    environment = jinja2.Environment()
+    template = environment.from_string(part["command_template"])
+
+    publish(
+        broker, part["command_topic"], template.render(value=12.5, now=lambda: datetime.now(UTC)).encode()
+    )
+    assert told(listener)["done"]
+    assert known.commands.noted == [("write", "pump-1", "setpoint", 12.5)]
+
+
+def test_a_name_is_an_id_that_no_other_name_has(listener: Listener, start: Start) -> None:
+    start(home_assistant=True)
+    ids = {
+        listener.wait_for(lambda received: received.topic.startswith("homeassistant/")).topic
+        for _ in range(2)
+    }
+    assert len(ids) == 2
+    assert all(topic.isascii() for topic in ids)
+
+
+def configured(drive: Drive, polled: Sequence[str], writable: Sequence[str], **more: Any) -> Any:
+    topics = {name: f"multidrop/{name}" for name in ("state", "gateway", "available", "set", "stop")}
+    details: Any = {"prefix": "works", "version": "1", "every_s": 1.0, "takes_commands": True, **more}
+    registers = [drive.register(name) for name in polled]
+    return json.loads(discovery(drive, registers, topics, writable=writable, **details))
+
+
+def rendered(part: dict[str, Any], said: dict[str, Any]) -> str:
+    jinja2 = require_module("jinja2")
+    return str(jinja2.Environment().from_string(part["value_template"]).render(value_json=said))
+
+
+# Keys of Home Assistant 2026.11's documentation of MQTT (device discovery, sensor, binary sensor, number,
+# select, button): those of each platform that are used here, and those without which it refuses a component.
+HA_KEYS = {
+    "sensor": (
+        {"state_topic"},
+        {"value_template", "expire_after", "device_class", "options", "state_class", "entity_category"}
+        | {"unit_of_measurement", "suggested_display_precision"},
+    ),
+    "binary_sensor": ({"state_topic"}, {"value_template", "expire_after", "device_class"}),
+    "number": (
+        {"command_topic", "min", "max"},  # without a span it is 1 to 100
+        {"state_topic", "value_template", "command_template", "retain", "step", "mode", "entity_category"}
+        | {"unit_of_measurement"},
+    ),
+    "select": (
+        {"command_topic", "options"},
+        {"state_topic", "value_template", "command_template", "retain", "entity_category"},
+    ),
+    "button": ({"command_topic"}, {"payload_press", "availability"}),
+}
+
+
+def check_components(found: Any) -> None:
+    assert not {"state_topic", "command_topic", "value_template"} & found.keys()  # all components have those
+    assert found["dev"]["ids"]
+    for part in found["cmps"].values():
+        needed, known = HA_KEYS[part["p"]]
+        given = part.keys() - {"p", "unique_id", "name"}
+        assert needed <= given <= needed | known
+        assert ("state_topic" in part) == ("value_template" in part)
+        if part["p"] == "number":
+            assert part["min"] < part["max"]
+            assert part["step"] >= 0.001
+        if part.get("device_class") == "enum":
+            assert part["options"]
+            assert not {"unit_of_measurement", "state_class"} & part.keys()
+        assert part.get("entity_category") in (None, "diagnostic", *["config"] * (part["p"] != "sensor"))
+    ids = [part["unique_id"] for part in found["cmps"].values()]
+    assert len(set(ids)) == len(ids)
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_home_assistant_takes_the_components_of_each_family(model: str) -> None:
+    drive = MODELS[model](1, name="pump-1")
+    registers = list(drive.registers)
+    polled = [name for name in registers if drive.register(name).readable]
+    writable = [name for name in registers if drive.register(name).writable]
+    found = configured(drive, polled, writable)
+    check_components(found)
+    assert len(found["cmps"]) == 4 + len(polled) + len(writable)
+
+
+class Awkward(Drive):
+    """A user's own, whose registers have the names of our components."""
+
+    title = "ACME A-1"
+    running = reading(1, "Hz")
+    problem = reading(2, "V")
+    value = reading(3, "A")
+    level = setting(4, "m", moves=False)
+    level_set = reading(5, "m")
+    mode = setting(6, values=IntEnum("Mode", {"SLOW": 1, "FAST": 7}), moves=False)
+
+
+def test_registers_with_the_names_of_components_keep_them_apart() -> None:
+    found = configured(Awkward(1, name="a"), [*Awkward.registers], ["level", "mode"], page="http://hall:8750")
+    check_components(found)
+    assert found["dev"] == {
+        **{"ids": "works-a", "name": "a", "mdl": "ACME A-1", "mf": "ACME", "cu": "http://hall:8750"}
+    }
+    parts = {part["unique_id"]: part for part in found["cmps"].values()}
+    assert parts["works-a-running"]["p"] == "binary_sensor"
+    assert parts["works-a-running-value"]["unit_of_measurement"] == "Hz"
+    assert parts["works-a-level-set"]["state_topic"] == "multidrop/state"
+    assert (parts["works-a-level-set"]["min"], parts["works-a-level-set"]["max"]) == (0, 65535)
+    mode = parts["works-a-mode-set"]
+    assert (mode["p"], mode["options"]) == ("select", ["SLOW", "FAST"])
+    jinja2 = require_module("jinja2")
+    command = jinja2.Environment().from_string(mode["command_template"])
+    assert json.loads(command.render(value="FAST", now=lambda: datetime.now(UTC)))["value"] == 7
+
+
+def test_a_number_that_is_not_polled_has_no_state() -> None:
+    drive = InvtCHE(1, name="a")
+    assert (
+        not {"state_topic", "value_template"}
+        & configured(drive, [], ["setpoint"])["cmps"]["setpoint_set"].keys()
+    )
+
+
+@pytest.mark.parametrize(
+    ("state", "problem", "running"),
+    [
+        ("runs", "OFF", "ON"),
+        ("stands", "OFF", "OFF"),
+        ("fault", "ON", "None"),
+        ("unknown", "None", "None"),
+        ("silent", "None", "None"),
+    ],
+)
+def test_binary_sensors_say_what_is_known(state: str, problem: str, running: str) -> None:
+    parts = configured(InvtCHE(1, name="a"), [], [])["cmps"]
+    assert [rendered(parts[key], {"state": state}) for key in ("problem", "running")] == [problem, running]
+    assert rendered(parts["state"], {"state": state}) in parts["state"]["options"]
+
+
+def test_a_choice_without_a_name_is_unknown_and_not_the_one_before() -> None:
+    """Home Assistant ignores a state that is no option, and shows the one before it."""
+    part = configured(InvtCHE(1, name="a"), ["status"], [])["cmps"]["status"]
+    values = [rendered(part, {"values": {"status": value}}) for value in ("FORWARD", "77", None)]
+    assert values == ["FORWARD", "None", "None"]
+
+
+def test_a_stop_is_there_while_its_drive_is_silent() -> None:
+    parts = configured(InvtCHE(1, name="a"), [], [])["cmps"]
+    assert parts["stop"]["availability"] == [{"topic": "multidrop/gateway"}]
+
+
+def test_two_gateways_have_no_id_of_one_another() -> None:
+    names = [("a-b", "c"), ("a", "b-c"), ("a_2d_b", "c"), ("a", "b_c"), ("a", "b c")]
+    assert len({discovery_topic(*one) for one in names}) == len(names)
+
+
+# ---- settings ----
+
+
+def test_every_mistake_of_the_settings_is_told_at_once(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="broker = ") as told:
+        MqttSettings("http://x", prefix="a/+", every="soon", sparkplug="a/b", node="#")
+    sentences = str(told.value).splitlines()
+    assert len(sentences) == 5
+    assert (
+        sentences[0] == 'broker = "http://x" is no broker; write broker = "mqtt://broker:1883", or mqtts://'
+    )
+
+
+def test_authorities_that_are_none_are_told_before_anything_is_polled(tmp_path: Path) -> None:
+    certificate(tmp_path, "own")
+    (tmp_path / "text.pem").write_text("no certificate\n", "ascii")
+    plant = inside(tmp_path).plant
+    for name, told in (
+        ("own.pem", []),
+        ("own.key", [f'authorities = "own.key": {tmp_path}/own.key has no certificates in PEM']),
+        ("text.pem", [f'authorities = "text.pem": {tmp_path}/text.pem has no certificates in PEM']),
+        ("none.pem", [f'authorities = "none.pem": there is no file {tmp_path}/none.pem']),
+    ):
+        settings = MqttSettings("mqtts://broker", authorities=name)
+        assert [one for one in settings.check(plant) if "authorities" in one] == told
+
+
+def test_a_drive_that_cannot_be_a_topic_is_told(tmp_path: Path) -> None:
+    plant = inside(tmp_path).plant
+    odd = tuple(PolledDrive(InvtCHE(3, name=name), ()) for name in ("a/b", "fine", "gateway", "stop"))
+    plant = replace(plant, lines=(replace(plant.lines[0], drives=odd),))
+    assert MqttSettings(password="secret").check(plant) == [
+        f'password = "secret": there is no file {tmp_path}/secret',
+        "drive 'a/b' cannot be a topic: give it a name without + # and /",
+        *(
+            f'drive {name!r}: name "{name}" is reserved for {RESERVED_NAMES[name]}; give it another name'
+            for name in ("gateway", "stop")
+        ),
+    ]
+
+
+@pytest.mark.parametrize(
+    "topics", [{"prefix": "homeassistant/x"}, {"prefix": "spBv1.0"}, {"sparkplug": "STATE"}]
+)
+def test_topics_of_others_are_refused(topics: dict[str, str]) -> None:
+    with pytest.raises(ValueError, match=r"topic of others|another group"):
+        MqttSettings(**topics)
+
+
+def test_a_plant_file_s_name_that_cannot_be_an_edge_node_is_told(tmp_path: Path) -> None:
+    plant = replace(inside(tmp_path).plant, path=tmp_path / "a+b.toml")
+    assert MqttSettings().check(plant) == MqttSettings(sparkplug="works", node="hall").check(plant) == []
+    (sentence,) = MqttSettings(sparkplug="works").check(plant)
+    assert sentence == "the plant file's name 'a+b' cannot be an edge node; add node = \"hall-1\""
+
+
+def test_all_words_of_topics_are_reserved_names(tmp_path: Path) -> None:
+    topics = JsonTopics(MqttSettings(commands=True), inside(tmp_path), now_ms)
+    topics.outbox = PutMessages()
+    topics.connected()
+    topics._tell(FAN.name, "stop", Told(True, "done"))
+    said = {message.topic for message in topics.outbox.put_in} | {topic for topic, _ in topics.topics()}
+    words = {word for topic in said for word in topic.removeprefix("multidrop/").split("/")}
+    ours = words - {"+", FAN.name, "pump-1"}
+    assert ours == {"gateway", "stop", "act", "set", "available", "told"}
+    assert ours <= RESERVED_NAMES.keys()
+
+
+# ---- figures ----
+
+
+@pytest.mark.slow
+def test_metrics_say_what_was_sent(broker: Broker, tmp_path: Path) -> None:
+    require_module("paho.mqtt.client")
+    with served(tmp_path, f'[serve.mqtt]\nbroker = "{broker.address}"\n') as gateway:
+
+        def figures() -> dict[str, float]:
+            lines = gateway.get("/metrics").body.decode().splitlines()
+            found = [line.split() for line in lines if line.startswith("multidrop_mqtt_")]
+            return {name.removeprefix("multidrop_mqtt_"): float(value) for name, value in found}
+
+        until(lambda: figures().get("connected") == 1.0 and figures()["sent_total"] > 3)
+        assert figures().keys() == {"sent_total", "dropped_total", "connected"}
+        broker.kill()
+        until(lambda: figures()["connected"] == 0.0)
+
+
+def test_metrics_say_in_words_what_they_count(broker: Broker, tmp_path: Path) -> None:
+    require_module("paho.mqtt.client")
+    with served(tmp_path, f'[serve.history]\n[serve.mqtt]\nbroker = "{broker.address}"\n') as gateway:
+        lines = gateway.get("/metrics").body.decode().splitlines()
+        told = dict(
+            line.removeprefix("# HELP multidrop_").split(" ", 1) for line in lines if "# HELP" in line
+        )
+        assert told["history_rows_total"] == "Rows written to the history."
+        assert told["history_dropped_total"] == "Rows that the history could not take or write."
+        assert told["mqtt_sent_total"] == "Messages handed to connections to the broker."
+        for word in ("replaced", "no connection", "not acknowledged"):
+            assert word in told["mqtt_dropped_total"]
+        assert "one more for Sparkplug" in told["mqtt_connected"]
+
+
+# ---- another plant ----
+
+
+class PutMessages:
+    """An outbox that keeps what is put into it."""
+
+    def __init__(self) -> None:
+        self.put_in: list[Any] = []
+
+    def put(self, message: Any) -> None:
+        self.put_in.append(message)
+
+    def emptied(self) -> set[str]:
+        return {one.topic for one in self.put_in if one.is_retained and one.make() == b""}
+
+
+def test_a_drive_that_left_while_the_broker_was_away_is_taken_back_when_it_is_there(tmp_path: Path) -> None:
+    """Messages that wait are dropped when a connection breaks; the topics would say old values for ever."""
+    known = inside(tmp_path)
+    whole = known.plant
+    topics = JsonTopics(MqttSettings(home_assistant=True), known, now_ms)
+    fan = f"multidrop/{FAN.name}"
+    expected = {fan, f"{fan}/available", discovery_topic("multidrop", FAN.name)}
+    topics.outbox = PutMessages()
+    topics.adopt(without_fan(known))
+    assert topics.outbox.emptied() == expected
+    topics.outbox = PutMessages()
+    topics.connected()
+    assert topics.outbox.emptied() == expected
+    known.hub.names.append(FAN.name)
+    topics.outbox = PutMessages()
+    topics.adopt(whole)
+    topics.connected()
+    assert topics.outbox.emptied() == set()
+
+
+def test_what_is_kept_of_a_drive_that_left_is_taken_back(
+    broker: Broker, listener: Listener, start: Start
+) -> None:
+    known, running = start(home_assistant=True)
+    fan = f"multidrop/{FAN.name}"
+    topics = [fan, f"{fan}/available", discovery_topic("multidrop", FAN.name)]
+    listener.wait_for(has(topics[1], b"online"))
+    running.adopt(without_fan(known))
+    for topic in topics:
+        listener.wait_for(has(topic, b""))
+    listener.wait_for(has(discovery_topic("multidrop", "pump-1")))
+    listener.wait_for(has("multidrop/pump-1/available", b"online"))
+    later = Listener(broker)
+    later.wait_for(has("multidrop/pump-1"))
+    running.step()
+    told = later.wait_for(lambda received: received.topic in ("multidrop/pump-1", *topics))
+    assert told.topic == "multidrop/pump-1"
+    later.close()
