@@ -37,7 +37,7 @@ PAGES = sorted([*ROOT.glob("*.md"), *DOCS.rglob("*.md")])
 LANGUAGES = {"python", "toml", "sh", "console", "text", "c"}  # text and c are shown, and not run
 PACKAGES = (
     "multidrop",
-    *(f"multidrop.{name}" for name in ("drive", "profiles", "sim", "recording", "capture", "scan")),
+    *(f"multidrop.{name}" for name in ("drive", "families.profiles", "sim", "recording", "capture", "scan")),
 )
 
 # Commands that are not run, and why: those that begin so.

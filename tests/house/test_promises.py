@@ -54,7 +54,7 @@ def test_files_that_are_named_exist() -> None:
 def test_tests_that_are_named_exist(name: str) -> None:
     """In the file that was named last before it."""
     for before in re.findall(rf"^(.*)`{name}`", PAGE, re.MULTILINE):
-        file = re.findall(r"tests/\w+/test_\w+\.py", before)[-1]
+        file = re.findall(r"tests/[\w/]+/test_\w+\.py", before)[-1]
         assert f"def {name}(" in (ROOT / file).read_text("utf-8")
 
 

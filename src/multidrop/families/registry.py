@@ -15,7 +15,7 @@ from multidrop.drive import Drive
 from multidrop.families import MODELS
 from multidrop.families.model_file import load_model_file
 
-_SHIPPED = Path(__file__).parents[1] / "families"
+_SHIPPED = Path(__file__).parent / "shipped"
 SHIPPED = tuple(sorted(path.stem for path in _SHIPPED.glob("*.toml")))  # each is read when it is asked for
 
 

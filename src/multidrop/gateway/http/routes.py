@@ -42,7 +42,7 @@ from multidrop.supervisor import Hung, supervisor
 if TYPE_CHECKING:
     from multidrop.gateway.gateway import Gateway
 
-PAGE = Path(__file__).parent / "page"
+PAGE = Path(__file__).parents[1] / "page"
 MOST_QUERIES = 2  # of the audit log, at the same time
 AUDIT_S = 20.0  # that one may take
 COOKIE_S = 30 * 24 * 3600

@@ -1,1 +1,1 @@
-"""What the gateway shows live: frames, events, alarms and views of the drives."""
+"""Live data of the drives: frames, events, alarms and views."""
