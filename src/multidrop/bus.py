@@ -66,9 +66,9 @@ class Bus:
 
     A write is not sent when it is late by `expiry` seconds: since the verb was called, but for the time that
     its own steps may take. It is not sent either once a stop was called: that ends all that may move a motor
-    and was called before it, on any thread, with Overtaken. A drive is on one bus at a time. Leaving the
-    `with` block, or closing, waits for the stops that are under way and closes the port; it sends nothing,
-    unless `stop_on_exit` was called, and nothing that moves a motor is sent after it.
+    and was called before it, on any thread, with CancelledByStop. A drive is on one bus at a time. Leaving
+    the `with` block, or closing, waits for the stops that are under way and closes the port; it sends
+    nothing, unless `stop_on_exit` was called, and nothing that moves a motor is sent after it.
 
     Where other processes may be masters of the line too, `mastership` holds requests back: what is too late
     is not sent, a stop neither, and raises NotMaster. Nor is the port opened unless it holds.
@@ -239,8 +239,8 @@ class Bus:
     def detach(self, drive: Drive) -> None:
         """Take a drive off the bus: nothing is asked of it any more, and its verbs raise ValueError.
 
-        Nothing is sent: its motor goes on as it is. Ends what would move it with Overtaken, or Unconfirmed
-        where it was sent, and waits until its stops that are under way are done.
+        Nothing is sent: its motor goes on as it is. Ends what would move it with CancelledByStop, or
+        Unconfirmed where it was sent, and waits until its stops that are under way are done.
         """
         self._latches.remove(drive)
         with self._attached.lock:
@@ -272,7 +272,7 @@ class Bus:
     def read(self, drive: Drive, register: Register[T]) -> T:
         """Return the register's value in engineering units.
 
-        Raises NoReply, NoValue, BadReply, DriveRefused or LineError; ValueError if it cannot be read.
+        Raises NoReply, NoValue, BadReply, DriveException or LineError; ValueError if it cannot be read.
         """
         return cast(T, self.read_many(drive, [register])[register.name])
 
@@ -289,7 +289,7 @@ class Bus:
     def read_text(self, drive: Drive, text: Text) -> str:
         """Return a text of the drive, such as its serial number.
 
-        Raises NoReply, BadReply, DriveRefused or LineError; ValueError for another family's text.
+        Raises NoReply, BadReply, DriveException or LineError; ValueError for another family's text.
         """
         check_own_text(drive, text)
         return self._exchanges.text(drive, text)
@@ -306,7 +306,7 @@ class Bus:
         Sent once, ahead of any polling, and never when it could not begin within `expiry` seconds. It is no
         write: none is audited, no identity is checked, and a lost reply is NoReply. A late reply to another
         request is never returned. An address to which the drive keeps silent costs its time-out and counts as
-        a failure of the drive. Raises NoReply, BadReply, DriveRefused, Expired or LineError; ValueError or
+        a failure of the drive. Raises NoReply, BadReply, DriveException, Expired or LineError; ValueError or
         TypeError, and nothing is sent, for what no such request can say.
         """
         return self._exchanges.ask(drive, function, start, count, checked_expiry(expiry, "a read"))
@@ -318,9 +318,9 @@ class Bus:
 
         Sent once; not at all where a register that may be in EEPROM holds the value already, nor when
         its turn does not come within `expiry` seconds. Before the first write to a drive its identity is
-        checked. Raises Refused (also a ValueError) for what the library does not send, TypeError for what
-        is no value, Expired, DriveRefused when the drive says no, and Unconfirmed when its answer is lost
-        and the write may have happened.
+        checked. Raises WriteForbidden (also a ValueError) for what the library does not send, TypeError for
+        what is no value, Expired, DriveException when the drive says no, and Unconfirmed when its answer is
+        lost and the write may have happened.
         """
         return cast(T, self.try_write(drive, register, value).value)
 
@@ -332,8 +332,8 @@ class Bus:
         """Send any request but a Modbus read once, past every rule, and return the data of the reply.
 
         The one deliberate way round: no check of the drive's identity, no span, no budget. It may start a
-        motor. Raises Unconfirmed when no answer comes, and DriveRefused; Overtaken and Expired as `write`;
-        ValueError for functions 1 to 4, which `ask` sends.
+        motor. Raises Unconfirmed when no answer comes, and DriveException; CancelledByStop and Expired as
+        `write`; ValueError for functions 1 to 4, which `ask` sends.
         """
         check_drive(drive)
         if not isinstance(data, bytes | bytearray):
@@ -344,7 +344,7 @@ class Bus:
         """Carry out a script's steps, none of which is written once a stop was called.
 
         A read that fails after something was written is Unconfirmed: NoReply would say that nothing was
-        written, and DriveRefused that the drive did not do it.
+        written, and DriveException that the drive did not do it.
         """
         return self._performer.perform(script, self._performer.call(drive))
 
@@ -352,8 +352,8 @@ class Bus:
         """Check that the drive at this address is of its declared family, as far as the family can tell.
 
         It only reads, and does so once until the port is opened again. The first write does this by itself.
-        The first check also logs what the drive's watchdog does. Raises Refused when it is another drive,
-        NoReply when it does not answer.
+        The first check also logs what the drive's watchdog does. Raises WriteForbidden when it is another
+        drive, NoReply when it does not answer.
         """
         check_drive(drive)
         self._performer.check_identity(drive)
@@ -375,7 +375,7 @@ class Bus:
 
         The same address means different things to different families. So all drives on the line must be of
         one family and share their settings and framing, and its document must have this broadcast. Returns
-        each drive's state, or why it says none, by name. Raises Refused.
+        each drive's state, or why it says none, by name. Raises WriteForbidden.
         """
         return self._broadcaster.write(self.drives, register, value)
 
@@ -385,8 +385,8 @@ class Bus:
         First by broadcast, where all drives are known to be of one family that has it. Then each drive is
         sent its stop, in turns, until it is seen to stand: for `seconds` s, or without that for 30 s at
         least, and for as long as the motor's ramp may take; what is no time is logged, and is as none. Never
-        raises for one drive: the others go on. A call that would move a motor ends with Overtaken, if it came
-        before this or comes while it lasts.
+        raises for one drive: the others go on. A call that would move a motor ends with CancelledByStop, if
+        it came before this or comes while it lasts.
         After an interruption each drive that does not stand yet is sent its stop once more.
         """
         run: StopRun | None = None

@@ -68,7 +68,7 @@ class NoValue(BadReply):
         self.values = values
 
 
-class DriveRefused(BusError):
+class DriveException(BusError):
     """The drive answered with an exception: it did not do what the request asked.
 
     `register` is the name of the one that could not be read, where it was asked for by itself.
@@ -97,7 +97,7 @@ class Unsupported(BusError):
     """The family's document has no such thing."""
 
 
-class NotDone(BusError):
+class NotVerified(BusError):
     """The drive confirmed the write and did not do it: it took another value, or tripped."""
 
     def __init__(self, drive: str, what: str, reason: str) -> None:
@@ -117,7 +117,7 @@ class Expired(BusError):
         self.seconds = seconds
 
 
-class Overtaken(BusError):
+class CancelledByStop(BusError):
     """Ended before it was sent: a stop was called, the bus was left, or the drive taken off it."""
 
     def __init__(self, drive: str, what: str, why: str) -> None:
@@ -188,10 +188,10 @@ class Advice(NamedTuple):
         )
 
 
-ANOTHER_FAMILY = "another family is at its address"  # the rule of a Refused that withholds a stop too
+ANOTHER_FAMILY = "another family is at its address"  # the rule of a WriteForbidden that withholds a stop too
 
 
-class Refused(BusError, ValueError):
+class WriteForbidden(BusError, ValueError):
     """The library itself did not send it; with the register, the rule, and its place in the manual.
 
     `is_budget` says that the register's memory wears: the same may be sent at another time.

@@ -236,10 +236,10 @@ class Poller(RowSource):
         are missed. What `add` and `set_rate` changed is as in the plant.
 
         What leaves: requests under way are ended, and their rows come; other calls that use the line fail
-        with LineError, those of a drive with NotAttached, and what would move its motor with Overtaken. Stops
-        under way are waited for. Motors go on as they are, unless `stop_on_exit` was called: then they are
-        stopped before they leave, for nobody would later. One whose address is another family's now is not:
-        the old family's stop may mean something else there.
+        with LineError, those of a drive with NotAttached, and what would move its motor with CancelledByStop.
+        Stops under way are waited for. Motors go on as they are, unless `stop_on_exit` was called: then they
+        are stopped before they leave, for nobody would later. One whose address is another family's now is
+        not: the old family's stop may mean something else there.
 
         Names in batches keep their codes. Returns when all is done; other lines are polled meanwhile. Any
         thread may call this, one at a time.

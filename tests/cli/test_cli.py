@@ -18,7 +18,7 @@ from tables import table
 
 from multidrop.cli import COMMANDS, main
 from multidrop.cli.fleet import ACTIONS as FLEET
-from multidrop.drive import Advice, Refused, carry_out
+from multidrop.drive import Advice, WriteForbidden, carry_out
 from multidrop.families import MODELS, ErmanERG220, InnovertIBD, InvtCHE
 from multidrop.families.registry import SHIPPED, find_model
 
@@ -303,14 +303,16 @@ def test_advice_for_a_drive_of_a_plant_file_is_what_its_command_takes(run: Run, 
 
 
 def test_advice_for_a_program_becomes_a_command_s() -> None:
-    reset = Refused("x has a fault: see to it, then call reset_fault()", advice=Advice.call("reset_fault"))
+    reset = WriteForbidden(
+        "x has a fault: see to it, then call reset_fault()", advice=Advice.call("reset_fault")
+    )
     assert reset.for_command_line() == "x has a fault: see to it, then run `multidrop reset-fault`"
-    declare = Refused("and declare confirmed = 1 if it is", advice=Advice.declare("confirmed", 1))
+    declare = WriteForbidden("and declare confirmed = 1 if it is", advice=Advice.declare("confirmed", 1))
     assert declare.for_command_line() == "and add --option confirmed=1 if it is"
     in_plant = declare.for_command_line(in_plant=True)
     assert in_plant == "and write confirmed = 1 below its [[line.drive]] if it is"
     assert reset.for_command_line(in_plant=True) == reset.for_command_line()
-    assert Refused("use emergency_stop()").for_command_line() == "use emergency_stop()"
+    assert WriteForbidden("use emergency_stop()").for_command_line() == "use emergency_stop()"
 
 
 def test_a_family_s_advice_stands_in_its_sentence() -> None:
@@ -322,7 +324,7 @@ def test_a_family_s_advice_stands_in_its_sentence() -> None:
         (che.start.script(), "see to it, then run `multidrop reset-fault`"),
         (ibd.identify.script(), "and add --option confirmed=1 if it is an IBD"),
     ):
-        with pytest.raises(Refused) as refused:
+        with pytest.raises(WriteForbidden) as refused:
             carry_out(script, lambda step: step.register.decode(answers.get(step.register.name, 0)))
         assert refused.value.for_command_line().endswith(command)
 

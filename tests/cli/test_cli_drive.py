@@ -31,7 +31,7 @@ from multidrop.bus import Bus
 from multidrop.cli.support.confirm import confirm
 from multidrop.control import eeprom_ledger as ledger
 from multidrop.core import Message
-from multidrop.errors import Refused
+from multidrop.errors import WriteForbidden
 from multidrop.families.innovert_ibd import InnovertIBD
 from multidrop.families.invt_che import InvtCHE
 from multidrop.recording import open_reader
@@ -309,7 +309,7 @@ def test_what_was_typed_before_the_question_does_not_answer_it(monkeypatch: pyte
         assert select.select([keyboard], [], [], 10)[0]  # it is there
         monkeypatch.setattr("sys.stdin", keyboard)
         monkeypatch.setattr("sys.stderr", Screen())
-        with pytest.raises(Refused, match="nothing was sent"):
+        with pytest.raises(WriteForbidden, match="nothing was sent"):
             confirm("Start the motor of pump?", argparse.Namespace(yes=False))
 
 

@@ -20,7 +20,7 @@ from multidrop.drive import Condition, Drive, Script, State
 from multidrop.drive.declare import command, setting
 from multidrop.drive.table import Kept
 from multidrop.drive.verbs import verb
-from multidrop.errors import BusError, Expired, Overtaken, PortLost, Refused, Unconfirmed
+from multidrop.errors import BusError, CancelledByStop, Expired, PortLost, Unconfirmed, WriteForbidden
 from multidrop.families import MODELS, InvtCHE
 from multidrop.sim import simulated
 
@@ -130,7 +130,7 @@ def test_a_word_that_is_no_stop_is_broadcast_by_no_stop(
         line.bus.broadcast(drives[0].frequency, 0.0)
         assert len(broadcasts(line)) == 1
     else:
-        with pytest.raises(Refused, match="confirmed = 1"):
+        with pytest.raises(WriteForbidden, match="confirmed = 1"):
             line.bus.broadcast(drives[0].frequency, 0.0)
         assert broadcasts(line) == []
 
@@ -169,7 +169,7 @@ def test_nothing_is_broadcast_where_one_is_of_another_family(
     sims[address - 1]["device"] = 0x010A
     line = SimulatedBus(monkeypatch, *sims)
     drives = [line.attach(sim.drive) for sim in sims]
-    with pytest.raises(Refused, match="010AH"):
+    with pytest.raises(WriteForbidden, match="010AH"):
         line.bus.broadcast(drives[0].control, stop_of(drives[0]))
     assert line.written == []
 
@@ -212,7 +212,7 @@ def test_a_setpoint_is_broadcast_to_nobody_once_the_bus_was_left(
     line, drives, _ = line_of(monkeypatch, model, model)
     assert 0 in setpoint_of(drives[0]).broadcast
     line.bus.leave()
-    with pytest.raises(Overtaken, match="the bus was left"):
+    with pytest.raises(CancelledByStop, match="the bus was left"):
         line.bus.broadcast(setpoint_of(drives[0]), 0.0)
     line.bus.broadcast(drives[0].control, stop_of(drives[0]))  # unlike a stop
     (sent,) = broadcasts(line)
@@ -234,7 +234,7 @@ def test_a_setpoint_that_was_called_before_a_stop_is_not_broadcast_after_it(
         return carry_out(exchange, **details)
 
     monkeypatch.setattr(line, "carry_out", stop_meanwhile)
-    with pytest.raises(Overtaken, match=r"setpoint = 0\.00 %.*a stop was called"):
+    with pytest.raises(CancelledByStop, match=r"setpoint = 0\.00 %.*a stop was called"):
         line.bus.broadcast(drives[0].setpoint, 0.0)
     assert [request.address for request, _ in line.frames[begun:]] == [1, 2]
     assert line.written == []
@@ -272,7 +272,7 @@ def test_a_setpoint_is_broadcast_to_nobody_where_another_drive_may_be_there_by_n
     line, drives, sims = line_of(monkeypatch, "invt-che", "invt-che")
     line.sleep(60)
     sims[1]["device"] = 0x010A
-    with pytest.raises(Refused, match="010AH"):
+    with pytest.raises(WriteForbidden, match="010AH"):
         line.bus.broadcast(drives[0].setpoint, 0.0)
     assert line.written == []
 

@@ -23,12 +23,12 @@ from multidrop.drive.verbs import verb
 from multidrop.errors import (
     BadReply,
     BusError,
-    DriveRefused,
+    DriveException,
     LineError,
     NoReply,
     NotAttached,
-    Refused,
     Unconfirmed,
+    WriteForbidden,
 )
 from multidrop.families import YD1000, DelixiModbus, DelixiNative, ErmanERG220, InnovertIBD, InvtCHE
 from multidrop.families.innovert_ibd import IBDControl
@@ -237,12 +237,12 @@ def test_the_alias_in_ram_is_written_where_there_is_one() -> None:
 MISTAKES: dict[str, tuple[Callable[[Bus, Rig], Any], type[Exception], str]] = {
     "a reading is written": (
         lambda bus, rig: bus.write(rig, rig.speed, 1),
-        Refused,
+        WriteForbidden,
         "speed of pump is not written: it is a reading",
     ),
     "a sealed setting is written": (
         lambda bus, rig: bus.write(rig, rig.sealed, 1),
-        Refused,
+        WriteForbidden,
         "sealed of pump is not written: it is the maker's",
     ),
     "above the span": (
@@ -392,7 +392,7 @@ MISTAKES: dict[str, tuple[Callable[[Bus, Rig], Any], type[Exception], str]] = {
     ),
     "a broadcast that the document does not have": (
         lambda bus, rig: bus.broadcast(rig.target, 0),
-        Refused,
+        WriteForbidden,
         "has no harmless broadcast of target",
     ),
 }
@@ -553,7 +553,7 @@ def test_a_refusal_has_its_family_s_meaning(
     there = simulated(drive)
     with faulty(there, lambda _: checksums.rtu(reply)) as sim, Bus(path(sim)) as bus:
         bus.attach(drive)
-        with pytest.raises(DriveRefused) as caught:
+        with pytest.raises(DriveException) as caught:
             bus.read(drive, register)
     assert caught.value.code == code
     assert caught.value.meaning.startswith(meaning)
@@ -604,7 +604,7 @@ def test_a_broadcast_that_could_do_harm_is_refused(drives: list[Drive], value: I
     with unpaced(*there) as sim, Bus(path(sim)) as bus:
         for each in there:
             bus.attach(each.drive)
-        with pytest.raises(Refused):
+        with pytest.raises(WriteForbidden):
             bus.broadcast(InnovertIBD.control, value)
     assert [each.counters.broadcasts for each in there] == [0, 0]
 

@@ -23,7 +23,7 @@ from multidrop.control.author import noted_first, written_by
 from multidrop.control.eeprom_ledger import Ledger, LedgerCell
 from multidrop.control.outcome import Effect
 from multidrop.core import Message
-from multidrop.errors import Refused, Unconfirmed
+from multidrop.errors import Unconfirmed, WriteForbidden
 from multidrop.families import DelixiModbus, ErmanERG220, InvtCHE
 from multidrop.sim import simulated
 from multidrop.transport.aside_log import flush
@@ -329,7 +329,7 @@ def test_a_setpoint_loop_while_the_clock_is_set_back(monkeypatch: pytest.MonkeyP
             utc[0] -= 3600 * 10**9
         try:
             drive.set_frequency(10 + second / 10)
-        except Refused:
+        except WriteForbidden:
             continue
         finally:
             line.sleep(1)

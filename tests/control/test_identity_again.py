@@ -12,7 +12,7 @@ from lines import line, plant, polled, until
 from motors import MAKE, ReceivedRequests
 from simulated_bus import SimulatedBus, is_write, one
 
-from multidrop import Bus, Drive, InnovertIBD, InvtCHE, NoReply, Poller, Refused, Script
+from multidrop import Bus, Drive, InnovertIBD, InvtCHE, NoReply, Poller, Script, WriteForbidden
 from multidrop.control import records
 from multidrop.control.outcome import Seen
 from multidrop.core import PAUSE_NS, Completion, Exchange, Framing, Message, build_reply
@@ -57,7 +57,7 @@ def test_another_drive_in_the_place_of_a_known_one_is_not_started() -> None:
         be_silent(bus, drive, received)
         received.sim["device"] = GOODRIVE
         for move in (drive.start, drive.jog, lambda: drive.set_frequency(20)):
-            with pytest.raises(Refused, match="010AH"):
+            with pytest.raises(WriteForbidden, match="010AH"):
                 move()
         assert received.requests
         assert received.writes == []
@@ -165,7 +165,7 @@ def test_a_setpoint_that_cannot_be_read_is_forgotten_once_the_drive_may_have_los
         drive.set_frequency(10)
         received.requests.clear()
         lose(bus, drive, monkeypatch)
-        with pytest.raises(Refused, match="cannot say its setpoint: call set_frequency before start"):
+        with pytest.raises(WriteForbidden, match="cannot say its setpoint: call set_frequency before start"):
             drive.start()
         assert received.writes == []
         drive.set_frequency(10)
@@ -179,7 +179,7 @@ def test_a_setpoint_is_forgotten_where_the_look_before_start_ends_a_long_silence
         drive.set_frequency(10)
         be_silent(bus, drive, received)
         bus.peer(drive).c.answered_ns -= 2 * PAUSE_NS
-        with pytest.raises(Refused, match="cannot say its setpoint: call set_frequency before start"):
+        with pytest.raises(WriteForbidden, match="cannot say its setpoint: call set_frequency before start"):
             drive.start()
         assert received.writes == []
 
@@ -192,7 +192,7 @@ def test_a_setpoint_that_was_written_through_another_bus_is_not_known(model: str
         bus.detach(drive)
         bus.attach(drive)
         received.requests.clear()
-        with pytest.raises(Refused, match="cannot say its setpoint"):
+        with pytest.raises(WriteForbidden, match="cannot say its setpoint"):
             drive.start()
         assert received.writes == []
 
@@ -222,7 +222,7 @@ def test_what_polling_missed_counts_too() -> None:
             until(lambda: bus.peers[drive].silences > 0)
             received.loses = lambda request: False
             sim["device"] = GOODRIVE
-            with pytest.raises(Refused, match="010AH"):
+            with pytest.raises(WriteForbidden, match="010AH"):
                 drive.start()
     assert received.writes == []
 
@@ -238,7 +238,7 @@ def test_a_drive_that_was_taken_off_is_asked_again_before_it_is_moved(
     bus.bus.detach(drive)
     bus.attach(drive)
     sim["device"] = GOODRIVE
-    with pytest.raises(Refused, match="010AH"):
+    with pytest.raises(WriteForbidden, match="010AH"):
         drive.start()
     assert len(bus.written) == 1
 
@@ -253,7 +253,7 @@ def test_a_drive_that_was_taken_off_is_asked_again_before_its_stop(monkeypatch: 
     bus.bus.detach(drive)
     bus.attach(drive)
     sim["device"] = GOODRIVE
-    with pytest.raises(Refused, match="no stop was sent"):
+    with pytest.raises(WriteForbidden, match="no stop was sent"):
         drive.stop()
     assert len(bus.written) == begun
 

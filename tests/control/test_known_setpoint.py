@@ -12,7 +12,7 @@ from multidrop import DelixiModbus, DelixiNative, Drive, ErmanERG220, InnovertIB
 from multidrop.control import records
 from multidrop.core import Message, build_reply
 from multidrop.drive.known_setpoint import KnownSetpoint
-from multidrop.errors import BusError, DriveRefused, Expired, NotDone, Refused, Unconfirmed
+from multidrop.errors import BusError, DriveException, Expired, NotVerified, Unconfirmed, WriteForbidden
 
 UNREADABLE = [
     pytest.param(lambda: InnovertIBD(1, maximum_frequency=50), id="innovert-ibd"),
@@ -35,7 +35,7 @@ def told(monkeypatch: pytest.MonkeyPatch, make: Make) -> tuple[SimulatedBus, Dri
 def test_what_a_rule_refuses_changes_nothing(monkeypatch: pytest.MonkeyPatch, make: Make) -> None:
     bus, drive = told(monkeypatch, make)
     known = drive.commanded
-    with pytest.raises((Refused, ValueError)):
+    with pytest.raises((WriteForbidden, ValueError)):
         drive.set_frequency(-1)
     assert bus.written == []
     assert drive.commanded == known
@@ -64,7 +64,7 @@ def test_what_the_drive_refuses_changes_nothing(monkeypatch: pytest.MonkeyPatch)
     bus, drive = told(monkeypatch, lambda: InnovertIBD(1, maximum_frequency=50))
     known = drive.commanded
     bus.answers = refused
-    with pytest.raises(DriveRefused):
+    with pytest.raises(DriveException):
         drive.set_frequency(30)
     bus.answers = lambda request: None
     assert drive.commanded == known
@@ -86,7 +86,7 @@ def test_after_a_lost_reply_nothing_is_known_and_no_motor_starts(
     bus.loses = bus.deafens = lambda request: False
     bus.frames.clear()
     assert drive.commanded is None
-    with pytest.raises(Refused, match="cannot say its setpoint: call set_frequency before start"):
+    with pytest.raises(WriteForbidden, match="cannot say its setpoint: call set_frequency before start"):
         drive.start()
     assert bus.written == []
 
@@ -103,7 +103,7 @@ def test_what_a_drive_takes_as_another_value_is_not_what_it_was_told(monkeypatch
         return request
 
     monkeypatch.setattr(type(sim), "answer", held_back)
-    with pytest.raises(NotDone):
+    with pytest.raises(NotVerified):
         drive.set_frequency(30)
     assert drive.commanded is None
 

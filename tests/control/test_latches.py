@@ -9,7 +9,7 @@ from weakref import ref
 import pytest
 from simulated_bus import one
 
-from multidrop.errors import Overtaken
+from multidrop.errors import CancelledByStop
 from multidrop.families import InvtCHE
 
 
@@ -39,7 +39,7 @@ def test_a_drive_that_is_attached_to_a_bus_that_was_left_is_not_moved(
     line.bus.detach(drive)
     line.attach(drive)
     for call in (drive.start, drive.jog, lambda: drive.set_frequency(20)):
-        with pytest.raises(Overtaken, match="the bus was left"):
+        with pytest.raises(CancelledByStop, match="the bus was left"):
             call()
     assert line.written == []
     drive.stop()

@@ -11,7 +11,7 @@ from lines import until
 from simulated_bus import SimulatedBus
 
 from multidrop.core import Message
-from multidrop.errors import Overtaken, PortLost
+from multidrop.errors import CancelledByStop, PortLost
 from multidrop.families import InvtCHE
 from multidrop.sim import simulated
 from multidrop.transport.aside_log import flush
@@ -76,7 +76,7 @@ def test_drives_that_are_about_to_leave_are_stopped_where_that_was_asked_for(
     pair.bus.part_with([first], [first])
     assert pair.turning == [False, True]
     for act in (first.start, first.jog, lambda: first.set_frequency(10)):
-        with pytest.raises(Overtaken, match="the drive was taken off the bus"):
+        with pytest.raises(CancelledByStop, match="the drive was taken off the bus"):
             act()
     assert [record for record in caplog.records if record.levelno >= logging.WARNING] == []
 

@@ -21,7 +21,7 @@ from multidrop.control.eeprom_ledger import Ledger, LedgerCell, default_path
 from multidrop.drive import Drive
 from multidrop.drive.declare import setting
 from multidrop.drive.table import COIL, Kept
-from multidrop.errors import Refused
+from multidrop.errors import WriteForbidden
 from multidrop.sim import SimulatedDrive, Simulator, Wire, simulated
 from multidrop.transport import port_identity, simulated_ports
 from multidrop.transport.line import Line
@@ -62,7 +62,7 @@ def test_one_write_a_minute_however_the_port_is_spelt(
             f"spy://{device}",
         )
         for at, port in enumerate(spellings):
-            with pytest.raises(Refused, match="is written once in 60 s at most"):
+            with pytest.raises(WriteForbidden, match="is written once in 60 s at most"):
                 write(port, 13.0 + at, ledger)
         (wear,) = ledger.wear(0)
         assert (wear.cell.port, wear.writes) == (device, 1)
@@ -73,7 +73,7 @@ def test_one_write_a_minute_by_whatever_name_of_a_host(tmp_path: Path) -> None:
     with toys("socket://127.0.0.1:0") as sim:
         path = sim.wires[0].path
         write(path, 12.0, ledger)
-        with pytest.raises(Refused, match="is written once in 60 s at most"):
+        with pytest.raises(WriteForbidden, match="is written once in 60 s at most"):
             write(path.replace("127.0.0.1", "localhost"), 13.0, ledger)
         assert [each.cell.port for each in ledger.wear(0)] == [path.removeprefix("socket://")]
 
@@ -205,7 +205,7 @@ def test_a_simulated_drive_does_not_spend_the_user_s_ledger(tmp_path: Path, port
     with toys(str(tmp_path / "link") if port == "link" else port) as sim:
         path = sim.wires[0].path.replace("0.0.0.0", "127.0.0.1")
         write(path, 12.0)
-        with pytest.raises(Refused, match="is written once in 60 s at most"):  # as with a real one
+        with pytest.raises(WriteForbidden, match="is written once in 60 s at most"):  # as with a real one
             write(path, 13.0)
     assert Ledger().wear(0) == []
     assert not list(default_path().parent.rglob("*.sqlite"))

@@ -22,7 +22,7 @@ from multidrop.drive import Direction, Drive, Script, read, write
 from multidrop.drive.declare import reading, setting
 from multidrop.drive.table import Kept
 from multidrop.drive.verbs import verb
-from multidrop.errors import BusError, Expired, NotDone, Overtaken, Refused, Unconfirmed
+from multidrop.errors import BusError, CancelledByStop, Expired, NotVerified, Unconfirmed, WriteForbidden
 from multidrop.families import YD1000, DelixiModbus, ErmanERG220, InvtCHE
 from multidrop.families.invt_che import CHEControl
 from multidrop.sim import MotorDrive, simulated
@@ -82,7 +82,7 @@ def test_a_start_that_goes_on_after_its_stop_ends_all_the_same(monkeypatch: pyte
     line, drive = stubborn(monkeypatch)
     call_stop_at(line, drive, 1)
     with pytest.raises(
-        Overtaken, match=r"^fan: the start was not sent: a stop was called; nothing more was sent$"
+        CancelledByStop, match=r"^fan: the start was not sent: a stop was called; nothing more was sent$"
     ):
         drive.start()
     assert line.written == []
@@ -93,7 +93,7 @@ def test_a_write_that_a_script_goes_on_to_after_a_stop_is_named(monkeypatch: pyt
     drive.set_frequency(10)
     before = len(line.written)
     call_stop_at(line, drive, 3)
-    with pytest.raises(Overtaken, match=r"^yd1000@1: frequency was not sent: a stop was called"):
+    with pytest.raises(CancelledByStop, match=r"^yd1000@1: frequency was not sent: a stop was called"):
         ramp(drive, 20.0)
     assert len(line.written) == before
 
@@ -216,7 +216,7 @@ def test_a_trip_while_the_motor_changes_its_direction_ends_the_start(monkeypatch
         return False
 
     line.loses = trip
-    with pytest.raises(NotDone, match=r"it tripped: overcurrent while accelerating .OC1"):
+    with pytest.raises(NotVerified, match=r"it tripped: overcurrent while accelerating .OC1"):
         drive.start(Direction.REVERSE)
 
 
@@ -238,7 +238,7 @@ def test_what_is_refused_is_told_to_the_log(
 ) -> None:
     caplog.set_level(logging.INFO, "multidrop.control")
     line, drive, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
-    with pytest.raises(Refused) as refusal:
+    with pytest.raises(WriteForbidden) as refusal:
         drive.start()
     assert f"refused: {refusal.value}" in [record.getMessage() for record in caplog.records]
     assert line.written == []
@@ -264,12 +264,12 @@ def test_a_write_that_its_budget_holds_back_says_that_it_may_be_sent_later(
 ) -> None:
     line, drive, _ = one(monkeypatch, DelixiModbus(1), ledger=tmp_path / "wear")
     line.bus.write(drive, drive.frequency, 12.0)
-    with pytest.raises(Refused, match="was written 0 s ago") as refusal:
+    with pytest.raises(WriteForbidden, match="was written 0 s ago") as refusal:
         line.bus.write(drive, drive.frequency, 13.0)
     assert refusal.value.is_budget
     line.sleep(61)
     line.bus.write(drive, drive.frequency, 13.0)
-    with pytest.raises(Refused, match="does not fit") as refusal:
+    with pytest.raises(WriteForbidden, match="does not fit") as refusal:
         line.bus.write(drive, drive.frequency, 1e9)
     assert not refusal.value.is_budget
 

@@ -19,7 +19,7 @@ from multidrop.drive import Drive, Script, read
 from multidrop.drive.declare import setting
 from multidrop.drive.table import Kept
 from multidrop.drive.verbs import verb
-from multidrop.errors import NoReply, Refused
+from multidrop.errors import NoReply, WriteForbidden
 from multidrop.families import YD1000, InnovertIBD, InvtCHE
 from multidrop.sim import simulated
 
@@ -121,7 +121,9 @@ def test_a_drive_without_a_slope_of_its_own_needs_a_rate(
 ) -> None:
     line, drive, sim = ramped(monkeypatch, Ramped)
     sim["maximum_frequency"], sim["acceleration_time"] = most, seconds
-    with pytest.raises(Refused, match="the acceleration of ramped@1 cannot be read: give a rate in Hz/s"):
+    with pytest.raises(
+        WriteForbidden, match="the acceleration of ramped@1 cannot be read: give a rate in Hz/s"
+    ):
         ramp(drive, 2.0)
     assert line.written == []
     ramp(drive, 2.0, rate=4.0)
@@ -137,7 +139,7 @@ class Nameless(Ramped):
 
 def test_a_ramp_of_a_drive_that_nobody_confirmed_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     line, drive, _ = ramped(monkeypatch, Nameless, confirmed=0)
-    with pytest.raises(Refused, match="confirmed = 1"):
+    with pytest.raises(WriteForbidden, match="confirmed = 1"):
         ramp(drive, 2.0, rate=1.0)
     assert line.frames == []
     line, drive, _ = ramped(monkeypatch, Nameless, confirmed=1)
@@ -187,7 +189,7 @@ def test_what_a_staggered_start_did_not_come_to_is_not_stopped(monkeypatch: pyte
     line, drives, sims = che(monkeypatch, 3)
     sims[1].trip(4)
     line.frames.clear()
-    with pytest.raises(Refused, match="OC1"):
+    with pytest.raises(WriteForbidden, match="OC1"):
         start_staggered(drives, 1.0)
     assert {request.address for request, _ in line.frames if is_write(request)} == {1, 2}
 
@@ -237,7 +239,7 @@ def test_started_drives_are_stopped_side_by_side(monkeypatch: pytest.MonkeyPatch
 
     noted.acts[1] = wait_for_both
     noted.acts[2] = noted.acts[3] = lambda seconds: others.release()
-    with pytest.raises(Refused, match="OC1"):
+    with pytest.raises(WriteForbidden, match="OC1"):
         start_staggered(drives, 1.0)
     assert sorted(noted.calls) == [(1, None), (2, None), (3, None)]
     assert not others.acquire(blocking=False)
@@ -255,7 +257,7 @@ def test_without_threads_each_is_sent_its_stop_before_any_is_waited_for(
     sims[1].trip(4)
     noted = NotedCalls(drives)
     monkeypatch.setattr(threading, "Thread", NoThread)
-    with pytest.raises(Refused, match="OC1"):
+    with pytest.raises(WriteForbidden, match="OC1"):
         start_staggered(drives, 1.0)
     assert noted.calls == [(1, 0.0), (2, 0.0), (1, None), (2, None)]
 

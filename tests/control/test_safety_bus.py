@@ -28,15 +28,15 @@ from multidrop.drive.declare import command, reading, setting
 from multidrop.drive.table import COIL, Kept
 from multidrop.drive.verbs import verb
 from multidrop.errors import (
-    DriveRefused,
+    DriveException,
     Expired,
     LineError,
     NoReply,
-    NotDone,
     NotMaster,
-    Refused,
+    NotVerified,
     Unconfirmed,
     Unsupported,
+    WriteForbidden,
 )
 from multidrop.families import MODELS, YD1000, DelixiModbus, ErmanERG220, InnovertIBD, InvtCHE
 from multidrop.families.invt_che import CHEControl, parameter
@@ -73,7 +73,7 @@ def test_a_plain_write_never_starts_a_motor_nor_resets_a_fault(
             if register.encode(value) in register.harmless:
                 continue
             refusals += 1
-            with pytest.raises(Refused, match=r"commands the motor.*use start\(\)") as refusal:
+            with pytest.raises(WriteForbidden, match=r"commands the motor.*use start\(\)") as refusal:
                 line.bus.write(drive, register, value)
             assert refusal.value.register == register.name
             assert refusal.value.place
@@ -122,7 +122,7 @@ def test_what_is_against_a_rule_is_refused_and_not_sent(
 ) -> None:
     line, _, _ = one(monkeypatch, drive)
     register = drive.register(name)
-    with pytest.raises(Refused, match=sentence) as refusal:
+    with pytest.raises(WriteForbidden, match=sentence) as refusal:
         line.bus.write(drive, register, value)
     assert isinstance(refusal.value, ValueError)  # a mistake of the caller's
     assert (refusal.value.register, bool(refusal.value.rule), bool(refusal.value.place)) == (name, True, True)
@@ -136,7 +136,7 @@ def test_what_changes_only_at_rest_is_refused_while_the_motor_turns(monkeypatch:
     line.sleep(1)
     before = list(line.written)
     with pytest.raises(
-        Refused, match=r"maximum_frequency .* only while the motor stands; state: running.*FH"
+        WriteForbidden, match=r"maximum_frequency .* only while the motor stands; state: running.*FH"
     ):
         line.bus.write(drive, drive.maximum_frequency, 90)
     assert line.written == before
@@ -190,7 +190,7 @@ def test_a_drive_of_another_family_is_not_written_to(
     line = SimulatedBus(monkeypatch, sim)
     drive = line.attach(MAKE[model](1))
     for call in (lambda: drive.set_frequency(20), drive.start, drive.jog, drive.reset_fault):
-        with pytest.raises((Refused, NoReply, Unsupported)):
+        with pytest.raises((WriteForbidden, NoReply, Unsupported)):
             call()
     assert line.written == []
     assert not sim.counters.writes
@@ -200,7 +200,7 @@ def test_a_goodrive_is_not_taken_for_a_che(monkeypatch: pytest.MonkeyPatch) -> N
     line, drive, sim = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
     sim["device"] = 0x010A
     for call in (lambda: drive.set_frequency(20), drive.start, drive.stop, drive.coast):
-        with pytest.raises(Refused, match="010AH"):
+        with pytest.raises(WriteForbidden, match="010AH"):
             call()
     assert line.written == []
 
@@ -232,7 +232,7 @@ def test_an_ibd_that_cannot_be_told_apart_needs_its_owner_s_word(monkeypatch: py
             assert sim.counters.requests > 1  # a read went before: it tells whether the adapter echoes
             assert line.frames[0][0].function == 3
         else:
-            with pytest.raises(Refused, match="confirmed = 1"):
+            with pytest.raises(WriteForbidden, match="confirmed = 1"):
                 drive.set_frequency(20)
             assert line.written == []
 
@@ -305,7 +305,7 @@ def test_refused_by_the_drive_has_the_family_s_meaning(monkeypatch: pytest.Monke
     line.answers = lambda request: refusal if request.function == 6 else None
     outcome = line.bus.try_write(drive, drive.setpoint, 50.0)
     assert outcome.effect is Effect.REFUSED
-    with pytest.raises(DriveRefused, match="code 12H, write not allowed: out of range"):
+    with pytest.raises(DriveException, match="code 12H, write not allowed: out of range"):
         assert outcome.value
     assert len(line.written) == 1
 
@@ -316,7 +316,7 @@ def test_a_raw_request_that_is_refused_is_noted_as_that(
     line, drive, _ = one(monkeypatch, InvtCHE(1), audit=tmp_path / "audit")
     refusal = build_reply(Framing.RTU, Message(1, 6, exception=0x12))
     line.answers = lambda request: refusal if request.function == 6 else None
-    with pytest.raises(DriveRefused, match="code 12H"):
+    with pytest.raises(DriveException, match="code 12H"):
         line.bus.raw(drive, 6, 0x1000, b"\0\5")
     line.bus.close()
     assert [entry["outcome"] for entry in read_audit(tmp_path / "audit")] == ["refused by the drive"]
@@ -463,7 +463,7 @@ def test_a_drive_that_is_heard_no_more_after_its_command(
 
 
 def test_a_drive_that_refuses_to_be_read_after_its_start(monkeypatch: pytest.MonkeyPatch) -> None:
-    """DriveRefused would say that it did not start."""
+    """DriveException would say that it did not start."""
     line, drive, sim = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
     drive.set_frequency(20)
     busy = build_reply(Framing.RTU, Message(1, 3, exception=6))
@@ -498,10 +498,10 @@ def test_a_trip_while_starting(monkeypatch: pytest.MonkeyPatch) -> None:
     control = sim.obeys[3, 0x1000]
     trips = {(3, 0x1000): lambda sim, raw: sim.trip(4) if raw == 1 else control(sim, raw)}
     monkeypatch.setattr(type(sim), "obeys", trips)
-    with pytest.raises(NotDone, match=r"tripped: overcurrent while accelerating .OC1"):
+    with pytest.raises(NotVerified, match=r"tripped: overcurrent while accelerating .OC1"):
         drive.start()
     assert len(starts(line, "invt-che")) == 1
-    with pytest.raises(Refused, match=r"OC1.*reset_fault"):
+    with pytest.raises(WriteForbidden, match=r"OC1.*reset_fault"):
         drive.start()
     drive.reset_fault()
     assert len(starts(line, "invt-che")) == 1
@@ -521,7 +521,7 @@ def test_a_power_cycle_in_mid_ramp(monkeypatch: pytest.MonkeyPatch) -> None:
     line.sleep(5)
     sent = len(line.written)
     assert drive.state().condition is Condition.STOPPED
-    with pytest.raises(Refused, match="set_frequency"):
+    with pytest.raises(WriteForbidden, match="set_frequency"):
         drive.start()
     assert len(line.written) == sent
     assert not sim.motor.energised
@@ -535,7 +535,7 @@ def test_two_clients_on_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
     line, drive, sim = one(monkeypatch, YD1000(1))
     drive.set_frequency(10)
     sim["frequency"] = 60.0
-    with pytest.raises(Refused, match=r"holds 60\.00 Hz and not 10\.00 Hz"):
+    with pytest.raises(WriteForbidden, match=r"holds 60\.00 Hz and not 10\.00 Hz"):
         drive.start()
     assert starts(line, "yd1000") == []
     assert not sim.motor.energised
@@ -549,7 +549,9 @@ def test_a_setpoint_that_is_clamped_is_told_with_what_was_taken(monkeypatch: pyt
         "accept",
         lambda sim, cell, raw: min(raw, 300) if cell.name == "frequency" else accept(sim, cell, raw),
     )
-    with pytest.raises(NotDone, match=r"frequency = 45\.0 Hz did not take effect: the drive holds 30\.0 Hz"):
+    with pytest.raises(
+        NotVerified, match=r"frequency = 45\.0 Hz did not take effect: the drive holds 30\.0 Hz"
+    ):
         drive.set_frequency(45)
     assert line.written == ["01 06 00 02 01 C2 A8 0B"]
 
@@ -562,7 +564,7 @@ def test_a_setpoint_loop_to_an_eeprom_is_stopped_with_advice(monkeypatch: pytest
     line, drive, sim = one(monkeypatch, DelixiModbus(1))
     drive.set_frequency(10.0)
     for step in range(60):  # a minute at 1 Hz
-        with pytest.raises(Refused, match=r"written once in 60 s at most; .*kept in RAM.*P00\.02"):
+        with pytest.raises(WriteForbidden, match=r"written once in 60 s at most; .*kept in RAM.*P00\.02"):
             drive.set_frequency(10.1 + 0.1 * (step % 9))
         line.sleep(1.0 - 0.04)
     assert sim.counters.eeprom_writes["frequency"] == 1
@@ -577,7 +579,7 @@ def test_the_budget_of_a_year(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -
     line, drive, sim = one(monkeypatch, ErmanERG220(1), ledger=Ledger(tmp_path / "wear", budget=20))
     for step in range(20):  # unknown storage: budgeted, and not held to once a minute
         drive.set_frequency(10 + step)
-    with pytest.raises(Refused, match=r'written 20 times in a year.*ram = \["frequency"\].*b\.007'):
+    with pytest.raises(WriteForbidden, match=r'written 20 times in a year.*ram = \["frequency"\].*b\.007'):
         drive.set_frequency(45)
     assert sim.counters.eeprom_writes["frequency"] == 20
     line.sleep(366 * 86400)
@@ -632,9 +634,9 @@ def test_a_broadcast_is_refused_on_a_mixed_line_and_for_all_but_stop_and_zero(
     line = SimulatedBus(monkeypatch, *sims)
     first, _ = (line.attach(sim.drive) for sim in sims)
     for value in set(CHEControl) - {CHEControl.STOP}:
-        with pytest.raises(Refused, match="no harmless broadcast"):
+        with pytest.raises(WriteForbidden, match="no harmless broadcast"):
             line.bus.broadcast(first.control, value)
-    with pytest.raises(Refused, match="no harmless broadcast"):
+    with pytest.raises(WriteForbidden, match="no harmless broadcast"):
         line.bus.broadcast(first.setpoint, 50.0)
     assert line.written == []
     found = line.bus.broadcast(first.setpoint, 0.0)
@@ -644,7 +646,7 @@ def test_a_broadcast_is_refused_on_a_mixed_line_and_for_all_but_stop_and_zero(
         "invt-che@2": Condition.STOPPED,
     }
     line.attach(InnovertIBD(3))
-    with pytest.raises(Refused, match="differ in family"):
+    with pytest.raises(WriteForbidden, match="differ in family"):
         line.bus.broadcast(first.control, CHEControl.STOP)
     assert len(line.written) == 1
 
@@ -784,7 +786,7 @@ def test_a_staggered_start_stops_what_it_started_at_the_first_failure(
     line.bus.stop_all()
     sims[1].trip(4)
     line.frames.clear()
-    with pytest.raises(Refused, match="OC1"):
+    with pytest.raises(WriteForbidden, match="OC1"):
         start_staggered(drives, 2.0)
     assert [each[:17] for each in starts(line, "invt-che")] == ["01 06 10 00 00 01"]
     assert all_stopped(line, sims)
@@ -817,7 +819,7 @@ def test_all_that_was_started_is_stopped_though_the_system_gives_no_thread(
     line.loses = lambda request: request.address == 1 and bool(starts(line, "invt-che")[1:])
     sims[2].trip(4)
     monkeypatch.setattr(threading, "Thread", NoThread)
-    with pytest.raises(Refused, match="OC1"):
+    with pytest.raises(WriteForbidden, match="OC1"):
         start_staggered(drives, 2.0)
     sent = [frame[:17] for frame in line.written]
     assert not any(sim.motor.goal for sim in sims)
@@ -844,7 +846,7 @@ def test_a_ramp_goes_no_faster_than_the_drive(monkeypatch: pytest.MonkeyPatch) -
 
 def test_a_ramp_without_a_known_acceleration_needs_a_rate(monkeypatch: pytest.MonkeyPatch) -> None:
     line, drive, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
-    with pytest.raises(Refused, match="give a rate"):
+    with pytest.raises(WriteForbidden, match="give a rate"):
         ramp(drive, 20.0)
     ramp(drive, 2.0, rate=2.0)
     assert [int(each[12:17].replace(" ", ""), 16) for each in line.written] == [200, 400]  # 0.01 % of 50 Hz
@@ -869,7 +871,7 @@ def test_a_ramp_looks_at_the_drive_s_own_limit_first(monkeypatch: pytest.MonkeyP
     line, drive, _ = one(monkeypatch, YD1000(1))
     drive.set_frequency(10)
     line.frames.clear()
-    with pytest.raises(Refused, match=r"82\.50 Hz is above maximum_frequency, which is 80 Hz"):
+    with pytest.raises(WriteForbidden, match=r"82\.50 Hz is above maximum_frequency, which is 80 Hz"):
         ramp(drive, 82.5)
     assert line.written == []
 
@@ -891,7 +893,7 @@ def test_a_ramp_goes_on_from_no_setpoint_that_is_in_doubt(monkeypatch: pytest.Mo
     with pytest.raises(Unconfirmed):
         line.bus.write(drive, drive.frequency, 10.0)
     for act in (lambda: ramp(drive, 14, rate=4.0), drive.start):
-        with pytest.raises(Refused, match="cannot say its setpoint"):
+        with pytest.raises(WriteForbidden, match="cannot say its setpoint"):
             act()
 
 
@@ -899,7 +901,7 @@ def test_a_ramp_goes_on_from_no_setpoint_before_a_broadcast(monkeypatch: pytest.
     line, drive, _ = one(monkeypatch, InnovertIBD(1, confirmed=1))
     drive.set_frequency(40)
     line.bus.broadcast(drive.frequency, 0)
-    with pytest.raises(Refused, match="cannot say its setpoint"):
+    with pytest.raises(WriteForbidden, match="cannot say its setpoint"):
         ramp(drive, 14, rate=4.0)
 
 
@@ -916,7 +918,9 @@ class ShareToy(Toy):
 
 def test_a_ramp_of_a_share_of_nobody_knows_what_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     line = SimulatedBus(monkeypatch, simulated(ShareToy(1)))
-    with pytest.raises(Refused, match=r"is in %: a ramp needs maximum_frequency, which is not declared"):
+    with pytest.raises(
+        WriteForbidden, match=r"is in %: a ramp needs maximum_frequency, which is not declared"
+    ):
         ramp(line.attach(ShareToy(1, name="toy")), 20.0, rate=5.0)
     assert line.written == []
 
@@ -946,14 +950,16 @@ def test_a_ramp_by_an_alias_in_ram_wears_nothing(monkeypatch: pytest.MonkeyPatch
 def test_a_ramp_from_a_setpoint_that_nobody_knows_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     line = SimulatedBus(monkeypatch)
     toy = line.attach(Toy(1, name="toy"))
-    with pytest.raises(Refused, match=r"^toy cannot say its setpoint: call set_frequency before a ramp$"):
+    with pytest.raises(
+        WriteForbidden, match=r"^toy cannot say its setpoint: call set_frequency before a ramp$"
+    ):
         ramp(toy, 20.0, rate=5.0)
     assert line.frames == []
 
 
 def test_a_ramp_to_an_eeprom_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     line, drive, _ = one(monkeypatch, DelixiModbus(1))
-    with pytest.raises(Refused, match="EEPROM"):
+    with pytest.raises(WriteForbidden, match="EEPROM"):
         ramp(drive, 20.0)
     assert line.written == []
 
@@ -975,7 +981,7 @@ def test_a_ramp_to_a_command_in_eeprom_is_refused_before_its_first_step(
     toy = line.attach(KeptToy(1))
     toy.set_frequency(5)
     line.frames.clear()
-    with pytest.raises(Refused, match="which a ramp would wear out"):
+    with pytest.raises(WriteForbidden, match="which a ramp would wear out"):
         ramp(toy, 20.0, rate=5.0)
     assert line.written == []
 
@@ -1161,7 +1167,7 @@ def test_a_look_at_an_identity_that_would_write_is_refused(monkeypatch: pytest.M
 
     line = SimulatedBus(monkeypatch, simulated(Meddler(1)))
     drive = line.attach(Meddler(1, name="meddler"))
-    with pytest.raises(Refused, match=r"^meddler: a look at its identity must not write$"):
+    with pytest.raises(WriteForbidden, match=r"^meddler: a look at its identity must not write$"):
         drive.set_frequency(20.0)
     assert line.frames == []
 
@@ -1177,7 +1183,7 @@ def test_what_changes_only_at_rest_is_not_written_where_nobody_can_say_what_rest
 
     line = SimulatedBus(monkeypatch, simulated(Mute(1)))
     drive = line.attach(Mute(1, name="mute"))
-    with pytest.raises(Refused) as refusal:
+    with pytest.raises(WriteForbidden) as refusal:
         line.bus.write(drive, Mute.ratio, 3)
     assert str(refusal.value) == (
         "ratio of mute is not written: it changes only while the motor stands, which the family cannot say"

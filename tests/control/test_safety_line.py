@@ -16,7 +16,7 @@ from motors import MAKE, ReceivedRequests
 
 from multidrop.bus import Bus
 from multidrop.drive import Condition, Drive, read
-from multidrop.errors import NoReply, NotDone, Refused, Unconfirmed
+from multidrop.errors import NoReply, NotVerified, Unconfirmed, WriteForbidden
 from multidrop.families import YD1000, DelixiModbus, ErmanERG220, InnovertIBD, InvtCHE
 from multidrop.sim import MotorDrive, Simulator, Wire, simulated
 from multidrop.transport import peers
@@ -88,7 +88,7 @@ OTHERS: dict[str, tuple[Drive, Drive]] = {  # declared, and there: of one framin
 def test_a_drive_of_another_family_is_not_written_to(pair: str) -> None:
     declared, there = OTHERS[pair]
     with line(declared, there) as (drive, sim, received):
-        with pytest.raises((Refused, NoReply)):
+        with pytest.raises((WriteForbidden, NoReply)):
             drive.start()
         assert received.requests
         assert received.writes == []
@@ -98,7 +98,7 @@ def test_a_drive_of_another_family_is_not_written_to(pair: str) -> None:
 def test_a_goodrive_is_not_taken_for_a_che() -> None:
     with line(InvtCHE(1, maximum_frequency=50)) as (drive, sim, received):
         sim["device"] = GOODRIVE
-        with pytest.raises(Refused, match="010AH"):
+        with pytest.raises(WriteForbidden, match="010AH"):
             drive.start()
         assert received.writes == []
 
@@ -109,7 +109,7 @@ def test_a_setpoint_that_is_clamped_is_told_with_what_was_taken(monkeypatch: pyt
         monkeypatch.setattr(
             sim, "accept", lambda cell, raw: min(raw, 300) if cell.name == "frequency" else accept(cell, raw)
         )
-        with pytest.raises(NotDone, match=r"45\.0 Hz did not take effect: the drive holds 30\.0 Hz"):
+        with pytest.raises(NotVerified, match=r"45\.0 Hz did not take effect: the drive holds 30\.0 Hz"):
             drive.set_frequency(45)
         assert len(received.writes) == 1
 
@@ -119,9 +119,9 @@ def test_a_trip_while_starting(monkeypatch: pytest.MonkeyPatch) -> None:
         drive.set_frequency(20)
         run = sim.motor.run
         monkeypatch.setattr(sim.motor, "run", lambda direction: sim.trip(4))
-        with pytest.raises(NotDone, match=r"tripped: overcurrent while accelerating .OC1"):
+        with pytest.raises(NotVerified, match=r"tripped: overcurrent while accelerating .OC1"):
             drive.start()
-        with pytest.raises(Refused, match=r"OC1.*reset_fault"):
+        with pytest.raises(WriteForbidden, match=r"OC1.*reset_fault"):
             drive.start()
         monkeypatch.setattr(sim.motor, "run", run)
         drive.reset_fault()
@@ -147,7 +147,7 @@ def test_a_power_cycle_in_mid_ramp() -> None:
             drive.state()
         sim.deaf_until = 0.0
         until(lambda: _condition(drive) is Condition.STOPPED)
-        with pytest.raises(Refused, match="set_frequency"):
+        with pytest.raises(WriteForbidden, match="set_frequency"):
             drive.start()
         assert len(received.writes) == sent
         assert not sim.motor.energised

@@ -24,7 +24,7 @@ from shared_pair import SharedPair, shared
 from multidrop.bus import Bus
 from multidrop.core import Framing, Message, parse_request
 from multidrop.drive import Condition
-from multidrop.errors import BusError, DriveRefused, NotDone, Refused, Unconfirmed
+from multidrop.errors import BusError, DriveException, NotVerified, Unconfirmed, WriteForbidden
 from multidrop.families import InvtCHE
 from multidrop.sim import MotorDrive, Simulator, Wire, simulated
 from multidrop.transport import peers
@@ -131,7 +131,7 @@ def test_starts_and_stops_while_another_client_talks(model: str) -> None:
             assert carried_out <= sent <= 1
             if failure is None:
                 assert carried_out == 1
-            elif not isinstance(failure, (Unconfirmed, NotDone)):
+            elif not isinstance(failure, (Unconfirmed, NotVerified)):
                 assert carried_out == 0, f"{failure!r}, and it started"
             until(lambda: attempt(drive.stop) is None)
             until(lambda: not first.sim.motor.energised)
@@ -172,7 +172,7 @@ SAYS: dict[str, bytes] = {
     "an exception of the other drive": rtu("02 86 12"),
     "an exception to another function": rtu("01 83 02"),
 }
-FAILURES = {"ours with one bit turned": DriveRefused}  # a CHE answers it with exception 11H
+FAILURES = {"ours with one bit turned": DriveException}  # a CHE answers it with exception 11H
 PULSES = {"start": START, "jog": JOG, "reset_fault": RESET}
 
 
@@ -256,6 +256,6 @@ def test_another_client_s_setpoint_is_seen_before_the_start() -> None:
     with shared_line("invt-che", seed=3) as (drive, pair, received), Bus(pair.theirs) as other:
         set_frequency(drive, 20)
         set_frequency(other.attach(InvtCHE(1, maximum_frequency=50)), 50)
-        with pytest.raises(Refused, match=r"holds 100\.00 % and not 40\.00 %"):
+        with pytest.raises(WriteForbidden, match=r"holds 100\.00 % and not 40\.00 %"):
             drive.start()
         assert not received[0].starts

@@ -27,7 +27,7 @@ from multidrop.control.ramp import start_staggered
 from multidrop.control.stop_attempt import LEAST_S, StopAttempt
 from multidrop.core import Completion, Exchange
 from multidrop.drive import Script, verb
-from multidrop.errors import Overtaken, Refused, Unconfirmed
+from multidrop.errors import CancelledByStop, Unconfirmed, WriteForbidden
 from multidrop.families import InvtCHE
 from multidrop.sim import simulated
 from multidrop.transport import clock
@@ -129,7 +129,7 @@ def test_a_stop_that_a_signal_s_handler_calls_ends_the_start_that_it_interrupts(
     stop = line.bus.stop_all if verb == "stop_all" else getattr(drive, verb)
     start, first = drive.start, 9  # the opcodes before read how many stops were called
     for nth in chain(range(first, first + 80, 4), count(first + 80, 499)):
-        with calling_at(nth, is_ours, stop) as place, suppress(Overtaken, Unconfirmed):
+        with calling_at(nth, is_ours, stop) as place, suppress(CancelledByStop, Unconfirmed):
             start()
         if not place:
             break
@@ -213,7 +213,7 @@ def test_a_failed_staggered_start_stops_each_though_the_stop_of_one_raises_anyth
     line.bus.stop_all()
     drives[0].begin_stop = raises
     sims[2].trip(4)
-    with pytest.raises(Refused, match="OC1"):
+    with pytest.raises(WriteForbidden, match="OC1"):
         start_staggered(drives, 2.0)
     assert [bool(sim.motor.goal) for sim in sims] == [True, False, False]
 

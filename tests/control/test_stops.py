@@ -29,14 +29,14 @@ from multidrop.drive.table import Kept
 from multidrop.drive.verbs import verb
 from multidrop.errors import (
     BusError,
+    CancelledByStop,
     Expired,
     LineError,
     NoReply,
     NotAttached,
-    Overtaken,
     PortLost,
-    Refused,
     Unconfirmed,
+    WriteForbidden,
 )
 from multidrop.families import YD1000, DelixiModbus, ErmanERG220, InnovertIBD, InvtCHE
 from multidrop.families.invt_che import CHEControl
@@ -182,7 +182,7 @@ def test_nothing_moves_after_a_stop_wherever_it_came_in_a_start(
         assert meanwhile.failure is None
         start = first(line, begun, STARTS[model])
         assert start is None or start < frames
-        assert isinstance(failure, Overtaken if start is None else Unconfirmed), (frames, failure)
+        assert isinstance(failure, CancelledByStop if start is None else Unconfirmed), (frames, failure)
         if act in ("stop", "stop_all"):
             stop = first(line, begun, STOPS[model])
             assert stop is not None
@@ -203,7 +203,7 @@ def test_the_other_stops_win_too(
         getattr(drive, verb_name)()
 
     line, _, _, begun, failure = started_while(monkeypatch, tmp_path, model, 1, act)
-    assert isinstance(failure, Overtaken)
+    assert isinstance(failure, CancelledByStop)
     assert "a stop was called; nothing more was sent" in str(failure)
     assert first(line, begun, STARTS[model]) is None
 
@@ -233,7 +233,7 @@ def test_what_is_called_while_a_stop_is_under_way_is_not_sent(monkeypatch: pytes
     begun = len(line.frames)
     meanwhile = Meanwhile(line, 2, drive.start)
     drive.stop()
-    assert isinstance(meanwhile.failure, Overtaken)
+    assert isinstance(meanwhile.failure, CancelledByStop)
     assert first(line, begun, STARTS["invt-che"]) is None
     assert not sim.motor.energised
 
@@ -243,7 +243,7 @@ def test_a_ramp_ends_with_a_stop(monkeypatch: pytest.MonkeyPatch) -> None:
     drive.set_frequency(10)
     begun = len(line.frames)
     meanwhile = Meanwhile(line, 8, drive.stop)
-    with pytest.raises(Overtaken):
+    with pytest.raises(CancelledByStop):
         ramp(drive, 60.0)
     assert meanwhile.has_come
     stop = first(line, begun, STOPS["yd1000"])
@@ -266,7 +266,7 @@ def test_a_staggered_start_ends_with_a_stop_of_all(monkeypatch: pytest.MonkeyPat
         return perform(script)
 
     monkeypatch.setattr(drives[1], "perform", stop_meanwhile)
-    with pytest.raises(Overtaken):
+    with pytest.raises(CancelledByStop):
         start_staggered(drives, 1.0)
     assert not any(sim.motor.energised for sim in sims)
 
@@ -283,7 +283,7 @@ def test_after_closing_nothing_that_moves_is_sent(monkeypatch: pytest.MonkeyPatc
         lambda: line.bus.write(drive, drive.setpoint, 10.0),
         lambda: line.bus.raw(drive, 6, 0x1000, b"\0\1"),
     ):
-        with pytest.raises(Overtaken, match="the bus was left"):
+        with pytest.raises(CancelledByStop, match="the bus was left"):
             call()
     assert writes(line, begun) == []
 
@@ -381,7 +381,9 @@ def test_a_drive_that_ever_failed_to_answer_proves_nothing(monkeypatch: pytest.M
 def test_a_stop_that_is_withheld_says_what_to_do(monkeypatch: pytest.MonkeyPatch) -> None:
     line, drive, sim = one(monkeypatch, InvtCHE(1))
     sim["device"] = 0x010A
-    with pytest.raises(Refused, match=r"no stop was sent .* said twice .*010AH.* Use the hard-wired stop"):
+    with pytest.raises(
+        WriteForbidden, match=r"no stop was sent .* said twice .*010AH.* Use the hard-wired stop"
+    ):
         drive.stop()
     assert line.written == []
     sim["device"] = 0x0101
@@ -405,7 +407,7 @@ def test_the_stop_of_the_family_that_it_looks_like_is_offered(
     sim = simulated(there)
     line = SimulatedBus(monkeypatch, sim)
     drive = line.attach(declared)
-    with pytest.raises(Refused, match=f"multidrop stop PORT {there.model} 1"):
+    with pytest.raises(WriteForbidden, match=f"multidrop stop PORT {there.model} 1"):
         drive.stop()
     assert line.written == []
     line.bus.detach(drive)
@@ -444,7 +446,7 @@ def test_one_value_that_does_not_fit_its_family_withholds_a_start_and_no_stop(
 ) -> None:
     line, drive, _ = one(monkeypatch, MAKE[model](1))
     shows(line, drive, name, count)
-    with pytest.raises(Refused):
+    with pytest.raises(WriteForbidden):
         drive.set_frequency(20)
     assert line.written == []
     if how == "stop":
@@ -740,7 +742,7 @@ def test_a_plain_stop_is_withheld_where_another_family_answers_twice(
     if suspicions == 1:
         line.bus.write(drive, drive.control, CHEControl.STOP)
     else:
-        with pytest.raises(Refused, match="no stop was sent"):
+        with pytest.raises(WriteForbidden, match="no stop was sent"):
             line.bus.write(drive, drive.control, CHEControl.STOP)
     assert len(line.written) == 2 - suspicions
 
@@ -871,7 +873,7 @@ def test_a_write_that_a_stop_keeps_back_is_not_counted(
         ledger = Ledger(tmp_path / f"wear-{frames}")
         line, drive, sim = one(monkeypatch, DelixiModbus(1), ledger=ledger)
         meanwhile = Meanwhile(line, frames, lambda drive=drive: drive.stop())
-        with suppress(Overtaken):
+        with suppress(CancelledByStop):
             line.bus.write(drive, drive.frequency, 12.0)
         written = sim.counters.eeprom_writes["frequency"]
         assert sum(wear.writes for wear in ledger.wear(line.seconds)) == written

@@ -18,7 +18,7 @@ from multidrop.bus import Bus
 from multidrop.control.audit_log import read_audit
 from multidrop.core import Message
 from multidrop.drive import Condition
-from multidrop.errors import BusError, LineError, NoReply, Overtaken, PortLost, Unconfirmed
+from multidrop.errors import BusError, CancelledByStop, LineError, NoReply, PortLost, Unconfirmed
 from multidrop.poller import Poller
 from multidrop.polling.reopening import Reopening
 from multidrop.sim import MotorDrive, Simulator, Wire, simulated
@@ -127,7 +127,7 @@ def test_a_stop_of_another_thread_ends_a_start_that_is_waiting_in_its_looks(mode
         drive.stop()
         stopped.set()
         starting.join(PATIENCE)
-        assert [type(failure) for failure in failures] in ([Overtaken], [Unconfirmed])
+        assert [type(failure) for failure in failures] in ([CancelledByStop], [Unconfirmed])
         until(lambda: not received.sim.motor.energised)
 
 
@@ -257,7 +257,7 @@ def test_nothing_is_sent_to_a_drive_while_its_stop_is_repeated() -> None:
         stopping, _ = in_thread(lambda: drive.stop(seconds=1))
         until(lambda: any(write.data == b"\0\5" for write in received.writes))
         for call in (drive.start, lambda: drive.set_frequency(30)):
-            with pytest.raises((Overtaken, NoReply)):
+            with pytest.raises((CancelledByStop, NoReply)):
                 call()
         stopping.join(PATIENCE)
         assert received.starts == []

@@ -7,7 +7,7 @@ from simulated_bus import SimulatedBus, is_write, one
 
 from multidrop.control.outcome import Seen
 from multidrop.core import Message, build_reply
-from multidrop.errors import DriveRefused
+from multidrop.errors import DriveException
 from multidrop.families import YD1000, InnovertIBD
 from multidrop.sim import simulated
 
@@ -87,6 +87,6 @@ def test_a_stop_that_the_drive_refuses_each_time_is_not_told_as_unsent(
     found = line.bus.stop_all(seconds=2)[drive.name]
     assert found.seen is Seen.REFUSED
     assert str(found).startswith(f"{drive.name}: refused by the drive after 2.")
-    with pytest.raises(DriveRefused):
+    with pytest.raises(DriveException):
         drive.stop(seconds=1)
     assert any(text.startswith(f"{drive.name}: the stop was sent, and is not confirmed yet") for text in told)

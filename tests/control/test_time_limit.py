@@ -15,7 +15,7 @@ from multidrop.drive import Direction, Drive, Script, read, wait, write
 from multidrop.drive.declare import reading, setting
 from multidrop.drive.table import Kept
 from multidrop.drive.verbs import verb
-from multidrop.errors import Expired, Overtaken
+from multidrop.errors import CancelledByStop, Expired
 from multidrop.families import InvtCHE
 from multidrop.sim import simulated
 
@@ -141,7 +141,7 @@ def test_the_limit_is_asked_for_when_a_stop_would_end_the_call(line: SimulatedBu
         drive.stop()  # at the latest moment
         return inf
 
-    with written_before(limit), pytest.raises(Overtaken):
+    with written_before(limit), pytest.raises(CancelledByStop):
         drive.set_frequency(20)
     assert written(line)[before:] == written(line)[-1:]  # the stop
 

@@ -24,7 +24,7 @@ from toy import Toy
 from multidrop.bus import Bus
 from multidrop.core import Field, NumberFormat, RowLayout, RowQueue, Status
 from multidrop.core.fork import only_here
-from multidrop.errors import LineError, NoReply, Overtaken
+from multidrop.errors import CancelledByStop, LineError, NoReply
 from multidrop.families import InvtCHE
 from multidrop.poller import Poller
 from multidrop.sim import MotorDrive, Simulator, Wire, simulated
@@ -161,7 +161,7 @@ def test_an_inherited_bus_says_that_it_is_its_parent_s(any_port: str) -> None:
             stopped = [each.why for each in bus.stop_all().values()]
             with pytest.raises(LineError) as failure:
                 current(bus)
-            with pytest.raises(Overtaken, match="the start was not sent: the bus was left"):
+            with pytest.raises(CancelledByStop, match="the start was not sent: the bus was left"):
                 bus.drives[0].start()
         return [*stopped, str(failure.value)]
 

@@ -21,7 +21,7 @@ from multidrop.drive.declare import command, reading, setting
 from multidrop.drive.register import Register
 from multidrop.drive.request import write_request
 from multidrop.drive.table import Carrier, Kept, Table
-from multidrop.errors import Refused
+from multidrop.errors import WriteForbidden
 from multidrop.sim import SimulatedDrive
 
 SEVERAL = Table("holding register, several at once", 0x03, 0x10)
@@ -132,7 +132,7 @@ def test_the_nearest_float32_is_what_was_taken(attached: Any, value: float) -> N
 def test_what_no_number_format_holds_is_refused(attached: Any, name: str, value: float) -> None:
     line, meter, _ = attached
     before = len(line.written)
-    with pytest.raises(Refused, match=rf"{name} (takes a finite number, not|= .* does not fit:)"):
+    with pytest.raises(WriteForbidden, match=rf"{name} (takes a finite number, not|= .* does not fit:)"):
         line.bus.write(meter, meter.register(name), value)
     assert len(line.written) == before
 
@@ -172,7 +172,7 @@ def test_a_half_float_is_shown_as_short_as_it_reads_back(capsys: pytest.CaptureF
 def test_an_end_of_a_span_that_no_float32_is_can_be_written(attached: Any) -> None:
     line, meter, _ = attached
     assert line.bus.write(meter, Meter.narrow, 0.1) == pytest.approx(0.1)
-    with pytest.raises(Refused, match=r"narrow = 0\.10001 is outside 0 to 0\.1 V"):
+    with pytest.raises(WriteForbidden, match=r"narrow = 0\.10001 is outside 0 to 0\.1 V"):
         line.bus.write(meter, Meter.narrow, 0.10001)
 
 
@@ -246,7 +246,7 @@ def test_a_step_may_be_negative(attached: Any) -> None:
     line, meter, sim = attached
     assert line.bus.write(meter, Meter.downwards, -5.0) == -5.0 == sim["downwards"]
     assert Meter.downwards.format(Meter.downwards.decode(0.0)) == "0.0 V"
-    with pytest.raises(Refused, match=r"downwards = 5 does not fit: -6553\.5 to 0 V$"):
+    with pytest.raises(WriteForbidden, match=r"downwards = 5 does not fit: -6553\.5 to 0 V$"):
         line.bus.write(meter, Meter.downwards, 5)
 
 

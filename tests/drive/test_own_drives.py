@@ -15,7 +15,7 @@ from multidrop.drive import Condition, Direction, Drive, Script, State, insist, 
 from multidrop.drive.declare import command, reading, setting
 from multidrop.drive.table import Kept
 from multidrop.drive.verbs import verb
-from multidrop.errors import DriveRefused, Refused, Unconfirmed
+from multidrop.errors import DriveException, Unconfirmed, WriteForbidden
 from multidrop.plant.loader import load_plant
 from multidrop.sim import simulated
 
@@ -75,7 +75,7 @@ class Known(Pump):
     def identify(self) -> Script[None]:
         """Its kind is 0."""
         if (yield from read(self.kind)) != 0:
-            raise Refused(f"{self.name} is no pump")
+            raise WriteForbidden(f"{self.name} is no pump")
 
 
 STOP, RUN = "01 06 00 30 00 00", "01 06 00 30 00 01"
@@ -99,7 +99,7 @@ def test_a_command_of_which_nothing_is_said_is_not_plainly_written(
 ) -> None:
     line = SimulatedBus(monkeypatch, simulated(Pump(1)))
     pump = line.attach(Pump(1, name="pump", confirmed=confirmed))
-    with pytest.raises(Refused) as refusal:
+    with pytest.raises(WriteForbidden) as refusal:
         line.bus.write(pump, pump.control, word)
     assert str(refusal.value) == (
         f"control of pump is not written: {word.name} commands the motor, which verbs alone do: "
@@ -118,7 +118,7 @@ def test_where_there_is_no_verb_its_author_is_told_what_to_say(monkeypatch: pyte
     line = SimulatedBus(monkeypatch, simulated(Bare(1)))
     bare = line.attach(Bare(1, confirmed=1))
     with pytest.raises(
-        Refused, match=r"its class does not say .*: declare harmless = \(…\), moves = False, or"
+        WriteForbidden, match=r"its class does not say .*: declare harmless = \(…\), moves = False, or"
     ):
         line.bus.write(bare, bare.run, 1)
     assert line.frames == []
@@ -133,7 +133,7 @@ def test_what_is_harmless_needs_no_confirmation(monkeypatch: pytest.MonkeyPatch)
     line = SimulatedBus(monkeypatch, simulated(Stoppable(1)))
     pump = line.attach(Stoppable(1))
     line.bus.write(pump, pump.control, Word.STOP)
-    with pytest.raises(Refused, match="RUN commands the motor"):
+    with pytest.raises(WriteForbidden, match="RUN commands the motor"):
         line.bus.write(pump, pump.control, Word.RUN)
     assert written(line) == [STOP]
 
@@ -152,7 +152,7 @@ def test_what_may_move_the_motor_of_an_unknown_drive_needs_its_owner_s_word(
 
     line = SimulatedBus(monkeypatch, simulated(Pump(1)))
     pump = line.attach(Pump(1, name="pump"))
-    with pytest.raises(Refused) as refusal:
+    with pytest.raises(WriteForbidden) as refusal:
         command_it(line, pump)
     assert str(refusal.value) == (
         f"{name} is not sent to pump: its class has no `identify` that could tell a Pump from another drive, "
@@ -188,7 +188,7 @@ def test_nor_is_it_commanded_by_what_is_made_of_verbs(monkeypatch: pytest.Monkey
 
     line = SimulatedBus(monkeypatch, simulated(Combined(1)))
     pump = line.attach(Combined(1, name="pump"))
-    with pytest.raises(Refused, match=r"is not sent to pump: .*declare confirmed = 1"):
+    with pytest.raises(WriteForbidden, match=r"is not sent to pump: .*declare confirmed = 1"):
         command_it(pump)
     assert line.frames == []
     line.bus.detach(pump)
@@ -243,7 +243,7 @@ def test_a_drive_s_own_meaning_of_05_is_a_refusal(monkeypatch: pytest.MonkeyPatc
     line = SimulatedBus(monkeypatch, simulated(Locked(1)))
     drive = line.attach(Locked(1))
     line.answers = acknowledged
-    with pytest.raises(DriveRefused, match="code 05H, locked by its password"):
+    with pytest.raises(DriveException, match="code 05H, locked by its password"):
         drive.start()
 
 
@@ -257,7 +257,7 @@ def test_a_setting_may_be_said_to_move_the_motor(monkeypatch: pytest.MonkeyPatch
     line = SimulatedBus(monkeypatch, simulated(Readable(1)))
     drive = line.attach(Readable(1, confirmed=1))
     for register, value in ((drive.control, Word.RUN), (drive.mode, 1)):
-        with pytest.raises(Refused, match="commands the motor"):
+        with pytest.raises(WriteForbidden, match="commands the motor"):
             line.bus.write(drive, register, value)
     line.bus.write(drive, drive.control, Word.STOP)
     assert len(line.written) == 1

@@ -14,7 +14,7 @@ from simulated_bus import SimulatedBus
 from tables import table
 
 from multidrop.core import Message
-from multidrop.drive import Drive, Refused, Script, read, verb
+from multidrop.drive import Drive, Script, WriteForbidden, read, verb
 from multidrop.drive.declaration_check import DeclarationError
 from multidrop.drive.declare import reading, setting
 from multidrop.drive.table import COIL, INPUT, Kept
@@ -79,7 +79,7 @@ class Known(Meter):
     def identify(self) -> Script[None]:
         """Ask for its maker."""
         if (found := (yield from read(self.maker))) != "ABB":
-            raise Refused(f"{self.name} is of {found}")
+            raise WriteForbidden(f"{self.name} is of {found}")
 
 
 @pytest.mark.parametrize("maker", ["ABB", "ABC"])
@@ -91,7 +91,7 @@ def test_a_text_says_what_a_device_is(monkeypatch: pytest.MonkeyPatch, maker: st
     if maker == "ABB":
         assert line.bus.write(drive, drive.limit, 3) == 3
     else:
-        with pytest.raises(Refused, match="em-1 is of ABC"):
+        with pytest.raises(WriteForbidden, match="em-1 is of ABC"):
             line.bus.write(drive, drive.limit, 3)
     assert (line.written != []) == (maker == "ABB")
 

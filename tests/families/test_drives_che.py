@@ -15,12 +15,12 @@ from multidrop.core import NumberFormat
 from multidrop.drive import (
     Condition,
     Direction,
-    DriveRefused,
-    NotDone,
-    Refused,
+    DriveException,
+    NotVerified,
     State,
     Unconfirmed,
     Unsupported,
+    WriteForbidden,
 )
 from multidrop.drive.table import HOLDING, Kept
 from multidrop.errors import BadReply, BusError, NoReply
@@ -144,7 +144,7 @@ def test_start_without_a_direction_does_not_turn_a_running_motor_round() -> None
 @pytest.mark.parametrize("direction", [None, *Direction])
 def test_a_motor_that_may_turn_is_not_jogged(status: int, sentence: str, direction: Direction | None) -> None:
     wire = Wire(InvtCHE(1), {**STANDBY, "status": status})
-    with pytest.raises(Refused, match=sentence):
+    with pytest.raises(WriteForbidden, match=sentence):
         wire.drive.jog(direction)
     assert wire.sent == []
 
@@ -153,7 +153,7 @@ def test_a_motor_that_may_turn_is_not_jogged(status: int, sentence: str, directi
 def test_a_state_that_is_not_explained_is_not_started_from(direction: Direction | None) -> None:
     """The manual has 1 to 4 at 1001H: 5 may be anything, and the motor may turn the other way."""
     wire = Wire(InvtCHE(1), {**STANDBY, "status": 5})
-    with pytest.raises(Refused, match="has 0005H at 1001H, which is not explained"):
+    with pytest.raises(WriteForbidden, match="has 0005H at 1001H, which is not explained"):
         wire.drive.start(direction)
     assert wire.sent == []
 
@@ -189,7 +189,7 @@ def test_a_motor_that_coasts_on_is_told_of() -> None:
 
 
 def test_a_jog_is_stopped_also_where_the_stop_is_refused() -> None:
-    refusal = DriveRefused("drive", 0x12, "")
+    refusal = DriveException("drive", 0x12, "")
     turns = {STOP_JOG: {"status": CHEStatus.STANDBY}}
     wire = Wire(InvtCHE(1), {"status": CHEStatus.FORWARD}, {STOP: [refusal] * 3}, turns)
     wire.drive.stop()
@@ -208,7 +208,7 @@ def test_a_jog_is_stopped_also_where_nobody_confirms_the_stop() -> None:
 
 @pytest.mark.parametrize(
     "unseen",
-    [NoReply("drive"), BadReply("drive", "checksum", b""), DriveRefused("drive", 6, "busy")],
+    [NoReply("drive"), BadReply("drive", "checksum", b""), DriveException("drive", 6, "busy")],
     ids=lambda unseen: type(unseen).__name__,
 )
 def test_a_jog_is_stopped_also_where_nobody_says_whether_the_motor_turns(unseen: BusError) -> None:
@@ -219,14 +219,16 @@ def test_a_jog_is_stopped_also_where_nobody_says_whether_the_motor_turns(unseen:
 
 
 def test_no_jog_is_stopped_where_another_drive_is_there() -> None:
-    wire = Wire(InvtCHE(1), {"status": CHEStatus.FORWARD}, {STOP: [Refused("another family is there")]})
-    with pytest.raises(Refused, match="another family"):
+    wire = Wire(
+        InvtCHE(1), {"status": CHEStatus.FORWARD}, {STOP: [WriteForbidden("another family is there")]}
+    )
+    with pytest.raises(WriteForbidden, match="another family"):
         wire.drive.stop()
     assert wire.sent == [STOP]
 
 
 def test_a_run_whose_drive_has_no_jog_to_stop_is_watched() -> None:
-    refusal = DriveRefused("drive", 0x12, "")
+    refusal = DriveException("drive", 0x12, "")
     says = {"status": [CHEStatus.FORWARD] * 4 + [CHEStatus.STANDBY]}
     wire = Wire(InvtCHE(1), says, {STOP_JOG: [refusal] * 3})
     wire.drive.stop()
@@ -234,12 +236,12 @@ def test_a_run_whose_drive_has_no_jog_to_stop_is_watched() -> None:
 
 
 def test_a_stop_may_be_refused_by_a_drive_that_stands() -> None:
-    refusal = DriveRefused("drive", 1, "")
+    refusal = DriveException("drive", 1, "")
     wire = Wire(InvtCHE(1), {"status": CHEStatus.FAULT}, {STOP: [refusal] * 3})
     wire.drive.stop()
-    loses = {STOP: [refusal] * 3, STOP_JOG: [DriveRefused("drive", 0x12, "")] * 3}
+    loses = {STOP: [refusal] * 3, STOP_JOG: [DriveException("drive", 0x12, "")] * 3}
     wire = Wire(InvtCHE(1), {"status": CHEStatus.FORWARD}, loses)
-    with pytest.raises(DriveRefused) as told:
+    with pytest.raises(DriveException) as told:
         wire.drive.stop()
     assert told.value is refusal
     wire = Wire(InvtCHE(1), {"status": [CHEStatus.FORWARD, CHEStatus.STANDBY]}, loses)
@@ -263,16 +265,16 @@ def test_a_fault_is_reset_before_a_start_and_not_by_it() -> None:
     says = {**STANDBY, "status": CHEStatus.FAULT, "fault": CHEFault.OC1_OVERCURRENT_ACCELERATING}
     wire = Wire(InvtCHE(1), says, turns=TURNS)
     for verb in (wire.drive.start, wire.drive.jog):
-        with pytest.raises(Refused, match=r"overcurrent while accelerating.*reset_fault"):
+        with pytest.raises(WriteForbidden, match=r"overcurrent while accelerating.*reset_fault"):
             verb()
     assert wire.sent == []
     wire.drive.reset_fault()
     assert wire.sent == [RESET]
     stubborn = Wire(InvtCHE(1), says)
-    with pytest.raises(NotDone, match="overcurrent while accelerating"):
+    with pytest.raises(NotVerified, match="overcurrent while accelerating"):
         stubborn.drive.reset_fault()
     assert stubborn.sent == [RESET]
-    with pytest.raises(Refused, match="runs"):
+    with pytest.raises(WriteForbidden, match="runs"):
         Wire(InvtCHE(1), {"status": CHEStatus.FORWARD}).drive.reset_fault()
 
 
@@ -281,7 +283,7 @@ def test_a_trip_while_starting_is_told(name: str, word: CHEControl) -> None:
     tripped = {"status": CHEStatus.FAULT, "fault": CHEFault.OC1_OVERCURRENT_ACCELERATING}
     sent = frame(InvtCHE(1), InvtCHE.control, word)
     wire = Wire(InvtCHE(1), STANDBY, turns={sent: tripped})
-    with pytest.raises(NotDone, match="tripped: overcurrent while accelerating"):
+    with pytest.raises(NotVerified, match="tripped: overcurrent while accelerating"):
         getattr(wire.drive, name)()
     assert wire.sent == [sent]
 
@@ -296,9 +298,9 @@ def test_the_setpoint_is_a_percentage_of_the_maximum_frequency() -> None:
             wire.drive.set_frequency(wrong)
     wire.held.clear()
     wire.says["setpoint"] = [30.0]
-    with pytest.raises(NotDone, match=r"30\.00 %"):
+    with pytest.raises(NotVerified, match=r"30\.00 %"):
         wire.drive.set_frequency(40)
-    with pytest.raises(Refused, match="maximum_frequency"):
+    with pytest.raises(WriteForbidden, match="maximum_frequency"):
         Wire(InvtCHE(1)).drive.set_frequency(40)
 
 
@@ -339,7 +341,7 @@ def test_state(says: dict[str, object], state: State) -> None:
 def test_identify_refuses_what_is_no_che() -> None:
     for device in (0x0101, 0x0102):
         Wire(InvtCHE(1), {"device": InvtCHE.device.decode(device)}).drive.identify()
-    with pytest.raises(Refused, match="010AH"):
+    with pytest.raises(WriteForbidden, match="010AH"):
         Wire(InvtCHE(1), {"device": InvtCHE.device.decode(0x010A)}).drive.identify()
 
 
@@ -378,7 +380,7 @@ def test_a_parameter_may_be_declared_as_stored(monkeypatch: pytest.MonkeyPatch, 
     assert ledger.wear(line.seconds) == []
     line.bus.write(drive, drive.jump, 0x1388)
     assert line.written[-1] == "02 06 00 08 13 88 05 6D"  # worked out by hand from section 11.6.2
-    with pytest.raises(Refused, match="less often"):
+    with pytest.raises(WriteForbidden, match="less often"):
         line.bus.write(drive, drive.jump, 0x1389)
     assert sim.counters.eeprom_writes == {"jump": 1}
 
@@ -391,7 +393,7 @@ def test_a_jog_that_a_start_may_not_end_is_stopped_first() -> None:
         turns={**TURNS, jog: {"status": CHEStatus.FORWARD}, STOP: {"status": CHEStatus.STANDBY}},
     )
     wire.drive.jog()
-    with pytest.raises(Refused, match=r"may still jog.*call stop\(\) first"):
+    with pytest.raises(WriteForbidden, match=r"may still jog.*call stop\(\) first"):
         wire.drive.start()
     wire.drive.stop()
     wire.drive.start()

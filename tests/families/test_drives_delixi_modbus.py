@@ -7,7 +7,16 @@ from delixi_tables import MONITORS
 from scripts import Wire, frame, rows, typed
 from tables import table
 
-from multidrop.drive import Condition, Direction, Framing, NotDone, Refused, State, Unconfirmed, Unsupported
+from multidrop.drive import (
+    Condition,
+    Direction,
+    Framing,
+    NotVerified,
+    State,
+    Unconfirmed,
+    Unsupported,
+    WriteForbidden,
+)
 from multidrop.drive.table import HOLDING, Kept
 from multidrop.families.delixi_modbus import DelixiModbus, DelixiModbusControl
 from multidrop.families.delixi_parameters import DelixiBaudrate, DelixiFault, DelixiRunSource
@@ -69,7 +78,7 @@ def test_a_jog_that_a_start_may_not_end_is_stopped_first() -> None:
     jog = frame(DelixiModbus(1), DelixiModbus.control, DelixiModbusControl.JOG_FORWARD)
     wire = Wire(DelixiModbus(1), STANDING, turns={jog: TURNING} | TURNS)
     wire.drive.jog()
-    with pytest.raises(Refused, match=r"may still jog.*call stop\(\) first"):
+    with pytest.raises(WriteForbidden, match=r"may still jog.*call stop\(\) first"):
         wire.drive.start(Direction.FORWARD)
     wire.drive.stop()
     wire.drive.start(Direction.FORWARD)
@@ -102,7 +111,7 @@ def test_jog_has_its_direction_too() -> None:
     wire = Wire(DelixiModbus(1), STANDING, turns=dict.fromkeys(jogs, TURNING))
     wire.drive.jog()
     for direction in Direction:
-        with pytest.raises(Refused, match=r"turns, and may go on through a jog: call stop\(\) first"):
+        with pytest.raises(WriteForbidden, match=r"turns, and may go on through a jog: call stop\(\) first"):
             wire.drive.jog(direction)
     wire.say(STANDING)
     wire.drive.jog(Direction.REVERSE)
@@ -119,7 +128,7 @@ def test_a_motor_that_is_not_seen_to_run_is_told_of(name: str) -> None:
 
 def test_a_motor_that_turns_is_not_started_without_a_direction() -> None:
     wire = Wire(DelixiModbus(1), {**STANDING, **TURNING})
-    with pytest.raises(Refused, match="name the direction"):
+    with pytest.raises(WriteForbidden, match="name the direction"):
         wire.drive.start()
     assert wire.sent == []
     wire.drive.start(Direction.FORWARD)
@@ -140,7 +149,7 @@ def test_the_only_setpoint_wears_the_eeprom() -> None:
     assert DelixiModbus.frequency.kept is Kept.EEPROM
     assert "EEPROM" in DelixiModbus.frequency.note
     wire = Wire(DelixiModbus(1), {"frequency": 40.0})
-    with pytest.raises(NotDone, match=r"holds 40\.00 Hz"):
+    with pytest.raises(NotVerified, match=r"holds 40\.00 Hz"):
         wire.drive.set_frequency(50)
 
 
@@ -167,7 +176,7 @@ def test_identify() -> None:
         ("address_setting", 2, r"P04\.30"),
         ("baudrate_setting", DelixiBaudrate.B1200, r"P04\.28"),
     ):
-        with pytest.raises(Refused, match=sentence):
+        with pytest.raises(WriteForbidden, match=sentence):
             Wire(DelixiModbus(1), {**STANDING, name: other}).drive.identify()
 
 
@@ -182,7 +191,7 @@ def test_identify() -> None:
 )
 def test_start_is_refused(name: str, held: float, sentence: str) -> None:
     wire = Wire(DelixiModbus(1), {**STANDING, name: held})
-    with pytest.raises(Refused, match=sentence):
+    with pytest.raises(WriteForbidden, match=sentence):
         wire.drive.start()
     assert wire.sent == []
 

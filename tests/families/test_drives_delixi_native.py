@@ -11,7 +11,16 @@ from simulated_bus import one
 from tables import table
 
 from multidrop.control.eeprom_ledger import Ledger
-from multidrop.drive import Condition, Direction, Framing, NotDone, Refused, State, Unconfirmed, Unsupported
+from multidrop.drive import (
+    Condition,
+    Direction,
+    Framing,
+    NotVerified,
+    State,
+    Unconfirmed,
+    Unsupported,
+    WriteForbidden,
+)
 from multidrop.drive.declare import setting
 from multidrop.drive.table import Carrier, Kept
 from multidrop.errors import NoReply
@@ -100,7 +109,7 @@ def test_start_without_a_direction_does_not_turn_a_running_motor_round() -> None
 
 def test_start_without_a_known_setpoint_is_refused() -> None:
     wire = Wire(DelixiNative(1), STANDING)
-    with pytest.raises(Refused, match="set_frequency"):
+    with pytest.raises(WriteForbidden, match="set_frequency"):
         wire.drive.start()
     assert wire.sent == []
 
@@ -118,7 +127,7 @@ def test_no_motor_is_started_that_could_run_later(status: int, sentence: str) ->
     wire = Wire(DelixiNative(1), {**STANDING, "status": status})
     wire.drive.set_frequency(50)
     for direction in (None, *Direction):
-        with pytest.raises(Refused, match=sentence):
+        with pytest.raises(WriteForbidden, match=sentence):
             wire.drive.start(direction)
     assert wire.sent == [FIFTY]
 
@@ -133,7 +142,7 @@ def test_no_motor_is_started_that_could_run_later(status: int, sentence: str) ->
 def test_a_drive_that_would_not_obey_is_not_started(says: dict[str, object], sentence: str) -> None:
     wire = Wire(DelixiNative(1), STANDING | says, turns=TURNS)
     wire.drive.set_frequency(50)
-    with pytest.raises(Refused, match=sentence):
+    with pytest.raises(WriteForbidden, match=sentence):
         wire.drive.start()
     assert wire.sent == [FIFTY]
 
@@ -224,7 +233,7 @@ def test_identify_is_a_read() -> None:
     assert (wire.reads, wire.sent) == (["address_setting", "baudrate_setting"], [])
     with pytest.raises(NoReply):
         Wire(DelixiNative(1), {"address_setting": NoReply("drive")}).drive.identify()
-    with pytest.raises(Refused, match=r"P04\.30"):
+    with pytest.raises(WriteForbidden, match=r"P04\.30"):
         Wire(DelixiNative(2), STANDING).drive.identify()
 
 
@@ -269,7 +278,7 @@ def test_what_is_not_stored_is_not_counted_and_what_is_waits_its_minute(
     assert ledger.wear(line.seconds) == []
     assert not sim.counters.eeprom_writes
     line.bus.write(drive, drive.stored_ramp, 1.0)
-    with pytest.raises(Refused, match="less often"):
+    with pytest.raises(WriteForbidden, match="less often"):
         line.bus.write(drive, drive.stored_ramp, 2.0)
     assert sim.counters.eeprom_writes == {"stored_ramp": 1}
 
@@ -283,7 +292,7 @@ def test_what_the_document_does_not_have(name: str) -> None:
 @pytest.mark.parametrize("status", [DelixiNativeStatus.FAULT, DelixiNativeStatus.UNDERVOLTAGE])
 def test_a_fault_that_stands_after_its_reset_is_told(status: DelixiNativeStatus) -> None:
     wire = Wire(DelixiNative(1), {**STANDING, "status": status, "fault": DelixiFault.OC_OVERCURRENT})
-    with pytest.raises(NotDone, match=r"the fault reset.*the fault stands: overcurrent"):
+    with pytest.raises(NotVerified, match=r"the fault reset.*the fault stands: overcurrent"):
         wire.drive.reset_fault()
     assert wire.sent == [RESET]  # once
 
@@ -298,6 +307,6 @@ def test_a_fault_that_stands_after_its_reset_is_told(status: DelixiNativeStatus)
 )
 def test_a_motor_that_turns_has_no_fault_to_reset(status: DelixiNativeStatus, hz: float) -> None:
     wire = Wire(DelixiNative(1), {**STANDING, "status": status, "output_frequency": hz})
-    with pytest.raises(Refused, match="runs: it has no fault to reset"):
+    with pytest.raises(WriteForbidden, match="runs: it has no fault to reset"):
         wire.drive.reset_fault()
     assert wire.sent == []

@@ -9,7 +9,15 @@ from simulated_bus import one
 from tables import table
 
 from multidrop.core import NumberFormat
-from multidrop.drive import Condition, Direction, DriveRefused, NotDone, Refused, Unconfirmed, Unsupported
+from multidrop.drive import (
+    Condition,
+    Direction,
+    DriveException,
+    NotVerified,
+    Unconfirmed,
+    Unsupported,
+    WriteForbidden,
+)
 from multidrop.drive.table import COIL, HOLDING, INPUT, Kept
 from multidrop.errors import BadReply, NoReply
 from multidrop.families.erman_er_g_220 import Coil, ErmanERG220, ErmanFault, ErmanStatus, Modes
@@ -112,7 +120,7 @@ def test_there_is_no_reverse() -> None:
 
 def test_start_is_refused_while_a_fault_may_stand() -> None:
     wire = Wire(ErmanERG220(1), {**STOPPED, "last_fault": ErmanFault.OVERHEAT}, turns=TURNS)
-    with pytest.raises(Refused, match=r"overheat.*reset_fault.*acknowledged_fault = 64"):
+    with pytest.raises(WriteForbidden, match=r"overheat.*reset_fault.*acknowledged_fault = 64"):
         wire.drive.start()
     assert wire.sent == []
     wire.drive.reset_fault()
@@ -120,14 +128,14 @@ def test_start_is_refused_while_a_fault_may_stand() -> None:
     wire.drive.start()
     assert wire.sent[-1] == START_ON
     wire.says["last_fault"] = [ErmanFault.LOW_DC_VOLTAGE]
-    with pytest.raises(Refused, match="low DC voltage"):
+    with pytest.raises(WriteForbidden, match="low DC voltage"):
         wire.drive.start()
 
 
 @pytest.mark.parametrize("fault", ErmanFault)
 def test_no_fault_counts_as_dealt_with_by_itself(fault: ErmanFault) -> None:
     wire = Wire(ErmanERG220(1), {**STOPPED, "last_fault": fault}, turns=TURNS)
-    with pytest.raises(Refused, match=f"acknowledged_fault = {int(fault)}"):
+    with pytest.raises(WriteForbidden, match=f"acknowledged_fault = {int(fault)}"):
         wire.drive.start()
     assert wire.sent == []
 
@@ -163,7 +171,7 @@ def test_stop_ends_in_an_emergency_stop_and_then_in_an_error() -> None:
 
 
 @pytest.mark.parametrize(
-    "failure", [NoReply("drive"), BadReply("drive", "odd", b"\1"), DriveRefused("drive", 2, "")]
+    "failure", [NoReply("drive"), BadReply("drive", "odd", b"\1"), DriveException("drive", 2, "")]
 )
 def test_stop_ends_in_an_emergency_stop_where_the_ramp_cannot_be_read(failure: Exception) -> None:
     says = {**STOPPED, "deceleration_time": failure, "status": ErmanStatus.RUNNING}
@@ -191,7 +199,7 @@ def test_start_is_written_off_though_nobody_confirms_the_stop() -> None:
 
 
 def test_a_drive_that_refuses_its_stop_is_stopped_by_the_emergency_stop() -> None:
-    refusal = DriveRefused("drive", 3, "")
+    refusal = DriveException("drive", 3, "")
     for refused, begun in ((STOP_ON, [STOP_ON] * 3), (START_OFF, [STOP_ON, *[START_OFF] * 3])):
         wire = Wire(ErmanERG220(1), STOPPED, {refused: [refusal] * 3})
         wire.drive.stop()
@@ -201,7 +209,7 @@ def test_a_drive_that_refuses_its_stop_is_stopped_by_the_emergency_stop() -> Non
 
 def test_stop_is_sent_again_when_its_answer_is_lost() -> None:
     lost = Unconfirmed("drive", "stop", "no reply")
-    wire = Wire(ErmanERG220(1), STOPPED, {STOP_ON: [lost, DriveRefused("drive", 3, "")]})
+    wire = Wire(ErmanERG220(1), STOPPED, {STOP_ON: [lost, DriveException("drive", 3, "")]})
     wire.drive.stop()
     assert wire.sent == [STOP_ON] * 3 + [START_OFF]
     wire = Wire(ErmanERG220(1), STOPPED, {STOP_ON: [lost] * 3})
@@ -220,13 +228,13 @@ def test_start_needs_a_setpoint_that_is_still_there() -> None:
     wire = Wire(
         ErmanERG220(1), {**STOPPED, "frequency": 0.0, "maximum_frequency": 50.0, "minimum_frequency": 0.0}
     )
-    with pytest.raises(Refused, match="set_frequency"):
+    with pytest.raises(WriteForbidden, match="set_frequency"):
         wire.drive.start()
     del wire.says["frequency"]
     wire.drive.set_frequency(20)
     wire.held["frequency"] = 30.0
     sent = list(wire.sent)
-    with pytest.raises(Refused, match=r"holds 30\.0 Hz and not 20\.0 Hz"):
+    with pytest.raises(WriteForbidden, match=r"holds 30\.0 Hz and not 20\.0 Hz"):
         wire.drive.start()
     assert wire.sent == sent
 
@@ -256,7 +264,7 @@ def test_reset_cannot_start_and_leaves_its_coil_off() -> None:
         wire.drive.reset_fault()
     assert wire.sent == [START_OFF, RESET_ON, RESET_OFF]
     wire = Wire(ErmanERG220(1), {**STOPPED, "status": ErmanStatus.RUNNING_OVERLOADED})
-    with pytest.raises(Refused, match="runs"):
+    with pytest.raises(WriteForbidden, match="runs"):
         wire.drive.reset_fault()
     assert wire.sent == []
 
@@ -265,16 +273,16 @@ def test_the_setpoint_is_0002h_and_below_the_maximum() -> None:
     wire = Wire(ErmanERG220(1), {"maximum_frequency": 50.0, "minimum_frequency": 5.0})
     wire.drive.set_frequency(28.5)
     assert wire.sent == [FREQUENCY_28_5]
-    with pytest.raises(Refused, match=r"50\.1 Hz is above maximum_frequency, which is 50 Hz .*b\.007"):
+    with pytest.raises(WriteForbidden, match=r"50\.1 Hz is above maximum_frequency, which is 50 Hz .*b\.007"):
         wire.drive.set_frequency(50.1)
-    with pytest.raises(Refused, match=r"4\.9 Hz is below minimum_frequency, which is 5 Hz"):
+    with pytest.raises(WriteForbidden, match=r"4\.9 Hz is below minimum_frequency, which is 5 Hz"):
         wire.drive.set_frequency(4.9)
     with pytest.raises(ValueError, match="frequency"):
         wire.drive.set_frequency(-1)
     assert wire.sent == [FREQUENCY_28_5]
     del wire.held["frequency"]
     wire.says["frequency"] = [20.0]
-    with pytest.raises(NotDone, match=r"the drive holds 20\.0 Hz"):
+    with pytest.raises(NotVerified, match=r"the drive holds 20\.0 Hz"):
         wire.drive.set_frequency(28.5)
 
 
@@ -305,15 +313,15 @@ def test_a_last_fault_of_unnamed_bits_is_a_fault() -> None:
     """Bits 8, 9 and 12 to 31 are reserved (section 10, state: 1026-1027)."""
     wire = Wire(ErmanERG220(1), {**STOPPED, "last_fault": ErmanERG220.last_fault.decode(0x1100)}, turns=TURNS)
     assert "last fault bit 8, bit 12" in wire.drive.state().note
-    with pytest.raises(Refused, match="may have a fault, bit 8, bit 12"):
+    with pytest.raises(WriteForbidden, match="may have a fault, bit 8, bit 12"):
         wire.drive.start()
     assert wire.sent == []
 
 
 def test_identify_refuses_the_models_03_and_04() -> None:
     Wire(ErmanERG220(1), STOPPED).drive.identify()
-    with pytest.raises(Refused, match="0400H"):
-        Wire(ErmanERG220(1), {"status": DriveRefused("drive", 1, "")}).drive.identify()
+    with pytest.raises(WriteForbidden, match="0400H"):
+        Wire(ErmanERG220(1), {"status": DriveException("drive", 1, "")}).drive.identify()
     with pytest.raises(NoReply):
         Wire(ErmanERG220(1), {"status": NoReply("drive")}).drive.identify()
 
@@ -346,7 +354,7 @@ def test_coils_are_read_one_byte_at_a_time_and_only_when_they_are_asked_for(
     assert line.bus.read(drive, drive.start_held) is Coil.OFF
     assert line.bus.read(drive, drive.stop_held) is Coil.ON
     for register in coils:
-        with pytest.raises(Refused, match="it is a reading"):
+        with pytest.raises(WriteForbidden, match="it is a reading"):
             line.bus.write(drive, register, Coil.ON)
 
 
@@ -359,5 +367,5 @@ def test_diagnostics_as_printed(monkeypatch: pytest.MonkeyPatch) -> None:
     assert read.startswith("01 04")  # that was a copy, as an adapter's echo is
     for refusal in ("01 89 01 86 50", "01 88 01 87 C0"):
         line.answers = lambda request, refusal=refusal: bytes.fromhex(refusal)  # type: ignore[misc]
-        with pytest.raises(DriveRefused, match="unknown command"):
+        with pytest.raises(DriveException, match="unknown command"):
             line.bus.raw(drive, 0x08, 0x0000, b"\xa5\x37")

@@ -8,7 +8,15 @@ from scripts import Wire, frame, rows, typed
 from simulated_bus import one
 from tables import table
 
-from multidrop.drive import Condition, Direction, DriveRefused, Framing, Refused, Unconfirmed, Unsupported
+from multidrop.drive import (
+    Condition,
+    Direction,
+    DriveException,
+    Framing,
+    Unconfirmed,
+    Unsupported,
+    WriteForbidden,
+)
 from multidrop.drive.table import HOLDING
 from multidrop.families.innovert_ibd import (
     FrequencySource,
@@ -120,7 +128,7 @@ def test_no_run_command_outlasts_the_fault() -> None:
     assert wire.sent == [stop] * 3
     for turning in ({"motor_speed": 120.0}, {"output_current": 0.4}):
         wire = Wire(InnovertIBD(1), {**STANDING, **turning})
-        with pytest.raises(Refused, match="turns: it has no fault to reset"):
+        with pytest.raises(WriteForbidden, match="turns: it has no fault to reset"):
             wire.drive.reset_fault()
         assert wire.sent == []
 
@@ -129,7 +137,7 @@ def test_no_run_command_outlasts_the_fault() -> None:
 def test_a_direction_is_refused(direction: Direction) -> None:
     wire = Wire(InnovertIBD(1))
     for verb in (wire.drive.start, wire.drive.jog):
-        with pytest.raises(Refused, match="ambiguous"):
+        with pytest.raises(WriteForbidden, match="ambiguous"):
             verb(direction)
     assert wire.sent == []
 
@@ -166,7 +174,9 @@ def test_a_motor_that_turns_may_jog_and_is_stopped_before_a_start(turning: dict[
     wire = Wire(InnovertIBD(1), {**STANDING, "terminals": Terminals(0), **turning})
     wire.drive.set_frequency(50)
     for verb in (wire.drive.start, wire.drive.jog):
-        with pytest.raises(Refused, match=r"turns, and a jog would go on through this: call stop\(\) first"):
+        with pytest.raises(
+            WriteForbidden, match=r"turns, and a jog would go on through this: call stop\(\) first"
+        ):
             verb()
     assert wire.sent == [FIFTY[Framing.RTU]]
 
@@ -175,7 +185,7 @@ def test_a_start_after_a_jog_is_at_the_setpoint(monkeypatch: pytest.MonkeyPatch)
     line, drive, sim = one(monkeypatch, InnovertIBD(1))
     drive.jog()
     drive.set_frequency(50)
-    with pytest.raises(Refused, match=r"stop\(\) first"):
+    with pytest.raises(WriteForbidden, match=r"stop\(\) first"):
         drive.start()
     drive.stop()
     drive.start()
@@ -194,7 +204,7 @@ def test_a_start_after_a_jog_is_at_the_setpoint(monkeypatch: pytest.MonkeyPatch)
 )
 def test_start_is_refused(says: dict[str, object], sentence: str) -> None:
     wire = Wire(InnovertIBD(1), {**STANDING, "terminals": Terminals(0), **says})
-    with pytest.raises(Refused, match=sentence):
+    with pytest.raises(WriteForbidden, match=sentence):
         wire.drive.start()
     assert wire.sent == []
 
@@ -205,9 +215,9 @@ def test_identity_is_its_own_address_or_its_owner_s_word() -> None:
     for other in (
         {"address_setting": 0},
         {"baudrate_setting": 3},
-        {"address_setting": DriveRefused("it", 2, "")},
+        {"address_setting": DriveException("it", 2, "")},
     ):
-        with pytest.raises(Refused, match="confirmed = 1"):
+        with pytest.raises(WriteForbidden, match="confirmed = 1"):
             Wire(InnovertIBD(1), {**says, **other}).drive.identify()
         Wire(InnovertIBD(1, confirmed=1), {**says, **other}).drive.identify()
 
@@ -238,7 +248,7 @@ def test_a_drive_that_has_not_all_that_is_named_resembles_none(name: str) -> Non
         return found
 
     assert resembles(SEEN)
-    assert not resembles({**SEEN, name: DriveRefused("it", 2, "")})
+    assert not resembles({**SEEN, name: DriveException("it", 2, "")})
 
 
 def test_stop_waits_until_neither_speed_nor_current_is_shown() -> None:
@@ -263,7 +273,7 @@ def test_stop_goes_by_the_outputs_where_they_are_programmed() -> None:
 
 def test_the_setpoint_is_limited_by_the_owner() -> None:
     wire = Wire(InnovertIBD(1, maximum_frequency=50))
-    with pytest.raises(Refused, match=r"50\.50 Hz is above maximum_frequency, which is 50 Hz"):
+    with pytest.raises(WriteForbidden, match=r"50\.50 Hz is above maximum_frequency, which is 50 Hz"):
         wire.drive.set_frequency(50.5)
     with pytest.raises(ValueError, match="0 to 400 Hz"):
         Wire(InnovertIBD(1)).drive.set_frequency(400.5)
@@ -271,7 +281,7 @@ def test_the_setpoint_is_limited_by_the_owner() -> None:
 
 
 def test_the_state_is_unknown_unless_the_outputs_are_programmed() -> None:
-    refusal = DriveRefused("drive", 2, "")
+    refusal = DriveException("drive", 2, "")
     for says in (
         {**PROGRAMMED, "output_m01": 0},
         {**PROGRAMMED, "output_virtual": Output.RUNNING},

@@ -11,12 +11,12 @@ from tables import table
 from multidrop.drive import (
     Condition,
     Direction,
-    DriveRefused,
-    NotDone,
-    Refused,
+    DriveException,
+    NotVerified,
     State,
     Unconfirmed,
     Unsupported,
+    WriteForbidden,
     write,
 )
 from multidrop.drive.table import HOLDING, Kept
@@ -301,7 +301,7 @@ def test_options_of_start(options: dict[str, float], forward: int, reverse: int)
 
 def test_a_motor_without_a_setpoint_is_not_started() -> None:
     wire = Wire(YD1000(1), STANDING | {"frequency": 0.0}, turns=TURNS)
-    with pytest.raises(Refused, match=r"the setpoint of .* is 0: call set_frequency before start"):
+    with pytest.raises(WriteForbidden, match=r"the setpoint of .* is 0: call set_frequency before start"):
         wire.drive.start()
     assert wire.sent == []
 
@@ -311,7 +311,7 @@ def test_where_fnod_has_the_setpoint_1001h_is_not_looked_at() -> None:
     wire.drive.start()
     assert wire.sent == [yd_word(0x8400)]
     for option in ("setpoint_by_fnod", "preset_speed"):
-        with pytest.raises(Refused, match=option):
+        with pytest.raises(WriteForbidden, match=option):
             Wire(YD1000(1, **{option: 1})).drive.set_frequency(20)
 
 
@@ -348,7 +348,7 @@ def test_a_preset_speed_that_is_not_seen_starts_nothing(
     says: dict[str, object], sent: list[str], sentence: str
 ) -> None:
     wire = Wire(YD1000(1, preset_speed=3), {**AT_PRESET, **says})
-    with pytest.raises(Refused, match=sentence):
+    with pytest.raises(WriteForbidden, match=sentence):
         wire.drive.start()
     assert wire.sent == sent
 
@@ -400,7 +400,9 @@ def test_emergency_stop_is_taken_back_when_it_has_worked() -> None:
     assert wire.sent[-1] == STOP
 
 
-@pytest.mark.parametrize("failure", [Unconfirmed("drive", "stop", "no reply"), DriveRefused("drive", 4, "")])
+@pytest.mark.parametrize(
+    "failure", [Unconfirmed("drive", "stop", "no reply"), DriveException("drive", 4, "")]
+)
 def test_emergency_stop_is_a_pulse_and_sent_once(failure: Exception) -> None:
     pulse = frame(YD1000(1), YD1000.control, YD1000Control(0xD000))
     wire = Wire(YD1000(1), STANDING, {pulse: [failure]})
@@ -424,13 +426,13 @@ def test_reset_is_sent_once_and_followed_by_a_stop() -> None:
     wire.drive.reset_fault()
     assert wire.sent == [reset, STOP]
     assert wire.seconds >= 3
-    wire = Wire(YD1000(1), STANDING, {reset: [DriveRefused("drive", 4, "")]})
-    with pytest.raises(DriveRefused):
+    wire = Wire(YD1000(1), STANDING, {reset: [DriveException("drive", 4, "")]})
+    with pytest.raises(DriveException):
         wire.drive.reset_fault()
-    with pytest.raises(Refused, match="runs"):
+    with pytest.raises(WriteForbidden, match="runs"):
         Wire(YD1000(1), {"output_frequency": 5.0}).drive.reset_fault()
     turning = Wire(YD1000(1), {**STANDING, "output_frequency": 0.01})
-    with pytest.raises(Refused, match="runs"):
+    with pytest.raises(WriteForbidden, match="runs"):
         turning.drive.reset_fault()
     assert turning.sent == []
 
@@ -443,7 +445,7 @@ def test_a_start_after_a_reset_is_at_the_setpoint_that_was_written(monkeypatch: 
     wire.sent.clear()
     wire.say({"frequency": 20.0})
     with pytest.raises(
-        Refused, match=r"holds 20\.00 Hz and not 30\.00 Hz .* call set_frequency before start"
+        WriteForbidden, match=r"holds 20\.00 Hz and not 30\.00 Hz .* call set_frequency before start"
     ):
         wire.drive.start()
     assert wire.sent == []
@@ -451,7 +453,7 @@ def test_a_start_after_a_reset_is_at_the_setpoint_that_was_written(monkeypatch: 
     drive.set_frequency(30)
     sim.trip(4)
     drive.reset_fault()
-    with pytest.raises(Refused, match="call set_frequency before start"):
+    with pytest.raises(WriteForbidden, match="call set_frequency before start"):
         drive.start()
     assert not sim.motor.energised
     line.sleep(1)
@@ -477,7 +479,7 @@ def test_a_reset_that_a_terminal_could_make_a_start_is_not_sent(
 ) -> None:
     """Bit 15 goes with a power-on (section 8.1), and may with the restart: then the terminals command."""
     wire = Wire(YD1000(1), {**STANDING, **FUNCTIONS, **says})
-    with pytest.raises(Refused, match=f"^{terminal}.* says run, and may start its motor"):
+    with pytest.raises(WriteForbidden, match=f"^{terminal}.* says run, and may start its motor"):
         wire.drive.reset_fault()
     assert wire.sent == []
 
@@ -492,7 +494,9 @@ def test_other_terminals_keep_no_reset_back(closed: Inputs) -> None:
 def test_a_limit_that_the_manual_does_not_print_is_not_said_to_be_its_own() -> None:
     """It has 0.5 to FH for UL, and of FH only 30.0 to 320.0."""
     wire = Wire(YD1000(1), {**STANDING, "upper_limit_frequency": 60.0})
-    with pytest.raises(Refused, match=r"50\.00 Hz is below upper_limit_frequency, which is 60 Hz") as refusal:
+    with pytest.raises(
+        WriteForbidden, match=r"50\.00 Hz is below upper_limit_frequency, which is 60 Hz"
+    ) as refusal:
         wire.run(write(wire.drive.maximum_frequency, 50.0))
     assert str(refusal.value).endswith("(in the manual, maximum_frequency is 6.1, FH)")
 
@@ -506,7 +510,7 @@ def test_the_command_is_given_back_at_rest_alone() -> None:
     assert wire.sent == [RELEASE]
     for frequencies in (12.0, [0.0, 12.0]):  # 1100H must be 0 twice
         wire = Wire(YD1000(1), {**STANDING, **FUNCTIONS, "output_frequency": frequencies})
-        with pytest.raises(Refused, match=r"turns: call stop\(\) first"):
+        with pytest.raises(WriteForbidden, match=r"turns: call stop\(\) first"):
             wire.drive.release_control()
         assert wire.sent == []
 
@@ -521,7 +525,9 @@ def test_the_command_is_given_back_at_rest_alone() -> None:
 )
 def test_the_command_is_not_given_to_a_terminal_that_says_run(says: dict[str, object], terminal: str) -> None:
     wire = Wire(YD1000(1), {**STANDING, **FUNCTIONS, **says})
-    with pytest.raises(Refused, match=f"^{terminal}.* says run, .* once the line no longer commands it"):
+    with pytest.raises(
+        WriteForbidden, match=f"^{terminal}.* says run, .* once the line no longer commands it"
+    ):
         wire.drive.release_control()
     assert wire.sent == []
 
@@ -529,7 +535,9 @@ def test_the_command_is_not_given_to_a_terminal_that_says_run(says: dict[str, ob
 def test_a_motor_that_turns_once_its_command_is_given_back_is_stopped_again() -> None:
     turns = {RELEASE: {"output_frequency": [0.0, 0.0, 1.5]}}
     wire = Wire(YD1000(1), {**STANDING, **FUNCTIONS}, turns=TURNS | turns)
-    with pytest.raises(NotDone, match="its panel or a terminal started the motor, so the stop was written"):
+    with pytest.raises(
+        NotVerified, match="its panel or a terminal started the motor, so the stop was written"
+    ):
         wire.drive.release_control()
     assert wire.sent == [RELEASE, STOP]
 
@@ -554,7 +562,7 @@ def test_the_panel_commands_the_motor_again_once_it_has_the_command(monkeypatch:
     drive.stop()  # which takes the command
     sim.panel_runs = True
     assert not sim.motor.energised
-    with pytest.raises(NotDone, match="started the motor"):
+    with pytest.raises(NotVerified, match="started the motor"):
         drive.release_control()
     assert drive.state().condition is not Condition.RUNNING
     sim.panel_runs = False
@@ -570,11 +578,11 @@ def test_the_setpoint() -> None:
     wire = Wire(YD1000(1), STANDING)
     wire.drive.set_frequency(80)
     assert wire.sent == [EIGHTY]
-    with pytest.raises(Refused, match=r"80\.50 Hz is above maximum_frequency, which is 80 Hz"):
+    with pytest.raises(WriteForbidden, match=r"80\.50 Hz is above maximum_frequency, which is 80 Hz"):
         wire.drive.set_frequency(80.5)
     wire.held.clear()
     wire.says["frequency"] = [60.0]
-    with pytest.raises(NotDone, match=r"60\.00 Hz"):
+    with pytest.raises(NotVerified, match=r"60\.00 Hz"):
         wire.drive.set_frequency(80)
 
 
@@ -595,9 +603,9 @@ def test_identify() -> None:
     wire = Wire(YD1000(5), says)
     wire.drive.identify()
     assert wire.sent == []
-    with pytest.raises(Refused, match="0802H"):
+    with pytest.raises(WriteForbidden, match="0802H"):
         Wire(YD1000(6), says).drive.identify()
-    with pytest.raises(Refused, match="0011H"):
+    with pytest.raises(WriteForbidden, match="0011H"):
         Wire(YD1000(5), {**says, "maximum_frequency": 0.1}).drive.identify()
 
 
@@ -606,7 +614,9 @@ def test_a_motor_with_a_fault_is_not_started() -> None:
     wire.drive.state()
     wire.says["fault_record_1"] = [0x0A]  # since then
     for verb in (wire.drive.start, wire.drive.jog):
-        with pytest.raises(Refused, match=r"has a fault, code 0AH: see to it, then call reset_fault\(\)$"):
+        with pytest.raises(
+            WriteForbidden, match=r"has a fault, code 0AH: see to it, then call reset_fault\(\)$"
+        ):
             verb()
     assert wire.sent == []
 
@@ -628,7 +638,7 @@ def test_a_start_after_an_emergency_stop_is_told_of_reset_fault(monkeypatch: pyt
     drive.emergency_stop()
     line.bus.detach(drive)
     drive = line.attach(YD1000(1))
-    with pytest.raises(Refused, match=r"has a fault, code 11H: see to it, then call reset_fault\(\)$"):
+    with pytest.raises(WriteForbidden, match=r"has a fault, code 11H: see to it, then call reset_fault\(\)$"):
         drive.start()
     drive.reset_fault()
     drive.set_frequency(30)
@@ -652,11 +662,11 @@ def test_the_watchdog_is_set_over_the_line_while_the_motor_stands(monkeypatch: p
     assert line.bus.write(drive, drive.communication_timeout, 5) == 5
     assert sim["communication_timeout"] == 5
     for wrong in (-1, 101, 0.5):
-        with pytest.raises(Refused, match="communication_timeout"):
+        with pytest.raises(WriteForbidden, match="communication_timeout"):
             line.bus.write(drive, drive.communication_timeout, wrong)
     drive.set_frequency(30)
     drive.start()
-    with pytest.raises(Refused, match="only while the motor stands"):
+    with pytest.raises(WriteForbidden, match="only while the motor stands"):
         line.bus.write(drive, drive.communication_timeout, 2)
 
 

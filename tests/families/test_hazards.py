@@ -20,7 +20,7 @@ from simulated_bus import SimulatedBus, one, text
 from multidrop.core import Framing, Message, NumberFormat, build_reply, build_request, parse_reply
 from multidrop.drive import Condition, Direction, Drive
 from multidrop.drive.table import HOLDING, Kept
-from multidrop.errors import BadReply, DriveRefused, NoReply, Refused, Unconfirmed, Unsupported
+from multidrop.errors import BadReply, DriveException, NoReply, Unconfirmed, Unsupported, WriteForbidden
 from multidrop.families import YD1000, DelixiModbus, DelixiNative, ErmanERG220, InnovertIBD, InvtCHE
 from multidrop.families.delixi_native import DelixiNativeStatus
 from multidrop.families.erman_er_g_220 import ErmanFault, ErmanStatus, Modes
@@ -63,7 +63,7 @@ class Hazard:
     naive: str
     sends: tuple[str, ...] = ()
     refuses: str = ""  # the sentence with which it is refused
-    error: type[Exception] = Refused
+    error: type[Exception] = WriteForbidden
     shows: Mapping[str, Any] = field(default_factory=dict)
     turning: bool = False  # it was given a setpoint, started, and has run for a second
 
@@ -556,7 +556,7 @@ def test_i2_e_identity_of_the_models_03_and_04(monkeypatch: pytest.MonkeyPatch) 
     line, drive, _ = one(monkeypatch, ErmanERG220(1))
     refusal = build_reply(Framing.RTU, Message(1, 4, exception=1))
     line.answers = lambda request: refusal if request.function == 4 else None
-    with pytest.raises(Refused, match="not an ER-G-220"):
+    with pytest.raises(WriteForbidden, match="not an ER-G-220"):
         drive.set_frequency(20)
     assert line.written == []
 
@@ -629,7 +629,7 @@ def test_d13_y15_any_exception_is_a_refusal(monkeypatch: pytest.MonkeyPatch, cod
         line, drive, _ = one(monkeypatch, make())
         refusal = build_reply(Framing.RTU, Message(1, 3, exception=code))
         line.answers = lambda request, refusal=refusal: refusal
-        with pytest.raises(DriveRefused) as told:
+        with pytest.raises(DriveException) as told:
             line.bus.read(drive, drive.output_frequency)
         assert told.value.code == code
 

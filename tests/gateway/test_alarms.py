@@ -18,7 +18,7 @@ from gateways import POLL, Served, plant_text, running, served, written
 from lines import until
 from tables import table
 
-from multidrop import BusError, Refused, can_show_fault, load_plant
+from multidrop import BusError, WriteForbidden, can_show_fault, load_plant
 from multidrop.core import Columns, Field, Names, NumberFormat, RowLayout
 from multidrop.errors import Advice
 from multidrop.families import MODELS
@@ -405,14 +405,14 @@ def test_a_stop_that_was_called_here_is_no_alarm_and_another_is(tmp_path: Path) 
     ("failure", "said"),
     [
         (
-            Refused("pump-1 has a fault: then call reset_fault()", advice=Advice.call("reset_fault")),
+            WriteForbidden("pump-1 has a fault: then call reset_fault()", advice=Advice.call("reset_fault")),
             'pump-1 has a fault: then use "reset fault"',
         ),
         (
-            Refused("x: declare confirmed = 1", advice=Advice.declare("confirmed", 1)),
+            WriteForbidden("x: declare confirmed = 1", advice=Advice.declare("confirmed", 1)),
             "x: write confirmed = 1 below its [[line.drive]]",
         ),
-        (Refused("call set_frequency before start"), 'use "set frequency" before start'),
+        (WriteForbidden("call set_frequency before start"), 'use "set frequency" before start'),
         (BusError("it needs reset_fault() to start"), 'it needs "reset fault" to start'),
         (BusError("pump-1.coast: no stop of start"), "pump-1.coast: no stop of start"),
     ],

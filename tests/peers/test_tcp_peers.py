@@ -15,7 +15,7 @@ from peers import build_with_libmodbus, require_module, require_program
 
 from multidrop.bus import Bus
 from multidrop.cli import main
-from multidrop.errors import DriveRefused, NoReply
+from multidrop.errors import DriveException, NoReply
 from multidrop.families import InnovertIBD, InvtCHE
 from multidrop.families.registry import find_model
 from multidrop.plant.loader import load_plant
@@ -80,7 +80,7 @@ def test_what_is_written_is_what_is_read_back(server: str) -> None:
 def test_an_exception_is_the_device_s_refusal(server: str) -> None:
     with Bus(server) as bus:
         device = bus.attach(find_model(DEVICE.replace("Device", "Mistaken")), ADDRESS)
-        with pytest.raises(DriveRefused, match="illegal address") as refusal:
+        with pytest.raises(DriveException, match="illegal address") as refusal:
             bus.read(device, device.register("absent"))
         assert refusal.value.code == 2
 

@@ -22,7 +22,7 @@ from multidrop.control.outcome import Seen, Stopped
 from multidrop.control.stop_attempt import StopAttempt
 from multidrop.drive import Drive
 from multidrop.drive.script import Step
-from multidrop.errors import LineError, NoReply, NotAttached, Overtaken
+from multidrop.errors import CancelledByStop, LineError, NoReply, NotAttached
 from multidrop.plant.model import PlantLine, PolledDrive
 from multidrop.poller import Poller
 from multidrop.sim import SimulatedDrive, Simulator, Wire, simulated
@@ -128,7 +128,7 @@ def test_a_drive_that_leaves_is_not_started_behind_its_stop(both: TwoLines) -> N
 
         def start_the_other(drive: Drive) -> None:
             if drive is pump_1:
-                with pytest.raises(Overtaken):
+                with pytest.raises(CancelledByStop):
                     pump_2.start()
             detach(drive)
 
@@ -400,7 +400,7 @@ def test_calls_on_what_has_gone_say_so(both: TwoLines) -> None:
         poller.adopt(plant(both.hall(1)))
         with pytest.raises(LineError, match="its line is polled no more"):
             gone_bus.read(fan, CURRENT)
-        with pytest.raises(Overtaken):
+        with pytest.raises(CancelledByStop):
             fan.start()
         with pytest.raises(NotAttached, match="pump-2 is not attached to this bus"):
             bus.read(pump_2, CURRENT)

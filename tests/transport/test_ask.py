@@ -16,7 +16,7 @@ from toy import Toy
 
 from multidrop.control.audit_log import read_audit
 from multidrop.core import Failure, Message
-from multidrop.errors import BadReply, DriveRefused, Expired, NoReply, NotAttached
+from multidrop.errors import BadReply, DriveException, Expired, NoReply, NotAttached
 from multidrop.families import DelixiModbus, DelixiNative, InnovertIBD
 from multidrop.poller import Poller
 from multidrop.sim import EncodedDrive, SimulatedDrive, Simulator, Wire, proof
@@ -51,7 +51,7 @@ def test_it_is_no_write(simulated: SimulatedBus, tmp_path: Path) -> None:
 
 def test_an_exception_is_the_drives_refusal(simulated: SimulatedBus) -> None:
     bus, (toy,) = simulated.bus, simulated.bus.drives
-    with pytest.raises(DriveRefused) as refusal:
+    with pytest.raises(DriveException) as refusal:
         bus.ask(toy, 3, 0x4000, 1)
     assert refusal.value.code == 2
 

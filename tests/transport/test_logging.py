@@ -15,7 +15,7 @@ from lines import PATIENCE
 from simulated_bus import one
 from toy import PatientToy
 
-from multidrop import Bus, LineError, Refused
+from multidrop import Bus, LineError, WriteForbidden
 from multidrop.families import InvtCHE
 from multidrop.sim import SimulatedDrive, Simulator, Wire
 from multidrop.transport import aside_log
@@ -110,7 +110,7 @@ def test_writes_refusals_and_stops_are_logged(
     bus: Any = drive.bus
     with caplog.at_level(logging.INFO, "multidrop"):
         drive.set_frequency(20)
-        with pytest.raises(Refused):
+        with pytest.raises(WriteForbidden):
             bus.write(drive, drive.register("setpoint"), 1e6)
         bus.stop_all()
         flush(PATIENCE)

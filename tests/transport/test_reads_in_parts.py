@@ -13,7 +13,7 @@ from simulated_bus import SimulatedBus
 
 from multidrop.core import NumberFormat
 from multidrop.drive.declare import reading
-from multidrop.errors import BadReply, DriveRefused, NoReply
+from multidrop.errors import BadReply, DriveException, NoReply
 
 WIDE = 24
 
@@ -40,13 +40,13 @@ def test_a_refused_register_is_refused_by_itself(monkeypatch: pytest.MonkeyPatch
     sim = Picky(drive, refused={3})
     bus = SimulatedBus(monkeypatch, sim)
     bus.attach(drive)
-    with pytest.raises(DriveRefused, match=r"^pump-1 refuses r3: ") as caught:
+    with pytest.raises(DriveException, match=r"^pump-1 refuses r3: ") as caught:
         bus.bus.read_many(drive, drive.registers.values())
     assert caught.value.register == "r3"
     assert sim.asked[-1] == (3, 1)
     assert len(sim.asked) <= 11
     sim.asked.clear()
-    with pytest.raises(DriveRefused, match=r"^pump-1 refuses r3: "):
+    with pytest.raises(DriveException, match=r"^pump-1 refuses r3: "):
         bus.bus.read_many(drive, drive.registers.values())
     assert sim.asked == [(3, 1)]  # what comes to nothing costs the line no more
     sim.missing.clear()
@@ -66,7 +66,7 @@ def test_all_comes_or_what_is_refused_is_named(refused: set[int], most: int, ask
             if not refused & asked:
                 assert bus.read_many(drive, registers) == right(asked)
                 continue
-            with pytest.raises(DriveRefused) as caught:
+            with pytest.raises(DriveException) as caught:
                 bus.read_many(drive, registers)
             assert caught.value.register in {f"r{at}" for at in refused & asked}
 
@@ -78,7 +78,7 @@ def test_busy_splits_nothing(code: int, monkeypatch: pytest.MonkeyPatch) -> None
     bus.attach(drive)
     sim.limit = 0
     monkeypatch.setattr(sim, "_code", lambda reason: code)
-    with pytest.raises(DriveRefused):
+    with pytest.raises(DriveException):
         bus.bus.read_many(drive, drive.registers.values())
     assert sim.asked == [(0, WIDE)]
 
@@ -90,7 +90,7 @@ def test_no_register_is_named_where_several_were_asked_for(monkeypatch: pytest.M
     bus.attach(drive)
     sim.limit = 0
     monkeypatch.setattr(sim, "_code", lambda reason: 6)
-    with pytest.raises(DriveRefused, match=r"^pump-1 refuses: ") as caught:
+    with pytest.raises(DriveException, match=r"^pump-1 refuses: ") as caught:
         bus.bus.read_many(drive, [drive.register("r1"), drive.register("flow")])
     assert caught.value.register is None
 

@@ -17,7 +17,7 @@ from multidrop.core import Framing, Message, build_reply, build_request, parse_r
 from multidrop.drive import Drive
 from multidrop.drive.declare import reading
 from multidrop.drive.table import HOLDING
-from multidrop.errors import BadReply, LineError, NoReply, NoSuchPort, PortLost, Refused
+from multidrop.errors import BadReply, LineError, NoReply, NoSuchPort, PortLost, WriteForbidden
 from multidrop.families import YD1000, DelixiNative, InnovertIBD
 from multidrop.plant.loader import PlantError, load_plant
 from multidrop.poller import Poller
@@ -166,7 +166,7 @@ def test_nothing_is_broadcast() -> None:
             bus.attach(drive)
             bus.check_identity(drive)
         register = bus.drives[0].register("control")
-        with pytest.raises(Refused, match="cannot be broadcast over Modbus TCP"):
+        with pytest.raises(WriteForbidden, match="cannot be broadcast over Modbus TCP"):
             bus.broadcast(register, 0xC000)
         bus.stop_all(seconds=5)
     assert [sim.counters.broadcasts for sim in sims] == [0, 0]

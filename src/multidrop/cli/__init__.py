@@ -16,7 +16,7 @@ from contextlib import nullcontext, suppress
 from functools import partial
 from typing import Any, NoReturn
 
-from multidrop.errors import BusError, Refused, Unsupported
+from multidrop.errors import BusError, Unsupported, WriteForbidden
 
 DONE, FAILED, MISTAKE, INTERRUPTED = 0, 1, 2, 130
 STOPS = ("stop", "coast", "emergency-stop")  # neither a mistake beside their drive nor SIGHUP keeps one back
@@ -190,7 +190,7 @@ def _run(command: str, words: list[str]) -> int:
         _fail(f"left out, for {command} knows no such option: {' '.join(left_out)}", MISTAKE)
     try:
         return int(module.run(arguments)) or (MISTAKE if left_out else DONE)
-    except Refused as refusal:
+    except WriteForbidden as refusal:
         from multidrop.cli.support.plants import is_plant
 
         in_plant = any(is_plant(first) for first in getattr(arguments, "words", [])[:1])

@@ -15,7 +15,7 @@ from multidrop.core import Status
 from multidrop.drive.family import Drive
 from multidrop.drive.register import Register
 from multidrop.drive.text import Text
-from multidrop.errors import DriveRefused, NoValue
+from multidrop.errors import DriveException, NoValue
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -48,7 +48,7 @@ def run(arguments: argparse.Namespace) -> int:
         lines += aligned([_text_row(*answer) for answer in read_texts.items()], "<<")
         print_text("\n".join(lines))
     answers = (*values.values(), *read_texts.values())
-    return 1 if any(isinstance(answer, DriveRefused) for answer in answers) else 0
+    return 1 if any(isinstance(answer, DriveException) for answer in answers) else 0
 
 
 def _read(bus: Bus, drive: Drive, wanted: list[Register[Any]]) -> dict[Register[Any], Any]:
@@ -57,7 +57,7 @@ def _read(bus: Bus, drive: Drive, wanted: list[Register[Any]]) -> dict[Register[
         found = bus.read_many(drive, wanted)
     except NoValue as lack:
         found = dict(lack.values)
-    except DriveRefused:  # which register, only single reads show
+    except DriveException:  # which register, only single reads show
         return {register: _read_one(bus, drive, register) for register in wanted}
     return {register: found.get(register.name) for register in wanted}
 
@@ -67,41 +67,41 @@ def _read_one(bus: Bus, drive: Drive, register: Register[Any]) -> Any:
         return bus.read(drive, register)
     except NoValue:
         return None
-    except DriveRefused as refusal:
+    except DriveException as refusal:
         return refusal
 
 
-def _read_text(bus: Bus, drive: Drive, text: Text) -> str | DriveRefused:
+def _read_text(bus: Bus, drive: Drive, text: Text) -> str | DriveException:
     try:
         return bus.read_text(drive, text)
-    except DriveRefused as refusal:
+    except DriveException as refusal:
         return refusal
 
 
 def _row(register: Register[Any], value: Any) -> Row:
-    if isinstance(value, DriveRefused):
+    if isinstance(value, DriveException):
         return register.name, "", _refusal(value)
     if value is None:
         return register.name, "", str(Status.NO_VALUE)
     return as_row(register, value)
 
 
-def _text_row(text: Text, answer: str | DriveRefused) -> Row:
-    return text.name, _refusal(answer) if isinstance(answer, DriveRefused) else answer
+def _text_row(text: Text, answer: str | DriveException) -> Row:
+    return text.name, _refusal(answer) if isinstance(answer, DriveException) else answer
 
 
-def _refusal(refusal: DriveRefused) -> str:
+def _refusal(refusal: DriveException) -> str:
     return f"refused: code {refusal.code:02X}H, {refusal.meaning}"
 
 
-def _text_as_json(answer: str | DriveRefused) -> dict[str, Any]:
-    if isinstance(answer, DriveRefused):
+def _text_as_json(answer: str | DriveException) -> dict[str, Any]:
+    if isinstance(answer, DriveException):
         return {"value": None, "refused": answer.meaning, "code": answer.code}
     return {"value": answer}
 
 
 def _as_json(register: Register[Any], value: Any) -> dict[str, Any]:
-    if isinstance(value, DriveRefused):
+    if isinstance(value, DriveException):
         return {"value": None, "refused": value.meaning, "code": value.code}
     if value is None:
         return {"value": None, "reason": str(Status.NO_VALUE)}

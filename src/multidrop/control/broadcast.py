@@ -19,7 +19,7 @@ from multidrop.core import Framing
 from multidrop.drive.family import Drive
 from multidrop.drive.register import Register
 from multidrop.drive.state import State
-from multidrop.errors import BusError, Refused, Unconfirmed
+from multidrop.errors import BusError, Unconfirmed, WriteForbidden
 
 
 class Broadcaster:
@@ -33,9 +33,9 @@ class Broadcaster:
     def write(
         self, drives: Sequence[Drive], register: Register[Any], value: Any
     ) -> dict[str, State | BusError]:
-        """Write to all; then read each one's state, or why it says none. Raises Refused."""
+        """Write to all; then read each one's state, or why it says none. Raises WriteForbidden."""
         if drives and drives[0].framing is Framing.TCP:
-            raise Refused(
+            raise WriteForbidden(
                 f"{register.name} cannot be broadcast over Modbus TCP: unit id 0 is the gateway or the "
                 "device itself, and what it does with a write is its maker's choice; write to one after "
                 "another",
@@ -43,7 +43,7 @@ class Broadcaster:
                 rule="Modbus TCP has no broadcast",
             )
         if not _are_alike(drives):
-            raise Refused(
+            raise WriteForbidden(
                 f"{register.name} cannot be broadcast: the drives on this line differ in family or settings, "
                 "and the same address means different things to them; write to one after another",
                 register=register.name,
@@ -52,7 +52,7 @@ class Broadcaster:
         first = drives[0]
         raw = raw_count(first, register, value)
         if raw not in register.broadcast:
-            raise Refused(f"{first.title} has no harmless broadcast of {register.name} = {value}")
+            raise WriteForbidden(f"{first.title} has no harmless broadcast of {register.name} = {value}")
         for drive in drives:
             check_broadcast(drive, register, raw)
         if is_harmless(register, raw):

@@ -11,7 +11,7 @@ from multidrop.control.exit_hook import await_signal
 from multidrop.control.outcome import Outcome
 from multidrop.core import Permit
 from multidrop.drive.family import Drive
-from multidrop.errors import Expired, Overtaken, Refused, Unconfirmed
+from multidrop.errors import CancelledByStop, Expired, Unconfirmed, WriteForbidden
 from multidrop.transport import clock
 
 MOST_CHARACTERS = 64  # of a request and its reply about one register
@@ -67,16 +67,16 @@ class Call:
         return self.step(drive.least_interval + drive.response_timeout + wire)
 
     def check(self, what: str) -> None:
-        """Raise Overtaken once a stop was called, and Expired where the limit of its caller is over."""
+        """Raise CancelledByStop once a stop was called, and Expired where the limit of its caller is over."""
         if not self.permit.is_good:
             raise self.overtaken(what)
         if not self.sent and clock.boottime_ns() >= self._limit_ns:
             raise Expired(self.drive.name, what, self.expiry)
 
-    def overtaken(self, what: str) -> Overtaken:
-        return Overtaken(self.drive.name, what, self.permit.latch.why)
+    def overtaken(self, what: str) -> CancelledByStop:
+        return CancelledByStop(self.drive.name, what, self.permit.latch.why)
 
-    def unsent(self, what: str) -> Overtaken | Expired:
+    def unsent(self, what: str) -> CancelledByStop | Expired:
         """Return the reason why the core did not send it."""
         return (
             self.overtaken(what) if not self.permit.is_good else Expired(self.drive.name, what, self.expiry)
@@ -90,10 +90,10 @@ class Call:
         """
         try:
             yield
-        except (Overtaken, Unconfirmed):
+        except (CancelledByStop, Unconfirmed):
             await_signal()
             raise
-        except Refused as refusal:
+        except WriteForbidden as refusal:
             _log.info("refused: %s", refusal)
             raise
         except KeyboardInterrupt as interruption:

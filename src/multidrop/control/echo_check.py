@@ -8,7 +8,7 @@ from __future__ import annotations
 from contextlib import suppress
 
 from multidrop.drive.family import Drive
-from multidrop.errors import BadReply, DriveRefused, LineError, NoReply, NotAttached, NotMaster, NoValue
+from multidrop.errors import BadReply, DriveException, LineError, NoReply, NotAttached, NotMaster, NoValue
 from multidrop.transport.exchange import READ_ATTEMPTS, WRITE_TIMEOUT, Exchanges
 
 
@@ -23,7 +23,7 @@ class EchoCheck:
         readable = (register for register in drive.registers.values() if register.readable)
         register = drive.echo_probe or next(readable, None)
         if register is not None:
-            with suppress(DriveRefused, NoValue):
+            with suppress(DriveException, NoValue):
                 self._exchanges.values(drive, [register], attempts, insists=insists, timeout=timeout)
 
     def probe(self, drive: Drive, *, insists: bool = False) -> None:

@@ -10,7 +10,7 @@ from multidrop.control.echo_check import EchoCheck
 from multidrop.core import PAUSE_NS
 from multidrop.drive.family import Drive
 from multidrop.drive.script import Read, Step, Wait, carry_out
-from multidrop.errors import ANOTHER_FAMILY, BusError, CheckAgain, DriveRefused, Refused
+from multidrop.errors import ANOTHER_FAMILY, BusError, CheckAgain, DriveException, WriteForbidden
 from multidrop.families import MODELS
 from multidrop.transport import clock
 from multidrop.transport.exchange import READ_ATTEMPTS, Exchanges
@@ -67,7 +67,7 @@ class IdentityCheck:
     # ---- before a write that may move a motor ----
 
     def check(self, drive: Drive, timed: Timed = nullcontext) -> None:
-        """Check once; Refused when it is of another family, NoReply when it does not answer.
+        """Check once; WriteForbidden when it is of another family, NoReply when it does not answer.
 
         At least one value is read, so that the echo of an adapter is known before it could be taken for
         the drive's confirmation of a write. It is checked again after the port was opened again, after it
@@ -87,9 +87,9 @@ class IdentityCheck:
         port, silences = self._exchanges.line.queue, self._exchanges.peer(drive).silences
         try:
             carry_out(drive.identify.script(), do)
-        except DriveRefused as refusal:
+        except DriveException as refusal:
             kind = drive.title or type(drive).__name__
-            raise Refused(
+            raise WriteForbidden(
                 f"nothing is written to {drive.name}: it refuses what every {kind} answers ({refusal})",
                 rule="it does not look like its family",
             ) from refusal
@@ -107,13 +107,13 @@ class IdentityCheck:
 
     def _read(self, drive: Drive, step: Step, attempts: int, *, insists: bool = False) -> object:
         if not isinstance(step, Read):
-            raise Refused(f"{drive.name}: a look at its identity must not write")
+            raise WriteForbidden(f"{drive.name}: a look at its identity must not write")
         return self._exchanges.value(drive, step.register, attempts, insists=insists)
 
     # ---- before a stop ----
 
     def check_before_stop(self, drive: Drive) -> None:
-        """Check once, without waiting for anything; only proof of another family is Refused.
+        """Check once, without waiting for anything; only proof of another family is WriteForbidden.
 
         Raises CheckAgain after the first suspicion: call this again, after the stops of other drives.
 
@@ -121,7 +121,7 @@ class IdentityCheck:
         an address or a baud rate may hold a value that is not in force, and a reply may be the answer to an
         earlier request. The stop is sent then. It is withheld only if `identify` fails SURE times in a row,
         every request was answered so far, and either the drive is recognised as one of another built-in
-        family, or `identify` itself is certain: it raised Refused by the rule ANOTHER_FAMILY.
+        family, or `identify` itself is certain: it raised WriteForbidden by the rule ANOTHER_FAMILY.
         """
         port = self._exchanges.line.queue
         if self.is_known(drive) or self._stoppable.get(drive, self) is port:
@@ -153,7 +153,7 @@ class IdentityCheck:
                 return None  # a stop waits for nothing
             try:
                 return self._read(drive, step, 1, insists=True)
-            except DriveRefused as refusal:
+            except DriveException as refusal:
                 refused = refusal
                 raise
 
@@ -161,10 +161,10 @@ class IdentityCheck:
             carry_out(drive.identify.script(), do)
             if not self._exchanges.has_answered(drive):
                 self._echo.read_any(drive, 1, insists=True)
-        except (Refused, DriveRefused) as refusal:
+        except (WriteForbidden, DriveException) as refusal:
             if refused and drive.is_passing(refused.code):
                 return None
-            return str(refusal), isinstance(refusal, Refused) and refusal.rule == ANOTHER_FAMILY
+            return str(refusal), isinstance(refusal, WriteForbidden) and refusal.rule == ANOTHER_FAMILY
         except Exception:  # no answer; or the family's own code failed, which must not keep a stop back
             return None
         if self._is_in_step(drive):
@@ -211,7 +211,7 @@ def _slept_ns() -> int:
     return int(clock.boottime_ns() - clock.now_ns())
 
 
-def _withheld(drive: Drive, why: str, other: Drive | None) -> Refused:
+def _withheld(drive: Drive, why: str, other: Drive | None) -> WriteForbidden:
     way = "Use the hard-wired stop, and find out which drive has this address"
     if other is not None:
         way = (
@@ -219,7 +219,7 @@ def _withheld(drive: Drive, why: str, other: Drive | None) -> Refused:
             f"`multidrop stop PORT {other.model} {drive.address}`; in a program detach {drive.name} "
             f"first, and attach {type(other).__name__}({drive.address})"
         )
-    return Refused(
+    return WriteForbidden(
         f"no stop was sent to {drive.name}: at its address is another drive, as it said twice ({why}), "
         f"which may run at this family's stop. {way}",
         rule=ANOTHER_FAMILY,

@@ -20,12 +20,12 @@ from multidrop.drive.request import check_no_read
 from multidrop.drive.script import Insist, Read, Script, Step, Wait, Write, carry_out
 from multidrop.errors import (
     BadReply,
-    DriveRefused,
+    CancelledByStop,
+    DriveException,
     LineError,
     NoReply,
     NotAttached,
     NotMaster,
-    Overtaken,
     Unconfirmed,
 )
 from multidrop.transport import clock
@@ -35,11 +35,11 @@ _log = logging.getLogger("multidrop.control")
 
 
 # The failures of a read that say nothing of what was written before it.
-_ENDING = (NoReply, BadReply, DriveRefused, LineError, NotAttached, NotMaster)
+_ENDING = (NoReply, BadReply, DriveException, LineError, NotAttached, NotMaster)
 
 
 class _Over(Exception):
-    """The script went on after Overtaken was raised in it."""
+    """The script went on after CancelledByStop was raised in it."""
 
 
 class Performer:
@@ -67,7 +67,8 @@ class Performer:
     def move(self, script: Script[Any], call: Call) -> Any:
         """Carry out a verb that may move the motor: a stop ends it at whatever step it is.
 
-        Raises Overtaken then, where nothing was sent, and Unconfirmed where something was, as `perform`.
+        Raises CancelledByStop then, where nothing was sent, and Unconfirmed where something was, as
+        `perform`.
         """
         with call.noted():
             call.check(f"the {call.verb}")
@@ -127,7 +128,7 @@ class Performer:
             return drive.watchdog
         try:
             held = self._exchanges.value(drive, register)
-        except DriveRefused:
+        except DriveException:
             return drive.watchdog
         if held == 0:
             return f"its watchdog ({register.name}) is off: the motor runs on when the client dies"
@@ -137,10 +138,10 @@ class Performer:
         """Carry out a script's steps.
 
         A read that fails after something was written is Unconfirmed: NoReply would say that nothing was
-        written, and DriveRefused that the drive did not do it.
+        written, and DriveException that the drive did not do it.
         """
         unseen: list[Exception] = []  # why something was not read
-        overtaken: list[Overtaken] = []
+        overtaken: list[CancelledByStop] = []
 
         def do(step: Step) -> Any:
             try:
@@ -153,7 +154,7 @@ class Performer:
 
         try:
             return carry_out(script, do)
-        except (*_ENDING, Overtaken, _Over) as failure:
+        except (*_ENDING, CancelledByStop, _Over) as failure:
             why: Exception = overtaken[0] if isinstance(failure, _Over) else failure
             if not call.sent or why not in unseen:
                 raise why from None if why is failure else failure
@@ -176,7 +177,7 @@ class Performer:
         return self._writer.put(drive, step, call).value
 
 
-def _check(step: Step, call: Call, overtaken: list[Overtaken]) -> None:
+def _check(step: Step, call: Call, overtaken: list[CancelledByStop]) -> None:
     """End a script once a stop was called: at its next write, and if it may move a motor at any step.
 
     A write that does no harm may still take something back.
@@ -191,7 +192,7 @@ def _check(step: Step, call: Call, overtaken: list[Overtaken]) -> None:
 
 
 def _unseen(call: Call, why: Exception) -> Unconfirmed:
-    if isinstance(why, Overtaken):
+    if isinstance(why, CancelledByStop):
         reason = f"it was sent, and then {why.why}"
     elif call.is_confirmed:
         reason = f"it was confirmed, but its effect could not be seen: {why}"

@@ -15,7 +15,7 @@ from multidrop.drive.register import Register
 from multidrop.drive.script import Script, Write, read, wait
 from multidrop.drive.state import Direction
 from multidrop.drive.table import Kept
-from multidrop.errors import Refused
+from multidrop.errors import WriteForbidden
 
 HEARD_S = PAUSE_NS / 2e9  # after PAUSE_NS nobody knows whether a drive has lost its power (identity.py)
 
@@ -92,8 +92,8 @@ def ramp(drive: Drive, hz: float, *, rate: float | None = None, every: float = 0
     """Bring the setpoint to `hz` in steps, one in `every` seconds, at `rate` Hz/s.
 
     The rate is the drive's own (maximum frequency / acceleration time) where these can be read and
-    none is given, and never above it. Refused for a setpoint that every step would store in EEPROM. For one
-    that the drive does not take nothing is sent, and this raises as `set_frequency`.
+    none is given, and never above it. WriteForbidden for a setpoint that every step would store in EEPROM.
+    For one that the drive does not take nothing is sent, and this raises as `set_frequency`.
     """
     drive.perform(_ramp(drive, hz, rate, every))
 
@@ -104,10 +104,12 @@ def _ramp(drive: Drive, hz: float, rate: float | None, every: float) -> Script[N
     drive.check_confirmed("set_frequency")
     register = drive.register(drive.setpoint_name)
     if wears(drive, register) is not Kept.RAM:
-        raise Refused(f"the setpoint of {drive.name} may be kept in EEPROM, which a ramp would wear out")
+        raise WriteForbidden(
+            f"the setpoint of {drive.name} may be kept in EEPROM, which a ramp would wear out"
+        )
     own = yield from _own_rate(drive)
     if rate is None and own is None:
-        raise Refused(f"the acceleration of {drive.name} cannot be read: give a rate in Hz/s")
+        raise WriteForbidden(f"the acceleration of {drive.name} cannot be read: give a rate in Hz/s")
     if rate is not None and not rate > 0:
         raise ValueError(f"rate = {rate:g} Hz/s is not above 0")
     if rate is not None and own is not None and rate > own:
@@ -150,12 +152,12 @@ def _present(drive: Drive, register: Register[float]) -> Script[float]:
     """Return the setpoint in force, in Hz."""
     held = (yield from read(register)) if register.readable else drive.commanded
     if held is None:
-        raise Refused(f"{drive.name} cannot say its setpoint: call set_frequency before a ramp")
+        raise WriteForbidden(f"{drive.name} cannot say its setpoint: call set_frequency before a ramp")
     if register.unit != "%":
         return held
     most = drive.option.get("maximum_frequency")
     if most is None:
-        raise Refused(
+        raise WriteForbidden(
             f"{register.name} of {drive.name} is in %: a ramp needs maximum_frequency, which is not declared"
         )
     return held * most / 100

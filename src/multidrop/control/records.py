@@ -49,7 +49,7 @@ class WriteRecords:
         self._writers: list[None] = []  # in `catch_up`; a list grows and shrinks without a lock
 
     def count(self, drive: Drive, register: Register[Any], kept: Kept) -> None:
-        """Count a write in the ledger before it is sent; Refused when it must not be."""
+        """Count a write in the ledger before it is sent; WriteForbidden when it must not be."""
         least = LEAST_INTERVAL if kept is Kept.EEPROM else 0.0
         ledger = self._ledger.at(self._line.identity)
         why = ledger.enter(self._cell(drive, register), clock.utc_ns() / 1e9, least)

@@ -1,6 +1,6 @@
 """Rules of a register, which must hold before anything is written to it.
 
-A write against them is `Refused`, with the register, the rule and the manual's place.
+A write against them is `WriteForbidden`, with the register, the rule and the manual's place.
 """
 
 from __future__ import annotations
@@ -14,24 +14,26 @@ from multidrop.drive.script import Script, read
 from multidrop.drive.state import Condition
 from multidrop.drive.table import Carrier, Kept
 from multidrop.drive.verbs import VERBS
-from multidrop.errors import Advice, Refused, Unsupported
+from multidrop.errors import Advice, Unsupported, WriteForbidden
 
 T = TypeVar("T", bound=float)
 
 
-def refused(drive: Drive, register: Register[Any], rule: str, advice: Advice | None = None) -> Refused:
+def refused(drive: Drive, register: Register[Any], rule: str, advice: Advice | None = None) -> WriteForbidden:
     """Return the error that says that this rule keeps the register from being written."""
     return _refusal(register, rule, f"{register.name} of {drive.name} is not written: {rule}", advice)
 
 
-def _refusal(register: Register[Any], rule: str, sentence: str, advice: Advice | None = None) -> Refused:
+def _refusal(
+    register: Register[Any], rule: str, sentence: str, advice: Advice | None = None
+) -> WriteForbidden:
     place = "; ".join(filter(None, (register.place, register.outside)))
     where = f" (manual: {place})" if place else ""
-    return Refused(sentence + where, register=register.name, rule=rule, place=place, advice=advice)
+    return WriteForbidden(sentence + where, register=register.name, rule=rule, place=place, advice=advice)
 
 
 def raw_count(drive: Drive, register: Register[T], value: T) -> float:
-    """Return the raw count to be sent; Refused if its declaration forbids it, TypeError for no value."""
+    """Return the raw count to send. Raises WriteForbidden by its declaration, TypeError for no value."""
     check_own(drive, register)
     if register.never:
         raise refused(drive, register, register.never)
@@ -44,7 +46,7 @@ def raw_count(drive: Drive, register: Register[T], value: T) -> float:
 
 
 def check_known(drive: Drive, register: Register[Any], raw: float) -> None:
-    """Raise Refused unless the drive is known to be of its class, where this may command the motor.
+    """Raise WriteForbidden unless the drive is known to be of its class, where this may command the motor.
 
     A stop needs no such knowledge. What a file calls harmless is believed where its stop was checked with it.
     """
@@ -57,7 +59,7 @@ def check_known(drive: Drive, register: Register[Any], raw: float) -> None:
 
 
 def check_plain(drive: Drive, register: Register[Any], raw: float) -> None:
-    """Raise Refused unless a plain write may do this: only a verb moves a motor or resets a fault.
+    """Raise WriteForbidden unless a plain write may do this: only a verb moves a motor or resets a fault.
 
     A command that moves nothing by itself is sent to a drive that is known to be of its class.
     """
@@ -86,7 +88,7 @@ def _has(drive: Drive, name: str) -> bool:
 
 
 def check_broadcast(drive: Drive, register: Register[Any], raw: float) -> None:
-    """Raise Refused for a broadcast of a user's family that nobody has confirmed, unless it stops."""
+    """Raise WriteForbidden for a broadcast of a user's family that nobody has confirmed, unless it stops."""
     if not is_stop(drive, register, raw):
         drive.check_confirmed(register.name)
 
@@ -131,11 +133,11 @@ def _must_stand(drive: Drive, register: Register[Any]) -> Script[None]:
         raise _not_now(drive, register, f"it changes only while the motor stands; state: {state}")
 
 
-def _not_now(drive: Drive, register: Register[Any], rule: str) -> Refused:
+def _not_now(drive: Drive, register: Register[Any], rule: str) -> WriteForbidden:
     """Return the refusal by a rule that a manual need not print: its place is said to be the register's."""
     where = f" (in the manual, {register.name} is {register.place})" if register.place else ""
     sentence = f"{register.name} of {drive.name} is not written: {rule}{where}"
-    return Refused(sentence, register=register.name, rule=rule, place=register.place)
+    return WriteForbidden(sentence, register=register.name, rule=rule, place=register.place)
 
 
 def wears(drive: Drive, register: Register[Any]) -> Kept:

@@ -15,15 +15,15 @@ from multidrop.errors import (
     BadReply,
     BusError,
     CheckAgain,
-    DriveRefused,
+    DriveException,
     LineError,
     NoReply,
-    NotDone,
     NotMaster,
+    NotVerified,
     PortLost,
-    Refused,
     Unconfirmed,
     Unsupported,
+    WriteForbidden,
 )
 from multidrop.transport.aside_log import log_aside
 
@@ -32,8 +32,8 @@ PAUSE_S = 0.2  # before it is repeated
 AT_ONCE = 8  # steps without a good answer, after which the line is shared with polling
 SHARE = 1.5  # time left to polling after such a step, in units of the step's own time
 MOST_STEPS = 8  # that are sent once more after an interruption
-UNSENT = (Refused, LineError, NotMaster, ValueError)
-WORTH_REPEATING = (Unconfirmed, NotDone, NoReply, BadReply, DriveRefused, PortLost, NotMaster)
+UNSENT = (WriteForbidden, LineError, NotMaster, ValueError)
+WORTH_REPEATING = (Unconfirmed, NotVerified, NoReply, BadReply, DriveException, PortLost, NotMaster)
 UNANSWERED = (Unconfirmed, NoReply, BadReply)
 NO_ROOM = (MemoryError, OSError)  # what the system may have again soon, such as memory and descriptors
 
@@ -178,7 +178,7 @@ class StopAttempt:
             self.times_sent += 1
             if isinstance(step, Pulse):
                 self._pulses.add((step.register.name, step.value))
-        self.is_sent |= not isinstance(failure, (*UNSENT, DriveRefused))
+        self.is_sent |= not isinstance(failure, (*UNSENT, DriveException))
         self._is_confirmed |= failure is None
 
     def _goes_on(self, failure: Exception, now: float) -> bool:
@@ -226,7 +226,7 @@ class StopAttempt:
     def known(self) -> Exception | None:
         """The failure of the whole stop; None where the motor is seen to stand."""
         failure = self.failure
-        if failure is None or isinstance(failure, (Unsupported, Refused)):
+        if failure is None or isinstance(failure, (Unsupported, WriteForbidden)):
             return failure
         if self._is_confirmed and not isinstance(failure, Unconfirmed):
             reason = f"it was confirmed, but its effect could not be seen: {failure}"

@@ -23,14 +23,14 @@ from multidrop.drive.table import Kept
 from multidrop.errors import (
     BadReply,
     BusError,
-    DriveRefused,
+    CancelledByStop,
+    DriveException,
     Expired,
     LineError,
     NoReply,
     NotAttached,
     NotMaster,
     NoValue,
-    Overtaken,
     Unconfirmed,
 )
 from multidrop.transport import clock
@@ -52,7 +52,7 @@ class Writer:
     # ---- writing ----
 
     def put(self, drive: Drive, step: Write, call: Call) -> Outcome:
-        """Write once, by all rules but that for plain writes. Raises Overtaken and Expired, by its call."""
+        """Write once, by all rules but those of plain writes. Raises CancelledByStop or Expired."""
         check_author()
         register, value = step.register, step.value
         raw = raw_count(drive, register, value)
@@ -82,8 +82,8 @@ class Writer:
         """Write what stops the motor, or does no harm at any time: only the port can hold it back.
 
         Neither a rule nor the ledger is asked; the records are kept afterwards, by `catch_up`. Only proof of
-        another family is Refused. Where answers are known to be late, it waits up to `timeout` seconds for
-        its own. `log` notes it instead of the records.
+        another family is WriteForbidden. Where answers are known to be late, it waits up to `timeout` seconds
+        for its own. `log` notes it instead of the records.
         """
         register = step.register
         raw = raw_count(drive, register, step.value)
@@ -121,7 +121,7 @@ class Writer:
         except (NoReply, BadReply) as failure:
             log(drive, request, what, Effect.UNCONFIRMED, str(failure))
             raise Unconfirmed(drive.name, what, _reason(failure)) from failure
-        except DriveRefused as failure:
+        except DriveException as failure:
             log(drive, request, what, Effect.REFUSED, str(failure))
             raise
         if completion.raw == frame:
@@ -218,7 +218,7 @@ class Writer:
         held, unread = None, None
         try:
             good_reply(drive, completion)
-        except DriveRefused as failure:
+        except DriveException as failure:
             if call is None or not _is_under_way(failure):
                 return Outcome(drive.name, register, asked, Effect.REFUSED, failure=failure)
             lost = failure
@@ -243,7 +243,7 @@ class Writer:
         try:
             with call.look() if call else nullcontext():
                 return self._exchanges.value(drive, register), None
-        except (NoReply, BadReply, DriveRefused, LineError, NotAttached, NotMaster) as failure:
+        except (NoReply, BadReply, DriveException, LineError, NotAttached, NotMaster) as failure:
             return None, failure
 
     def _look(self, drive: Drive, step: Step, call: Call) -> Any:
@@ -276,15 +276,15 @@ def _is_unsent(failure: BaseException) -> bool:
     """Return True where a write ended so before anything of it was sent."""
     if isinstance(failure, (LineError, NotMaster)):
         return not failure.is_sent
-    return isinstance(failure, (Expired, Overtaken, NotAttached, NoReply))
+    return isinstance(failure, (Expired, CancelledByStop, NotAttached, NoReply))
 
 
-def _is_under_way(failure: DriveRefused) -> bool:
+def _is_under_way(failure: DriveException) -> bool:
     """Return True for exception 05: it was accepted, and takes longer (application protocol V1.1b3, 7)."""
     return failure.code == ACKNOWLEDGED and failure.meaning == Drive.exceptions[ACKNOWLEDGED]
 
 
 def _reason(failure: BusError) -> str:
-    if isinstance(failure, DriveRefused):
+    if isinstance(failure, DriveException):
         return f"its reply is code {failure.code:02X}H, {failure.meaning}"
     return failure.reason if isinstance(failure, BadReply) else "no reply"

@@ -22,7 +22,7 @@ from multidrop.drive.script import Script, read, until, write
 from multidrop.drive.state import Condition, Direction, State
 from multidrop.drive.text import Text, text_errors
 from multidrop.drive.verbs import MOVING, CalledStop, UnattachedStop, verb, verb_errors
-from multidrop.errors import Advice, NotAttached, NotDone, Refused, Unconfirmed, Unsupported
+from multidrop.errors import Advice, NotAttached, NotVerified, Unconfirmed, Unsupported, WriteForbidden
 
 START_TIME = 5.0  # s, after which a motor that was started must be seen to run
 REVERSAL_TIME = 60.0  # s, for the ramps of a motor that turned the other way, without the option `stop_time`
@@ -75,7 +75,7 @@ class Drive(ManualFacts):
         return cls.identify is not Drive.identify
 
     def check_confirmed(self, what: str) -> None:
-        """Raise Refused for a drive that must be confirmed and is not.
+        """Raise WriteForbidden for a drive that must be confirmed and is not.
 
         It must be where its class cannot identify its drives: the same address means different things to
         different makes, and may start their motor. It must be too where a file declares the class, which
@@ -85,7 +85,7 @@ class Drive(ManualFacts):
             return
         kind = self.title or type(self).__name__
         if why := doubt(kind, self.declared_in, identifies=self._identifies()):
-            raise Refused(
+            raise WriteForbidden(
                 f"{what} is not sent to {self.name}: {why}, and declare confirmed = 1",
                 rule="nobody has confirmed what it is",
                 advice=Advice.declare("confirmed", 1),
@@ -156,14 +156,14 @@ class Drive(ManualFacts):
             raise Unconfirmed(self.name, "the stop", f"after {limit:g} s it is not seen to have stopped")
 
     def _hold(self, register: Register[float], value: float) -> Script[None]:
-        """Write the setpoint; NotDone when the drive then holds another value."""
+        """Write the setpoint; NotVerified when the drive then holds another value."""
         held = yield from write(register, value)
         if held != register.decode(register.encode(value)):
             what = f"{register.name} = {register.format(value)}"
-            raise NotDone(self.name, what, f"the drive holds {register.format(held)}")
+            raise NotVerified(self.name, what, f"the drive holds {register.format(held)}")
 
     def _setpoint_in_force(self) -> Script[None]:
-        """Raise Refused unless the setpoint is known, is not 0, and is still the one that was written."""
+        """Raise WriteForbidden unless the setpoint is known, not 0, and still the one that was written."""
         register = self.register(self.setpoint_name)
         held = (yield from read(register)) if register.readable else self.commanded
         if held is None:
@@ -175,20 +175,20 @@ class Drive(ManualFacts):
             why = f"{self.name} holds {shown} as it was told: it may have lost its power;"
         else:
             return
-        raise Refused(f"{why} call set_frequency before start", advice=_SETPOINT_FIRST)
+        raise WriteForbidden(f"{why} call set_frequency before start", advice=_SETPOINT_FIRST)
 
-    def _stop_first(self, why: str) -> Refused:
-        return Refused(f"{self.name} {why} call stop() first", advice=Advice.call("stop"))
+    def _stop_first(self, why: str) -> WriteForbidden:
+        return WriteForbidden(f"{self.name} {why} call stop() first", advice=Advice.call("stop"))
 
-    def _reset_first(self, fault: str = "") -> Refused:
+    def _reset_first(self, fault: str = "") -> WriteForbidden:
         shown = f"a fault, {fault}" if fault else "a fault"
         why = f"{self.name} has {shown}: see to it, then call reset_fault()"
-        return Refused(why, advice=Advice.call("reset_fault"))
+        return WriteForbidden(why, advice=Advice.call("reset_fault"))
 
     def _started(self, direction: Direction | None = None) -> Script[None]:
         """Wait until the motor is seen to run, and in `direction` if the drive shows one.
 
-        A motor that turned the other way has the time of its ramps for that. Raises NotDone if the drive
+        A motor that turned the other way has the time of its ramps for that. Raises NotVerified if the drive
         trips, Unconfirmed if it is not seen to run so.
         """
         if not (yield from until(self._runs, limit=START_TIME)):
@@ -216,12 +216,12 @@ class Drive(ManualFacts):
     def _without_trip(self) -> Script[State]:
         state = yield from self.state.script()
         if state.condition is Condition.FAULT:
-            raise NotDone(self.name, "the start", f"it tripped: {state.fault or 'it shows a fault'}")
+            raise NotVerified(self.name, "the start", f"it tripped: {state.fault or 'it shows a fault'}")
         return state
 
     @verb
     def identify(self) -> Script[None]:
-        """Check by reading that this is a drive of the family; Refused when it is another.
+        """Check by reading that this is a drive of the family; WriteForbidden when it is another.
 
         A drive that passes is not proven to be one: few families say who they are.
         """

@@ -11,7 +11,7 @@ from typing import Any, TypeVar, cast, overload
 
 from multidrop.drive.register import Register
 from multidrop.drive.text import Text
-from multidrop.errors import BadReply, BusError, DriveRefused, NoReply, Unconfirmed
+from multidrop.errors import BadReply, BusError, DriveException, NoReply, Unconfirmed
 
 MOST_UNANSWERED = 3  # looks in a row
 
@@ -87,7 +87,7 @@ def insist(register: Register[T], value: T, attempts: int = 3) -> Script[None]:
     for attempt in range(1, attempts + 1):
         try:
             yield Insist(register, value)
-        except (Unconfirmed, DriveRefused):
+        except (Unconfirmed, DriveException):
             if attempt == attempts:
                 raise
         else:

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from enum import IntEnum
 from typing import Any
 
-from multidrop.drive import Framing, Refused
+from multidrop.drive import Framing, WriteForbidden
 from multidrop.drive.declare import command, setting
 from multidrop.drive.register import Register
 from multidrop.drive.script import Script, insist, read, write
@@ -107,7 +107,7 @@ class DelixiModbus(DelixiParameters, table=HOLDING):
         yield from self._shows_its_line()
         fault = yield from read(self.fault)
         if not isinstance(fault, type(self.fault.decode(0))):
-            raise Refused(
+            raise WriteForbidden(
                 f"{self.name} has {int(fault):04X}H as its present fault (P05.31), which no list explains: "
                 "it may be another make; look at its name plate"
             )
@@ -119,7 +119,7 @@ class DelixiModbus(DelixiParameters, table=HOLDING):
             raise self._stop_first("may still jog, which a start may not end:")
         forward = yield from self._forward(direction)
         if (yield from read(self.frequency_source)) != 1:
-            raise Refused(f"{self.name} takes no setpoint from P00.02: set P00.01 to 1 on the keypad")
+            raise WriteForbidden(f"{self.name} takes no setpoint from P00.02: set P00.01 to 1 on the keypad")
         yield from self._setpoint_in_force()
         self._jogged = False
         yield from write(
@@ -142,7 +142,7 @@ class DelixiModbus(DelixiParameters, table=HOLDING):
     def _forward(self, direction: Direction | None) -> Script[bool]:
         yield from self._may_start()
         if direction is None and not (yield from self._stands()):
-            raise Refused(f"{self.name} turns, and cannot say which way: name the direction")
+            raise WriteForbidden(f"{self.name} turns, and cannot say which way: name the direction")
         return direction is not Direction.REVERSE
 
     @verb

@@ -5,7 +5,7 @@ from __future__ import annotations
 from enum import IntEnum
 from typing import Any
 
-from multidrop.drive import Framing, NotDone, Refused
+from multidrop.drive import Framing, NotVerified, WriteForbidden
 from multidrop.drive.declare import command, reading, setting
 from multidrop.drive.register import Register
 from multidrop.drive.script import Script, insist, read, write
@@ -124,7 +124,7 @@ class DelixiNative(DelixiParameters, table=PARAMETER):
         if status in (DelixiNativeStatus.FAULT, DelixiNativeStatus.UNDERVOLTAGE):
             raise self._reset_first(status.name)
         if status not in CONDITIONS:
-            raise Refused(f"{self.name} says {int(status):04X}H to K = 03, which is not explained")
+            raise WriteForbidden(f"{self.name} says {int(status):04X}H to K = 03, which is not explained")
         yield from self._setpoint_in_force()
         if direction is None and status == DelixiNativeStatus.REVERSE:
             direction = Direction.REVERSE
@@ -151,12 +151,12 @@ class DelixiNative(DelixiParameters, table=PARAMETER):
     def reset_fault(self) -> Script[None]:
         """Reset a fault; never starts the motor. Sent once, then looked at."""
         if (yield from read(self.status)) in CONDITIONS and not (yield from self._stands()):
-            raise Refused(f"{self.name} runs: it has no fault to reset")
+            raise WriteForbidden(f"{self.name} runs: it has no fault to reset")
         yield from write(self.control, DelixiNativeControl.RESET_FAULT)
         status = yield from read(self.status)
         if status in (DelixiNativeStatus.FAULT, DelixiNativeStatus.UNDERVOLTAGE):
             fault = self.fault.in_words((yield from read(self.fault)))
-            raise NotDone(self.name, "the fault reset", f"the fault stands: {fault}")
+            raise NotVerified(self.name, "the fault reset", f"the fault stands: {fault}")
 
     @verb
     def set_frequency(self, hz: float) -> Script[None]:

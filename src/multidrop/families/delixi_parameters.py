@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from enum import IntEnum
 
-from multidrop.drive import Drive, Refused
+from multidrop.drive import Drive, WriteForbidden
 from multidrop.drive.declare import reading, setting
 from multidrop.drive.options import Option
 from multidrop.drive.register import Register, Worded
@@ -142,10 +142,10 @@ class DelixiParameters(Drive):
         super().__init_subclass__()
 
     def _shows_its_line(self) -> Script[None]:
-        """Raise Refused unless P04.30 and P04.28 are the declared address and baud rate."""
+        """Raise WriteForbidden unless P04.30 and P04.28 are the declared address and baud rate."""
         address = yield from read(self.address_setting)
         if address != self.address:
-            raise Refused(
+            raise WriteForbidden(
                 f"{self.name} has {address:g} as P04.30, not its address {self.address}: it may be another "
                 "make; look at its name plate, and at P04.30 on its keypad"
             )
@@ -153,20 +153,20 @@ class DelixiParameters(Drive):
         if held == DelixiBaudrate[f"B{declared}"]:
             return
         named = f", {held.name[1:]} bit/s" if isinstance(held, DelixiBaudrate) else ""
-        raise Refused(
+        raise WriteForbidden(
             f"{self.name} has {int(held)} as P04.28{named}, and is declared with {declared} bit/s: declare "
             "its baud rate, behind a converter too; if its keypad shows another P04.28, it is another make"
         )
 
     def _may_start(self) -> Script[None]:
-        """Raise Refused with a fault, without a setpoint, and where the line does not command it."""
+        """Raise WriteForbidden with a fault, without a setpoint, and where the line does not command it."""
         fault = yield from read(self.fault)
         if fault:
-            raise Refused(
+            raise WriteForbidden(
                 f"{self.name} has a fault, {self.fault.in_words(fault)}: see to it and reset it first"
             )
         if (yield from read(self.run_source)) != DelixiRunSource.LINE:
-            raise Refused(f"{self.name} is not commanded by the line: {self.remote}")
+            raise WriteForbidden(f"{self.name} is not commanded by the line: {self.remote}")
 
     def _limit(self) -> float:
         return self.option.get("stop_time", STOP_TIME)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from enum import IntEnum, IntFlag
 from typing import Any, Unpack
 
-from multidrop.drive import Advice, BusError, Drive, DriveRefused, Refused, Unconfirmed
+from multidrop.drive import Advice, BusError, Drive, DriveException, Unconfirmed, WriteForbidden
 from multidrop.drive.declare import Details, command, declaration, reading, setting
 from multidrop.drive.number_format import NumberFormat
 from multidrop.drive.options import Option
@@ -217,8 +217,8 @@ class ErmanERG220(Drive):
         """Check that 0400H can be read; on the models -03 and -04 function 04 does not exist."""
         try:
             yield from read(self.status)
-        except DriveRefused as refusal:
-            raise Refused(
+        except DriveException as refusal:
+            raise WriteForbidden(
                 f"{self.name} has no state register at 0400H: it is not an ER-G-220-01(02)"
             ) from refusal
 
@@ -237,7 +237,9 @@ class ErmanERG220(Drive):
                 f"{reset.command}, or {declare.plant}",
             )
             shown = self.last_fault.in_words(fault)
-            raise Refused(f"{self.name} may have a fault, {shown}: see to it, then {way.program}", advice=way)
+            raise WriteForbidden(
+                f"{self.name} may have a fault, {shown}: see to it, then {way.program}", advice=way
+            )
         yield from self._setpoint_in_force()
         yield from write(self.stop_coil, Coil.OFF)
         yield from write(self.emergency_stop_coil, Coil.OFF)
@@ -249,7 +251,7 @@ class ErmanERG220(Drive):
         """Stop along the ramp; when the motor still runs after it, or refuses that, emergency stop."""
         try:
             yield from self._hold_back(self.stop_coil)
-        except DriveRefused:
+        except DriveException:
             yield from self.emergency_stop.script()
             return
         limit = yield from self._longest_ramp()
@@ -289,7 +291,7 @@ class ErmanERG220(Drive):
     def reset_fault(self) -> Script[None]:
         """Reset a fault; START is written off before, so that it cannot start the motor again."""
         if (yield from read(self.status)) & PHASE:
-            raise Refused(f"{self.name} runs: it has no fault to reset")
+            raise WriteForbidden(f"{self.name} runs: it has no fault to reset")
         fault = yield from read(self.last_fault)
         yield from insist(self.start_coil, Coil.OFF)
         try:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from enum import IntEnum, IntFlag
 
-from multidrop.drive import Advice, BusError, Drive, DriveRefused, Framing, Refused
+from multidrop.drive import Advice, BusError, Drive, DriveException, Framing, WriteForbidden
 from multidrop.drive.declare import command, reading, setting
 from multidrop.drive.options import Option
 from multidrop.drive.script import Script, insist, read, write
@@ -220,7 +220,7 @@ class InnovertIBD(Drive):
         if self.option.get("confirmed"):
             return
         if not (yield from self._shows_its_line()):
-            raise Refused(
+            raise WriteForbidden(
                 f"{self.name} does not show its own baud rate at 02BCH and its address at 02BEH: look at its "
                 "name plate, and declare confirmed = 1 if it is an IBD",
                 advice=Advice.declare("confirmed", 1),
@@ -230,7 +230,7 @@ class InnovertIBD(Drive):
         try:
             baudrate = yield from read(self.baudrate_setting)
             address = yield from read(self.address_setting)
-        except DriveRefused:
+        except DriveException:
             return False
         return baudrate == IBDBaudrate[f"B{self.settings.baudrate}"] and address == self.address
 
@@ -270,7 +270,7 @@ class InnovertIBD(Drive):
     def _bit(self, direction: Direction) -> int:
         forward = self.option.get("forward_bit")
         if forward not in (2, 3):
-            raise Refused(
+            raise WriteForbidden(
                 f"{self.name}: the manual is ambiguous about which bit of 2000H is {direction.value}; "
                 "start without a direction, or try which of bits 2 and 3 turns it forward, and "
                 "declare forward_bit = N",
@@ -282,7 +282,7 @@ class InnovertIBD(Drive):
         if (yield from read(self.frequency_source)) != FrequencySource.LINE or (
             yield from read(self.run_source)
         ) != IBDRunSource.LINE:
-            raise Refused(f"{self.name} is not commanded by the line: {self.remote}")
+            raise WriteForbidden(f"{self.name} is not commanded by the line: {self.remote}")
 
     def _runs(self) -> Script[bool]:
         return (yield from super()._runs()) or not (yield from self._stands())
@@ -305,7 +305,7 @@ class InnovertIBD(Drive):
     def reset_fault(self) -> Script[None]:
         """Reset a fault after a stop was commanded; never starts the motor. Sent once."""
         if not (yield from self._stands()):
-            raise Refused(f"{self.name} turns: it has no fault to reset")
+            raise WriteForbidden(f"{self.name} turns: it has no fault to reset")
         yield from insist(self.control, IBDControl.STOP)
         yield from write(self.control, IBDControl.RESET_FAULT)
 

@@ -6,7 +6,15 @@ from contextlib import suppress
 from enum import IntEnum
 from typing import Any, Unpack
 
-from multidrop.drive import ANOTHER_FAMILY, Advice, BusError, Drive, DriveRefused, NotDone, Refused
+from multidrop.drive import (
+    ANOTHER_FAMILY,
+    Advice,
+    BusError,
+    Drive,
+    DriveException,
+    NotVerified,
+    WriteForbidden,
+)
 from multidrop.drive.declare import Details, command, declaration, reading, setting
 from multidrop.drive.number_format import NumberFormat
 from multidrop.drive.options import Option
@@ -267,7 +275,7 @@ class InvtCHE(Drive):
             return
         series = OTHER_SERIES.get(int(device))
         known = f", a {series}" if series else ""
-        raise Refused(
+        raise WriteForbidden(
             f"{self.name} says that it is device {int(device):04X}H{known}; a CHE is 0101H or 0102H",
             rule=ANOTHER_FAMILY if series else "",
         )
@@ -299,7 +307,7 @@ class InvtCHE(Drive):
             fault = self.fault.in_words((yield from read(self.fault)))
             raise self._reset_first(fault)
         if status not in STATES:
-            raise Refused(f"{self.name} has {int(status):04X}H at 1001H, which is not explained")
+            raise WriteForbidden(f"{self.name} has {int(status):04X}H at 1001H, which is not explained")
         if direction is None:
             return status != CHEStatus.REVERSE
         return direction is Direction.FORWARD
@@ -307,11 +315,11 @@ class InvtCHE(Drive):
     @verb
     def stop(self) -> Script[None]:
         """Stop along the ramp, and a jog too where the motor turns after it: that it jogs cannot be read."""
-        refusals: list[DriveRefused] = []
+        refusals: list[DriveException] = []
         try:
             if (yield from self._stands_by(CHEControl.STOP, refusals)):
                 return
-        except Refused:  # another drive is there
+        except WriteForbidden:  # another drive is there
             raise
         except BusError:  # one that is not heard may hear, and jog
             with suppress(BusError):
@@ -323,11 +331,11 @@ class InvtCHE(Drive):
             raise refusals[0]
         yield from self._stopped(self._stands, self.option.get("stop_time", STOP_TIME))
 
-    def _stands_by(self, word: CHEControl, refusals: list[DriveRefused]) -> Script[bool]:
+    def _stands_by(self, word: CHEControl, refusals: list[DriveException]) -> Script[bool]:
         """Write a stop, and return True where the motor stands then; note its refusal."""
         try:
             yield from insist(self.control, word)
-        except DriveRefused as refusal:  # as it may in a fault, or where there is no jog to stop
+        except DriveException as refusal:  # as it may in a fault, or where there is no jog to stop
             refusals.append(refusal)
         return (yield from self._stands())
 
@@ -345,18 +353,18 @@ class InvtCHE(Drive):
     def reset_fault(self) -> Script[None]:
         """Reset a fault; never starts the motor. Sent once, then looked at."""
         if (yield from read(self.status)) in (CHEStatus.FORWARD, CHEStatus.REVERSE):
-            raise Refused(f"{self.name} runs: it has no fault to reset")
+            raise WriteForbidden(f"{self.name} runs: it has no fault to reset")
         yield from write(self.control, CHEControl.RESET_FAULT)
         if (yield from read(self.status)) == CHEStatus.FAULT:
             fault = self.fault.in_words((yield from read(self.fault)))
-            raise NotDone(self.name, "the fault reset", f"the fault stands: {fault}")
+            raise NotVerified(self.name, "the fault reset", f"the fault stands: {fault}")
 
     @verb
     def set_frequency(self, hz: float) -> Script[None]:
         """Write the setpoint as the percentage of the maximum frequency that it is."""
         most = self.option.get("maximum_frequency")
         if most is None:
-            raise Refused(
+            raise WriteForbidden(
                 f"{self.name} takes its setpoint in percent of P0.04: declare maximum_frequency = HZ",
                 advice=Advice.declare("maximum_frequency", "HZ"),
             )

@@ -8,7 +8,7 @@ from contextlib import suppress
 from enum import IntEnum, IntFlag
 from typing import Any, Unpack
 
-from multidrop.drive import BusError, Drive, DriveRefused, NotDone, Refused, Unconfirmed
+from multidrop.drive import BusError, Drive, DriveException, NotVerified, Unconfirmed, WriteForbidden
 from multidrop.drive.declare import Details, command, reading, setting
 from multidrop.drive.options import Option
 from multidrop.drive.register import Register
@@ -375,13 +375,13 @@ class YD1000(Drive):
         """Check that 0802H is the drive's own address, and 0011H a maximum frequency."""
         address = yield from read(self.address_setting)
         if address != self.address:
-            raise Refused(
+            raise WriteForbidden(
                 f"{self.name} has {address:g} at 0802H (F802), not its address {self.address}: it may be "
                 "another make; look at its name plate"
             )
         most = yield from read(self.maximum_frequency)
         if not 30 <= most <= 320:
-            raise Refused(
+            raise WriteForbidden(
                 f"{self.name} has {most:g} Hz at 0011H (FH), not 30 to 320: it may be another make; look at "
                 "its name plate"
             )
@@ -410,12 +410,14 @@ class YD1000(Drive):
         number = int(self.option["preset_speed"])
         hz = yield from read(self.registers[f"preset_speed_{number}"])
         if hz == 0:
-            raise Refused(f"preset speed {number} of {self.name} is 0: set preset_speed_{number} first")
+            raise WriteForbidden(
+                f"preset speed {number} of {self.name} is 0: set preset_speed_{number} first"
+            )
         if (yield from self._without_fault()).condition is Condition.RUNNING:
             raise self._stop_first("turns: a preset speed is started from rest, so")
         yield from insist(self.control, STOP)
         if (yield from read(self.reference_frequency)) == hz:
-            raise Refused(
+            raise WriteForbidden(
                 f"{self.name} has {hz:g} Hz as its frequency command without preset speed {number} too, so "
                 "that nothing would show the wrong bits: write another frequency to 1001H first"
             )
@@ -426,7 +428,7 @@ class YD1000(Drive):
         yield from write(self.control, self._valid() | bits)
         if not (yield from until(lambda: self._is_commanded(hz), limit=SELECTION_TIME)):
             yield from insist(self.control, STOP)
-            raise Refused(
+            raise WriteForbidden(
                 f"{self.name} does not take {hz:g} Hz, preset speed {number}, as its frequency command when "
                 "the bits for it are set: it is not started"
             )
@@ -483,7 +485,7 @@ class YD1000(Drive):
         """
         try:
             yield Pulse(self.control, STOP | YD1000Control.EMERGENCY_STOP)
-        except (Unconfirmed, DriveRefused):
+        except (Unconfirmed, DriveException):
             yield from self.stop.script()
             return
         try:
@@ -510,7 +512,7 @@ class YD1000(Drive):
         Its setpoint is lost with it: call set_frequency before the next start.
         """
         if (yield from read(self.output_frequency)) > 0:
-            raise Refused(f"{self.name} runs: it has no fault to reset")
+            raise WriteForbidden(f"{self.name} runs: it has no fault to reset")
         yield from self._no_terminal_runs("once a reset has restarted the drive")
         with suppress(Unconfirmed):  # the restart cuts the reply off
             yield from write(self.control, STOP | YD1000Control.RESET)
@@ -519,7 +521,7 @@ class YD1000(Drive):
         self._record = yield from read(self.fault_record_1)
 
     def _no_terminal_runs(self, when: str) -> Script[None]:
-        """Raise Refused if a terminal could start the motor once bit 15 is off, which a restart takes too."""
+        """Raise WriteForbidden if a terminal could start the motor once bit 15 is off, as after a restart."""
         closed = yield from read(self.inputs)
         functions = {"F110, which is always on,": self.always_on_function}
         for number, terminal in enumerate(Inputs, 1):  # F111 is the function of F, and so on
@@ -527,7 +529,7 @@ class YD1000(Drive):
                 functions[f"terminal {terminal.name}"] = self.registers[f"input_{number}_function"]
         for what, function in functions.items():
             if (yield from read(function)) in RUN_FUNCTIONS:
-                raise Refused(
+                raise WriteForbidden(
                     f"{what} of {self.name} says run, and may start its motor {when}: take that back first"
                 )
 
@@ -553,7 +555,7 @@ class YD1000(Drive):
         if turns:
             yield from self.stop.script()
             reason = "its panel or a terminal started the motor, so the stop was written again"
-            raise NotDone(self.name, "the release of its control", reason)
+            raise NotVerified(self.name, "the release of its control", reason)
 
     def _turns(self) -> Script[bool]:
         return (yield from read(self.output_frequency)) > 0
@@ -563,7 +565,9 @@ class YD1000(Drive):
         """Write the setpoint, which is at most FH."""
         for name in ("preset_speed", "setpoint_by_fnod"):
             if self.option.get(name):
-                raise Refused(f"{self.name} takes no setpoint from 1001H: its option {name} gives it another")
+                raise WriteForbidden(
+                    f"{self.name} takes no setpoint from 1001H: its option {name} gives it another"
+                )
         yield from self._hold(self.frequency, hz)
 
     @verb

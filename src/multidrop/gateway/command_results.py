@@ -6,7 +6,7 @@ import re
 from collections.abc import Mapping
 from typing import NamedTuple
 
-from multidrop import BusError, Refused, Seen, Stopped
+from multidrop import BusError, Seen, Stopped, WriteForbidden
 from multidrop.gateway.http.rights import NOT_ALLOWED, NOT_LISTED, Caller, Right
 from multidrop.gateway.verb_rules import VERBS
 
@@ -31,7 +31,7 @@ def failed(failure: BaseException) -> Told:
 def in_words(failure: BusError | ValueError) -> str:
     """Return a failure's sentence with what a gateway's user does in place of what a program would call."""
     text = str(failure)
-    advice = failure.advice if isinstance(failure, Refused) else None
+    advice = failure.advice if isinstance(failure, WriteForbidden) else None
     if advice is not None and advice.plant:
         text = text.replace(advice.program, advice.plant)
     return _CALL.sub(_used, text)
@@ -66,12 +66,12 @@ def denied(caller: Caller, role: Right, what: str) -> Told:
     """Return the end of a command whose caller lacks this role."""
     needed = role.name.lower()
     sentence = f"{what} needs the role {needed}, and {caller.name} has {caller.role.name.lower()}"
-    return failed(Refused(sentence, rule=NOT_ALLOWED))
+    return failed(WriteForbidden(sentence, rule=NOT_ALLOWED))
 
 
-def not_listed(what: str, key: str) -> Refused:
+def not_listed(what: str, key: str) -> WriteForbidden:
     """Return the reason why a write or a verb that the plant file does not list is refused."""
-    return Refused(
+    return WriteForbidden(
         f'{what} is not in the plant file\'s list; add it to {key} = ["{what}"] of [serve.may]',
         rule=NOT_LISTED,
     )

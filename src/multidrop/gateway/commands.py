@@ -19,8 +19,8 @@ from multidrop import (
     Bus,
     Drive,
     Plant,
-    Refused,
     RepeatedStops,
+    WriteForbidden,
     drive_meant,
     verb_arguments,
     written_before,
@@ -40,7 +40,8 @@ BUSY = "too many writes are under way"  # a rule
 UNAUDITED = "the audit log cannot be written"  # a rule
 WAYS_WITHOUT_VERBS = frozenset({"modbus"})
 
-# Returns until when a command may be sent (CLOCK_BOOTTIME, ns), as it is called in words, or raises Refused.
+# Returns until when a command may be sent (CLOCK_BOOTTIME, ns), as it is called in words, or raises
+# WriteForbidden.
 Admit = Callable[[str], float]
 
 StopWork = Callable[[float | None], dict[str, Told]]  # takes for how long a stop is repeated
@@ -197,7 +198,7 @@ class Commands:
             return failed(ValueError(f"there is no verb {verb!r}; there are {', '.join(VERBS)}"))
         if caller.way in WAYS_WITHOUT_VERBS:
             refusal = f"{verb} is never carried out by way of {caller.way}"
-            return failed(Refused(refusal, rule=NEVER_THIS_WAY))
+            return failed(WriteForbidden(refusal, rule=NEVER_THIS_WAY))
         if caller.role < rule.role:
             return denied(caller, rule.role, what)
         if rule.is_listed and what not in self.may.verbs:
@@ -260,13 +261,13 @@ class Commands:
         except ValueError as mistake:
             return failed(mistake)
         if self.withheld:
-            return failed(Refused(f"{what} was not sent: {self.withheld}", rule=UNAUDITED))
+            return failed(WriteForbidden(f"{what} was not sent: {self.withheld}", rule=UNAUDITED))
         if self._under_way.get(line.name, 0) >= MOST_WRITES:
             reason = f"{what} was not sent: {MOST_WRITES} others are under way on line {line.name}"
-            return failed(Refused(reason, rule=BUSY))
+            return failed(WriteForbidden(reason, rule=BUSY))
         try:
             until_ns = admit(what)
-        except Refused as refusal:
+        except WriteForbidden as refusal:
             return failed(refusal)
         self.called += 1
         stops = self.stops[drive]
@@ -277,7 +278,9 @@ class Commands:
 
         def checked() -> Told:
             if self.stops[drive] != stops:
-                return failed(Refused(f"{what} was not sent: a stop was called", rule="a stop was called"))
+                return failed(
+                    WriteForbidden(f"{what} was not sent: a stop was called", rule="a stop was called")
+                )
             with written_before(limit_ns):
                 return work(known)
 

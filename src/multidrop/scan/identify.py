@@ -15,7 +15,7 @@ from multidrop.drive.register import Register
 from multidrop.drive.script import Read, Script, Step, carry_out
 from multidrop.drive.text import Text
 from multidrop.drive.timing import Settings
-from multidrop.errors import BusError, NoValue, Refused
+from multidrop.errors import BusError, NoValue, WriteForbidden
 from multidrop.planning.blocks import blocks, text_blocks
 from multidrop.scan.results import GUESS
 from multidrop.scan.sweep import Sweep
@@ -78,7 +78,7 @@ def _score(drive: Drive, ask: Ask) -> int:
         except BusError:
             return score  # not every firmware has it
         if held != drive.address:
-            raise Refused(f"{drive.name} holds {held:g} as its address")
+            raise WriteForbidden(f"{drive.name} holds {held:g} as its address")
         score += 1
     return score
 
@@ -90,11 +90,11 @@ def _resembles(drive: Drive, ask: Ask) -> bool:
 
 
 def _run(drive: Drive, script: Script[R], ask: Ask) -> R:
-    """Carry a script out that only reads; return its result. Raises Refused for any other step."""
+    """Carry a script out that only reads; return its result. Raises WriteForbidden for any other step."""
 
     def do(step: Step) -> Any:
         if not isinstance(step, Read):
-            raise Refused(f"the look at {drive.title} does more than read")
+            raise WriteForbidden(f"the look at {drive.title} does more than read")
         return _read(drive, step.register, ask)
 
     return carry_out(script, do)

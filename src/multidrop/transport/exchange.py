@@ -10,7 +10,7 @@ from multidrop.drive.family import Drive
 from multidrop.drive.register import Register
 from multidrop.drive.request import any_read
 from multidrop.drive.text import Text
-from multidrop.errors import BadReply, DriveRefused, Expired, NoReply, NotMaster, PortLost
+from multidrop.errors import BadReply, DriveException, Expired, NoReply, NotMaster, PortLost
 from multidrop.planning.blocks import Block, blocks, text_blocks
 from multidrop.planning.splitting import halves, least
 from multidrop.transport import clock
@@ -128,7 +128,7 @@ class Exchanges:
                 except PortLost as failure:
                     self._check_held_back(drive, failure)
                     raise
-                except (DriveRefused, NoReply, BadReply) as failure:
+                except (DriveException, NoReply, BadReply) as failure:
                     parts = self._parts(drive, prepared, read, failure)
             wanted += [prepared.prepare(part) for part in reversed(parts)]
         if None in found.values():
@@ -140,14 +140,14 @@ class Exchanges:
     ) -> tuple[Block, ...]:
         """Return the blocks to ask for instead of one that failed; raise why it did where that is no help."""
         block = read.block
-        if isinstance(failure, DriveRefused):
+        if isinstance(failure, DriveException):
             helps = failure.code != ILLEGAL_FUNCTION and not drive.is_passing(failure.code)
         else:
             helps = read.may_be_too_long and block not in prepared.answered and self._is_there(drive, block)
         if helps and (parts := halves(drive, block)):
             prepared.parts[block] = parts
             return parts
-        if isinstance(failure, DriveRefused) and len(block.registers) == 1:
+        if isinstance(failure, DriveException) and len(block.registers) == 1:
             prepared.ask_first(block)
             raise refusal_of(drive, failure.code, block.registers[0].name) from None
         raise failure
@@ -158,7 +158,7 @@ class Exchanges:
             self._ask(drive, self._prepare(drive).prepare(least(drive, block)).exchange, 1)
         except (NoReply, BadReply):
             return False
-        except DriveRefused:
+        except DriveException:
             pass
         return True
 
@@ -239,10 +239,10 @@ class Exchanges:
             self._note_answer(drive, completion)
             try:
                 good_reply(drive, completion)  # raises
-            except (NoReply, BadReply, DriveRefused) as failure:
+            except (NoReply, BadReply, DriveException) as failure:
                 if isinstance(failure, BadReply):
                     came = failure
-                is_final = isinstance(failure, DriveRefused) and failure.code not in drive.damaged
+                is_final = isinstance(failure, DriveException) and failure.code not in drive.damaged
                 if came and isinstance(failure, NoReply) and not attempts:
                     raise came from None
                 if not attempts or is_final:

@@ -6,12 +6,12 @@ from typing import Any
 
 from multidrop.core import STATUSES, Completion, Failure, Framing, Message
 from multidrop.drive.family import Drive
-from multidrop.errors import BadReply, DriveRefused, NoReply, NotMaster, NoValue
+from multidrop.errors import BadReply, DriveException, NoReply, NotMaster, NoValue
 from multidrop.transport.mixed_up import mixed_up, silence_hint
 
 
 def good_reply(drive: Drive, completion: Completion) -> Message:
-    """Return the good reply; raises NoReply, BadReply or DriveRefused."""
+    """Return the good reply; raises NoReply, BadReply or DriveException."""
     result, reply = completion.result, completion.reply
     if result > 0 and not reply.exception:
         return reply
@@ -38,9 +38,9 @@ def check_master(drive: Drive, completion: Completion) -> None:
         raise NotMaster(drive.name, _port_of(drive), heard=completion.raw, is_sent=is_sent)
 
 
-def refusal_of(drive: Drive, code: int, register: str | None = None) -> DriveRefused:
+def refusal_of(drive: Drive, code: int, register: str | None = None) -> DriveException:
     """Return the error of an exception, and of the register that was asked for by itself."""
-    return DriveRefused(drive.name, code, drive.exception(code), register)
+    return DriveException(drive.name, code, drive.exception(code), register)
 
 
 def no_value(drive: Drive, found: dict[str, Any]) -> NoValue:

@@ -12,7 +12,7 @@ from lines import ANY_PORT
 from peers import require_module
 from simulated_bus import SimulatedBus
 
-from multidrop import INPUT, Bus, Drive, Refused, load_family, load_plant, open_reader
+from multidrop import INPUT, Bus, Drive, WriteForbidden, load_family, load_plant, open_reader
 from multidrop.control.eeprom_ledger import Ledger
 from multidrop.families.registry import find_model
 from multidrop.planning.blocks import blocks
@@ -156,7 +156,7 @@ def test_a_file_that_could_move_a_motor_writes_nothing_unconfirmed(
     wire = Wire([simulated(pump(2))], port=ANY_PORT, unpaced=True)
     with Simulator([wire]) as line, Bus(wire.path) as bus:
         drive = bus.attach(pump, address=2)
-        with pytest.raises(Refused, match=r"`multidrop check pump\.toml`") as refused:
+        with pytest.raises(WriteForbidden, match=r"`multidrop check pump\.toml`") as refused:
             bus.write(drive, drive.register(name), drive.register(name).parse(value))
         assert refused.value.rule == "nobody has confirmed what it is"
         assert simulated_writes(line) == []
@@ -170,7 +170,7 @@ def test_an_unconfirmed_file_broadcasts_nothing(tmp_path: Path, monkeypatch: pyt
     fan = load_family(path)
     line = SimulatedBus(monkeypatch, simulated(fan(1)), simulated(fan(2)))
     first, second = line.attach(fan(1)), line.attach(fan(2))
-    with pytest.raises(Refused, match="declare confirmed = 1"):
+    with pytest.raises(WriteForbidden, match="declare confirmed = 1"):
         line.bus.broadcast(first.control, 0x047F)
     for drive in (first, second):
         line.bus.check_identity(drive)
@@ -183,7 +183,7 @@ def test_a_confirmed_one_is_written_to(pump: type[Drive]) -> None:
     with Simulator([wire]) as line, Bus(wire.path) as bus:
         drive = bus.attach(pump, address=2, confirmed=1)
         assert bus.write(drive, drive.register("ramp"), 5.0) == 5.0
-        with pytest.raises(Refused, match="on commands the motor"):
+        with pytest.raises(WriteForbidden, match="on commands the motor"):
             bus.write(drive, drive.register("run"), drive.register("run").parse("on"))
         bus.write(drive, drive.register("run"), drive.register("run").parse("off"))
         assert simulated_writes(line) == ["ramp", "run"]
@@ -217,7 +217,7 @@ def test_file_recognises_its_drives_by_the_values_of_registers(
     if is_one:
         drive.perform(drive.identify.script())
         return
-    with pytest.raises(Refused, match=f"shows device = {value}: it is no Meter"):
+    with pytest.raises(WriteForbidden, match=f"shows device = {value}: it is no Meter"):
         drive.perform(drive.identify.script())
 
 

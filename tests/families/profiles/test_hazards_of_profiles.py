@@ -15,7 +15,7 @@ from tables import table
 from multidrop.control.ramp import ramp
 from multidrop.core import Framing, Message, build_reply
 from multidrop.drive import Condition, Direction, Drive
-from multidrop.errors import DriveRefused, NoReply, NotDone, Refused, Unconfirmed
+from multidrop.errors import DriveException, NoReply, NotVerified, Unconfirmed, WriteForbidden
 from multidrop.families import YD1000, InnovertIBD, InvtCHE
 from multidrop.families.profiles.invt import InvtControl
 from multidrop.sim import simulated
@@ -127,11 +127,11 @@ def test_a_stop_is_watched(line: Line) -> None:
 def test_a_trip_while_starting(line: Line, monkeypatch: pytest.MonkeyPatch) -> None:
     line.drive.set_frequency(20)
     monkeypatch.setattr(line.sim.motor, "run", lambda direction: line.sim.trip(FAULT))
-    with pytest.raises(NotDone, match="tripped"):
+    with pytest.raises(NotVerified, match="tripped"):
         line.drive.start()
     assert len(line.starts) == 1
     assert line.drive.state().condition is Condition.FAULT
-    with pytest.raises(Refused, match="reset_fault"):
+    with pytest.raises(WriteForbidden, match="reset_fault"):
         line.drive.start()
     assert len(line.starts) == 1
 
@@ -178,7 +178,7 @@ def test_a_reset_whose_replies_are_lost_starts_nothing(line: Line, lost: int) ->
 def test_a_reset_is_refused_while_the_motor_turns(line: Line) -> None:
     line.runs()
     begun = len(line.writes)
-    with pytest.raises(Refused, match="runs"):
+    with pytest.raises(WriteForbidden, match="runs"):
         line.drive.reset_fault()
     assert line.writes[begun:] == []
     assert line.sim.motor.energised
@@ -192,7 +192,7 @@ def test_a_reset_without_a_fault_sends_nothing(line: Line) -> None:
 def test_a_fault_that_stands_is_told(line: Line, monkeypatch: pytest.MonkeyPatch) -> None:
     line.sim.trip(FAULT)
     monkeypatch.setattr(line.sim.motor, "reset", lambda: None)
-    with pytest.raises(NotDone, match="the fault stands"):
+    with pytest.raises(NotVerified, match="the fault stands"):
         line.drive.reset_fault()
     assert not line.starts
 
@@ -201,17 +201,17 @@ def test_a_start_in_a_fault_is_refused(line: Line) -> None:
     line.drive.set_frequency(20)
     line.sim.trip(FAULT)
     begun = len(line.writes)
-    with pytest.raises(Refused, match=r"fault.*reset_fault"):
+    with pytest.raises(WriteForbidden, match=r"fault.*reset_fault"):
         line.drive.start()
     assert line.writes[begun:] == []
 
 
 def test_a_start_without_a_setpoint_is_refused(line: Line) -> None:
-    with pytest.raises(Refused, match="set_frequency"):
+    with pytest.raises(WriteForbidden, match="set_frequency"):
         line.drive.start()
     assert line.writes == []
     line.drive.set_frequency(0)
-    with pytest.raises(Refused, match=r"setpoint .* is 0"):
+    with pytest.raises(WriteForbidden, match=r"setpoint .* is 0"):
         line.drive.start()
     assert not line.starts
 
@@ -227,7 +227,7 @@ def test_a_power_cycle_forgets_the_setpoint(line: Line, model: str) -> None:
     if KIND[model] == "danfoss-fc51":  # whose reference cannot be read
         line.drive.start()
         return
-    with pytest.raises(Refused, match="set_frequency"):
+    with pytest.raises(WriteForbidden, match="set_frequency"):
         line.drive.start()
     assert line.writes[begun:] == []
     line.runs()
@@ -249,7 +249,7 @@ def test_a_drive_in_local_control_is_not_started(model: str, monkeypatch: pytest
     line.drive.set_frequency(20)
     line.sim.is_local = True
     begun = len(line.writes)
-    with pytest.raises(Refused, match=LOCAL[model]):
+    with pytest.raises(WriteForbidden, match=LOCAL[model]):
         line.drive.start()
     assert line.writes[begun:] == []
 
@@ -272,7 +272,7 @@ def test_a_drive_of_another_make_is_not_written_to(
     bus = SimulatedBus(monkeypatch, there)
     drive: Any = bus.attach(ALL[model](1))
     for call in (lambda: drive.set_frequency(20), drive.start, drive.reset_fault):
-        with pytest.raises((Refused, NoReply, DriveRefused)):
+        with pytest.raises((WriteForbidden, NoReply, DriveException)):
             call()
     assert bus.frames
     assert bus.written == []
@@ -284,7 +284,7 @@ NO_DIRECTION = ("abb-acs355", "siemens-v20", "optidrive-e3")
 def test_a_direction_is_sent_or_refused(line: Line, model: str) -> None:
     line.drive.set_frequency(20)
     if KIND[model] in NO_DIRECTION:
-        with pytest.raises(Refused, match="direction"):
+        with pytest.raises(WriteForbidden, match="direction"):
             line.drive.start(Direction.REVERSE)
         assert not line.starts
         return
@@ -293,7 +293,7 @@ def test_a_direction_is_sent_or_refused(line: Line, model: str) -> None:
     assert line.drive.state().condition is Condition.RUNNING
     assert line.sim.motor.frequency == pytest.approx(-20, abs=0.01)
     if KIND[model] in ("danfoss-fc51", "schneider-atv320"):  # whose status shows no direction
-        with pytest.raises(Refused, match="cannot say which way"):
+        with pytest.raises(WriteForbidden, match="cannot say which way"):
             line.drive.start()
     else:
         line.drive.start()  # does not turn it round
@@ -309,7 +309,7 @@ def test_a_start_word_is_never_plainly_written(line: Line) -> None:
         request = Message(1, 6, control.address, data=count.to_bytes(2))
         if not line.is_start(request):
             continue
-        with pytest.raises((Refused, TypeError)):
+        with pytest.raises((WriteForbidden, TypeError)):
             line.bus.bus.write(line.drive, control, control.decode(count))
         if count > 0x900:
             break
@@ -388,10 +388,10 @@ def test_no_stop_of_a_jog_is_sent_where_another_drive_is_there(monkeypatch: pyte
 
     def withhold(drive: Drive) -> None:
         checked.append(drive)
-        raise Refused("another family is there")
+        raise WriteForbidden("another family is there")
 
     monkeypatch.setattr(line.bus.bus._writer.identity_check, "check_before_stop", withhold)
-    with pytest.raises(Refused, match="another family"):
+    with pytest.raises(WriteForbidden, match="another family"):
         line.drive.stop()
     assert checked == [line.drive]
     assert line.writes == []
@@ -401,7 +401,7 @@ def test_a_cia402_drive_without_mains_is_not_started(monkeypatch: pytest.MonkeyP
     line = Line(monkeypatch, "schneider-atv320")
     line.drive.set_frequency(20)
     line.sim.stays_off = True
-    with pytest.raises(NotDone, match="not switched on"):
+    with pytest.raises(NotVerified, match="not switched on"):
         line.drive.start()
     assert line.starts == []
 
@@ -411,7 +411,7 @@ def test_a_profidrive_is_not_started_through_an_off(name: str, monkeypatch: pyte
     line = Line(monkeypatch, "abb-acs355")
     line.drive.set_frequency(20)
     setattr(line.sim, name, True)
-    with pytest.raises(Refused, match=f"{name.upper()}.* is active from elsewhere"):
+    with pytest.raises(WriteForbidden, match=f"{name.upper()}.* is active from elsewhere"):
         line.drive.start()
     assert line.starts == []
     setattr(line.sim, name, False)
@@ -431,7 +431,7 @@ def test_a_locked_trip_is_not_reset(monkeypatch: pytest.MonkeyPatch) -> None:
     line = Line(monkeypatch, "danfoss-fc51")
     line.sim.trip(FAULT)
     line.sim.is_locked = True
-    with pytest.raises(Refused, match="take its mains away"):
+    with pytest.raises(WriteForbidden, match="take its mains away"):
         line.drive.reset_fault()
     assert line.writes == []
     line.sim.power_cycle()
@@ -442,7 +442,7 @@ def test_an_optidrive_of_the_first_guide_is_never_started(monkeypatch: pytest.Mo
     line = Line(monkeypatch, "optidrive-e3")
     line.sim.is_first_reading = True
     line.drive.set_frequency(20)
-    with pytest.raises(Refused, match="not ready to run"):
+    with pytest.raises(WriteForbidden, match="not ready to run"):
         line.drive.start()
     line.sim.motor.run(1)  # at its keypad
     line.bus.sleep(2)
@@ -479,7 +479,7 @@ def test_a_stop_is_withheld_only_if_the_status_and_another_value_are_another_dri
             line.drive.stop(seconds=1)
         assert line.writes
     else:
-        with pytest.raises(Refused, match="no stop was sent"):
+        with pytest.raises(WriteForbidden, match="no stop was sent"):
             line.drive.stop(seconds=1)
         assert line.writes == []
 

@@ -11,7 +11,7 @@ from scripts import Wire
 from tables import table
 
 from multidrop.core import NumberFormat
-from multidrop.drive import Drive, DriveRefused, Refused
+from multidrop.drive import Drive, DriveException, WriteForbidden
 from multidrop.drive.declaration_check import DeclarationError
 from multidrop.drive.declare import command, reading, setting
 from multidrop.drive.table import COIL
@@ -139,7 +139,7 @@ def test_a_signed_status_is_no_word_of_bits() -> None:
 def test_a_percentage_needs_to_know_of_what() -> None:
     drive = Fc51(1)
     wire = Wire(drive)
-    with pytest.raises(Refused, match="maximum_frequency = HZ") as refusal:
+    with pytest.raises(WriteForbidden, match="maximum_frequency = HZ") as refusal:
         drive.set_frequency(20)
     assert "--option maximum_frequency=HZ" in refusal.value.for_command_line()
     assert wire.sent == []
@@ -199,13 +199,13 @@ STRANGERS: list[tuple[str, dict[str, Any], str]] = [
 def test_a_drive_that_shows_something_else_is_refused(
     model: str, says: dict[str, Any], sentence: str
 ) -> None:
-    with pytest.raises(Refused, match=sentence):
+    with pytest.raises(WriteForbidden, match=sentence):
         identify(model, **says)
 
 
 def test_a_drive_that_refuses_a_role_is_no_drive_of_the_family() -> None:
-    with pytest.raises(DriveRefused):
-        identify("abb-acs355", signature=DriveRefused("abb", 2, "illegal address"))
+    with pytest.raises(DriveException):
+        identify("abb-acs355", signature=DriveException("abb", 2, "illegal address"))
 
 
 # ---- derived once more ----

@@ -15,11 +15,11 @@ from multidrop.drive import (
     Condition,
     Direction,
     Drive,
-    NotDone,
-    Refused,
+    NotVerified,
     State,
     Unconfirmed,
     Unsupported,
+    WriteForbidden,
 )
 
 # Each without its checksum: address 1, function 06, where the manual has the word.
@@ -155,7 +155,7 @@ def test_a_reset(model: str) -> None:
 
 def test_a_locked_trip_is_not_reset() -> None:
     found = wire("danfoss-fc51", FC_LOCK)
-    with pytest.raises(Refused, match="take its mains away"):
+    with pytest.raises(WriteForbidden, match="take its mains away"):
         found.drive.reset_fault()
     assert found.sent == []
 
@@ -195,7 +195,7 @@ def test_a_jog_has_its_direction() -> None:
 def test_a_motor_that_turns_is_not_jogged(model: str, status: Any) -> None:
     found = wire(model, [status])
     for direction in (None, *Direction):
-        with pytest.raises(Refused, match=r"turns, and may go on through a jog: call stop\(\) first"):
+        with pytest.raises(WriteForbidden, match=r"turns, and may go on through a jog: call stop\(\) first"):
             found.drive.jog(direction)
     assert sent(found) == []
 
@@ -236,7 +236,7 @@ HINDRANCES = [
 @table(("model", "status", "sentence"), HINDRANCES)
 def test_a_hindrance_is_named_and_nothing_starts(model: str, status: int, sentence: str) -> None:
     found = wire(model, status)
-    with pytest.raises(Refused, match=sentence):
+    with pytest.raises(WriteForbidden, match=sentence):
         found.drive.start()
     assert all(frame[-5:] == "04 76" for frame in sent(found))
 
@@ -297,7 +297,7 @@ def test_a_drive_that_runs_at_0_hz_does_not_stand(model: str, running: int) -> N
 )
 def test_a_delta_that_follows_another_setpoint_is_not_started(shown: float, sentence: str) -> None:
     found = wire("delta-vfd-el", DELTA_STOP, reference_in_force=shown)
-    with pytest.raises(Refused, match=sentence):
+    with pytest.raises(WriteForbidden, match=sentence):
         found.drive.start()
     assert found.sent == []
 
@@ -316,7 +316,7 @@ def test_an_invt_that_was_jogged_is_stopped_before_a_start() -> None:
     found = wire("invt-goodrive", [GD_STANDBY, GD_RUNS])
     found.drive.jog()
     found.sent.clear()
-    with pytest.raises(Refused, match=r"may still jog.*stop\(\)"):
+    with pytest.raises(WriteForbidden, match=r"may still jog.*stop\(\)"):
         found.drive.start()
     assert found.sent == []
     found.say({"status": found.drive.status.values(GD_STANDBY)})
@@ -336,13 +336,13 @@ def test_a_cia402_drive_goes_up_step_by_step(
     status: list[int], words: tuple[str, ...], sentence: str
 ) -> None:
     found = wire("schneider-atv320", status)
-    with pytest.raises(NotDone, match=sentence):
+    with pytest.raises(NotVerified, match=sentence):
         found.drive.start()
     assert sent(found) == [ATV + word for word in words]
 
 
 def test_a_profidrive_that_does_not_get_ready_to_operate_is_switched_off() -> None:
     found = wire("abb-acs355", [ABB_OFF, ABB_READY])
-    with pytest.raises(NotDone, match="not ready to operate"):
+    with pytest.raises(NotVerified, match="not ready to operate"):
         found.drive.start()
     assert sent(found) == [ABB + "04 76", ABB + "04 77", ABB + "04 7E"]

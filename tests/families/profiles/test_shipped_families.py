@@ -15,7 +15,7 @@ from simulated_bus import SimulatedBus, one
 
 from multidrop import Bus, load_plant
 from multidrop.cli import main
-from multidrop.drive import Condition, Drive, Refused, Unsupported
+from multidrop.drive import Condition, Drive, Unsupported, WriteForbidden
 from multidrop.drive.register import Access
 from multidrop.families import MODELS
 from multidrop.families.profiles import PROFILES, Profile
@@ -174,7 +174,7 @@ def test_the_pump_controller_whose_map_leaves_too_much_open_is_only_read(
     assert bus.bus.read(drive, drive.register("pressure")) == 2.5
     drive.perform(drive.identify.script())
     sim["minimum_frequency"] = 0
-    with pytest.raises(Refused):
+    with pytest.raises(WriteForbidden):
         drive.perform(drive.identify.script())
 
 
@@ -185,7 +185,7 @@ def test_nothing_is_commanded_before_the_owner_has_confirmed_it(
     family = shipped_family(name)
     bus, drive, _ = one(monkeypatch, family(1))
     for call in (lambda: drive.set_frequency(20), drive.start, drive.reset_fault):
-        with pytest.raises(Refused, match=rf"multidrop check {name}` .*confirmed = 1"):
+        with pytest.raises(WriteForbidden, match=rf"multidrop check {name}` .*confirmed = 1"):
             call()
     assert bus.frames == []
     drive.stop()  # which is sent all the same

@@ -10,7 +10,7 @@ import pytest
 from lines import PATIENCE
 from modbus_gateway import plant_of
 
-from multidrop import Drive, InvtCHE, Plant, Refused
+from multidrop import Drive, InvtCHE, Plant, WriteForbidden
 from multidrop.gateway import commands
 from multidrop.gateway.commands import BUSY, Commands, Told
 from multidrop.gateway.http.rights import NEVER_THIS_WAY, NOT_ALLOWED, NOT_LISTED, Caller, May, Right
@@ -47,7 +47,7 @@ def rules_of(may: May, way: str, role: Right) -> dict[str, str | None]:
         return told | {"stop all": stopped["mill"]}
 
     return {
-        what: told.error.rule if isinstance(told.error, Refused) else None
+        what: told.error.rule if isinstance(told.error, WriteForbidden) else None
         for what, told in asyncio.run(carried_out()).items()
     }
 
@@ -101,10 +101,10 @@ def test_a_line_has_a_few_writes_under_way_and_takes_any_stop(monkeypatch: pytes
             control.act("mill", "start", {}, writer),
         ):
             told = await further
-            assert isinstance(told.error, Refused)
+            assert isinstance(told.error, WriteForbidden)
             assert told.error.rule == BUSY
         stopped = await control.stop(["mill"], writer)
-        assert not isinstance(stopped["mill"].error, Refused)
+        assert not isinstance(stopped["mill"].error, WriteForbidden)
         go_on.set()
         await asyncio.gather(*some)
         assert (await control.write("mill", "setpoint", 9.0, writer)).is_done  # there is room again

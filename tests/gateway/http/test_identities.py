@@ -13,7 +13,7 @@ import pytest
 from gateways import served
 from lines import until
 
-from multidrop import LineError, Refused
+from multidrop import LineError, WriteForbidden
 from multidrop.gateway.http import identities as module
 from multidrop.gateway.http.identities import Identities
 
@@ -94,7 +94,9 @@ def test_who_is_known_is_not_asked() -> None:
 
 
 def test_another_drive_is_told_of_once_and_no_failure_ends_it(caplog: pytest.LogCaptureFixture) -> None:
-    stranger = Refused("nothing is written to fan-1: it is no CHE", rule="it does not look like its family")
+    stranger = WriteForbidden(
+        "nothing is written to fan-1: it is no CHE", rule="it does not look like its family"
+    )
     failures = {"fan-1": stranger, "lost": LineError("/dev/x", "gone"), "broken": RuntimeError("a bug")}
     bus = Asked(failures)
     with caplog.at_level(logging.WARNING):

@@ -18,7 +18,7 @@ from gateways import Served, served
 from lines import PATIENCE, until
 from peers import require_program
 
-from multidrop import Drive, Refused
+from multidrop import Drive, WriteForbidden
 from multidrop.gateway import commands as commands_module
 from multidrop.gateway.clock import boottime_ns
 from multidrop.gateway.commands import Told
@@ -53,7 +53,7 @@ class Times:
         """Return the rule that a command breaks; "" for one that may be sent."""
         try:
             self.frames.admit(drive, f"{drive}.{command}", command, seen)
-        except Refused as refused:
+        except WriteForbidden as refused:
             return str(refused.rule)
         return ""
 

@@ -6,16 +6,16 @@ import argparse
 import sys
 from contextlib import suppress
 
-from multidrop.errors import Refused
+from multidrop.errors import WriteForbidden
 from multidrop.printable import printable
 
 
 def confirm(question: str, arguments: argparse.Namespace) -> None:
-    """Return if --yes was given or the user answers yes on the terminal; raise Refused otherwise."""
+    """Return if --yes was given or the user answers yes on the terminal; raise WriteForbidden otherwise."""
     if arguments.yes:
         return
     if not sys.stdin.isatty():
-        raise Refused(f"{question} There is no terminal to ask on: add --yes if it is meant")
+        raise WriteForbidden(f"{question} There is no terminal to ask on: add --yes if it is meant")
     _drop_what_was_typed_before()
     print(f"{printable(question)} [y/N] ", end="", file=sys.stderr, flush=True)
     answer = ""
@@ -28,7 +28,7 @@ def confirm(question: str, arguments: argparse.Namespace) -> None:
         if not answer.endswith("\n"):  # the question's line has no end yet
             print(file=sys.stderr)
     if answer.strip().lower() not in ("y", "yes"):
-        raise Refused("nothing was sent")
+        raise WriteForbidden("nothing was sent")
 
 
 def _drop_what_was_typed_before() -> None:

@@ -17,7 +17,7 @@ from multidrop.bus import Bus
 from multidrop.cli import main
 from multidrop.cli.support.output import print_text
 from multidrop.cli.support.values import counted
-from multidrop.errors import BadReply, Expired, NoReply, NotDone, Unconfirmed
+from multidrop.errors import BadReply, Expired, NoReply, NotVerified, Unconfirmed
 from multidrop.families import MODELS
 from multidrop.plant.model import PlantLine
 
@@ -64,7 +64,7 @@ def start_motors(line: PlantLine, ledger: Path) -> None:
         for number, polled in enumerate(line.drives):
             drive = bus.attach(polled.drive)
             # On a busy machine a simulated drive may answer too late: the demo goes on without its motor.
-            with suppress(BadReply, Expired, NoReply, NotDone, Unconfirmed):
+            with suppress(BadReply, Expired, NoReply, NotVerified, Unconfirmed):
                 drive.set_frequency(20.0 + 3 * number)
                 drive.start()
 

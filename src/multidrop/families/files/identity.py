@@ -11,7 +11,7 @@ from multidrop.drive.family import Drive
 from multidrop.drive.register import Register
 from multidrop.drive.script import Script, read
 from multidrop.drive.verbs import Verb, verb
-from multidrop.errors import Refused
+from multidrop.errors import WriteForbidden
 from multidrop.toml_check import Key, TomlPlace
 
 MOST_PROOFS = 20
@@ -76,12 +76,14 @@ def identify_by(proofs: Sequence[Proof]) -> Verb[[], None]:
 
     @verb
     def identify(self: Drive) -> Script[None]:
-        """Check that the registers of [[identify]] have their values; raise Refused if one has not."""
+        """Check that the registers of [[identify]] have their values; raise WriteForbidden if one has not."""
         for proof in proofs:
             register = self.register(proof.register)
             value = yield from read(register)
             if not proof.holds(value):
                 shown = f"{register.name} = {register.format(value)}"
-                raise Refused(f"{self.name} shows {shown}: it is no {self.title or type(self).__name__}")
+                raise WriteForbidden(
+                    f"{self.name} shows {shown}: it is no {self.title or type(self).__name__}"
+                )
 
     return identify

@@ -6,7 +6,7 @@ from enum import IntFlag
 from functools import partial
 from typing import ClassVar
 
-from multidrop.drive import NotDone, Refused
+from multidrop.drive import NotVerified, WriteForbidden
 from multidrop.drive.register import Access
 from multidrop.drive.script import Script, insist, until
 from multidrop.drive.state import Condition, Direction
@@ -102,12 +102,12 @@ class CiA402(Profile):
     def _start_word(self, direction: Direction | None, status: int) -> int:
         reverse = {member.name: int(member) for member in self.control.values or ()}.get("REVERSE", 0)
         if direction is not None and not reverse:
-            raise Refused(
+            raise WriteForbidden(
                 f"{self.name}: the standard has no direction, and its family declares no bit for it; "
                 "start without a direction"
             )
         if direction is None and reverse and self._turns(status):
-            raise Refused(f"{self.name} turns, and cannot say which way: name the direction")
+            raise WriteForbidden(f"{self.name} turns, and cannot say which way: name the direction")
         return ENABLE | reverse if direction is Direction.REVERSE else ENABLE
 
     def _prepare(self, status: int) -> Script[None]:
@@ -115,7 +115,7 @@ class CiA402(Profile):
             yield from insist(self.control, self._word(word))
             if not (yield from until(partial(self._is_in, state), limit=READY_TIME)):
                 why = f"after {READY_TIME:g} s it is not {words}"
-                raise NotDone(self.name, "the start", f"{why}; {self.remote}")
+                raise NotVerified(self.name, "the start", f"{why}; {self.remote}")
 
     def _is_in(self, state: int) -> Script[bool]:
         return (yield from self._status()) & MASK == state

@@ -5,7 +5,7 @@ from __future__ import annotations
 from enum import IntFlag
 from typing import ClassVar
 
-from multidrop.drive import Refused
+from multidrop.drive import WriteForbidden
 from multidrop.drive.register import Access
 from multidrop.drive.state import Direction
 from multidrop.families.profiles.profile import Profile
@@ -99,5 +99,5 @@ class DanfossFC(Profile):
 
     def _start_word(self, direction: Direction | None, status: int) -> int:
         if direction is None and self._turns(status):
-            raise Refused(f"{self.name} turns, and cannot say which way: name the direction")
+            raise WriteForbidden(f"{self.name} turns, and cannot say which way: name the direction")
         return START | DanfossControl.REVERSE if direction is Direction.REVERSE else START

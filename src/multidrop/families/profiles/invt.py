@@ -7,7 +7,7 @@ from contextlib import suppress
 from enum import IntEnum
 from typing import ClassVar
 
-from multidrop.drive import BusError, DriveRefused, Refused
+from multidrop.drive import BusError, DriveException, WriteForbidden
 from multidrop.drive.register import Access
 from multidrop.drive.script import Script, insist, write
 from multidrop.drive.state import Condition, Direction
@@ -115,14 +115,14 @@ class Invt(Profile):
         try:
             yield from self._send_stop(word)
             may_jog = self._turns((yield from self._status()))
-        except Refused:  # another drive is there
+        except WriteForbidden:  # another drive is there
             raise
         except BusError:  # one that is not heard may hear, and jog
             with suppress(BusError):
                 yield from insist(self.control, self._word(InvtControl.STOP_JOG), attempts=1)
             raise
         if may_jog:
-            with suppress(DriveRefused):  # there may be no jog to stop
+            with suppress(DriveException):  # there may be no jog to stop
                 yield from insist(self.control, self._word(InvtControl.STOP_JOG))
         yield from self._watch_stop()
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from enum import IntFlag
 from typing import ClassVar
 
-from multidrop.drive import Refused
+from multidrop.drive import WriteForbidden
 from multidrop.drive.register import Access
 from multidrop.drive.script import Script
 from multidrop.drive.state import Direction
@@ -91,5 +91,5 @@ class Optidrive(Profile):
 
     def _start_word(self, direction: Direction | None, status: int) -> int:
         if direction is not None:
-            raise Refused(f"{self.name}: no bit of its control word is a direction; start without one")
+            raise WriteForbidden(f"{self.name}: no bit of its control word is a direction; start without one")
         return START

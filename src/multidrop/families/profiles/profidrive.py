@@ -5,7 +5,7 @@ from __future__ import annotations
 from enum import IntFlag
 from typing import ClassVar
 
-from multidrop.drive import NotDone, Refused
+from multidrop.drive import NotVerified, WriteForbidden
 from multidrop.drive.register import Access
 from multidrop.drive.script import Script, insist, until, wait, write
 from multidrop.drive.state import Condition, Direction
@@ -108,7 +108,7 @@ class Profidrive(Profile):
 
     def _start_word(self, direction: Direction | None, status: int) -> int:
         if direction is not None:
-            raise Refused(
+            raise WriteForbidden(
                 f"{self.name}: no bit of this profile is a direction, which is the sign of the reference or "
                 "set on the drive; start without a direction"
             )
@@ -117,13 +117,13 @@ class Profidrive(Profile):
     def _prepare(self, status: int) -> Script[None]:
         yield from insist(self.control, self._word(SWITCH_OFF))
         if not (yield from until(self._is_ready, limit=READY_TIME)):
-            raise Refused(f"{self.name} {self._hindrance((yield from self._status()))}; {self.remote}")
+            raise WriteForbidden(f"{self.name} {self._hindrance((yield from self._status()))}; {self.remote}")
         yield from wait(BETWEEN)
         yield from write(self.control, self._word(SWITCH_ON))
         if not (yield from until(self._is_on, limit=READY_TIME)):
             yield from insist(self.control, self._word(STOP))
             why = f"after {READY_TIME:g} s it is not ready to operate"
-            raise NotDone(self.name, "the start", f"{why}; {self.remote}")
+            raise NotVerified(self.name, "the start", f"{why}; {self.remote}")
 
     def _is_ready(self) -> Script[bool]:
         return self._ready_to_switch_on((yield from self._status()))

@@ -6,7 +6,15 @@ from collections.abc import Mapping
 from itertools import chain
 from typing import Any, ClassVar
 
-from multidrop.drive import ANOTHER_FAMILY, Advice, Drive, DriveRefused, NotDone, Refused, Unconfirmed
+from multidrop.drive import (
+    ANOTHER_FAMILY,
+    Advice,
+    Drive,
+    DriveException,
+    NotVerified,
+    Unconfirmed,
+    WriteForbidden,
+)
 from multidrop.drive.declaration_check import DeclarationError
 from multidrop.drive.options import Option
 from multidrop.drive.register import Register
@@ -142,7 +150,7 @@ class Profile(Drive):
         return (yield from read(self.output_frequency)) == 0
 
     def _setpoint_in_force(self) -> Script[None]:
-        """Raise Refused unless the setpoint, as the drive shows it, is the one that was written and not 0."""
+        """Raise WriteForbidden unless the drive shows the setpoint that was written, and it is not 0."""
         yield from super()._setpoint_in_force()
         shown = self.registers.get("reference_in_force")
         if shown is None:
@@ -154,7 +162,7 @@ class Profile(Drive):
             why = f"{self.name} follows {shown.format(held)}, which is not what it was told;"
         else:
             return
-        raise Refused(f"{why} call set_frequency before start", advice=Advice.call("set_frequency"))
+        raise WriteForbidden(f"{why} call set_frequency before start", advice=Advice.call("set_frequency"))
 
     # ---- verbs ----
 
@@ -178,7 +186,7 @@ class Profile(Drive):
         if wrong:
             kind = self.title or type(self).__name__
             rule = ANOTHER_FAMILY if impossible and len(wrong) > 1 else ""
-            raise Refused(f"{self.name} is not known as {kind}: {'; '.join(wrong)}", rule=rule)
+            raise WriteForbidden(f"{self.name} is not known as {kind}: {'; '.join(wrong)}", rule=rule)
 
     @verb
     def start(self, direction: Direction | None = None) -> Script[None]:
@@ -193,14 +201,14 @@ class Profile(Drive):
         yield from self._started(direction)
 
     def _may_start(self, status: int) -> Script[None]:
-        """Raise Refused in a fault, in local control, and where the status shows another hindrance."""
+        """Raise WriteForbidden in a fault, in local control, and where the status shows another hindrance."""
         if (yield from self._tripped(status)):
             raise self._reset_first((yield from self._fault()))
         if why := self._not_ready(status):
-            raise Refused(f"{self.name} {why}; {self.remote}")
+            raise WriteForbidden(f"{self.name} {why}; {self.remote}")
 
     def _may_jog(self, status: int) -> Script[None]:
-        """Raise Refused as before a start, and while the motor turns: no manual says what a jog does then."""
+        """Raise WriteForbidden as before a start, and while the motor turns: no manual defines a jog then."""
         yield from self._may_start(status)
         if self._turns(status):
             raise self._stop_first("turns, and may go on through a jog:")
@@ -228,7 +236,7 @@ class Profile(Drive):
     def _send_stop(self, word: int) -> Script[None]:
         try:
             yield from insist(self.control, self._word(word))
-        except DriveRefused:  # as some do in a fault, in which they stand already
+        except DriveException:  # as some do in a fault, in which they stand already
             if not (yield from self._stands()):
                 raise
 
@@ -244,15 +252,15 @@ class Profile(Drive):
         status = yield from self._status()
         if not (yield from self._tripped(status)):
             if not (yield from self._stands()):
-                raise Refused(f"{self.name} runs: it has no fault to reset")
+                raise WriteForbidden(f"{self.name} runs: it has no fault to reset")
             return
         if why := self._cannot_reset(status):
-            raise Refused(f"{self.name} {why}")
+            raise WriteForbidden(f"{self.name} {why}")
         yield from insist(self.control, self._word(self.stop_word))  # no run command outlasts the fault
         yield from self._pulse()
         if not (yield from until(self._is_reset, limit=RESET_TIME)):
             fault = (yield from self._fault()) or "it shows a fault"
-            raise NotDone(self.name, "the fault reset", f"the fault stands: {fault}")
+            raise NotVerified(self.name, "the fault reset", f"the fault stands: {fault}")
 
     def _pulse(self) -> Script[None]:
         """Write the reset once, and take its bit back, so that it resets no later fault by itself."""
@@ -260,7 +268,7 @@ class Profile(Drive):
         assert register.values is not None
         try:
             yield from write(register, register.values(self.reset_word))
-        except (Unconfirmed, DriveRefused):
+        except (Unconfirmed, DriveException):
             yield from self._take_reset_back()
             raise
         yield from self._take_reset_back()
@@ -276,7 +284,7 @@ class Profile(Drive):
         """Write the setpoint in Hz, or as the percentage of `maximum_frequency` that it is."""
         most = self.option.get("maximum_frequency")
         if self.reference.unit == "%" and most is None:
-            raise Refused(
+            raise WriteForbidden(
                 f"{self.name} takes its setpoint in percent: declare maximum_frequency = HZ, which is 100 %",
                 advice=Advice.declare("maximum_frequency", "HZ"),
             )

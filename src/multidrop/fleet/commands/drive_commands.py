@@ -8,21 +8,21 @@ from typing import Any, NamedTuple
 from multidrop import (
     BadReply,
     Bus,
+    CancelledByStop,
     Drive,
-    DriveRefused,
+    DriveException,
     Effect,
     Expired,
     LineError,
     NoReply,
     NotAttached,
-    NotDone,
     NotMaster,
-    Overtaken,
-    Refused,
+    NotVerified,
     Register,
     Seen,
     Stopped,
     Unsupported,
+    WriteForbidden,
     verb_arguments,
     verbs_of,
 )
@@ -46,7 +46,7 @@ def commands_of(drive: Drive) -> list[str]:
 def prepare(drive: Drive, request: CommandRequest) -> Prepared:
     """Return what a request means for this drive; nothing is sent.
 
-    Raises ValueError (or Refused, which is one), TypeError or Unsupported for what is never sent.
+    Raises ValueError (or WriteForbidden, which is one), TypeError or Unsupported for what is never sent.
     """
     return _prepare_write(drive, request) if request.register else _prepare_verb(drive, request)
 
@@ -76,7 +76,7 @@ def _prepare_write(drive: Drive, request: CommandRequest) -> Prepared:
     register = drive.register(request.register)
     if not register.writable:
         why = register.never or "it can only be read"
-        raise Refused(f"{request.entry} is never written: {why}", register=register.name)
+        raise WriteForbidden(f"{request.entry} is never written: {why}", register=register.name)
     value = register.decode(register.encode(_typed(register, request.value)))
 
     def work() -> CommandAnswer:
@@ -110,13 +110,13 @@ def _typed(register: Register[Any], value: float | str) -> Any:
 # ---- what became of it ----
 
 _OUTCOMES: tuple[tuple[type[BaseException], CommandOutcome], ...] = (  # by the first that fits
-    (Refused, CommandOutcome.REFUSED),
+    (WriteForbidden, CommandOutcome.REFUSED),
     (Unsupported, CommandOutcome.REFUSED),
     (NotAttached, CommandOutcome.NOT_SENT),
     (Expired, CommandOutcome.NOT_SENT),
-    (Overtaken, CommandOutcome.NOT_SENT),
-    (DriveRefused, CommandOutcome.FAILED),
-    (NotDone, CommandOutcome.FAILED),
+    (CancelledByStop, CommandOutcome.NOT_SENT),
+    (DriveException, CommandOutcome.FAILED),
+    (NotVerified, CommandOutcome.FAILED),
     (NoReply, CommandOutcome.NOT_SENT),  # of a read before anything was written
     (BadReply, CommandOutcome.NOT_SENT),
 )
@@ -139,7 +139,7 @@ def stop_drive(drive: Drive, seconds: float | None) -> dict[str, CommandAnswer]:
     """Stop one drive, for so many seconds or the usual ones; by its name, what is known. Never raises."""
     try:
         drive.stop(seconds=seconds)
-    except DriveRefused as failure:  # each time that it was sent
+    except DriveException as failure:  # each time that it was sent
         return {drive.name: CommandAnswer(CommandOutcome.FAILED, str(failure))}
     except Exception as failure:  # whatever it is: everybody must see it
         return {drive.name: answer_of_stop(failure)}
@@ -148,7 +148,7 @@ def stop_drive(drive: Drive, seconds: float | None) -> dict[str, CommandAnswer]:
 
 def answer_of_stop(failure: Exception) -> CommandAnswer:
     """Return what the failure of a stop means: it is sent again and again, so most say nothing certain."""
-    if isinstance(failure, (Refused, NotMaster, Unsupported)):
+    if isinstance(failure, (WriteForbidden, NotMaster, Unsupported)):
         return answer_of(failure)
     return CommandAnswer(CommandOutcome.UNKNOWN, str(failure) or type(failure).__name__)
 

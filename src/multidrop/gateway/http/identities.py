@@ -7,7 +7,7 @@ import logging
 from collections.abc import Callable
 from functools import partial
 
-from multidrop import Bus, BusError, Drive, Plant, Refused
+from multidrop import Bus, BusError, Drive, Plant, WriteForbidden
 from multidrop.supervisor import supervisor
 
 PAUSE_S = 0.2  # between two drives that are asked: the polling keeps the line
@@ -59,7 +59,7 @@ class Identities:
     def _ask(self, line: str, drive: Drive) -> None:
         try:
             self._bus(line).check_identity(drive)
-        except Refused as refusal:
+        except WriteForbidden as refusal:
             if self._refused.get(drive.name) != str(refusal):
                 _log.warning("%s", refusal)
             self._refused[drive.name] = str(refusal)

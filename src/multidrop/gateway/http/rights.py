@@ -14,7 +14,7 @@ from ipaddress import ip_address
 from typing import NamedTuple
 from urllib.parse import urlsplit
 
-NOT_LISTED = "not on the list"  # rules of a Refused that the gateway itself raises
+NOT_LISTED = "not on the list"  # rules of a WriteForbidden that the gateway itself raises
 NOT_ALLOWED = "the role does not allow it"
 NEVER_THIS_WAY = "never by this way"
 

@@ -16,7 +16,7 @@ from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp, Receive, Scope, Send
 
-from multidrop import Refused, expose_metrics
+from multidrop import WriteForbidden, expose_metrics
 from multidrop.gateway.audit import MOST_RECORDS, newest_records, time_asked
 from multidrop.gateway.clock import utc_ms
 from multidrop.gateway.commands import Admit, Told
@@ -134,7 +134,7 @@ def _told(told: Told) -> dict[str, Any]:
 
 def _answer(told: Told) -> Response:
     """Return what became of a command: 403 where a right was missing, else 200 with what happened."""
-    is_denied = isinstance(told.error, Refused) and told.error.rule in RIGHTS_RULES
+    is_denied = isinstance(told.error, WriteForbidden) and told.error.rule in RIGHTS_RULES
     return JsonResponse(_told(told) | ({"error": told.text} if is_denied else {}), 403 if is_denied else 200)
 
 

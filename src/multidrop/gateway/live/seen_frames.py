@@ -10,11 +10,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from multidrop import Refused
+from multidrop import WriteForbidden
 from multidrop.gateway.commands import MOST_AGE_S
 
 MOST_AGE_NS = round(MOST_AGE_S * 1e9)
-TOO_LATE, OVERTAKEN, DOUBLED = "too late", "a stop was called", "it came before"  # rules of a Refused
+TOO_LATE, OVERTAKEN, DOUBLED = "too late", "a stop was called", "it came before"  # rules of a WriteForbidden
 ANOTHER_PLANT = "the plant was read anew"
 
 
@@ -48,24 +48,28 @@ class SeenFrames:
     def admit(self, drive: str, what: str, command: object, seen: int) -> int:
         """Return until when a command may be sent whose sender had seen this frame, by the clock.
 
-        Raises Refused where it may not, and when the same command names the same frame again.
+        Raises WriteForbidden where it may not, and when the same command names the same frame again.
         """
         made_ns = self._made.get(seen)
         until_ns = 0 if made_ns is None else made_ns + MOST_AGE_NS
         if made_ns is None or self.clock() > until_ns:
             last = f"frame {seen} is none of the last {MOST_AGE_S:g} s"
-            raise Refused(f"{what} was not sent: {last}: look again, and confirm it anew", rule=TOO_LATE)
+            raise WriteForbidden(
+                f"{what} was not sent: {last}: look again, and confirm it anew", rule=TOO_LATE
+            )
         if seen <= self._newest_before:
             since = f"the plant was read anew after frame {seen}"
-            raise Refused(
+            raise WriteForbidden(
                 f"{what} was not sent: {since}: look again, and confirm it anew", rule=ANOTHER_PLANT
             )
         if (self._stopped_ns(drive) or 0) >= made_ns:
             since = f"a stop was called after frame {seen}"
-            raise Refused(f"{what} was not sent: {since}: look again, and confirm it anew", rule=OVERTAKEN)
+            raise WriteForbidden(
+                f"{what} was not sent: {since}: look again, and confirm it anew", rule=OVERTAKEN
+            )
         came = self._came.setdefault(seen, set())
         if command in came:
             first = "the first answer says what became of it"
-            raise Refused(f"{what} was not sent again: it came a second time; {first}", rule=DOUBLED)
+            raise WriteForbidden(f"{what} was not sent again: it came a second time; {first}", rule=DOUBLED)
         came.add(command)
         return until_ns

@@ -7,17 +7,17 @@ from enum import IntEnum
 
 from multidrop import (
     BadReply,
-    DriveRefused,
+    CancelledByStop,
+    DriveException,
     Expired,
     LineError,
     NoReply,
     NotAttached,
-    NotDone,
     NotMaster,
-    Overtaken,
-    Refused,
+    NotVerified,
     Unconfirmed,
     Unsupported,
+    WriteForbidden,
 )
 from multidrop.gateway.commands import BUSY
 from multidrop.gateway.http.rights import NOT_ALLOWED, NOT_LISTED
@@ -49,7 +49,7 @@ class Declined(Exception):
 _CODES: tuple[tuple[type[BaseException], ModbusCode], ...] = (
     (PassingBusy, ModbusCode.BUSY),
     (Expired, ModbusCode.BUSY),
-    (Overtaken, ModbusCode.BUSY),
+    (CancelledByStop, ModbusCode.BUSY),
     (LineError, ModbusCode.NO_PATH),
     (NotMaster, ModbusCode.NO_PATH),
     (NotAttached, ModbusCode.NO_PATH),
@@ -57,7 +57,7 @@ _CODES: tuple[tuple[type[BaseException], ModbusCode], ...] = (
     (BadReply, ModbusCode.NO_RESPONSE),
     (Unconfirmed, ModbusCode.NO_RESPONSE),
     (Unsupported, ModbusCode.ILLEGAL_FUNCTION),
-    (NotDone, ModbusCode.DEVICE_FAILURE),
+    (NotVerified, ModbusCode.DEVICE_FAILURE),
     (ValueError, ModbusCode.ILLEGAL_VALUE),
 )
 # The same for refusals by the rule that they name.
@@ -70,10 +70,10 @@ _RULES: Mapping[str, ModbusCode] = {
 
 def code_of(error: BaseException | None) -> int:
     """Return the exception code that tells a client of this error; a drive's own code as it came."""
-    if isinstance(error, DriveRefused):
+    if isinstance(error, DriveException):
         return error.code if 1 <= error.code <= 0x7F else ModbusCode.DEVICE_FAILURE
-    if isinstance(error, Refused) and (code := _RULES.get(error.rule)):
+    if isinstance(error, WriteForbidden) and (code := _RULES.get(error.rule)):
         return code
-    if isinstance(error, Refused) and error.is_budget:
+    if isinstance(error, WriteForbidden) and error.is_budget:
         return ModbusCode.BUSY
     return next((code for kind, code in _CODES if isinstance(error, kind)), ModbusCode.DEVICE_FAILURE)
