@@ -16,7 +16,7 @@ from multidrop.gateway.modbus_server.settings import ModbusSettings
 from multidrop.gateway.modbus_server.unit_ids import MAIN, StopWrite, Unit, Units
 from multidrop.plant.model import PolledDrive
 
-FAMILIES = Path(__file__).parents[3] / "src" / "multidrop" / "families"
+FAMILIES = Path(__file__).parents[3] / "src" / "multidrop" / "families" / "shipped"
 
 
 def numbers(units: Units) -> dict[tuple[str, int], str]:
