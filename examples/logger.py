@@ -10,7 +10,8 @@ from pathlib import Path
 
 from simulated_plant import simulated_plant
 
-from multidrop import Plant, Poller, convert, load_plant, open_writer
+from multidrop import Plant, Poller, load_plant, open_writer
+from multidrop.recording import convert
 
 PLANT = """
 [[line]]

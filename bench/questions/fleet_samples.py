@@ -28,13 +28,14 @@ sys.path.append(str(Path(__file__).parents[2] / "tests" / "support"))
 from postgres_clusters import Postgres, postgres
 
 from bench.support import tables
-from multidrop import BatchColumns, PlantLine
+from multidrop import PlantLine
 from multidrop.fleet.samples.hub import Commit, SampleSink
 from multidrop.fleet.samples.message import Packed, RowBuffer, unpack
 from multidrop.fleet.samples.parquet_sink import ParquetSink
 from multidrop.fleet.samples.polled_units import PolledUnits
 from multidrop.fleet.samples.postgres_sink import PostgresSink
 from multidrop.fleet.samples.spool_folder import SpoolFolder
+from multidrop.polling import BatchColumns
 
 UTC = 1_795_253_399_123_456_789
 DRIVES = 16  # a line

@@ -26,8 +26,9 @@ from gateway_users import COMMON, COMMON_WORDS, WORDS
 from simulated_pumps import FIRST_READING, POLLED, write_plant
 
 from bench.support import tables
-from multidrop import expose_metrics, load_plant
+from multidrop import load_plant
 from multidrop.core import Columns, Counters, Names, Status
+from multidrop.exposition import expose_metrics
 from multidrop.gateway.gateway import Gateway
 from multidrop.gateway.http.connections import Connections, Watched
 from multidrop.gateway.http.routes import make_app

@@ -32,7 +32,8 @@ from simulated_pumps import POLLED, SimulatedPumps, free_ports, simulated_pumps,
 
 from bench.support import tables
 from bench.support.programs import module
-from multidrop import Poller, SegmentWriter, load_plant
+from multidrop import Poller, load_plant
+from multidrop.recording import SegmentWriter
 
 LINES = (8, 8, 8, 7)  # drives on each, at 115200 bit/s: `multidrop plan` says 78 % of the time
 LOOK_S = 0.05  # between looks at counters

@@ -22,8 +22,9 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from bench.support import tables
-from multidrop import History, HistoryWriter
+from multidrop import History
 from multidrop.core.columns import COLUMNS, Names
+from multidrop.history import HistoryWriter
 from multidrop.history.compact import ROWS, TENS, compact
 from multidrop.history.database import TABLE, connect, copy_out, rows_of
 from multidrop.history.folder import STEM, file_name, parquet_files

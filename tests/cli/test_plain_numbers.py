@@ -7,13 +7,13 @@ from typing import Any
 
 import pytest
 
-from multidrop import plain_number, plain_whole
 from multidrop.cli import main
 from multidrop.families import InvtCHE
 from multidrop.families.files import cells
 from multidrop.gateway.http.guard import Denied
 from multidrop.gateway.http.request_fields import number_in
 from multidrop.importers.numbers import count, number
+from multidrop.printable import plain_number, plain_whole
 from multidrop.recording.csv import _parse
 
 # Fullwidth, Arabic-Indic, Devanagari and mathematical digits, and Python's own underscore.

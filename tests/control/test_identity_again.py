@@ -12,11 +12,11 @@ from lines import line, plant, polled, until
 from motors import MAKE, ReceivedRequests
 from simulated_bus import SimulatedBus, is_write, one
 
-from multidrop import Bus, Drive, InnovertIBD, InvtCHE, NoReply, Poller, Script, WriteForbidden
+from multidrop import Bus, Drive, InnovertIBD, InvtCHE, NoReply, Poller, WriteForbidden
 from multidrop.control import records
 from multidrop.control.outcome import Seen
 from multidrop.core import PAUSE_NS, Completion, Exchange, Framing, Message, build_reply
-from multidrop.drive import write
+from multidrop.drive import Script, write
 from multidrop.drive.declare import reading, setting
 from multidrop.drive.table import Kept
 from multidrop.drive.verbs import verb

@@ -22,12 +22,13 @@ from examples import usually
 from lines import PATIENCE, until
 from toy import Status, Toy
 
-from multidrop import Mastership, NoSuchPort, NotMaster, Script, Seen, insist, read_audit, verb, write
+from multidrop import NotMaster, Seen
 from multidrop.bus import Bus
-from multidrop.core import Completion, Exchange, Failure
+from multidrop.control import read_audit
+from multidrop.core import Completion, Exchange, Failure, Mastership
 from multidrop.core import Status as Missed
-from multidrop.drive import read
-from multidrop.errors import LineError, NoReply, Unconfirmed
+from multidrop.drive import Script, insist, read, verb, write
+from multidrop.errors import LineError, NoReply, NoSuchPort, Unconfirmed
 from multidrop.sim import Simulator, Wire, simulated
 
 if sys.platform != "linux":

@@ -15,8 +15,7 @@ import pytest
 from kills import BoundProcess
 from tables import table
 
-import multidrop
-from multidrop import Mastership
+from multidrop.core import Mastership
 
 if sys.platform != "linux":
     pytest.skip("masterships are Linux's", allow_module_level=True)
@@ -24,7 +23,7 @@ if sys.platform != "linux":
 S = 1_000_000_000
 KEEPER = """
 import sys, time
-from multidrop import Mastership
+from multidrop.core import Mastership
 mastership = Mastership(guard_s=float(sys.argv[1]))
 mastership.extend(time.clock_gettime_ns(time.CLOCK_BOOTTIME) + round(float(sys.argv[2]) * 1e9))
 exec(sys.argv[3])
@@ -191,7 +190,3 @@ def test_a_child_of_a_fork_is_no_master() -> None:
     assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
     assert mastership.holds
     mastership.end()
-
-
-def test_it_is_a_public_name() -> None:
-    assert multidrop.Mastership is Mastership

@@ -6,8 +6,8 @@ import math
 
 import pytest
 
-from multidrop import Condition, StateReader
-from multidrop.drive import Drive
+from multidrop import Condition
+from multidrop.drive import Drive, StateReader
 from multidrop.drive.declare import reading
 from multidrop.drive.script import Script, read
 from multidrop.drive.state import State

@@ -23,7 +23,8 @@ from multidrop.scan.identify import _read
 from multidrop.sim import SimulatedDrive, Simulator, Wire
 
 METER = """\
-from multidrop import INPUT, Drive, reading, text
+from multidrop import Drive, reading, text
+from multidrop.drive import INPUT
 
 class Meter(Drive):
     model = "meter"

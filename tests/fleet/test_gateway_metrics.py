@@ -15,7 +15,7 @@ from tables import table
 
 require_module("nats")
 
-from multidrop import expose_metrics  # noqa: E402
+from multidrop.exposition import expose_metrics  # noqa: E402
 from multidrop.fleet.gateway_metrics import families_of  # noqa: E402
 from multidrop.fleet.metrics_port import MOST_CLIENTS, MOST_HEAD, answer, listen, serving  # noqa: E402
 

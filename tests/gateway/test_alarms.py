@@ -18,8 +18,9 @@ from gateways import POLL, Served, plant_text, running, served, written
 from lines import until
 from tables import table
 
-from multidrop import BusError, WriteForbidden, can_show_fault, load_plant
+from multidrop import BusError, WriteForbidden, load_plant
 from multidrop.core import Columns, Field, Names, NumberFormat, RowLayout
+from multidrop.drive import can_show_fault
 from multidrop.errors import Advice
 from multidrop.families import MODELS
 from multidrop.families.erman_er_g_220 import ErmanFault

@@ -16,7 +16,8 @@ from modbus_gateway import plant_of
 from simulated_bus import one
 from tables import table
 
-from multidrop import Bus, InvtCHE, Ledger, Plant, Seen, Stopped, Unconfirmed
+from multidrop import Bus, InvtCHE, Plant, Seen, Stopped, Unconfirmed
+from multidrop.control import Ledger
 from multidrop.gateway.commands import Commands, Told
 from multidrop.gateway.http.rights import Caller, May, Right
 from multidrop.gateway.live.views import look_at

@@ -6,7 +6,8 @@ from collections.abc import Mapping
 
 import pytest
 
-from multidrop import MetricFamily, expose_metrics, exposition
+from multidrop import exposition
+from multidrop.exposition import MetricFamily, expose_metrics
 
 
 def test_labels_are_spelled_out_once_and_not_at_each_scrape(monkeypatch: pytest.MonkeyPatch) -> None:

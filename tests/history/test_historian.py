@@ -14,11 +14,13 @@ import pytest
 from gateways import serving, simulated_plant
 from histories import NOON, SECOND, batch
 
-from multidrop import Buckets, History, Plant, open_reader
+from multidrop import History, Plant
 from multidrop.core.columns import Names
 from multidrop.gateway import historian
 from multidrop.gateway.historian import MOST_BUCKETS, HistorySettings, as_json, build
 from multidrop.gateway.http.exports import Exports
+from multidrop.history import Buckets
+from multidrop.recording import open_reader
 
 MS = 1_000_000
 

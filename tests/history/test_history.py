@@ -15,13 +15,14 @@ import pytest
 from examples import examples, usually
 from histories import DAY, METADATA, NOON, SECOND, check_buckets, random_rows, record, rows_in
 
-from multidrop import History, open_reader
+from multidrop import History
 from multidrop.history import growing, kept_series
 from multidrop.history.buckets import grid_of
 from multidrop.history.compact import compact
 from multidrop.history.database import Database
 from multidrop.history.sources import Replaced, Sources
 from multidrop.polling.batch import Row
+from multidrop.recording import open_reader
 from multidrop.recording.rows import from_rows
 from multidrop.recording.segments import SegmentWriter
 

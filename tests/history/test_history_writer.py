@@ -13,9 +13,10 @@ import pytest
 from disks import full_at, read_only_directory
 from histories import DAY, METADATA, NOON, SECOND, batch, random_rows, record, rows_in
 
-from multidrop import History, HistoryWriter, Poller, Seen, load_plant
+from multidrop import History, Poller, Seen, load_plant
 from multidrop.core.columns import Names
 from multidrop.families import InnovertIBD
+from multidrop.history import HistoryWriter
 from multidrop.history import writer as writer_module
 from multidrop.history.folder import HistoryFile, file_name, listing, parquet_files, widest
 from multidrop.recording.append_file import AppendFile

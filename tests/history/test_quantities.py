@@ -10,8 +10,9 @@ import pytest
 from histories import DAY, NOON, SECOND, batch
 
 import multidrop
-from multidrop import Buckets, History, HistoryWriter
+from multidrop import History
 from multidrop.core.columns import Names
+from multidrop.history import Buckets, HistoryWriter
 from multidrop.history.compact import compact
 from multidrop.history.quantities import quantities_of
 from multidrop.polling.batch import Row, Rows

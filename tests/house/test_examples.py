@@ -12,8 +12,9 @@ import pytest
 from lines import PATIENCE
 from tables import table
 
-from multidrop import open_reader, read_audit
 from multidrop.cli import main
+from multidrop.control import read_audit
+from multidrop.recording import open_reader
 
 ROOT = Path(__file__).parents[2]
 EXAMPLES = ROOT / "examples"

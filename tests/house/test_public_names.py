@@ -14,6 +14,8 @@ from toy import Toy
 
 import multidrop
 from multidrop import Bus, Plant, Poller
+from multidrop.core import Framing, NumberFormat
+from multidrop.drive import DISCRETE, HOLDING, INPUT, Kept
 
 NAMES = [name for name in multidrop.__all__ if name != "__version__"]
 
@@ -60,13 +62,11 @@ def test_what_a_declaration_needs() -> None:
     """A user's own family, by public names alone."""
 
     class Own(multidrop.Drive):
-        speed = multidrop.reading(
-            1, "Hz", step=0.1, table=multidrop.INPUT, number_format=multidrop.NumberFormat.I16
-        )
-        level = multidrop.setting(2, kept=multidrop.Kept.RAM, table=multidrop.HOLDING)
-        lamp = multidrop.reading(3, number_format=multidrop.NumberFormat.BIT, table=multidrop.DISCRETE)
+        speed = multidrop.reading(1, "Hz", step=0.1, table=INPUT, number_format=NumberFormat.I16)
+        level = multidrop.setting(2, kept=Kept.RAM, table=HOLDING)
+        lamp = multidrop.reading(3, number_format=NumberFormat.BIT, table=DISCRETE)
 
-    assert Own(1, framing=multidrop.Framing.RTU).speed is Own.speed
+    assert Own(1, framing=Framing.RTU).speed is Own.speed
 
 
 # ---- in a debugger ----

@@ -11,9 +11,8 @@ from hypothesis import strategies as st
 from meter import ADDRESSES, Meter, StatedMeter
 from tables import table
 
-from multidrop import HOLDING_MULTIPLE
 from multidrop.core import Message, NumberFormat
-from multidrop.drive import Drive, Framing
+from multidrop.drive import HOLDING_MULTIPLE, Drive, Framing
 from multidrop.drive.declaration_check import DeclarationError
 from multidrop.drive.declare import command, reading, setting
 from multidrop.drive.register import Register

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from multidrop import RESERVED_NAMES, check_drive_name, drive_meant
+from multidrop.plant import RESERVED_NAMES, check_drive_name, drive_meant
 
 # One letter and its two spellings each, by the code charts: U+00FC = U+0075 U+0308; U+0439 = U+0438 U+0306.
 COMPOSED, APART = "L\u00fcfter", "Lu\u0308fter"

@@ -20,8 +20,9 @@ from examples import usually
 from lines import HOST_LATE, PATIENCE, line, plant, polled, rows_of, until
 from toy import Toy
 
-from multidrop import Bus, Mastership, NoSuchPort, NotMaster
-from multidrop.core import RowQueue
+from multidrop import Bus, NotMaster
+from multidrop.core import Mastership, RowQueue
+from multidrop.errors import NoSuchPort
 from multidrop.plant.loader import PlantError
 from multidrop.plant.model import PlantLine, PolledDrive
 from multidrop.poller import Poller

@@ -79,7 +79,7 @@ def test_a_library_that_is_missing_is_told_with_its_extra(
 @pytest.mark.long
 def test_no_library_is_imported_before_it_is_needed() -> None:
     code = (
-        "import sys, multidrop; multidrop.Poller, multidrop.read, multidrop.WideRows; "
+        "import sys, multidrop; multidrop.Poller, multidrop.read, multidrop.Batch; "
         "import multidrop.cli.poll.command; print(*sys.modules)"
     )
     told = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)

@@ -13,7 +13,8 @@ from unittest.mock import patch
 
 from fleets import HandClock
 
-from multidrop import YD1000, Bus, read_audit, written_before
+from multidrop import YD1000, Bus
+from multidrop.control import read_audit, written_before
 from multidrop.fleet.commands import desk as command_desk
 from multidrop.fleet.commands.desk import CommandDesk
 from multidrop.fleet.commands.log import CommandLog

@@ -23,7 +23,8 @@ from typing import NamedTuple
 from kills import kill_all
 from nats_clusters import Cluster, cluster
 
-from multidrop import YD1000, read_audit
+from multidrop import YD1000
+from multidrop.control import read_audit
 from multidrop.fleet.commands.fleet_commands import FleetCommands
 from multidrop.fleet.commands.words import CommandAnswer, CommandOutcome, Offered
 from multidrop.fleet.errors import FleetError

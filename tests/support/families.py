@@ -5,19 +5,9 @@ from __future__ import annotations
 from enum import IntEnum, IntFlag
 from pathlib import Path
 
-from multidrop import (
-    COIL,
-    DISCRETE,
-    HOLDING,
-    INPUT,
-    Drive,
-    Framing,
-    Kept,
-    NumberFormat,
-    Option,
-    reading,
-    setting,
-)
+from multidrop import Drive, reading, setting
+from multidrop.core import Framing, NumberFormat
+from multidrop.drive import COIL, DISCRETE, HOLDING, INPUT, Kept, Option
 
 METER = """\
 [family]

@@ -18,7 +18,8 @@ import traceback
 from contextlib import suppress
 from pathlib import Path
 
-from multidrop import Mastership, Plant, PlantLine, Polled, PolledDrive, Poller
+from multidrop import Plant, PlantLine, Polled, PolledDrive, Poller
+from multidrop.core import Mastership
 from multidrop.drive import Drive, Framing
 from multidrop.drive.declare import reading
 from multidrop.drive.table import HOLDING

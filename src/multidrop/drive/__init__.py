@@ -1,10 +1,26 @@
 """Drives as their manuals describe them, without I/O: registers, facts of the line, verbs."""
 
 from multidrop.core import Framing
+from multidrop.drive.declaration_check import DeclarationError as DeclarationError
 from multidrop.drive.family import Drive
+from multidrop.drive.known_state import FAULT_RECORDS as FAULT_RECORDS
+from multidrop.drive.known_state import StateReader as StateReader
+from multidrop.drive.known_state import can_show_fault as can_show_fault
+from multidrop.drive.named_verbs import verb_arguments as verb_arguments
+from multidrop.drive.named_verbs import verbs_of as verbs_of
 from multidrop.drive.options import Option
+from multidrop.drive.register import Access as Access
 from multidrop.drive.script import Read, Script, Wait, carry_out, insist, read, until, wait, write
 from multidrop.drive.state import Condition, Direction, State
+from multidrop.drive.table import COIL as COIL
+from multidrop.drive.table import DISCRETE as DISCRETE
+from multidrop.drive.table import HOLDING as HOLDING
+from multidrop.drive.table import HOLDING_MULTIPLE as HOLDING_MULTIPLE
+from multidrop.drive.table import INPUT as INPUT
+from multidrop.drive.table import Carrier as Carrier
+from multidrop.drive.table import Kept as Kept
+from multidrop.drive.table import Table as Table
+from multidrop.drive.text import Text as Text
 from multidrop.drive.verbs import verb
 from multidrop.errors import (
     ANOTHER_FAMILY,
@@ -19,27 +35,43 @@ from multidrop.errors import (
 
 __all__ = [
     "ANOTHER_FAMILY",
+    "COIL",
+    "DISCRETE",
+    "FAULT_RECORDS",
+    "HOLDING",
+    "HOLDING_MULTIPLE",
+    "INPUT",
+    "Access",
     "Advice",
     "BusError",
+    "Carrier",
     "Condition",
+    "DeclarationError",
     "Direction",
     "Drive",
     "DriveException",
     "Framing",
+    "Kept",
     "NotVerified",
     "Option",
     "Read",
     "Script",
     "State",
+    "StateReader",
+    "Table",
+    "Text",
     "Unconfirmed",
     "Unsupported",
     "Wait",
     "WriteForbidden",
+    "can_show_fault",
     "carry_out",
     "insist",
     "read",
     "until",
     "verb",
+    "verb_arguments",
+    "verbs_of",
     "wait",
     "write",
 ]

@@ -12,7 +12,8 @@ from typing import Any
 
 from nats.aio.msg import Msg
 
-from multidrop import Mastership, PollingFailed
+from multidrop import PollingFailed
+from multidrop.core import Mastership
 from multidrop.fleet.commands.log import CommandLog
 from multidrop.fleet.commands.subjects import CommandedLines, CommandSubjects
 from multidrop.fleet.errors import FleetError, NoRight

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
 
-from multidrop import MetricFamily
+from multidrop.exposition import MetricFamily
 from multidrop.fleet.leases.member import MemberState
 
 

@@ -14,7 +14,7 @@ from collections.abc import AsyncIterator, Callable, Iterable
 from contextlib import asynccontextmanager, suppress
 from ipaddress import ip_address
 
-from multidrop import MetricFamily, expose_metrics
+from multidrop.exposition import MetricFamily, expose_metrics
 
 EXAMPLE = "127.0.0.1:9464"
 MOST_HEAD = 8192  # bytes of a request

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
-from multidrop import masked
 from multidrop.fleet.task_end import end_tasks
+from multidrop.printable import masked
 
 if TYPE_CHECKING:
     from multidrop.fleet.commands.fleet_commands import FleetCommands

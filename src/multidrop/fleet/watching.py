@@ -7,8 +7,8 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-from multidrop import masked
 from multidrop.fleet.overview import FleetView
+from multidrop.printable import masked
 
 EVERY_S = 1.0  # between looks
 

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from multidrop import read_audit
+from multidrop.control import read_audit
 from multidrop.gateway.http.guard import Denied
 
 MOST_RECORDS = 200  # of an answer

@@ -8,7 +8,7 @@ from contextlib import suppress
 from functools import partial
 from typing import TypeVar
 
-from multidrop import noted_first, written_by
+from multidrop.control import noted_first, written_by
 from multidrop.gateway.http.rights import Caller
 from multidrop.supervisor import supervisor
 

@@ -15,16 +15,9 @@ from functools import partial
 from math import inf
 from typing import Protocol
 
-from multidrop import (
-    Bus,
-    Drive,
-    Plant,
-    RepeatedStops,
-    WriteForbidden,
-    drive_meant,
-    verb_arguments,
-    written_before,
-)
+from multidrop import Bus, Drive, Plant, WriteForbidden
+from multidrop.control import RepeatedStops, written_before
+from multidrop.drive import verb_arguments
 from multidrop.gateway.clock import boottime_ns, monotonic_ns
 from multidrop.gateway.command_results import Told as Told
 from multidrop.gateway.command_results import as_one, denied, failed, not_listed, of_stop
@@ -33,6 +26,7 @@ from multidrop.gateway.drive_commands import act_one, stop_by, stop_one, write_o
 from multidrop.gateway.http.rights import NEVER_THIS_WAY, Caller, May, Right
 from multidrop.gateway.stops_amid_reload import ChangingLines, drives_of, names_of, stop_meant
 from multidrop.gateway.verb_rules import STOPPING, VERBS
+from multidrop.plant import drive_meant
 
 MOST_AGE_S = 5.0  # of a write or a verb that a network held up; a stop is never too old
 MOST_WRITES = 8  # under way on a line, without stops

@@ -6,7 +6,8 @@ from collections.abc import Mapping
 from math import isfinite
 from typing import Any
 
-from multidrop import Bus, BusError, Drive, Effect, Register
+from multidrop import Bus, BusError, Drive, Register
+from multidrop.control import Effect
 from multidrop.gateway.command_results import Told, failed, in_words
 
 

@@ -17,7 +17,8 @@ from typing import Any
 import uvicorn
 
 import multidrop
-from multidrop import Batch, Bus, Ledger, LineError, Plant, Poller
+from multidrop import Batch, Bus, LineError, Plant, Poller
+from multidrop.control import Ledger
 from multidrop.gateway.clock import boottime_ns, now_and_slept_ns, utc_ms
 from multidrop.gateway.commands import Commands
 from multidrop.gateway.http.connections import Connections, Watched, WatchedProtocol

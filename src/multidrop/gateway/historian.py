@@ -15,18 +15,11 @@ from shutil import rmtree
 from tempfile import TemporaryDirectory
 from typing import Any, Protocol
 
-from multidrop import (
-    Batch,
-    Buckets,
-    History,
-    HistoryState,
-    HistoryWriter,
-    MetricFamily,
-    Plant,
-    parse_age,
-    parse_size,
-)
+from multidrop import Batch, History, Plant
+from multidrop.exposition import MetricFamily
 from multidrop.gateway.metrics import counter
+from multidrop.history import Buckets, HistoryState, HistoryWriter
+from multidrop.recording import parse_age, parse_size
 from multidrop.supervisor import supervisor
 
 MS_NS = 1_000_000

@@ -8,9 +8,10 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import NamedTuple
 
-from multidrop import LineStatistics, MetricFamily
+from multidrop.exposition import MetricFamily
 from multidrop.gateway.live.frames import lost_of
 from multidrop.gateway.live.hub import FAULT, RUNS, SILENT, STANDS, UNKNOWN, Hub
+from multidrop.transport import LineStatistics
 
 Sample = tuple[str, Mapping[str, str], float]  # the name's suffix, labels, value
 STATES = (RUNS, STANDS, FAULT, SILENT, UNKNOWN)

@@ -13,10 +13,12 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from multidrop import MAY_LISTS, Key, Plant, PlantError, TomlPlace, check_listed
+from multidrop import Plant, PlantError
 from multidrop.gateway.http.rights import May, Right, Token, is_loopback, read_tokens
 from multidrop.gateway.parts import PARTS, Part, settings_class
+from multidrop.plant import MAY_LISTS, check_listed
 from multidrop.supervisor import Hung, in_time
+from multidrop.toml_check import Key, TomlPlace
 
 LISTEN = "127.0.0.1:8750"
 AUDIT_S = 2.0  # within which the disk of the audit log must answer

@@ -6,7 +6,8 @@ import asyncio
 from collections.abc import Awaitable, Callable, Sequence
 from typing import Protocol, TypeVar
 
-from multidrop import Drive, Plant, PlantLine, drive_meant
+from multidrop import Drive, Plant, PlantLine
+from multidrop.plant import drive_meant
 from multidrop.supervisor import supervisor
 
 LOOK_S = 0.02  # between looks at what a reload changes

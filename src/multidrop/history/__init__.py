@@ -17,3 +17,8 @@ Numbers grow, also over restarts. Three rules say where a row is read, so that i
 
 BEGIN and END are UTC, such as 20261122T213700Z, and enclose the times of all rows in the file.
 """
+
+from multidrop.history.buckets import Buckets as Buckets
+from multidrop.history.history import HistoryRows as HistoryRows
+from multidrop.history.writer import HistoryState as HistoryState
+from multidrop.history.writer import HistoryWriter as HistoryWriter

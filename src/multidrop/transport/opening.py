@@ -106,7 +106,7 @@ def check_port(port: str, mastership: Mastership | None) -> None:
     NoSuchPort is raised for such a port too.
     """
     if mastership is not None and not isinstance(mastership, Mastership):
-        raise TypeError(f"mastership takes a multidrop.Mastership, not {mastership!r}")
+        raise TypeError(f"mastership takes a multidrop.core.Mastership, not {mastership!r}")
     if is_bridged(unopened(port)) and mastership:
         raise NoSuchPort(
             port,

@@ -12,10 +12,12 @@ from lines import ANY_PORT
 from peers import require_module
 from simulated_bus import SimulatedBus
 
-from multidrop import INPUT, Bus, Drive, WriteForbidden, load_family, load_plant, open_reader
+from multidrop import Bus, Drive, WriteForbidden, load_family, load_plant
 from multidrop.control.eeprom_ledger import Ledger
+from multidrop.drive import INPUT
 from multidrop.families.registry import find_model
 from multidrop.planning.blocks import blocks
+from multidrop.recording import open_reader
 from multidrop.sim import Simulator, Wire, simulated
 
 pytestmark = pytest.mark.usefixtures("_turns_awaited")

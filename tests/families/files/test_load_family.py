@@ -12,8 +12,9 @@ import pytest
 from families import METER, METER_CSV, Meter, write_meter
 from tables import table
 
-from multidrop import Drive, FamilyError, Kept, load_family
+from multidrop import Drive, FamilyError, load_family
 from multidrop.core import NumberFormat
+from multidrop.drive import Kept
 from multidrop.drive.register import Register
 from multidrop.drive.table import HOLDING, INPUT
 from multidrop.families.files.facts import FAMILY_KEYS

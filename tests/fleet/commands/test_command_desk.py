@@ -17,7 +17,8 @@ from lines import patient
 from peers import require_module
 from tables import table
 
-from multidrop import Seen, Stopped, read_audit
+from multidrop import Seen, Stopped
+from multidrop.control import read_audit
 
 require_module("nats")
 

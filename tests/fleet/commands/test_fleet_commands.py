@@ -15,7 +15,7 @@ from peers import require_module
 
 require_module("nats")
 
-from multidrop import read_audit  # noqa: E402
+from multidrop.control import read_audit  # noqa: E402
 from multidrop.fleet.commands import fleet_commands as asker_module  # noqa: E402
 from multidrop.fleet.commands import stop_asking  # noqa: E402
 from multidrop.fleet.commands.fleet_commands import FleetCommands  # noqa: E402

@@ -11,10 +11,9 @@ from pathlib import Path
 import pytest
 from lines import until
 
-from multidrop import Mastership
 from multidrop.cli.fleet.demo.judgement import Answers, KeptRow, judge_drive
 from multidrop.cli.fleet.demo.numbered_lines import PORT, NumberedDrive, drive_name, plant_file
-from multidrop.core import UNASKED
+from multidrop.core import UNASKED, Mastership
 from multidrop.families import InnovertIBD
 from multidrop.plant.loader import load_plant
 from multidrop.plant.model import Plant, PlantLine

@@ -12,7 +12,8 @@ from peers import require_module
 from spooled import NOON, STEP, numbered
 
 import multidrop
-from multidrop import History, Mastership
+from multidrop import History
+from multidrop.core import Mastership
 from multidrop.fleet.lines.fleet_lines import FleetLines
 from multidrop.fleet.samples import polled_units
 from multidrop.fleet.samples.hub import Commit

@@ -8,7 +8,8 @@ from collections.abc import Iterator
 import pytest
 from lines import line, plant, polled
 
-from multidrop import Drive, NumberFormat, reading, setting
+from multidrop import Drive, reading, setting
+from multidrop.core import NumberFormat
 from multidrop.families import MODELS, DelixiModbus, InvtCHE
 from multidrop.gateway.http.rights import May
 from multidrop.gateway.live.descriptions import describe

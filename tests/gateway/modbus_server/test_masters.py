@@ -19,7 +19,8 @@ from lines import until
 from modbus_gateway import in_thread
 from modbus_masters import Master, master_of
 
-from multidrop import Batch, Bus, BusError, Carrier, Plant, Poller, load_plant
+from multidrop import Batch, Bus, BusError, Plant, Poller, load_plant
+from multidrop.drive import Carrier
 from multidrop.gateway.commands import Commands
 from multidrop.gateway.http.rights import May
 from multidrop.gateway.live.hub import Hub

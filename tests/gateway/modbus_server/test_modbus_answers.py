@@ -14,26 +14,25 @@ from lines import until
 from modbus_gateway import Gateway, plant_of, request, serving
 
 from multidrop import (
-    COIL,
     BadReply,
     BusError,
     CancelledByStop,
     Drive,
     DriveException,
     Expired,
-    Kept,
     NoReply,
     NotAttached,
     NotMaster,
     NotVerified,
-    NumberFormat,
-    PortLost,
     Unconfirmed,
     Unsupported,
     WriteForbidden,
     reading,
     setting,
 )
+from multidrop.core import NumberFormat
+from multidrop.drive import COIL, Kept
+from multidrop.errors import PortLost
 from multidrop.families import DelixiNative, ErmanERG220, InnovertIBD, InvtCHE
 from multidrop.gateway.commands import BUSY, Told
 from multidrop.gateway.http.rights import NOT_ALLOWED, NOT_LISTED, Caller, Right

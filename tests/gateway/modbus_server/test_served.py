@@ -15,7 +15,8 @@ from lines import until
 from modbus_gateway import RawClient, RawReply, request
 from peers import require_module
 
-from multidrop import InvtCHE, PlantError, load_plant, read_audit
+from multidrop import InvtCHE, PlantError, load_plant
+from multidrop.control import read_audit
 from multidrop.gateway.settings import read_settings
 from multidrop.sim import SimulatedDrive, Simulator, Wire, simulated
 

@@ -9,7 +9,8 @@ import pytest
 from modbus_gateway import plant_of
 from tables import table
 
-from multidrop import COIL, HOLDING, Carrier, Drive, load_family, reading, setting, text
+from multidrop import Drive, load_family, reading, setting, text
+from multidrop.drive import COIL, HOLDING, Carrier
 from multidrop.families import MODELS, InnovertIBD, InvtCHE
 from multidrop.families.registry import find_model
 from multidrop.gateway.modbus_server.settings import ModbusSettings

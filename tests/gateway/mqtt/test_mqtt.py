@@ -32,7 +32,7 @@ from gateways import certificate, served
 from lines import until
 from peers import require_module
 
-from multidrop import RESERVED_NAMES, Drive, InvtCHE, PolledDrive
+from multidrop import Drive, InvtCHE, PolledDrive
 from multidrop.drive.declare import reading, setting
 from multidrop.families import MODELS
 from multidrop.gateway.clock import boottime_ns
@@ -41,6 +41,7 @@ from multidrop.gateway.mqtt.home_assistant import discovery, discovery_topic
 from multidrop.gateway.mqtt.json_topics import JsonTopics
 from multidrop.gateway.mqtt.outbox import MOST_UNDER_WAY
 from multidrop.gateway.mqtt.part import MqttSettings, build
+from multidrop.plant import RESERVED_NAMES
 
 Start = Callable[..., tuple[Any, Running]]
 

@@ -14,7 +14,8 @@ from contextlib import suppress
 from functools import partial
 from typing import Any
 
-from multidrop import Unsupported, written_before, written_by
+from multidrop import Unsupported
+from multidrop.control import written_before, written_by
 from multidrop.fleet.commands.drive_commands import Prepared, prepare
 from multidrop.fleet.commands.log import CommandLog
 from multidrop.fleet.commands.offers import Offer, Offers

@@ -11,7 +11,6 @@ from multidrop import (
     CancelledByStop,
     Drive,
     DriveException,
-    Effect,
     Expired,
     LineError,
     NoReply,
@@ -23,9 +22,9 @@ from multidrop import (
     Stopped,
     Unsupported,
     WriteForbidden,
-    verb_arguments,
-    verbs_of,
 )
+from multidrop.control import Effect
+from multidrop.drive import verb_arguments, verbs_of
 from multidrop.fleet.commands.words import CommandAnswer, CommandOutcome, CommandRequest
 
 _MOVING = ("start", "jog", "reset_fault", "set_frequency")

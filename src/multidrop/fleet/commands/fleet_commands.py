@@ -11,7 +11,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Self
 
-from multidrop import drive_meant
 from multidrop.fleet.commands.log import open_log
 from multidrop.fleet.commands.stop_asking import HARD_WIRED, News, first_answer
 from multidrop.fleet.commands.words import (
@@ -33,6 +32,7 @@ from multidrop.fleet.servers.buckets import Bucket, Follower
 from multidrop.fleet.servers.connections import ServerPath, paths_of
 from multidrop.fleet.servers.setup import open_all
 from multidrop.fleet.task_end import end_tasks
+from multidrop.plant import drive_meant
 from multidrop.supervisor import Ended, reason_of
 
 LOST_S = 6.0  # without any answer, after which what became of a command stays unknown

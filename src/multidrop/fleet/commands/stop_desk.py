@@ -13,7 +13,8 @@ from functools import partial
 from hashlib import sha256
 from typing import Any
 
-from multidrop import Bus, Drive, RepeatedStops, drive_meant, written_by
+from multidrop import Bus, Drive
+from multidrop.control import RepeatedStops, written_by
 from multidrop.fleet.commands.desk import HOLD_S, WAY
 from multidrop.fleet.commands.drive_commands import answers_of_stops, stop_drive
 from multidrop.fleet.commands.log import CommandLog
@@ -28,6 +29,7 @@ from multidrop.fleet.commands.words import (
     worst,
 )
 from multidrop.fleet.lines.held_lines import HeldLine, HeldLines
+from multidrop.plant import drive_meant
 from multidrop.supervisor import supervisor
 
 REMEMBERED = 1000  # stops, of which the oldest are forgotten

@@ -31,7 +31,7 @@ def boottime_ns() -> int:
 
 
 class MayPoll(Protocol):
-    """The engine's right to send; `multidrop.Mastership` is one."""
+    """The engine's right to send; `multidrop.core.Mastership` is one."""
 
     def extend(self, until_ns: int) -> object:
         """Let the engine send until then, and put the kernel's timer off.

@@ -9,7 +9,8 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
-from multidrop import Bus, Mastership, Plant, Poller, PollingFailed
+from multidrop import Bus, Plant, Poller, PollingFailed
+from multidrop.core import Mastership
 from multidrop.fleet.samples.polled_units import PolledUnits
 from multidrop.fleet.servers.buckets import Record
 from multidrop.fleet.servers.plant_store import line_of

@@ -9,8 +9,8 @@ from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from multidrop import masked
 from multidrop.fleet.errors import FleetError, MayNotSend, NoRight, NotAdmitted
+from multidrop.printable import masked
 
 MOST_DENIALS = 1000
 REFUSALS = (  # what a failure says, and what that means at this address

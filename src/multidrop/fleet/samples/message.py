@@ -33,9 +33,9 @@ from typing import Any, NamedTuple
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from multidrop import BatchColumns
 from multidrop.fleet.samples.polled_units import PolledUnits
 from multidrop.fleet.samples.unpacked_size import unpacked_size
+from multidrop.polling import BatchColumns
 
 MOST_BYTES = 900_000  # of a message: NATS takes 1 MiB from the factory, its headers included
 MOST_ROWS = 1 << 16

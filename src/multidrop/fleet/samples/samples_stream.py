@@ -17,10 +17,10 @@ from typing import Any, NamedTuple
 from nats.aio.client import Client
 from nats.errors import Error, NoRespondersError
 
-from multidrop import masked
 from multidrop.fleet.lines.refusals import failure_to_connect
 from multidrop.fleet.samples.batch_client import BatchClient
 from multidrop.fleet.servers.connections import OLDEST
+from multidrop.printable import masked
 
 STREAM = "samples"
 SEQUENCE, DIGEST, LOST = "Multidrop-Sequence", "Multidrop-Digest", "Multidrop-Lost"

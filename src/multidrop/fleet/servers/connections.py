@@ -13,12 +13,12 @@ from nats.aio.msg import Msg
 from nats.aio.subscription import Subscription
 from nats.errors import Error as NatsError
 
-from multidrop import masked
 from multidrop.fleet.errors import FleetError, NobodyThere, NotAdmitted, NotDelivered, TooOld, Unsure
 from multidrop.fleet.leases.rules import PATHS
 from multidrop.fleet.lines.refusals import Denials, failure_to_connect
 from multidrop.fleet.samples.batch_client import BatchClient, DirectGet, DirectMessage, Request
 from multidrop.fleet.servers.direct_gets import Spare, first_answer
+from multidrop.printable import masked
 
 OLDEST = (2, 12)  # 2.9.10 grants one revision to several claimants (nats-server issue 4320)
 CONNECT_S = 1.0

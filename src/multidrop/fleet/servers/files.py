@@ -19,10 +19,10 @@ from pathlib import Path
 from typing import NamedTuple
 from urllib.parse import urlsplit
 
-from multidrop import masked
 from multidrop.fleet.servers.accounts import accounts
 from multidrop.fleet.servers.credentials import new_seed, public_key
 from multidrop.fleet.servers.rights import rights_of
+from multidrop.printable import masked
 
 CLUSTER = "multidrop"
 ROUTE_PORTS = 2000  # from a server's port to that of its routes: 4222 and 6222, as usual

@@ -13,9 +13,11 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from multidrop import MAY_LISTS, Key, Plant, PlantError, PlantLine, TomlPlace, check_listed, load_plant
+from multidrop import Plant, PlantError, PlantLine, load_plant
 from multidrop.fleet.servers import names
 from multidrop.fleet.servers.buckets import Bucket, Follower, Record
+from multidrop.plant import MAY_LISTS, check_listed
+from multidrop.toml_check import Key, TomlPlace
 
 AT_ONCE = 64
 SOCKETS = ("socket://", "tcp://")

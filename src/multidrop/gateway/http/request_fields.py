@@ -10,9 +10,9 @@ from typing import Any
 
 from starlette.requests import ClientDisconnect, Request
 
-from multidrop import plain_whole
 from multidrop.gateway.http.guard import Denied
 from multidrop.gateway.http.rights import Caller
+from multidrop.printable import plain_whole
 
 MOST_BYTES = 64 * 1024  # of a body
 BODY_S = 10.0  # that it may take to come

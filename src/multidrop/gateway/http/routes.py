@@ -16,7 +16,8 @@ from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp, Receive, Scope, Send
 
-from multidrop import WriteForbidden, expose_metrics
+from multidrop import WriteForbidden
+from multidrop.exposition import expose_metrics
 from multidrop.gateway.audit import MOST_RECORDS, newest_records, time_asked
 from multidrop.gateway.clock import utc_ms
 from multidrop.gateway.commands import Admit, Told

@@ -6,7 +6,8 @@ from collections.abc import Sequence
 from enum import Flag
 from typing import Any, cast
 
-from multidrop import Drive, PlantLine, PolledDrive, Register, verbs_of
+from multidrop import Drive, PlantLine, PolledDrive, Register
+from multidrop.drive import verbs_of
 from multidrop.gateway.http.rights import May, Right
 from multidrop.gateway.live.hub import Hub
 

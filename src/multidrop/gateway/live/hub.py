@@ -9,7 +9,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any, NamedTuple
 
-from multidrop import FAULT_RECORDS, Batch, Condition, Plant, PolledDrive, Register, StateReader
+from multidrop import Batch, Condition, Plant, PolledDrive, Register
+from multidrop.drive import FAULT_RECORDS, StateReader
 from multidrop.gateway.live.kept_rows import FreshValues, Known, RegisterRows
 
 RUNS, STANDS, FAULT, SILENT, UNKNOWN = "runs", "stands", "fault", "silent", "unknown"

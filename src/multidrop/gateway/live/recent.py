@@ -10,7 +10,8 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any, TypeVar
 
-from multidrop import LineStatistics, Plant, PlantLine, Statistics
+from multidrop import Plant, PlantLine
+from multidrop.transport import LineStatistics, Statistics
 
 SECONDS = 5.0  # over which a line's use is taken, and between two readings of the last minute's figures
 MINUTES = 60

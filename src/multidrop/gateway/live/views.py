@@ -7,12 +7,16 @@ import time
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from multidrop import Drive, Ledger, MetricFamily, Statistics, drive_meant
+from multidrop import Drive
+from multidrop.control import Ledger
+from multidrop.exposition import MetricFamily
 from multidrop.gateway.live.frames import lost_of
 from multidrop.gateway.live.recent import asked_of, misses_of
 from multidrop.gateway.metrics import Figures
 from multidrop.gateway.stops_amid_reload import drives_of
+from multidrop.plant import drive_meant
 from multidrop.supervisor import Hung, supervisor
+from multidrop.transport import Statistics
 
 if TYPE_CHECKING:
     from multidrop.gateway.gateway import Gateway

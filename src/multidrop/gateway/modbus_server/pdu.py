@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from typing import NamedTuple
 
-from multidrop import Carrier
+from multidrop.drive import Carrier
 from multidrop.gateway.modbus_server.codes import Declined, ModbusCode
 from multidrop.gateway.modbus_server.mbap import MbapRequest
 

@@ -13,7 +13,8 @@ from contextlib import suppress
 from functools import partial
 from typing import TYPE_CHECKING, Any, Protocol
 
-from multidrop import Batch, BusError, Carrier, Plant, Register
+from multidrop import Batch, BusError, Plant, Register
+from multidrop.drive import Carrier
 from multidrop.gateway.clock import monotonic_ns
 from multidrop.gateway.commands import Told
 from multidrop.gateway.http.listener import listen

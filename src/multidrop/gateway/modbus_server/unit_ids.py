@@ -7,7 +7,8 @@ from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Any, NamedTuple, Protocol
 
-from multidrop import Carrier, Plant, PolledDrive, Register
+from multidrop import Plant, PolledDrive, Register
+from multidrop.drive import Carrier
 from multidrop.gateway.modbus_server.common_block import CommonBlock
 from multidrop.gateway.modbus_server.pdu import WriteRequest
 from multidrop.gateway.modbus_server.words import DriveWords, reading_function

@@ -16,7 +16,9 @@ from enum import Enum
 from functools import lru_cache
 from typing import Any, Protocol
 
-from multidrop import Carrier, NumberFormat, PolledDrive, Register, Table
+from multidrop import PolledDrive, Register
+from multidrop.core import NumberFormat
+from multidrop.drive import Carrier, Table
 
 _FLOATS = {
     NumberFormat.F16: (">e", ">H"),

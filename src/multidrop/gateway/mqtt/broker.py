@@ -12,8 +12,8 @@ from contextlib import suppress
 from typing import Any, NamedTuple, Protocol
 from urllib.parse import urlsplit
 
-from multidrop import masked
 from multidrop.gateway.mqtt.outbox import Outbox, Publication
+from multidrop.printable import masked
 from multidrop.supervisor import Hung, supervisor
 
 PORTS = {"mqtt": 1883, "mqtts": 8883}

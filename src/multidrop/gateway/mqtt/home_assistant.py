@@ -11,7 +11,8 @@ from collections.abc import Iterable, Mapping
 from enum import Flag
 from typing import Any
 
-from multidrop import Access, Drive, Register
+from multidrop import Drive, Register
+from multidrop.drive import Access
 from multidrop.gateway.live.descriptions import digits_of
 from multidrop.gateway.live.hub import FAULT, RUNS, SILENT, STANDS, UNKNOWN
 

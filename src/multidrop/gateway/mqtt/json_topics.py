@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
 
-from multidrop import Plant, drive_meant
+from multidrop import Plant
 from multidrop.gateway.commands import Told
 from multidrop.gateway.live.hub import SILENT
 from multidrop.gateway.mqtt.home_assistant import discovery, discovery_topic
@@ -21,6 +21,7 @@ from multidrop.gateway.mqtt.settings import MqttSettings, fresh_values
 from multidrop.gateway.offers import Orders
 from multidrop.gateway.parts import Inside
 from multidrop.gateway.verb_rules import STOPPING
+from multidrop.plant import drive_meant
 
 EXAMPLES = {
     "set": '{"value": 25.0, "time": UTC in ms}',

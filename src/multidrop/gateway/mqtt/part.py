@@ -6,7 +6,8 @@ import asyncio
 from collections.abc import Awaitable, Callable
 from typing import Any
 
-from multidrop import Batch, MetricFamily, Plant
+from multidrop import Batch, Plant
+from multidrop.exposition import MetricFamily
 from multidrop.gateway.clock import utc_ms
 from multidrop.gateway.metrics import counter
 from multidrop.gateway.mqtt.broker import Broker, parse_broker

@@ -9,10 +9,12 @@ from math import isfinite
 from pathlib import Path
 from typing import Any
 
-from multidrop import Plant, Register, check_drive_name, parse_duration
+from multidrop import Plant, Register
 from multidrop.gateway.http.rights import Caller, Right
 from multidrop.gateway.live.hub import Hub
 from multidrop.gateway.mqtt.broker import Login, parse_broker
+from multidrop.plant import check_drive_name
+from multidrop.toml_check import parse_duration
 
 LEVEL = re.compile(r"[^+#/\0]+")  # one level of a topic
 OTHERS = ("homeassistant", "spBv1.0")  # first levels of topics that are not ours: discovery and Sparkplug
