@@ -27,7 +27,7 @@ require_module("pyarrow")
 
 import multidrop.fleet  # noqa: E402
 from multidrop import Poller, PollingFailed  # noqa: E402
-from multidrop.cli.support.fleet_tables import count_sentence, failing_lines  # noqa: E402
+from multidrop.cli.fleet.tables import count_sentence, failing_lines  # noqa: E402
 from multidrop.core import Mastership  # noqa: E402
 from multidrop.fleet import gateway as fleet_gateway  # noqa: E402
 from multidrop.fleet import metrics_port  # noqa: E402

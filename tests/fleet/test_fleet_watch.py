@@ -27,8 +27,8 @@ require_module("rich")
 
 from multidrop.cli.fleet import look  # noqa: E402
 from multidrop.cli.fleet import watch as fleet_watch  # noqa: E402
-from multidrop.cli.support.fleet_screen import picture  # noqa: E402
-from multidrop.cli.support.fleet_tables import moment, move_table, size  # noqa: E402
+from multidrop.cli.fleet.screen import picture  # noqa: E402
+from multidrop.cli.fleet.tables import moment, move_table, size  # noqa: E402
 from multidrop.fleet.overview import is_shown  # noqa: E402
 from multidrop.fleet.watching import FleetWatch  # noqa: E402
 from multidrop.supervisor import Ended, supervisor  # noqa: E402

@@ -62,7 +62,7 @@ CLIENTS = {  # rooms that use what a package's __init__ names, and the commands 
         *(f"cli/fleet/{name}.py" for name in ("rights", "serve", "watch")),
         "cli/fleet/demo/command.py",
         "cli/hub.py",
-        "cli/support/nats.py",
+        "cli/fleet/nats.py",
     },
 }
 ROOMS = ("core", "drive", "families", "plant", "transport", "control", "polling", "recording", "history")

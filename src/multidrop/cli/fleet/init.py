@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from multidrop.cli.fleet.connection import add_server_arguments, require_fleet, run_with_paths, urls_of
-from multidrop.cli.support.fleet_tables import size
-from multidrop.cli.support.nats import nats_options
+from multidrop.cli.fleet.nats import nats_options
+from multidrop.cli.fleet.tables import size
 from multidrop.cli.support.output import print_text, warn
 
 if TYPE_CHECKING:

@@ -8,7 +8,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from multidrop.cli.fleet.connection import add_server_arguments, run_with_paths
-from multidrop.cli.support.fleet_tables import (
+from multidrop.cli.fleet.tables import (
     count_sentence,
     failing_lines,
     free_lines,

@@ -9,8 +9,8 @@ from contextlib import AsyncExitStack
 from pathlib import Path
 
 from multidrop.cli.fleet.connection import STATE, add_address_arguments, require_fleet, state_folder, urls_of
+from multidrop.cli.fleet.nats import nats_options
 from multidrop.cli.support.log_thread import FORMATTERS, LogThread, add_log_argument
-from multidrop.cli.support.nats import nats_options
 from multidrop.cli.support.output import logging_by, print_text
 from multidrop.cli.support.signals import on_end_signals, run_loop
 from multidrop.supervisor import supervisor

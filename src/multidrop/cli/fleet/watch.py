@@ -88,7 +88,7 @@ def drawing(head: str = "multidrop fleet watch") -> Iterator[Callable[[dict[str,
     from rich.console import Console
     from rich.control import Control
 
-    from multidrop.cli.support.fleet_screen import picture
+    from multidrop.cli.fleet.screen import picture
     from multidrop.cli.support.screen_text import joined
 
     console = Console()

@@ -19,9 +19,9 @@ from multidrop.cli.fleet.demo.judgement import Judgement, Kill, judge
 from multidrop.cli.fleet.demo.nats_nodes import server_program, start_nodes
 from multidrop.cli.fleet.demo.numbered_lines import DRIVES, drive_name, plant_file
 from multidrop.cli.fleet.demo.vanishing_folder import vanishing_folder
+from multidrop.cli.fleet.nats import CA, CREDENTIALS
+from multidrop.cli.fleet.tables import natural
 from multidrop.cli.fleet.watch import drawing, follow
-from multidrop.cli.support.fleet_tables import natural
-from multidrop.cli.support.nats import CA, CREDENTIALS
 from multidrop.cli.support.output import print_text
 from multidrop.cli.support.signals import end_signals_cancel
 

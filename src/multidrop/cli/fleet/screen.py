@@ -11,7 +11,7 @@ from typing import Any
 
 from rich.text import Text
 
-from multidrop.cli.support.fleet_tables import (
+from multidrop.cli.fleet.tables import (
     Told,
     count_sentence,
     gateway_table,
