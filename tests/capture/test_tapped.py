@@ -24,7 +24,7 @@ from multidrop.capture import Capture, CaptureWriter, Decoding, FlightRecorder, 
 from multidrop.capture import flight_recorder as flight
 from multidrop.capture.anomalies import AnomalyWatch
 from multidrop.capture.pcapng_writer import WRAPPINGS
-from multidrop.cli.poll.command import tap_text
+from multidrop.cli.poll import tap_text
 from multidrop.core import Exchange, Framing, Message, NumberFormat, Peer, Splitter, Status, Tap
 from multidrop.families import InnovertIBD
 from multidrop.plant.model import PolledDrive

@@ -28,7 +28,7 @@ from toy import Status, Toy
 
 import multidrop.cli
 from multidrop.bus import Bus
-from multidrop.cli.support.confirm import confirm
+from multidrop.cli.support.writing import confirm
 from multidrop.control import eeprom_ledger as ledger
 from multidrop.core import Message
 from multidrop.errors import WriteForbidden

@@ -13,8 +13,7 @@ from tables import table
 from toy import Status, Toy
 
 from multidrop.bus import Bus
-from multidrop.cli import stop_plant
-from multidrop.cli.monitor import command as monitor
+from multidrop.cli import monitor, verbs
 from multidrop.drive import Drive
 from multidrop.families import InvtCHE
 from multidrop.families.registry import find_model
@@ -423,7 +422,7 @@ def test_interrupted_stop_of_a_plant_says_what_is_known_of_each_drive(
     def interrupt(*arguments: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(stop_plant, "_start", interrupt)
+    monkeypatch.setattr(verbs, "_start_stops", interrupt)
     status, _, err = run("stop", plant, at)
     assert status == 130
     names = ("pump-1", "fan-1", "che-1", "pump-2")

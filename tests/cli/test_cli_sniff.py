@@ -24,9 +24,8 @@ from taps import tapped
 
 from multidrop.capture import CaptureWriter, Side
 from multidrop.capture.pairing import Pairing
-from multidrop.cli.sniff import command
-from multidrop.cli.sniff.listener import Listener
-from multidrop.cli.support.traffic import TrafficPrinter
+from multidrop.cli import sniff
+from multidrop.cli.sniff import Listener, TrafficPrinter
 from multidrop.core import Framing, Message, Splitter, Stream, build_reply, build_request
 from multidrop.drive.timing import Settings
 from multidrop.families.delixi_native import DelixiNative
@@ -144,9 +143,9 @@ def test_bytes_that_came_while_the_machine_was_busy_are_no_silence(
             return len(said)
 
     coming = iter([(READ.request_frame, 2.0), (b"", 0.05), (READ.frame, 0.05)])
-    monkeypatch.setattr(command.time, "monotonic", lambda: now)
+    monkeypatch.setattr(sniff.time, "monotonic", lambda: now)
     printer = TrafficPrinter("line", None, as_json=True, out=None)
-    command._listen(Listening(), printer, 3.0)  # type: ignore[arg-type]
+    sniff._listen(Listening(), printer, 3.0)  # type: ignore[arg-type]
     assert printer.pairing.counts()["exchanges"] == 1
     assert printer.pairing.counts()["unanswered"] == 0
 
@@ -410,7 +409,7 @@ def test_no_permission_is_told_in_a_sentence(run: Run, monkeypatch: pytest.Monke
     def refuse(path: str, flags: int) -> int:
         raise PermissionError(13, "Permission denied", path)
 
-    monkeypatch.setattr("multidrop.cli.sniff.listener.os.open", refuse)
+    monkeypatch.setattr("multidrop.cli.sniff.os.open", refuse)
     assert run("sniff", "/dev/ttyS0") == (
         1,
         "",

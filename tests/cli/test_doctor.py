@@ -21,24 +21,22 @@ from examples import usually
 from serial_server import SerialServer, pyserials_own, vanishing_pty
 from tables import table
 
-from multidrop.cli.doctor.adapter import (
+from multidrop.cli.doctor_findings import (
+    ROUNDS,
     RS485_ENABLED,
     RS485_RX_DURING_TX,
     Adapter,
     RS485Mode,
-    decoded_rs485,
-    find_adapter,
-    low_latency,
-    rs485_mode,
-)
-from multidrop.cli.doctor.findings import (
-    ROUNDS,
     adapter_finding,
+    decoded_rs485,
     echo_finding,
+    find_adapter,
     latency_finding,
+    low_latency,
     low_latency_finding,
     round_trip_finding,
     rs485_finding,
+    rs485_mode,
 )
 from multidrop.core import RS485, Completion, Failure, Framing, Message, build_reply
 from multidrop.drive.timing import Settings
@@ -451,9 +449,7 @@ def test_an_exception_to_the_look_for_an_echo_is_no_foreign_traffic(
     run: Run, responder: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A server may answer for every address."""
-    monkeypatch.setattr(
-        "multidrop.cli.doctor.command.LEAST_TIMEOUT", 2.0
-    )  # it may come late on a busy machine
+    monkeypatch.setattr("multidrop.cli.doctor.LEAST_TIMEOUT", 2.0)  # it may come late on a busy machine
     end = responder(lambda request: build_reply(Framing.RTU, Message(request[0], request[1], exception=4)))
     told = " ".join(run("doctor", end.path)[1].split())
     assert "answers with exception 04" in told
@@ -505,7 +501,7 @@ def test_a_drive_that_refuses_is_there_and_its_code_is_told(run: Run, responder:
 def test_only_what_was_sent_is_counted(run: Run, responder: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """A silent drive is not asked again while its late answer may come; that was no request."""
     end = responder(lambda request: b"")
-    monkeypatch.setattr("multidrop.cli.doctor.round_trip.MOST_S", 1.0)
+    monkeypatch.setattr("multidrop.cli.doctor.MOST_S", 1.0)
     status, out, _ = run("doctor", end.path, "--model", "invt-che", "--address", "9")
     told = " ".join(out.split())
     assert status == 1

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-import multidrop.cli.poll.live_table
-from multidrop.cli.poll.live_table import LiveTable
+import multidrop.cli.poll
+from multidrop.cli.poll import LiveTable
 from multidrop.plant.loader import load_plant
 from multidrop.polling.batch import Row
 from multidrop.recording.rows import from_rows
@@ -21,9 +21,7 @@ WIDE_NAME = "\u4e3b\u6cf5-1"  # two columns for each of its first two characters
 def size(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """The terminal's columns and lines, which a test may change."""
     found = [80, 24]
-    monkeypatch.setattr(
-        multidrop.cli.poll.live_table.shutil, "get_terminal_size", lambda: os.terminal_size(found)
-    )
+    monkeypatch.setattr(multidrop.cli.poll.shutil, "get_terminal_size", lambda: os.terminal_size(found))
     return found
 
 

@@ -23,11 +23,21 @@ from rich.text import Text
 from tables import table
 from terminals import Terminal, on_terminal
 
-import multidrop.cli.support.extras
-from multidrop.cli.monitor import keys as monitor_keys
-from multidrop.cli.monitor.command import PAGE, Monitor
-from multidrop.cli.monitor.keys import DOWN, ENTER, KEYS, PAGE_DOWN, PAGE_UP, UNKNOWN, UP, next_key
-from multidrop.cli.monitor.screen import (
+import multidrop.cli.support.files
+from multidrop.cli.monitor import (
+    DOWN,
+    ENTER,
+    KEYS,
+    PAGE,
+    PAGE_DOWN,
+    PAGE_UP,
+    UNKNOWN,
+    UP,
+    Monitor,
+    next_key,
+    terminal_keys,
+)
+from multidrop.cli.monitor_screen import (
     BLOCKS,
     LEAST_HEIGHT,
     LEAST_WIDTH,
@@ -37,9 +47,7 @@ from multidrop.cli.monitor.screen import (
     page,
     sparkline,
 )
-from multidrop.cli.monitor.side_reads import SideRead, pause_s
-from multidrop.cli.support.live_plant import LivePlant
-from multidrop.cli.support.polling import PollingSession
+from multidrop.cli.support.polling import LivePlant, PollingSession, SideRead, pause_s
 from multidrop.cli.support.screen_text import joined
 from multidrop.cli.support.signals import Interruption
 from multidrop.control.outcome import Seen, Stopped
@@ -388,7 +396,7 @@ def test_a_key_whose_bytes_come_apart_is_one_key(
     real = select.select
     with open(end, closefd=True) as stdin:  # noqa: PTH123
         monkeypatch.setattr(sys, "stdin", stdin)
-        with monitor_keys.keys() as wait_for_key:
+        with terminal_keys() as wait_for_key:
             monkeypatch.setattr(select, "select", wait)
             assert [wait_for_key(PATIENCE) for _ in pressed] == pressed
     os.close(terminal)
@@ -625,7 +633,7 @@ def test_a_terminal_that_is_gone_is_not_read_again_and_again(monkeypatch: pytest
     fd, slave = os.openpty()
     with open(slave) as stdin:  # noqa: PTH123 (it is no path)
         monkeypatch.setattr(sys, "stdin", stdin)
-        with monitor_keys.keys() as wait_for_key:
+        with terminal_keys() as wait_for_key:
             os.close(fd)
             with pytest.raises(OSError):  # noqa: PT011 (in the system's words)
                 wait_for_key(PATIENCE)
@@ -757,7 +765,7 @@ def test_without_a_terminal_it_says_what_works(run: Run, tmp_path: Path) -> None
 
 
 def test_without_the_extra_it_is_named(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(multidrop.cli.support.extras.importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setattr(multidrop.cli.support.files.importlib.util, "find_spec", lambda name: None)
     status, _, err = run("monitor", plant_file(tmp_path))
     assert status == 2
     assert "pip install 'multidrop[monitor]'" in err

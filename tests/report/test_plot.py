@@ -17,7 +17,7 @@ from examples import usually
 from peers import require_installed
 from recordings import ABOUT, record, row
 
-import multidrop.cli.support.extras
+import multidrop.cli.support.files
 from multidrop.plant.loader import load_plant
 from multidrop.polling.batch import Row
 from multidrop.recording import open_writer
@@ -859,7 +859,7 @@ def test_what_is_no_recording_or_has_no_rows_is_one_sentence(run: Run, tmp_path:
 def test_without_the_extra_it_is_named(
     run: Run, ramp: Path, command: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(multidrop.cli.support.extras.importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setattr(multidrop.cli.support.files.importlib.util, "find_spec", lambda name: None)
     status, _, err = run(command, ramp)
     assert status == 2
     assert "pip install 'multidrop[plot]'" in err

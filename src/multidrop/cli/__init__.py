@@ -26,7 +26,7 @@ _MISNAMED = (FileNotFoundError, IsADirectoryError, NotADirectoryError)
 COMMANDS = {  # name: module in this package, and help
     "demo": ("demo", "poll simulated drives of every family on one line"),
     "models": ("models", "list the families, or one family's registers"),
-    "check": ("check.command", "check a family's file, or a plant file; opens no port"),
+    "check": ("check", "check a family's file, or a plant file; opens no port"),
     "import": ("import_family", "make a family's file of another program's register table"),
     "read": ("read", "read values from a drive"),
     "write": ("write", "write one register of a drive"),
@@ -42,14 +42,14 @@ COMMANDS = {  # name: module in this package, and help
     "scan": ("scan", "find the drives on a line, by reading only"),
     "plan": ("plan", "predict what a plant file's lines will reach; opens no port"),
     "wear": ("wear", "list what was written to EEPROMs, and what is left"),
-    "poll": ("poll.command", "poll the drives of a plant file, and record them"),
-    "doctor": ("doctor.command", "say what is amiss with a port and its adapter"),
+    "poll": ("poll", "poll the drives of a plant file, and record them"),
+    "doctor": ("doctor", "say what is amiss with a port and its adapter"),
     "serve": ("serve", "poll a plant for browsers and other programs"),
     "fleet": ("fleet", "share the lines of a plant out to several gateways, by NATS"),
     "hub": ("hub", "keep a fleet's samples in Parquet files or in PostgreSQL"),
-    "monitor": ("monitor.command", "show the drives of a plant file live on a terminal"),
+    "monitor": ("monitor", "show the drives of a plant file live on a terminal"),
     "simulate": ("simulate", "play the drives of a plant file on pseudo-terminals"),
-    "sniff": ("sniff.command", "listen to a line that someone else masters"),
+    "sniff": ("sniff", "listen to a line that someone else masters"),
     "decode": ("decode", "turn a capture into a recording or into text"),
     "plot": ("plot", "draw a recording's values into a picture"),
     "report": ("report", "write one page of all that a recording tells"),
@@ -191,7 +191,7 @@ def _run(command: str, words: list[str]) -> int:
     try:
         return int(module.run(arguments)) or (MISTAKE if left_out else DONE)
     except WriteForbidden as refusal:
-        from multidrop.cli.support.plants import is_plant
+        from multidrop.cli.support.arguments import is_plant
 
         in_plant = any(is_plant(first) for first in getattr(arguments, "words", [])[:1])
         return _fail(refusal.for_command_line(in_plant=in_plant), FAILED)

@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import Any
 
 from multidrop.capture import Capture, Decoding
+from multidrop.cli.sniff import replay, summary
 from multidrop.cli.support.arguments import add_json_argument
 from multidrop.cli.support.files import refuse_overwriting
 from multidrop.cli.support.output import print_text, warn
-from multidrop.cli.support.traffic import replay, summary
 from multidrop.cli.support.values import counted
 from multidrop.plant.loader import load_plant
 from multidrop.plant.model import Plant

@@ -8,8 +8,8 @@ from importlib.util import find_spec
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from multidrop.cli.monitor.command import is_possible, watch
-from multidrop.cli.poll.command import add_polling_arguments, conclude, follow
+from multidrop.cli.monitor import is_possible, watch
+from multidrop.cli.poll import add_polling_arguments, conclude, follow
 from multidrop.cli.support.demo_plant import DRIVES, demo_port, plant_file, simulator, start_motors
 from multidrop.cli.support.files import refuse_overwriting
 from multidrop.plant.loader import load_plant

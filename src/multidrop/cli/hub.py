@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from multidrop.cli.fleet.nats import URLS, add_nats_arguments, nats_options, nats_urls
 from multidrop.cli.support.arguments import add_json_argument, duration
-from multidrop.cli.support.extras import require_extra
+from multidrop.cli.support.files import require_extra
 from multidrop.cli.support.log_thread import FORMATTERS, LogThread, add_log_argument
 from multidrop.cli.support.output import logging_by, print_text
 from multidrop.cli.support.signals import end_signals_cancel

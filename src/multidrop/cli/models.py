@@ -6,17 +6,25 @@ import argparse
 import inspect
 import json
 import math
+import re
+from collections.abc import Iterator
+from enum import Flag
 from typing import Any
 
 from multidrop.cli.support.arguments import add_json_argument
-from multidrop.cli.support.family_sheet import gain_of, needed_silence, range_text, sheet, verbs_of
 from multidrop.cli.support.output import print_text
-from multidrop.cli.support.values import aligned, wrapped
+from multidrop.cli.support.values import LONGEST_NAME, aligned, wrapped
+from multidrop.core import Framing, NumberFormat
 from multidrop.drive.family import Drive
-from multidrop.drive.read_limits import read_limit
-from multidrop.drive.register import Register
+from multidrop.drive.options import Option
+from multidrop.drive.read_limits import read_limit, stated_limit
+from multidrop.drive.register import Access, Register
+from multidrop.drive.table import Carrier, Kept, Table
+from multidrop.drive.text import Text
+from multidrop.drive.verbs import VERBS
 from multidrop.families import MODELS
-from multidrop.families.registry import SHIPPED, find_model, shipped_family
+from multidrop.families.registry import SHIPPED, find_model, is_users_own, shipped_family
+from multidrop.planning.reading_gain import ReadingGain, reading_gain
 from multidrop.plant.loader import load_plant
 
 
@@ -144,3 +152,223 @@ _REGISTER_KEYS = (  # in this order
     *("kept", "ram_address", "default", "while_running", "broadcast", "moves", "harmless", "never_together"),
     *("never", "place", "outside", "note"),
 )
+
+
+INDENT = 16  # of a family's facts
+
+
+def sheet(family: type[Drive]) -> str:
+    lines = [family.title or family.__name__, *wrapped(family.manual), ""]
+    for name, text in _lines_of(family):
+        lines += wrapped(text, f"{name:<{INDENT}}", " " * INDENT)
+    exceptions = {f"{code:02X}H": meaning for code, meaning in family.exceptions.items()}
+    options = {name: _option(option) for name, option in family.options.items()}
+    for heading, entries in (("exceptions", exceptions), ("options", options)):
+        if entries:
+            lines += ["", heading]
+            width = max(map(len, entries))
+            for name, meaning in entries.items():
+                lines += wrapped(meaning, f"  {name:<{width}}  ", " " * 8)
+    for table in dict.fromkeys(register.table for register in family.registers.values()):
+        lines += ["", *wrapped(_table_heading(table, family), "", "  "), *_registers(family, table)]
+    if family.texts:
+        lines += ["", "texts (read on demand)", *aligned(map(_text_row, family.texts.values()), "<<<<<")]
+    notes = inspect.cleandoc(family.__doc__ or "")
+    for block in notes.split("\n\n") if notes else ():
+        lines.append("")
+        for paragraph in re.split(r"\n(?=[-*] |    )", block):  # an indented line is one that stays a line
+            item = "  " if paragraph[:2] in ("- ", "* ") else ""
+            first = " " * (len(paragraph) - len(paragraph.lstrip()))
+            lines += wrapped(" ".join(paragraph.split()), first, first + item)
+    return "\n".join(lines)
+
+
+def _lines_of(family: type[Drive]) -> Iterator[tuple[str, str]]:
+    yield "model", family.model or "(a file of your own)"
+    if family.declared_in:
+        yield "origin", f"declared by its file, not tested by us; see `multidrop check {family.declared_in}`"
+    yield "addresses", range_text(family.addresses)
+    default = " (the first is the default)" if len(family.baudrates) > 1 else ""
+    yield "baud rates", ", ".join(map(str, family.baudrates)) + default
+    for framing, formats in family.formats.items():
+        yield f"{framing} formats", ", ".join(formats)
+    for framing in family.framings:
+        yield f"{framing} silence", _silence(family, framing)
+    yield "response", _response(family)
+    pause = f"yes; then {_ms(family.turnaround_delay)} of pause"
+    yield "broadcast", pause if family.broadcasts else family.no_broadcasts
+    if family.least_interval:
+        yield "interval", f"{_ms(family.least_interval)} from the end of an exchange to the next request"
+    for group in family.read_together:
+        yield "read together", ", ".join(group)
+    if gain := gain_of(family):
+        yield "reading", f"all readings in {gain} (at {gain.drive.settings})"
+    yield "verbs", ", ".join(verbs_of(family)) or "none"
+    if family.line_terminals:
+        yield "terminals", family.line_terminals
+    if family.most_devices:
+        yield "devices", f"at most {family.most_devices} on a line"
+    if family.line_parameters:
+        yield "line", family.line_parameters
+    if family.remote != Drive.remote:
+        yield "remote", family.remote
+    if verbs_of(family) or "confirmed" in family.options or family.watchdog != Drive.watchdog:
+        yield "watchdog", family.watchdog
+
+
+def gain_of(family: type[Drive]) -> ReadingGain | None:
+    """Return what stated gaps would save a class of a user's own, at its default settings."""
+    drive = family(family.addresses[0])
+    if not is_users_own(family):
+        return None
+    return reading_gain(drive, [(register, None) for register in drive.readings()])
+
+
+def _ms(seconds: float) -> str:
+    return f"{seconds * 1e3:g} ms"
+
+
+def _silence(family: type[Drive], framing: Framing) -> str:
+    if not needed_silence(family, framing):
+        return "none"
+    own = []
+    if family.silence:
+        own.append(_ms(family.silence))
+    if family.silence_characters:
+        own.append(f"{family.silence_characters:g} characters")
+    standard = "3.5 characters, above 19200 bit/s 1.75 ms,"
+    return f"{' and '.join(own) or standard} before and after a frame"
+
+
+def needed_silence(family: type[Drive], framing: Framing) -> float:
+    """Return the silence in s at the family's default baud rate."""
+    return family(family.addresses[0], framing=framing).needed_silence()
+
+
+def _response(family: type[Drive]) -> str:
+    stated = f", less than {_ms(family.answering_time)} by its document" if family.answering_time else ""
+    return f"{_response_delay(family)} until measured{stated}; none after {_ms(family.response_timeout)}"
+
+
+def _response_delay(family: type[Drive]) -> str:
+    if not family.response_delay_characters:
+        return _ms(family.response_delay)
+    drive = family(family.addresses[0])
+    at = f"{_ms(drive.response_delay)} at {drive.settings.baudrate} bit/s"
+    return f"{family.response_delay_characters:g} characters ({at})"
+
+
+def verbs_of(family: type[Drive]) -> list[str]:
+    return [name.replace("_", "-") for name in VERBS if getattr(family, name) is not getattr(Drive, name)]
+
+
+def _option(option: Option) -> str:
+    low, high = (f"{end:d}" if isinstance(end, int) else f"{end:g}" for end in option.span)
+    return f"{option.meaning} ({low} to {high} {option.unit}".rstrip() + ")"
+
+
+def _table_heading(table: Table, family: type[Drive]) -> str:
+    codes = []
+    if table.read is not None:
+        is_stated = stated_limit(family, table) or table.carrier not in (Carrier.BIT, Carrier.WORD)
+        stated = "" if is_stated else ", as the standard has it: the family states no limit"
+        codes.append(f"read {table.read:02X}H, {read_limit(family, table)} at most{stated}")
+    if table.write is not None:
+        codes.append(f"write {table.write:02X}H")
+    return f"{table.name}s ({'; '.join(codes)})"
+
+
+def _registers(family: type[Drive], table: Table) -> Iterator[str]:
+    """Return a row per register, with remarks under it."""
+    registers = [register for register in family.registers.values() if register.table is table]
+    rows = aligned([_row(register) for register in registers], "<<<<<")
+    for register, row in zip(registers, rows, strict=True):
+        yield f"  {row}"
+        yield from wrapped("; ".join(_remarks(register)), " " * 8, " " * 8)
+
+
+def _row(register: Register[Any]) -> tuple[str, ...]:
+    if register.values is not None:
+        what = "names"
+    elif register.step is None:
+        what = f"{register.unit} scale not stated"
+    else:
+        what = f"{register.step:g} {register.unit}"
+    span = f"{register.span[0]:g} to {register.span[1]:g}" if register.span else ""
+    return f"{register.address:04X}H", register.name, register.access.value, what.strip(), span
+
+
+def _text_row(text: Text) -> tuple[str, ...]:
+    length = text.length * (1 if text.order == "B" else 2)
+    return f"  {text.address:04X}H", text.name, text.table.name, f"{length} characters", text.place
+
+
+def _remarks(register: Register[Any]) -> Iterator[str]:
+    if register.access is Access.SETTING or register.kept is not Kept.UNKNOWN:
+        yield f"kept: {register.kept.value}"
+    if register.ram_address is not None:
+        yield f"written at {register.ram_address:04X}H, in RAM"
+    yield from _number(register)
+    if register.at_least:
+        yield f"at least {register.at_least}"
+    if register.at_most:
+        yield f"at most {register.at_most}"
+    if register.default is not None:
+        yield f"from the factory {register.default:g}"
+    if register.while_running is not None:
+        yield "may change while running" if register.while_running else "only while stopped"
+    if register.broadcast:
+        yield "may be broadcast: " + ", ".join(f"{raw:04X}H" for raw in register.broadcast)
+    if register.moves is not None:
+        yield "a write may move the motor" if register.moves else "a write starts, stops and resets nothing"
+    if register.harmless is not None:
+        harmless = ", ".join(_word(register, raw) for raw in register.harmless)
+        yield f"verbs alone write it, but for {harmless}" if harmless else "verbs alone write it"
+    if register.never_together:
+        yield "never together: " + ", ".join(_bits(register, mask) for mask in register.never_together)
+    if register.never:
+        yield f"never written: {register.never}"
+    if register.values is not None:
+        yield ", ".join(_member(member) for member in register.values)
+    yield from (text.rstrip(".") for text in (register.note, register.outside, register.place) if text)
+
+
+def _word(register: Register[Any], raw: int) -> str:
+    """Return the name of a raw count, or the word where the names of its bits would fill lines."""
+    name = register.format(register.decode(raw))
+    return name if len(name) <= 2 * LONGEST_NAME else f"{raw:04X}H"
+
+
+def _member(member: Any) -> str:
+    if isinstance(member, Flag) and member.value.bit_count() == 1:
+        return f"bit {member.value.bit_length() - 1} {member.name}"
+    return f"{member.value} {member.name}"
+
+
+def _number(register: Register[Any]) -> Iterator[str]:
+    if register.words > 1:
+        order = "" if register.order in ("AB", "ABCD") else f" in the order {register.order}"
+        yield f"{register.words} words, {register.number_format.name}{order}"
+    elif register.number_format in (NumberFormat.I8, NumberFormat.BCD16):
+        yield register.number_format.name
+    if register.part:
+        low, high = register.part
+        yield f"bit {low} of its word" if low == high else f"bits {low} to {high} of its word"
+    if register.offset:
+        yield f"{register.offset:+g} {register.unit}".rstrip()
+    if register.scale_register:
+        yield f"times ten to the power of {register.scale_register}"
+    if register.invalid:
+        yield "no value: " + ", ".join(_count(register, count) for count in register.invalid)
+
+
+def _count(register: Register[Any], count: float) -> str:
+    return f"{count:g}" if register.is_float or count < 0 else f"{int(count):04X}H"
+
+
+def _bits(register: Register[Any], mask: int) -> str:
+    return register.format(register.decode(mask)).replace("|", " and ")
+
+
+def range_text(numbers: range) -> str:
+    return f"{numbers[0]}-{numbers[-1]}"

@@ -11,9 +11,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
-from multidrop.cli.support.arguments import add_json_argument
+from multidrop.cli.support.arguments import add_json_argument, add_plant_argument
 from multidrop.cli.support.output import print_text
-from multidrop.cli.support.plants import add_plant_argument
 from multidrop.cli.support.values import Row, aligned, counted, shortened, wrapped
 from multidrop.families.registry import is_users_own
 from multidrop.planning.prediction import Prediction, Rate, predict

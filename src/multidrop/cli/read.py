@@ -7,9 +7,8 @@ import json
 from typing import Any
 
 from multidrop.bus import Bus
-from multidrop.cli.support.arguments import add_json_argument
+from multidrop.cli.support.arguments import add_json_argument, add_target_arguments, target_of
 from multidrop.cli.support.output import print_text
-from multidrop.cli.support.target import add_target_arguments, target_of
 from multidrop.cli.support.values import Row, aligned, as_json, as_row
 from multidrop.core import Status
 from multidrop.drive.family import Drive

@@ -10,10 +10,8 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from multidrop.cli.support.arguments import add_json_argument
-from multidrop.cli.support.files import check_writable
-from multidrop.cli.support.output import print_text
-from multidrop.cli.support.plants import (
+from multidrop.cli.support.arguments import (
+    add_json_argument,
     add_line_arguments,
     add_rs485_argument,
     add_settle_argument,
@@ -22,6 +20,8 @@ from multidrop.cli.support.plants import (
     rs485_at,
     settle_at,
 )
+from multidrop.cli.support.files import check_writable
+from multidrop.cli.support.output import print_text
 from multidrop.cli.support.values import counted
 from multidrop.core import RS485
 from multidrop.drive.fact_check import UNIT_IDS

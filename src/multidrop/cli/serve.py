@@ -16,11 +16,11 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
+from multidrop.cli.support.arguments import add_port_option, plant_of
 from multidrop.cli.support.demo_plant import DRIVES, demo_port, plant_file, simulator, start_motors
-from multidrop.cli.support.extras import require_extra
+from multidrop.cli.support.files import require_extra
 from multidrop.cli.support.log_thread import FORMATTERS, LogThread, add_log_argument
 from multidrop.cli.support.output import logging_by, print_text, warn
-from multidrop.cli.support.plants import add_port_option, plant_of
 from multidrop.cli.support.signals import on_end_signals, on_reload_signal, run_loop
 from multidrop.drive.known_state import can_show_fault
 from multidrop.drive.named_verbs import verbs_of

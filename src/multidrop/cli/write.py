@@ -6,12 +6,16 @@ import argparse
 import json
 import sys
 
-from multidrop.cli.support.arguments import add_json_argument, add_writing_arguments
-from multidrop.cli.support.confirm import confirm
-from multidrop.cli.support.interruption import telling_what_was_sent
+from multidrop.cli.support.arguments import (
+    add_json_argument,
+    add_target_arguments,
+    add_writing_arguments,
+    check_words,
+    target_of,
+)
 from multidrop.cli.support.output import print_text
-from multidrop.cli.support.target import add_target_arguments, check_words, target_of
 from multidrop.cli.support.values import as_json, nearest_value
+from multidrop.cli.support.writing import confirm, telling_what_was_sent
 from multidrop.control.outcome import Effect
 from multidrop.control.rules import check_plain, raw_count, refused
 

@@ -18,8 +18,8 @@ from typing import TYPE_CHECKING, Any
 from multidrop.cli import STOPS
 from multidrop.cli.fleet.connection import STATE, add_server_arguments, run_action, state_folder, urls_of
 from multidrop.cli.fleet.nats import nats_options
-from multidrop.cli.support.confirm import confirm
 from multidrop.cli.support.output import print_text, warn
+from multidrop.cli.support.writing import confirm
 from multidrop.printable import plain_number, printable
 
 if TYPE_CHECKING:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from multidrop.cli.fleet.nats import URLS, add_nats_arguments, nats_options, nats_urls
 from multidrop.cli.support.arguments import add_json_argument
-from multidrop.cli.support.extras import require_extra
+from multidrop.cli.support.files import require_extra
 from multidrop.cli.support.output import logging_to, warn
 from multidrop.cli.support.signals import run_loop
 from multidrop.control.eeprom_ledger import default_path

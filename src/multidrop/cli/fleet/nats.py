@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from multidrop.cli.support.extras import require_extra
+from multidrop.cli.support.files import require_extra
 from multidrop.printable import masked
 
 URLS = "nats://127.0.0.1:4222"

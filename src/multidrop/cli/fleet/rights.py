@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from multidrop.cli.fleet.connection import add_server_arguments, require_fleet, urls_of
-from multidrop.cli.support.extras import require_extra
+from multidrop.cli.support.files import require_extra
 from multidrop.cli.support.output import print_text, warn
 
 if TYPE_CHECKING:

@@ -13,7 +13,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from multidrop.cli.fleet.connection import add_server_arguments, run_with_paths
-from multidrop.cli.support.extras import require_extra
+from multidrop.cli.support.files import require_extra
 from multidrop.cli.support.output import print_text
 from multidrop.cli.support.signals import on_end_signals
 from multidrop.supervisor import supervisor

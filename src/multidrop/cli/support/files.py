@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import importlib.util
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from multidrop.cli.support.extras import require_extra
 from multidrop.cli.support.output import warn
 from multidrop.cli.support.values import counted
 from multidrop.recording.append_file import already_there, new_file
@@ -81,3 +81,11 @@ def load_recording(path: Path, out: Path, command: str) -> Recording:
     recording = load(path)
     warn_truncated(recording.path, recording.rows, recording.truncated)
     return recording
+
+
+def require_extra(library: str, extra: str, command: str) -> None:
+    """Raise ValueError, with what to install, when the library is missing."""
+    if importlib.util.find_spec(library) is None:
+        raise ValueError(
+            f"`multidrop {command}` needs {library}, which is not installed: pip install 'multidrop[{extra}]'"
+        )

@@ -2,18 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+import re
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack, closing, contextmanager
+from dataclasses import dataclass, field
+from enum import Flag
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from multidrop.cli.support.signals import Interruption, noting_signals
-from multidrop.plant.model import Plant
+from multidrop.cli.support.values import value_text
+from multidrop.core import UNASKED, Counters
+from multidrop.errors import BusError
+from multidrop.plant.model import Plant, PlantLine, PolledDrive
 from multidrop.poller import Poller
-from multidrop.polling.batch import Rows
+from multidrop.polling.batch import Row, Rows
 from multidrop.recording import open_writer
 from multidrop.recording.format import Metadata, RecordingWriter
 from multidrop.recording.segments import SegmentWriter
+from multidrop.transport.statistics import LineStatistics, Statistics, line_statistics
 
 
 class PollingSession(NamedTuple):
@@ -60,3 +70,214 @@ def polling_session(
             yield PollingSession(poller, interruption, hand_out)
         finally:
             hand_out()  # what came while the poller closed, also after a failure
+
+
+HISTORY = 240  # points, one a second
+LATELY = 5.0  # s over which rates are taken
+OLD = 5.0  # s, or so many periods of a register, or bus cycles of its line, if they are longer:
+PERIODS = 3  # a value is old then,
+MISSED = 1.0  # s: and where it was missed since, after so long
+FREQUENCY, CURRENT, FAULT, STATE = "output_frequency", "output_current", "fault", "status"
+
+_NOTHING = Statistics(1.0, Counters())
+
+
+@dataclass
+class LiveDrive:
+    """One polled drive."""
+
+    line: PlantLine
+    polled: PolledDrive
+    cycle: float = 0.0  # s, of its line, as planned
+    line_utilisation: float = 1.0  # as planned; 1 or more: the polls leave no spare time
+    newest: dict[str, Row] = field(default_factory=dict)  # samples, by register
+    missed: dict[str, Row] = field(default_factory=dict)  # misses newer than the register's sample
+    last_miss: str = ""  # status of the last miss of a request that was sent
+    so_far: Statistics = _NOTHING
+    lately: Statistics = _NOTHING
+    history: deque[float | None] = field(default_factory=lambda: deque(maxlen=HISTORY))
+
+    @property
+    def name(self) -> str:
+        return self.polled.drive.name
+
+    def add(self, row: Row) -> None:
+        if row.value is None:
+            self.missed[row.register] = row
+            if not row.status.startswith(UNASKED):
+                self.last_miss = row.status
+        else:
+            self.newest[row.register] = row
+            self.missed.pop(row.register, None)
+
+    def shown(self, name: str) -> str:
+        """Return a register's newest value with its unit; "" where there is none."""
+        row = self.newest.get(name)
+        if row is None or row.value is None:
+            return ""
+        return value_text(self.polled.drive.register(name), row.value)
+
+    def age(self, now_ns: int) -> float | None:
+        """Return the seconds since the newest sample."""
+        newest = max((row.time for row in self.newest.values()), default=None)
+        return None if newest is None else max(0.0, (now_ns - newest) / 1e9)
+
+    def is_old(self, name: str, now_ns: int) -> bool:
+        """Return True where a register's newest value is not the present one any more."""
+        row = self.newest.get(name)
+        age = 0.0 if row is None else (now_ns - row.time) / 1e9
+        return age > (MISSED if name in self.missed else self._holds(name))
+
+    def _holds(self, name: str) -> float:
+        """Return for how long a value of this register is the present one."""
+        every = next((poll.every for poll in self.polled.polls if poll.register.name == name), None)
+        return max(OLD, PERIODS * max(every or 0.0, self.cycle))
+
+    @property
+    def why_silent(self) -> str:
+        """Return the reason for the misses, where every polled register is missed."""
+        if not self.missed or len(self.missed) < len(self.polled.polls):
+            return ""
+        return self.last_miss or max(self.missed.values(), key=lambda row: row.time).status
+
+    @property
+    def fault(self) -> str:
+        row = self.newest.get(FAULT)
+        return self.shown(FAULT).lower() if row and row.value else ""
+
+    @property
+    def told_by(self) -> str:
+        """Return the register that tells the state; "" where the drive is silent."""
+        if self.why_silent:
+            return ""
+        if self.fault:
+            return FAULT
+        is_named = STATE in self.newest and not self._is_bare(self.newest[STATE])
+        return STATE if is_named else FREQUENCY
+
+    @property
+    def state(self) -> str:
+        """Return the state as far as the polled registers show it."""
+        told_by = self.told_by
+        if told_by == STATE:
+            return self.shown(STATE).lower()
+        if told_by != FREQUENCY:
+            return "fault" if told_by else "silent"
+        row = self.newest.get(FREQUENCY)
+        return "turns" if row and row.value else ""  # 0 Hz may be a stop, or a run at a setpoint of 0
+
+    def _is_bare(self, row: Row) -> bool:
+        """Return True for flags of which none is set: they are no name of a state."""
+        values = self.polled.drive.register(row.register).values
+        return not row.value and values is not None and issubclass(values, Flag)
+
+    def remember(self) -> None:
+        """Add a point of history: the frequency where it is polled, else the register polled first."""
+        polled = [poll.register.name for poll in self.polled.polls]
+        name = FREQUENCY if FREQUENCY in polled else next(iter(polled), "")
+        fresh = name in self.newest and name not in self.missed
+        self.history.append(self.newest[name].value if fresh else None)
+
+
+class LivePlant:
+    """All drives of a plant, and the statistics of its lines: so far, and of the last LATELY seconds.
+
+    `planned` is `plant.metadata()["planned"]`, for a screen that tells old values from new ones.
+    """
+
+    def __init__(self, plant: Plant, planned: Mapping[str, Any] | None = None) -> None:
+        self.plant = plant
+        self.drives = []
+        for line in plant.lines:
+            facts = planned[line.name] if planned else {}
+            cycle, utilisation = facts.get("cycle_ms", 0.0) / 1e3, facts.get("utilisation", 1.0)
+            self.drives += [LiveDrive(line, polled, cycle, utilisation) for polled in line.drives]
+        self.so_far = {line.name: line_statistics(1.0, {}, None) for line in plant.lines}
+        self.lately = self.so_far
+        self._by_name = {drive.name: drive for drive in self.drives}
+        self._earlier: deque[tuple[float, Mapping[str, LineStatistics]]] = deque()
+
+    def add(self, rows: Iterable[Row]) -> None:
+        for row in rows:
+            self._by_name[row.drive].add(row)
+
+    def tick(self, now: float, statistics: dict[str, LineStatistics]) -> None:
+        """Take the poller's statistics; call this once a second."""
+        self._earlier.append((now, statistics))
+        while now - self._earlier[0][0] > LATELY:
+            self._earlier.popleft()
+        before = self._earlier[0][1]
+        self.so_far = self.lately = statistics
+        if before is not statistics:
+            self.lately = {name: line.since(before[name]) for name, line in statistics.items()}
+        for drive in self.drives:
+            drive.so_far = statistics[drive.line.name].drives[drive.name]
+            drive.lately = self.lately[drive.line.name].drives[drive.name]
+            drive.remember()
+
+
+# ---- side reads ----
+
+LEAST_PAUSE_S = 0.1  # between two reads
+MOST_SHARE, LEAST_SHARE = 0.05, 0.01  # of a line's time: with spare time, and on a full line
+
+
+class SideRead(NamedTuple):
+    """One read of a register: its value as text, or why there is none."""
+
+    text: str
+    time: int  # UTC, ns: the read was over
+
+
+class SideReader:
+    """Reads one drive's other registers, one after another, in a thread of its own.
+
+    The reads use the time that the polls leave, at most MOST_SHARE of it; on a full line LEAST_SHARE.
+    """
+
+    def __init__(self, poller: Poller) -> None:
+        self._poller = poller
+        self._drive: LiveDrive | None = None
+        self._found: dict[str, SideRead] = {}
+        self._thread: threading.Thread | None = None
+
+    def read(self, drive: LiveDrive) -> dict[str, SideRead]:
+        """Return what was found so far, by register; go on reading."""
+        if self._drive is not drive:
+            self._drive, self._found = drive, {}
+        if self._thread is None or not self._thread.is_alive():
+            self._thread = threading.Thread(target=self._read_all, args=(drive, self._found), daemon=True)
+            self._thread.start()
+        return self._found
+
+    def rest(self) -> None:
+        """Read no further."""
+        self._drive = None
+
+    def _read_all(self, chosen: LiveDrive, found: dict[str, SideRead]) -> None:
+        drive = chosen.polled.drive
+        polled = {poll.register.name for poll in chosen.polled.polls}
+        bus = self._poller.bus(chosen.line.name)
+        for name, register in drive.registers.items():
+            if not register.readable or name in polled:
+                continue
+            if self._drive is not chosen:
+                return
+            asked = time.monotonic()
+            try:
+                text = value_text(register, bus.read(drive, register))
+            except BusError as failure:
+                text = _in_words(failure)
+            found[name] = SideRead(text, time.time_ns())
+            time.sleep(pause_s(time.monotonic() - asked, chosen.line_utilisation))
+
+
+def pause_s(read_s: float, utilisation: float) -> float:
+    """Return how long to wait, in s, after a read that took `read_s` on a line with this utilisation."""
+    share = min(MOST_SHARE, max(LEAST_SHARE, 1.0 - utilisation))
+    return max(LEAST_PAUSE_S, read_s * (1.0 / share - 1.0))
+
+
+def _in_words(failure: BusError) -> str:
+    """Return the kind of a failure in a few words, such as "no reply"."""
+    return re.sub(r"(?<=[a-z])(?=[A-Z])", " ", type(failure).__name__).lower()

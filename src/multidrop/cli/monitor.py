@@ -3,26 +3,27 @@
 from __future__ import annotations
 
 import argparse
+import codecs
+import os
+import re
+import select
 import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
+from errno import EIO
 from functools import partial
 from logging import WARNING
+from os import get_terminal_size
 from pathlib import Path
 from typing import Any
 
-from multidrop.cli.monitor.console import open_console
-from multidrop.cli.monitor.keys import DOWN, ENTER, ESCAPE, PAGE_DOWN, PAGE_UP, UP, keys
-from multidrop.cli.monitor.side_reads import SideReader
-from multidrop.cli.support.extras import require_extra
-from multidrop.cli.support.files import refuse_overwriting
-from multidrop.cli.support.live_plant import LiveDrive, LivePlant
+from multidrop.cli.support.arguments import add_plant_argument, add_port_option, plant_of
+from multidrop.cli.support.files import refuse_overwriting, require_extra
 from multidrop.cli.support.output import logging_to, warn
-from multidrop.cli.support.plants import add_plant_argument, add_port_option, plant_of
-from multidrop.cli.support.polling import PollingSession, polling_session
+from multidrop.cli.support.polling import LiveDrive, LivePlant, PollingSession, SideReader, polling_session
 from multidrop.cli.support.values import counted
 from multidrop.control.outcome import Seen
 from multidrop.plant.model import Plant
@@ -80,7 +81,7 @@ class Monitor:
     """The screen of a polled plant: draws what has come, and carries out what keys ask for."""
 
     def __init__(self, plant: LivePlant, session: PollingSession, console: Any) -> None:
-        from multidrop.cli.monitor.screen import BLOCKS, PLAIN_BLOCKS, Position
+        from multidrop.cli.monitor_screen import BLOCKS, PLAIN_BLOCKS, Position
 
         self._console = console
         self._session = session
@@ -99,7 +100,7 @@ class Monitor:
         # Warnings on standard error would spoil the screen.
         with (
             self._drawing() as (draw, every),
-            keys() as wait_for_key,
+            terminal_keys() as wait_for_key,
             logging_to(self._show_message, "multidrop", WARNING),
         ):
             while not (self._session.interruption.came or self._has_left):
@@ -155,7 +156,7 @@ class Monitor:
             yield draw, DRAW_S
 
     def _picture(self) -> Any:
-        from multidrop.cli.monitor.screen import overview, page
+        from multidrop.cli.monitor_screen import overview, page
         from multidrop.cli.support.screen_text import joined
 
         size = self._console.width, self._console.height
@@ -296,3 +297,110 @@ class Monitor:
         lines, done = len(self._plant.plant.lines), len(self._stop_results)
         so_far = f", on {done} of {lines} lines so far" if done < lines else ""
         return f"{have} of {asked} drives stopped{so_far}", doubtful
+
+
+UP, DOWN, PAGE_UP, PAGE_DOWN, ENTER, ESCAPE = "up", "down", "page up", "page down", "enter", "escape"
+KEYS = {  # as terminals send them
+    b"\x1b[A": UP,
+    b"\x1bOA": UP,
+    b"k": UP,
+    b"\x1b[B": DOWN,
+    b"\x1bOB": DOWN,
+    b"j": DOWN,
+    b"\x1b[5~": PAGE_UP,
+    b"\x1b[6~": PAGE_DOWN,
+    b" ": PAGE_DOWN,
+    b"\r": ENTER,
+    b"\n": ENTER,
+}
+UNKNOWN = "unknown"
+# A key that is no letter, as F4, which ends in S: it asks for nothing. And the beginning of one.
+_SEQUENCE = re.compile(rb"\x1b(?:\[\[?[0-?]*[ -/]*[@-Z\\-~]|O[ -~])")
+_BEGUN = re.compile(rb"\x1b(?:\[\[?[0-?]*[ -/]*|O)?")
+SPLIT_S = 0.05  # after which the rest of one has not been sent
+MOST_BYTES = 4  # of a character in UTF-8
+# Letters of the Russian and the Ukrainian layout, and those of the same keys on a Latin one.
+LATIN = str.maketrans("йыіфнолЙЫІФНОЛ", "qssayjkQSSAYJK")
+
+
+@contextmanager
+def terminal_keys() -> Iterator[Callable[[float], str]]:
+    """Give a function that waits so many seconds for a key, and returns its name or letter, or "".
+
+    It raises OSError once the terminal is gone. Raises ValueError on Windows, whose consoles have no such
+    mode.
+    """
+    if sys.platform == "win32":
+        raise ValueError("the live screen needs a terminal of Linux or macOS; `multidrop poll` works here")
+    import termios
+    import tty
+
+    fd = sys.stdin.fileno()
+    before = termios.tcgetattr(fd)
+    tty.setcbreak(fd)
+    pressed = b""  # and not returned yet
+
+    def read() -> bytes:
+        found = os.read(fd, 64)
+        if not found:
+            raise OSError(EIO, "the terminal is closed")
+        return found
+
+    def wait_for_key(seconds: float) -> str:
+        nonlocal pressed
+        if not pressed and select.select([fd], [], [], seconds)[0]:
+            pressed = read()
+        while is_begun(pressed) and select.select([fd], [], [], SPLIT_S)[0]:
+            pressed += read()
+        key, pressed = next_key(pressed)
+        return key
+
+    try:
+        yield wait_for_key
+    finally:
+        with suppress(termios.error):  # of a terminal that is gone
+            termios.tcsetattr(fd, termios.TCSADRAIN, before)
+
+
+def next_key(pressed: bytes) -> tuple[str, bytes]:
+    """Split off the first key of what a terminal sent: its name or letter, and the rest."""
+    if sequence := _SEQUENCE.match(pressed):
+        return KEYS.get(sequence[0], UNKNOWN), pressed[sequence.end() :]
+    if pressed[:1] == b"\x1b":
+        return ESCAPE, pressed[1:]
+    letter, rest = _first_letter(pressed)
+    return KEYS.get(letter.encode(), letter), rest
+
+
+def is_begun(pressed: bytes) -> bool:
+    """Return True for the beginning of a key or of a letter whose rest may be sent yet."""
+    with suppress(UnicodeDecodeError):
+        return bool(_BEGUN.fullmatch(pressed)) or (
+            pressed != b"" and codecs.getincrementaldecoder("utf-8")().decode(pressed) == ""
+        )
+    return False
+
+
+def _first_letter(pressed: bytes) -> tuple[str, bytes]:
+    for length in range(1, MOST_BYTES + 1):
+        with suppress(UnicodeDecodeError):
+            return pressed[:length].decode().translate(LATIN), pressed[length:]
+    return "\ufffd", pressed[1:]
+
+
+def open_console() -> Any:
+    """Return the terminal. Raises ValueError when it is too small."""
+    from rich.console import Console
+
+    from multidrop.cli.monitor_screen import LEAST_HEIGHT, LEAST_WIDTH
+
+    console = Console()
+    if console.is_dumb_terminal:
+        width, height = get_terminal_size()
+        console = Console(width=width, height=height - 1)  # it scrolls, and its last line stays empty
+    if console.width < LEAST_WIDTH or console.height < LEAST_HEIGHT:
+        raise ValueError(
+            f"the terminal is too small: it has {console.width} x {console.height} characters, "
+            f"and the monitor needs {LEAST_WIDTH} x {LEAST_HEIGHT}"
+        )
+    return console

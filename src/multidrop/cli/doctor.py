@@ -6,24 +6,29 @@ import argparse
 import json
 import os
 import sys
+import time
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from multidrop.cli.doctor.adapter import com_description, find_adapter, low_latency, rs485_mode
-from multidrop.cli.doctor.findings import (
+from multidrop.bus import Bus
+from multidrop.cli.doctor_findings import (
+    ROUNDS,
     Finding,
     adapter_finding,
+    com_description,
     echo_finding,
+    find_adapter,
     latency_finding,
+    low_latency,
     low_latency_finding,
+    round_trip_finding,
     rs485_finding,
+    rs485_mode,
 )
-from multidrop.cli.doctor.other_way import other_way_finding, unit_finding
-from multidrop.cli.doctor.round_trip import measure
-from multidrop.cli.support.arguments import add_json_argument, whole
-from multidrop.cli.support.output import print_text
-from multidrop.cli.support.plants import (
+from multidrop.cli.support.arguments import (
+    add_json_argument,
     add_line_arguments,
     add_rs485_argument,
     add_settle_argument,
@@ -31,16 +36,23 @@ from multidrop.cli.support.plants import (
     rs485_at,
     settle_at,
     usual_settings,
+    whole,
 )
+from multidrop.cli.support.output import print_text
 from multidrop.cli.support.values import wrapped
 from multidrop.core import (
     RS485,
+    STATUSES,
+    Completion,
     Exchange,
+    Failure,
     Framing,
     Message,
     Peer,
     build_request,
+    characters_on_wire,
     is_pseudo_terminal,
+    parse_reply,
 )
 from multidrop.drive.family import Drive
 from multidrop.drive.network import speaks_tcp
@@ -50,9 +62,10 @@ from multidrop.families.registry import find_model
 from multidrop.planning.blocks import first_block
 from multidrop.plant.model import Plant
 from multidrop.transport.line import Line
-from multidrop.transport.mixed_up import other_port
+from multidrop.transport.mixed_up import mixed_up, other_port, spoken_on
 from multidrop.transport.peers import LEAST_TIMEOUT
 from multidrop.transport.port_identity import lasting_name
+from multidrop.transport.prepared import make_exchange
 
 NOBODY = 247  # the address of the request that looks for an echo
 SETTING_UP_COM = "while it has the port, multidrop makes it raw, and sets each drive's baud rate and format"
@@ -285,3 +298,140 @@ def _text(findings: list[Finding]) -> Iterator[str]:
         if finding.advice:  # may hold a command to be copied
             indent = " " * width
             yield from wrapped(finding.advice, f"{indent}-> ", f"{indent}   ", breaks_words=False)
+
+
+UNANSWERED = 5  # requests to a drive that has answered none
+MOST_S = 5.0  # that all rounds take, where the drive is slow or silent
+LOOK_S = 0.05  # between attempts to send a request that was held back
+OF_GATEWAYS = (0x0A, 0x0B)  # no path, and no response from the device (application protocol V1.1b3, 7)
+
+
+def measure(port: str, rs485: RS485, settle: float, drive: Drive | None) -> tuple[Finding, bool]:
+    """Return the finding, and True where the far end has answered anything in the port's framing."""
+    if drive is None:
+        return Finding(
+            "round trip",
+            "not measured: a drive must answer",
+            "name one with --model and --address, or one of a plant file; `multidrop scan` finds those "
+            "that are there",
+        ), False
+    block = first_block(drive)
+    if block is None:
+        return Finding("round trip", f"not measured: nothing of it can be read ({drive.name})"), False
+    with Bus(port, rs485=rs485, settle=settle) as bus:
+        bus.attach(drive)
+        poll = make_exchange(drive, block.request, bus.peer(drive))
+        completions = list(_repeat(bus.line, poll))
+    # Time of the request and the reply's first character: unknown on a network and on a pseudo-terminal.
+    sent = characters_on_wire(drive.framing, len(build_request(drive.framing, poll.request)))
+    wire = (sent + 1) * drive.settings.character
+    shows_bits = "://" not in port and not is_pseudo_terminal(str(Path(port).resolve()))
+    its_own = [done for done in completions if done.result > 0 and not _is_gateway_s(drive, done)]
+    seen = [(done.first_ns - done.sent_ns) / 1e9 for done in its_own]
+    delays = sorted(max(0.0, delay - wire) if shows_bits else delay for delay in seen)
+    refusals = [code for done in completions if (code := _exception(drive.framing, poll.request, done))]
+    wire = 0.0 if shows_bits else wire
+    finding = round_trip_finding(drive, delays, len(completions), wire, refusals, _what_came(completions))
+    return finding, bool(delays or refusals)
+
+
+def _what_came(completions: Sequence[Completion]) -> str:
+    """Return the most frequent reason why bytes were no good reply, with an example; "" without one."""
+    bad = [done for done in completions if done.result < 0 and done.raw and done.result != Failure.NO_REPLY]
+    if not bad:
+        return ""
+    (result, _), *_ = Counter(done.result for done in bad).most_common(1)
+    example = next(done.raw for done in bad if done.result == result)
+    return f"{STATUSES[-result]} (received {example.hex(' ').upper()})"
+
+
+def _exception(framing: Framing, request: Message, done: Completion) -> int:
+    """Return the code of a reply that is an exception, also of a gateway's; else 0."""
+    if done.result > 0:
+        return done.reply.exception
+    if framing is not Framing.TCP:
+        return 0
+    _, taken_for_silence = parse_reply(framing, done.raw, request)  # the core does so with a gateway's
+    return taken_for_silence.exception if taken_for_silence else 0
+
+
+def _is_gateway_s(drive: Drive, done: Completion) -> bool:
+    """Return True for the exception that a gateway sends where it does not reach its device."""
+    return done.reply.exception in OF_GATEWAYS and done.reply.exception not in drive.exceptions
+
+
+def _repeat(line: Line, poll: Exchange) -> Iterator[Completion]:
+    """Send ROUNDS requests, or those that fit into MOST_S, and return what became of each.
+
+    A request that is held back, because an earlier answer may still come, does not count. A drive that is
+    silent from the start gets UNANSWERED requests.
+    """
+    end = time.monotonic() + MOST_S
+    count, is_silent = 0, True
+    while count < (UNANSWERED if is_silent else ROUNDS) and (time.monotonic() < end or not count):
+        found = line.carry_out(poll)
+        if found.sent_ns:
+            count += 1
+            is_silent &= not found.raw
+            yield found
+        else:
+            time.sleep(LOOK_S)
+
+
+TIMEOUT = 2.0  # s: a gateway waits for its drives first
+
+
+def ask_once(port: str, request: Message, settings: Settings) -> Completion:
+    """Send one read in the framing of this network port, and return its outcome. Raises LineError."""
+    exchange = Exchange(
+        Framing.TCP if speaks_tcp(port) else Framing.RTU,
+        request,
+        Peer(least_timeout=TIMEOUT, most_timeout=TIMEOUT),
+        baudrate=settings.baudrate,
+        format=settings.format,
+        character=settings.character,
+        silence=0.0 if speaks_tcp(port) else settings.t3_5,
+    )
+    line = Line(port).open()
+    try:
+        return line.carry_out(exchange)
+    finally:
+        line.close()
+
+
+def other_way_finding(port: str, request: Message, settings: Settings) -> Finding:
+    """Report whether the far end answers in the other framing."""
+    other = other_port(port)
+    way = spoken_on(other)
+    try:
+        found = ask_once(other, request, settings)
+    except LineError as failure:
+        return Finding("other way", f"{way} was not tried: {failure.reason}")
+    if found.result > 0 or mixed_up(port, found.raw):  # any other bytes prove nothing
+        return Finding(
+            "other way",
+            f"the far end speaks {way}, and not {spoken_on(port)}",
+            f"name the port {other} in place of {port}, or set the far end to {spoken_on(port)}",
+            is_failure=True,
+        )
+    return Finding("other way", f"{way} was tried too, and not answered either")
+
+
+def unit_finding(port: str, request: Message, settings: Settings) -> Finding:
+    """Report what a port of Modbus TCP says of a unit that nobody should have."""
+    try:
+        found = ask_once(port, request, settings)
+    except LineError as failure:
+        return Finding("Modbus TCP", f"it is not spoken: {failure.reason}", is_failure=True)
+    asked = f"asked for unit {request.address}, which should be nobody's,"
+    if found.result > 0:
+        reply = found.reply
+        how = f"with exception {reply.exception:02X}" if reply.exception else "with a value"
+        return Finding(
+            "Modbus TCP",
+            f"{asked} it answers {how}",
+            "it may be a device that answers for every unit: then a wrong address goes unnoticed",
+        )
+    if found.raw:
+        return Finding("Modbus TCP", f"{asked} the gateway says that it does not answer: as it should")
+    return Finding("Modbus TCP", f"{asked} it is silent: a gateway may be, and a far end of another kind is")

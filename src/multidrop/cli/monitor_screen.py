@@ -13,8 +13,7 @@ from datetime import UTC, datetime
 from rich.cells import cell_len, set_cell_size
 from rich.text import Text
 
-from multidrop.cli.monitor.side_reads import SideRead
-from multidrop.cli.support.live_plant import CURRENT, FAULT, FREQUENCY, STATE, LiveDrive, LivePlant
+from multidrop.cli.support.polling import CURRENT, FAULT, FREQUENCY, STATE, LiveDrive, LivePlant, SideRead
 from multidrop.cli.support.screen_text import cut
 from multidrop.cli.support.values import counted
 from multidrop.printable import printable

@@ -1,1 +1,0 @@
-"""`multidrop check`: says what a family's file declares, what it leaves open, and what will be refused."""

@@ -1,1 +1,0 @@
-"""`multidrop doctor`: checks a port, its adapter and its line."""

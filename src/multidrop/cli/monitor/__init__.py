@@ -1,1 +1,0 @@
-"""`multidrop monitor`: shows a plant's drives live on a terminal."""

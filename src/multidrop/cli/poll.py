@@ -1,0 +1,346 @@
+"""The `poll` command: polls, shows the newest values, records, and prints a summary."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import shutil
+import sys
+import time
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, closing, suppress
+from math import ceil
+from pathlib import Path
+from typing import Any, TextIO
+
+from multidrop.capture import CaptureWriter, FlightRecorder, Tapped
+from multidrop.cli.support.arguments import (
+    add_json_argument,
+    add_plant_argument,
+    add_port_option,
+    duration,
+    plant_of,
+)
+from multidrop.cli.support.files import check_capture, refuse_overwriting
+from multidrop.cli.support.output import print_text
+from multidrop.cli.support.polling import LiveDrive, LivePlant, Rotation, polling_session
+from multidrop.cli.support.signals import Interruption
+from multidrop.cli.support.values import aligned, columns_of, counted, cut_to, shortened
+from multidrop.planning.prediction import Prediction, predict
+from multidrop.plant.metadata import planned_on
+from multidrop.plant.model import Plant, PlantLine
+from multidrop.poller import Poller
+from multidrop.polling.batch import Rows
+from multidrop.printable import printable
+from multidrop.recording import FORMATS
+from multidrop.recording.retention import parse_age, parse_size
+
+_TAKE_S = 0.1  # between looks for new rows
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    add_plant_argument(parser)
+    add_port_option(parser)
+    add_polling_arguments(parser, out=None, seconds=None)
+    add_rotation_arguments(parser)
+
+
+def add_polling_arguments(parser: argparse.ArgumentParser, *, out: str | None, seconds: float | None) -> None:
+    """Add what `poll` and `demo` take: duration, files and --json."""
+    parser.add_argument(
+        "--seconds",
+        metavar="S",
+        type=duration,
+        default=seconds,
+        help=f"how long it polls; {f'{seconds:g} s' if seconds else 'until Ctrl-C'} if not given",
+    )
+    parser.add_argument(
+        "--out",
+        metavar="FILE",
+        type=Path,
+        default=out,
+        help=f"record into this new file: {', '.join(FORMATS)}; {out or 'nothing is recorded'} if not given",
+    )
+    parser.add_argument(
+        "--capture", metavar="FILE.pcapng", type=Path, help="all that goes over the lines, for Wireshark"
+    )
+    parser.add_argument(
+        "--flight-recorder",
+        metavar="DIR",
+        type=Path,
+        help="when something goes wrong, a capture of the last minutes is written there",
+    )
+    add_json_argument(parser)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    rotation = rotation_of(arguments)
+    if arguments.out and not rotation:
+        refuse_overwriting(arguments.out)
+    return follow(plant_of(arguments.plant, arguments), arguments, rotation)
+
+
+def follow(plant: Plant, arguments: argparse.Namespace, rotation: Rotation | None = None) -> int:
+    """Poll the plant as the polling arguments say, and print the summary."""
+    if arguments.capture:
+        check_capture(arguments.capture)
+    if arguments.flight_recorder and arguments.flight_recorder.is_file():
+        raise ValueError(f"{arguments.flight_recorder} is a file: name a directory for the flight recorder")
+    show = not arguments.json and sys.stdout.isatty()
+    table = LiveTable(plant, sys.stdout) if show else None
+    consumers = [table.add] if table else []
+    with (
+        polling_session(plant, arguments.out, *consumers, rotation=rotation) as session,
+        ExitStack() as stack,
+    ):
+        taps = _Taps(session.poller, arguments, stack)
+        with session.poller:
+            for _ in _ticks(arguments.seconds, session.interruption):
+                session.hand_out()
+                taps.collect()
+                if table:
+                    table.draw_if_due(time.monotonic())
+    if table:
+        table.draw()
+    return conclude(plant, session.poller.summary() | taps.summary(), arguments)
+
+
+class _Taps:
+    """Taps on the lines, for --capture and --flight-recorder; `stack` closes their files."""
+
+    def __init__(self, poller: Poller, arguments: argparse.Namespace, stack: ExitStack) -> None:
+        lines = list(poller.buses)
+        self._capture = self._flight = self._tapped = None
+        if arguments.capture:
+            self._capture = stack.enter_context(CaptureWriter(arguments.capture, lines))
+        if arguments.flight_recorder:
+            self._flight = stack.enter_context(closing(FlightRecorder(arguments.flight_recorder, lines)))
+        sinks = [sink for sink in (self._capture, self._flight) if sink]
+        if sinks:
+            self._tapped = stack.enter_context(Tapped(poller.buses, *sinks))
+
+    def collect(self) -> None:
+        if self._tapped:
+            self._tapped.collect()
+
+    def summary(self) -> dict[str, Any]:
+        found: dict[str, Any] = {}
+        if self._capture:
+            found["capture"] = str(self._capture.path)
+        if self._flight:
+            found["flight_recordings"] = [str(path) for path in self._flight.written]
+        if self._tapped:
+            found["untapped_bytes"] = self._tapped.lost
+        return found
+
+
+def conclude(plant: Plant, polled: Mapping[str, Any], arguments: argparse.Namespace) -> int:
+    """Print the poller's summary beside the prediction; return the exit status."""
+    summary = {**polled, "recording": str(arguments.out) if arguments.out else None}
+    for line in plant.lines:
+        summary["lines"][line.name]["comparison"] = compare(line, summary["lines"][line.name])
+    into = "segments of " if getattr(arguments, "rotate", None) else ""
+    print_text(json.dumps(summary, indent=2) if arguments.json else _text(summary, into))
+    return 0 if summary["samples"] else 1
+
+
+def _ticks(seconds: float | None, interruption: Interruption) -> Iterator[None]:
+    end = None if seconds is None else time.monotonic() + seconds
+    while not interruption.came and (end is None or time.monotonic() < end):
+        time.sleep(_TAKE_S if end is None else max(0.0, min(_TAKE_S, end - time.monotonic())))
+        yield
+
+
+def _text(summary: dict[str, Any], into: str) -> str:
+    lines: list[str] = []
+    for name, line in summary["lines"].items():
+        lines.append(
+            f"{name}: {counted(line['exchanges'], 'exchange')} in {line['seconds']:.1f} s, "
+            f"utilisation {line['utilisation']:.1%}"
+        )
+        rows = [("DRIVE", "EXCHANGES/S", "SAMPLES/S", "MISSES")]
+        for drive, counts in line["drives"].items():
+            exchanges, samples = counts["exchanges_per_second"], counts["samples_per_second"]
+            first, *more = [f"{reason} {count}" for reason, count in counts["misses"].items()] or ["none"]
+            rows.append((drive, f"{exchanges:.1f}", f"{samples:.1f}", first))
+            rows += [("", "", "", reason) for reason in more]
+        lines += [f"  {row}" for row in aligned(rows, "<>><")]
+        lines += comparison_text(line["comparison"])
+    into = f" in {into}{summary['recording']}" if summary["recording"] else ""
+    dropped = f", {summary['dropped']} dropped" if summary["dropped"] else ""
+    samples, misses = counted(summary["samples"], "sample"), counted(summary["misses"], "miss", "misses")
+    lines.append(f"{samples} and {misses}{into}{dropped}")
+    lines += tap_text(summary)
+    return "\n".join(lines)
+
+
+def tap_text(summary: Mapping[str, Any]) -> Iterator[str]:
+    if "capture" in summary:
+        yield f"captured in {summary['capture']}"
+    for path in summary.get("flight_recordings", ()):
+        yield f"trouble: see {path}"
+    if summary.get("untapped_bytes"):
+        yield f"{counted(summary['untapped_bytes'], 'byte')} not captured: this machine was too slow"
+
+
+EVERY = 0.5  # s, between two drawings
+_UP_AND_CLEAR = "\x1b[{}F\x1b[J"
+
+
+class LiveTable:
+    """One line per drive: its samples and misses so far, and its newest values."""
+
+    def __init__(self, plant: Plant, terminal: TextIO) -> None:
+        self._plant = LivePlant(plant)
+        self._terminal = terminal
+        self._samples: Counter[str] = Counter()
+        self._misses: Counter[str] = Counter()
+        self._drawn: list[str] = []  # lines of the last drawing
+        self._next_draw = 0.0
+
+    def add(self, rows: Rows) -> None:
+        added = list(rows)
+        self._plant.add(added)
+        for row in added:
+            (self._misses if row.value is None else self._samples)[row.drive] += 1
+
+    def draw_if_due(self, now: float) -> None:
+        """Draw, unless the last drawing is younger than EVERY."""
+        if now >= self._next_draw:
+            self._next_draw = now + EVERY
+            self.draw()
+
+    def draw(self) -> None:
+        columns, height = shutil.get_terminal_size()
+        encoding = self._terminal.encoding or "utf-8"  # an escape for what it lacks would be longer
+        shown = (printable(line).encode(encoding, "replace").decode(encoding) for line in self._lines())
+        lines = [cut_to(line, columns - 1) for line in shown]
+        if len(lines) > height - 1:
+            lines = [*lines[: height - 2], f"... and {counted(len(lines) - height + 2, 'more drive')}"]
+        # A terminal that has become narrower has wrapped what was drawn.
+        rows = sum(max(1, ceil(columns_of(line) / columns)) for line in self._drawn)
+        back = _UP_AND_CLEAR.format(min(rows, height - 1)) if self._drawn else ""
+        with suppress(OSError):  # of a terminal that is closed: the recording goes on to its end
+            print(back + "\n".join(lines), file=self._terminal, flush=True)
+        self._drawn = lines
+
+    def _lines(self) -> Iterator[str]:
+        rows = [("DRIVE", "SAMPLES", "MISSES", "NEWEST VALUES")]
+        for drive in self._plant.drives:
+            counts = str(self._samples[drive.name]), str(self._misses[drive.name])
+            rows.append((drive.name, *counts, ", ".join(_values(drive))))
+        yield from aligned(rows, "<>><")
+
+
+def _values(drive: LiveDrive) -> Iterator[str]:
+    for poll in drive.polled.polls:
+        name = poll.register.name
+        if name in drive.missed:
+            yield f"{name}: {drive.missed[name].status}"
+        elif name in drive.newest:
+            yield f"{name} {drive.shown(name)}"
+
+
+Figures = dict[str, Any]
+
+
+def compare(line: PlantLine, summary: dict[str, Any]) -> dict[str, Figures]:
+    """Predict a line with the documents' delays and with the measured ones, beside its summary."""
+    drives = summary["drives"]
+    delays = {
+        polled.drive: drives[polled.drive.name]["response_delay_ms"] / 1e3
+        for polled in line.drives
+        if drives[polled.drive.name]["exchanges_per_second"]  # a silent drive has no delay
+    }
+    polls = [poll for polled in line.drives for poll in polled.polls]
+    is_timed = any(poll.every is not None for poll in polls)  # cycles then do not follow each other
+    cycles = (summary["samples"] + sum(summary["misses"].values())) / len(polls)
+    by_delays = predict(planned_on(line, delays), delays, summary["switching_ms"] / 1e3)
+    return {
+        "predicted": _figures(predict(planned_on(line), switching=line.switching)),
+        "predicted_with_measured_delays": _figures(by_delays),
+        "measured": {
+            "cycle_ms": None if is_timed or not cycles else round(summary["seconds"] / cycles * 1e3, 3),
+            "utilisation": summary["utilisation"],
+            "switching_ms": summary["switching_ms"],
+            "exchanges_per_second": {name: drive["exchanges_per_second"] for name, drive in drives.items()},
+        },
+    }
+
+
+def _figures(prediction: Prediction) -> Figures:
+    drives = dict.fromkeys(rate.drive for rate in prediction.rates)
+    return {
+        "cycle_ms": round(prediction.cycle * 1e3, 3),
+        "switches": prediction.switches,
+        "utilisation": round(prediction.utilisation, 4),
+        "exchanges_per_second": {
+            drive.name: round(prediction.exchanges_per_second(drive), 2) for drive in drives
+        },
+    }
+
+
+def comparison_text(found: dict[str, Figures]) -> Iterator[str]:
+    """Format the comparison as a table."""
+    columns = list(found.values())
+    cycles = ("-" if column["cycle_ms"] is None else f"{column['cycle_ms']:.1f} ms" for column in columns)
+    rows = [
+        ("", "PREDICTED", "BY DELAYS", "MEASURED"),
+        ("bus cycle", *cycles),
+        ("utilisation", *(f"{column['utilisation']:.1%}" for column in columns)),
+    ]
+    for name in found["measured"]["exchanges_per_second"]:
+        rates = (f"{column['exchanges_per_second'][name]:.1f}" for column in columns)
+        rows.append((f"{shortened(name)}, exchanges/s", *rates))
+    yield from (f"  {row}" for row in aligned(rows, "<>>>"))
+    yield "  by delays: predicted with the response delays that were measured"
+    if found["predicted"]["switches"]:
+        took = found["measured"]["switching_ms"]
+        yield f"  and with the {took:.2f} ms that the port needed to change its settings"
+
+
+def add_rotation_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--rotate",
+        metavar="TIME",
+        type=_age,
+        help='begin a new file so often, such as "1 h": run.arrows becomes run.00000001.arrows and so on',
+    )
+    parser.add_argument(
+        "--keep",
+        metavar="TIME",
+        type=_age,
+        help='with --rotate: remove files older than so long, such as "30 days"',
+    )
+    parser.add_argument(
+        "--most",
+        metavar="SIZE",
+        type=_size,
+        help='with --rotate: remove the oldest beyond a size, such as "20 GB"',
+    )
+
+
+def rotation_of(arguments: argparse.Namespace) -> Rotation | None:
+    """Return how the recording is cut into files. Raises ValueError where options do not fit together."""
+    if arguments.rotate is None:
+        if arguments.keep is not None or arguments.most is not None:
+            raise ValueError('--keep and --most remove whole files: say --rotate too, such as --rotate "1 h"')
+        return None
+    if not arguments.out or arguments.out.suffix != ".arrows":
+        raise ValueError("--rotate needs a recording whose name ends in .arrows: say --out run.arrows")
+    return Rotation(arguments.rotate, arguments.keep, arguments.most)
+
+
+def _age(text: str) -> float:
+    try:
+        return parse_age(text)
+    except ValueError as mistake:
+        raise argparse.ArgumentTypeError(str(mistake)) from None
+
+
+def _size(text: str) -> int:
+    try:
+        return parse_size(text)
+    except ValueError as mistake:
+        raise argparse.ArgumentTypeError(str(mistake)) from None

@@ -1,1 +1,0 @@
-"""`multidrop poll`: polls a plant's drives and records them."""

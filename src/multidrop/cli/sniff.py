@@ -1,0 +1,302 @@
+"""The `sniff` command: prints and captures a line's traffic, and sends nothing."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import select
+import sys
+import time
+from collections import Counter
+from collections.abc import Iterable, Mapping
+from contextlib import ExitStack, closing
+from io import FileIO
+from pathlib import Path
+from typing import Any, NoReturn
+
+from multidrop.capture import Capture, CaptureWriter, Pairing, Side, Sniffed
+from multidrop.capture.lookup import RegisterLookup
+from multidrop.capture.lookup import line_of as captured_line
+from multidrop.capture.text import ExchangeFormatter
+from multidrop.cli.support.arguments import (
+    add_json_argument,
+    add_line_arguments,
+    duration,
+    line_of,
+    plant_at,
+    usual_settings,
+    whole,
+)
+from multidrop.cli.support.files import check_capture
+from multidrop.cli.support.output import print_text
+from multidrop.cli.support.signals import noting_signals
+from multidrop.core import FrameSpan, Kind, Splitter, Stream, must_take, refused_names, set_settings
+from multidrop.drive.timing import Settings
+from multidrop.errors import LineError
+from multidrop.plant.loader import load_plant
+from multidrop.plant.model import Plant, PlantLine
+from multidrop.transport.bridge import PORT_FAILURES
+from multidrop.transport.opening import reason_of, unopened
+
+_SILENT_S = 0.5  # longer than any pause within a frame
+_GIVEN_UP_S = 1.5  # longer than any master waits for a reply
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    add_line_arguments(parser)
+    parser.add_argument("--replay", metavar="FILE", type=Path, help="a capture, instead of a port")
+    parser.add_argument("--plant", metavar="PLANT.toml", help="for names and engineering units")
+    parser.add_argument("--out", metavar="FILE.pcapng", type=Path, help="write a capture, for Wireshark too")
+    parser.add_argument(
+        "--baudrate", type=whole, metavar="N", help="as the plant file says, or 9600, if not given"
+    )
+    parser.add_argument("--format", metavar="8N1", help="as the plant file says, or 8N1, if not given")
+    parser.add_argument("--seconds", type=duration, metavar="S", help="how long; until Ctrl-C if not given")
+    add_json_argument(parser)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    if (arguments.port is None) == (arguments.replay is None):
+        raise ValueError("name a PORT to listen to, or a capture with --replay FILE, and not both")
+    if arguments.out:
+        check_capture(arguments.out)
+    plant = load_plant(arguments.plant) if arguments.plant else None
+    with ExitStack() as stack:
+        if arguments.replay:
+            source = stack.enter_context(Capture(arguments.replay))
+            out = stack.enter_context(CaptureWriter(arguments.out)) if arguments.out else None
+            counts = dict(replay(source, plant, as_json=arguments.json, out=out))
+        else:
+            line = _line(arguments, plant)
+            listener = stack.enter_context(closing(Listener(arguments.port, _settings(arguments, line))))
+            out = stack.enter_context(CaptureWriter(arguments.out)) if arguments.out else None
+            name = line.name if line else _name(arguments.port)
+            printer = TrafficPrinter(name, line, as_json=arguments.json, out=out)
+            _listen(listener, printer, arguments.seconds)
+            counts = printer.pairing.counts()
+    print_text(json.dumps({"summary": counts}) if arguments.json else summary(counts))
+    return 0
+
+
+def _line(arguments: argparse.Namespace, plant: Plant | None) -> PlantLine | None:
+    """Return the plant file's line to listen to, or None where none is known.
+
+    With PLANT.toml in place of PORT, sets `arguments.port` to the line's port. With --plant it is the line
+    that has this port, or else the plant's only line.
+    """
+    named = plant_at(arguments)
+    if named is None:
+        port = arguments.port
+        lines = plant.lines if plant else ()
+        return next((line for line in lines if line.port == port), captured_line(plant, port))
+    if plant:
+        raise ValueError(f"--plant is for a PORT: {arguments.port} is a plant file already")
+    line = line_of(named, arguments.name)
+    arguments.port = line.port
+    return line
+
+
+def _name(port: str) -> str:
+    return port if "://" in port else Path(port).name
+
+
+def _settings(arguments: argparse.Namespace, line: PlantLine | None) -> Settings:
+    """Return the settings that the arguments state, and for the rest those of most of the line's drives."""
+    usual = usual_settings(line)
+    baudrate = usual.baudrate if arguments.baudrate is None else arguments.baudrate
+    return Settings(baudrate, arguments.format or usual.format)
+
+
+def _listen(listener: Listener, printer: TrafficPrinter, seconds: float | None) -> None:
+    print_text(f"listening on {listener.port}, Ctrl-C ends", file=sys.stderr, flush=True)
+    begun = received_at = time.monotonic()
+    with noting_signals() as interruption:
+        while not interruption.came:
+            now = time.monotonic()
+            if seconds is not None and now - begun >= seconds:
+                break
+            if listener.receive():
+                received_at = time.monotonic()  # not `now`: a busy machine may have let us wait for long
+            listener.stream.end(now - received_at > _SILENT_S)
+            printer.show(listener.stream)
+            if now - received_at > _GIVEN_UP_S:
+                printer.finish()
+    listener.stream.end(True)
+    printer.show(listener.stream)
+    printer.finish()
+
+
+LOOK_S = 0.05  # the longest wait for bytes
+_MOST = 4096  # bytes of one read
+
+
+def _open_device(port: str, settings: Settings) -> FileIO:
+    """Open a device of this machine read-only, and lock and set it up."""
+    if sys.platform == "win32":
+        raise LineError(port, "on Windows only a socket:// can be listened to, and no serial device")
+    import fcntl
+
+    fd = os.open(port, os.O_RDONLY | os.O_NOCTTY | os.O_NONBLOCK)
+    try:
+        fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        refused = set_settings(fd, settings.baudrate, settings.format) & must_take(os.ttyname(fd))
+        if refused:
+            raise LineError(port, f"the port does not take the {refused_names(refused)} of {settings}")
+    except OSError:
+        os.close(fd)
+        raise
+    return FileIO(fd)
+
+
+def _open_url(url: str, settings: Settings) -> Any:
+    """Open a URL, with a `write` that refuses."""
+    port = unopened(url)
+    vars(port)["write"] = _refuse
+    port.baudrate = settings.baudrate
+    port.bytesize = settings.databits
+    port.parity = settings.parity
+    port.stopbits = settings.stopbits
+    port.timeout = LOOK_S
+    port.open()
+    return port
+
+
+def _refuse(data: bytes) -> NoReturn:
+    raise OSError(f"this port is only listened to: {data.hex(' ')} is not sent")
+
+
+class Listener:
+    """A port or URL whose bytes go into `stream`. Every failure of the port is a LineError."""
+
+    def __init__(self, port: str, settings: Settings) -> None:
+        self.port = port
+        self._character_ns = round(settings.character * 1e9)
+        self._pause_ns = round(settings.t3_5 * 1e9)
+        self._last_ns = 0
+        self.stream = Stream()
+        try:
+            self._source: Any = (_open_url if "://" in port else _open_device)(port, settings)
+        except LineError:
+            raise
+        except PORT_FAILURES as failure:
+            raise LineError(port, reason_of(failure)) from failure
+
+    def receive(self) -> int:
+        """Wait for bytes, LOOK_S at most, and put them into the stream; return how many came."""
+        try:
+            received = self._read()
+        except PORT_FAILURES as failure:
+            raise LineError(self.port, f"the port was lost ({reason_of(failure)})") from failure
+        if not received:
+            return 0
+        now_ns = time.time_ns()
+        begun_ns = max(self._last_ns, now_ns - len(received) * self._character_ns)
+        after_pause = begun_ns - self._last_ns >= self._pause_ns
+        self.stream.put(received, begun_ns, after_pause=after_pause)
+        self._last_ns = now_ns
+        return len(received)
+
+    def _read(self) -> bytes:
+        """Return what came within LOOK_S. Raises EOFError when the other end has hung up."""
+        try:
+            fd = self.fileno()
+        except OSError:  # no descriptor, as of loop://
+            return bytes(self._source.read(1) + self._source.read_all())
+        if not select.select([fd], [], [], LOOK_S)[0]:
+            return b""
+        try:
+            received = os.read(fd, _MOST)
+        except BlockingIOError:
+            return b""
+        if not received:
+            raise EOFError("hung up")
+        return received
+
+    def fileno(self) -> int:
+        return int(self._source.fileno())
+
+    def close(self) -> None:
+        self._source.close()
+
+
+_SIDES = {
+    Kind.JUNK: Side.EITHER,
+    Kind.REQUEST: Side.ASKING,
+    Kind.EITHER: Side.ASKING,
+    Kind.REPLY: Side.ANSWERING,
+    Kind.STRAY: Side.ANSWERING,
+}
+
+
+class TrafficPrinter:
+    """Prints the exchanges of one line."""
+
+    def __init__(
+        self, name: str, line: PlantLine | None, *, as_json: bool, out: CaptureWriter | None
+    ) -> None:
+        self.name = name
+        self.pairing = Pairing()
+        self._splitter = Splitter()
+        self._formatter = ExchangeFormatter(RegisterLookup(line))
+        self._as_json = as_json
+        self._out = out
+
+    def show(self, stream: Stream) -> None:
+        """Print what is complete in the stream so far."""
+        spans = list(self._splitter.spans(stream))
+        if self._out:
+            self._write(spans, self._out)
+        self._print(self.pairing.pair(spans))
+
+    def finish(self) -> None:
+        """Print the requests that still wait for a reply: none will come."""
+        self._print(self.pairing.flush())
+
+    def _write(self, spans: list[FrameSpan], out: CaptureWriter) -> None:
+        for span in spans:
+            out.write(span.raw, _SIDES[span.kind], span.time_ns, self.name)
+
+    def _print(self, traffic: Iterable[Sniffed]) -> None:
+        for sniffed in traffic:
+            if self._as_json:
+                print_text(json.dumps({"line": self.name} | self._formatter.json(sniffed)))
+            else:
+                print_text(self._formatter.text(sniffed))
+        sys.stdout.flush()
+
+
+def replay(
+    capture: Capture, plant: Plant | None, *, as_json: bool, out: CaptureWriter | None = None
+) -> Counter[str]:
+    """Print all that a capture holds; return its counts, as `summary` takes them."""
+    printers: list[TrafficPrinter] = []
+    for _ in capture:
+        printers += [
+            TrafficPrinter(name, captured_line(plant, name), as_json=as_json, out=out)
+            for name in capture.lines[len(printers) :]
+        ]
+        for printer, stream in zip(printers, capture.streams, strict=True):
+            printer.show(stream)
+    for printer in printers:
+        printer.finish()
+    return sum((Counter(printer.pairing.counts()) for printer in printers), Counter())
+
+
+_COUNTED = {  # one, many
+    "exchanges": ("exchange", "exchanges"),
+    "broadcasts": ("broadcast", "broadcasts"),
+    "unanswered": ("request without a reply", "requests without a reply"),
+    "strays": ("reply without a request", "replies without a request"),
+    "unknown_bytes": ("unknown byte", "unknown bytes"),
+}
+_ALWAYS = ("exchanges", "unknown_bytes")
+
+
+def summary(counts: Mapping[str, int]) -> str:
+    """Return the counts in words."""
+    return ", ".join(
+        f"{counts.get(name, 0)} {words[counts.get(name, 0) != 1]}"
+        for name, words in _COUNTED.items()
+        if counts.get(name) or name in _ALWAYS
+    )

@@ -1,1 +1,0 @@
-"""`multidrop sniff`: listens to a line that another master polls."""
