@@ -17,6 +17,7 @@ from disks import full_at, read_only_directory
 from simulated_bus import SimulatedBus, one
 
 from multidrop.cli import main
+from multidrop.control import audit_log
 from multidrop.control import records as write_records
 from multidrop.control.audit_log import AuditLog, read_audit
 from multidrop.control.author import noted_first, written_by
@@ -227,6 +228,17 @@ def test_a_stop_is_two_lines_however_often_it_is_sent(
         "invt-che@1": "sent but unknown",
         "invt-che@2": "stopped",
     }
+
+
+def test_a_disk_that_does_not_open_the_audit_log_is_given_up(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    answers = threading.Event()
+    monkeypatch.setattr(audit_log, "OPENING_S", 0.05)
+    monkeypatch.setattr(Path, "open", lambda *details, **options: answers.wait(PATIENCE_S))
+    with pytest.raises(OSError, match="audit log: not done within 0.05 s; does the disk answer?"):
+        AuditLog(tmp_path / "audit.jsonl")
+    answers.set()
 
 
 def test_an_audit_log_in_a_read_only_directory_is_refused_before_anything_is_sent(

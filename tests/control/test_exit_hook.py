@@ -291,6 +291,65 @@ def test_a_later_bus_takes_signals_that_the_program_has_handled_since(
     assert (handled, caught) == ([signal.SIGTERM], [])
 
 
+@pytest.mark.parametrize("effect", ["called", "default", "ignored"])
+def test_a_program_handler_may_call_ours_in_turn(caught: list[int], effect: str) -> None:
+    """The signal then has its earlier effect once, unless that would end the program behind its handler."""
+    hook, act, handled = ExitHook(), Act(), list[int]()
+    if effect != "called":
+        signal.signal(signal.SIGTERM, signal.SIG_DFL if effect == "default" else signal.SIG_IGN)
+    hook.add(act.begin, act.work)
+    ours: Any = signal.getsignal(signal.SIGTERM)
+
+    def handle(number: int, frame: Any) -> None:
+        handled.append(number)
+        ours(number, frame)
+
+    signal.signal(signal.SIGTERM, handle)
+    signal.raise_signal(signal.SIGTERM)
+    assert act.is_begun
+    act.go_on.set()
+    until(lambda: len(handled) == 2)  # when it came, and after the stops
+    assert caught == ([signal.SIGTERM] if effect == "called" else [])
+
+
+def test_a_handler_that_ours_replaced_may_call_an_earlier_one_of_ours(caught: list[int]) -> None:
+    hook, handled = ExitHook(), list[int]()
+    hook.add(lambda: None, lambda: None)
+    ours: Any = signal.getsignal(signal.SIGTERM)
+
+    def handle(number: int, frame: Any) -> None:
+        handled.append(number)
+        ours(number, frame)
+
+    signal.signal(signal.SIGTERM, handle)
+    last = hook.add(lambda: None, lambda: None)  # takes the signal again
+    signal.raise_signal(signal.SIGTERM)
+    until(lambda: handled)
+    assert last.is_over
+    assert handled == [signal.SIGTERM]
+
+
+def test_a_thread_reports_that_the_program_took_the_signals_back(
+    caught: list[int], caplog: pytest.LogCaptureFixture
+) -> None:
+    hook, handled = ExitHook(), list[int]()
+    hook.add(lambda: None, lambda: None)
+    signal.signal(signal.SIGTERM, lambda number, frame: handled.append(number))
+    acts = list[LastAct]()
+    thread = threading.Thread(target=lambda: acts.append(hook.add(lambda: None, lambda: None)))
+    thread.start()
+    thread.join(PATIENCE)
+    assert (
+        caplog.text.count("SIGTERM will not stop the drives: the program has set its own handler since") == 1
+    )
+    assert "SIGINT" not in caplog.text
+    signal.raise_signal(signal.SIGTERM)
+    assert handled == [signal.SIGTERM]
+    assert not acts[0].is_over
+    hook._at_exit()
+    assert acts[0].is_over
+
+
 def test_a_child_begins_its_own_last_acts_though_its_parent_was_ending(caught: list[int]) -> None:
     hook, acts = ExitHook(), [Act(), Act()]
     hook.add(acts[0].begin, acts[0].work)

@@ -159,7 +159,9 @@ def _audit_file(arguments: argparse.Namespace) -> str | None:
         try:
             AuditLog(audit).close()
         except OSError as failure:
-            warn(f"{audit}: {failure.strerror}: the {arguments.command} is sent and not noted there")
+            warn(
+                f"{audit}: {failure.strerror or failure}: the {arguments.command} is sent and not noted there"
+            )
             return None
     return audit
 

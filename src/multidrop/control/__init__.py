@@ -1,5 +1,6 @@
 """Control: everything that is written to a drive, and every stop."""
 
+from multidrop.control.audit_log import AuditLog as AuditLog
 from multidrop.control.audit_log import read_audit as read_audit
 from multidrop.control.author import noted_first as noted_first
 from multidrop.control.author import written_by as written_by

@@ -1,53 +1,71 @@
-"""Audit log: every write that was sent, as one line of JSON in a file that only grows.
+"""AuditLog: a file of JSON lines that only grows, with every write that was sent.
 
-A write is noted when its outcome is known: one that a killed process had under way is there only if it had to
-be noted first (`noted_first`). A stop is noted when it is called, and each drive's when it ends.
-A line that a crash or a full disk truncated harms no other: the next record begins a new line.
+A write is recorded when its outcome is known. A write that was in flight when the process was killed is only
+there if `noted_first` asked for an earlier record. A stop is recorded when it is called, and again for each
+drive when it ends. A line that a crash or a full disk truncated does not damage the next record.
 """
 
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Iterator
-from io import SEEK_END
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 from multidrop.iso_time import format_time
+from multidrop.supervisor import in_time
+
+OPENING_S = 5.0  # within which the disk must open the file
+
+_sync = getattr(os, "fdatasync", os.fsync)  # macOS has no fdatasync
 
 
 class AuditLog:
-    """The log in this file. Raises OSError when it cannot be opened or written."""
+    """The log in this file. Raises OSError if it cannot be opened, or is not opened within OPENING_S."""
 
     def __init__(self, path: Path | str) -> None:
         self.path = Path(path)
-        self._file = self.path.open("a+b", buffering=0)  # one call, one write: processes do not mix lines
+        self._file = _opened(self.path)
 
     def add(self, utc_ns: int, record: dict[str, Any]) -> None:
-        """Append a record. Raises OSError, also when there was room for a part of it only."""
+        """Append a record. Raises OSError, also if only a part of it was written."""
         line = json.dumps({"time": format_time(utc_ns), **record}, ensure_ascii=False)
         whole = (b"\n" if self._is_truncated() else b"") + line.encode(errors="backslashreplace") + b"\n"
         if self._file.write(whole) < len(whole):
             raise OSError(f"{self.path}: there was room for a part of a record only")
 
+    def sync(self) -> None:
+        """Return when all records are on the disk. Raises OSError."""
+        _sync(self._file.fileno())
+
     def close(self) -> None:
         self._file.close()
 
     def _is_truncated(self) -> bool:
-        """Return True where the last line has no end, whichever process began it."""
-        if self._file.seek(0, SEEK_END) == 0:
+        """Return True if the last line is incomplete, whichever process wrote it."""
+        if self._file.seek(0, os.SEEK_END) == 0:
             return False
-        self._file.seek(-1, SEEK_END)
+        self._file.seek(-1, os.SEEK_END)
         return self._file.read(1) != b"\n"
 
 
-def read_audit(path: Path | str) -> Iterator[dict[str, Any]]:
-    """Yield the records of a log in order, without those that a crash truncated.
+def _opened(path: Path) -> IO[bytes]:
+    """Open it with a time limit, because a disk may hang. Unbuffered: processes do not mix their lines."""
+    open_file = partial(path.open, "a+b", buffering=0)
+    try:
+        return in_time("audit log", OPENING_S, open_file)
+    except RuntimeError:  # the system has no thread left
+        return open_file()
 
-    Each has `time` (UTC), `port`, `drive`, `write` and `outcome`, and if they are known `model`, `address`,
-    `sent` (the newest frame), `frames` (how many frames a stop took), `held` (what the drive holds since),
-    `why`, `by` and `way` (see `written_by`). The `outcome` of what was about to be sent is "called". Raises
-    OSError.
+
+def read_audit(path: Path | str) -> Iterator[dict[str, Any]]:
+    """Yield the records of a log in order, without truncated ones. Raises OSError.
+
+    Each has `time` (UTC), `port`, `drive`, `write` and `outcome`. If known, it also has `model`, `address`,
+    `sent` (the newest frame), `frames` (the number of frames of a stop), `held` (the value that the drive
+    holds), `why`, `by` and `way` (see `written_by`). The outcome "called" means that it is about to be sent.
     """
     with Path(path).open("rb") as lines:
         for line in lines:

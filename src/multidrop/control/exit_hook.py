@@ -29,6 +29,10 @@ HANDLING_S = 0.05  # the longest that a signal waits to be handled
 PACKAGE = __name__.partition(".")[0]
 MOST_NAMES = 20  # of drives in a message
 CUT_SHORT = "the stops were cut short by a third signal: motors may still be turning"
+REPLACED = (
+    "%s will not stop the drives: the program has set its own handler since. They are stopped when the bus is "
+    "closed or the process exits; open a bus with stop_on_exit in the main thread to take the signals again"
+)
 STOPPING = "{} received: stopping {}; Ctrl-C three times within a second gives up"
 
 
@@ -60,6 +64,9 @@ def _tell(sentence: str) -> None:
 def _listed(names: list[str]) -> str:
     left = len(names) - MOST_NAMES
     return ", ".join(names[:MOST_NAMES]) + (f" and {left} more" if left > 0 else "")
+
+
+_log = logging.getLogger("multidrop.control")
 
 
 class LastAct:
@@ -109,7 +116,7 @@ class LastAct:
         try:
             self._work()
         except Exception:
-            logging.getLogger("multidrop.control").exception("the drives could not be stopped")
+            _log.exception("the drives could not be stopped")
         finally:
             self._over.set()
             self._on_over()
@@ -130,6 +137,7 @@ class ExitHook:
         self._came: list[float] = []  # when it and others did
         self._passing = threading.Lock()
         self._has_passed = False
+        self._is_passing_on = False
         atexit.register(self._at_exit)
         register_at_fork(self)
 
@@ -158,6 +166,7 @@ class ExitHook:
         except ValueError:
             self._acts.remove(act)
             raise
+        self._warn_of_replaced()
         if self._held is not None:  # the end has begun without it
             act.begin()
         return act
@@ -175,6 +184,11 @@ class ExitHook:
                 self._before[number] = had  # noted first: the signal may come at once
                 signal.signal(number, self._on_signal)
         self._has_taken = True
+
+    def _warn_of_replaced(self) -> None:
+        """Log which of the signals stop no drive because the program has set its own handler since."""
+        if lost := [number.name for number in _SIGNALS if signal.getsignal(number) != self._on_signal]:
+            _log.warning(REPLACED, " and ".join(lost))
 
     def finish(self, act: LastAct) -> None:
         """Do it now, and forget it."""
@@ -212,12 +226,12 @@ class ExitHook:
         if is_first and names:
             _tell(STOPPING.format(signal.Signals(number).name, _listed(names)))
         if all(act.is_over for act in acts):
-            self._pass_on(number)
+            self._pass_on(number, frame)
         elif len(self._came) >= IMPATIENT:
             _tell(CUT_SHORT)
             for act in acts:
                 act.is_cut_short = True
-            self._pass_on(number)
+            self._pass_on(number, frame)
 
     def _one_is_over(self) -> None:
         """Send the signal that is held to the main thread, once all last acts are over."""
@@ -237,10 +251,24 @@ class ExitHook:
         while self._held is not None:
             time.sleep(HANDLING_S)
 
-    def _pass_on(self, number: int) -> None:
+    def _pass_on(self, number: int, frame: FrameType | None) -> None:
+        """Give the signal the effect that it had before these stops.
+
+        A handler of the program that was set since may have called ours: it is not called again.
+        """
+        installed, before = signal.getsignal(number), self._before.get(signal.Signals(number))
         self._let_go()
         self._held, self._came = None, []
-        signal.raise_signal(number)
+        if self._is_passing_on:
+            return
+        self._is_passing_on = True
+        try:
+            if installed == self._on_signal:
+                signal.raise_signal(number)
+            elif callable(before) and before != installed:
+                before(number, frame)
+        finally:
+            self._is_passing_on = False
 
     def _let_go(self) -> None:
         self._has_taken = False

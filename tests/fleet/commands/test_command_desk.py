@@ -18,11 +18,10 @@ from peers import require_module
 from tables import table
 
 from multidrop import Seen, Stopped
-from multidrop.control import read_audit
+from multidrop.control import audit_log, read_audit
 
 require_module("nats")
 
-from multidrop.fleet.commands import log as command_log  # noqa: E402
 from multidrop.fleet.commands.desk import MOST_WRITES  # noqa: E402
 from multidrop.fleet.commands.words import (  # noqa: E402
     CommandAnswer,
@@ -145,7 +144,7 @@ def test_a_command_is_on_the_disk_before_it_is_sent(tmp_path: Path, monkeypatch:
             os.fsync(file)
             synced.append((len(desk.notes), len(desk.writes)))
 
-        monkeypatch.setattr(command_log, "_sync", sync)
+        monkeypatch.setattr(audit_log, "_sync", sync)
         assert asyncio.run(desk.do(desk.offered())).is_done
         assert synced == [(1, 0), (2, 1)]
 

@@ -27,6 +27,7 @@ from multidrop.fleet.servers.buckets import Bucket  # noqa: E402
 from multidrop.fleet.servers.connections import connect, paths_of  # noqa: E402
 from multidrop.fleet.servers.plant_store import store  # noqa: E402
 from multidrop.fleet.servers.setup import open_all, set_up  # noqa: E402
+from multidrop.supervisor import supervisor  # noqa: E402
 
 pytestmark = [pytest.mark.slow, pytest.mark.long]
 
@@ -53,7 +54,7 @@ async def commanded(servers: SecuredCluster, made: Desks) -> AsyncIterator[Comma
         await open_all(paths)
         await subjects.begin()
         subjects.open(LINE, PLANT[LINE])
-        await asyncio.gather(*subjects._tasks)
+        await asyncio.gather(*supervisor().started)
         yield subjects
     finally:
         for path in (*operator, *paths):
@@ -101,7 +102,7 @@ def test_where_nobody_polls_the_line_each_server_says_so(servers: SecuredCluster
             askers = [await connect(url, servers.options("commander")) for url in servers.urls]
             assert not any([await nobody_is_asked(asker) for asker in askers])
             subjects.shut(LINE)
-            await asyncio.gather(*subjects._tasks)
+            await asyncio.gather(*supervisor().started)
             assert all([await nobody_is_asked(asker) for asker in askers])
             for asker in askers:
                 await asker.close()

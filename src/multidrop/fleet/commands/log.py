@@ -1,72 +1,73 @@
-"""Command log: one line of JSON for each step of a command, on the disk before the next step is taken."""
+"""CommandLog: one line of JSON for each step of a command, on the disk before the next step is taken."""
 
 from __future__ import annotations
 
 import asyncio
-import json
-import os
+import threading
 import time
 from collections.abc import Mapping
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
-_sync = getattr(os, "fdatasync", os.fsync)  # an asker may be on a system without it
+from multidrop.control import AuditLog
+from multidrop.supervisor import supervisor
+
+WRITING_S = 10.0  # after which a record is reported as hanging
+CLOSING_S = 1.0  # that closing waits for the record that is being written
 
 
 class CommandLog:
-    """The log in this file, which only grows. Raises OSError where it cannot be opened.
+    """The log in this file, which only grows. Raises OSError if it cannot be opened.
 
-    A line that a crash or a full disk truncated harms no other: the next one begins a new line.
+    Each record has a daemon thread of its own: a disk that hangs neither blocks the loop nor the exit.
     """
 
     def __init__(self, path: Path) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         self.path = path
-        self._file = path.open("a+b", buffering=0)
-        self._disk = ThreadPoolExecutor(1, "multidrop log")  # a disk that hangs holds nothing else up
+        self._log = AuditLog(path)
+        self._turn = asyncio.Lock()  # records are in the order of the calls
+        self._writing = threading.Lock()
+        self._is_closed = False
 
     async def note(self, record: Mapping[str, Any]) -> None:
-        """Append a record with the time of day (UTC), and wait until the disk has it.
+        """Append a record with the time of day (UTC), and return when the disk has it.
 
-        Raises OSError, also once the log is closed.
+        Raises OSError, also if the log is closed or the system has no thread left.
         """
-        loop = asyncio.get_running_loop()
-        try:
-            written = loop.run_in_executor(self._disk, self._add, record, time.time_ns())
-        except RuntimeError:
-            raise OSError(f"{self.path} is closed") from None
-        await written
+        now_ns = time.time_ns()
+        async with self._turn:
+            if self._is_closed:
+                raise OSError(f"{self.path} is closed")
+            try:
+                await supervisor().thread("command log", WRITING_S, lambda: self._add(record, now_ns))
+            except OSError:
+                raise
+            except Exception as failure:  # of its thread: there is none, or it was ended
+                raise OSError(f"{self.path}: {type(failure).__name__}: {failure}") from failure
 
     def _add(self, record: Mapping[str, Any], now_ns: int) -> None:
-        at = time.strftime("%Y-%m-%dT%H:%M:%S", time.gmtime(now_ns // 10**9))
-        line = json.dumps({"time": f"{at}.{now_ns % 10**9 // 1000:06d}Z", **record}, ensure_ascii=False)
-        whole = (b"\n" if self._is_truncated() else b"") + line.encode(errors="backslashreplace") + b"\n"
-        if self._file.write(whole) < len(whole):
-            raise OSError(f"{self.path}: there was room for a part of a record only")
-        _sync(self._file.fileno())
-
-    def _is_truncated(self) -> bool:
-        if self._file.seek(0, os.SEEK_END) == 0:
-            return False
-        self._file.seek(-1, os.SEEK_END)
-        return self._file.read(1) != b"\n"
+        with self._writing:
+            self._log.add(now_ns, dict(record))
+            self._log.sync()
 
     def close(self) -> None:
-        """Close it after what is queued; a record that comes later is not taken."""
-        self._disk.submit(self._file.close)
-        self._disk.shutdown(wait=False)
+        """Close the file after the record that is being written; later records are refused."""
+        self._is_closed = True
+        if self._writing.acquire(timeout=CLOSING_S):
+            self._log.close()
+            self._writing.release()
 
 
 class UnopenedLog:
-    """A log that could not be opened: each attempt to note something in it says why."""
+    """A log that could not be opened: each record raises the reason."""
 
     def __init__(self, path: Path, failure: OSError) -> None:
         self.path = path
         self._failure = failure
 
     async def note(self, record: Mapping[str, Any]) -> None:
-        """Raise the OSError that kept it from being opened."""
+        """Raise the OSError that kept the file from being opened."""
         raise self._failure
 
     def close(self) -> None:
@@ -74,7 +75,7 @@ class UnopenedLog:
 
 
 def open_log(path: Path) -> CommandLog | UnopenedLog:
-    """Open the log in this file. One that cannot be opened fails when something is to be noted."""
+    """Open the log in this file. If it cannot be opened, each `note` fails instead."""
     try:
         return CommandLog(path)
     except OSError as failure:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import asyncio
 import time
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+from math import inf
 from pathlib import Path
 from typing import Any
 
@@ -14,9 +15,9 @@ from multidrop.core import Mastership
 from multidrop.fleet.samples.polled_units import PolledUnits
 from multidrop.fleet.servers.buckets import Record
 from multidrop.fleet.servers.plant_store import line_of
-from multidrop.supervisor import for_a_future
+from multidrop.supervisor import supervisor
 
-THREADS = 32
+THREADS = 32  # at most, at once
 
 
 class FleetLines:
@@ -26,7 +27,7 @@ class FleetLines:
         self.poller = Poller(Plant((), folder), mastership=mastership, audit=folder / "audit.jsonl")
         self._folder = folder / "lines"
         self._units = units
-        self._threads = ThreadPoolExecutor(THREADS, "multidrop line")
+        self._free = asyncio.Semaphore(THREADS)
 
     async def take(self, line: str, description: Any) -> None:
         """Open the line and poll it; if that raises, it is not polled, and its port is closed.
@@ -37,15 +38,9 @@ class FleetLines:
         await self._in_thread(self._take, Record(line, 0, description))
 
     async def _in_thread(self, act: Callable[..., object], *details: object) -> None:
-        """Call it on one of the threads. What would end the loop, such as SystemExit, is a RuntimeError."""
-
-        def work() -> None:
-            try:
-                act(*details)
-            except (SystemExit, KeyboardInterrupt, GeneratorExit) as failure:
-                raise for_a_future(failure) from failure
-
-        await asyncio.get_running_loop().run_in_executor(self._threads, work)
+        """Call it in a daemon thread. SystemExit, which would end the loop, becomes RuntimeError."""
+        async with self._free:
+            await supervisor().thread("line", inf, partial(act, *details))
 
     def _take(self, record: Record) -> None:
         line = line_of(record, self._folder)
@@ -75,7 +70,4 @@ class FleetLines:
 
     async def close(self) -> None:
         """Stop polling; the last rows are handed out. Raises PollingFailed if polling had failed."""
-        try:
-            await self._in_thread(self.poller.close)
-        finally:
-            self._threads.shutdown(wait=False)
+        await self._in_thread(self.poller.close)
