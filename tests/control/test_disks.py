@@ -236,7 +236,7 @@ def test_a_disk_that_does_not_open_the_audit_log_is_given_up(
     answers = threading.Event()
     monkeypatch.setattr(audit_log, "OPENING_S", 0.05)
     monkeypatch.setattr(Path, "open", lambda *details, **options: answers.wait(PATIENCE_S))
-    with pytest.raises(OSError, match="audit log: not done within 0.05 s; does the disk answer?"):
+    with pytest.raises(OSError, match=r"audit log: not done within 0\.05 s; does the disk answer\?"):
         AuditLog(tmp_path / "audit.jsonl")
     answers.set()
 

@@ -80,7 +80,7 @@ def test_leaving_stops_only_when_it_was_asked_for(ending: str, opted: str) -> No
         assert client.returncode in (status, -int(number or 0))
         written = [write.raw for write in sim.counters.writes if write.name == "control"]
         assert written[:2] == ([1, 5] if opted == "stop" else [1])
-        assert written[2:] in ([], [8])  # it turned yet, and might jog
+        assert set(written[2:]) <= {5, 8}  # again if a reply was late; 8 ends a jog if it still turned
         assert sim.motor.energised == (opted == "leave")
 
 

@@ -10,7 +10,6 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Iterator
-from functools import partial
 from pathlib import Path
 from typing import IO, Any
 
@@ -52,8 +51,11 @@ class AuditLog:
 
 
 def _opened(path: Path) -> IO[bytes]:
-    """Open it with a time limit, because a disk may hang. Unbuffered: processes do not mix their lines."""
-    open_file = partial(path.open, "a+b", buffering=0)
+    """Open it with a time limit, because a disk may hang."""
+
+    def open_file() -> IO[bytes]:
+        return path.open("a+b", buffering=0)  # one call, one write: processes do not mix their lines
+
     try:
         return in_time("audit log", OPENING_S, open_file)
     except RuntimeError:  # the system has no thread left

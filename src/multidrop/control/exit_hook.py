@@ -30,8 +30,8 @@ PACKAGE = __name__.partition(".")[0]
 MOST_NAMES = 20  # of drives in a message
 CUT_SHORT = "the stops were cut short by a third signal: motors may still be turning"
 REPLACED = (
-    "%s will not stop the drives: the program has set its own handler since. They are stopped when the bus is "
-    "closed or the process exits; open a bus with stop_on_exit in the main thread to take the signals again"
+    "%s will not stop the drives: the program has set its own handler since. They are stopped when the bus "
+    "is closed or the process exits; open a bus with stop_on_exit in the main thread to take it again"
 )
 STOPPING = "{} received: stopping {}; Ctrl-C three times within a second gives up"
 
