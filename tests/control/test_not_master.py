@@ -469,7 +469,7 @@ def test_a_bridged_port_is_refused(port: str) -> None:
 
 
 def test_a_mastership_is_one() -> None:
-    with pytest.raises(TypeError, match=r"^mastership takes a multidrop\.Mastership, not 0\.7$"):
+    with pytest.raises(TypeError, match=r"^mastership takes a multidrop\.core\.Mastership, not 0\.7$"):
         Bus("/dev/null", mastership=0.7)  # type: ignore[arg-type]
 
 
