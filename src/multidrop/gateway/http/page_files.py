@@ -1,0 +1,74 @@
+"""The files of the web page, read into memory at the first request: no later one waits for a disk."""
+
+from __future__ import annotations
+
+import hashlib
+from functools import partial
+from pathlib import Path
+from typing import NamedTuple
+
+from starlette.requests import Request
+from starlette.responses import Response
+
+from multidrop.gateway.http.guard import Denied
+from multidrop.supervisor import supervisor
+
+PAGE = Path(__file__).parents[1] / "page"
+INDEX = "index.html"
+READ_S = 5.0  # time limit for reading all files
+TYPES = {  # by suffix; all others are plain text
+    ".html": "text/html",
+    ".js": "text/javascript",
+    ".css": "text/css",
+    ".svg": "image/svg+xml",
+}
+
+
+class PageFile(NamedTuple):
+    """One file of the page."""
+
+    body: bytes
+    media_type: str
+    etag: str
+
+
+class PageFiles:
+    """The files of a folder and of the folders in it, by relative path."""
+
+    def __init__(self, folder: Path = PAGE) -> None:
+        self._folder = folder
+        self._files: dict[str, PageFile] = {}
+
+    async def index(self, request: Request) -> Response:
+        """Return the page itself. Raises Denied if this installation has none, Hung if the disk hangs."""
+        return await self._respond(request, INDEX)
+
+    async def file(self, request: Request) -> Response:
+        """Return the file that the path names. Raises Denied if there is none, Hung if the disk hangs."""
+        return await self._respond(request, request.path_params["name"])
+
+    async def _respond(self, request: Request, name: str) -> Response:
+        if not self._files:
+            read = partial(_read_files, self._folder)
+            self._files = await supervisor().within("page files", READ_S, read)
+        found = self._files.get(name)
+        if found is None and name == INDEX:
+            raise Denied(404, "this version of multidrop has no page; /api/plant and /metrics are there")
+        if found is None:
+            raise Denied(404, "there is nothing here")
+        headers = {"etag": found.etag}
+        if found.etag in request.headers.get("if-none-match", ""):
+            return Response(status_code=304, headers=headers)
+        return Response(found.body, media_type=found.media_type, headers=headers)
+
+
+def _read_files(folder: Path) -> dict[str, PageFile]:
+    """Return the files by their paths with slashes. Raises OSError if one cannot be read."""
+    found = {}
+    for path in sorted(folder.rglob("*")):
+        if path.is_file():
+            body = path.read_bytes()
+            etag = f'"{hashlib.sha256(body).hexdigest()[:32]}"'
+            name = path.relative_to(folder).as_posix()
+            found[name] = PageFile(body, TYPES.get(path.suffix, "text/plain"), etag)
+    return found
