@@ -153,11 +153,11 @@ class Worker:
             )
             for line in self.plant.lines
         }
-        self.gateway.lately.tick(float(turn), turn * 1000, reading)
+        self.gateway.recent.tick(float(turn), turn * 1000, reading)
 
     def metrics(self) -> None:
         gateway = self.gateway
-        expose_metrics(families_of(gateway.hub, gateway.lately.newest, figures_of(gateway)), "")
+        expose_metrics(families_of(gateway.hub, gateway.recent.newest, figures_of(gateway)), "")
 
     def masters(self, start: int, words: int) -> Callable[[], None]:
         """Return what reads these words of all drives."""

@@ -10,8 +10,7 @@ import pytest
 from multidrop.cli import main
 from multidrop.families import InvtCHE
 from multidrop.families.files import cells
-from multidrop.gateway.http.guard import Denied
-from multidrop.gateway.http.request_fields import number_in
+from multidrop.gateway.http.messages import Denied, number_in
 from multidrop.importers.numbers import count, number
 from multidrop.printable import plain_number, plain_whole
 from multidrop.recording.csv import _parse

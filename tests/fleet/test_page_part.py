@@ -57,7 +57,7 @@ def test_its_settings_need_no_library(tmp_path: Path, monkeypatch: pytest.Monkey
     with pytest.raises(
         ValueError, match=r"it needs nats.*, which is not installed: pip install 'multidrop\[f"
     ):
-        parts.build(parts.PARTS["fleet"], settings.parts["fleet"], None)  # type: ignore[arg-type]
+        parts.build("fleet", settings.parts["fleet"], None)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("dying", ["path", "watch"])

@@ -22,8 +22,7 @@ import multidrop.families.files
 import multidrop.families.registry
 import multidrop.fleet.samples.message
 import multidrop.fleet.samples.unpacked_size
-import multidrop.gateway.modbus_server.mbap
-import multidrop.gateway.modbus_server.pdu
+import multidrop.gateway.modbus_server.protocol
 import multidrop.gateway.modbus_server.server
 import multidrop.importers
 import multidrop.plant.model
@@ -48,9 +47,9 @@ MODULES = (  # and of several
     multidrop.sim.faults,
     multidrop.fleet.samples.message,
     multidrop.fleet.samples.unpacked_size,
-    multidrop.gateway.modbus_server.mbap,
+    multidrop.gateway.modbus_server.protocol,
     multidrop.gateway.modbus_server.server,
-    multidrop.gateway.modbus_server.pdu,
+    multidrop.gateway.modbus_server.protocol,
     tomllib._parser,
 )
 

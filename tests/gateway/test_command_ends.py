@@ -201,7 +201,7 @@ def test_a_look_finds_its_drive_by_another_spelling(tmp_path: Path) -> None:
         ledger=Ledger(tmp_path / "wear.sqlite"),
         poller=None,
         side_reads=SimpleNamespace(look=lambda plant, name: {"of": name}),
-        lately=SimpleNamespace(drive=lambda line, name: None),
+        recent=SimpleNamespace(drive=lambda line, name: None),
     )
     found = asyncio.run(look_at(gateway, "Lu\u0308fter"))
     assert found["drive"] == "L\u00fcfter"

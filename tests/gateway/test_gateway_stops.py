@@ -30,9 +30,8 @@ from multidrop.gateway import drive_commands as drive_works
 from multidrop.gateway import parts
 from multidrop.gateway.command_results import Told
 from multidrop.gateway.command_threads import begin_stops
-from multidrop.gateway.http import request_fields
+from multidrop.gateway.http import messages
 from multidrop.gateway.http.rights import Caller, Right
-from multidrop.gateway.parts import Part
 from multidrop.gateway.settings import read_settings
 
 MAY = """[serve.may]
@@ -47,8 +46,7 @@ BROKEN = f"{MAY}[serve.history]\n[serve.mqtt]\n"
 @pytest.fixture
 def _broken_parts(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("history", "mqtt"):
-        broken = Part("broken_part", "BrokenSettings", "build", "broken")
-        monkeypatch.setitem(parts.PARTS, name, broken)  # type: ignore[arg-type]
+        monkeypatch.setitem(parts.PARTS, name, "broken_part")  # type: ignore[arg-type]
 
 
 def start(gateway: Served, *drives: str) -> None:
@@ -188,7 +186,7 @@ def gateway(tmp_path: Path) -> Iterator[Served]:
 def test_a_stop_whose_body_cannot_be_read_is_one_of_all_drives(
     gateway: Served, monkeypatch: pytest.MonkeyPatch, body: bytes
 ) -> None:
-    monkeypatch.setattr(request_fields, "STOP_BODY_S", 0.1)
+    monkeypatch.setattr(messages, "STOP_BODY_S", 0.1)
     with calling(gateway) as client:
         start(gateway, "pump-1", "pump-2")
         client.sendall(STOP + body)
@@ -292,7 +290,7 @@ def test_a_stop_works_while_the_hub_and_the_frames_are_broken(
         def fail(*arguments: object, **more: object) -> None:
             raise ZeroDivisionError
 
-        for broken in ("hub.take", "hub.seen", "events.look", "frames.note_news", "lately.tick"):
+        for broken in ("hub.take", "hub.seen", "events.look", "frames.note_news", "recent.tick"):
             name, method = broken.split(".")
             monkeypatch.setattr(getattr(gateway.gateway, name), method, fail)
         until(lambda: gateway.gateway.failures.get("hub", 0) > 3)
@@ -571,7 +569,7 @@ def test_a_part_that_cannot_begin_is_one_sentence(tmp_path: Path) -> None:
     for how, sentence in (
         (
             "library",
-            r"\[serve.mqtt\]: it needs nosuch, which is not installed: pip install 'multidrop\[broken\]'",
+            r"\[serve.mqtt\]: it needs nosuch, which is not installed: pip install 'multidrop\[mqtt\]'",
         ),
         ("port", r"\[serve.mqtt\]: 127.0.0.1:1502 cannot be had"),
     ):
@@ -588,11 +586,3 @@ def test_a_part_that_cannot_begin_is_one_sentence(tmp_path: Path) -> None:
         "[serve.mqtt]: breaks = 'somehow' is no way to break",
         "[serve.mqtt]: nor would another one be",
     ]
-
-
-def test_a_part_that_this_version_lacks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    missing = Part("multidrop.gateway.nosuch", "Settings", "build", "")
-    monkeypatch.setitem(parts.PARTS, "mqtt", missing)  # type: ignore[arg-type]
-    plant = written(tmp_path, "[serve.mqtt]\n")
-    with pytest.raises(PlantError, match=r"\[serve.mqtt\]: this version of multidrop has no such part"):
-        read_settings(plant, {})

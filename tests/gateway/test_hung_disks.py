@@ -18,11 +18,11 @@ from lines import PATIENCE, until
 
 from multidrop import History
 from multidrop.gateway import gateway as gateway_module
-from multidrop.gateway import historian, reload, settings
+from multidrop.gateway import historian, parts, reload, settings
 from multidrop.gateway.http import page_files
 from multidrop.gateway.http import routes as web
 from multidrop.gateway.http.rights import Right
-from multidrop.gateway.live import live_parts, views
+from multidrop.gateway.live import views
 from multidrop.history import writer as writer_module
 
 SERVE = '[serve]\nlisten = "127.0.0.1:0"\n[serve.may]\nstop = "anyone"\nwrite = ["pump-1.setpoint"]\n'
@@ -43,7 +43,7 @@ SETPOINT = {"drive": "pump-1", "register": "setpoint", "value": 10.0}
 @pytest.fixture(autouse=True)
 def _soon(monkeypatch: pytest.MonkeyPatch) -> None:
     """Wait for no part, and for no end, for longer than needed."""
-    for module, name in ((live_parts, "START_S"), (live_parts, "BUILD_S"), (reload, "QUICK_S")):
+    for module, name in ((parts, "START_S"), (parts, "BUILD_S"), (reload, "QUICK_S")):
         monkeypatch.setattr(module, name, SHORT_S)
     monkeypatch.setattr(historian, "CLOSING_S", SHORT_S)
 

@@ -21,7 +21,7 @@ from multidrop import Batch, Bus, InvtCHE, LineError, Plant, load_plant
 from multidrop.gateway.clock import boottime_ns
 from multidrop.gateway.gateway import Gateway
 from multidrop.gateway.http.rights import Right, new_token
-from multidrop.gateway.live import side_reads
+from multidrop.gateway.live import drive_reads
 from multidrop.gateway.settings import ServeSettings, read_settings
 from multidrop.recording.segments import segments_of
 from multidrop.sim import Simulator, Wire, simulated
@@ -171,7 +171,7 @@ def test_drives_come_and_go_and_a_line_that_is_the_same_goes_on(tmp_path: Path) 
         assert "fan-1" not in later()
         told = gateway.post("/api/stop").json
         assert {name: one["done"] for name, one in told.items()} == {"pump-1": True, "fan-2": True}
-        until(lambda: gateway.gateway.lately.line("roof")["rate"])
+        until(lambda: gateway.gateway.recent.line("roof")["rate"])
         assert gateway.gateway.failures == {}
 
 
@@ -272,7 +272,7 @@ def test_what_was_looked_at_before_a_reload_is_not_shown_after_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The name may be another drive's now, and this one answers no more."""
-    monkeypatch.setattr(side_reads, "PAUSE_S", 0.0)
+    monkeypatch.setattr(drive_reads, "PAUSE_S", 0.0)
     with served(tmp_path, MAY) as gateway:
         gateway.await_state("pump-1", "stands")
 

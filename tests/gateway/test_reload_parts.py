@@ -15,8 +15,8 @@ from lines import PATIENCE, until
 from modbus_gateway import RawClient
 from peers import require_module
 
+from multidrop.gateway import parts as parts_module
 from multidrop.gateway.http.rights import Right
-from multidrop.gateway.live import live_parts
 
 MODBUS = '[serve.modbus]\nlisten = "127.0.0.1:{}"\nunits = {{ pump-1 = {} }}\n'
 STATUS = 0x1001  # CHE100 manual v1.4, p. 117: 3 is "standby"
@@ -96,14 +96,14 @@ def test_a_part_that_fails_in_another_way_changes_nothing(
 ) -> None:
     first = free_port()
     assert reload(gateway, MODBUS.format(first, 21))["done"] is True
-    build, failures = live_parts.build, [MemoryError("no memory")]
+    build, failures = parts_module.build, [MemoryError("no memory")]
 
     def build_or_fail(*arguments: Any) -> Any:
         if failures:
             raise failures.pop()
         return build(*arguments)
 
-    monkeypatch.setattr(live_parts, "build", build_or_fail)
+    monkeypatch.setattr(parts_module, "build", build_or_fail)
     assert reload(gateway, MODBUS.format(free_port(), 22))["mistakes"] == ["no memory"]
     assert parts(gateway) == {"modbus": "ok"}
     until(lambda: status_of(first, 21) == [3])
@@ -145,14 +145,14 @@ def test_a_part_that_takes_its_time_to_open_holds_no_stop_up(
     gateway: Served, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     opens, goes_on = threading.Event(), threading.Event()
-    build = live_parts.build
+    build = parts_module.build
 
     def slow(*given: Any) -> Any:
         opens.set()
         assert goes_on.wait(PATIENCE)
         return build(*given)
 
-    monkeypatch.setattr(live_parts, "build", slow)
+    monkeypatch.setattr(parts_module, "build", slow)
     told: list[Any] = []
     reloading = threading.Thread(target=lambda: told.append(reload(gateway, "[serve.history]\n")))
     reloading.start()

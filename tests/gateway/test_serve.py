@@ -22,7 +22,7 @@ from kills import BoundProcess
 from lines import PATIENCE, until
 
 from multidrop.cli import serve as serve_command
-from multidrop.gateway.http.listener import listen
+from multidrop.gateway.http.connections import listen
 from multidrop.gateway.http.rights import Right, digest, read_tokens
 
 UNITS = sorted((Path(__file__).parents[2] / "packaging").glob("*.service"))

@@ -9,7 +9,7 @@ from gateways import certificate, plant_text, written
 from tables import table
 
 from multidrop import PlantError, load_plant
-from multidrop.gateway.http.listener import listen
+from multidrop.gateway.http.connections import listen
 from multidrop.gateway.http.rights import Right, digest, new_token, read_tokens
 from multidrop.gateway.settings import read_plant, read_settings
 

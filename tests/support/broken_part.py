@@ -7,7 +7,7 @@ from typing import Any, NoReturn
 
 
 @dataclass(frozen=True)
-class BrokenSettings:
+class Settings:
     """Its one key: how it breaks."""
 
     breaks: str = "always"
@@ -36,7 +36,7 @@ class BrokenFeed:
         raise RuntimeError("no figures")
 
 
-def build(settings: BrokenSettings, inside: object) -> BrokenFeed:
+def build(settings: Settings, inside: object) -> BrokenFeed:
     if settings.breaks == "library":
         raise ImportError("No module named 'nosuch'", name="nosuch")
     if settings.breaks == "port":

@@ -23,9 +23,8 @@ from peers import require_module, require_program
 from multidrop import Drive, InvtCHE, Plant, PlantLine, Polled, PolledDrive
 from multidrop.gateway.commands import Told
 from multidrop.gateway.http.rights import Caller, May
-from multidrop.gateway.live.hub import Shown
-from multidrop.gateway.live.kept_rows import Known
-from multidrop.gateway.parts import Inside
+from multidrop.gateway.live.hub import Known, Shown
+from multidrop.gateway.parts import PartContext
 
 PATIENCE_S = 30.0  # for an event that comes at once on an idle machine
 TRIALS = 5
@@ -256,7 +255,7 @@ def inside(folder: Path, fan: Drive = FAN) -> Any:
     plant = Plant((PlantLine("hall", "/dev/null", None, None, drives),), folder / "plant.toml")
     hub: Any = SaidHub(fan.name)
     commands: Any = NotedCommands()
-    return Inside(plant, hub, commands, SimpleNamespace(), folder, "0.2")  # type: ignore[arg-type]
+    return PartContext(plant, hub, commands, SimpleNamespace(), folder, "0.2")  # type: ignore[arg-type]
 
 
 def without_fan(known: Any) -> Plant:

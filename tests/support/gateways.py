@@ -21,16 +21,16 @@ from lines import PATIENCE, until
 
 from multidrop import InvtCHE, Plant, load_plant
 from multidrop.gateway import gateway as gateway_module
-from multidrop.gateway import reload
+from multidrop.gateway import parts, reload
 from multidrop.gateway import settings as settings_module
 from multidrop.gateway.gateway import Gateway
 from multidrop.gateway.http.rights import Right, Token, new_token
-from multidrop.gateway.live import frames, live_parts
+from multidrop.gateway.live import frames
 from multidrop.gateway.settings import ServeSettings, read_plant
 from multidrop.sim import SimulatedDrive, Simulator, Wire, simulated
 
 for module, name in (  # a busy machine is slow, and no disk hangs
-    *((live_parts, "START_S"), (live_parts, "BUILD_S"), (reload, "READ_S")),
+    *((parts, "START_S"), (parts, "BUILD_S"), (reload, "READ_S")),
     *((settings_module, "AUDIT_S"), (gateway_module, "AUDIT_S"), (reload, "AUDIT_S")),
 ):
     setattr(module, name, PATIENCE)

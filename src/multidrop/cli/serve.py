@@ -10,7 +10,7 @@ import threading
 import time
 import webbrowser
 from collections.abc import Callable
-from contextlib import AbstractContextManager, suppress
+from contextlib import AbstractContextManager
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -126,8 +126,8 @@ def _demo_registers() -> list[str]:
 
 
 def _demo_settings(plant: Plant, folder: Path) -> ServeSettings:
+    from multidrop.gateway.historian import HistorySettings
     from multidrop.gateway.http.rights import May, Right
-    from multidrop.gateway.parts import PARTS, settings_class
     from multidrop.gateway.settings import ServeSettings
 
     drives = [polled.drive for line in plant.lines for polled in line.drives]
@@ -136,9 +136,7 @@ def _demo_settings(plant: Plant, folder: Path) -> ServeSettings:
     ]
     verbs = [f"{one.name}.{verb}" for one in drives for verb in verbs_of(one)]
     may = May("anyone", Right.WRITE, frozenset(writes), frozenset(verbs))
-    parts: dict[str, object] = {}
-    with suppress(ValueError):  # this build has no history
-        parts["history"] = settings_class(PARTS["history"])()
+    parts = {"history": HistorySettings()}
     audit = folder / "audit.jsonl"
     alarms = folder / "alarms.jsonl"
     return ServeSettings(

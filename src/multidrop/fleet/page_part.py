@@ -47,6 +47,9 @@ class FleetSettings:
             raise ValueError("\n".join(wrong))
 
 
+Settings = FleetSettings
+
+
 class FleetPart:
     """A part that looks at a fleet once a second.
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from multidrop.control import read_audit
-from multidrop.gateway.http.guard import Denied
+from multidrop.gateway.http.messages import Denied
 
 MOST_RECORDS = 200  # of an answer
 

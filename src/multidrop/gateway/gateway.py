@@ -21,22 +21,19 @@ from multidrop import Batch, Bus, LineError, Plant, Poller
 from multidrop.control import Ledger
 from multidrop.gateway.clock import boottime_ns, now_and_slept_ns, utc_ms
 from multidrop.gateway.commands import Commands
-from multidrop.gateway.http.connections import Connections, Watched, WatchedProtocol
+from multidrop.gateway.http.connections import BACKLOG, Connections, Watched, WatchedProtocol, listen
 from multidrop.gateway.http.guard import MOST_HEAD
-from multidrop.gateway.http.identities import Identities
-from multidrop.gateway.http.listener import BACKLOG, listen
 from multidrop.gateway.http.rights import OwnNames, Tokens
 from multidrop.gateway.http.routes import make_app
 from multidrop.gateway.live.alarm_file import AlarmFile
-from multidrop.gateway.live.events import Alarm, Events
-from multidrop.gateway.live.frames import Frames, frame_of, lost_of
+from multidrop.gateway.live.alarms import Alarm, Alarms
+from multidrop.gateway.live.drive_reads import Identities, SideReads
+from multidrop.gateway.live.frames import Frames, SeenFrames, frame_of, lost_of
 from multidrop.gateway.live.hub import SILENT, Hub
-from multidrop.gateway.live.live_parts import LiveParts
 from multidrop.gateway.live.newcomers import Newcomers
-from multidrop.gateway.live.recent import Lately
-from multidrop.gateway.live.seen_frames import SeenFrames
-from multidrop.gateway.live.side_reads import SideReads
+from multidrop.gateway.live.recent_statistics import RecentStatistics
 from multidrop.gateway.live.views import troubles_of
+from multidrop.gateway.parts import LiveParts, PartContext
 from multidrop.gateway.reload import ADOPTION_S, Read, Reload
 from multidrop.gateway.sd_notify import Notifier
 from multidrop.gateway.settings import AUDIT_S, ServeSettings, check_writable
@@ -92,10 +89,10 @@ class Gateway:
         self.tokens = Tokens(settings.tokens)
         self.hub = Hub(plant, now_and_slept_ns)
         self.newcomers = Newcomers()
-        self.events = Events(utc_ms(), self._note_alarm)
+        self.alarms = Alarms(utc_ms(), self._note_alarm)
         self.alarm_file = AlarmFile(settings.alarms) if settings.alarms else None
         self._is_restored = self.alarm_file is None
-        self.lately = Lately(plant)
+        self.recent = RecentStatistics(plant)
         self.notifier = Notifier()
         self.reload = Reload(self, read)
         self.commands = Commands(self, settings.may, lambda drive: self.hub.note_reset(drive))
@@ -270,12 +267,12 @@ class Gateway:
         now = utc_ms()
         for name in self.hub.drives:
             stops = None if self.hub.is_set_to_zero(name) else self.commands.halts(name)
-            self.events.look(now, name, self.hub.seen(name), stops)
+            self.alarms.look(now, name, self.hub.seen(name), stops)
         for line in self.plant.lines:
             lost = lost_of(self.hub, line.name)
-            self.events.look_at_line(now, line.name, lost)
+            self.alarms.look_at_line(now, line.name, lost)
             if lost is None and any(self.hub.seen_at(polled.drive.name) for polled in line.drives):
-                self.events.note_there(line.name)
+                self.alarms.note_there(line.name)
             if lost is None and self.hub.taken:
                 self.hub.unopened.pop(line.name, None)  # should it go again, that has another reason
 
@@ -286,7 +283,7 @@ class Gateway:
             return False
         if past is not None:
             names = [line.name for line in self.plant.lines]
-            self.events.restore(past, utc_ms(), {*names, *self.hub.drives})
+            self.alarms.restore(past, utc_ms(), {*names, *self.hub.drives})
             self._is_restored = True
         return True
 
@@ -305,7 +302,7 @@ class Gateway:
 
     def forget(self, name: str) -> None:
         """End the alarms of a drive or a line that is no longer there."""
-        self.events.forget(name, utc_ms())
+        self.alarms.forget(name, utc_ms())
 
     def guarded(self, name: str, work: Callable[..., object], *arguments: object) -> None:
         try:
@@ -337,7 +334,7 @@ class Gateway:
             await asyncio.sleep(every)
 
     def _read_statistics(self, poller: Poller) -> None:
-        self.lately.tick(self.clock(), utc_ms(), poller.statistics())
+        self.recent.tick(self.clock(), utc_ms(), poller.statistics())
         self.hub.unopened |= {line: why for line, bus in poller.buses.items() if (why := bus.why_lost)}
 
     def note_unopened(self, failures: Mapping[str, LineError]) -> None:
@@ -385,11 +382,16 @@ class Gateway:
             return [data[bit // 8] >> bit % 8 & 1 for bit in range(count)]
         return list(struct.unpack(f">{count}H", data))
 
+    def part_context(self, plant: Plant) -> PartContext:
+        """Return the objects that parts built for this plant may use."""
+        folder, page = self.settings.folder, self.settings.page
+        return PartContext(plant, self.hub, self.commands, self.ask, folder, self.version, page)
+
     def _frame(self, n: int) -> dict[str, Any]:
         self.seen_frames.note(n)
         stops = self.commands.stops
         frame = frame_of(
-            self.hub, self.events, self.lately, stops, n=n, revision=self.revision, time_ns=time.time_ns()
+            self.hub, self.alarms, self.recent, stops, n=n, revision=self.revision, time_ns=time.time_ns()
         )
         return frame | {"troubles": troubles_of(self)}
 

@@ -13,11 +13,12 @@ from math import isfinite
 from pathlib import Path
 from shutil import rmtree
 from tempfile import TemporaryDirectory
-from typing import Any, Protocol
+from typing import Any
 
 from multidrop import Batch, History, Plant
 from multidrop.exposition import MetricFamily
 from multidrop.gateway.metrics import counter
+from multidrop.gateway.parts import PartContext
 from multidrop.history import Buckets, HistoryState, HistoryWriter
 from multidrop.recording import parse_age, parse_size
 from multidrop.supervisor import supervisor
@@ -52,25 +53,19 @@ class HistorySettings:
             raise ValueError("\n".join(mistakes))
 
 
-class Surroundings(Protocol):
-    """The part of the gateway that the historian needs."""
-
-    @property
-    def plant(self) -> Plant: ...
-    @property
-    def folder(self) -> Path: ...
+Settings = HistorySettings
 
 
-def build(settings: HistorySettings, inside: Surroundings) -> Historian:
+def build(settings: HistorySettings, context: PartContext) -> Historian:
     """Return the historian of a gateway; a relative folder is beside its plant file.
 
     DuckDB is loaded here, before polling begins, and not while the first viewer waits.
     """
     with suppress(ImportError):
         import_module("duckdb")
-    folder = inside.folder / settings.folder
+    folder = context.folder / settings.folder
     try:
-        return Historian(inside.plant, folder, settings)
+        return Historian(context.plant, folder, settings)
     except OSError as failure:
         if failure.filename is None:  # it is a sentence
             raise

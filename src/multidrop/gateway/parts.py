@@ -1,11 +1,15 @@
-"""Parts: what may be plugged into the gateway, by the name of its table in `[serve]`.
+"""The four optional parts of the gateway: fleet view, history, Modbus server and MQTT.
 
-A part is fed with every batch, and may die alone: what it raises is counted and logged, and the others go on.
+Each has a table in `[serve]` and is fed with every batch. If one fails, the failure is counted and logged,
+and the others continue.
 """
 
 from __future__ import annotations
 
-from collections.abc import Awaitable, Callable, Mapping
+import asyncio
+import logging
+from collections.abc import Awaitable, Callable, Mapping, Sequence
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
@@ -13,78 +17,237 @@ from typing import Any, NamedTuple, Protocol
 from multidrop import Batch, Plant
 from multidrop.gateway.commands import Commands
 from multidrop.gateway.live.hub import Hub
+from multidrop.supervisor import supervisor
 
+START_S = 2.0  # how long a start waits for parts whose files do not answer
+BUILD_S = 5.0  # how long a reload waits for them
+END_S = 3.0  # time limit for closing a part
 
-class Part(NamedTuple):
-    """A module, with the names in it: of the gateway, or of another client of the library."""
-
-    module: str
-    settings: str  # a frozen dataclass: the keys of its table, with their defaults
-    build: str  # a function of the settings and of Inside, which returns a Feed
-    extra: str  # that installs what it needs; "": nothing
-
-
-PARTS: Mapping[str, Part] = {
-    "fleet": Part("multidrop.fleet.page_part", "FleetSettings", "build", "fleet"),
-    "history": Part("multidrop.gateway.historian", "HistorySettings", "build", "history"),
-    "modbus": Part("multidrop.gateway.modbus_server.server", "ModbusSettings", "build", ""),
-    "mqtt": Part("multidrop.gateway.mqtt.part", "MqttSettings", "build", "mqtt"),
+# Module of each part, imported when its table is used. It has `Settings`, a frozen dataclass of the table's
+# keys and their defaults, and `build`, which takes these settings and PartContext and returns a Part.
+PARTS: Mapping[str, str] = {
+    "fleet": "multidrop.fleet.page_part",
+    "history": "multidrop.gateway.historian",
+    "modbus": "multidrop.gateway.modbus_server.server",
+    "mqtt": "multidrop.gateway.mqtt.part",
 }
 
-# Registers past the table of a drive, by name: function, first address, number, and seconds it may wait.
+# Reads registers that need not be in the drive's table: drive, function, first address, count, expiry in s.
 Ask = Callable[[str, int, int, int, float], Awaitable[list[int]]]
 
+_log = logging.getLogger("multidrop.gateway")
 
-class Inside(NamedTuple):
-    """The gateway, as its parts see it."""
+
+class PartContext(NamedTuple):
+    """The objects of the gateway that a part may use."""
 
     plant: Plant
     hub: Hub
     commands: Commands
     ask: Ask
-    folder: Path  # for what is kept: relative paths of settings are relative to it
+    folder: Path  # base of relative paths in the settings
     version: str
-    page: str = ""  # the address of the gateway's page; "": other machines have none
+    page: str = ""  # address of the gateway's page; "": other machines cannot reach it
 
 
-class Feed(Protocol):
+class Part(Protocol):
     """A part that was built.
 
-    It may have `adopt(plant)`, which is told of another plant once the hub has it, `health()`, which says
-    what is not well, and `figures()`, a list of families for the metrics.
+    Three more methods are optional: `adopt(plant)` is called after a reload, `health()` returns a problem or
+    "", and `figures()` returns metric families.
     """
 
     def take(self, batch: Batch) -> None:
-        """Take rows, in the loop, within 1 ms."""
+        """Take rows. Called in the loop; must return within 1 ms."""
 
     async def run(self) -> None:
-        """Live, until cancelled."""
+        """Run until cancelled."""
 
     async def close(self) -> None:
-        """End in good order, after the last batch."""
+        """Finish after the last batch."""
 
 
-def settings_class(part: Part) -> Any:
-    """Return the dataclass of a part's settings. Raises ValueError where this build has no such part."""
-    return getattr(_module(part), part.settings)
+class PartHost(Protocol):
+    """The methods of the gateway that LiveParts uses."""
+
+    plant: Plant
+
+    def part_context(self, plant: Plant) -> PartContext: ...
+    def guarded(self, name: str, work: Callable[..., object], *arguments: object) -> None: ...
+    def count_failure(self, name: str) -> None: ...
 
 
-def build(part: Part, settings: object, inside: Inside) -> Feed:
-    """Return the part. Raises ValueError, with the extra to install, where a library is missing."""
-    make = getattr(_module(part), part.build)
+def build(name: str, settings: object, context: PartContext) -> Part:
+    """Return the part of this table. Raises ValueError if a library is missing, with the extra to install."""
     try:
-        feed: Feed = make(settings, inside)
+        part: Part = import_module(PARTS[name]).build(settings, context)
     except ImportError as missing:
-        name = missing.name or str(missing)
-        extra = f"pip install 'multidrop[{part.extra}]'" if part.extra else f"install {name}"
-        raise ValueError(f"it needs {name}, which is not installed: {extra}") from missing
-    return feed
+        library = missing.name or str(missing)
+        raise ValueError(
+            f"it needs {library}, which is not installed: pip install 'multidrop[{name}]'"
+        ) from missing
+    return part
 
 
-def _module(part: Part) -> Any:
-    try:
-        return import_module(part.module)
-    except ModuleNotFoundError as missing:
-        if missing.name != part.module:
+class Building(NamedTuple):
+    """A part under construction in a thread: its files may be on a disk that does not answer."""
+
+    settings: Any
+    plant: Plant
+    part: asyncio.Future[Part]
+
+
+class Replacement(NamedTuple):
+    """Parts that were built but not started, and the settings of the parts that they replace."""
+
+    built: dict[str, Building]
+    before: Mapping[str, Any]
+
+
+class LiveParts:
+    """The running parts by table name, in `feeds`.
+
+    A part whose files do not answer delays nothing: it stays in `pending` until it is built.
+    """
+
+    def __init__(self, host: PartHost) -> None:
+        self.feeds: dict[str, Part] = {}
+        self.dead: dict[str, str] = {}  # parts that could not start, and why
+        self.pending: dict[str, Building] = {}
+        self._host = host
+        self._settings: dict[str, Any] = {}
+        self._built: dict[str, Building] = {}  # not started yet
+
+    async def build(self, wanted: Mapping[str, Any]) -> dict[str, Building]:
+        """Build the parts of a starting gateway. Raises ValueError if one cannot be opened."""
+        self._built = await self._build(wanted, self._host.plant, START_S)
+        return self._built
+
+    def take_up(self, built: Mapping[str, Building]) -> None:
+        """Start these parts; the plant they were built for is in effect now."""
+        self._built = {}
+        for name, building in built.items():
+            self._settings[name] = building.settings
+            self.dead.pop(name, None)
+            if building.part.done():
+                self._start(name, building.part.result())
+            else:
+                _log.warning("%s is not ready: it starts when its files answer", name)
+                self.pending[name] = building
+                supervisor().start(f"{name} pending", self._start_when_built(name, building))
+
+    async def close(self, seconds: float) -> None:
+        """Close all parts together within `seconds`, after the last batch."""
+        await _discard(self._built)
+        await self._drop([*self._settings], seconds)
+
+    # ---- reload ----
+
+    async def replace(self, wanted: Mapping[str, Any], plant: Plant) -> Replacement:
+        """Close the parts whose tables changed or are gone, and build the new ones.
+
+        Raises ValueError if one cannot be opened; the previous parts run again then.
+        """
+        before = {name: one for name, one in self._settings.items() if wanted.get(name) != one}
+        await self._drop([*before], END_S)
+        new = {name: settings for name, settings in wanted.items() if name not in self._settings}
+        try:
+            return Replacement(await self._build(new, plant), before)
+        except Exception:
+            await self.take_back(Replacement({}, before))
             raise
-        raise ValueError("this version of multidrop has no such part; leave the table out") from None
+
+    async def take_back(self, replacement: Replacement) -> None:
+        """Discard the new parts and start the previous ones again."""
+        await _discard(replacement.built)
+        for name, settings in replacement.before.items():
+            try:
+                self.take_up(await self._build({name: settings}, self._host.plant))
+            except Exception as failure:  # another program may have taken its port
+                self.dead[name] = str(failure)
+                _log.error("%s did not start again: %s", name, failure)
+
+    # ---- one part ----
+
+    async def _build(
+        self, wanted: Mapping[str, Any], plant: Plant, seconds: float = BUILD_S
+    ) -> dict[str, Building]:
+        """Build parts concurrently, waiting up to `seconds`. Raises ValueError if one cannot be opened."""
+        context, threads = self._host.part_context(plant), supervisor()
+        built = {
+            name: Building(
+                settings, plant, threads.thread(name, BUILD_S, partial(build, name, settings, context))
+            )
+            for name, settings in wanted.items()
+        }
+        try:
+            if built:
+                await asyncio.wait([one.part for one in built.values()], timeout=seconds)
+        except asyncio.CancelledError:
+            await _discard(built)
+            raise
+        for name, building in built.items():
+            failure = building.part.exception() if building.part.done() else None
+            if failure is not None:
+                await _discard(built)
+                if isinstance(failure, (ValueError, OSError)):
+                    raise ValueError(f"[serve.{name}]: {failure}") from failure
+                raise failure
+        return built
+
+    async def _start_when_built(self, name: str, building: Building) -> None:
+        """Start a part when its files have answered, unless it was dropped meanwhile."""
+        await asyncio.wait([building.part])
+        if self.pending.get(name) is not building:
+            return
+        del self.pending[name]
+        failure = building.part.exception()
+        if failure is None:
+            part: Any = building.part.result()
+            if building.plant is not self._host.plant and hasattr(part, "adopt"):
+                self._host.guarded(name, part.adopt, self._host.plant)
+            self._start(name, part)
+            return
+        self.dead[name] = str(failure)
+        _log.error("%s does not start: %s", name, failure)
+
+    def _start(self, name: str, part: Part) -> None:
+        self.feeds[name] = part
+        supervisor().keep(name, self._run(name, part))
+
+    async def _run(self, name: str, part: Part) -> None:
+        try:
+            await part.run()
+        except Exception:
+            self._host.count_failure(name)
+            raise
+
+    async def _drop(self, names: Sequence[str], seconds: float) -> None:
+        """Close parts concurrently."""
+        for name in names:
+            del self._settings[name]
+            self.dead.pop(name, None)
+        await _discard({name: self.pending.pop(name) for name in names if name in self.pending})
+        parts = {name: self.feeds.pop(name) for name in names if name in self.feeds}
+        await supervisor().release(*names)
+        await asyncio.gather(*(_close(name, part, seconds) for name, part in parts.items()))
+
+
+async def _discard(built: Mapping[str, Building]) -> None:
+    """Close parts that were not started, each when it is built; wait only for those built already."""
+    closing = [supervisor().start(f"{name} closing", _close_built(name, one)) for name, one in built.items()]
+    ready = [task for task, one in zip(closing, built.values(), strict=True) if one.part.done()]
+    await asyncio.gather(*ready)
+
+
+async def _close_built(name: str, building: Building) -> None:
+    await asyncio.wait([building.part])
+    if building.part.exception() is None:
+        await _close(name, building.part.result(), END_S)
+
+
+async def _close(name: str, part: Part, seconds: float) -> None:
+    try:
+        await asyncio.wait_for(part.close(), seconds)
+    except Exception:  # the others are closed nevertheless
+        _log.exception("closing %s failed", name)

@@ -157,7 +157,7 @@ class Reload:
         self._take_up_rights(settings)
         gateway.side_reads.begin_anew()
         gateway.guarded("hub", gateway.hub.adopt, plant, planned)
-        gateway.guarded("statistics", gateway.lately.adopt, plant, planned)
+        gateway.guarded("statistics", gateway.recent.adopt, plant, planned)
         for name, feed in gateway.feeds.items():
             if hasattr(feed, "adopt"):
                 gateway.guarded(name, feed.adopt, plant)

@@ -10,12 +10,13 @@ from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import MISSING, Field, dataclass, field, fields
 from functools import partial
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 from multidrop import Plant, PlantError
 from multidrop.gateway.http.rights import May, Right, Token, is_loopback, read_tokens
-from multidrop.gateway.parts import PARTS, Part, settings_class
+from multidrop.gateway.parts import PARTS
 from multidrop.plant import MAY_LISTS, check_listed
 from multidrop.supervisor import Hung, in_time
 from multidrop.toml_check import Key, TomlPlace
@@ -141,7 +142,7 @@ def read_settings(plant: Plant, environment: Mapping[str, str]) -> ServeSettings
     audit = folders.state / given.get("audit", "audit.jsonl")
     place.attempt(_check_audit, audit)
     parts = {
-        name: _part(PARTS[name], given[name], plant, place.of_file(plant.path, f"[serve.{name}]"))
+        name: _part(name, given[name], plant, place.of_file(plant.path, f"[serve.{name}]"))
         for name in PARTS
         if name in given
     }
@@ -227,11 +228,9 @@ def _may(table: Any, look: str, plant: Plant, place: TomlPlace) -> May:
     return May(given.get("look", look), on_loopback, listed["write"], listed["verbs"])
 
 
-def _part(part: Part, table: Mapping[str, Any], plant: Plant, place: TomlPlace) -> Any:
-    """Return a part's settings: its keys, and the types of their defaults."""
-    made = place.attempt(settings_class, part)
-    if made is None:
-        return None
+def _part(name: str, table: Mapping[str, Any], plant: Plant, place: TomlPlace) -> Any:
+    """Return a part's settings; keys and types are those of its dataclass. None after a mistake."""
+    made = import_module(PARTS[name]).Settings
     defaults = {one.name: _default(one) for one in fields(made) if one.init}
     keys = {name: _key_of(name, default) for name, default in defaults.items()}
     before = len(place.config_errors)

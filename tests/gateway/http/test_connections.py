@@ -23,10 +23,11 @@ from gateways import certificate, get, served, serving, simulated_plant
 from lines import PATIENCE, until
 
 from multidrop.gateway import gateway as gateway_module
-from multidrop.gateway.http import connections, request_fields
+from multidrop.gateway.http import connections, messages
 from multidrop.gateway.http import routes as web
 from multidrop.gateway.http.connections import (
     AGAIN_S,
+    BACKLOG,
     FIRST_S,
     FRESH_S,
     MOST_OPEN,
@@ -35,7 +36,6 @@ from multidrop.gateway.http.connections import (
     Turns,
 )
 from multidrop.gateway.http.guard import MOST_HEAD
-from multidrop.gateway.http.listener import BACKLOG
 from multidrop.gateway.http.rights import digest
 
 HEAD = b"POST /api/act HTTP/1.1\r\nhost: localhost\r\ncontent-type: application/json\r\n"
@@ -90,7 +90,7 @@ def test_a_stop_gets_in_beside_500_slow_clients(tmp_path: Path, sent: bytes, way
 
 
 def test_a_slow_body_is_ended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(request_fields, "BODY_S", 0.1)
+    monkeypatch.setattr(messages, "BODY_S", 0.1)
     with (
         served(tmp_path, '[serve.may]\nstop = "anyone"\n') as gateway,
         socket.create_connection(("127.0.0.1", gateway.gateway.port), PATIENCE) as client,

@@ -17,7 +17,7 @@ from multidrop import NoReply
 from multidrop.control.eeprom_ledger import LedgerCell
 from multidrop.families import ErmanERG220, InvtCHE
 from multidrop.gateway.http.rights import May
-from multidrop.gateway.live import side_reads
+from multidrop.gateway.live import drive_reads
 from multidrop.gateway.live.descriptions import describe
 from multidrop.gateway.live.hub import Hub
 
@@ -129,8 +129,8 @@ def test_a_fault_is_told_in_the_drives_words(gateway: Served) -> None:
 def test_one_drive_shows_what_is_not_polled_while_somebody_looks(
     gateway: Served, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(side_reads, "PAUSE_S", 0.0)
-    monkeypatch.setattr(side_reads, "SHARE", 0)
+    monkeypatch.setattr(drive_reads, "PAUSE_S", 0.0)
+    monkeypatch.setattr(drive_reads, "SHARE", 0)
     gateway.sims["pump-1"]["dc_bus_voltage"] = 537.0
 
     def looked() -> dict[str, list[object]]:
@@ -143,8 +143,8 @@ def test_one_drive_shows_what_is_not_polled_while_somebody_looks(
     asked = gateway.get("/api/drive/pump-1").json
     assert asked["asked"] > 0
     assert sum(count for _, count in asked["delays"]["counts"]) == asked["delays"]["replies"]
-    monkeypatch.setattr(side_reads, "LOOKED_S", -1.0)
-    until(lambda: not gateway.gateway.side_reads.under_way)
+    monkeypatch.setattr(drive_reads, "LOOKED_S", -1.0)
+    until(lambda: not gateway.gateway.drive_reads.under_way)
 
 
 @pytest.mark.long
@@ -155,7 +155,7 @@ def test_a_silent_drive_is_not_read_by_those_who_look(gateway: Served) -> None:
     asked: list[object] = []
     bus = gateway.gateway.bus("hall")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(side_reads, "PAUSE_S", 0.0)
+        patch.setattr(drive_reads, "PAUSE_S", 0.0)
         patch.setattr(bus, "read", lambda *arguments: asked.append(arguments))
         for _ in range(20):
             assert gateway.get("/api/drive/pump-2").json["values"] == {}
@@ -175,10 +175,10 @@ def test_lines_show_what_each_drive_costs(gateway: Served) -> None:
 @pytest.mark.long
 def test_a_silent_drives_misses_are_a_share_of_its_values(gateway: Served) -> None:
     """They were set against its requests, of which each brings several values, and a silent drive has few."""
-    lately = gateway.gateway.lately
+    recent = gateway.gateway.recent
 
     def came() -> int:
-        statistics = lately.drive("hall", "pump-2")
+        statistics = recent.drive("hall", "pump-2")
         return statistics.samples if statistics else 0
 
     def missed() -> int:

@@ -16,7 +16,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from multidrop.gateway.gateway import Gateway
-from multidrop.gateway.http.frame_route import FrameRoute
+from multidrop.gateway.http.routes import FrameRoute
 from multidrop.gateway.live import frames as module
 from multidrop.gateway.live.frames import REMEMBERED, WHOLE, Encoded, Frames, changes
 from multidrop.gateway.settings import ServeSettings

@@ -13,10 +13,10 @@ from hypothesis import strategies as st
 
 from multidrop import load_plant
 from multidrop.core import Columns, Field, Names, NumberFormat, RowLayout, Status
-from multidrop.gateway.live.events import Events
+from multidrop.gateway.live.alarms import Alarms
 from multidrop.gateway.live.frames import frame_of, lost_of
 from multidrop.gateway.live.hub import INCOMPLETE, LEAST_SLEEP_NS, NOT_ASKED, Hub, Newest, Shown
-from multidrop.gateway.live.recent import Lately
+from multidrop.gateway.live.recent_statistics import RecentStatistics
 from multidrop.gateway.mqtt.settings import fresh_values
 from multidrop.polling.batch import Batch
 
@@ -286,7 +286,7 @@ SHOWN = st.sampled_from(
 @given(st.lists(SHOWN, max_size=30))
 def test_alarms_begin_and_end_once(shown: list[Shown]) -> None:
     """Compared with a plain reading of the rules, one state after another."""
-    events = Events()
+    events = Alarms()
     fault: str | None = None
     silent = False
     for time, one in enumerate(shown):
@@ -310,7 +310,7 @@ def test_a_fault_lasts_while_only_some_of_its_drive_is_known(
     hub: Hub, clock: HubClock, status: int, is_over: bool
 ) -> None:
     """A busy line misses its status for a second, and reads its current: nobody saw the fault go."""
-    events = Events()
+    events = Alarms()
 
     def look() -> list[tuple[int, int | None]]:
         events.look(clock.now_ns // PERIOD, "pump-1", hub.seen("pump-1"))
@@ -328,14 +328,14 @@ def test_a_fault_lasts_while_only_some_of_its_drive_is_known(
 
 
 def test_a_fault_that_gets_its_name_goes_on() -> None:
-    events = Events()
+    events = Alarms()
     for time, words in enumerate(("it shows a fault", "overcurrent", "it shows a fault"), 1):
         events.look(time, "pump-1", Shown("fault", words))
     assert [(one.time, one.text, one.ended) for one in events.shown()] == [(1, "overcurrent", None)]
 
 
 def test_ended_alarms_are_bounded() -> None:
-    events = Events(since=7)
+    events = Alarms(since=7)
     for time in range(4000):
         events.look(time, "pump-1", Shown("fault", "a") if time % 2 else Shown("runs", None))
         assert time > 100 or events.since == 7
@@ -353,7 +353,9 @@ def test_a_frame_gives_no_value_that_is_overdue_or_was_missed_since(hub: Hub, cl
         (25, [None, "overdue", 25.0], [None, "no reply", 12.0]),
     ):
         clock.now_ns = now * PERIOD
-        frame = frame_of(hub, Events(), Lately(hub.plant), {}, n=1, revision=1, time_ns=UTC_0 + clock.now_ns)
+        frame = frame_of(
+            hub, Alarms(), RecentStatistics(hub.plant), {}, n=1, revision=1, time_ns=UTC_0 + clock.now_ns
+        )
         told = frame["drives"]["pump-1"]["values"]
         assert [*told["output_frequency"][:1], *told["output_frequency"][2:4]] == frequency
         assert [*told["output_current"][:1], *told["output_current"][2:4]] == current
@@ -373,8 +375,8 @@ def test_an_age_is_right_though_a_clock_was_set_back_or_slept(hub: Hub, clock: H
         ("the machine slept", asked_ns + hour_ns, 60 * PERIOD, 3_600_000),
     ):
         clock.now_ns = now_ns
-        lately = Lately(hub.plant)
-        frame = frame_of(hub, Events(), lately, {}, n=1, revision=1, time_ns=utc_ns)
+        recent = RecentStatistics(hub.plant)
+        frame = frame_of(hub, Alarms(), recent, {}, n=1, revision=1, time_ns=utc_ns)
         pump = frame["drives"]["pump-1"]
         now, missed, status, last, then = pump["values"]["output_frequency"]
         assert (now, status, last) == (None, "no reply", 25.0), told

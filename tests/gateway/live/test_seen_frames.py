@@ -23,7 +23,7 @@ from multidrop.gateway import commands as commands_module
 from multidrop.gateway.clock import boottime_ns
 from multidrop.gateway.commands import Told
 from multidrop.gateway.http.rights import Right
-from multidrop.gateway.live.seen_frames import (
+from multidrop.gateway.live.frames import (
     ANOTHER_PLANT,
     DOUBLED,
     MOST_AGE_NS,

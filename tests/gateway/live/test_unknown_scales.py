@@ -13,8 +13,7 @@ from multidrop.core import NumberFormat
 from multidrop.families import MODELS, DelixiModbus, InvtCHE
 from multidrop.gateway.http.rights import May
 from multidrop.gateway.live.descriptions import describe
-from multidrop.gateway.live.hub import Hub, Newest
-from multidrop.gateway.live.kept_rows import Known
+from multidrop.gateway.live.hub import Hub, Known, Newest
 from multidrop.gateway.metrics import Figures, families_of
 from multidrop.gateway.modbus_server.common_block import CURRENT, FREQUENCY, NO_NUMBER, SETPOINT, CommonBlock
 from multidrop.gateway.mqtt.home_assistant import discovery

@@ -17,7 +17,7 @@ from multidrop.families import InvtCHE
 from multidrop.gateway.commands import Told
 from multidrop.gateway.modbus_server import clients as modbus_clients
 from multidrop.gateway.modbus_server.clients import ModbusClient, ModbusPort
-from multidrop.gateway.modbus_server.mbap import MbapRequest, take_request
+from multidrop.gateway.modbus_server.protocol import MbapRequest, take_request
 from multidrop.gateway.modbus_server.settings import ModbusSettings
 
 UNREAD = 150_000  # requests whose answers are more than the sockets of both sides hold

@@ -11,9 +11,9 @@ import pytest
 from multidrop import load_plant
 from multidrop.gateway.modbus_server import clients as modbus_clients
 from multidrop.gateway.modbus_server import common_block
-from multidrop.gateway.modbus_server.codes import ModbusCode
+from multidrop.gateway.modbus_server import line_share as passing
+from multidrop.gateway.modbus_server.protocol import ModbusCode
 from multidrop.gateway.modbus_server.settings import ModbusSettings
-from multidrop.gateway.mqtt import throttle as passing
 from multidrop.gateway.settings import read_settings
 
 DOCS = Path(__file__).parents[3] / "docs"

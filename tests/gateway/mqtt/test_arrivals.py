@@ -8,8 +8,7 @@ from typing import Any
 import pytest
 from peers import require_module
 
-from multidrop.gateway.mqtt.broker import Broker, Login, parse_broker
-from multidrop.gateway.mqtt.outbox import Publication
+from multidrop.gateway.mqtt.broker import Broker, Login, Publication, parse_broker
 
 
 class Silent:

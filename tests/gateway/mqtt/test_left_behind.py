@@ -14,8 +14,9 @@ from peers import require_module
 from tables import table
 
 from multidrop.gateway.mqtt.home_assistant import discovery_topic
-from multidrop.gateway.mqtt.part import MqttSettings, build
-from multidrop.gateway.mqtt.retained_topics import MOST_DISCOVERY, MOST_KEPT, LeftBehind
+from multidrop.gateway.mqtt.json_topics import MOST_DISCOVERY, MOST_KEPT, LeftBehind
+from multidrop.gateway.mqtt.part import build
+from multidrop.gateway.mqtt.settings import MqttSettings
 
 GATEWAY = "works/gateway", b"offline"
 THERE = {"pump-1"}

@@ -37,10 +37,11 @@ from multidrop.drive.declare import reading, setting
 from multidrop.families import MODELS
 from multidrop.gateway.clock import boottime_ns
 from multidrop.gateway.commands import Told
+from multidrop.gateway.mqtt.broker import MOST_UNDER_WAY
 from multidrop.gateway.mqtt.home_assistant import discovery, discovery_topic
 from multidrop.gateway.mqtt.json_topics import JsonTopics
-from multidrop.gateway.mqtt.outbox import MOST_UNDER_WAY
-from multidrop.gateway.mqtt.part import MqttSettings, build
+from multidrop.gateway.mqtt.part import build
+from multidrop.gateway.mqtt.settings import MqttSettings
 from multidrop.plant import RESERVED_NAMES
 
 Start = Callable[..., tuple[Any, Running]]

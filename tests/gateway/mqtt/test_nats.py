@@ -15,7 +15,8 @@ from nats_clusters import old_server_program, server_program
 from peers import require_module
 from sparkplug_host import ROOT, Host, command
 
-from multidrop.gateway.mqtt.part import MqttSettings, build
+from multidrop.gateway.mqtt.part import build
+from multidrop.gateway.mqtt.settings import MqttSettings
 
 Start = Callable[..., tuple[Any, Running]]
 

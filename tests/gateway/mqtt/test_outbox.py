@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from multidrop.gateway.mqtt.outbox import MOST_UNDER_WAY, MOST_WAITING, Outbox, Publication
+from multidrop.gateway.mqtt.broker import MOST_UNDER_WAY, MOST_WAITING, Outbox, Publication
 
 
 class Wire:

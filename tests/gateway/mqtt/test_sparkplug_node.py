@@ -15,8 +15,9 @@ from profile_families import VfdEl
 from sparkplug_host import ROOT, Host, command
 
 from multidrop import DelixiModbus, Drive, InvtCHE
-from multidrop.gateway.mqtt.outbox import Outbox, Publication
-from multidrop.gateway.mqtt.part import MqttSettings, build
+from multidrop.gateway.mqtt.broker import Outbox, Publication
+from multidrop.gateway.mqtt.part import build
+from multidrop.gateway.mqtt.settings import MqttSettings
 from multidrop.gateway.mqtt.sparkplug import DataType, Metric, payload, read_command
 from multidrop.gateway.mqtt.sparkplug_node import STOP, SparkplugNode
 

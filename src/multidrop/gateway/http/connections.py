@@ -8,6 +8,7 @@ those that may stop a drive come first.
 from __future__ import annotations
 
 import asyncio
+import errno
 import socket
 from collections import deque
 from collections.abc import Callable
@@ -18,7 +19,7 @@ from typing import Any
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
-from multidrop.gateway.http.json_response import JsonResponse
+from multidrop.gateway.http.messages import JsonResponse
 
 MOST_OPEN = 256  # a process has 1024 descriptors as a rule, and lines and files need some
 FIRST_S = 10.0  # for a TLS handshake and the whole first request
@@ -258,3 +259,34 @@ class Watched:
                 await JsonResponse({"error": ENDS}, 503)(scope, receive, send)
         finally:
             self._connections.finish(client)
+
+
+BACKLOG = 64  # connections that wait, and that are taken at once: their descriptors are not bounded yet
+
+_WHY = {
+    errno.EADDRINUSE: "another program listens there",
+    errno.EACCES: "this user may not",
+    errno.EADDRNOTAVAIL: "it is no address of this machine",
+}
+
+
+def listen(host: str, port: int) -> CountingSocket:
+    """Return a listening socket. Raises OSError with a sentence where the port cannot be had."""
+    try:
+        family, _, _, _, address = socket.getaddrinfo(
+            host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
+        )[0]
+    except socket.gaierror as failure:
+        raise OSError(f"listen: {host} is no address of this machine: {failure.strerror}") from failure
+    # With its protocol named asyncio sets TCP_NODELAY: else each frame waits 40 ms.
+    listener = CountingSocket(family, socket.SOCK_STREAM, socket.IPPROTO_TCP)
+    try:
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        listener.bind(address)
+        listener.listen(BACKLOG)
+        listener.setblocking(False)
+    except OSError as failure:
+        listener.close()
+        reason = _WHY.get(failure.errno or 0, failure.strerror)
+        raise OSError(f"listen: {host}:{port} cannot be had: {reason}") from failure
+    return listener

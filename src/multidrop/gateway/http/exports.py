@@ -15,7 +15,7 @@ from urllib.parse import quote
 from starlette.responses import Response, StreamingResponse
 from starlette.types import Receive, Scope, Send
 
-from multidrop.gateway.http.guard import Denied
+from multidrop.gateway.http.messages import Denied
 from multidrop.supervisor import supervisor
 
 MOST_EXPORTS = 8  # under way

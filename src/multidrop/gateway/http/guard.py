@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 from starlette.datastructures import Headers
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from multidrop.gateway.http.json_response import JsonResponse
+from multidrop.gateway.http.messages import Denied, JsonResponse
 from multidrop.gateway.http.rights import SCHEMES, Caller, May, OwnNames, Right, Token, Tokens, is_loopback
 
 COOKIE = "multidrop"
@@ -49,14 +49,6 @@ class Needed(NamedTuple):
 
     method: str
     right: Right | None
-
-
-class Denied(Exception):
-    """A request that is not served: its status, and a sentence."""
-
-    def __init__(self, status: int, sentence: str) -> None:
-        super().__init__(sentence)
-        self.status = status
 
 
 class Guard:

@@ -10,7 +10,7 @@ from typing import NamedTuple
 from starlette.requests import Request
 from starlette.responses import Response
 
-from multidrop.gateway.http.guard import Denied
+from multidrop.gateway.http.messages import Denied
 from multidrop.supervisor import supervisor
 
 PAGE = Path(__file__).parents[1] / "page"

@@ -7,8 +7,10 @@ import logging
 from collections.abc import AsyncIterator, Coroutine, Mapping
 from functools import partial
 from typing import TYPE_CHECKING, Any
+from urllib.parse import parse_qs
 
 from starlette.applications import Starlette
+from starlette.datastructures import Headers
 from starlette.requests import Request
 from starlette.responses import PlainTextResponse, Response, StreamingResponse
 from starlette.routing import Route
@@ -20,11 +22,10 @@ from multidrop.gateway.audit import MOST_RECORDS, newest_records, time_asked
 from multidrop.gateway.clock import utc_ms
 from multidrop.gateway.commands import Admit, Told
 from multidrop.gateway.http.exports import Exports
-from multidrop.gateway.http.frame_route import FrameRoute
-from multidrop.gateway.http.guard import COOKIE, HAS_WRONG_TOKEN, SHUT, WRONG, Denied, Guard, Needed
-from multidrop.gateway.http.json_response import JsonResponse
-from multidrop.gateway.http.page_files import PageFiles
-from multidrop.gateway.http.request_fields import (
+from multidrop.gateway.http.guard import COOKIE, HAS_WRONG_TOKEN, SHUT, WRONG, Guard, Needed
+from multidrop.gateway.http.messages import (
+    Denied,
+    JsonResponse,
     body_of,
     caller_of,
     drives_to_stop,
@@ -32,8 +33,10 @@ from multidrop.gateway.http.request_fields import (
     number_in,
     text_in,
 )
+from multidrop.gateway.http.page_files import PageFiles
 from multidrop.gateway.http.rights import NEVER_THIS_WAY, NOT_ALLOWED, NOT_LISTED, Right
 from multidrop.gateway.live.descriptions import describe
+from multidrop.gateway.live.frames import WHOLE, Frames
 from multidrop.gateway.live.views import figures_of, health_of, look_at, look_at_lines
 from multidrop.gateway.metrics import families_of
 from multidrop.gateway.verb_rules import STOPPING
@@ -41,6 +44,7 @@ from multidrop.supervisor import Hung, supervisor
 
 if TYPE_CHECKING:
     from multidrop.gateway.gateway import Gateway
+
 
 MOST_QUERIES = 2  # of the audit log, at the same time
 AUDIT_S = 20.0  # that one may take
@@ -198,7 +202,7 @@ class _Pages:
 
     async def metrics(self, request: Request) -> Response:
         gateway = self._gateway
-        families = families_of(gateway.hub, gateway.lately.newest, figures_of(gateway))
+        families = families_of(gateway.hub, gateway.recent.newest, figures_of(gateway))
         kind, text = expose_metrics(families, request.headers.get("accept", ""))
         return PlainTextResponse(text, headers={"content-type": kind, "vary": "accept"})
 
@@ -211,7 +215,7 @@ class _Pages:
     async def alarms(self, request: Request) -> Response:
         query = request.query_params
         begin, end = (number_in(query.get(key, ""), key) for key in ("from", "to"))
-        events = self._gateway.events
+        events = self._gateway.alarms
         found = [alarm.as_json() for alarm in events.between(begin, end)]
         return JsonResponse({"alarms": found, "since": events.since})
 
@@ -222,7 +226,7 @@ class _Pages:
         if not isinstance(note, str) or len(note) > MOST_NOTE or not note.isprintable():
             raise Denied(400, f"note is no text of at most {MOST_NOTE} printable characters")
         try:
-            found = self._gateway.events.acknowledge(alarm, utc_ms(), caller_of(request).by, note.strip())
+            found = self._gateway.alarms.acknowledge(alarm, utc_ms(), caller_of(request).by, note.strip())
         except KeyError:
             raise Denied(404, "there is no such alarm; its list may have changed meanwhile") from None
         self._gateway.frames.note_news()
@@ -345,3 +349,33 @@ class _Pages:
         response = JsonResponse({})
         response.delete_cookie(COOKIE, httponly=True, samesite="strict")
         return response
+
+
+_PLAIN = [(b"content-type", b"application/json"), (b"vary", b"accept-encoding")]
+_GZIPPED = [*_PLAIN, (b"content-encoding", b"gzip")]
+
+
+class FrameRoute:
+    """Answers `/api/frame?after=N` with a frame other than the N-th, as soon as there is one."""
+
+    def __init__(self, frames: Frames) -> None:
+        self._frames = frames
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        try:
+            asked = parse_qs(scope["query_string"].decode("latin-1"), keep_blank_values=True)
+            frame = await self._frames.after(number_in(asked.get("after", [str(WHOLE)])[-1], "after"))
+        except Denied as denied:
+            await JsonResponse({"error": str(denied)}, denied.status)(scope, receive, send)
+            return
+        except OverflowError as full:
+            await JsonResponse({"error": str(full)}, 503)(scope, receive, send)
+            return
+        status, headers, body = 304, list[tuple[bytes, bytes]](), b""
+        if frame is not None:
+            takes_gzip = "gzip" in Headers(scope=scope).get("accept-encoding", "")
+            status, headers = 200, _GZIPPED if takes_gzip else _PLAIN
+            body = frame.gzipped if takes_gzip else frame.plain
+            headers = [*headers, (b"content-length", str(len(body)).encode())]
+        await send({"type": "http.response.start", "status": status, "headers": headers})
+        await send({"type": "http.response.body", "body": body})

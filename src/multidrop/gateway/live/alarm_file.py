@@ -10,7 +10,7 @@ from pathlib import Path
 from queue import Empty, Full, Queue
 from typing import Any
 
-from multidrop.gateway.live.events import KINDS, MOST_ENDED, Alarm
+from multidrop.gateway.live.alarms import KINDS, MOST_ENDED, Alarm
 
 MOST_WAITING = 10_000  # alarms that the disk has not taken yet
 MOST_BYTES = 4 << 20  # of the file, which is written anew with its newest alarms when it is longer

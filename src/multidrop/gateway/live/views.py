@@ -11,7 +11,7 @@ from multidrop import Drive
 from multidrop.control import Ledger
 from multidrop.exposition import MetricFamily
 from multidrop.gateway.live.frames import lost_of
-from multidrop.gateway.live.recent import asked_of, misses_of
+from multidrop.gateway.live.recent_statistics import asked_of, misses_of
 from multidrop.gateway.metrics import Figures
 from multidrop.gateway.stops_amid_reload import drives_of
 from multidrop.plant import drive_meant
@@ -32,7 +32,7 @@ async def look_at(gateway: Gateway, name: str) -> dict[str, Any]:
     port = bus.line.identity if bus else line.port
     wear = await _wear_within(gateway.ledger, port, drive)
     found = gateway.side_reads.look(gateway.plant, name)
-    statistics = gateway.lately.drive(line.name, name)
+    statistics = gateway.recent.drive(line.name, name)
     return {
         "drive": name,
         "delays": _delays(statistics),
@@ -91,9 +91,9 @@ def look_at_lines(gateway: Gateway) -> dict[str, Any]:
     return {
         line.name: {
             "lost": lost_of(gateway.hub, line.name),
-            "minutes": gateway.lately.hour(line.name),
+            "minutes": gateway.recent.hour(line.name),
             "drives": {
-                polled.drive.name: _drive_figures(gateway.lately.drive(line.name, polled.drive.name))
+                polled.drive.name: _drive_figures(gateway.recent.drive(line.name, polled.drive.name))
                 for polled in line.drives
             },
         }
@@ -139,7 +139,7 @@ def parts_of(gateway: Gateway) -> dict[str, str]:
     parts, dead, kept = gateway.parts, supervisor().dead, gateway.alarm_file
     return (
         {name: _health_of_part(feed) for name, feed in parts.feeds.items()}
-        | dict.fromkeys(parts.coming, "it is not there yet: its files do not answer")
+        | dict.fromkeys(parts.pending, "it is not there yet: its files do not answer")
         | parts.dead
         | {name: why for name, why in dead.items() if name in parts.feeds}
         | ({"alarms": kept.trouble} if kept is not None and kept.trouble else {})

@@ -11,16 +11,16 @@ import logging
 from collections.abc import Awaitable, Callable
 from typing import Any, cast
 
-from multidrop.gateway.modbus_server.codes import ModbusCode
-from multidrop.gateway.modbus_server.mbap import (
+from multidrop.gateway.modbus_server.protocol import (
+    WRITES,
     Garbage,
     MbapRequest,
+    ModbusCode,
     function_of,
     request_of,
     take_frame,
     take_request,
 )
-from multidrop.gateway.modbus_server.pdu import WRITES
 from multidrop.supervisor import supervisor
 
 SLICE = 64  # requests of a client that are answered before others have their turn,

@@ -8,35 +8,39 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections import Counter
-from collections.abc import Awaitable, Callable, Sequence
+from collections.abc import Awaitable, Sequence
 from contextlib import suppress
 from functools import partial
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any, Protocol
 
 from multidrop import Batch, BusError, Plant, Register
 from multidrop.drive import Carrier
 from multidrop.gateway.clock import monotonic_ns
 from multidrop.gateway.commands import Told
-from multidrop.gateway.http.listener import listen
+from multidrop.gateway.http.connections import listen
 from multidrop.gateway.http.rights import Caller, Right
 from multidrop.gateway.modbus_server.clients import SWEEP_S, Answer, ModbusClient, ModbusPort, RoundShare
-from multidrop.gateway.modbus_server.codes import Declined, ModbusCode, code_of
 from multidrop.gateway.modbus_server.common_block import STOP, CommonSource
-from multidrop.gateway.modbus_server.mbap import MbapRequest
-from multidrop.gateway.modbus_server.pdu import WRITES, read_range, reply_data
+from multidrop.gateway.modbus_server.line_share import LineShare, PassingBusy
+from multidrop.gateway.modbus_server.protocol import (
+    WRITES,
+    Declined,
+    MbapRequest,
+    ModbusCode,
+    code_of,
+    read_range,
+    reply_data,
+)
 from multidrop.gateway.modbus_server.settings import ModbusSettings
 from multidrop.gateway.modbus_server.unit_ids import MAIN, StopWrite, Unit, Units
 from multidrop.gateway.modbus_server.words import Lack
-from multidrop.gateway.mqtt.throttle import LineShare, PassingBusy
+from multidrop.gateway.parts import Ask, PartContext
 from multidrop.supervisor import supervisor
-
-if TYPE_CHECKING:
-    from multidrop.gateway.parts import Inside
 
 STOP_WAIT_S = 0.4  # for which a stop's answer waits for the motor: less than clients wait for a reply
 MOST_STOPS = 8  # of one drive, under way; further requests are acknowledged alone
 
-Ask = Callable[[str, int, int, int, float], Awaitable[list[int]]]
+Settings = ModbusSettings
 
 _log = logging.getLogger("multidrop.gateway")
 
@@ -49,9 +53,9 @@ class ModbusCommands(Protocol):
     def ended_ns(self, drive: str) -> int: ...
 
 
-def build(settings: ModbusSettings, inside: Inside) -> ModbusServer:
+def build(settings: ModbusSettings, context: PartContext) -> ModbusServer:
     """Return the server as a part of the gateway, listening. Raises OSError where a port cannot be had."""
-    server = ModbusServer(inside.plant, inside.hub, inside.commands, settings, inside.ask)
+    server = ModbusServer(context.plant, context.hub, context.commands, settings, context.ask)
     server.listen()
     return server
 

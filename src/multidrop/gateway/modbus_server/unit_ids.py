@@ -10,7 +10,7 @@ from typing import Any, NamedTuple, Protocol
 from multidrop import Plant, PolledDrive, Register
 from multidrop.drive import Carrier
 from multidrop.gateway.modbus_server.common_block import CommonBlock
-from multidrop.gateway.modbus_server.pdu import WriteRequest
+from multidrop.gateway.modbus_server.protocol import WriteRequest
 from multidrop.gateway.modbus_server.words import DriveWords, reading_function
 
 MAIN = ""  # the TCP port of all lines that have none of their own

@@ -7,21 +7,98 @@ from __future__ import annotations
 
 import json
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 from multidrop import Plant
 from multidrop.gateway.commands import Told
 from multidrop.gateway.live.hub import SILENT
-from multidrop.gateway.mqtt.home_assistant import discovery, discovery_topic
-from multidrop.gateway.mqtt.outbox import Publication
-from multidrop.gateway.mqtt.retained_topics import OFFLINE, ONLINE, LeftBehind
+from multidrop.gateway.mqtt.broker import Publication
+from multidrop.gateway.mqtt.home_assistant import DISCOVERY, discovery, discovery_topic, object_id
 from multidrop.gateway.mqtt.settings import MqttSettings, fresh_values
 from multidrop.gateway.offers import Orders
-from multidrop.gateway.parts import Inside
+from multidrop.gateway.parts import PartContext
 from multidrop.gateway.verb_rules import STOPPING
 from multidrop.plant import drive_meant
+
+ONLINE, OFFLINE = b"online", b"offline"
+MOST_KEPT = 256  # messages of a connection that are looked at; what is more waits for the next one
+MOST_DISCOVERY = 1 << 18  # bytes of a configuration
+
+
+class KeptTopic(NamedTuple):
+    """A topic of a drive, of which the broker keeps a message."""
+
+    drive: str
+    topic: str
+
+
+class LeftBehind:
+    """Looks for such topics among the messages that a broker kept."""
+
+    def __init__(self, prefix: str, *, home_assistant: bool) -> None:
+        self._prefix = prefix
+        self._home_assistant = home_assistant
+        self.begin()
+
+    def begin(self) -> None:
+        """Begin anew, on a new connection."""
+        self._is_alone = False  # the gateway of before is gone, and no other one has this prefix
+        self._found: list[KeptTopic] = []
+        self._looked_at = 0
+
+    def topics(self) -> list[str]:
+        """Return what is to be listened to."""
+        kept = [f"{self._prefix}/gateway", f"{self._prefix}/+/available"]
+        return [*kept, f"{DISCOVERY}/device/+/config"] if self._home_assistant else kept
+
+    def hear(self, topic: str, payload: bytes, there: Collection[str]) -> list[str]:
+        """Take a message that was kept; return the topics to be taken back now. `there` are the drives."""
+        if topic == f"{self._prefix}/gateway":
+            self._is_alone = payload == OFFLINE
+        elif self._looked_at < MOST_KEPT:
+            self._found += self._topics_of(topic, payload, there)
+        if not self._is_alone:
+            return []
+        found, self._found = self._found, []
+        return [one.topic for one in found if one.drive not in there]
+
+    def _topics_of(self, topic: str, payload: bytes, there: Collection[str]) -> list[KeptTopic]:
+        """Return the topics of which a message tells that a drive has them that is not there."""
+        if payload in (ONLINE, OFFLINE):
+            drive = self._drive_in(topic.removesuffix("/available"))
+            if drive is None or drive in there or topic != f"{self._prefix}/{drive}/available":
+                return []
+            self._looked_at += 1
+            return [KeptTopic(drive, topic.removesuffix("/available")), KeptTopic(drive, topic)]
+        if not topic.startswith(f"{DISCOVERY}/device/{object_id(self._prefix, '')}"):
+            return []
+        self._looked_at += 1
+        drive = self._drive_in(_state_topic(payload))
+        if drive is None or drive in there or topic != discovery_topic(self._prefix, drive):
+            return []  # another gateway's, whose prefix and drive make the same beginning
+        return [KeptTopic(drive, topic)]
+
+    def _drive_in(self, topic: str) -> str | None:
+        """Return the drive whose values are on this topic."""
+        drive = topic.removeprefix(f"{self._prefix}/")
+        return drive if drive and topic == f"{self._prefix}/{drive}" and "/" not in drive else None
+
+
+def _state_topic(payload: bytes) -> str:
+    """Return where a drive's values are, as its discovery says; "" where it says nothing of it."""
+    if len(payload) > MOST_DISCOVERY:
+        return ""
+    try:
+        said = json.loads(payload)
+    except (ValueError, RecursionError):
+        return ""
+    parts = said.get("cmps") if isinstance(said, dict) else None
+    state = parts.get("state") if isinstance(parts, dict) else said  # the whole device had one once
+    found = state.get("state_topic") if isinstance(state, dict) else None
+    return found if isinstance(found, str) else ""
+
 
 EXAMPLES = {
     "set": '{"value": 25.0, "time": UTC in ms}',
@@ -38,13 +115,13 @@ class JsonTopics:
 
     kind = "json"
 
-    def __init__(self, settings: MqttSettings, inside: Inside, utc_ms: Callable[[], int]) -> None:
+    def __init__(self, settings: MqttSettings, context: PartContext, utc_ms: Callable[[], int]) -> None:
         self.outbox: Any = None
         self._settings = settings
-        self._inside = inside
-        self._hub = inside.hub
-        self._plant = inside.plant
-        self._orders = Orders(inside.commands, settings.caller, utc_ms, self._tell)
+        self._context = context
+        self._hub = context.hub
+        self._plant = context.plant
+        self._orders = Orders(context.commands, settings.caller, utc_ms, self._tell)
         self._available: dict[str, bytes] = {}
         self._left: set[str] = set()  # drives of which the broker is to keep nothing
         self._left_behind = LeftBehind(settings.prefix, home_assistant=settings.home_assistant)
@@ -190,7 +267,7 @@ class JsonTopics:
 
     def _discover(self, name: str) -> None:
         _, drive = self._plant.find_drive(name)
-        may = self._inside.commands.may.write
+        may = self._context.commands.may.write
         writable = [register for register in drive.registers if f"{name}.{register}" in may]
         topics = {
             "state": self._topic(name),
@@ -204,11 +281,11 @@ class JsonTopics:
             self._hub.polled(name),
             topics,
             prefix=self._settings.prefix,
-            version=self._inside.version,
+            version=self._context.version,
             every_s=self._settings.every_s,
             writable=writable,
             takes_commands=self._settings.commands,
-            page=self._inside.page,
+            page=self._context.page,
         )
         self.outbox.put(self._kept(discovery_topic(self._settings.prefix, name), said))
 

@@ -12,29 +12,31 @@ from multidrop.gateway.clock import utc_ms
 from multidrop.gateway.metrics import counter
 from multidrop.gateway.mqtt.broker import Broker, parse_broker
 from multidrop.gateway.mqtt.json_topics import JsonTopics
-from multidrop.gateway.mqtt.settings import MqttSettings as MqttSettings
+from multidrop.gateway.mqtt.settings import MqttSettings
 from multidrop.gateway.mqtt.sparkplug_node import SparkplugNode
-from multidrop.gateway.parts import Feed, Inside
+from multidrop.gateway.parts import PartContext
+
+Settings = MqttSettings
 
 
-def build(settings: MqttSettings, inside: Inside) -> Feed:
+def build(settings: MqttSettings, context: PartContext) -> Mqtt:
     """Return the part. Raises ImportError without paho."""
-    speakers: list[Any] = [JsonTopics(settings, inside, utc_ms)]
+    speakers: list[Any] = [JsonTopics(settings, context, utc_ms)]
     if settings.sparkplug:
-        speakers.append(SparkplugNode(settings, inside, utc_ms))
-    return Mqtt(settings, inside, speakers)
+        speakers.append(SparkplugNode(settings, context, utc_ms))
+    return Mqtt(settings, context, speakers)
 
 
 class Mqtt:
     """The speakers of MQTT, each with a connection of its own, since a connection has only one will."""
 
-    def __init__(self, settings: MqttSettings, inside: Inside, speakers: list[Any]) -> None:
-        address, login = parse_broker(settings.broker), settings.login(inside.plant)
+    def __init__(self, settings: MqttSettings, context: PartContext, speakers: list[Any]) -> None:
+        address, login = parse_broker(settings.broker), settings.login(context.plant)
         self._every = settings.every_s
         self._speakers = speakers
         self._brokers = []
         for speaker in speakers:
-            name = f"{settings.prefix}/{inside.plant.path.stem}/{speaker.kind}"  # no other gateway's
+            name = f"{settings.prefix}/{context.plant.path.stem}/{speaker.kind}"  # no other gateway's
             broker = Broker(address, login, name, speaker)
             speaker.outbox = broker.outbox
             self._brokers.append(broker)

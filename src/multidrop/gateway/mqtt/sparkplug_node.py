@@ -9,7 +9,7 @@ from typing import Any
 from multidrop import Plant, Register
 from multidrop.gateway.commands import Told
 from multidrop.gateway.live.hub import SILENT
-from multidrop.gateway.mqtt.outbox import Publication
+from multidrop.gateway.mqtt.broker import Publication
 from multidrop.gateway.mqtt.settings import MqttSettings, fresh_values
 from multidrop.gateway.mqtt.sparkplug import (
     BIRTH_DEATH,
@@ -23,7 +23,7 @@ from multidrop.gateway.mqtt.sparkplug import (
     read_command,
 )
 from multidrop.gateway.offers import Orders
-from multidrop.gateway.parts import Inside
+from multidrop.gateway.parts import PartContext
 
 STATE, FAULT, STOP = "state", "fault", "Device Control/Stop"
 OWN = (STATE, FAULT)  # of all drives alike, in words
@@ -37,15 +37,15 @@ class SparkplugNode:
 
     kind = "sparkplug"
 
-    def __init__(self, settings: MqttSettings, inside: Inside, utc_ms: Callable[[], int]) -> None:
+    def __init__(self, settings: MqttSettings, context: PartContext, utc_ms: Callable[[], int]) -> None:
         self.outbox: Any = None
         self._settings = settings
-        self._inside = inside
-        self._hub = inside.hub
-        self._plant = inside.plant
+        self._context = context
+        self._hub = context.hub
+        self._plant = context.plant
         self._utc_ms = utc_ms
-        self._node = settings.node or inside.plant.path.stem
-        self._orders = Orders(inside.commands, settings.caller, utc_ms, self._tell)
+        self._node = settings.node or context.plant.path.stem
+        self._orders = Orders(context.commands, settings.caller, utc_ms, self._tell)
         self._birth = -1  # bdSeq
         self._seq = 0
         self._said: dict[str, dict[str, Value]] = {}  # by drive that is born
@@ -191,7 +191,7 @@ class SparkplugNode:
     def _writable(self, drive: str) -> list[str]:
         if not self._settings.commands:
             return []
-        listed = self._inside.commands.may.write
+        listed = self._context.commands.may.write
         return [name for name in self._registers(drive) if f"{drive}.{name}" in listed]
 
     def _registers(self, drive: str) -> dict[str, Register[Any]]:

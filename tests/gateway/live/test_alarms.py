@@ -28,7 +28,7 @@ from multidrop.gateway.command_results import in_words
 from multidrop.gateway.gateway import Gateway
 from multidrop.gateway.http.rights import Right
 from multidrop.gateway.live.alarm_file import AlarmFile, alarm_in
-from multidrop.gateway.live.events import Alarm, Events
+from multidrop.gateway.live.alarms import Alarm, Alarms
 from multidrop.gateway.live.hub import RAN_NS, Hub, Shown
 from multidrop.gateway.settings import read_settings
 from multidrop.polling.batch import Batch
@@ -139,13 +139,13 @@ def test_check_warns_of_registers_that_cannot_show_a_fault(run: Run, tmp_path: P
 RUNS, STANDS = Shown("runs", None), Shown("stands", None)
 
 
-def seen(events: Events) -> list[tuple[str, str, int, int | None]]:
+def seen(events: Alarms) -> list[tuple[str, str, int, int | None]]:
     return [(one.drive or one.line, one.kind, one.time, one.ended) for one in events.between(0, 10**9)]
 
 
 @pytest.mark.parametrize("standing", [STANDS, Shown("unknown", None)])
 def test_a_motor_that_stopped_though_nobody_stopped_it_is_an_alarm(standing: Shown) -> None:
-    events = Events()
+    events = Alarms()
     for time, shown in ((1000, standing), (2000, RUNS), (3000, standing), (4999, standing)):
         events.look(time, "pump-1", shown, 0)
     assert seen(events) == []  # it may reverse
@@ -166,14 +166,14 @@ def test_a_motor_that_stopped_though_nobody_stopped_it_is_an_alarm(standing: Sho
 
 
 def test_a_fault_is_no_stop_of_its_own() -> None:
-    events = Events()
+    events = Alarms()
     for time, shown in enumerate((RUNS, Shown("silent", "no reply"), Shown("fault", "a"), STANDS), 1):
         events.look(time, "pump-1", shown, 0)
     assert {kind for _, kind, _, _ in seen(events)} == {"fault", "silent"}
 
 
 def test_the_gravest_comes_first_and_what_was_acknowledged_last() -> None:
-    events = Events()
+    events = Alarms()
     events.look(1, "pump-1", Shown("fault", "overheat"))
     events.look(2, "pump-2", RUNS, 0)
     events.look(3, "pump-2", STANDS, 0)
@@ -196,7 +196,7 @@ def test_the_gravest_comes_first_and_what_was_acknowledged_last() -> None:
 
 
 def test_an_alarm_at_the_first_look_began_before() -> None:
-    events = Events()
+    events = Alarms()
     events.look(1, "pump-1", Shown("fault", "overheat"))
     events.look(1, "pump-2", RUNS)
     events.look(2, "pump-2", Shown("fault", "overheat"))
@@ -210,12 +210,12 @@ def test_an_alarm_at_the_first_look_began_before() -> None:
 
 def test_alarms_of_an_earlier_run_go_on_or_are_over() -> None:
     kept: dict[str, Alarm] = {}
-    before = Events(0, lambda alarm: kept.update({alarm.id: alarm}))
+    before = Alarms(0, lambda alarm: kept.update({alarm.id: alarm}))
     for drive in ("goes-on", "is-over", "is-another", "is-gone", "is-silent"):
         before.look(1, drive, RUNS, 0)
         before.look(2, drive, Shown("fault", "overheat"))
     before.acknowledge(before.shown()[0].id, 3, "anna", "seen")
-    events = Events(100)
+    events = Alarms(100)
     events.restore(kept.values(), 101, ["goes-on", "is-over", "is-another", "is-silent"])
     events.look(102, "goes-on", Shown("fault", "overheat"))
     events.look(102, "is-over", STANDS)
@@ -237,7 +237,7 @@ def test_alarms_of_an_earlier_run_go_on_or_are_over() -> None:
 
 def test_alarms_that_are_read_late_meet_those_of_now() -> None:
     """A slow disk: the drives were looked at before."""
-    events = Events(100)
+    events = Alarms(100)
     events.look(101, "pump-1", Shown("fault", "overheat"))
     events.look(101, "pump-2", STANDS)
     kept = [Alarm(2, name, "overheat", None, "fault") for name in ("pump-1", "pump-2")]

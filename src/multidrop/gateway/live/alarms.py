@@ -50,7 +50,7 @@ class Alarm(NamedTuple):
         return {"id": self.id, **self._asdict()}
 
 
-class Events:
+class Alarms:
     """Alarms that last, and the latest of those that are over.
 
     `since` is the time (UTC, ms) from which all are known: none is of before it, and of later ones those that

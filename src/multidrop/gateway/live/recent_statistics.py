@@ -1,7 +1,4 @@
-"""Lately: what the lines did in the last seconds and in the last hour, from readings of their statistics.
-
-Pure: readings and times come in.
-"""
+"""Recent statistics of lines and drives, over seconds and over an hour. Pure: takes readings and times."""
 
 from __future__ import annotations
 
@@ -20,7 +17,7 @@ Reading = Mapping[str, LineStatistics]
 T = TypeVar("T", float, int)
 
 
-class Lately:
+class RecentStatistics:
     """Readings of a poller's statistics, about one a second."""
 
     def __init__(self, plant: Plant) -> None:
@@ -87,7 +84,7 @@ class Lately:
         }
 
     def _use(self, name: str) -> tuple[float | None, float | None]:
-        """Return the used share of a line's time and its exchanges a second, lately."""
+        """Return the used share of a line's time and its exchanges a second, recent."""
         before = self._recent[0][1].get(name) if self._recent else None
         now = self.newest.get(name)
         if before is None or now is None or before is now or before.epoch != now.epoch:

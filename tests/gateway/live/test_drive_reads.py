@@ -14,8 +14,8 @@ from gateways import served
 from lines import until
 
 from multidrop import LineError, WriteForbidden
-from multidrop.gateway.http import identities as module
-from multidrop.gateway.http.identities import Identities
+from multidrop.gateway.live import drive_reads as module
+from multidrop.gateway.live.drive_reads import Identities
 
 MAY = '[serve.may]\nstop = "anyone"\n'
 

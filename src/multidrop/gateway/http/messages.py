@@ -9,10 +9,28 @@ from collections.abc import Mapping
 from typing import Any
 
 from starlette.requests import ClientDisconnect, Request
+from starlette.responses import Response
 
-from multidrop.gateway.http.guard import Denied
 from multidrop.gateway.http.rights import Caller
 from multidrop.printable import plain_whole
+
+
+class Denied(Exception):
+    """A request that is not served: its status, and a sentence."""
+
+    def __init__(self, status: int, sentence: str) -> None:
+        super().__init__(sentence)
+        self.status = status
+
+
+class JsonResponse(Response):
+    """An answer of ASCII alone; what is no Unicode is told by its escape."""
+
+    media_type = "application/json"
+
+    def render(self, content: Any) -> bytes:
+        return json.dumps(content, allow_nan=False, separators=(",", ":")).encode()
+
 
 MOST_BYTES = 64 * 1024  # of a body
 BODY_S = 10.0  # that it may take to come

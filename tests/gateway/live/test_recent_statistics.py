@@ -14,7 +14,7 @@ from gateways import written
 
 from multidrop.core import Counters, Status
 from multidrop.gateway.live.hub import Hub
-from multidrop.gateway.live.recent import MINUTES, Lately
+from multidrop.gateway.live.recent_statistics import MINUTES, RecentStatistics
 from multidrop.gateway.live.views import look_at_lines
 from multidrop.gateway.metrics import Figures, families_of
 from multidrop.transport.statistics import LineStatistics, line_statistics
@@ -30,55 +30,55 @@ def reading(seconds: int, *, per_s: int = 10) -> LineStatistics:
 
 
 @pytest.fixture
-def lately(tmp_path: Path) -> Lately:
-    return Lately(written(tmp_path))
+def recent(tmp_path: Path) -> RecentStatistics:
+    return RecentStatistics(written(tmp_path))
 
 
 @pytest.mark.slow
-def test_an_hour_of_minutes_and_no_hour_of_readings(lately: Lately) -> None:
+def test_an_hour_of_minutes_and_no_hour_of_readings(recent: RecentStatistics) -> None:
     alive: list[weakref.ref[LineStatistics]] = []
     for second in range(0, 70 * 60 + 31, 5):
         found = reading(second)
         alive.append(weakref.ref(found))
-        lately.tick(float(second), second * 1000, {"hall": found})
+        recent.tick(float(second), second * 1000, {"hall": found})
     del found
-    hour = lately.hour("hall")
+    hour = recent.hour("hall")
     assert len(hour) == MINUTES
     assert [one["time"] for one in hour] == [minute * MINUTE_MS for minute in range(11, 71)]
     assert all(one["asked"] == 602 and one["misses"] == {"no reply": 2} for one in hour[:-1])
     assert hour[-1] == {"time": 70 * MINUTE_MS, "asked": 301, "misses": {"no reply": 1}}
     assert sum(one() is not None for one in alive) < 10
-    assert lately.hour("roof") == []
+    assert recent.hour("roof") == []
 
 
-def test_figures_of_a_line_are_those_of_the_last_seconds(lately: Lately) -> None:
+def test_figures_of_a_line_are_those_of_the_last_seconds(recent: RecentStatistics) -> None:
     for second in range(200):
-        lately.tick(float(second), second * 1000, {"hall": reading(second)})
+        recent.tick(float(second), second * 1000, {"hall": reading(second)})
         if second == 100:
-            assert lately.line("hall")["misses"] == 3
-    assert lately.line("hall")["rate"] == 10.0
-    assert lately.drive_figures("pump-1")["missed"] == pytest.approx(2 / 600, abs=1e-3)
-    assert lately.line("roof")["rate"] is None
+            assert recent.line("hall")["misses"] == 3
+    assert recent.line("hall")["rate"] == 10.0
+    assert recent.drive_figures("pump-1")["missed"] == pytest.approx(2 / 600, abs=1e-3)
+    assert recent.line("roof")["rate"] is None
 
 
-def test_what_no_reply_said_and_no_reading_is_not_known_and_never_0(lately: Lately, tmp_path: Path) -> None:
-    assert lately.line("hall")["misses"] is None
+def test_figures_without_replies_are_none_not_zero(recent: RecentStatistics, tmp_path: Path) -> None:
+    assert recent.line("hall")["misses"] is None
     for second in range(100):
-        lately.tick(float(second), second * 1000, {"hall": reading(second)})  # no reply has a delay
-    assert lately.line("hall")["p99"] is None
+        recent.tick(float(second), second * 1000, {"hall": reading(second)})  # no reply has a delay
+    assert recent.line("hall")["p99"] is None
     plant = written(tmp_path)
-    gateway: Any = SimpleNamespace(plant=plant, hub=Hub(plant), lately=lately)
+    gateway: Any = SimpleNamespace(plant=plant, hub=Hub(plant), recent=recent)
     drive = look_at_lines(gateway)["hall"]["drives"]["pump-1"]
     assert (drive["p50"], drive["p99"]) == (None, None)
-    families = families_of(gateway.hub, lately.newest, Figures("0", 0, 0, 0, {}, []))
+    families = families_of(gateway.hub, recent.newest, Figures("0", 0, 0, 0, {}, []))
     (delays,) = [one for one in families if one.name == "multidrop_response_delay_seconds"]
     assert delays.samples == [("_count", {"line": "hall", "drive": "pump-1"}, 0.0)]
 
 
-def test_another_line_of_a_name_is_not_set_against_the_one_before(lately: Lately) -> None:
+def test_another_line_of_a_name_is_not_set_against_the_one_before(recent: RecentStatistics) -> None:
     """A reading of it may come while its plant is being adopted."""
-    lately.tick(100.0, 100_000, {"hall": replace(reading(100), epoch=1)})
-    lately.tick(101.0, 101_000, {"hall": replace(reading(1), epoch=2)})
-    assert (lately.line("hall")["rate"], lately.line("hall")["used"]) == (None, None)
-    lately.tick(106.0, 106_000, {"hall": replace(reading(6), epoch=2)})
-    assert lately.line("hall")["rate"] == 10.0
+    recent.tick(100.0, 100_000, {"hall": replace(reading(100), epoch=1)})
+    recent.tick(101.0, 101_000, {"hall": replace(reading(1), epoch=2)})
+    assert (recent.line("hall")["rate"], recent.line("hall")["used"]) == (None, None)
+    recent.tick(106.0, 106_000, {"hall": replace(reading(6), epoch=2)})
+    assert recent.line("hall")["rate"] == 10.0

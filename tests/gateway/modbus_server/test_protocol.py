@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from tables import table
 
-from multidrop.gateway.modbus_server.mbap import Garbage, MbapRequest, take_request
+from multidrop.gateway.modbus_server.protocol import Garbage, MbapRequest, take_request
 
 # MODBUS Messaging on TCP/IP Implementation Guide V1.0b, 4.4.2.1 and the example of section 3.1.3:
 # transaction 1501H, protocol 0, length 6, unit FFH, function 03, start 0004H, count 0001H

@@ -8,7 +8,7 @@ import pytest
 from controlled_loop import run_controlled
 from examples import usually
 
-from multidrop.gateway.mqtt.throttle import (
+from multidrop.gateway.modbus_server.line_share import (
     BURST_S,
     EXPIRY_S,
     MOST_WAITING,

@@ -1,0 +1,218 @@
+"""MBAP: the frames of Modbus TCP.
+
+Source: MODBUS Messaging on TCP/IP Implementation Guide V1.0b, section 3.1.3.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable, Mapping
+from enum import IntEnum
+from functools import partial
+from typing import NamedTuple
+
+from multidrop import (
+    BadReply,
+    CancelledByStop,
+    DriveException,
+    Expired,
+    LineError,
+    NoReply,
+    NotAttached,
+    NotMaster,
+    NotVerified,
+    Unconfirmed,
+    Unsupported,
+    WriteForbidden,
+)
+from multidrop.drive import Carrier
+from multidrop.gateway.commands import BUSY
+from multidrop.gateway.http.rights import NOT_ALLOWED, NOT_LISTED
+from multidrop.gateway.modbus_server.line_share import PassingBusy
+
+MOST_DATA = 253  # bytes of a function code and its data (application protocol V1.1b3, 4.1)
+_HEADER = struct.Struct(">HHHB")
+_FUNCTION = _HEADER.size  # where the function code stands
+
+
+class Garbage(ValueError):
+    """Bytes that are no header of Modbus TCP."""
+
+
+class MbapRequest(NamedTuple):
+    """One request of a client."""
+
+    transaction: int
+    unit: int
+    function: int
+    data: bytes  # that follows the function code
+
+    def reply(self, data: bytes) -> bytes:
+        """Return the frame of a good reply."""
+        return _HEADER.pack(self.transaction, 0, 2 + len(data), self.unit) + bytes([self.function]) + data
+
+    def exception(self, code: int) -> bytes:
+        """Return the frame of an exception."""
+        return _HEADER.pack(self.transaction, 0, 3, self.unit) + bytes([self.function | 0x80, code])
+
+
+def take_frame(buffer: bytearray) -> bytes | None:
+    """Take the first request's frame out of the bytes that came; None where it is not whole yet.
+
+    Raises Garbage as soon as a header can be none: after it no frame's begin is known any more.
+    """
+    if len(buffer) >= 4 and buffer[2:4] != b"\0\0":
+        raise Garbage(f"protocol id {int.from_bytes(buffer[2:4]):04X}H, and Modbus has 0")
+    if len(buffer) < 6:
+        return None
+    length = int.from_bytes(buffer[4:6])
+    if not 2 <= length <= 1 + MOST_DATA:
+        raise Garbage(f"length {length}, and a frame has 2 to {1 + MOST_DATA} bytes after it")
+    if len(buffer) < 6 + length:
+        return None
+    frame = bytes(buffer[: 6 + length])
+    del buffer[: 6 + length]
+    return frame
+
+
+def function_of(frame: bytes) -> int:
+    """Return the function code of a whole frame."""
+    return frame[_FUNCTION]
+
+
+def request_of(frame: bytes) -> MbapRequest:
+    """Return the request of a whole frame."""
+    transaction, _, _, unit = _HEADER.unpack_from(frame)
+    return MbapRequest(transaction, unit, frame[_FUNCTION], frame[_FUNCTION + 1 :])
+
+
+def take_request(buffer: bytearray) -> MbapRequest | None:
+    """Take the first request out of the bytes that came; None where it is not whole yet. Raises Garbage."""
+    frame = take_frame(buffer)
+    return None if frame is None else request_of(frame)
+
+
+class ModbusCode(IntEnum):
+    """Exception codes of a reply (application protocol V1.1b3, section 7)."""
+
+    ILLEGAL_FUNCTION = 0x01
+    ILLEGAL_ADDRESS = 0x02
+    ILLEGAL_VALUE = 0x03
+    DEVICE_FAILURE = 0x04
+    ACKNOWLEDGE = 0x05
+    BUSY = 0x06
+    NO_PATH = 0x0A
+    NO_RESPONSE = 0x0B
+
+
+class Declined(Exception):
+    """A request that is answered with an exception code."""
+
+    def __init__(self, code: int) -> None:
+        super().__init__(f"exception {code:02X}H")
+        self.code = code
+
+
+# The first of these that an error is decides the code.
+_CODES: tuple[tuple[type[BaseException], ModbusCode], ...] = (
+    (PassingBusy, ModbusCode.BUSY),
+    (Expired, ModbusCode.BUSY),
+    (CancelledByStop, ModbusCode.BUSY),
+    (LineError, ModbusCode.NO_PATH),
+    (NotMaster, ModbusCode.NO_PATH),
+    (NotAttached, ModbusCode.NO_PATH),
+    (NoReply, ModbusCode.NO_RESPONSE),
+    (BadReply, ModbusCode.NO_RESPONSE),
+    (Unconfirmed, ModbusCode.NO_RESPONSE),
+    (Unsupported, ModbusCode.ILLEGAL_FUNCTION),
+    (NotVerified, ModbusCode.DEVICE_FAILURE),
+    (ValueError, ModbusCode.ILLEGAL_VALUE),
+)
+# The same for refusals by the rule that they name.
+_RULES: Mapping[str, ModbusCode] = {
+    NOT_ALLOWED: ModbusCode.ILLEGAL_FUNCTION,
+    NOT_LISTED: ModbusCode.ILLEGAL_ADDRESS,
+    BUSY: ModbusCode.BUSY,
+}
+
+
+def code_of(error: BaseException | None) -> int:
+    """Return the exception code that tells a client of this error; a drive's own code as it came."""
+    if isinstance(error, DriveException):
+        return error.code if 1 <= error.code <= 0x7F else ModbusCode.DEVICE_FAILURE
+    if isinstance(error, WriteForbidden) and (code := _RULES.get(error.rule)):
+        return code
+    if isinstance(error, WriteForbidden) and error.is_budget:
+        return ModbusCode.BUSY
+    return next((code for kind, code in _CODES if isinstance(error, kind)), ModbusCode.DEVICE_FAILURE)
+
+
+MOST_READ = {1: 2000, 2: 2000, 3: 125, 4: 125}  # in one request: 6.1 to 6.4
+MOST_WRITTEN = {0x0F: 1968, 0x10: 123}  # the same: 6.11 and 6.12
+ADDRESSES = 0x10000
+
+
+class WriteRequest(NamedTuple):
+    """The words or bits that a request writes."""
+
+    carrier: Carrier
+    address: int
+    size: int  # words or bits
+    data: bytes
+
+
+def read_range(request: MbapRequest) -> range:
+    """Return the addresses that a request reads; raises Declined for what cannot be read."""
+    if request.function not in MOST_READ:
+        raise Declined(ModbusCode.ILLEGAL_FUNCTION)
+    if len(request.data) != 4:
+        raise Declined(ModbusCode.ILLEGAL_VALUE)
+    start, count = struct.unpack(">HH", request.data)
+    if not 1 <= count <= MOST_READ[request.function]:
+        raise Declined(ModbusCode.ILLEGAL_VALUE)
+    if start + count > ADDRESSES:
+        raise Declined(ModbusCode.ILLEGAL_ADDRESS)
+    return range(start, start + count)
+
+
+def reply_data(function: int, words: list[int]) -> bytes:
+    """Return a reply's data: words, or bits of which the first is the least significant of the first byte."""
+    if function in (3, 4):
+        return struct.pack(f">B{len(words)}H", 2 * len(words), *words)
+    size = (len(words) + 7) // 8
+    bits = sum(1 << at for at, bit in enumerate(words) if bit)
+    return bytes([size]) + bits.to_bytes(size, "little")
+
+
+def _one_coil(request: MbapRequest) -> WriteRequest:
+    if len(request.data) != 4 or request.data[2:] not in (b"\xff\0", b"\0\0"):
+        raise Declined(ModbusCode.ILLEGAL_VALUE)
+    return WriteRequest(Carrier.BIT, int.from_bytes(request.data[:2]), 1, bytes([request.data[2] & 1]))
+
+
+def _one_word(request: MbapRequest) -> WriteRequest:
+    if len(request.data) != 4:
+        raise Declined(ModbusCode.ILLEGAL_VALUE)
+    return WriteRequest(Carrier.WORD, int.from_bytes(request.data[:2]), 1, request.data[2:])
+
+
+def _several(carrier: Carrier, request: MbapRequest) -> WriteRequest:
+    """Return the words or bits that functions 15 and 16 write."""
+    if len(request.data) < 5:
+        raise Declined(ModbusCode.ILLEGAL_VALUE)
+    address, count, size = struct.unpack_from(">HHB", request.data)
+    needed = (count + 7) // 8 if carrier is Carrier.BIT else 2 * count
+    data = request.data[5:]
+    if not 1 <= count <= MOST_WRITTEN[request.function] or not size == needed == len(data):
+        raise Declined(ModbusCode.ILLEGAL_VALUE)
+    if address + count > ADDRESSES:
+        raise Declined(ModbusCode.ILLEGAL_ADDRESS)
+    return WriteRequest(carrier, address, count, data)
+
+
+WRITES: Mapping[int, Callable[[MbapRequest], WriteRequest]] = {
+    0x05: _one_coil,
+    0x06: _one_word,
+    0x0F: partial(_several, Carrier.BIT),
+    0x10: partial(_several, Carrier.WORD),
+}
