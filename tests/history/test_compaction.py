@@ -25,7 +25,7 @@ from multidrop.history.database import connect
 from multidrop.history.folder import listing, parquet_files
 from multidrop.history.history import History
 from multidrop.polling.batch import Row
-from multidrop.recording.file_lock import FileLock
+from multidrop.recording.segments import FileLock
 
 duckdb = pytest.importorskip("duckdb", reason="needs duckdb")
 SERIES = "pump-1.speed"

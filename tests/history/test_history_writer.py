@@ -19,7 +19,7 @@ from multidrop.families import InnovertIBD
 from multidrop.history import HistoryWriter
 from multidrop.history import writer as writer_module
 from multidrop.history.folder import HistoryFile, file_name, listing, parquet_files, widest
-from multidrop.recording.append_file import AppendFile
+from multidrop.recording.format import AppendFile
 from multidrop.sim import Simulator, Wire, simulated
 from multidrop.transport import clock
 

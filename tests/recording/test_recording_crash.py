@@ -37,7 +37,7 @@ from multidrop.recording import (
     open_writer,
     repair,
 )
-from multidrop.recording.append_file import AppendFile
+from multidrop.recording.format import AppendFile
 from multidrop.recording.rows import from_rows
 
 growing = pytest.mark.parametrize("suffix", [".arrows", ".csv"])

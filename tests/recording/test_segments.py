@@ -14,9 +14,15 @@ from tables import table
 from multidrop.polling.batch import Row
 from multidrop.recording import RecordingError, open_reader
 from multidrop.recording import segments as segments_module
-from multidrop.recording.retention import StoredFile, outlived, parse_age, parse_size
 from multidrop.recording.rows import RecordedRows, from_rows
-from multidrop.recording.segments import SegmentWriter, segments_of
+from multidrop.recording.segments import (
+    SegmentWriter,
+    StoredFile,
+    outlived,
+    parse_age,
+    parse_size,
+    segments_of,
+)
 from multidrop.transport import clock
 
 DAY = 86400.0

@@ -8,8 +8,7 @@ from pathlib import Path
 from typing import Self
 
 from multidrop.core import Side, Wrappings
-from multidrop.recording.append_file import AppendFile
-from multidrop.recording.format import RecordingError, writing
+from multidrop.recording.format import AppendFile, RecordingError, writing
 
 EXPORTED_PDU = 252
 APPLICATION = b"multidrop"  # begins the application's name in captures of ours

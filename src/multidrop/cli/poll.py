@@ -34,7 +34,7 @@ from multidrop.poller import Poller
 from multidrop.polling.batch import Rows
 from multidrop.printable import printable
 from multidrop.recording import FORMATS
-from multidrop.recording.retention import parse_age, parse_size
+from multidrop.recording.segments import parse_age, parse_size
 
 _TAKE_S = 0.1  # between looks for new rows
 

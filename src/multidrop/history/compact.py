@@ -21,8 +21,7 @@ from multidrop.history.folder import STEM, HistoryFile, file_name, parquet_files
 from multidrop.history.quantities import units_of
 from multidrop.polling.batch import Rows
 from multidrop.recording.arrows import ArrowsReader
-from multidrop.recording.file_lock import FileLock
-from multidrop.recording.segments import segments_of
+from multidrop.recording.segments import FileLock, segments_of
 
 MEMORY = "100MB"  # of DuckDB; the process takes about 80 MB more
 TOLD = """

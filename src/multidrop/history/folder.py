@@ -9,8 +9,7 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import NamedTuple
 
-from multidrop.recording.retention import StoredFile
-from multidrop.recording.segments import segments_of
+from multidrop.recording.segments import StoredFile, segments_of
 
 SECOND_NS = 1_000_000_000
 TEN_NS = 10 * SECOND_NS

@@ -14,7 +14,7 @@ from multidrop.history.folder import TEN_NS
 from multidrop.history.kept_series import KeptSeries, Series, SeriesRow
 from multidrop.polling.batch import Row
 from multidrop.recording.arrow_decoder import RecordedColumns
-from multidrop.recording.arrows_tail import ArrowsTail, BatchPlace
+from multidrop.recording.arrows import ArrowsTail, BatchPlace
 
 MOST_TENS = 4096  # series whose tens are kept: names of none may be asked for, too
 

@@ -26,9 +26,8 @@ from multidrop.history.sources import ALWAYS, MOST_TRIES, Replaced, Sources
 from multidrop.history.told_units import UnitBuckets
 from multidrop.polling.batch import Row, Rows
 from multidrop.recording import open_writer
-from multidrop.recording.append_file import new_file
 from multidrop.recording.csv import WITH_UNITS, lines_with_units
-from multidrop.recording.format import Metadata, RecordingReader
+from multidrop.recording.format import Metadata, RecordingReader, new_file
 from multidrop.recording.rows import from_rows
 
 

@@ -17,8 +17,7 @@ from multidrop.history.folder import STEM, listing, stored_files
 from multidrop.polling.batch import Batch
 from multidrop.polling.gathered import GatheredRows, gather
 from multidrop.recording.format import Metadata
-from multidrop.recording.retention import outlived
-from multidrop.recording.segments import SegmentWriter, segments_of
+from multidrop.recording.segments import SegmentWriter, outlived, segments_of
 from multidrop.transport import clock
 
 MOST_WAITING = 250_000  # rows, for a disk that is slow: 12 MB

@@ -12,8 +12,16 @@ from typing import Any, NamedTuple
 from multidrop.core import Names, spell
 from multidrop.core.narrow import greatest_code, wide_codes, widen
 from multidrop.polling.batch import assemble
-from multidrop.recording.arrow_ipc import DICTIONARY_BATCH, RECORD_BATCH, FlatTable, IpcMessage
-from multidrop.recording.arrow_schema import FLOAT, SINGLE, UTF8, FileColumn
+from multidrop.recording.arrow_ipc import (
+    DICTIONARY_BATCH,
+    FLOAT,
+    RECORD_BATCH,
+    SINGLE,
+    UTF8,
+    FileColumn,
+    FlatTable,
+    IpcMessage,
+)
 from multidrop.recording.rows import RecordedRows
 
 MOST_SPELLED = 1 << 28  # bytes of one column's names in a batch: a few may make a small file a huge table

@@ -1,70 +1,194 @@
-"""Encode rows as messages of an Arrow IPC stream, with names as dictionaries.
+"""Encode rows as record batches of an Arrow IPC stream, with names as dictionaries.
 
-A dictionary goes before the first batch that needs it and again, whole, once it has changed: polars and
-nanoarrow read no deltas. It is one piece of the file with that batch.
+A dictionary precedes the first batch that needs it, and is written again, whole, when it has changed: polars
+and nanoarrow read no deltas. It is one piece of the file with that batch.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from array import array
+from collections.abc import Iterator, Sequence
 from itertools import accumulate
 from struct import pack
-from typing import Any
+from typing import Any, NamedTuple
 
-from multidrop.polling.batch import Rows
-from multidrop.recording.arrow_ipc import CONTINUATION, DICTIONARY_BATCH, PREFIX, RECORD_BATCH, SCHEMA
-from multidrop.recording.arrow_schema import CODED, schema_table
-from multidrop.recording.coded_rows import CodedRows, Coder, Names
-from multidrop.recording.flat_builder import Structs, Table, build
+from multidrop.core import STATUSES
+from multidrop.core.narrow import MOST_NARROW, CodeTable, narrow_up
+from multidrop.polling.batch import Batch, Rows
+from multidrop.recording.arrow_ipc import (
+    CODED,
+    CONTINUATION,
+    DICTIONARY_BATCH,
+    PREFIX,
+    RECORD_BATCH,
+    SCHEMA,
+    Structs,
+    Table,
+    build,
+    schema_table,
+)
+from multidrop.recording.rows import texts_of
 
 VERSION = ("<h", 4)  # of the format: V5
 LONGEST_TEXTS = (1 << 31) - 1  # bytes of a dictionary
+DRIVE, REGISTER, STATUS = CODED  # ids of the dictionaries
+MOST_NAMES = {DRIVE: 1 << 16, REGISTER: 1 << 16, STATUS: MOST_NARROW}  # codes of each dictionary
+
+Names = tuple[str, ...]
+Column = Any  # memoryview, array or bytes: anything with a buffer
+Codes = dict[int, tuple[Column, Names]]  # codes and the names they stand for, by dictionary
+
+
+def schema_message(metadata: dict[bytes, bytes]) -> bytes:
+    """Return the first message of a file: its schema and metadata."""
+    return b"".join(_message(SCHEMA, schema_table(metadata), []))
 
 
 class Encoder:
-    """Makes the pieces of one file, and knows which dictionaries it has."""
+    """Encodes the rows of one file. A name keeps its code while its dictionary has room."""
 
     def __init__(self) -> None:
-        self._coder = Coder()
-        self._written: dict[int, Names] = {}
+        self._statuses = CodeTable(STATUSES)
+        self._codes: dict[int, dict[str, int]] = {number: {} for number in CODED}
+        self._dictionaries: dict[int, Names] = {}  # those in the file
 
-    @staticmethod
-    def head(metadata: dict[bytes, bytes]) -> bytes:
-        """Return the message that begins the file."""
-        return b"".join(_message(SCHEMA, schema_table(metadata), []))
+    def encode(self, batch: Rows) -> bytes:
+        """Return the messages of these rows, behind the dictionaries that the file lacks.
 
-    def piece(self, batch: Rows) -> tuple[bytes, dict[int, Names]]:
-        """Return the messages of these rows, and the dictionaries that the file has after them."""
-        after = dict(self._written)
+        Call `forget_dictionaries` if they could not be appended.
+        """
+        source = (
+            _BatchCodes(batch, self._statuses) if isinstance(batch, Batch) else _RowCodes(batch, self._codes)
+        )
         parts: list[Any] = []
-        for coded in self._coder.coded(batch):
-            for number in CODED:
-                names = coded.names[number]
-                if after.get(number) != names:
+        for rows in _pieces(source, 0, len(batch)):
+            for number, names in rows.names.items():
+                if self._dictionaries.get(number) != names:
                     parts += _dictionary(number, names)
-                    after[number] = names
-            parts += _batch(coded)
-        return b"".join(parts), after
+                    self._dictionaries[number] = names
+            parts += _batch(rows)
+        return b"".join(parts)
 
-    def is_written(self, after: dict[int, Names]) -> None:
-        """Note that a piece is in the file."""
-        self._written = after
+    def forget_dictionaries(self) -> None:
+        """Write every dictionary again with the next batch."""
+        self._dictionaries = {}
+
+
+# ---- codes ----
+
+
+class _CodedRows(NamedTuple):
+    """Rows of one record batch."""
+
+    length: int
+    columns: tuple[tuple[bytes, Column], ...]  # validity bitmap (empty: no nulls) and data of each column
+    names: dict[int, Names]  # by dictionary
+
+
+def _pieces(source: _BatchCodes | _RowCodes, begin: int, end: int) -> Iterator[_CodedRows]:
+    """Yield the rows in one piece, or in several if a column has more names than codes."""
+    codes = source.codes(begin, end)
+    if codes is None:
+        middle = begin + (end - begin) // 16 * 8  # a bitmap starts at a whole byte
+        yield from _pieces(source, begin, middle)
+        yield from _pieces(source, middle, end)
+        return
+    rows = slice(begin, end)
+    columns = (
+        (b"", source.time[rows]),
+        (b"", source.sent[rows]),
+        (_bitmap(source.certain, begin, end), narrow_up(source.uncertainty[rows])),
+        (b"", codes[DRIVE][0]),
+        (b"", codes[REGISTER][0]),
+        (_bitmap(source.valid, begin, end), source.value[rows]),
+        (b"", codes[STATUS][0]),
+    )
+    yield _CodedRows(end - begin, columns, {number: names for number, (_, names) in codes.items()})
+
+
+def _bitmap(bits: memoryview | None, begin: int, end: int) -> bytes:
+    """Return the bits of these rows, or nothing if all are set."""
+    if bits is None:
+        return b""
+    rows = end - begin
+    found = int.from_bytes(bits[begin // 8 : (end + 7) // 8], "little") & ((1 << rows) - 1)
+    return b"" if found.bit_count() == rows else found.to_bytes((rows + 7) // 8, "little")
+
+
+class _BatchCodes:
+    """Codes of a polled batch: the core has numbered its drives and registers already."""
+
+    def __init__(self, batch: Batch, statuses: CodeTable) -> None:
+        columns = self._columns = batch.columns()
+        self._statuses = statuses
+        self.time, self.sent, self.uncertainty = columns.time, columns.monotonic_ns, columns.uncertainty_ns
+        self.value = columns.value
+        self.certain = self.valid = columns.valid
+
+    def codes(self, begin: int, end: int) -> Codes | None:
+        """Return the codes of these rows; None if there are too many names."""
+        columns, rows = self._columns, slice(begin, end)
+        statuses = self._statuses.narrow(columns.status[rows])
+        if statuses is None:
+            self._statuses.forget()
+            statuses = self._statuses.narrow(columns.status[rows])
+        if statuses is None:
+            return None
+        return {
+            DRIVE: (columns.drive[rows], columns.drives),
+            REGISTER: (columns.register[rows], columns.registers),
+            STATUS: (statuses, self._statuses.used),
+        }
+
+
+class _RowCodes:
+    """Codes of rows that were read from a recording, as text."""
+
+    def __init__(self, rows: Rows, known: dict[int, dict[str, int]]) -> None:
+        children = list(rows.arrow().view().children)
+        self._known = known
+        self._texts = {number: list(texts_of(children[number])) for number in CODED}
+        self.time, self.sent, self.uncertainty, self.value = (
+            memoryview(children[number].buffer(1)) for number in (0, 1, 2, 5)
+        )
+        self.certain, self.valid = (_bits(children[number]) for number in (2, 5))
+
+    def codes(self, begin: int, end: int) -> Codes | None:
+        """Return the codes of these rows; None if there are too many names."""
+        found: Codes = {}
+        for number, texts in self._texts.items():
+            known, part = self._known[number], texts[begin:end]
+            if len({*known, *part}) > MOST_NAMES[number]:
+                known.clear()
+                if len(set(part)) > MOST_NAMES[number]:
+                    return None
+            kind = "B" if number == STATUS else "H"
+            codes = array(kind, [known.setdefault(text, len(known)) for text in part])
+            found[number] = codes, tuple(known)
+        return found
+
+
+def _bits(column: Any) -> memoryview | None:
+    return memoryview(column.buffer(0)).cast("B") if column.null_count else None
+
+
+# ---- messages ----
 
 
 def _dictionary(number: int, names: Names) -> list[Any]:
     texts = [name.encode() for name in names]
     ends = list(accumulate(map(len, texts), initial=0))
     if ends[-1] > LONGEST_TEXTS:
-        raise ValueError("more than 2 GiB of names in one batch")
+        raise ValueError(f"a batch has {ends[-1]} bytes of names; at most {LONGEST_TEXTS} fit")
     buffers = [b"", pack(f"={len(ends)}i", *ends), b"".join(texts)]
     data, body = _record_batch(len(names), [0], buffers)
     return _message(DICTIONARY_BATCH, {0: ("<q", number), 1: data}, body)
 
 
-def _batch(coded: CodedRows) -> list[Any]:
-    nulls = [_zeros(bits, coded.rows) for bits, _ in coded.columns]
-    buffers = [buffer for column in coded.columns for buffer in column]
-    return _message(RECORD_BATCH, *_record_batch(coded.rows, nulls, buffers))
+def _batch(rows: _CodedRows) -> list[Any]:
+    nulls = [_zeros(bits, rows.length) for bits, _ in rows.columns]
+    buffers = [buffer for column in rows.columns for buffer in column]
+    return _message(RECORD_BATCH, *_record_batch(rows.length, nulls, buffers))
 
 
 def _zeros(bits: bytes, rows: int) -> int:
@@ -72,7 +196,7 @@ def _zeros(bits: bytes, rows: int) -> int:
 
 
 def _record_batch(rows: int, nulls: Sequence[int], buffers: Sequence[Any]) -> tuple[Table, list[Any]]:
-    """Return the table of a batch, and its body: each buffer filled up to eight bytes."""
+    """Return the table of a batch, and its body: each buffer padded to a multiple of eight bytes."""
     nodes = [number for count in nulls for number in (rows, count)]
     places: list[int] = []
     body: list[Any] = []

@@ -7,9 +7,11 @@ numbers of Arrow's format/Message.fbs and format/Schema.fbs.
 from __future__ import annotations
 
 import struct
+import sys
+from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import BinaryIO
+from typing import Any, BinaryIO, NamedTuple
 
 PREFIX = struct.Struct("<4si")  # the continuation marker, and the length of the metadata
 CONTINUATION = b"\xff\xff\xff\xff"
@@ -105,3 +107,140 @@ def _message(file: BinaryIO, at: int, size: int) -> IpcMessage | None:
         return IpcMessage(message.number(1, "<B"), message.table(2), body, end)
     except struct.error:
         return None
+
+
+Table = dict[int, Any]
+_OFFSET = ("<I", 0)  # of what is written later
+
+
+class Structs(bytes):
+    """A vector of structs, which take 16 bytes each."""
+
+
+def build(root: Table) -> bytes:
+    """Return the flatbuffer of this table."""
+    out = bytearray(4)
+    waiting: deque[tuple[int, Any]] = deque([(0, root)])  # with the place of the offset to it
+    while waiting:
+        place, thing = waiting.popleft()
+        if isinstance(thing, dict):
+            at = _put_table(out, thing, waiting)
+        elif isinstance(thing, list):
+            at = _put_tables(out, thing, waiting)
+        else:
+            at = _put_vector(out, thing)
+        struct.pack_into("<I", out, place, at - place)
+    return bytes(out)
+
+
+def _align(out: bytearray, size: int, ahead: int = 0) -> None:
+    """Fill up so that what comes `ahead` bytes later is aligned."""
+    out += bytes(-(len(out) + ahead) % size)
+
+
+def _put_table(out: bytearray, table: Table, waiting: deque[tuple[int, Any]]) -> int:
+    """Put the vtable and then the table: its larger fields first, so that all are aligned."""
+    fields = {number: value if isinstance(value, tuple) else _OFFSET for number, value in table.items()}
+    in_order = sorted(fields, key=lambda number: -struct.calcsize(fields[number][0]))
+    slots = [0] * (max(table, default=-1) + 1)
+    size = 4
+    for number in in_order:
+        width = struct.calcsize(fields[number][0])
+        size += -size % width
+        slots[number] = size
+        size += width
+    vtable = struct.pack(f"<{2 + len(slots)}H", 4 + 2 * len(slots), size, *slots)
+    _align(out, 8, len(vtable))
+    out += vtable
+    at = len(out)
+    out += struct.pack("<i", len(vtable)) + bytes(size - 4)
+    for number, value in table.items():
+        struct.pack_into(fields[number][0], out, at + slots[number], fields[number][1])
+        if not isinstance(value, tuple):
+            waiting.append((at + slots[number], value))
+    return at
+
+
+def _put_tables(out: bytearray, tables: list[Table], waiting: deque[tuple[int, Any]]) -> int:
+    _align(out, 4)
+    at = len(out)
+    out += struct.pack("<I", len(tables)) + bytes(4 * len(tables))
+    waiting.extend((at + 4 + 4 * number, table) for number, table in enumerate(tables))
+    return at
+
+
+def _put_vector(out: bytearray, data: bytes) -> int:
+    is_structs = isinstance(data, Structs)
+    _align(out, 8 if is_structs else 4, 4 if is_structs else 0)
+    at = len(out)
+    out += struct.pack("<I", len(data) // 16 if is_structs else len(data)) + data + b"\0"
+    return at
+
+
+INT, FLOAT, UTF8, TIMESTAMP = 2, 3, 5, 10  # Field.type_type
+SINGLE, DOUBLE, NANOSECONDS = 1, 2, 3
+BUFFERS = {INT: 2, FLOAT: 2, TIMESTAMP: 2, UTF8: 3}  # that a column has in a batch
+
+
+class FileColumn(NamedTuple):
+    """A column's name, type, the first field of that (bits, precision, unit), and the bits of its codes."""
+
+    name: bytes
+    kind: int
+    detail: int = 0
+    code_bits: int = 0  # of unsigned codes of a dictionary; 0: it has none
+    nullable: bool = False
+
+    @property
+    def buffers(self) -> int:
+        """Buffers in a batch; codes have two, as all numbers."""
+        return 2 if self.code_bits else BUFFERS[self.kind]
+
+
+COLUMNS = (
+    FileColumn(b"time", TIMESTAMP, NANOSECONDS),
+    FileColumn(b"monotonic_ns", INT, 64),
+    FileColumn(b"uncertainty_ns", FLOAT, SINGLE, nullable=True),  # rounded up: the bound stays true
+    FileColumn(b"drive", UTF8, code_bits=16),
+    FileColumn(b"register", UTF8, code_bits=16),
+    FileColumn(b"value", FLOAT, DOUBLE, nullable=True),
+    FileColumn(b"status", UTF8, code_bits=8),
+)
+COLUMNS_BEFORE = (  # until 0.1; and as other programs write our batches
+    *COLUMNS[:2],
+    FileColumn(b"uncertainty_ns", INT, 64, nullable=True),
+    *(FileColumn(name, UTF8) for name in (b"drive", b"register")),
+    COLUMNS[5],
+    FileColumn(b"status", UTF8),
+)
+CODED = {number: column for number, column in enumerate(COLUMNS) if column.code_bits}  # by dictionary's id
+
+
+def schema_table(metadata: dict[bytes, bytes]) -> Table:
+    """Return the Schema of these columns."""
+    return {
+        0: ("<h", int(sys.byteorder == "big")),
+        1: [_field(number, column) for number, column in enumerate(COLUMNS)],
+        2: [{0: key, 1: value} for key, value in metadata.items()],
+    }
+
+
+def _field(number: int, column: FileColumn) -> Table:
+    field: Table = {
+        0: column.name,
+        1: ("<?", column.nullable),
+        2: ("<B", column.kind),
+        3: _type(column.kind, column.detail),
+        5: [],
+    }
+    if column.code_bits:
+        field[4] = {0: ("<q", number), 1: {0: ("<i", column.code_bits), 1: ("<?", False)}}
+    return field
+
+
+def _type(kind: int, detail: int) -> Table:
+    if kind == INT:
+        return {0: ("<i", detail), 1: ("<?", True)}
+    if kind == FLOAT:
+        return {0: ("<h", detail)}
+    return {0: ("<h", detail), 1: b"UTC"} if kind == TIMESTAMP else {}

@@ -14,7 +14,6 @@ from typing import Any
 
 from multidrop.polling.batch import Rows, schema
 from multidrop.polling.table import nanoarrow
-from multidrop.recording.append_file import new_file
 from multidrop.recording.format import (
     METADATA_KEY,
     Metadata,
@@ -22,6 +21,7 @@ from multidrop.recording.format import (
     RecordingReader,
     RecordingWriter,
     dump_metadata,
+    new_file,
     writing,
 )
 from multidrop.recording.rows import RecordedRows

@@ -40,7 +40,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     require_fleet()
     from multidrop.fleet.servers.plant_store import read_plant
-    from multidrop.recording.retention import parse_size
+    from multidrop.recording.segments import parse_size
 
     keep = parse_size(arguments.keep or KEEP)
     records = read_plant(arguments.plant)[1] if arguments.plant else None

@@ -45,7 +45,7 @@ async def _serve(arguments: argparse.Namespace, log: LogThread) -> int:
     from multidrop.fleet.gateway import FleetGateway
     from multidrop.fleet.gateway_metrics import families_of
     from multidrop.fleet.metrics_port import listen, serving
-    from multidrop.recording.retention import parse_size
+    from multidrop.recording.segments import parse_size
 
     name = arguments.gateway
     listener = listen(arguments.metrics) if arguments.metrics else None

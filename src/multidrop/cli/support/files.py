@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from multidrop.cli.support.output import warn
 from multidrop.cli.support.values import counted
-from multidrop.recording.append_file import already_there, new_file
+from multidrop.recording.format import already_there, new_file
 from multidrop.recording.segments import segments_of
 
 if TYPE_CHECKING:
