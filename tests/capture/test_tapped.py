@@ -21,9 +21,9 @@ from recordings import recorded
 from variants import LATEST, fast_drives, real_drives, real_wires
 
 from multidrop.capture import Capture, CaptureWriter, Decoding, FlightRecorder, Side, Tapped
-from multidrop.capture import flight_recorder as flight
-from multidrop.capture.anomalies import AnomalyWatch
+from multidrop.capture import tap as flight
 from multidrop.capture.pcapng_writer import WRAPPINGS
+from multidrop.capture.tap import AnomalyWatch
 from multidrop.cli.poll import tap_text
 from multidrop.core import Exchange, Framing, Message, NumberFormat, Peer, Splitter, Status, Tap
 from multidrop.families import InnovertIBD

@@ -14,7 +14,7 @@ from terminals import on_terminal
 from toy import Toy
 
 import multidrop.cli.scan
-import multidrop.scan.probe
+import multidrop.scan.identify
 from multidrop.cli.scan import sentence
 from multidrop.core import RS485, Framing
 from multidrop.drive.timing import Settings
@@ -35,7 +35,7 @@ PATIENTLY = ("--baudrates", "9600", "--formats", "8N1", "--addresses", "1-3")  #
 @pytest.fixture(autouse=True)
 def _slow_answers(monkeypatch: pytest.MonkeyPatch) -> None:
     """A drive that answered at once is waited for, when a busy machine holds its next answer up."""
-    monkeypatch.setattr(multidrop.scan.probe, "LEAST_TIMEOUT", 0.1)
+    monkeypatch.setattr(multidrop.scan.identify, "LEAST_TIMEOUT", 0.1)
 
 
 @pytest.fixture

@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 from simulated_bus import SimulatedBus
 from tables import table
 
-from multidrop.capture.lookup import RegisterLookup
+from multidrop.capture.decoding import RegisterLookup
 from multidrop.control.outcome import Effect
 from multidrop.core import Columns, Framing, Message, Names, NumberFormat, RowLayout
 from multidrop.drive import Drive

@@ -27,7 +27,7 @@ import multidrop.gateway.modbus_server.server
 import multidrop.importers
 import multidrop.plant.model
 import multidrop.recording
-import multidrop.sim.faults
+import multidrop.sim.faulty_wire
 import multidrop.toml_check
 from multidrop.capture import decoding
 
@@ -44,7 +44,7 @@ MODULES = (  # and of several
     multidrop.plant.model,
     multidrop.toml_check,
     multidrop.families.registry,
-    multidrop.sim.faults,
+    multidrop.sim.faulty_wire,
     multidrop.fleet.samples.message,
     multidrop.fleet.samples.unpacked_size,
     multidrop.gateway.modbus_server.protocol,

@@ -16,7 +16,7 @@ from examples import examples, usually
 from histories import DAY, METADATA, NOON, SECOND, check_buckets, random_rows, record, rows_in
 
 from multidrop import History
-from multidrop.history import growing, kept_series
+from multidrop.history import growing
 from multidrop.history.buckets import grid_of
 from multidrop.history.compact import compact
 from multidrop.history.database import Database
@@ -330,7 +330,7 @@ def test_plots_of_a_segment_that_grows_are_of_all_its_rows(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, most: int
 ) -> None:
     """Asked again and again for other series and ranges, among them such as begin before or far behind."""
-    monkeypatch.setattr(kept_series, "MOST_KEPT", most)
+    monkeypatch.setattr(growing, "MOST_KEPT", most)
     monkeypatch.setattr(growing, "MOST_TENS", 3 if most else 0)
     dice = random.Random(most)
     rows = random_rows(5, NOON, 400) + random_rows(6, NOON + 20 * SECOND, 200)  # the clock was set back
@@ -349,7 +349,7 @@ def test_plots_of_a_segment_that_grows_are_of_all_its_rows(
 
 
 def test_names_of_nothing_fill_no_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(kept_series, "MOST_SERIES", 3)
+    monkeypatch.setattr(growing, "MOST_SERIES", 3)
     with SegmentWriter(tmp_path / "rows.arrows", METADATA, every=1e9) as writer, History(tmp_path) as history:
         writer.write(from_rows(random_rows(1, NOON, 200)))
         for at in range(9):

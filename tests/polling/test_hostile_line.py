@@ -25,7 +25,7 @@ from variants import LINES, of_all_variants, of_one_variant
 from multidrop.drive import Drive
 from multidrop.families import DelixiNative
 from multidrop.sim import Faults, simulated
-from multidrop.sim.faults import RATES
+from multidrop.sim.faulty_wire import RATES
 
 pytestmark = pytest.mark.story
 

@@ -37,12 +37,10 @@ def _imported() -> None:
     import numpy as np
 
     from multidrop.report import Recording, load, plot, plot_page, png, report_page
-    from multidrop.report.health import MOST_REASONS, delays, draw_rates, miss_shares, reasons_of
+    from multidrop.report.health import MOST_REASONS, delays, draw_rates, line_uses, miss_shares, reasons_of
     from multidrop.report.html import _about, _drives
-    from multidrop.report.lanes import MOST_LANES
     from multidrop.report.style import MOST_DRIVES
-    from multidrop.report.utilisation import line_uses
-    from multidrop.report.value_plot import MOST_PANELS, MOST_POINTS, thinned
+    from multidrop.report.value_plot import MOST_LANES, MOST_PANELS, MOST_POINTS, thinned
 
 
 @pytest.mark.slow

@@ -18,7 +18,7 @@ from multidrop.core import STATUSES, Message, Peer
 from multidrop.errors import LineError, PortLost
 from multidrop.families import YD1000
 from multidrop.sim import Faults, FaultyWire, SimulatedDrive, Simulator, load_faults, simulated
-from multidrop.sim.faults import RATES
+from multidrop.sim.faulty_wire import RATES
 from multidrop.toml_check import parse_duration
 from multidrop.transport.line import Line
 from multidrop.transport.prepared import make_exchange

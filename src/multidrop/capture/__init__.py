@@ -20,7 +20,6 @@ not hold exactly one frame.
 from __future__ import annotations
 
 from multidrop.capture.decoding import Decoding as Decoding
-from multidrop.capture.flight_recorder import FlightRecorder as FlightRecorder
 from multidrop.capture.pairing import Junk as Junk
 from multidrop.capture.pairing import Pairing as Pairing
 from multidrop.capture.pairing import Sniffed as Sniffed
@@ -28,5 +27,6 @@ from multidrop.capture.pairing import SniffedExchange as SniffedExchange
 from multidrop.capture.pcapng_reader import Capture as Capture
 from multidrop.capture.pcapng_reader import CaptureError as CaptureError
 from multidrop.capture.pcapng_writer import CaptureWriter as CaptureWriter
+from multidrop.capture.tap import FlightRecorder as FlightRecorder
 from multidrop.capture.tap import Tapped as Tapped
 from multidrop.core import Side as Side

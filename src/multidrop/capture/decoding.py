@@ -6,13 +6,35 @@ reply's. A capture has one clock only: `monotonic_ns` equals `time`.
 
 from __future__ import annotations
 
+import struct
 from collections import Counter
 from collections.abc import Iterator
+from dataclasses import dataclass
+from datetime import datetime
+from typing import Any
 
-from multidrop.capture.lookup import RegisterLookup, RequestTarget, line_of
+from multidrop.capture.pairing import Junk, Sniffed, SniffedExchange
 from multidrop.capture.pcapng_reader import Capture
-from multidrop.core import Columns, Decoded, Decoder, Field, Framing, Names, RowLayout, Stream
+from multidrop.core import (
+    Columns,
+    Decoded,
+    Decoder,
+    Field,
+    Framing,
+    Message,
+    Names,
+    NumberFormat,
+    RowLayout,
+    Status,
+    Stream,
+    raw_value,
+)
+from multidrop.drive.family import Drive
+from multidrop.drive.number_format import bits_in
+from multidrop.drive.register import Register
 from multidrop.drive.row_field import row_field
+from multidrop.drive.table import Carrier
+from multidrop.iso_time import format_time
 from multidrop.plant.model import Plant, PlantLine
 from multidrop.polling.batch import Batch
 
@@ -88,3 +110,215 @@ class _LineDecoding:
             else:
                 fields.append(row_field(place.register, place.at, code))
         return RowLayout(drive, fields)
+
+
+_TABLES = {
+    0x01: "coil",
+    0x02: "discrete_input",
+    0x03: "holding_register",
+    0x04: "input_register",
+    0x05: "coil",
+    0x06: "holding_register",
+    0x08: "loopback",
+    0x0F: "coil",
+    0x10: "holding_register",
+}
+_BITS = (0x01, 0x02, 0x05, 0x0F)
+_MOST = {NumberFormat.BIT: 2000, NumberFormat.U16: 125}  # in a reply, whatever the request asks for
+_WRITES = {0x05: (0x05,), 0x06: (0x06,), 0x0F: (0x05, 0x0F), 0x10: (0x06, 0x10)}  # by function
+_DELIXI_WRITES = {0x02: (0x02,), 0x04: (0x04,), 0x05: (0x05, 0x06), 0x06: (0x05, 0x06)}
+
+
+@dataclass(frozen=True)
+class RegisterPlace:
+    """A register, None for an unknown one, and its offset in an exchange's data, in words or bits."""
+
+    name: str
+    at: int
+    number_format: NumberFormat
+    register: Register[Any] | None = None
+
+
+@dataclass(frozen=True)
+class RequestTarget:
+    """The drive that a request is for, and the registers that it reads or writes."""
+
+    drive: str
+    is_write: bool
+    places: tuple[RegisterPlace, ...]
+
+
+def line_of(plant: Plant | None, name: str) -> PlantLine | None:
+    """Return the plant's line with this name; its only line matches any name."""
+    lines = plant.lines if plant else ()
+    named = [line for line in lines if line.name == name]
+    return named[0] if named else lines[0] if len(lines) == 1 else None
+
+
+class RegisterLookup:
+    """The registers of one line's drives."""
+
+    def __init__(self, line: PlantLine | None) -> None:
+        drives = [polled.drive for polled in line.drives] if line else []
+        self._drives = {(drive.address, drive.framing): drive for drive in drives}
+
+    def find(self, framing: Framing, request: Message) -> RequestTarget:
+        drive = self._drives.get((request.address, framing))
+        name = drive.name if drive else f"address {request.address}"
+        writes = _DELIXI_WRITES if framing is Framing.DELIXI else _WRITES
+        is_write = request.function in writes
+        functions = writes.get(request.function, (request.function,))
+        known = _known(drive, request, functions, is_write) if drive else ()
+        return RequestTarget(name, is_write, known or _raw(framing, request))
+
+
+def _known(
+    drive: Drive, request: Message, functions: tuple[int, ...], is_write: bool
+) -> tuple[RegisterPlace, ...]:
+    found = [
+        RegisterPlace(register.name, at, register.number_format, register)
+        for register in drive.registers.values()
+        if (register.table.write if is_write else register.table.read) in functions
+        and (is_write or register.readable)
+        and (at := _offset(register, request)) is not None
+    ]
+    return tuple(sorted(found, key=lambda place: place.at))
+
+
+def _offset(register: Register[Any], request: Message) -> int | None:
+    """Return the register's offset in the data; None unless the request covers all that its value needs."""
+    if register.table.carrier is Carrier.NUMBER:
+        return 0
+    end, reach = request.start + max(request.count, 1), register.reach
+    for start in (reach.start, register.ram_address):
+        if start is not None and request.start <= start and start + len(reach) <= end:
+            return start - request.start + register.address - reach.start
+    return None
+
+
+def _raw(framing: Framing, request: Message) -> tuple[RegisterPlace, ...]:
+    if framing is Framing.DELIXI:
+        return (RegisterPlace(f"k{request.function}_{request.start:04X}", 0, NumberFormat.U32),)
+    table = _TABLES[request.function]
+    number_format = NumberFormat.BIT if request.function in _BITS else NumberFormat.U16
+    count = min(max(request.count, 1), _MOST[number_format])
+    return tuple(RegisterPlace(f"{table}_{request.start + at}", at, number_format) for at in range(count))
+
+
+_MOST_SHOWN = 16  # raw registers in a line of text
+_MOST_BYTES = 32
+
+
+class ExchangeFormatter:
+    """Format the exchanges of one line, in engineering units where the plant is known."""
+
+    def __init__(self, lookup: RegisterLookup) -> None:
+        self._lookup = lookup
+
+    def text(self, sniffed: Sniffed) -> str:
+        """Return one line of text, without the bus line's name."""
+        clock = _clock(sniffed.time_ns)
+        if isinstance(sniffed, Junk):
+            return f"{clock}  unknown: {_hex(sniffed.raw)}"
+        request = sniffed.request
+        if request is None:
+            reply = sniffed.reply
+            assert reply is not None
+            return (
+                f"{clock}  address {reply.address}  function {reply.function:02X}: "
+                f"reply without its request: {_hex(sniffed.raw[0][1])}"
+            )
+        target = self._lookup.find(sniffed.framing, request)
+        drive = "all drives" if sniffed.is_broadcast else target.drive
+        verb = "writes" if target.is_write else "reads"
+        doubt = "" if sniffed.is_sure else " (or its confirmation)"
+        return f"{clock}  {drive}  {verb}{doubt} {self._result(sniffed, request, target)}"
+
+    def _result(self, exchange: SniffedExchange, request: Message, target: RequestTarget) -> str:
+        places = target.places[:_MOST_SHOWN]
+        names = ", ".join(place.name for place in places)
+        if exchange.reply is not None and exchange.reply.exception:
+            return f"{names}: refused, code {exchange.reply.exception:02X}H{_delay(exchange)}"
+        if exchange.reply is None and not target.is_write:
+            return f"{names}: no reply"
+        data = data_of(exchange, request)
+        more = len(target.places) - len(places)
+        values = ", ".join(_shown(place, data) for place in places) + (f" and {more} more" if more else "")
+        if exchange.is_broadcast:
+            return f"{values} (broadcast)"
+        return values + (": no reply" if exchange.reply is None else _delay(exchange))
+
+    def json(self, sniffed: Sniffed) -> dict[str, Any]:
+        """Return an object for JSON, without the bus line's name."""
+        found: dict[str, Any] = {"time": format_time(sniffed.time_ns)}
+        if isinstance(sniffed, Junk):
+            return found | {"unknown": sniffed.raw.hex(" ").upper()}
+        request, reply = sniffed.request, sniffed.reply
+        message = request or reply
+        assert message is not None
+        found |= {
+            "framing": str(sniffed.framing),
+            "address": message.address,
+            "function": message.function,
+            "frames": [raw.hex(" ").upper() for _, raw, _ in sniffed.raw],
+        }
+        if request is None:
+            return found | {"result": "reply without its request"}
+        target = self._lookup.find(sniffed.framing, request)
+        found |= {"drive": target.drive, "access": "write" if target.is_write else "read"}
+        if reply is None:
+            found["result"] = "broadcast" if sniffed.is_broadcast else "no reply"
+        else:
+            found["result"] = "refused" if reply.exception else "ok"
+            found["reply_after_ns"] = sniffed.reply_time_ns - sniffed.time_ns
+            if reply.exception:
+                found["exception"] = reply.exception
+        if not sniffed.is_sure:
+            found["may_be_confirmation"] = True
+        if found["result"] == "ok" or target.is_write:
+            data = data_of(sniffed, request)
+            found["values"] = {place.name: _number(place, data) for place in target.places}
+        return found
+
+
+def data_of(exchange: SniffedExchange, request: Message) -> bytes:
+    """Return the data that was read or written: a write's reply does not always repeat it."""
+    if exchange.framing is Framing.DELIXI and request.function == 0x02:
+        return struct.pack(">I", request.start)
+    if exchange.framing is not Framing.DELIXI and request.function >= 0x05:
+        return request.data
+    return exchange.reply.data if exchange.reply else request.data
+
+
+def _clock(time_ns: int) -> str:
+    """Return the local time of day, to the microsecond."""
+    return f"{datetime.fromtimestamp(time_ns // 10**9).strftime('%H:%M:%S')}.{time_ns % 10**9 // 1000:06}"
+
+
+def _delay(exchange: SniffedExchange) -> str:
+    return f"  ({(exchange.reply_time_ns - exchange.time_ns) / 1e6:.1f} ms)"
+
+
+def _hex(raw: bytes) -> str:
+    more = f" and {len(raw) - _MOST_BYTES} bytes more" if len(raw) > _MOST_BYTES else ""
+    return raw[:_MOST_BYTES].hex(" ").upper() + more
+
+
+def _number(place: RegisterPlace, data: bytes) -> float | int | None:
+    if place.register is not None:
+        number = place.register.number_in(data, place.at)
+        return number if number is None or place.register.values is None else int(number)
+    raw = raw_value(data, place.at, place.number_format)
+    return int(raw) if raw == raw else None  # NaN: the data ends before it
+
+
+def _shown(place: RegisterPlace, data: bytes) -> str:
+    register = place.register
+    raw = raw_value(data, place.at, place.number_format)
+    if register is None:
+        return f"{place.name} = {int(raw)}" if raw == raw else f"{place.name} ?"
+    value = register.value_in(data, place.at)
+    if value is not None:
+        return f"{register.name} = {register.format(value)}"
+    is_there = bits_in(data, place.at, register.number_format, register.order) is not None
+    return f"{register.name}: {Status.NO_VALUE}" if is_there else f"{register.name} ?"

@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import re
+from collections import deque
+from collections.abc import Iterator, Mapping, Sequence
+from datetime import UTC, datetime
+from pathlib import Path
 from typing import Protocol, Self
 
 from multidrop.bus import Bus
-from multidrop.capture.anomalies import AnomalyWatch
-from multidrop.capture.pcapng_writer import TCP_WRAPPINGS, WRAPPINGS
-from multidrop.core import Tap, utc_minus_monotonic_ns
+from multidrop.capture.pcapng_writer import TCP_WRAPPINGS, WRAPPINGS, CaptureWriter
+from multidrop.core import Status, Tap, utc_minus_monotonic_ns
+from multidrop.drive.family import Drive
+from multidrop.recording.format import writing
+from multidrop.transport.clock import now_ns
 
 
 class Sink(Protocol):
@@ -66,3 +72,143 @@ class Tapped:
 
     def __exit__(self, *error: object) -> None:
         self.close()
+
+
+AFTER_S = 2.0  # of traffic after the anomaly are written too
+PAUSE_S = 60.0  # between two files, so that a noisy line does not fill the disk
+_NAME = re.compile(r"flight-\d{8}T\d{6}Z\.pcapng")
+_MOST_NAMED = 20  # anomalies in a file's comment
+
+
+class FlightRecorder:
+    """Keep the last `seconds` of the lines' traffic in memory, and no more than `most_bytes`.
+
+    `AFTER_S` after an anomaly, and not before `PAUSE_S` have passed since the last file, a capture
+    `flight-<UTC>.pcapng` is written into `directory`, with the anomaly in its comment. The newest
+    `most_files` of them are kept. `written` lists those of this recorder. Raises RecordingError.
+    """
+
+    def __init__(
+        self,
+        directory: Path | str,
+        lines: Sequence[str],
+        *,
+        seconds: float = 300.0,
+        most_bytes: int = 16 << 20,
+        most_files: int = 64,
+    ) -> None:
+        if most_files < 1:
+            raise ValueError(f"most_files = {most_files} would keep no capture")
+        self.directory = Path(directory)
+        self.written: list[Path] = []
+        self._lines = lines
+        self._kept_ns = round(seconds * 1e9)
+        self._most_bytes = most_bytes
+        self._most_files = most_files
+        self._packets: deque[tuple[int, bytes]] = deque()
+        self._bytes = 0
+        self._anomalies: list[str] = []
+        self._due_ns = 0
+        self._next_ns = now_ns()
+        with writing(self.directory):
+            self.directory.mkdir(parents=True, exist_ok=True)
+
+    def append(self, packets: bytes) -> None:
+        """Keep packets of the lines, and drop those that are too old or too many."""
+        self._packets.append((now_ns(), packets))
+        self._bytes += len(packets)
+        while self._packets and (
+            self._bytes > self._most_bytes or self._packets[0][0] < self._packets[-1][0] - self._kept_ns
+        ):
+            self._bytes -= len(self._packets.popleft()[1])
+
+    def report(self, anomalies: Sequence[str]) -> None:
+        """Take note of anomalies, and write a capture if one is due."""
+        now = now_ns()
+        if anomalies and not self._anomalies:
+            self._due_ns = max(now + round(AFTER_S * 1e9), self._next_ns)
+        self._anomalies += anomalies[: _MOST_NAMED - len(self._anomalies)]
+        if self._anomalies and now >= self._due_ns:
+            self._write(now)
+
+    def close(self) -> None:
+        """Write the capture that is still due."""
+        if self._anomalies and now_ns() >= self._next_ns:
+            self._write(now_ns())
+
+    def _write(self, now: int) -> None:
+        second = (now + utc_minus_monotonic_ns()) // 10**9
+        while (path := self.directory / _name(second)).exists():  # of another recorder in this directory
+            second += 1
+        with CaptureWriter(path, self._lines, "; ".join(dict.fromkeys(self._anomalies))) as capture:
+            for _, packets in self._packets:
+                capture.append(packets)
+        self.written.append(path)
+        self._anomalies = []
+        self._next_ns = now + round(PAUSE_S * 1e9)
+        files = sorted(file for file in self.directory.iterdir() if _NAME.fullmatch(file.name))
+        for oldest in files[: -self._most_files]:
+            oldest.unlink(missing_ok=True)  # another recorder may have removed it
+
+
+def _name(second: int) -> str:
+    return f"flight-{datetime.fromtimestamp(second, UTC):%Y%m%dT%H%M%SZ}.pcapng"
+
+
+SILENT = 3  # exchanges in a row without a reply
+_BAD = (
+    Status.NO_START,
+    Status.BAD_CHARACTER,
+    Status.BAD_CHECKSUM,
+    Status.BAD_ADDRESS,
+    Status.BAD_FUNCTION,
+    Status.BAD_LENGTH,
+    Status.BAD_ECHO,
+    Status.CUT_SHORT,
+)
+
+
+class AnomalyWatch:
+    """Find the anomalies of one line."""
+
+    def __init__(self, name: str, bus: Bus) -> None:
+        self._name = name
+        self._bus = bus
+        self._drives = [_WatchedDrive(bus, drive) for drive in bus.drives]
+        self._is_lost = False
+
+    def check(self) -> Iterator[str]:
+        """Yield a sentence for each anomaly since the last check."""
+        port = self._bus.line.queue
+        was_lost, self._is_lost = self._is_lost, port is None or port.lost
+        if self._is_lost and not was_lost:
+            yield f"{self._name}: the port was lost"
+        for drive in self._drives:
+            for anomaly in drive.check():
+                yield f"{self._name}: {drive.name}: {anomaly}"
+
+
+class _WatchedDrive:
+    def __init__(self, bus: Bus, drive: Drive) -> None:
+        self.name = drive.name
+        self._peer = bus.peer(drive)
+        self._exchanges = self._late = 0
+        self._is_silent = True
+        self._bad: dict[Status, int] = {}
+
+    def check(self) -> Iterator[str]:
+        if self._peer.exchanges == self._exchanges:
+            return
+        counters = self._peer.counters()
+        self._exchanges = counters.exchanges
+        was_silent = self._is_silent
+        self._is_silent = self._peer.failures >= SILENT or not counters.answered
+        if self._is_silent and not was_silent:
+            yield "fell silent"
+        if counters.late > self._late:
+            yield "late reply"
+        bad = {result: counters.ended[result] for result in _BAD if result in counters.ended}
+        for result, count in bad.items():
+            if count > self._bad.get(result, 0):
+                yield str(result)
+        self._late, self._bad = counters.late, bad

@@ -12,7 +12,7 @@ from multidrop.drive.network import speaks_tcp
 from multidrop.plant.loader import load_plant
 from multidrop.plant.model import PlantLine
 from multidrop.sim import FaultyWire, SimulatedDrive, Simulator, load_faults, serve, simulated
-from multidrop.sim.faults import HELP, Faults
+from multidrop.sim.faulty_wire import HELP, Faults
 
 ANY_TCP = "tcp://127.0.0.1:0"  # for a line on another machine: any free port of this one
 LOOPBACK = ("127.0.0.1", "localhost")

@@ -16,9 +16,8 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from multidrop.capture import Capture, CaptureWriter, Pairing, Side, Sniffed
-from multidrop.capture.lookup import RegisterLookup
-from multidrop.capture.lookup import line_of as captured_line
-from multidrop.capture.text import ExchangeFormatter
+from multidrop.capture.decoding import ExchangeFormatter, RegisterLookup
+from multidrop.capture.decoding import line_of as captured_line
 from multidrop.cli.support.arguments import (
     add_json_argument,
     add_line_arguments,

@@ -10,7 +10,7 @@ from shutil import rmtree
 from tempfile import mkdtemp
 from typing import Any
 
-from multidrop.history.kept_series import Series
+from multidrop.history.series import Series
 from multidrop.polling.batch import Rows, assemble, schema
 from multidrop.recording.format import METADATA_KEY, Metadata
 from multidrop.recording.rows import RecordedRows

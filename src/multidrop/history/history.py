@@ -7,23 +7,24 @@ import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 
-from multidrop.history.asked import Moment, ns_of, parsed_series
-from multidrop.history.buckets import Buckets, Grid, grid_of
+from multidrop.history.buckets import Buckets, Grid, UnitBuckets, grid_of
 from multidrop.history.database import MissingDuckDB
 from multidrop.history.folder import HistoryFile, Listing, listing
-from multidrop.history.kept_series import Series
 from multidrop.history.quantities import OtherColumn, Parting, units_of
-from multidrop.history.queries import (
+from multidrop.history.series import Moment, Series, ns_of, parsed_series
+from multidrop.history.sources import (
+    ALWAYS,
+    MOST_TRIES,
     OF_ROWS,
     OF_TENS,
+    Replaced,
+    Sources,
     gather_files,
     metadata_of,
     rows_of_file,
     told_by,
     write_parquet,
 )
-from multidrop.history.sources import ALWAYS, MOST_TRIES, Replaced, Sources
-from multidrop.history.told_units import UnitBuckets
 from multidrop.polling.batch import Row, Rows
 from multidrop.recording import open_writer
 from multidrop.recording.csv import WITH_UNITS, lines_with_units

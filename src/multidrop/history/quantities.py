@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
-from multidrop.history.kept_series import Series
+from multidrop.history.series import Series
 
 RAW, NAMED = "raw count", "names"
 

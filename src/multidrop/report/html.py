@@ -13,15 +13,17 @@ from matplotlib.figure import Figure
 from multidrop.printable import printable
 from multidrop.report.health import (
     DelaySeries,
+    LineUse,
     delays,
     draw_delays,
     draw_miss_shares,
     draw_rates,
+    draw_utilisation,
+    line_uses,
     reasons_of,
 )
 from multidrop.report.load import Recording, Series
 from multidrop.report.style import MOST_DRIVES, png
-from multidrop.report.utilisation import LineUse, draw_utilisation, line_uses
 from multidrop.report.value_plot import FAULTS, plot
 
 SHORT = 32  # characters, in a cell that is not broken

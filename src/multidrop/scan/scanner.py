@@ -22,7 +22,7 @@ from multidrop.core import (
 )
 from multidrop.drive.family import Drive
 from multidrop.errors import LineError
-from multidrop.scan.probe import MOST_TIMEOUT, TRIES, Probe, is_whole
+from multidrop.scan.identify import MOST_TIMEOUT, TRIES, Probe, is_whole
 from multidrop.scan.results import Crowd, Finding, Noise, Progress, Untried
 from multidrop.scan.sweep import Sweep
 

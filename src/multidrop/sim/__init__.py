@@ -1,15 +1,15 @@
 """Simulated drives that behave as their documents say, on ptys and TCP ports, at the pace of a wire."""
 
 from multidrop.sim.drive import DriveCounters as DriveCounters
+from multidrop.sim.drive import EncodedDrive as EncodedDrive
 from multidrop.sim.drive import SimulatedDrive as SimulatedDrive
 from multidrop.sim.drive import Written as Written
-from multidrop.sim.encoded import EncodedDrive as EncodedDrive
-from multidrop.sim.encoded import encoded as encoded
-from multidrop.sim.encoded import proof as proof
+from multidrop.sim.drive import encoded as encoded
+from multidrop.sim.drive import proof as proof
 from multidrop.sim.families import simulated as simulated
-from multidrop.sim.faults import Faults as Faults
-from multidrop.sim.faults import load_faults as load_faults
+from multidrop.sim.faulty_wire import Faults as Faults
 from multidrop.sim.faulty_wire import FaultyWire as FaultyWire
+from multidrop.sim.faulty_wire import load_faults as load_faults
 from multidrop.sim.motor import Motor as Motor
 from multidrop.sim.motor import Phase as Phase
 from multidrop.sim.motor import Rating as Rating

@@ -13,16 +13,18 @@ from multidrop.families.invt_che import InvtCHE
 from multidrop.families.profiles import CiA402, DanfossFC, Delta, Invt, Optidrive, Profidrive
 from multidrop.families.yd1000 import YD1000
 from multidrop.sim.che import SimulatedCHE
-from multidrop.sim.cia402 import SimulatedCiA402
-from multidrop.sim.danfoss_fc import SimulatedDanfossFC
 from multidrop.sim.delixi import SimulatedDelixi, SimulatedDelixiNative
-from multidrop.sim.delta import SimulatedDelta
 from multidrop.sim.drive import SimulatedDrive
 from multidrop.sim.erman import SimulatedERMAN
 from multidrop.sim.ibd import SimulatedIBD
-from multidrop.sim.invt import SimulatedInvt
-from multidrop.sim.optidrive import SimulatedOptidrive
-from multidrop.sim.profidrive import SimulatedProfidrive
+from multidrop.sim.profiles import (
+    SimulatedCiA402,
+    SimulatedDanfossFC,
+    SimulatedDelta,
+    SimulatedInvt,
+    SimulatedOptidrive,
+    SimulatedProfidrive,
+)
 from multidrop.sim.yd1000 import SimulatedYD1000
 
 FAMILIES: Mapping[type[Drive], type[SimulatedDrive]] = {

@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from datetime import UTC, datetime, timedelta
 
-from multidrop.history.kept_series import Series
-
+Series = tuple[str, str]  # drive and register
 Moment = int | datetime
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 

@@ -1,0 +1,340 @@
+"""PROFIdrive's state machine, simulated (ACS550-02/U2 manual p. 246, ACS355 p. 319, G120C p. 195 and 235)."""
+
+from __future__ import annotations
+
+from multidrop.families.profiles.cia402 import CiA402Control, CiA402Status
+from multidrop.families.profiles.danfoss_fc import DanfossControl, DanfossStatus
+from multidrop.families.profiles.delta import (
+    FORWARD,
+    REVERSE,
+    RUNNING,
+    STOPPED,
+    STOPPING,
+    DeltaReset,
+    DeltaStatus,
+)
+from multidrop.families.profiles.invt import InvtControl, InvtStatus
+from multidrop.families.profiles.optidrive import OptidriveControl, OptidriveStatus
+from multidrop.families.profiles.profidrive import ProfidriveControl, ProfidriveStatus
+from multidrop.sim.memory import MemoryCell
+from multidrop.sim.motor import Phase
+from multidrop.sim.motor_drive import ProfileDrive
+from multidrop.sim.protocol import Reason, Refusal
+
+_NO_OFF = ProfidriveControl.NO_OFF2 | ProfidriveControl.NO_OFF3
+_RUN = (
+    ProfidriveControl.ENABLE_OPERATION
+    | ProfidriveControl.ENABLE_RAMP
+    | ProfidriveControl.CONTINUE_RAMP
+    | ProfidriveControl.ENABLE_SETPOINT
+)
+
+
+class SimulatedProfidrive(ProfileDrive):
+    """PROFIdrive: inhibited after power-up, a trip, OFF2 and OFF3, until a word with OFF1 and without these.
+
+    `off2` and `off3` are active from elsewhere, such as a terminal. In local control, and where the remote
+    bit is 0, the word is ignored, but for its OFF bits. A word that takes back bit 3 lets the motor coast.
+    Whether the ramp bits stop a motor that runs is not simulated: all three at 1 let it run.
+    """
+
+    def prepare(self) -> None:
+        super().prepare()
+        self.off2 = self.off3 = False
+        self.powered_up()
+
+    def powered_up(self) -> None:
+        self._is_inhibited = True
+        self._is_on = False  # OFF1 is not active
+        self._is_enabled = False
+
+    def trip(self, code: int) -> None:
+        super().trip(code)
+        self._is_on = self._is_enabled = False
+
+    def _control(self, word: int) -> None:
+        if self.rises(word, ProfidriveControl.RESET) and self.motor.fault:
+            self.motor.reset()
+            self._is_inhibited = True
+        if self.off2 or not word & ProfidriveControl.NO_OFF2:
+            self.motor.coast()
+            self._off()
+        elif self.off3 or not word & ProfidriveControl.NO_OFF3:
+            self.motor.stop()
+            self._off()
+        elif not word & ProfidriveControl.ON:
+            self.motor.stop()
+            self._is_inhibited = False
+            self._is_on = self._is_enabled = False
+        elif word & ProfidriveControl.BY_LINE and not self.is_local:
+            self._switch_on(word)
+
+    def _off(self) -> None:
+        self._is_on = self._is_enabled = False
+        self._is_inhibited = True
+
+    def _switch_on(self, word: int) -> None:
+        if self._is_inhibited or self.motor.fault:
+            return
+        self._is_on = True
+        if word & ProfidriveControl.ENABLE_OPERATION:
+            self._is_enabled = True
+            if word & _RUN == _RUN:
+                self.motor.run(1)
+        elif self._is_enabled:
+            self.motor.coast()
+            self._is_enabled = False
+
+    def _state(self) -> int:
+        fault = bool(self.motor.fault)
+        ready = not (fault or self._is_inhibited or self.off2 or self.off3)
+        bits = {
+            ProfidriveStatus.READY_TO_SWITCH_ON: ready,
+            ProfidriveStatus.READY_TO_OPERATE: ready and self._is_on,
+            ProfidriveStatus.OPERATION_ENABLED: self._is_enabled or self.motor.energised,
+            ProfidriveStatus.TRIPPED: fault,
+            ProfidriveStatus.NO_OFF2: not self.off2 and self._last(ProfidriveControl.NO_OFF2),
+            ProfidriveStatus.NO_OFF3: not self.off3 and self._last(ProfidriveControl.NO_OFF3),
+            ProfidriveStatus.SWITCH_ON_INHIBITED: self._is_inhibited,
+            ProfidriveStatus.AT_SETPOINT: self._is_enabled and self.motor.frequency == self.motor.goal,
+            ProfidriveStatus.REMOTE: not self.is_local,
+        }
+        return sum(bit for bit, is_set in bits.items() if is_set)
+
+    def _last(self, bit: int) -> bool:
+        return bool(self.word_before & bit)
+
+    heeds = {"control": _control}
+    tells = {"status": _state}
+
+
+_COMMANDS = 0x8F  # bits 7 and 3 to 0
+DISABLED, READY, SWITCHED_ON, ENABLED = range(4)
+_STATES = {DISABLED: 0x40, READY: 0x21, SWITCHED_ON: 0x23, ENABLED: 0x27}
+
+
+class SimulatedCiA402(ProfileDrive):
+    """CiA 402: one step up for each word, none over a step; "disable voltage" and a trip go to the bottom.
+
+    A shutdown coasts here, as the standard's factory setting does, and "disable operation" ramps. A drive in
+    local control takes no word. `stays_off` keeps it from being switched on, as lacking mains do.
+    """
+
+    def prepare(self) -> None:
+        super().prepare()
+        self.stays_off = False
+        self.powered_up()
+
+    def powered_up(self) -> None:
+        self._state = DISABLED
+
+    def trip(self, code: int) -> None:
+        super().trip(code)
+        self._state = DISABLED
+
+    def _control(self, word: int) -> None:
+        if self.is_local:
+            return
+        if self.motor.fault:
+            if self.rises(word, CiA402Control.RESET):
+                self.motor.reset()
+                self._state = DISABLED
+            return
+        command = word & _COMMANDS & ~CiA402Control.RESET
+        if not command & CiA402Control.ENABLE_VOLTAGE:
+            self.motor.coast()
+            self._state = DISABLED
+        elif not command & CiA402Control.NO_QUICK_STOP:
+            self.motor.stop()
+            self._state = DISABLED
+        elif command == 0x06:
+            self.motor.coast()
+            self._state = READY
+        elif command == 0x07:
+            self._switched_on()
+        elif command == 0x0F and self._state in (SWITCHED_ON, ENABLED):
+            self._state = ENABLED
+            extra = word & ~_COMMANDS
+            self.motor.run(-1 if extra else 1)
+
+    def _switched_on(self) -> None:
+        if self._state == ENABLED:
+            self.motor.stop()
+        if self._state in (READY, ENABLED) and not self.stays_off:
+            self._state = SWITCHED_ON
+
+    def _status(self) -> int:
+        if self.motor.fault:
+            return CiA402Status.FAULT | self._remote()
+        return _STATES[self._state] | self._remote() | CiA402Status.VOLTAGE_ENABLED
+
+    def _remote(self) -> int:
+        return 0 if self.is_local else CiA402Status.REMOTE
+
+    heeds = {"control": _control}
+    tells = {"status": _status}
+
+
+class SimulatedDanfossFC(ProfileDrive):
+    """Danfoss FC: a word without bit 10 is ignored; bit 6 runs by its level, so also after a reset.
+
+    `is_locked` is a trip that no reset ends.
+    """
+
+    def prepare(self) -> None:
+        super().prepare()
+        self.is_locked = False
+
+    def powered_up(self) -> None:
+        self.is_locked = False
+
+    def _control(self, word: int) -> None:
+        if self.is_local or not word & DanfossControl.VALID:
+            return
+        if self.rises(word, DanfossControl.RESET) and not self.is_locked:
+            self.motor.reset()
+        if not word & DanfossControl.NO_COAST:
+            self.motor.coast()
+        elif not word & DanfossControl.RAMP or not word & DanfossControl.NO_QUICK_STOP:
+            self.motor.stop()
+        elif word & DanfossControl.START:
+            self.motor.run(-1 if word & DanfossControl.REVERSE else 1)
+        else:
+            self.motor.stop()
+
+    def _state(self) -> int:
+        fault = bool(self.motor.fault)
+        bits = {
+            DanfossStatus.CONTROL_READY: not fault,
+            DanfossStatus.DRIVE_READY: not fault,
+            DanfossStatus.NOT_COASTING: bool(self.word_before & DanfossControl.NO_COAST),
+            DanfossStatus.TRIPPED: fault,
+            DanfossStatus.TRIP_LOCKED: fault and self.is_locked,
+            DanfossStatus.BY_LINE: not self.is_local,
+            DanfossStatus.IN_RANGE: True,
+            DanfossStatus.RUNNING: self.motor.energised,
+        }
+        return sum(bit for bit, is_set in bits.items() if is_set)
+
+    heeds = {"control": _control}
+    tells = {"status": _state}
+
+
+EXTERNAL_FAULT = 49  # EF
+
+
+class SimulatedDelta(ProfileDrive):
+    """Delta: a run that comes in a fault is forgotten. The reset bit resets for as long as it is set.
+
+    The manuals do not say so; it is simulated to find a client that leaves the bit set.
+    """
+
+    def pass_time(self, now: float) -> None:
+        super().pass_time(now)
+        register = self.drive.register("reset")
+        if int(self.memory.get(register)) & DeltaReset.RESET:
+            self.motor.reset()
+
+    def _control(self, word: int) -> None:
+        if not self.is_local:
+            self.run_or_stop(word & 3, {0x10: 1, 0x20: -1, 0x30: -self.motor.direction}.get(word & 0x30))
+
+    def _reset(self, word: int) -> None:
+        if word & 1:
+            self.trip(EXTERNAL_FAULT)
+        if word & DeltaReset.RESET:
+            self.motor.reset()
+
+    def _state(self) -> int:
+        phase = self.motor.phase
+        lamps = STOPPED if not self.motor.energised else RUNNING
+        if phase is Phase.DECELERATING and self.motor.goal == 0:
+            lamps = STOPPING
+        side = REVERSE if self.motor.direction < 0 else FORWARD
+        by_line = 0 if self.is_local else DeltaStatus.COMMANDED_BY_LINE | DeltaStatus.REFERENCE_BY_LINE
+        return lamps | side << 3 | by_line
+
+    heeds = {"control": _control, "reset": _reset}
+    tells = {"status": _state}
+
+
+_STARTS = (InvtControl.FORWARD, InvtControl.REVERSE, InvtControl.JOG_FORWARD, InvtControl.JOG_REVERSE)
+
+
+class SimulatedInvt(ProfileDrive):
+    """INVT: a start in a fault is refused. `jog_needs_own_stop`: a jog goes on through a stop."""
+
+    def prepare(self) -> None:
+        super().prepare()
+        self.jog_needs_own_stop = False
+        self._jogs = False
+
+    def accept(self, cell: MemoryCell, raw: int) -> int:
+        if cell.name == "control" and raw in _STARTS and self.motor.fault:
+            raise Refusal(Reason.CANNOT)
+        return super().accept(cell, raw)
+
+    def _control(self, word: int) -> None:
+        if self.is_local or (word == InvtControl.STOP and self._jogs and self.jog_needs_own_stop):
+            return
+        actions = {
+            InvtControl.FORWARD: lambda: self.motor.run(1),
+            InvtControl.REVERSE: lambda: self.motor.run(-1),
+            InvtControl.JOG_FORWARD: lambda: self.motor.jog(1),
+            InvtControl.JOG_REVERSE: lambda: self.motor.jog(-1),
+            InvtControl.STOP: self.motor.stop,
+            InvtControl.COAST: self.motor.coast,
+            InvtControl.RESET_FAULT: self.motor.reset,
+            InvtControl.STOP_JOG: self.motor.stop,
+        }
+        actions[InvtControl(word)]()
+        self._jogs = word in (InvtControl.JOG_FORWARD, InvtControl.JOG_REVERSE)
+
+    def _state(self) -> int:
+        if self.motor.fault:
+            return InvtStatus.FAULT
+        if not self.motor.energised:
+            return InvtStatus.STANDBY
+        return InvtStatus.REVERSE if self.motor.frequency < 0 else InvtStatus.FORWARD
+
+    heeds = {"control": _control}
+    tells = {"status": _state}
+
+
+class SimulatedOptidrive(ProfileDrive):
+    """Optidrive E3: bit 0 runs by its level, so also after a reset, while digital input 1 enables it.
+
+    `is_enabled` is that input. `is_first_reading` shows register 6 as the first guide prints it: code low,
+    state high.
+    """
+
+    def prepare(self) -> None:
+        super().prepare()
+        self.is_enabled = True
+        self.is_first_reading = False
+
+    def _control(self, word: int) -> None:
+        if self.is_local:
+            return
+        if self.rises(word, OptidriveControl.RESET):
+            self.motor.reset()
+        if word & OptidriveControl.COAST or not self.is_enabled:
+            self.motor.coast()
+        elif word & OptidriveControl.RUN:
+            self.motor.run(1)
+        else:
+            self.motor.stop()
+
+    def _state(self) -> int:
+        fault, runs = self.motor.fault, self.motor.energised
+        if self.is_first_reading:
+            return fault | (2 if fault else int(runs)) << 8
+        bits = {
+            OptidriveStatus.RUNNING: runs,
+            OptidriveStatus.TRIPPED: bool(fault),
+            OptidriveStatus.READY: not fault and self.is_enabled,
+        }
+        return fault << 8 | sum(bit for bit, is_set in bits.items() if is_set)
+
+    heeds = {"control": _control}
+    tells = {"status": _state}
