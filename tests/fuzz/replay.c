@@ -1,21 +1,38 @@
-/* Runs files through a harness without libFuzzer: `replay FILE...`, all that were worth keeping. */
+/* Runs a packed corpus through a harness without libFuzzer: `replay corpus/PARSER.txt`. Each line has an input's
+ * name and its bytes in hex. */
 #include "fuzz.h"
+
+#include <ctype.h>
+
+static int value_of(int digit)
+{
+    return isdigit(digit) ? digit - '0' : digit - 'a' + 10;
+}
 
 int main(int argc, char **argv)
 {
     static uint8_t data[1 << 16];
-    for (int i = 1; i < argc; i++) {
-        FILE *file = fopen(argv[i], "rb");
-        if (!file) {
-            perror(argv[i]);
-            return 2;
+    char name[65];
+    FILE *file = argc == 2 ? fopen(argv[1], "r") : NULL;
+    if (!file) {
+        fprintf(stderr, "usage: %s corpus/PARSER.txt\n", argv[0]);
+        return 2;
+    }
+    while (fscanf(file, "%64s", name) == 1) {
+        size_t size = 0;
+        int high, low;
+        must(getc(file) == ' ');
+        while (isxdigit(high = getc(file))) {
+            low = getc(file);
+            must(isxdigit(low) && size < sizeof data);
+            data[size++] = (uint8_t)(value_of(high) << 4 | value_of(low));
         }
-        size_t size = fread(data, 1, sizeof data, file);
-        fclose(file);
-        fprintf(stderr, "%s\n", argv[i]); /* the last one is it */
+        must(high == '\n');
+        fprintf(stderr, "%s\n", name); /* if the harness aborts, the last name is its input's */
         uint8_t *exact = exact_copy(data, size);
         LLVMFuzzerTestOneInput(exact, size);
         free(exact);
     }
+    fclose(file);
     return 0;
 }
