@@ -40,7 +40,7 @@ size_t md_packet_length(const struct md_wrapping *wrappings, int side, uint8_t f
 void md_put_packet(const struct md_wrapping *wrappings, uint32_t interface, int side, int64_t time_ns,
                    const uint8_t *bytes, size_t len, uint8_t *out);
 
-/* ---- split.c: return 1; 0 when room (md_stream_put) or more bytes (md_split) are needed ---- */
+/* ---- capture.c: return 1; 0 when room (md_stream_put) or more bytes (md_split) are needed ---- */
 
 /* Bytes that came together, from `at` up to the next piece. */
 struct md_piece {
@@ -93,7 +93,7 @@ void md_stream_forget(struct md_stream *stream, struct md_splitter *splitter);
  * comes in any number of spans. */
 int md_split(struct md_splitter *splitter, const struct md_stream *stream, struct md_span *span);
 
-/* ---- decode.c: return an enum md_decoded ---- */
+/* ---- capture.c: return an enum md_decoded ---- */
 
 /* The fields of a request's reply; key 0: an empty place. */
 struct md_known {
@@ -127,7 +127,7 @@ int md_know(struct md_decoder *decoder, int framing, const struct md_message *re
 /* Add the rows of every sniffed exchange, also of requests without a reply. */
 int md_decode(struct md_decoder *decoder, const struct md_stream *stream, struct md_columns *columns);
 
-/* ---- unpack.c: return an enum md_unpacked ---- */
+/* ---- capture.c: return an enum md_unpacked ---- */
 
 enum { MD_LINK_RTAC = 250, MD_LINK_EXPORTED = 252 }; /* link types with a header; all others: bare bytes */
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from cffi import FFI
 
-HEADERS = ("rows.h", "multidrop.h", "capture.h", "internal.h", "line.h", "turn.h")
+HEADERS = ("multidrop.h", "capture.h", "internal.h", "line.h")
 
 
 def main(output: str) -> None:
@@ -16,7 +16,7 @@ def main(output: str) -> None:
     for header in HEADERS:
         text = Path(__file__).with_name(header).read_text()
         ffi.cdef(text.split("/* cdef: begin */")[1].split("/* cdef: end */")[0])
-    ffi.set_source("multidrop._core", '#include "turn.h"', py_limited_api=True)
+    ffi.set_source("multidrop._core", '#include "line.h"', py_limited_api=True)
     ffi.emit_c_code(output)
 
 

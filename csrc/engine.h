@@ -1,11 +1,13 @@
-/* The engine and its ports, as its thread and its clients see them. Calls run one way: port_api.c
- * (clients) -> engine.c (the thread) -> port_io.c (a port's system calls) -> port_turn.c -> line.c. */
+/* The engine and its ports, as its thread and its clients see them. Calls run one way: api.c (clients)
+ * -> engine.c (the thread) -> port.c (a port's system calls) -> turn.c -> line.c. */
 #ifndef MULTIDROP_ENGINE_H
 #define MULTIDROP_ENGINE_H
 
-#include "turn.h"
+#include "line.h"
 
+#include <errno.h>
 #include <pthread.h>
+#include <stdint.h>
 #include <sys/types.h>
 
 /* The transceiver's direction. */
@@ -78,13 +80,13 @@ void md_engine_leave(struct md_engine *engine);
 void md_engine_wake(struct md_engine *engine);
 void md_engine_await(struct md_engine *engine, const int *is_done); /* with the mutex */
 
-/* ---- port_io.c: on the engine's thread ---- */
+/* ---- port.c: on the engine's thread ---- */
 
 int64_t md_port_receive(struct md_port *port); /* what has come; return when it was read */
 /* Carry on until there is nothing to do but wait; return what time it is then. */
 int64_t md_port_advance(struct md_port *port, int64_t now_ns);
 
-/* ---- port_rs485.c ---- */
+/* ---- rs485.c ---- */
 
 int md_rs485_begin(struct md_port *port, int mode); /* 0, -errno */
 /* Write, with the transceiver sending from now on. */
@@ -92,11 +94,84 @@ ssize_t md_rs485_write(struct md_port *port, const uint8_t *bytes, size_t len);
 /* Let the transceiver receive again when the last bit has left; 0, or -errno: then the port is to be lost. */
 int md_rs485_look(struct md_port *port, int64_t now_ns);
 
-/* ---- ahead.c ---- */
 
-enum { MD_STEPS_AHEAD = 4 };
+/* ---- system calls on a descriptor; on Windows it is a handle, and windows/ has these functions ---- */
 
-/* Go one step on with the `next` port, which may be negative, and with each of those behind it. */
-void md_look_ahead(struct md_port *const *ports, int n, int next);
+#ifdef _WIN32
 
+/* ---- windows/file.c ---- */
+
+ssize_t md_descriptor_read(int fd, void *bytes, size_t room);
+ssize_t md_descriptor_write(int fd, const void *bytes, size_t len);
+
+/* ---- windows/com.c ---- */
+
+int md_descriptor_take_rs485(int fd);
+int md_descriptor_set_rts(int fd, int is_up);
+int md_descriptor_is_shifted_out(int fd);
+int md_descriptor_is_queued(int fd);
+
+#else
+
+#include <sys/ioctl.h>
+#include <unistd.h>
+#ifdef __linux__ /* others have no RS-485 mode */
+#include <linux/serial.h>
+#endif
+
+static inline ssize_t md_descriptor_read(int fd, void *bytes, size_t room)
+{
+    return read(fd, bytes, room);
+}
+
+static inline ssize_t md_descriptor_write(int fd, const void *bytes, size_t len)
+{
+    return write(fd, bytes, len);
+}
+
+/* Put the driver into its RS-485 mode; 0, -errno. */
+static inline int md_descriptor_take_rs485(int fd)
+{
+#ifdef __linux__
+    struct serial_rs485 mode;
+    if (ioctl(fd, TIOCGRS485, &mode))
+        return -errno;
+    if (!(mode.flags & (SER_RS485_RTS_ON_SEND | SER_RS485_RTS_AFTER_SEND))) /* else as it was set up */
+        mode.flags |= SER_RS485_RTS_ON_SEND;
+    mode.flags |= SER_RS485_ENABLED;
+    if (ioctl(fd, TIOCSRS485, &mode) || ioctl(fd, TIOCGRS485, &mode))
+        return -errno;
+    return mode.flags & SER_RS485_ENABLED ? 0 : -EOPNOTSUPP;
+#else
+    (void)fd;
+    return -EOPNOTSUPP;
+#endif
+}
+
+static inline int md_descriptor_set_rts(int fd, int is_up)
+{
+    int rts = TIOCM_RTS;
+    return ioctl(fd, is_up ? TIOCMBIS : TIOCMBIC, &rts) ? -errno : 0;
+}
+
+/* Return 1 where the UART says that its last bit has left, 0 where not, -errno where it does not tell. */
+static inline int md_descriptor_is_shifted_out(int fd)
+{
+#ifdef TIOCSERGETLSR
+    unsigned state = 0;
+    return ioctl(fd, TIOCSERGETLSR, &state) ? -errno : (state & TIOCSER_TEMT) != 0;
+#else
+    (void)fd;
+    return -ENOTTY;
+#endif
+}
+
+/* Return 1 where the driver says that it still holds bytes to be sent. */
+static inline int md_descriptor_is_queued(int fd)
+{
+    int queued = 0;
+    return ioctl(fd, TIOCOUTQ, &queued) == 0 && queued;
+}
+
+#endif
 #endif

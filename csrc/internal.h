@@ -10,7 +10,7 @@
 #include <time.h>
 
 /* cdef: begin */
-/* ---- counters.c ---- */
+/* ---- stats.c: counters ---- */
 
 /* Count an exchange that is over. */
 void md_counters_end(const struct md_exchange *exchange, const struct md_completion *completion);
@@ -57,7 +57,7 @@ void md_body_get_request(int framing, const uint8_t *body, struct md_message *me
 int md_body_get_reply(int framing, const uint8_t *body, const struct md_message *request,
                       struct md_message *reply);
 
-/* ---- frame.c, reason.c ---- */
+/* ---- frame.c ---- */
 
 enum {
     MD_MOST_ADDRESS = 247,
@@ -96,7 +96,7 @@ int md_is_gateways(int framing, const struct md_message *reply);
  * MD_NO_REPLY. */
 int md_reason(int framing, const struct md_message *request, const uint8_t *bytes, size_t len);
 
-/* ---- delay.c: what is learnt of a drive from the delays of its replies ---- */
+/* ---- stats.c: what is learnt of a drive from the delays of its replies ---- */
 
 /* Return the time after a request, beside its reply's own, before which it is not worth looking for that. */
 int64_t md_look_ns(const struct md_exchange *exchange);
@@ -118,7 +118,7 @@ static inline void md_count_failures(struct md_drive *drive, uint32_t failures)
         __atomic_store_n(&drive->failures, failures, __ATOMIC_RELAXED);
 }
 
-/* ---- tap.c, unpack.c ---- */
+/* ---- tap.c, capture.c ---- */
 
 /* The enhanced packet block of a pcapng file (draft-ietf-opsawg-pcapng, 4.3). */
 enum {

@@ -12,6 +12,178 @@
 
 #include <string.h>
 
+/* ---- one request whose reply may still come ---- */
+
+/* One request whose reply may still come: when it was sent, and what could be taken for its reply. */
+
+enum { DATA_KEPT = sizeof((struct md_owed){0}.data), LAST_READ = 0x04 };
+
+/* ---- what it asked for ---- */
+
+static uint8_t data_kept(const struct md_message *request)
+{
+    return (uint8_t)(request->data_len < DATA_KEPT ? request->data_len : DATA_KEPT);
+}
+
+static struct md_owed owed_of(const struct md_exchange *exchange)
+{
+    const struct md_message *request = &exchange->request;
+    struct md_owed owed = {.framing = (uint8_t)exchange->framing, .address = request->address,
+                           .function = request->function, .start = request->start, .count = request->count,
+                           .reply_len = (uint16_t)md_reply_length(exchange->framing, request),
+                           .least = exchange->least, .end = exchange->end,
+                           .data_len = data_kept(request)};
+    memcpy(owed.data, request->data, owed.data_len);
+    return owed;
+}
+
+static int is_same(const struct md_owed *owed, const struct md_exchange *exchange)
+{
+    const struct md_message *request = &exchange->request;
+    return owed->framing == exchange->framing && owed->function == request->function &&
+           owed->start == request->start && owed->count == request->count &&
+           owed->least == exchange->least && owed->end == exchange->end &&
+           memcmp(owed->data, request->data, data_kept(request)) == 0;
+}
+
+/* ---- what could be taken for its reply ---- */
+
+static int may_hold_the_same(const struct md_owed *owed, const struct md_exchange *exchange)
+{
+    return !owed->end || !exchange->end || (owed->least < exchange->end && exchange->least < owed->end);
+}
+
+int md_is_read(int framing, uint8_t function)
+{
+    if (framing == MD_DELIXI)
+        return function == MD_DELIXI_STATE_QUERY || function == MD_DELIXI_PARAMETER_QUERY;
+    return function <= LAST_READ;
+}
+
+/* A reply to the one could pass for the reply to the other. An exception does not say which write it
+ * refuses, and a start that is wrongly reported as refused is a motor that is wrongly reported to stand. */
+static int is_mistakable(const struct md_owed *owed, const struct md_exchange *exchange)
+{
+    const struct md_message *request = &exchange->request;
+    if (owed->framing != exchange->framing)
+        return 0;
+    if (!md_is_read(exchange->framing, request->function))
+        return exchange->framing == MD_DELIXI || owed->function == request->function;
+    if (owed->function != request->function)
+        return 0;
+    if (exchange->framing == MD_DELIXI)
+        return owed->start == request->start || owed->function == MD_DELIXI_STATE_QUERY;
+    return owed->reply_len == md_reply_length(exchange->framing, request) &&
+           may_hold_the_same(owed, exchange);
+}
+
+int md_is_in_range(const struct md_message *reply, uint16_t least, uint32_t end)
+{
+    uint32_t value = md_get16(reply->data);
+    return end == 0 || reply->exception || reply->data_len < 2 || (value >= least && value < end);
+}
+
+static int parse_owed(const struct md_owed *owed, const uint8_t *bytes, size_t len)
+{
+    struct md_message request = {.address = owed->address, .function = owed->function, .start = owed->start,
+                                 .count = owed->count, .data_len = owed->data_len};
+    struct md_message reply;
+    memcpy(request.data, owed->data, owed->data_len);
+    if (owed->framing == MD_RTU && bytes[0] != owed->address)
+        return MD_BAD_ADDRESS;
+    int used = md_parse_reply(owed->framing, bytes, len, &request, &reply);
+    return used > 0 && !md_is_in_range(&reply, owed->least, owed->end) ? MD_BAD_ECHO : used;
+}
+
+/* ---- when it was sent ---- */
+
+static uint32_t last_place(const struct md_owed *owed)
+{
+    return (owed->times < MD_TIMES_KEPT ? owed->times : MD_TIMES_KEPT) - 1;
+}
+
+static int64_t last_ns(const struct md_owed *owed)
+{
+    return owed->sent_ns[last_place(owed)];
+}
+
+static void add_time(struct md_owed *owed, int64_t sent_ns)
+{
+    if (owed->times >= MD_TIMES_KEPT)
+        memmove(owed->sent_ns + 1, owed->sent_ns + 2, (MD_TIMES_KEPT - 2) * sizeof *owed->sent_ns);
+    owed->times++;
+    owed->sent_ns[last_place(owed)] = sent_ns;
+}
+
+static void drop_time(struct md_owed *owed)
+{
+    if (owed->times-- <= MD_TIMES_KEPT)
+        memmove(owed->sent_ns, owed->sent_ns + 1, (MD_TIMES_KEPT - 1) * sizeof *owed->sent_ns);
+}
+
+/* ---- proofs ---- */
+
+/* A drive's proofs, and which of them serve: a device may be silent to registers that it lacks, and a
+ * document wrong about what a register holds. */
+
+/* A proof that was never answered is dropped after so many times in vain; a silence counts if other replies
+ * came before it. */
+enum { MOST_VAIN = 2, ANSWERED = 0xFF };
+
+/* Return which of the drive's proofs it is; their number: none, as most are. Then the list is not looked at,
+ * which is elsewhere in memory. */
+static uint32_t proof_at(const struct md_exchange *exchange)
+{
+    const struct md_drive *drive = exchange->drive;
+    uint32_t at = exchange->is_proof ? 0 : drive->proof_count;
+    while (at < drive->proof_count && drive->proofs[at] != exchange)
+        at++;
+    return at;
+}
+
+int md_proof_is(const struct md_exchange *exchange)
+{
+    return proof_at(exchange) < exchange->drive->proof_count;
+}
+
+/* One alone proves nothing of its own late replies. */
+static void drop_proof(struct md_drive *drive, uint32_t at)
+{
+    drive->proof_count--;
+    for (; at < drive->proof_count; at++) {
+        drive->proofs[at] = drive->proofs[at + 1];
+        drive->vain[at] = drive->vain[at + 1];
+    }
+    if (drive->proof_count == 1)
+        drive->proof_count = 0;
+}
+
+void md_proof_end(const struct md_exchange *exchange, int result)
+{
+    struct md_drive *drive = exchange->drive;
+    uint32_t at = proof_at(exchange);
+    if (at == drive->proof_count || drive->vain[at] == ANSWERED)
+        return;
+    uint64_t replies = md_replies(drive);
+    int is_silent_to_it = result == MD_NO_REPLY && replies != drive->vain_at;
+    if (result > 0)
+        drive->vain[at] = ANSWERED;
+    if (!is_silent_to_it && result != MD_BAD_ECHO) /* which is another value than its document says */
+        return;
+    drive->vain_at = replies;
+    if (++drive->vain[at] == MOST_VAIN)
+        drop_proof(drive, at);
+}
+
+static void note_late_proof(struct md_drive *drive, const struct md_owed *owed)
+{
+    for (uint32_t i = 0; i < MD_MOST_PROOFS && i < drive->proof_count; i++)
+        if (is_same(owed, drive->proofs[i]))
+            drive->vain[i] = ANSWERED;
+}
+
+/* ---- late replies ---- */
+
 static const int64_t FORGET_NS = INT64_C(120000000000); /* no path holds anything up for so long */
 
 /* ---- outstanding requests of a drive ---- */
@@ -20,7 +192,7 @@ static const int64_t FORGET_NS = INT64_C(120000000000); /* no path holds anythin
 static struct md_owed *find_same(struct md_drive *drive, const struct md_exchange *exchange)
 {
     for (uint32_t i = 0; i < drive->owed_count; i++)
-        if (md_owed_is_same(&drive->history->owed[i], exchange))
+        if (is_same(&drive->history->owed[i], exchange))
             return &drive->history->owed[i];
     return NULL;
 }
@@ -33,7 +205,7 @@ int md_late_is_repeated(const struct md_exchange *exchange)
 /* No reply to a later request has come: that would settle this one. */
 static int is_open(const struct md_drive *drive, const struct md_owed *owed)
 {
-    return md_owed_last_ns(owed) > drive->answered_ns;
+    return last_ns(owed) > drive->answered_ns;
 }
 
 static void drop(struct md_drive *drive, struct md_owed *owed)
@@ -46,7 +218,7 @@ static void forget_settled(struct md_drive *drive, int64_t now_ns)
     for (uint32_t i = drive->owed_count; i-- > 0;) {
         struct md_owed *owed = &drive->history->owed[i];
         int is_over = now_ns >= drive->late_until_ns && (!is_open(drive, owed) || drive->proof_count == 0);
-        if (is_over || now_ns - md_owed_last_ns(owed) > FORGET_NS)
+        if (is_over || now_ns - last_ns(owed) > FORGET_NS)
             drop(drive, owed);
     }
 }
@@ -60,8 +232,8 @@ static int has_mistakable(const struct md_exchange *exchange, int own)
     int is_crowded = drive->owed_count > MD_MOST_OWED - MD_MOST_PROOFS; /* room is kept for the proofs */
     for (uint32_t i = 0; i < drive->owed_count; i++) {
         const struct md_owed *owed = &drive->history->owed[i];
-        int counts = is_open(drive, owed) && (own || !md_owed_is_same(owed, exchange));
-        if (counts && (is_crowded || md_owed_is_mistakable(owed, exchange)))
+        int counts = is_open(drive, owed) && (own || !is_same(owed, exchange));
+        if (counts && (is_crowded || is_mistakable(owed, exchange)))
             return 1;
     }
     return 0;
@@ -122,16 +294,16 @@ static const struct md_exchange *last_proof(const struct md_drive *drive)
 static int is_sent_alone(const struct md_exchange *exchange)
 {
     const struct md_exchange *last = last_proof(exchange->drive);
-    struct md_owed own = md_owed_of(exchange);
+    struct md_owed own = owed_of(exchange);
     return exchange->drive->failures > 0 && !has_mistakable(exchange, 0) &&
-           (!last || !md_owed_is_mistakable(&own, last));
+           (!last || !is_mistakable(&own, last));
 }
 
 static int is_free(const struct md_drive *drive, const struct md_exchange *proof)
 {
     for (uint32_t i = 0; i < drive->owed_count; i++) {
         const struct md_owed *owed = &drive->history->owed[i];
-        if (is_open(drive, owed) && md_owed_is_mistakable(owed, proof))
+        if (is_open(drive, owed) && is_mistakable(owed, proof))
             return 0;
     }
     return 1;
@@ -141,7 +313,7 @@ static int is_free(const struct md_drive *drive, const struct md_exchange *proof
 static int64_t sent_last_ns(struct md_drive *drive, const struct md_exchange *proof)
 {
     const struct md_owed *owed = find_same(drive, proof);
-    return owed ? md_owed_last_ns(owed) : 0;
+    return owed ? last_ns(owed) : 0;
 }
 
 const struct md_exchange *md_late_proof(const struct md_exchange *exchange, int64_t now_ns)
@@ -182,7 +354,7 @@ static struct md_owed *place_of(struct md_drive *drive, const struct md_exchange
     struct md_owed *owed = find_same(drive, exchange);
     if (!owed && drive->owed_count < MD_MOST_OWED) {
         owed = &drive->history->owed[drive->owed_count++];
-        *owed = md_owed_of(exchange);
+        *owed = owed_of(exchange);
     }
     return owed;
 }
@@ -196,7 +368,7 @@ void md_late_expect(struct md_line *line, int64_t window_ns)
     forget_settled(drive, line->quiet_ns);
     struct md_owed *owed = place_of(drive, exchange);
     if (owed)
-        md_owed_add_time(owed, line->quiet_ns);
+        add_time(owed, line->quiet_ns);
     drive->late_until_ns = later(until_ns, drive->late_until_ns);
     md_late_link(line, drive);
 }
@@ -234,7 +406,7 @@ static int take_of(struct md_drive *drive, struct md_line *line, size_t at, int6
     int found = MD_NO_START, length = 0, fits = 0;
     for (uint32_t i = 0; i < drive->owed_count; i++) {
         struct md_owed *owed = &drive->history->owed[i];
-        int used = md_owed_parse(owed, line->rx + at, line->rx_len - at);
+        int used = parse_owed(owed, line->rx + at, line->rx_len - at);
         if (used == MD_INCOMPLETE)
             found = used;
         fits += used > 0;
@@ -249,14 +421,14 @@ static int take_of(struct md_drive *drive, struct md_line *line, size_t at, int6
         drive->doubtful++;
     else
         drive->history->late++;
-    md_proof_came_late(drive, earliest);
+    note_late_proof(drive, earliest);
     md_count_failures(drive, 0);
     drive->answered_ns = later(drive->answered_ns, earliest->sent_ns[0] - 1);
     if (since_ns)
-        *since_ns = md_owed_is_same(earliest, line->exchange) ? earliest->sent_ns[0] : 0;
+        *since_ns = is_same(earliest, line->exchange) ? earliest->sent_ns[0] : 0;
     else if (fits == 1)
-        md_learn_lateness(drive, now_ns - md_owed_last_ns(earliest), earliest->times == 1);
-    md_owed_drop_time(earliest);
+        md_learn_lateness(drive, now_ns - last_ns(earliest), earliest->times == 1);
+    drop_time(earliest);
     if (earliest->times == 0)
         drop(drive, earliest);
     if (drive->owed_count == 0)

@@ -8,6 +8,165 @@
 #include <errno.h>
 #include <string.h>
 
+/* ---- states ---- */
+
+/* The states of a line, and what leads from one to the next. */
+
+enum { IDLE = MD_IDLE, SILENCE, CHECK, READY, WRITING, AWAITING, LAST_LOOK, NONE = -1 };
+
+const int8_t md_line_follows[MD_LINE_STATES][MD_LINE_EVENTS] = {
+    /*              begun    silent  nothing stray    part     sent      timeout    in time   ended */
+    [IDLE]      = { SILENCE, NONE,   NONE,   IDLE,    NONE,    NONE,     NONE,      NONE,     NONE },
+    [SILENCE]   = { NONE,    CHECK,  NONE,   SILENCE, NONE,    NONE,     NONE,      NONE,     IDLE },
+    [CHECK]     = { NONE,    NONE,   READY,  SILENCE, NONE,    NONE,     NONE,      NONE,     IDLE },
+    [READY]     = { NONE,    NONE,   NONE,   SILENCE, WRITING, AWAITING, NONE,      NONE,     IDLE },
+    [WRITING]   = { NONE,    NONE,   NONE,   WRITING, WRITING, AWAITING, NONE,      NONE,     IDLE },
+    [AWAITING]  = { NONE,    NONE,   NONE,   NONE,    NONE,    NONE,     LAST_LOOK, AWAITING, IDLE },
+    [LAST_LOOK] = { NONE,    NONE,   NONE,   NONE,    NONE,    NONE,     NONE,      AWAITING, IDLE },
+};
+
+/* ---- listening for another master ---- */
+
+/* Listening before the first request: a line has one master, and a new one finds out whether it is alone.
+ * Bytes that come while nothing was asked are replies to another master, or its requests. Each of them begins
+ * the wait anew, so that nothing is asked before the line has been silent for long enough.
+ * The wait lasts for the guard at least: meanwhile a master before us that stands still is ended by its own
+ * timer. On a connection of Modbus TCP no other master can be heard, and only the guard is waited for.
+ *
+ * A stop is not held up: whoever else is there, the motor must stop. */
+
+enum { LONGEST_RTU = 256 }; /* serial-line guide V1.02, 2.5.1 */
+
+/* One burst is borne: it may be the reply to what another master, which is gone, asked last. */
+int md_listen_begin(struct md_line *line, int64_t now_ns, int64_t guard_ns)
+{
+    const struct md_exchange *exchange = line->exchange;
+    int longest = exchange->framing == MD_ASCII ? MD_MOST_FRAME : LONGEST_RTU;
+    if (line->state != MD_READY || (line->transactions && !guard_ns))
+        return 0;
+    md_line_go(line, MD_STRAY_BYTES);
+    line->listen_ns = longest * exchange->character_ns + exchange->drive->most_timeout_ns;
+    if (line->transactions)
+        line->listen_ns = 0;
+    line->listened_ns = now_ns + later(line->listen_ns, guard_ns);
+    line->give_up_ns = line->listened_ns + line->listen_ns;
+    return 1;
+}
+
+void md_listen_put_back(struct md_line *line)
+{
+    md_line_go(line, MD_ENDED);
+}
+
+void md_listen_hear(struct md_line *line, size_t len, int64_t now_ns)
+{
+    if (line->transactions) /* a late reply to ourselves */
+        return;
+    line->listened_ns = later(line->listened_ns, now_ns + line->listen_ns);
+    line->foreign += (uint32_t)len;
+}
+
+static int end_listening(struct md_line *line, int64_t now_ns)
+{
+    if (!md_listen_is_held(line)) /* a stop; what follows it goes on listening */
+        return 1;
+    if (now_ns < line->listened_ns)
+        return 0;
+    line->listened_ns = 0;
+    return 1;
+}
+
+/* ---- the end of an exchange ---- */
+
+/* The end of an exchange: its bytes for the tap, its completion, and the counts of its drive and block. */
+
+/* The drive does not answer, or cannot be reached. Damage says that it does. */
+static int is_failure(int result)
+{
+    switch (result) {
+    case MD_BAD_CHECKSUM:
+    case MD_BAD_CHARACTER:
+    case MD_LATE_ANSWER_DUE:
+    case MD_MAYBE_ECHO:
+    case MD_EXPIRED:
+    case MD_LINE_LOST:
+    case MD_POLL_ENDED:
+    case MD_NOT_MASTER:
+    case MD_OTHER_MASTER:
+        return 0;
+    default:
+        return result < 0;
+    }
+}
+
+static void count_reply(struct md_block *block, uint8_t exception)
+{
+    if (exception) {
+        block->refusals++;
+        block->refusal = exception;
+    } else if (block->refusals || !block->is_answered) { /* mostly nothing is written */
+        block->refusals = 0;
+        block->is_answered = 1;
+    }
+    if (block->failures)
+        block->failures = 0;
+}
+
+static void count(const struct md_exchange *exchange, const struct md_completion *completion)
+{
+    struct md_drive *drive = exchange->drive;
+    struct md_block *block = exchange->block;
+    md_counters_end(exchange, completion);
+    md_proof_end(exchange, completion->result);
+    int is_alive = completion->result == MD_BAD_ECHO && md_proof_is(exchange); /* its value is not as known */
+    if (is_failure(completion->result)) {
+        md_count_failures(drive, is_alive ? 0 : drive->failures + 1);
+        if (block)
+            block->failures++;
+    }
+    if (completion->result <= 0)
+        return;
+    md_count_failures(drive, 0);
+    if (block)
+        count_reply(block, completion->reply.exception);
+}
+
+static void tap_bytes(const struct md_line *line, int side, int64_t time_ns, const uint8_t *bytes, size_t len)
+{
+    if (line->tap && md_line_is_under_way(line)) /* what came before was put there when it came */
+        md_tap_put(line->tap, side, time_ns ? time_ns : line->completion->sent_ns, bytes, len);
+}
+
+/* What came since the request began to leave: the reply, or what came in its place, amid the rest. */
+static void tap_received(const struct md_line *line, struct md_ending ending)
+{
+    const struct md_completion *completion = line->completion;
+    size_t at = ending.at, len = ending.len;
+    int may_be_echo = ending.result <= 0 && !line->transactions && line->tx_len > 0;
+    if (may_be_echo && at == 0 && len >= line->tx_len && md_echo_is_copy(line, 0)) {
+        at += line->tx_len; /* the adapter's echo */
+        len -= line->tx_len;
+    }
+    tap_bytes(line, MD_NOISE, completion->first_ns, line->rx, at);
+    tap_bytes(line, ending.result > 0 ? MD_ANSWERING : MD_FAILED, completion->first_ns, line->rx + at, len);
+    tap_bytes(line, MD_NOISE, completion->last_ns, line->rx + at + len, line->rx_len - at - len);
+    line->tap->ahead_ns = 0;
+}
+
+static void complete(struct md_line *line, struct md_ending ending)
+{
+    struct md_completion *completion = line->completion;
+    if (line->tap)
+        tap_received(line, ending);
+    size_t most = sizeof completion->raw, cut = ending.len > most ? ending.len - most : 0;
+    completion->result = ending.result;
+    completion->raw_len = (uint16_t)(ending.len - cut);
+    memcpy(completion->raw, line->rx + ending.at + cut, completion->raw_len);
+    count(line->exchange, completion);
+}
+
+/* ---- the state machine ---- */
+
 static const int64_t WORTH_WAITING = 250000; /* ns; before a shorter time a sleep costs more than a look */
 
 /* ---- the end of an exchange ---- */
@@ -24,7 +183,7 @@ static int64_t silence_of(const struct md_line *line, const struct md_exchange *
 static void finish(struct md_line *line, struct md_ending ending)
 {
     const struct md_completion *completion = line->completion;
-    md_line_complete(line, ending);
+    complete(line, ending);
     line->rx_len = line->rx_from = 0;
     line->quiet_ns = later(line->quiet_ns, completion->last_ns);
     if (line->transactions && completion->last_ns) /* a network takes the next request at once */
@@ -120,7 +279,7 @@ int md_line_want(struct md_line *line, int64_t now_ns)
         md_line_go(line, MD_FELL_SILENT);
         return MD_READ;
     case MD_CHECK:
-        if (line->listened_ns && !md_listen_end(line, now_ns)) {
+        if (line->listened_ns && !end_listening(line, now_ns)) {
             fail(line, MD_OTHER_MASTER);
             return MD_DONE;
         }
@@ -191,7 +350,7 @@ static void forget(struct md_line *line)
     enum { GONE = sizeof line->rx / 2 };
     _Static_assert(sizeof line->rx / 2 >= MD_MOST_FRAME, "half of the room holds the longest frame");
     if (md_line_is_under_way(line)) /* else there is no completion, or its owner has it back */
-        md_line_tap(line, MD_NOISE, line->completion->first_ns, line->rx, GONE);
+        tap_bytes(line, MD_NOISE, line->completion->first_ns, line->rx, GONE);
     line->sight = 0;
     line->rx_len = (uint16_t)(line->rx_len - GONE);
     line->rx_from = (uint16_t)(line->rx_from > GONE ? line->rx_from - GONE : 0);

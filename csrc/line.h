@@ -5,7 +5,7 @@
 #include "internal.h"
 
 /* cdef: begin */
-/* ---- line_states.c ---- */
+/* ---- line.c: its states ---- */
 
 enum md_line_state {
     MD_IDLE,
@@ -97,16 +97,79 @@ void md_line_received(struct md_line *line, const uint8_t *bytes, size_t len, in
 /* End the exchange under way: the port failed, or it is not to be sent any more. */
 void md_line_abandon(struct md_line *line, int result, int error);
 
-/* ---- listen.c: is there another master? ---- */
+/* ---- line.c: is there another master? ---- */
 
 /* Listen before the request that is ready to leave, for the time that the longest frame and the drive's
  * time-out take, and for the guard at least; on a network, which has no frames of others, for that alone.
  * Return 0 where there is nothing to wait for. */
 int md_listen_begin(struct md_line *line, int64_t now_ns, int64_t guard_ns);
 void md_listen_put_back(struct md_line *line); /* an exchange that waits for it, as if it had never begun */
+
+/* ---- turn.c: whose turn it is on a line; I/O and time come from outside ---- */
+
+/* Proofs and echo probes are sent beforehand. */
+enum md_whose { MD_NOBODYS, MD_BEFOREHAND, MD_URGENT, MD_QUEUED, MD_REPEATED };
+
+struct md_slot {
+    const struct md_exchange *exchange;
+    int64_t not_before_ns;
+};
+
+/* An urgent request; it lives where its caller waits. */
+struct md_urgent {
+    const struct md_exchange *exchange;
+    int64_t not_before_ns; /* 0: at once */
+    int64_t expires_ns;    /* of CLOCK_BOOTTIME; 0: never */
+    struct md_completion *completion;
+    struct md_urgent *next;
+    int is_done;
+};
+
+/* The requests sent before an exchange. Zeroed, none was. */
+struct md_before {
+    const struct md_exchange *then; /* the exchange */
+    uint64_t replies;               /* of its drive, before the last proof */
+    uint32_t proofs, is_probed;     /* proofs sent; its echo probe was sent */
+    uint32_t failures;              /* of its drive, before all of that */
+};
+
+struct md_turn {
+    int whose, last;      /* enum md_whose: of the exchange under way, and of the one before it */
+    int is_ending;        /* nothing more that is polled is begun */
+    int has_done_urgent;  /* since its caller looked */
+    struct md_urgent *urgent;
+    const struct md_exchange *const *round; /* what is repeated */
+    uint32_t round_len, round_at;
+    struct md_slot *slots; /* a ring */
+    uint32_t room;         /* a power of two */
+    uint32_t is_idle;      /* the thread waits to be woken when more is queued */
+    int64_t owed_ns;       /* of the line, to what is polled beside urgent requests */
+    struct md_before before;
+    struct md_row_queue *row_queue;
+    uint32_t number; /* there */
+    int lost_error;
+    struct md_progress progress; /* its counters have one writer each, and are read atomically */
+    struct md_line line;
+    struct md_completion completion;
+};
+
+void md_turn_init(struct md_turn *turn, struct md_slot *slots, uint32_t room, int64_t now_ns);
+/* The same as md_port_submit() and its like. */
+int md_turn_submit(struct md_turn *turn, const struct md_exchange *const *exchanges,
+                   const int64_t *not_before_ns, int n);
+uint32_t md_turn_repeat(struct md_turn *turn, const struct md_exchange *const *exchanges, uint32_t n);
+void md_turn_add_urgent(struct md_turn *turn, struct md_urgent *urgent);
+void md_turn_tell_echo(struct md_turn *turn, int echo);
+int md_turn_end(struct md_turn *turn);
+int md_turn_is_asking(const struct md_turn *turn, const struct md_drive *drive);
+int64_t md_turn_counted_ns(const struct md_turn *turn, int64_t now_ns);
+/* Return what the line wants (enum md_want); MD_DONE: there is nothing to carry out before wake_ns. */
+int md_turn_want(struct md_turn *turn, int64_t *wake_ns, int64_t now_ns);
+void md_turn_lose(struct md_turn *turn, int error); /* the port failed */
+void md_turn_close(struct md_turn *turn);           /* end everything */
 /* cdef: end */
 
-/* ---- line_states.c ---- */
+/* ---- line.c: its states ---- */
 
 /* Go where the table says; an event that cannot happen now changes nothing. */
 static inline void md_line_go(struct md_line *line, enum md_line_event event)
@@ -116,11 +179,9 @@ static inline void md_line_go(struct md_line *line, enum md_line_event event)
         line->state = next;
 }
 
-/* ---- listen.c, of a line that is listened to ---- */
+/* ---- line.c, of a line that is listened to ---- */
 
 void md_listen_hear(struct md_line *line, size_t len, int64_t now_ns); /* bytes came */
-/* The line was looked at for the last time before the request; 0: it is not free. */
-int md_listen_end(struct md_line *line, int64_t now_ns);
 
 /* The exchange under way waits for the end of the listening, as all but stops do. */
 static inline int md_listen_is_held(const struct md_line *line)
@@ -128,18 +189,11 @@ static inline int md_listen_is_held(const struct md_line *line)
     return line->listened_ns && line->state != MD_IDLE && !line->exchange->insists;
 }
 
-/* ---- line_end.c: the end of an exchange ---- */
-
 /* The end of an exchange: its result, and the bytes that the completion keeps. */
 struct md_ending {
     int result;
     size_t at, len;
 };
-
-/* Give the tap its bytes, fill in its completion, and count it. */
-void md_line_complete(struct md_line *line, struct md_ending ending);
-/* Give the tap bytes of the exchange under way; time 0: when its request began to leave. */
-void md_line_tap(const struct md_line *line, int side, int64_t time_ns, const uint8_t *bytes, size_t len);
 
 /* At least a part of the request has left. */
 static inline int md_line_is_under_way(const struct md_line *line)
@@ -192,47 +246,24 @@ int md_tcp_find(struct md_line *line, int64_t now_ns, struct md_ending *ending);
 /* End the exchange at its time-out. */
 struct md_ending md_tcp_missed(struct md_line *line);
 
-/* ---- echo.c: adapters that repeat what they send ---- */
+/* ---- reply.c: adapters that repeat what they send ---- */
 
 /* A copy of the request may come that is not its reply. */
 int md_echo_is_due(const struct md_line *line, int reply_len);
 /* A copy of the request is there. */
 int md_echo_is_copy(const struct md_line *line, size_t at);
-/* All that is there begins as the request does, and is shorter. */
-int md_echo_may_follow(const struct md_line *line, size_t at);
-/* Learn from a reply that is no copy of its request. */
-void md_echo_learn(struct md_line *line, size_t reply_at);
-/* Learn from a copy that is all that came before the time-out: return whether it was the reply. */
-enum md_copy { MD_COPY_IS_ECHO, MD_COPY_MAY_BE_REPLY, MD_COPY_IS_REPLY };
-enum md_copy md_echo_learn_alone(struct md_line *line, int may_be_reply);
-/* Learn from a request to which nothing came, not even its copy. */
-void md_echo_learn_silence(struct md_line *line);
 /* An echo probe is to be sent first. */
 int md_echo_is_in_doubt(const struct md_line *line);
 /* Drop what came while the request was leaving, but the beginning of its echo. */
 void md_echo_keep(struct md_line *line);
 
-/* ---- owed.c: one request whose reply may still come ---- */
-
-struct md_owed md_owed_of(const struct md_exchange *exchange);
-int md_owed_is_same(const struct md_owed *owed, const struct md_exchange *exchange);
-int md_owed_is_mistakable(const struct md_owed *owed, const struct md_exchange *exchange);
-/* Return the length of the reply to this that begins there, MD_INCOMPLETE, or a reason. */
-int md_owed_parse(const struct md_owed *owed, const uint8_t *bytes, size_t len);
-int64_t md_owed_last_ns(const struct md_owed *owed); /* when it was sent last */
-void md_owed_add_time(struct md_owed *owed, int64_t sent_ns);
-void md_owed_drop_time(struct md_owed *owed); /* the earliest */
 /* The reply is an exception, or its one register is at least this and below `end`; `end` 0: anything. */
 int md_is_in_range(const struct md_message *reply, uint16_t least, uint32_t end);
 int md_is_read(int framing, uint8_t function);
 
-/* ---- proof.c: which of its proofs a drive answers ---- */
-
 int md_proof_is(const struct md_exchange *exchange);
 /* An exchange has ended, and may be a proof. */
 void md_proof_end(const struct md_exchange *exchange, int result);
-/* The reply to this request has come late, and that may be a proof. */
-void md_proof_came_late(struct md_drive *drive, const struct md_owed *owed);
 
 /* ---- late.c: replies that come after their time-out ---- */
 
@@ -255,5 +286,17 @@ void md_late_link(struct md_line *line, struct md_drive *drive);
  * answer the exchange under way instead, `since_ns` is to have the time at which that was sent first, 0 if
  * it never was; else NULL. */
 int md_late_take(struct md_line *line, size_t at, int64_t now_ns, int64_t *since_ns);
+
+/* ---- numbers with one writer, and readers on other threads ---- */
+
+static inline uint32_t md_load(const uint32_t *counter)
+{
+    return __atomic_load_n(counter, __ATOMIC_SEQ_CST);
+}
+
+static inline void md_store(uint32_t *counter, uint32_t value)
+{
+    __atomic_store_n(counter, value, __ATOMIC_SEQ_CST);
+}
 
 #endif

@@ -1,12 +1,13 @@
-/* The functions of the C core that Python calls: frames, drives and ports. Those of rows are in rows.h, those
- * of captures in capture.h, and those that only C calls in internal.h, line.h, turn.h and engine.h.
+/* The functions of the C core that Python calls: frames, drives, ports and rows. Those of captures are in
+ * capture.h, and those that only C calls in internal.h, line.h and engine.h.
  *
  * Each section begins with its one return rule. Times are in ns, of CLOCK_MONOTONIC where they are moments.
  * All but port, engine, row queue and clock are pure: no I/O, no callbacks, no globals. */
 #ifndef MULTIDROP_H
 #define MULTIDROP_H
 
-#include "rows.h"
+#include <stddef.h>
+#include <stdint.h>
 
 /* cdef: begin */
 enum {
@@ -23,7 +24,7 @@ enum {
     MD_TIMES_KEPT = 6         /* when the same request was sent */
 };
 
-/* ---- checksum.c: return the checksum ---- */
+/* ---- frame.c: return the checksum ---- */
 
 uint16_t md_crc16(const uint8_t *bytes, size_t len); /* CRC-16/MODBUS; the low byte goes first */
 uint8_t md_lrc(const uint8_t *bytes, size_t len);    /* two's complement of the sum */
@@ -101,7 +102,7 @@ int64_t md_now_ns(void);
  * UTC in every recording. */
 int64_t md_utc_minus_monotonic_ns(void);
 
-/* ---- delay.c, late.c, counters.c: what is known of a drive; return a time in ns ---- */
+/* ---- stats.c, late.c: what is known of a drive; return a time in ns ---- */
 
 /* Counts of a drive's exchanges; all but longest_ns only grow. Values are those of the exchange's block. */
 struct md_counters {
@@ -175,7 +176,7 @@ int64_t md_delay_edge(int bucket); /* the least delay of a bucket, which is an e
 /* Hand over the late replies that are due of another drive, whose place this one takes. */
 void md_late_inherit(struct md_drive *drive, const struct md_drive *before);
 
-/* ---- engine.c, port_api.c: return NULL and set errno on failure; counts and flags else ---- */
+/* ---- engine.c, api.c: return NULL and set errno on failure; counts and flags else ---- */
 
 enum md_echo { MD_ECHO_UNKNOWN, MD_ECHO, MD_NO_ECHO };
 
@@ -268,6 +269,7 @@ struct md_progress {
 
 struct md_engine;
 struct md_port;
+struct md_row_queue;
 struct md_tap;
 struct md_mastership;
 
@@ -328,7 +330,7 @@ int md_port_carry_out(struct md_port *port, const struct md_exchange *exchange, 
  * has. */
 int md_values(const struct md_block *block, const struct md_message *reply, double *values);
 
-/* ---- mastership.c, port_api.c: return NULL or -1 and set errno on failure; else a time, or a flag ---- */
+/* ---- mastership.c, api.c: return NULL or -1 and set errno on failure; else a time, or a flag ---- */
 
 int64_t md_boottime_ns(void); /* CLOCK_BOOTTIME, of which are the times below */
 /* Make one that does not hold yet; ENOSYS where the kernel has no such timer. A line is listened to for
@@ -341,6 +343,122 @@ int md_mastership_extend(struct md_mastership *mastership, int64_t until_ns, int
 void md_mastership_end(struct md_mastership *mastership);
 int64_t md_mastership_until_ns(const struct md_mastership *mastership); /* 0: it does not hold */
 int md_mastership_holds(const struct md_mastership *mastership);
+
+/* ---- rows ---- */
+
+enum {
+    MD_MOST_NUMBERS = 65536, /* of a row queue's ports */
+    MD_MOST_INVALID = 8      /* counts of a register that mean no value */
+};
+
+/* ---- columns.c: return NULL where there is no memory; md_value a number, NaN where there is none ---- */
+
+enum md_number_format {
+    MD_U16, MD_I16, MD_U32, MD_I32, MD_U32_EITHER, MD_F32, MD_BIT,
+    MD_I8, /* the low byte of a word */
+    MD_U64, MD_I64, MD_F64, MD_BCD16, MD_BCD32, MD_F16,
+    MD_LOW_WORD_FIRST = 0x40, /* added to a format of several words */
+    MD_LOW_BYTE_FIRST = 0x80  /* added to any but MD_BIT: within each word */
+};
+
+/* Read the number at word (MD_BIT: bit) `at` of a reply's data: none where a BCD digit is above 9. */
+double md_value(const uint8_t *data, size_t len, size_t at, int format);
+
+/* A register's place in a block's reply, and its scale: value = raw * multiplier / divisor. */
+struct md_field {
+    uint16_t at;
+    uint8_t format; /* enum md_number_format */
+    uint16_t reg;   /* code of its name */
+    uint16_t extra; /* 0: none; else it is the block's extra[extra - 1] */
+    double multiplier, divisor;
+};
+
+/* Bits of a number that mean that there is no value: bits & mask == pattern. */
+struct md_invalid {
+    uint64_t mask, pattern;
+};
+
+/* The rest of a field, which few have. */
+struct md_extra {
+    double addend;         /* value = (raw * multiplier + addend) / divisor */
+    uint8_t low, bits;     /* raw is so many bits of the number, from this one on; bits 0: the number */
+    uint8_t scale_format;  /* of the number whose power of ten it is multiplied by, at word scale_at; */
+    uint8_t has_scale;     /* beyond 10^-22 to 10^22 there is no value */
+    uint16_t scale_at;
+    uint8_t invalid_count, scale_invalid_count; /* the scale's follow on the number's own */
+    struct md_invalid invalid[MD_MOST_INVALID];
+};
+
+/* The fields of a drive's reply. Drives of a kind share them. */
+struct md_block {
+    const struct md_field *fields;
+    const struct md_extra *extra;
+    int count;
+    uint32_t refusals; /* exceptions in a row */
+    uint32_t failures; /* exchanges in a row without a reply, or with a bad one */
+    uint8_t refusal;   /* the last one's code */
+    uint8_t may_lack;  /* a good reply may hold no value for some field */
+    uint8_t is_answered; /* a good reply came once that was no exception */
+    uint16_t drive;    /* code of its name */
+};
+
+/* A row's status: why it has no value. Any other is -enum md_failure or -enum md_frame_fault. */
+enum md_status {
+    MD_OK = 0,
+    MD_NOT_ASKED = 15, /* the drive is silent and is given a rest */
+    MD_NO_VALUE = 18,  /* the reply holds what the device gives in place of a value: NaN, an invalid count */
+    MD_EXCEPTION = 256 /* + the exception's code */
+};
+
+/* Rows. All arrays have `room` elements. */
+struct md_columns {
+    int64_t *time, *sent;           /* of the request, UTC and monotonic; of its turn where it never left */
+    int64_t *uncertainty;           /* ns until the reply began */
+    uint16_t *drive, *reg, *status; /* enum md_status */
+    double *value;
+    uint8_t *valid;                 /* bitmap, least significant bit first: value and uncertainty exist */
+    size_t rows, room;
+};
+
+struct md_columns *md_columns_new(size_t room);
+void md_columns_free(struct md_columns *columns);
+
+/* Write the names of `n` codes as an Arrow utf8 column: n + 1 offsets, and the text. Name i is
+ * bytes[offsets[i]] to bytes[offsets[i + 1]]. Return the text's length; -1 where `room` is too small or a
+ * code has no name. */
+int64_t md_spell(const uint16_t *codes, size_t n, const uint8_t *bytes, const int32_t *offsets, size_t names,
+                 int32_t *out_offsets, uint8_t *out, size_t room);
+
+/* ---- columns.c, columns as recordings hold them: return 0 or -1, a place, or a code ---- */
+
+/* The next float that is no less. */
+void md_narrow_up(const int64_t *numbers, size_t n, float *out);
+/* Whole numbers of floats, 0 where the bitmap `valid` (NULL: all are) has none; -1 where one is none. */
+int md_widen(const float *numbers, const uint8_t *valid, size_t n, int64_t *out);
+/* The numbers of codes below `known`; return the place of the first code whose number is negative, else n. */
+size_t md_narrow_codes(const uint16_t *codes, size_t n, const int16_t *numbers, size_t known, uint8_t *out);
+void md_widen_codes(const uint8_t *codes, size_t n, uint16_t *out);
+uint16_t md_greatest_code(const uint16_t *codes, size_t n);
+/* The places of a series' rows, of which there may be `n`; return how many there are. */
+size_t md_find_codes(const uint16_t *drives, const uint16_t *registers, size_t n, uint16_t drive,
+                     uint16_t reg, uint32_t *places);
+
+/* ---- row_queue.c: return NULL where there is nothing, or no memory; else a number ---- */
+
+/* Keep up to `most_chunks` chunks of rows; rows that come when all are full are dropped and counted. */
+struct md_row_queue *md_row_queue_new(size_t chunk_rows, size_t most_chunks);
+/* Free it, once no port reports to it and the chunks that were taken are given back. */
+void md_row_queue_free(struct md_row_queue *row_queue);
+/* Add rows for values that were due at a time and not asked for. */
+void md_row_queue_miss(struct md_row_queue *row_queue, const struct md_block *block, int status,
+                       int64_t due_ns);
+struct md_columns *md_row_queue_take(struct md_row_queue *row_queue); /* the oldest chunk */
+void md_row_queue_give_back(struct md_row_queue *row_queue, struct md_columns *columns);
+size_t md_row_queue_chunks(struct md_row_queue *row_queue); /* with rows; the newest is still being filled */
+uint64_t md_row_queue_dropped(struct md_row_queue *row_queue); /* rows */
+void md_row_queue_call(struct md_row_queue *row_queue, uint32_t number); /* wake the client about this port */
+/* Wait for a call, at most so long; write the numbers called, each once, and return how many. */
+int md_row_queue_await(struct md_row_queue *row_queue, int64_t timeout_ns, uint32_t *numbers, int room);
 /* cdef: end */
 
 #endif

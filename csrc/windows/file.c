@@ -4,11 +4,54 @@
  * the thread waits, and so the waiter learns that bytes have come. The rest is read at once, as much as there
  * is. Time-outs of a COM port would not do instead: they are whole milliseconds. */
 #include "file.h"
+#include "../engine.h"
 
-#include "../descriptor.h"
-
+#include <errno.h>
 #include <stdlib.h>
 #include <string.h>
+
+/* ---- errors ---- */
+
+/* Windows' errors in the words of POSIX, which the rest of the core and Python speak. */
+
+static const struct {
+    DWORD error;
+    int number;
+} known[] = {
+    {WSAEWOULDBLOCK, EAGAIN},
+    {WSAECONNRESET, ECONNRESET},
+    {WSAECONNABORTED, ECONNABORTED},
+    {WSAENETRESET, ENETRESET},
+    {WSAENETDOWN, ENETDOWN},
+    {WSAEHOSTUNREACH, EHOSTUNREACH},
+    {WSAETIMEDOUT, ETIMEDOUT},
+    {WSAENOTCONN, ENOTCONN},
+    {WSAESHUTDOWN, EPIPE},
+    {ERROR_NETNAME_DELETED, ECONNRESET}, /* overlapped reads say it so */
+    {ERROR_CONNECTION_ABORTED, ECONNABORTED},
+    {ERROR_SEM_TIMEOUT, ETIMEDOUT},
+    {ERROR_INVALID_HANDLE, EBADF},
+    {ERROR_NOT_ENOUGH_MEMORY, ENOMEM},
+    {ERROR_INVALID_PARAMETER, EINVAL},
+    {ERROR_INVALID_FUNCTION, ENOTTY},
+    {ERROR_NOT_SUPPORTED, EOPNOTSUPP},
+    /* an adapter that was unplugged; which of them comes is the driver's choice */
+    {ERROR_ACCESS_DENIED, ENODEV},
+    {ERROR_BAD_COMMAND, ENODEV},
+    {ERROR_DEVICE_NOT_CONNECTED, ENODEV},
+    {ERROR_DEVICE_REMOVED, ENODEV},
+    {ERROR_FILE_NOT_FOUND, ENODEV},
+    {ERROR_NO_SUCH_DEVICE, ENODEV},
+    {ERROR_OPERATION_ABORTED, ENODEV},
+};
+
+int md_errno_of(DWORD error)
+{
+    for (size_t i = 0; i < sizeof known / sizeof *known; i++)
+        if (known[i].error == error)
+            return known[i].number;
+    return EIO;
+}
 
 enum {
     MOST_LEAVING_MS = 100, /* a file that is removed waits so long for its last request to leave */
@@ -69,7 +112,7 @@ static void begin(struct md_file *file)
         md_file_has_read(file, error, 0);
 }
 
-/* ---- for port_io.c ---- */
+/* ---- for port.c ---- */
 
 /* Complete the read of a byte that has come. Windows completes it at once, Wine in another process: until
  * then the byte lies in the queue, and must not be taken for missing. */
@@ -114,7 +157,7 @@ ssize_t md_descriptor_write(int fd, const void *bytes, size_t len)
     return file ? file->kind->write(file, bytes, len) : md_fail(ERROR_INVALID_HANDLE);
 }
 
-/* ---- for waiter.c and rts.c ---- */
+/* ---- for waiter.c and com.c ---- */
 
 static int grow(unsigned at)
 {

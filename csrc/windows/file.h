@@ -53,8 +53,6 @@ void md_file_remove(int fd);
 int md_files_ready(void **whose, int room);
 int md_file_is_writing(int fd); /* the last request has not left yet */
 
-/* ---- failure.c ---- */
-
 int md_errno_of(DWORD error); /* of GetLastError() or WSAGetLastError() */
 
 static inline ssize_t md_fail(DWORD error) /* -1, and errno */

@@ -1,9 +1,7 @@
 /* The C core against the documents' frames and against hostile lengths, without any framework.
  *
  *   cc -std=c11 -D_DEFAULT_SOURCE -g -O1 -fsanitize=address,undefined -fno-sanitize-recover=all \
- *      -Icsrc tests/c/test_core.c csrc/checksum.c csrc/body.c csrc/frame.c csrc/reason.c csrc/tap.c \
- *      csrc/line.c csrc/line_states.c csrc/listen.c csrc/line_end.c csrc/reply.c csrc/tcp.c csrc/echo.c \
- *      csrc/owed.c csrc/proof.c csrc/late.c csrc/delay.c csrc/counters.c csrc/columns.c \
+ *      -Icsrc tests/c/test_core.c csrc/{body,frame,tap,line,reply,tcp,late,stats,columns}.c \
  *      -lm -o test_core
  *   ./test_core tests/data/frames.csv
  *

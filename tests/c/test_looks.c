@@ -5,7 +5,7 @@
 static ssize_t counted(int fd, void *bytes, size_t room);
 #define read counted
 #define send send_request /* it is static there, and of another type than the system's */
-#include "port_io.c"
+#include "port.c"
 #undef send
 #undef read
 

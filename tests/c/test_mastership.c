@@ -12,14 +12,14 @@ static int made_timer(clockid_t clock, struct sigevent *event, timer_t *timer);
 static ssize_t noted_write(int fd, const void *bytes, size_t len);
 #define clock_gettime told_clock
 #define timer_create made_timer
+#define write noted_write
 #include "mastership.c"
 #undef timer_create
 #undef clock_gettime
-#define write noted_write
-#include "port_rs485.c"
+#include "rs485.c"
 #undef write
 #define send send_request /* it is static there, and of another type than the system's */
-#include "port_io.c"
+#include "port.c"
 #undef send
 
 #include <assert.h>

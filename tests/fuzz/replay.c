@@ -1,5 +1,5 @@
-/* Runs a packed corpus through a harness without libFuzzer: `replay corpus/PARSER.txt`. Each line has an input's
- * name and its bytes in hex. */
+/* Runs a packed corpus through a harness without libFuzzer: `replay corpus/PARSER.txt`. Each line of it is
+ * an input's name and its bytes in hex. */
 #include "fuzz.h"
 
 #include <ctype.h>

@@ -1,7 +1,7 @@
 """A poller and a simulated line on a clock of their own: an hour of the line takes seconds.
 
 The poller is the real one with its thread, plan and schedule; line and turns are the core's own code
-(csrc/line.c, csrc/port_turn.c). In place of the descriptor, the core's thread and the clock are stand-ins:
+(csrc/line.c, csrc/turn.c). In place of the descriptor, the core's thread and the clock are stand-ins:
 time passes only while the test lets it, and never because the machine is busy.
 """
 

@@ -7,7 +7,7 @@ which it first saw a revision, by its own clock, and ends that very revision aft
 clocks of two machines are compared. An ended path stays ended for this session, whatever comes.
 
 Once a session is over its lines are claimed and opened at once. The guard begins then: the engine listens for
-so long at least before the first request on a line (csrc/listen.c).
+so long at least before the first request on a line (csrc/line.c).
 tests/fleet/test_lease_model.py tries all interleavings with these functions.
 """
 

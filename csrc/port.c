@@ -1,6 +1,5 @@
 /* One port on the engine's thread: reading, writing and switching, until there is nothing to do but wait. */
 #define _GNU_SOURCE
-#include "descriptor.h"
 #include "engine.h"
 
 enum {

@@ -5,7 +5,6 @@
  * Nothing here waits: the thread looks when the last bit must have left. Then a UART that tells so has the
  * last word (TIOCSERGETLSR); where none does, nothing may be queued, and a character more is waited for. */
 #define _GNU_SOURCE
-#include "descriptor.h"
 #include "engine.h"
 
 static const int64_t LOOK_AGAIN_NS = 200000;
