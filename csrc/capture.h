@@ -4,7 +4,7 @@
 
 #include "multidrop.h"
 
-/* cdef: begin */
+/* cdef: start */
 /* ---- tap.c: return a length in bytes ---- */
 
 /* The sender, where it is known. The last two are no frames by the master's own account. */

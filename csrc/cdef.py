@@ -15,7 +15,7 @@ def main(output: str) -> None:
     ffi = FFI()
     for header in HEADERS:
         text = Path(__file__).with_name(header).read_text()
-        ffi.cdef(text.split("/* cdef: begin */")[1].split("/* cdef: end */")[0])
+        ffi.cdef(text.split("/* cdef: start */")[1].split("/* cdef: end */")[0])
     ffi.set_source("multidrop._core", '#include "line.h"', py_limited_api=True)
     ffi.emit_c_code(output)
 

@@ -9,7 +9,7 @@
 #include <stdatomic.h>
 #include <time.h>
 
-/* cdef: begin */
+/* cdef: start */
 /* ---- stats.c: counters ---- */
 
 /* Count an exchange that is over. */

@@ -4,7 +4,7 @@
 
 #include "internal.h"
 
-/* cdef: begin */
+/* cdef: start */
 /* ---- line.c: its states ---- */
 
 enum md_line_state {

@@ -1,61 +1,61 @@
 /* The functions of the C core that Python calls: frames, drives, ports and rows. Those of captures are in
  * capture.h, and those that only C calls in internal.h, line.h and engine.h.
  *
- * Each section begins with its one return rule. Times are in ns, of CLOCK_MONOTONIC where they are moments.
- * All but port, engine, row queue and clock are pure: no I/O, no callbacks, no globals. */
+ * Each section starts with its one return rule. Times are in ns; moments are of CLOCK_MONOTONIC. All
+ * functions are pure except those of ports, engine, row queue and clock: no I/O, no callbacks, no globals. */
 #ifndef MULTIDROP_H
 #define MULTIDROP_H
 
 #include <stddef.h>
 #include <stdint.h>
 
-/* cdef: begin */
+/* cdef: start */
 enum {
     MD_MOST_DATA = 250,       /* data bytes of a frame: 125 registers */
     MD_MOST_FRAME = 513,      /* ':', 2 * 255 hex digits, CR, LF */
     MD_MOST_TCP = 260,        /* a frame of Modbus TCP */
-    MD_KEPT_FRAME = 24,       /* the longest frame that its exchange keeps: that of any read */
-    MD_STATUSES = 22,         /* of a row without an exception */
+    MD_KEPT_FRAME = 24,       /* longest frame that an exchange stores; every read fits */
+    MD_STATUSES = 22,         /* row statuses below MD_EXCEPTION */
     MD_EXCEPTION_CODES = 256,
     MD_DELAY_BUCKETS = 128,
-    MD_MOST_OWED = 12,        /* requests of a drive whose replies may still come */
+    MD_MOST_OWED = 12,        /* outstanding requests of a drive */
     MD_MOST_PROOFS = 4,
-    MD_PAUSE_S = 10,          /* without a reply, in which another drive may take the place of one */
-    MD_TIMES_KEPT = 6         /* when the same request was sent */
+    MD_PAUSE_S = 10,          /* silence in which somebody may have replaced the drive */
+    MD_TIMES_KEPT = 6         /* send times stored for one outstanding request */
 };
 
 /* ---- frame.c: return the checksum ---- */
 
-uint16_t md_crc16(const uint8_t *bytes, size_t len); /* CRC-16/MODBUS; the low byte goes first */
+uint16_t md_crc16(const uint8_t *bytes, size_t len); /* CRC-16/MODBUS; sent low byte first */
 uint8_t md_lrc(const uint8_t *bytes, size_t len);    /* two's complement of the sum */
-uint8_t md_sum(const uint8_t *bytes, size_t len);    /* Delixi's own: the sum's low byte */
+uint8_t md_sum(const uint8_t *bytes, size_t len);    /* Delixi's checksum: the low byte of the sum */
 
 /* ---- frame.c: return the frame's length (> 0), or an enum md_frame_fault (<= 0) ---- */
 
 enum md_framing { MD_RTU, MD_ASCII, MD_DELIXI, MD_TCP };
 
-/* The reason why bytes are no frame. */
+/* Why bytes are not a frame. */
 enum md_frame_fault {
     MD_INCOMPLETE = 0,     /* more bytes are needed */
-    MD_NO_START = -1,      /* no frame begins here */
-    MD_BAD_CHARACTER = -2, /* no upper-case hex digit, or no CR LF at the end */
+    MD_NO_START = -1,      /* not the start of a frame */
+    MD_BAD_CHARACTER = -2, /* something else than an upper-case hex digit, or than CR LF at the end */
     MD_BAD_CHECKSUM = -3,
-    MD_BAD_ADDRESS = -4,  /* another drive's */
+    MD_BAD_ADDRESS = -4,  /* of another drive */
     MD_BAD_FUNCTION = -5, /* neither the request's function nor its exception */
-    MD_BAD_LENGTH = -6,   /* byte count or quantity differs from the request's */
-    MD_BAD_ECHO = -7,     /* a write confirmed with another address or value */
-    MD_BAD_REQUEST = -8   /* no frame can say this: a field is out of bounds */
+    MD_BAD_LENGTH = -6,   /* byte count or quantity does not match the request */
+    MD_BAD_ECHO = -7,     /* the reply to a write repeats another address or value */
+    MD_BAD_REQUEST = -8   /* a field is out of bounds */
 };
 
-/* One frame's meaning, whatever its framing. Which fields count depends on the function:
+/* The content of a frame in any framing. The function determines the fields in use:
  *   01-04     request start, count         reply data
  *   05, 06    request and reply start, data (2 bytes)
  *   08        request and reply start (the subfunction), data (2 bytes)
  *   0F, 10    request start, count, data   reply start, count
- *   Delixi's  function is K, start is P1P0, data is D3..D0 (4 bytes); a reply to K = 03 carries
- *             its value in P1P0, and has it in data too
- * `exception` is 0, or the code of an exception reply; of Delixi's protocol K = F0, FC..FF. `transaction` is
- * the id in a frame of Modbus TCP, whose address is any unit id. */
+ *   Delixi    function is K, start is P1P0, data is D3..D0 (4 bytes); a reply to K = 03 carries
+ *             its value in P1P0, and the parser copies it to data
+ * `exception` is 0, or the code of an exception reply (Delixi: K = F0, FC..FF). `transaction` is the id in a
+ * Modbus TCP frame, whose address may be any unit id. */
 struct md_message {
     uint8_t address, function, exception;
     uint16_t transaction;
@@ -64,12 +64,12 @@ struct md_message {
     uint8_t data[MD_MOST_DATA];
 };
 
-/* Write the frame to `out`, which has room for `room` bytes. */
+/* Write the frame to `out`, a buffer of `room` bytes. */
 int md_build_request(int framing, const struct md_message *message, uint8_t *out, size_t room);
 int md_build_reply(int framing, const struct md_message *message, uint8_t *out, size_t room);
-/* Parse a request to any address at the beginning of `bytes`. */
+/* Parse the request to any address that `bytes` start with. */
 int md_parse_request(int framing, const uint8_t *bytes, size_t len, struct md_message *message);
-/* Parse the reply to `request`, whatever its transaction, at the beginning of `bytes`. */
+/* Parse the reply to `request` that `bytes` start with; the transaction may differ. */
 int md_parse_reply(int framing, const uint8_t *bytes, size_t len, const struct md_message *request,
                    struct md_message *reply);
 /* Return the length of the good reply to `request`; 0 after a broadcast. */
@@ -91,180 +91,180 @@ enum md_refusal {
     MD_REFUSED_STOPBITS = 8
 };
 
-/* Make the port raw with these settings, and read them back to find what it did not take. */
+/* Make the port raw with these settings; return those that it did not take when read back. */
 int md_port_set(int fd, const struct md_settings *settings);
 int md_port_get(int fd, struct md_settings *settings);
 
 /* ---- clock.c: return a time ---- */
 
 int64_t md_now_ns(void);
-/* Return UTC - CLOCK_MONOTONIC. The value is kept while it is right to 0.1 ms, so that a moment has the same
- * UTC in every recording. */
+/* Return UTC - CLOCK_MONOTONIC. The value stays the same while it is right to 0.1 ms, so that a moment has
+ * one UTC time in all recordings. */
 int64_t md_utc_minus_monotonic_ns(void);
 
-/* ---- stats.c, late.c: what is known of a drive; return a time in ns ---- */
+/* ---- stats.c, late.c: a drive's statistics; return a time in ns ---- */
 
-/* Counts of a drive's exchanges; all but longest_ns only grow. Values are those of the exchange's block. */
+/* Counts of a drive's exchanges; all but longest_ns only grow. `values` counts fields of the blocks. */
 struct md_counters {
     uint64_t exchanges, answered, values;
-    uint64_t sent;        /* requests that began to leave */
-    uint64_t stray_bytes; /* bytes that were no part of a reply */
-    uint64_t ideal_ns;    /* the least time on the line that the answered exchanges needed */
-    int64_t longest_ns;   /* response delay */
+    uint64_t sent;        /* requests of which at least one byte left */
+    uint64_t stray_bytes; /* bytes outside of replies */
+    uint64_t ideal_ns;    /* least line time of the answered exchanges */
+    int64_t longest_ns;   /* longest response delay */
 };
 
-/* A request whose replies may still come. */
+/* An outstanding request: its replies may still come. */
 struct md_owed {
-    int64_t sent_ns[MD_TIMES_KEPT]; /* earliest first; later ones without room count as the last */
+    int64_t sent_ns[MD_TIMES_KEPT]; /* earliest first; the last element is the latest time */
     uint32_t times;
-    uint32_t end;   /* of the reply, as in md_exchange */
-    uint16_t least; /* likewise */
+    uint32_t end;   /* range of the reply, as in md_exchange */
+    uint16_t least;
     uint16_t start, count, reply_len;
     uint8_t framing, address, function, data_len;
     uint8_t data[4];
-    uint8_t is_doubtful; /* a reply came that may answer another process's request */
+    uint8_t is_doubtful; /* its reply may have answered another process */
 };
 
-/* A request of Modbus TCP whose reply may still come. */
+/* An outstanding request of Modbus TCP. */
 struct md_unanswered {
     int64_t sent_ns;
     uint16_t transaction;
     uint8_t address;
 };
 
-/* More counts of a drive, and its requests whose replies may still come. */
+/* More counts of a drive, and its outstanding requests. */
 struct md_history {
     uint64_t ended[MD_STATUSES];       /* exchanges without a reply, by status; MD_OK: broadcasts */
     uint64_t missed[MD_STATUSES];      /* values, by status */
-    uint64_t late;                     /* replies that came after their time-out */
-    uint64_t exceptions, naks, busies; /* exchanges that ended with an exception; with code 7; with code 6 */
+    uint64_t late;                     /* replies after their timeout */
+    uint64_t exceptions, naks, busies; /* replies with any exception, code 7, code 6 */
     uint32_t refused[MD_EXCEPTION_CODES]; /* values, by exception code */
-    uint64_t pauses;                      /* replies that came MD_PAUSE_S or more after the one before */
+    uint64_t pauses;                      /* replies MD_PAUSE_S or more after the previous one */
     struct md_owed owed[MD_MOST_OWED];
     struct md_unanswered unanswered[MD_MOST_OWED]; /* the oldest first */
 };
 
-/* A drive: the bounds of its time-out and its interval are given, the rest is learnt from its exchanges and
- * begins as 0. A time-out runs from the request's last bit to the reply's first.
- * A request needs the first cache line, its end the second one too. */
+/* A drive. The caller sets the bounds of its timeout and its interval; the core learns the rest, which starts
+ * as 0. A timeout runs from the request's last bit to the reply's first. Starting a request touches the first
+ * cache line only, its end the second one too. */
 struct md_drive {
     int64_t least_timeout_ns, most_timeout_ns;
-    int64_t delay_ns, deviation_ns;    /* the response delay, smoothed, and its mean deviation */
-    int64_t patience_ns;               /* a longer time-out, learnt from late replies */
-    int64_t interval_ns;               /* from the end of an exchange to its next request, at least */
-    int64_t ready_ns;                  /* no request leaves for it before then */
+    int64_t delay_ns, deviation_ns;    /* smoothed response delay, and its mean deviation */
+    int64_t patience_ns;               /* a longer timeout, learnt from late replies */
+    int64_t interval_ns;               /* least time between an exchange and the next request */
+    int64_t ready_ns;                  /* earliest time of the next request */
     uint32_t failures;                 /* in a row */
     uint8_t owed_count, proof_count;
-    uint8_t is_doubted;                /* its first reply may answer what another process asked */
-    uint8_t sure_looks;                /* so many replies are whole at the first look, if it stays steady */
+    uint8_t is_doubted;                /* its first reply may answer another process */
+    uint8_t sure_looks;                /* replies to expect whole at the first read */
     struct md_counters counters;
-    int64_t answered_ns;               /* requests that left before then are answered, or never will be */
-    int64_t late_until_ns;             /* until then a late reply may come, in any order */
-    uint64_t vain_at;                  /* its replies, when a proof was given up */
-    uint8_t vain[MD_MOST_PROOFS];      /* how often each proof was given up; 255: it was answered once */
-    uint32_t doubtful;                 /* replies of which it was doubted that they were its own */
+    int64_t answered_ns;               /* no reply to an earlier request can come */
+    int64_t late_until_ns;             /* late replies may come in any order until then */
+    uint64_t vain_at;                  /* its reply count when a proof last failed */
+    uint8_t vain[MD_MOST_PROOFS];      /* failures of each proof; 255: it was answered once */
+    uint32_t doubtful;                 /* replies that may have answered another process */
     uint32_t unanswered_count;
-    const struct md_exchange **proofs; /* reads whose replies differ from others' */
-    struct md_drive *next_late;        /* the next one on this line with late replies due */
-    struct md_history *history;        /* apart, for it is seldom needed: an exchange touches fewer pages */
-    uint64_t delays[MD_DELAY_BUCKETS]; /* replies by response delay: bucket n begins at md_delay_edge(n) */
+    const struct md_exchange **proofs; /* reads with distinguishable replies */
+    struct md_drive *next_late;        /* next drive of the line's list with late replies due */
+    struct md_history *history;        /* separate because exchanges seldom need it */
+    uint64_t delays[MD_DELAY_BUCKETS]; /* replies by delay: bucket n from md_delay_edge(n) */
 };
 
 int64_t md_present_timeout_ns(const struct md_drive *drive); /* of a read */
-int64_t md_vain_ns(const struct md_drive *drive);            /* of the next read, if the drive stays silent */
-int64_t md_delay_edge(int bucket); /* the least delay of a bucket, which is an eighth of that wide */
-/* Hand over the late replies that are due of another drive, whose place this one takes. */
+int64_t md_vain_ns(const struct md_drive *drive);            /* wait of the next read for a silent drive */
+int64_t md_delay_edge(int bucket); /* least delay of a bucket; its width is an eighth of that */
+/* Copy the outstanding requests of a drive that this one replaces. */
 void md_late_inherit(struct md_drive *drive, const struct md_drive *before);
 
-/* ---- engine.c, api.c: return NULL and set errno on failure; counts and flags else ---- */
+/* ---- engine.c, api.c: return NULL and set errno on failure; otherwise counts and flags ---- */
 
 enum md_echo { MD_ECHO_UNKNOWN, MD_ECHO, MD_NO_ECHO };
 
-/* The framing of a port's exchanges. */
+/* The transaction ids of a port. */
 enum md_transactions {
-    MD_NO_TRANSACTIONS, /* any but MD_TCP */
-    MD_MATCHED,         /* MD_TCP: a reply has its request's id */
-    MD_IGNORED          /* MD_TCP through a gateway that replies with ids of its own */
+    MD_NO_TRANSACTIONS, /* every framing except MD_TCP */
+    MD_MATCHED,         /* MD_TCP: a reply repeats its request's id */
+    MD_IGNORED          /* MD_TCP through a gateway that replies with its own ids */
 };
 
-/* The transceiver's direction: who switches it. */
+/* The owner of the transceiver's direction. */
 enum md_rs485_mode {
     MD_RS485_OFF,     /* the adapter itself */
-    MD_RS485_KERNEL,  /* the driver, with polarity and delays as they are set up there */
+    MD_RS485_KERNEL,  /* the driver, with its configured polarity and delays */
     MD_RS485_RTS_UP,  /* this port: RTS is on while a request leaves */
-    MD_RS485_RTS_DOWN /* this port: RTS is off then, and on else */
+    MD_RS485_RTS_DOWN /* this port: RTS is off while a request leaves, otherwise on */
 };
 
-/* One request with all that is needed to carry it out; constant while in use. What every exchange needs comes
- * first, in two cache lines: with many lines each of them is read from memory. */
+/* A request with its drive, timing and settings; constant while in use. Fields that every exchange needs come
+ * first, in two cache lines: with many lines the processor reads each from memory. */
 struct md_exchange {
     struct md_drive *drive;
-    struct md_block *block;        /* fields of its reply; NULL: no rows */
-    const struct md_block *values; /* what the caller of md_port_carry_out() gets; NULL: nothing */
+    struct md_block *block;        /* fields for rows; NULL: no rows */
+    const struct md_block *values; /* fields for md_port_carry_out(); NULL: none */
     int64_t character_ns;          /* one character on the wire */
     int64_t silence_ns;            /* before the request and after its reply */
-    /* The least time-out, of a write; 0: as learnt. One that insists waits as long as late replies are
-     * known to take, but not beyond this. */
+    /* The least timeout, for writes; 0: as learnt. With `insists` it is the limit of the wait for late
+     * replies instead. */
     int64_t timeout_ns;
-    int64_t period_ns; /* between its slots in a queue; 0: it has none */
-    /* Sent first while it is unknown whether the adapter echoes: its reply is never a copy of its request.
-     * NULL: none. */
+    int64_t period_ns; /* between its slots in a queue; 0: none */
+    /* Send this exchange first while it is unknown whether the adapter echoes. Its reply is never a copy of
+     * its request. NULL: none. */
     const struct md_exchange *echo_probe;
     struct md_settings settings;
     int framing;
-    int insists;          /* a stop: sent even where a late reply may pass for its own */
-    uint32_t end;         /* the reply's one register is below this; 0: it holds anything */
-    uint16_t least;       /* and not below this */
-    uint8_t is_proof;     /* of its drive */
-    uint8_t frame_len;    /* 0: the frame is built when its turn comes */
+    int insists;          /* a stop: sent even if a late reply may be mistaken for its own */
+    uint32_t end;         /* the reply's one register is below this; 0: no range */
+    uint16_t least;       /* ... and at least this */
+    uint8_t is_proof;     /* one of its drive's proofs */
+    uint8_t frame_len;    /* 0: build the frame at its turn */
     uint8_t frame[MD_KEPT_FRAME];
     struct md_message request;
     int64_t turnaround_ns; /* after a broadcast */
-    const uint32_t *stops; /* of its drive: sent only while they are stops_seen; NULL: always */
+    const uint32_t *stops; /* its drive's stop counter: send only while it equals stops_seen; NULL: always */
     uint32_t stops_seen;
 };
 
-/* The reason why an exchange has no reply; an enum md_frame_fault where something came in its place. */
+/* Why an exchange has no reply; an enum md_frame_fault if other bytes came. */
 enum md_failure {
-    MD_CUT_SHORT = -9,         /* a reply began and did not end within the time-out */
-    MD_NO_REPLY = -10,         /* nothing came within the time-out, but at most the request's echo */
-    MD_LINE_LOST = -11,        /* the port failed: errno in `error`, 0 at end of file, EPROTO: no MD_TCP */
+    MD_CUT_SHORT = -9,         /* the reply was incomplete at the timeout */
+    MD_NO_REPLY = -10,         /* no byte within the timeout except the request's echo */
+    MD_LINE_LOST = -11,        /* the port failed; `error`: errno, 0 at end of file, EPROTO: no Modbus TCP */
     MD_SETTINGS_REFUSED = -12, /* the port did not take baud rate or format */
     MD_LATE_ANSWER_DUE = -13,  /* not sent: a late reply could be mistaken for its own */
     MD_EXPIRED = -14,          /* not sent: its time was over, or a stop came first */
     MD_POLL_ENDED = -16,       /* the poll ended before its turn or its reply */
-    MD_MAYBE_ECHO = -17,       /* the reply cannot be told from the adapter's echo */
-    MD_NOT_MASTER = -19,       /* not sent: this process may not send any more; a part may have left before */
-    MD_OTHER_MASTER = -20,     /* not sent: bytes come that another master causes */
+    MD_MAYBE_ECHO = -17,       /* the bytes may be the reply or the adapter's echo */
+    MD_NOT_MASTER = -19,       /* this process lost the right to send; part of the request may have left */
+    MD_OTHER_MASTER = -20,     /* not sent: another master uses the line */
     MD_POLLING_FAILED = -21    /* not asked: the client that queues requests failed */
 };
 
-/* The result of an exchange. first_ns and last_ns are 0 where nothing came. */
+/* The result of an exchange. first_ns and last_ns are 0 if no byte came. */
 struct md_completion {
     int result;                /* > 0: length of the reply; 0: a broadcast, sent; < 0: see enum md_failure */
     int error;                 /* MD_LINE_LOST: errno; MD_SETTINGS_REFUSED: enum md_refusal */
-    int64_t begun_ns;          /* its turn came: the line's silence may not have been over */
-    int64_t sent_ns;           /* the request began to leave; 0: it never did */
-    int64_t utc_ahead_ns;      /* UTC - CLOCK_MONOTONIC then, before any sleep of the machine; 0: not known */
-    int64_t first_ns, last_ns; /* first and last byte after the request were seen */
-    int64_t late_until_ns;     /* of an urgent one: its drive's, when its caller asked for it */
-    uint32_t stale;            /* bytes thrown away before the request left: late replies, noise */
-    uint32_t skipped;          /* bytes after the request that were not part of the reply */
+    int64_t begun_ns;          /* its turn came; the line's silence may not have been over */
+    int64_t sent_ns;           /* the first byte of the request left; 0: never */
+    int64_t utc_ahead_ns;      /* UTC - CLOCK_MONOTONIC at sent_ns; 0: unknown */
+    int64_t first_ns, last_ns; /* arrival of the first and the last byte after the request */
+    int64_t late_until_ns;     /* the drive's late_until_ns at the call; of urgent exchanges only */
+    uint32_t stale;            /* discarded bytes before the request: late replies, noise */
+    uint32_t skipped;          /* bytes after the request outside of the reply */
     uint16_t raw_len;
     struct md_message reply;   /* a good reply or an exception */
-    uint8_t raw[MD_MOST_FRAME]; /* the reply; of a failure the end of what came */
+    uint8_t raw[MD_MOST_FRAME]; /* the reply; after a failure the last bytes received */
 };
 
 /* Progress of a port. Each number only grows, and wraps around. */
 struct md_progress {
     uint32_t submitted, done;
-    uint32_t lost;        /* the descriptor failed: all urgent ones that follow are MD_LINE_LOST */
-    uint32_t cut_off;     /* the newest polled exchange was lost with it, after replies to others on it */
+    uint32_t lost;        /* the descriptor failed: all later urgent exchanges are MD_LINE_LOST */
+    uint32_t cut_off;     /* the polled exchange in flight was lost too, on a port that had worked */
     uint32_t repeating;   /* exchanges are repeated */
     uint32_t switches;    /* of baud rate and format */
-    uint32_t echo;        /* of its adapter (enum md_echo), as far as is known */
-    uint32_t foreign;     /* bytes that came while the line was listened to before its first request */
-    int64_t switching_ns; /* time that the switches took */
+    uint32_t echo;        /* enum md_echo: whether the adapter echoes */
+    uint32_t foreign;     /* bytes received while listening before the first request */
+    int64_t switching_ns; /* time spent on the switches */
 };
 
 struct md_engine;
@@ -273,73 +273,73 @@ struct md_row_queue;
 struct md_tap;
 struct md_mastership;
 
-struct md_engine *md_engine_start(void); /* the thread for every line of the process; it ends with that */
+struct md_engine *md_engine_start(void); /* the thread of all lines; it lives as long as the process */
 
-/* `must_take`: the refusals (enum md_refusal) that are failures; -1: a port without settings. `transactions`:
- * enum md_transactions. `room` for queued exchanges is a power of two. */
+/* Open a port on a descriptor. `must_take`: mask of the refusals (enum md_refusal) that are failures; -1:
+ * a port without settings. `transactions`: enum md_transactions. `room` for queued exchanges: a power of
+ * two. */
 struct md_port *md_port_open(struct md_engine *engine, int fd, int must_take, int transactions,
                              unsigned room);
-/* Send only while the mastership holds: it is looked at right before each write(2), and must outlive the
- * port. Before the first request, and where it has not held all the time since the last one, the line is
- * listened to, for the mastership's guard at least; a stop is not held up. */
+/* Send only while the mastership holds, which is checked right before each write(2). It must outlive the
+ * port. Before the first request, and after any gap in the mastership, the port first listens to the line,
+ * at least for the mastership's guard. Stops do not wait for that. */
 void md_port_fence(struct md_port *port, struct md_mastership *mastership);
-/* Say who switches between sending and receiving, before anything is sent; return 0 or -errno. */
+/* Set who switches the transceiver (enum md_rs485_mode), before the first request; return 0 or -errno. */
 int md_port_rs485(struct md_port *port, int mode);
-/* Put all that goes over the line into `tap`, which must outlive the port or be replaced first. */
+/* Copy all bytes of the line to `tap`, which must outlive the port or be replaced first. */
 void md_port_tap(struct md_port *port, struct md_tap *tap);
-/* Begin nothing more of what is queued or repeated, but still urgent exchanges. Return 1 while one of the
- * former is under way. */
+/* From now on start urgent exchanges only, no queued or repeated ones. Return 1 while a polled one is in
+ * flight. */
 int md_port_end(struct md_port *port);
-/* Return 1 while an exchange with this drive is queued, repeated, urgent or under way. */
+/* Return 1 while an exchange with this drive is queued, repeated, urgent or in flight. */
 int md_port_is_asking(struct md_port *port, const struct md_drive *drive);
-/* Return until when the port's time is over and counted: no exchange that ends from now on needed the line
- * before then. While one is under way that is its beginning. */
+/* Return the time up to which all line use has been counted: the start of the exchange in flight, if any. */
 int64_t md_port_counted_ns(struct md_port *port);
-/* md_late_inherit() while the engine looks at neither drive. */
+/* Call md_late_inherit() under the engine's lock. */
 void md_port_inherit(struct md_port *port, struct md_drive *drive, const struct md_drive *before);
-/* Carry out nothing more, and give the descriptor back. What is under way after md_port_end() becomes
+/* Stop all exchanges and give the descriptor back. After md_port_end() a polled exchange in flight ends as
  * MD_POLL_ENDED. */
 void md_port_stop(struct md_port *port);
-/* Stop and free it; `memory` is what its client keeps for it, and outlives this call. */
+/* Stop and free the port; `memory` only keeps the client's memory alive until then. */
 void md_port_let_go(struct md_port *port, void *memory);
-/* Say whether the adapter echoes: MD_ECHO is never unlearnt, MD_NO_ECHO holds until an echo shows. */
+/* Set whether the adapter echoes: MD_ECHO is final, MD_NO_ECHO holds until an echo comes. */
 void md_port_tell_echo(struct md_port *port, int echo);
-/* Deliver rows to `row_queue`, and call it with `number` when the port needs attention. */
+/* Deliver rows to `row_queue`, and call its client with `number` when the port needs attention. */
 void md_port_report(struct md_port *port, struct md_row_queue *row_queue, uint32_t number);
-/* Queue exchanges, none to be sent before its time; return how many there was room for. One client at a
- * time. A slot that is late by a period is not sent (MD_EXPIRED) when the same exchange's next one is due. */
+/* Queue exchanges with the earliest time of each; return how many fitted. One client at a time. A slot
+ * that is late by a period ends as MD_EXPIRED if the same exchange's next slot is due. */
 int md_port_submit(struct md_port *port, const struct md_exchange *const *exchanges,
                    const int64_t *not_before_ns, int n);
-/* Repeat these in turn while nothing that is queued is due, until they are replaced, the port is lost, or one
- * of them could not be sent. Return which one of those that they replace would have been next. */
+/* Repeat these exchanges in turn whenever no queued one is due, until they are replaced, the port is lost, or
+ * one could not be sent. Return the index of the next one in the replaced round. */
 unsigned md_port_repeat(struct md_port *port, const struct md_exchange *const *exchanges, unsigned n);
 const struct md_progress *md_port_progress(struct md_port *port);
-/* Count a stop: no urgent exchange made before it begins to leave any more. */
+/* Count a stop: urgent exchanges with an older count are not sent. */
 void md_count_stop(uint32_t *stops);
-/* Carry one out ahead of the queue and wait for it; one that insists goes ahead of those that do not. After
- * `expires_ns` (of CLOCK_BOOTTIME; 0: never), or a stop, it is not sent (MD_EXPIRED). Beside many of these
- * the queue keeps a 20th of the line, one exchange at a time, but none while one that insists waits. Write
- * the exchange's values, NaN where the reply has none, and return how many it has; -1 where there is no good
- * reply, or an exception. */
+/* Carry out an urgent exchange ahead of the queue and wait for it; one with `insists` precedes the others.
+ * After `expires_ns` (of CLOCK_BOOTTIME; 0: never), or after a stop, it is not sent (MD_EXPIRED). Endless
+ * urgent exchanges leave the queue a 20th of the line, except while one with `insists` waits. Write the
+ * exchange's values, NaN for a missing one, and return how many exist; -1 without a good reply, or after an
+ * exception. */
 int md_port_carry_out(struct md_port *port, const struct md_exchange *exchange, int64_t not_before_ns,
                       int64_t expires_ns, struct md_completion *completion, double *values);
 
 /* ---- columns.c: return a count ---- */
 
-/* Write the value of each of the block's fields in a good reply, NaN where it has none; return how many it
- * has. */
+/* Write the values of the block's fields in a good reply, NaN for a missing one; return how many exist. */
 int md_values(const struct md_block *block, const struct md_message *reply, double *values);
 
-/* ---- mastership.c, api.c: return NULL or -1 and set errno on failure; else a time, or a flag ---- */
+/* ---- mastership.c, api.c: return NULL or -1 and set errno on failure; otherwise a time, or a flag ---- */
 
-int64_t md_boottime_ns(void); /* CLOCK_BOOTTIME, of which are the times below */
-/* Make one that does not hold yet; ENOSYS where the kernel has no such timer. A line is listened to for
- * `guard_ns` at least. */
+int64_t md_boottime_ns(void); /* CLOCK_BOOTTIME, the clock of the times below */
+/* Return a mastership that does not hold yet; ENOSYS if the kernel lacks the timer. Ports listen to their
+ * line for `guard_ns` at least. */
 struct md_mastership *md_mastership_new(int64_t guard_ns);
-void md_mastership_free(struct md_mastership *mastership); /* after all ports that have it */
-/* Hold until then. Where it is not extended by `kill_ns`, the kernel kills this process. */
+void md_mastership_free(struct md_mastership *mastership); /* after all ports that use it */
+/* Hold until `until_ns`. The kernel kills this process at `kill_ns` unless the mastership is extended
+ * before. */
 int md_mastership_extend(struct md_mastership *mastership, int64_t until_ns, int64_t kill_ns);
-/* Hold no more: nothing is sent once this has returned, and nobody is killed. */
+/* End the mastership: after this call no byte leaves, and the kernel kills no process. */
 void md_mastership_end(struct md_mastership *mastership);
 int64_t md_mastership_until_ns(const struct md_mastership *mastership); /* 0: it does not hold */
 int md_mastership_holds(const struct md_mastership *mastership);
@@ -347,21 +347,21 @@ int md_mastership_holds(const struct md_mastership *mastership);
 /* ---- rows ---- */
 
 enum {
-    MD_MOST_NUMBERS = 65536, /* of a row queue's ports */
-    MD_MOST_INVALID = 8      /* counts of a register that mean no value */
+    MD_MOST_NUMBERS = 65536, /* ports of a row queue */
+    MD_MOST_INVALID = 8      /* raw values of a register that mean "no value" */
 };
 
-/* ---- columns.c: return NULL where there is no memory; md_value a number, NaN where there is none ---- */
+/* ---- columns.c: return NULL without memory; md_value returns a number, NaN without one ---- */
 
 enum md_number_format {
     MD_U16, MD_I16, MD_U32, MD_I32, MD_U32_EITHER, MD_F32, MD_BIT,
     MD_I8, /* the low byte of a word */
     MD_U64, MD_I64, MD_F64, MD_BCD16, MD_BCD32, MD_F16,
-    MD_LOW_WORD_FIRST = 0x40, /* added to a format of several words */
-    MD_LOW_BYTE_FIRST = 0x80  /* added to any but MD_BIT: within each word */
+    MD_LOW_WORD_FIRST = 0x40, /* flag for formats of several words */
+    MD_LOW_BYTE_FIRST = 0x80  /* flag for all formats except MD_BIT: within each word */
 };
 
-/* Read the number at word (MD_BIT: bit) `at` of a reply's data: none where a BCD digit is above 9. */
+/* Read the number at word (MD_BIT: bit) `at` of a reply's data; NaN if a BCD digit is above 9. */
 double md_value(const uint8_t *data, size_t len, size_t at, int format);
 
 /* A register's place in a block's reply, and its scale: value = raw * multiplier / divisor. */
@@ -369,51 +369,51 @@ struct md_field {
     uint16_t at;
     uint8_t format; /* enum md_number_format */
     uint16_t reg;   /* code of its name */
-    uint16_t extra; /* 0: none; else it is the block's extra[extra - 1] */
+    uint16_t extra; /* 0: none; otherwise the block's extra[extra - 1] */
     double multiplier, divisor;
 };
 
-/* Bits of a number that mean that there is no value: bits & mask == pattern. */
+/* A pattern of bits that means "no value": bits & mask == pattern. */
 struct md_invalid {
     uint64_t mask, pattern;
 };
 
-/* The rest of a field, which few have. */
+/* Properties that few fields have. */
 struct md_extra {
     double addend;         /* value = (raw * multiplier + addend) / divisor */
-    uint8_t low, bits;     /* raw is so many bits of the number, from this one on; bits 0: the number */
-    uint8_t scale_format;  /* of the number whose power of ten it is multiplied by, at word scale_at; */
-    uint8_t has_scale;     /* beyond 10^-22 to 10^22 there is no value */
+    uint8_t low, bits;     /* raw is `bits` bits of the number, from bit `low` on; bits 0: all of them */
+    uint8_t scale_format;  /* format of the decimal exponent at word scale_at; */
+    uint8_t has_scale;     /* outside of 10^-22 to 10^22 the field has no value */
     uint16_t scale_at;
-    uint8_t invalid_count, scale_invalid_count; /* the scale's follow on the number's own */
+    uint8_t invalid_count, scale_invalid_count; /* the exponent's patterns follow the number's */
     struct md_invalid invalid[MD_MOST_INVALID];
 };
 
-/* The fields of a drive's reply. Drives of a kind share them. */
+/* The fields of a drive's reply. Drives of the same model share them. */
 struct md_block {
     const struct md_field *fields;
     const struct md_extra *extra;
     int count;
     uint32_t refusals; /* exceptions in a row */
-    uint32_t failures; /* exchanges in a row without a reply, or with a bad one */
-    uint8_t refusal;   /* the last one's code */
-    uint8_t may_lack;  /* a good reply may hold no value for some field */
-    uint8_t is_answered; /* a good reply came once that was no exception */
+    uint32_t failures; /* exchanges in a row without a good reply */
+    uint8_t refusal;   /* code of the last exception */
+    uint8_t may_lack;  /* a field may have no value in a good reply */
+    uint8_t is_answered; /* a good reply without exception came once */
     uint16_t drive;    /* code of its name */
 };
 
-/* A row's status: why it has no value. Any other is -enum md_failure or -enum md_frame_fault. */
+/* A row's status: why it has no value. Other values are -enum md_failure or -enum md_frame_fault. */
 enum md_status {
     MD_OK = 0,
-    MD_NOT_ASKED = 15, /* the drive is silent and is given a rest */
-    MD_NO_VALUE = 18,  /* the reply holds what the device gives in place of a value: NaN, an invalid count */
+    MD_NOT_ASKED = 15, /* the poller skips the silent drive for a while */
+    MD_NO_VALUE = 18,  /* the reply holds the device's mark for "no value": NaN, an invalid count */
     MD_EXCEPTION = 256 /* + the exception's code */
 };
 
 /* Rows. All arrays have `room` elements. */
 struct md_columns {
-    int64_t *time, *sent;           /* of the request, UTC and monotonic; of its turn where it never left */
-    int64_t *uncertainty;           /* ns until the reply began */
+    int64_t *time, *sent;           /* of the request, UTC and monotonic; of its turn if it never left */
+    int64_t *uncertainty;           /* ns between the request and the reply's first byte */
     uint16_t *drive, *reg, *status; /* enum md_status */
     double *value;
     uint8_t *valid;                 /* bitmap, least significant bit first: value and uncertainty exist */
@@ -424,40 +424,43 @@ struct md_columns *md_columns_new(size_t room);
 void md_columns_free(struct md_columns *columns);
 
 /* Write the names of `n` codes as an Arrow utf8 column: n + 1 offsets, and the text. Name i is
- * bytes[offsets[i]] to bytes[offsets[i + 1]]. Return the text's length; -1 where `room` is too small or a
- * code has no name. */
+ * bytes[offsets[i]] to bytes[offsets[i + 1]]. Return the text's length; -1 if `room` is too small or a code
+ * has no name. */
 int64_t md_spell(const uint16_t *codes, size_t n, const uint8_t *bytes, const int32_t *offsets, size_t names,
                  int32_t *out_offsets, uint8_t *out, size_t room);
 
-/* ---- columns.c, columns as recordings hold them: return 0 or -1, a place, or a code ---- */
+/* ---- columns.c, columns in the format of recordings: return 0 or -1, an index, or a code ---- */
 
-/* The next float that is no less. */
+/* Convert to floats, rounded up. */
 void md_narrow_up(const int64_t *numbers, size_t n, float *out);
-/* Whole numbers of floats, 0 where the bitmap `valid` (NULL: all are) has none; -1 where one is none. */
+/* Convert floats to whole numbers, 0 for those that the bitmap `valid` (NULL: all valid) excludes; -1 if
+ * one does not fit. */
 int md_widen(const float *numbers, const uint8_t *valid, size_t n, int64_t *out);
-/* The numbers of codes below `known`; return the place of the first code whose number is negative, else n. */
+/* Replace codes by their numbers; return the index of the first code that is not below `known` or has a
+ * negative number, otherwise n. */
 size_t md_narrow_codes(const uint16_t *codes, size_t n, const int16_t *numbers, size_t known, uint8_t *out);
 void md_widen_codes(const uint8_t *codes, size_t n, uint16_t *out);
 uint16_t md_greatest_code(const uint16_t *codes, size_t n);
-/* The places of a series' rows, of which there may be `n`; return how many there are. */
+/* Write the indexes of the rows of a drive's register to `places`, which holds `n`; return how many there
+ * are. */
 size_t md_find_codes(const uint16_t *drives, const uint16_t *registers, size_t n, uint16_t drive,
                      uint16_t reg, uint32_t *places);
 
-/* ---- row_queue.c: return NULL where there is nothing, or no memory; else a number ---- */
+/* ---- row_queue.c: return NULL without rows or memory; otherwise a number ---- */
 
-/* Keep up to `most_chunks` chunks of rows; rows that come when all are full are dropped and counted. */
+/* Return a queue of up to `most_chunks` chunks of rows; when all are full it drops and counts new rows. */
 struct md_row_queue *md_row_queue_new(size_t chunk_rows, size_t most_chunks);
-/* Free it, once no port reports to it and the chunks that were taken are given back. */
+/* Free the queue as soon as no port reports to it and all taken chunks are given back. */
 void md_row_queue_free(struct md_row_queue *row_queue);
-/* Add rows for values that were due at a time and not asked for. */
+/* Add rows for values that were due at `due_ns` but not asked for. */
 void md_row_queue_miss(struct md_row_queue *row_queue, const struct md_block *block, int status,
                        int64_t due_ns);
 struct md_columns *md_row_queue_take(struct md_row_queue *row_queue); /* the oldest chunk */
 void md_row_queue_give_back(struct md_row_queue *row_queue, struct md_columns *columns);
-size_t md_row_queue_chunks(struct md_row_queue *row_queue); /* with rows; the newest is still being filled */
-uint64_t md_row_queue_dropped(struct md_row_queue *row_queue); /* rows */
-void md_row_queue_call(struct md_row_queue *row_queue, uint32_t number); /* wake the client about this port */
-/* Wait for a call, at most so long; write the numbers called, each once, and return how many. */
+size_t md_row_queue_chunks(struct md_row_queue *row_queue); /* that hold rows; the newest is still growing */
+uint64_t md_row_queue_dropped(struct md_row_queue *row_queue); /* dropped rows */
+void md_row_queue_call(struct md_row_queue *row_queue, uint32_t number); /* wake the client */
+/* Wait for a call, at most `timeout_ns`; write each called number once, and return how many. */
 int md_row_queue_await(struct md_row_queue *row_queue, int64_t timeout_ns, uint32_t *numbers, int room);
 /* cdef: end */
 
