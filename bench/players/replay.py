@@ -3,9 +3,8 @@
 from typing import Any
 
 from multidrop.drive import Drive
-from multidrop.drive.declare import reading
-from multidrop.drive.table import HOLDING, INPUT
-from multidrop.drive.timing import Settings
+from multidrop.drive.line_settings import Settings
+from multidrop.drive.register import HOLDING, INPUT, reading
 
 
 class Played(Drive):

@@ -15,8 +15,7 @@ from typing import Any
 
 from bench.support import tables
 from multidrop.drive import Drive
-from multidrop.drive.register import Register
-from multidrop.drive.table import Table
+from multidrop.drive.register import Register, Table
 from multidrop.families import MODELS
 from multidrop.planning.blocks import Block, Planned, blocks, sending
 from multidrop.planning.bus_time import gap

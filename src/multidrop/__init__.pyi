@@ -9,10 +9,10 @@ from multidrop.drive import Condition as Condition
 from multidrop.drive import Direction as Direction
 from multidrop.drive import Drive as Drive
 from multidrop.drive import State as State
-from multidrop.drive.declare import command as command
-from multidrop.drive.declare import reading as reading
-from multidrop.drive.declare import setting as setting
 from multidrop.drive.register import Register as Register
+from multidrop.drive.register import command as command
+from multidrop.drive.register import reading as reading
+from multidrop.drive.register import setting as setting
 from multidrop.drive.text import text as text
 from multidrop.errors import BadReply as BadReply
 from multidrop.errors import BusError as BusError

@@ -23,8 +23,7 @@ from multidrop.control.writer import Writer
 from multidrop.core import RS485, Echo, Mastership, Message, Peer, TransactionIds
 from multidrop.core.fork import register_at_fork
 from multidrop.core.undisturbed import undisturbed
-from multidrop.drive.family import Drive
-from multidrop.drive.own import check_drive, check_own, check_own_text
+from multidrop.drive.family import Drive, check_drive, check_own, check_own_text
 from multidrop.drive.register import Register
 from multidrop.drive.script import Script
 from multidrop.drive.state import State

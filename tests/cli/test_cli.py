@@ -304,7 +304,7 @@ def test_advice_for_a_drive_of_a_plant_file_is_what_its_command_takes(run: Run, 
 
 def test_advice_for_a_program_becomes_a_command_s() -> None:
     reset = WriteForbidden(
-        "x has a fault: see to it, then call reset_fault()", advice=Advice.call("reset_fault")
+        "x has a fault: remove its cause, then call reset_fault()", advice=Advice.call("reset_fault")
     )
     assert reset.for_command_line() == "x has a fault: see to it, then run `multidrop reset-fault`"
     declare = WriteForbidden("and declare confirmed = 1 if it is", advice=Advice.declare("confirmed", 1))

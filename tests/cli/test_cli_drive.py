@@ -140,7 +140,7 @@ def test_what_a_drive_refuses_to_tell_does_not_hide_the_rest(run: Run, port: str
 MUTE = """\
 from enum import IntEnum
 from multidrop.drive.family import Drive, verb, write
-from multidrop.drive.declare import command, reading
+from multidrop.drive.register import command, reading
 
 class Word(IntEnum):
     STOP = 0

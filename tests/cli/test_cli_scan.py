@@ -17,7 +17,7 @@ import multidrop.cli.scan
 import multidrop.scan.identify
 from multidrop.cli.scan import sentence
 from multidrop.core import RS485, Framing
-from multidrop.drive.timing import Settings
+from multidrop.drive.line_settings import Settings
 from multidrop.families.delixi_modbus import DelixiModbus
 from multidrop.families.innovert_ibd import InnovertIBD
 from multidrop.families.invt_che import InvtCHE

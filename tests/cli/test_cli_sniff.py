@@ -27,7 +27,7 @@ from multidrop.capture.pairing import Pairing
 from multidrop.cli import sniff
 from multidrop.cli.sniff import Listener, TrafficPrinter
 from multidrop.core import Framing, Message, Splitter, Stream, build_reply, build_request
-from multidrop.drive.timing import Settings
+from multidrop.drive.line_settings import Settings
 from multidrop.families.delixi_native import DelixiNative
 from multidrop.families.innovert_ibd import InnovertIBD
 from multidrop.families.invt_che import InvtCHE
@@ -330,8 +330,8 @@ def test_noise_is_told_though_it_does_not_end() -> None:
 METER = """\
 from multidrop.core import NumberFormat
 from multidrop.drive.family import Drive
-from multidrop.drive.declare import reading
-from multidrop.drive.table import HOLDING
+from multidrop.drive.register import reading
+from multidrop.drive.register import HOLDING
 
 class Meter(Drive):
     model = "meter"

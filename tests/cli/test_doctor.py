@@ -39,7 +39,7 @@ from multidrop.cli.doctor_findings import (
     rs485_mode,
 )
 from multidrop.core import RS485, Completion, Failure, Framing, Message, build_reply
-from multidrop.drive.timing import Settings
+from multidrop.drive.line_settings import Settings
 from multidrop.families.innovert_ibd import InnovertIBD
 from multidrop.families.invt_che import InvtCHE
 from multidrop.families.registry import find_model

@@ -13,7 +13,7 @@ from multidrop.families.registry import find_model
 
 FAN = """\
 from multidrop.drive.family import Drive
-from multidrop.drive.declare import reading
+from multidrop.drive.register import reading
 
 class Fan(Drive):
     model = "fan"

@@ -248,7 +248,7 @@ def section_length(path: Path) -> int:
 
 @pytest.mark.slow
 def test_commands_print_through_what_spells_out() -> None:
-    """A `print` of its own is only for what is no text of others: help, drawing, questions."""
+    """A `print` of its own is only for what is not a text of others: help, drawing, questions."""
     ours = {"__init__.py", "support/output.py", "support/confirm.py", "poll/live_table.py", "scan.py"}
     root = Path(multidrop.cli.__file__).parent
     found = {

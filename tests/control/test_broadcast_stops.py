@@ -17,8 +17,7 @@ from multidrop.control.outcome import Seen
 from multidrop.control.time_limit import written_before
 from multidrop.core import Completion, Exchange, Message
 from multidrop.drive import Condition, Drive, Script, State
-from multidrop.drive.declare import command, setting
-from multidrop.drive.table import Kept
+from multidrop.drive.register import Kept, command, setting
 from multidrop.drive.verbs import verb
 from multidrop.errors import BusError, CancelledByStop, Expired, PortLost, Unconfirmed, WriteForbidden
 from multidrop.families import MODELS, InvtCHE

@@ -17,8 +17,7 @@ from toy import Fault, Toy
 from multidrop.bus import Bus
 from multidrop.core import Framing, Message
 from multidrop.drive import Drive, Script
-from multidrop.drive.declare import command, reading, setting
-from multidrop.drive.table import HOLDING, Kept
+from multidrop.drive.register import HOLDING, Kept, command, reading, setting
 from multidrop.drive.verbs import verb
 from multidrop.errors import (
     BadReply,
@@ -303,42 +302,42 @@ MISTAKES: dict[str, tuple[Callable[[Bus, Rig], Any], type[Exception], str]] = {
     "another family's register is read": (
         lambda bus, rig: bus.read(rig, InvtCHE.output_current),
         ValueError,
-        "this output_current is no register of pump, which is a Rig",
+        "this output_current is not a register of pump, which is a Rig",
     ),
     "another family's register is written": (
         lambda bus, rig: bus.write(rig, YD1000.acceleration_time, 5.0),
         ValueError,
-        "this acceleration_time is no register of pump, which is a Rig",
+        "this acceleration_time is not a register of pump, which is a Rig",
     ),
     "a name is read": (
         lambda bus, rig: bus.read(rig, "target"),
         TypeError,
-        "'target' is no register of pump: use its attribute, or drive.register(NAME)",
+        "'target' is not a register of pump: use its attribute, or drive.register(NAME)",
     ),
     "a name is written": (
         lambda bus, rig: bus.write(rig, "target", 5.0),
         TypeError,
-        "'target' is no register of pump: use its attribute, or drive.register(NAME)",
+        "'target' is not a register of pump: use its attribute, or drive.register(NAME)",
     ),
     "a name of a drive is read": (
         lambda bus, rig: bus.read("pump", rig.target),
         TypeError,
-        "'pump' is no drive: it is what attach returns",
+        "'pump' is not a drive: use the one that attach returns",
     ),
     "a list's watchdog is asked for": (
         lambda bus, rig: bus.watchdog([rig]),
         TypeError,
-        "is no drive: it is what attach returns",
+        "is not a drive: use the one that attach returns",
     ),
     "the identity of a list is checked": (
         lambda bus, rig: bus.check_identity([rig]),
         TypeError,
-        "is no drive: it is what attach returns",
+        "is not a drive: use the one that attach returns",
     ),
     "a frame goes to an address": (
         lambda bus, rig: bus.raw(1, 3, 0, count=1),
         TypeError,
-        "1 is no drive: it is what attach returns",
+        "1 is not a drive: use the one that attach returns",
     ),
     "a frame has a number in place of its data": (
         lambda bus, rig: bus.raw(rig, 16, 0, 5),
@@ -368,12 +367,12 @@ MISTAKES: dict[str, tuple[Callable[[Bus, Rig], Any], type[Exception], str]] = {
     "a script for a name": (
         lambda bus, rig: bus.perform(cast(Any, "pump"), rig.stop.script()),
         TypeError,
-        "'pump' is no drive: it is what attach returns",
+        "'pump' is not a drive: use the one that attach returns",
     ),
     "a name is detached": (
         lambda bus, rig: bus.detach(cast(Any, "pump")),
         TypeError,
-        "'pump' is no drive: it is what attach returns",
+        "'pump' is not a drive: use the one that attach returns",
     ),
     "a class is attached that is no family": (
         lambda bus, rig: bus.attach(dict, 2),

@@ -17,8 +17,7 @@ from multidrop.control import records
 from multidrop.control.outcome import Seen
 from multidrop.core import PAUSE_NS, Completion, Exchange, Framing, Message, build_reply
 from multidrop.drive import Script, write
-from multidrop.drive.declare import reading, setting
-from multidrop.drive.table import Kept
+from multidrop.drive.register import Kept, reading, setting
 from multidrop.drive.verbs import verb
 from multidrop.errors import CheckAgain
 from multidrop.sim import MotorDrive, Simulator, Wire, simulated

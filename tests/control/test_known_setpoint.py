@@ -11,7 +11,7 @@ from simulated_bus import SimulatedBus, is_write, one
 from multidrop import DelixiModbus, DelixiNative, Drive, ErmanERG220, InnovertIBD
 from multidrop.control import records
 from multidrop.core import Message, build_reply
-from multidrop.drive.known_setpoint import KnownSetpoint
+from multidrop.drive.state import KnownSetpoint
 from multidrop.errors import BusError, DriveException, Expired, NotVerified, Unconfirmed, WriteForbidden
 
 UNREADABLE = [

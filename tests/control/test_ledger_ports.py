@@ -19,8 +19,7 @@ from multidrop.bus import Bus
 from multidrop.control import eeprom_ledger
 from multidrop.control.eeprom_ledger import Ledger, LedgerCell, default_path
 from multidrop.drive import Drive
-from multidrop.drive.declare import setting
-from multidrop.drive.table import COIL, Kept
+from multidrop.drive.register import COIL, Kept, setting
 from multidrop.errors import WriteForbidden
 from multidrop.sim import SimulatedDrive, Simulator, Wire, simulated
 from multidrop.transport import port_identity, simulated_ports
@@ -222,7 +221,8 @@ def test_a_ledger_that_is_named_counts_simulated_drives_too(tmp_path: Path) -> N
 @with_names
 def test_a_simulator_in_another_process_is_known_until_it_is_killed(tmp_path: Path) -> None:
     program = (
-        "import time\nfrom multidrop.sim.port import PtyPort\nfrom multidrop.drive.timing import Settings\n"
+        "import time\nfrom multidrop.sim.port import PtyPort\n"
+        "from multidrop.drive.line_settings import Settings\n"
         "port = PtyPort(Settings(9600, '8N1'), None)\nprint(port.path, flush=True)\ntime.sleep(3600)"
     )
     with BoundProcess([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True) as process:

@@ -19,8 +19,7 @@ from multidrop.control.ramp import ramp
 from multidrop.control.time_limit import written_before
 from multidrop.core import Message
 from multidrop.drive import Direction, Drive, Script, read, write
-from multidrop.drive.declare import reading, setting
-from multidrop.drive.table import Kept
+from multidrop.drive.register import Kept, reading, setting
 from multidrop.drive.verbs import verb
 from multidrop.errors import BusError, CancelledByStop, Expired, NotVerified, Unconfirmed, WriteForbidden
 from multidrop.families import YD1000, DelixiModbus, ErmanERG220, InvtCHE

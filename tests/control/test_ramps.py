@@ -16,8 +16,7 @@ from toy import Toy
 from multidrop.control.ramp import ramp, start_staggered
 from multidrop.core import Message
 from multidrop.drive import Drive, Script, read
-from multidrop.drive.declare import setting
-from multidrop.drive.table import Kept
+from multidrop.drive.register import Kept, setting
 from multidrop.drive.verbs import verb
 from multidrop.errors import NoReply, WriteForbidden
 from multidrop.families import YD1000, InnovertIBD, InvtCHE

@@ -24,8 +24,7 @@ from multidrop.control.outcome import Effect, Seen
 from multidrop.control.ramp import ramp, start_staggered
 from multidrop.core import Completion, Exchange, Failure, Framing, Message, build_reply
 from multidrop.drive import Condition, Direction, Drive, Script, State, read, wait, write
-from multidrop.drive.declare import command, reading, setting
-from multidrop.drive.table import COIL, Kept
+from multidrop.drive.register import COIL, Kept, command, reading, setting
 from multidrop.drive.verbs import verb
 from multidrop.errors import (
     DriveException,

@@ -24,8 +24,7 @@ from multidrop.control.ramp import ramp, start_staggered
 from multidrop.control.stop_attempt import AT_ONCE, LEAST_S, PAUSE_S
 from multidrop.core import Completion, Exchange, Framing, Message, build_reply
 from multidrop.drive import Condition, Direction, Drive, Script, State, insist, read, wait, write
-from multidrop.drive.declare import reading, setting
-from multidrop.drive.table import Kept
+from multidrop.drive.register import Kept, reading, setting
 from multidrop.drive.verbs import verb
 from multidrop.errors import (
     BusError,

@@ -12,8 +12,7 @@ from tables import table
 
 from multidrop.control.time_limit import written_before
 from multidrop.drive import Direction, Drive, Script, read, wait, write
-from multidrop.drive.declare import reading, setting
-from multidrop.drive.table import Kept
+from multidrop.drive.register import Kept, reading, setting
 from multidrop.drive.verbs import verb
 from multidrop.errors import CancelledByStop, Expired
 from multidrop.families import InvtCHE

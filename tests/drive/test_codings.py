@@ -23,9 +23,7 @@ from multidrop.capture.decoding import RegisterLookup
 from multidrop.control.outcome import Effect
 from multidrop.core import Columns, Framing, Message, Names, NumberFormat, RowLayout
 from multidrop.drive import Drive
-from multidrop.drive.declare import reading, setting
-from multidrop.drive.row_field import row_field
-from multidrop.drive.table import HOLDING, INPUT, Kept
+from multidrop.drive.register import HOLDING, INPUT, Kept, reading, row_field, setting
 from multidrop.errors import NoValue
 from multidrop.plant.model import PlantLine, PolledDrive
 from multidrop.polling.batch import Batch, Row

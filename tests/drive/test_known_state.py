@@ -8,7 +8,7 @@ import pytest
 
 from multidrop import Condition
 from multidrop.drive import Drive, StateReader
-from multidrop.drive.declare import reading
+from multidrop.drive.register import reading
 from multidrop.drive.script import Script, read
 from multidrop.drive.state import State
 from multidrop.drive.verbs import verb

@@ -17,10 +17,8 @@ from multidrop.cli.support.values import as_json, nearest_value, value_text
 from multidrop.control.outcome import Effect
 from multidrop.core import Message, NumberFormat
 from multidrop.drive import Drive
-from multidrop.drive.declare import command, reading, setting
-from multidrop.drive.register import Register
+from multidrop.drive.register import Carrier, Kept, Register, Table, command, reading, setting
 from multidrop.drive.request import write_request
-from multidrop.drive.table import Carrier, Kept, Table
 from multidrop.errors import WriteForbidden
 from multidrop.sim import SimulatedDrive
 

@@ -12,8 +12,7 @@ from simulated_bus import SimulatedBus
 from multidrop.control.ramp import ramp, start_staggered
 from multidrop.core import Message
 from multidrop.drive import Condition, Direction, Drive, Script, State, insist, read, write
-from multidrop.drive.declare import command, reading, setting
-from multidrop.drive.table import Kept
+from multidrop.drive.register import Kept, command, reading, setting
 from multidrop.drive.verbs import verb
 from multidrop.errors import DriveException, Unconfirmed, WriteForbidden
 from multidrop.plant.loader import load_plant

@@ -10,9 +10,7 @@ from tables import table
 
 from multidrop.core import NumberFormat
 from multidrop.drive import Drive
-from multidrop.drive.declare import command, reading, setting
-from multidrop.drive.register import Register
-from multidrop.drive.table import COIL, Kept
+from multidrop.drive.register import COIL, Kept, Register, command, reading, setting
 
 
 class Run(IntEnum):
@@ -132,7 +130,7 @@ def test_an_unknown_register_is_answered_with_its_neighbours() -> None:
 
 
 def test_an_address_outside_the_protocol_is_refused() -> None:
-    with pytest.raises(ValueError, match=r"^Far\.frequency: address 10000H is outside 0 to FFFFH$"):
+    with pytest.raises(ValueError, match=r"^Far\.frequency: address = 65536 is not an address"):
         type("Far", (Drive,), {"frequency": reading(0x10000, "Hz")})
 
 

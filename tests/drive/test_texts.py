@@ -16,8 +16,7 @@ from tables import table
 from multidrop.core import Message
 from multidrop.drive import Drive, Script, WriteForbidden, read, verb
 from multidrop.drive.declaration_check import DeclarationError
-from multidrop.drive.declare import reading, setting
-from multidrop.drive.table import COIL, INPUT, Kept
+from multidrop.drive.register import COIL, INPUT, Kept, reading, setting
 from multidrop.drive.text import Text, text
 from multidrop.scan.identify import _read
 from multidrop.sim import SimulatedDrive, Simulator, Wire
@@ -119,9 +118,9 @@ def test_a_text_is_never_polled_nor_another_s(monkeypatch: pytest.MonkeyPatch) -
     drive = line.attach(Meter(1, name="em-1"))
     assert [register.name for register in Meter.readings()] == ["level"]
     assert list(Meter.texts) == ["serial", "maker"]
-    with pytest.raises(ValueError, match=r"^this serial is no text of em-1"):
+    with pytest.raises(ValueError, match=r"^this serial is not a text of em-1"):
         line.bus.read_text(drive, Other.serial)
-    with pytest.raises(TypeError, match="is no text of em-1"):
+    with pytest.raises(TypeError, match="is not a text of em-1"):
         line.bus.read_text(drive, Meter.level)
     with pytest.raises(AttributeError, match=r"serial is a text, which bus.read_text"):
         drive.serial = "x"
@@ -148,7 +147,7 @@ def test_a_text_s_other_mistakes() -> None:
         text(1, 2, order="CDAB")
     with pytest.raises(ValueError, match="a text is in holding or input registers, and 'coil' is neither"):
         text(1, 2, table=COIL)
-    with pytest.raises(DeclarationError, match="bus: this is a name that every drive has"):
+    with pytest.raises(DeclarationError, match="bus: reserved name"):
         type("Wrong", (Drive,), {"bus": text(1, 2)})
     with pytest.raises(DeclarationError, match="second: this is the text serial already"):
         type("Wrong", (Drive,), {"second": Meter.serial})

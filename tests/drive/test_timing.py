@@ -3,7 +3,7 @@
 import pytest
 from tables import table
 
-from multidrop.drive.timing import Settings
+from multidrop.drive.line_settings import Settings
 
 
 @table(

@@ -29,10 +29,8 @@ from multidrop.core import (
     raw_value,
 )
 from multidrop.drive import Condition, Direction, Drive, State, Unsupported
-from multidrop.drive.declare import reading
-from multidrop.drive.register import Access, Register
+from multidrop.drive.register import Access, Carrier, Register, reading
 from multidrop.drive.request import write_request
-from multidrop.drive.table import Carrier
 from multidrop.drive.verbs import VERBS
 from multidrop.families import MODELS, DelixiModbus, DelixiNative
 from multidrop.families.invt_che import CHEStatus
@@ -118,7 +116,7 @@ def test_a_framing_by_its_number_is_the_framing(family: type[Drive]) -> None:
 
 
 def test_the_class_of_all_families_is_none() -> None:
-    with pytest.raises(TypeError, match=r"^Drive is no family: take one, such as YD1000, or "):
+    with pytest.raises(TypeError, match=r"^Drive is the base class: use a family, such as YD1000, or "):
         Drive(1)
 
 

@@ -22,7 +22,7 @@ from multidrop.drive import (
     Unsupported,
     WriteForbidden,
 )
-from multidrop.drive.table import HOLDING, Kept
+from multidrop.drive.register import HOLDING, Kept
 from multidrop.errors import BadReply, BusError, NoReply
 from multidrop.families.invt_che import (
     CHEControl,

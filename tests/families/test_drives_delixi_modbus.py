@@ -17,7 +17,7 @@ from multidrop.drive import (
     Unsupported,
     WriteForbidden,
 )
-from multidrop.drive.table import HOLDING, Kept
+from multidrop.drive.register import HOLDING, Kept
 from multidrop.families.delixi_modbus import DelixiModbus, DelixiModbusControl
 from multidrop.families.delixi_parameters import DelixiBaudrate, DelixiFault, DelixiRunSource
 

@@ -21,8 +21,7 @@ from multidrop.drive import (
     Unsupported,
     WriteForbidden,
 )
-from multidrop.drive.declare import setting
-from multidrop.drive.table import Carrier, Kept
+from multidrop.drive.register import Carrier, Kept, setting
 from multidrop.errors import NoReply
 from multidrop.families.delixi_native import PARAMETER, PARAMETER_RAM, DelixiNative, DelixiNativeStatus
 from multidrop.families.delixi_parameters import DelixiBaudrate, DelixiFault, DelixiRunSource, parameter

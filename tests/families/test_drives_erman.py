@@ -18,7 +18,7 @@ from multidrop.drive import (
     Unsupported,
     WriteForbidden,
 )
-from multidrop.drive.table import COIL, HOLDING, INPUT, Kept
+from multidrop.drive.register import COIL, HOLDING, INPUT, Kept
 from multidrop.errors import BadReply, NoReply
 from multidrop.families.erman_er_g_220 import Coil, ErmanERG220, ErmanFault, ErmanStatus, Modes
 

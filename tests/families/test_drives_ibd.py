@@ -17,7 +17,7 @@ from multidrop.drive import (
     Unsupported,
     WriteForbidden,
 )
-from multidrop.drive.table import HOLDING
+from multidrop.drive.register import HOLDING
 from multidrop.families.innovert_ibd import (
     FrequencySource,
     IBDBaudrate,

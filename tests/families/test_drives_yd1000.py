@@ -19,7 +19,7 @@ from multidrop.drive import (
     WriteForbidden,
     write,
 )
-from multidrop.drive.table import HOLDING, Kept
+from multidrop.drive.register import HOLDING, Kept
 from multidrop.errors import Expired, NoReply
 from multidrop.families import DelixiModbus
 from multidrop.families.yd1000 import YD1000, Inputs, Outputs, YD1000Control, YD1000Status, extended
@@ -570,7 +570,7 @@ def test_the_panel_commands_the_motor_again_once_it_has_the_command(monkeypatch:
     assert not sim.motor.energised
     sim.panel_runs = True
     assert sim.motor.energised
-    with pytest.raises(Unsupported, match="no way to give the command back"):
+    with pytest.raises(Unsupported, match="no way to return control"):
         one(monkeypatch, DelixiModbus(1))[1].release_control()
 
 
@@ -615,7 +615,7 @@ def test_a_motor_with_a_fault_is_not_started() -> None:
     wire.says["fault_record_1"] = [0x0A]  # since then
     for verb in (wire.drive.start, wire.drive.jog):
         with pytest.raises(
-            WriteForbidden, match=r"has a fault, code 0AH: see to it, then call reset_fault\(\)$"
+            WriteForbidden, match=r"has a fault, code 0AH: remove its cause, then call reset_fault\(\)$"
         ):
             verb()
     assert wire.sent == []
@@ -638,7 +638,9 @@ def test_a_start_after_an_emergency_stop_is_told_of_reset_fault(monkeypatch: pyt
     drive.emergency_stop()
     line.bus.detach(drive)
     drive = line.attach(YD1000(1))
-    with pytest.raises(WriteForbidden, match=r"has a fault, code 11H: see to it, then call reset_fault\(\)$"):
+    with pytest.raises(
+        WriteForbidden, match=r"has a fault, code 11H: remove its cause, then call reset_fault\(\)$"
+    ):
         drive.start()
     drive.reset_fault()
     drive.set_frequency(30)

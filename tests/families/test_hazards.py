@@ -19,7 +19,7 @@ from simulated_bus import SimulatedBus, one, text
 
 from multidrop.core import Framing, Message, NumberFormat, build_reply, build_request, parse_reply
 from multidrop.drive import Condition, Direction, Drive
-from multidrop.drive.table import HOLDING, Kept
+from multidrop.drive.register import HOLDING, Kept
 from multidrop.errors import BadReply, DriveException, NoReply, Unconfirmed, Unsupported, WriteForbidden
 from multidrop.families import YD1000, DelixiModbus, DelixiNative, ErmanERG220, InnovertIBD, InvtCHE
 from multidrop.families.delixi_native import DelixiNativeStatus

@@ -16,8 +16,8 @@ from modbus_requests import read_requests
 
 from multidrop.capture import Capture, CaptureError, Decoding, Junk, Pairing
 from multidrop.core import Splitter
-from multidrop.drive.fact_check import UNIT_IDS
-from multidrop.drive.line_facts import SERIAL_ADDRESSES
+from multidrop.drive.declaration_check import UNIT_IDS
+from multidrop.drive.line_settings import SERIAL_ADDRESSES
 from multidrop.drive.register import Access
 from multidrop.families.files.errors import FamilyError
 from multidrop.families.files.loader import load_family

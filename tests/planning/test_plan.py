@@ -12,10 +12,18 @@ from tables import table
 
 from multidrop.core import Framing, Message, NumberFormat, build_request, reply_length
 from multidrop.drive import Drive
-from multidrop.drive.declare import command, reading, setting
-from multidrop.drive.register import Register
+from multidrop.drive.register import (
+    COIL,
+    DISCRETE,
+    HOLDING,
+    INPUT,
+    Register,
+    Table,
+    command,
+    reading,
+    setting,
+)
 from multidrop.drive.request import read_request, write_request
-from multidrop.drive.table import COIL, DISCRETE, HOLDING, INPUT, Table
 from multidrop.families import MODELS
 from multidrop.planning.blocks import Block, blocks, plan, planned, sending
 from multidrop.planning.bus_time import gap, in_order, silence

@@ -13,8 +13,7 @@ from line_driver import LineDriver
 
 from multidrop.core import Peer, build_reply
 from multidrop.drive import Drive, Framing
-from multidrop.drive.declare import reading
-from multidrop.drive.table import HOLDING
+from multidrop.drive.register import HOLDING, reading
 from multidrop.families import MODELS, YD1000, ErmanERG220, InnovertIBD, InvtCHE
 from multidrop.planning import prediction
 from multidrop.planning.blocks import Planned, planned

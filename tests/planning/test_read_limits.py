@@ -14,10 +14,19 @@ from tables import table
 from multidrop.core import Message, NumberFormat
 from multidrop.drive import HOLDING_MULTIPLE, Drive, Framing
 from multidrop.drive.declaration_check import DeclarationError
-from multidrop.drive.declare import command, reading, setting
-from multidrop.drive.register import Register
+from multidrop.drive.register import (
+    COIL,
+    DISCRETE,
+    HOLDING,
+    INPUT,
+    Carrier,
+    Register,
+    Table,
+    command,
+    reading,
+    setting,
+)
 from multidrop.drive.request import write_request
-from multidrop.drive.table import COIL, DISCRETE, HOLDING, INPUT, Carrier, Table
 from multidrop.families import MODELS
 from multidrop.planning.blocks import Block, blocks, planned, sending
 from multidrop.planning.bus_time import silence
@@ -259,14 +268,14 @@ def test_groups_are_asked_in_the_declared_order_and_before_all_else() -> None:
         ({"read_together": (("a", "far"),)}, "between them are addresses that are not declared"),
         ({"read_together": (("a", "b"),), "most_registers": {HOLDING: 1}}, "they take 2 addresses, and one"),
         ({"read_together": (("a", "input_3"),)}, "these are in several"),
-        ({"read_together": (("a", "none"),)}, "the name of a register that can be read"),
-        ({"read_together": (("a", "run"),)}, "the name of a register that can be read"),
-        ({"read_together": ("ab",)}, "no tuple of groups"),
+        ({"read_together": (("a", "none"),)}, "the name of a readable register"),
+        ({"read_together": (("a", "run"),)}, "the name of a readable register"),
+        ({"read_together": ("ab",)}, "not a tuple of groups"),
         ({"read_together": (("a", "b"), ("b",))}, "b is in another group too"),
-        ({"least_interval": -0.1}, "no time from 0 to 10 s"),
-        ({"least_interval": "100 ms"}, "no time from 0 to 10 s"),
-        ({"most_registers": {HOLDING: 126}}, "no number from 1 to 125"),
-        ({"most_registers": {HOLDING: 0}}, "no number from 1 to 125"),
+        ({"least_interval": -0.1}, "not a number of s from 0 to 10"),
+        ({"least_interval": "100 ms"}, "not a number of s from 0 to 10"),
+        ({"most_registers": {HOLDING: 126}}, "not a number from 1 to 125"),
+        ({"most_registers": {HOLDING: 0}}, "not a number from 1 to 125"),
     ],
 )
 def test_what_cannot_be_is_a_declaration_error(details: dict[str, Any], sentence: str) -> None:

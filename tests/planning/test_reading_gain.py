@@ -10,8 +10,7 @@ from meter import ADDRESSES, Meter, StatedMeter
 
 from multidrop.cli import main
 from multidrop.drive import Drive
-from multidrop.drive.declare import reading
-from multidrop.drive.table import HOLDING, INPUT
+from multidrop.drive.register import HOLDING, INPUT, reading
 from multidrop.families import MODELS
 from multidrop.families.files.loader import load_family
 from multidrop.families.registry import SHIPPED

@@ -13,7 +13,7 @@ from tables import table
 
 from multidrop.core import Echo
 from multidrop.drive import Framing
-from multidrop.drive.timing import Settings
+from multidrop.drive.line_settings import Settings
 from multidrop.families.yd1000 import YD1000
 from multidrop.plant.loader import PlantError, load_plant
 from multidrop.plant.model import Plant, Polled
@@ -22,7 +22,7 @@ from multidrop.toml_check import parse_duration
 FAMILY = """\
 from multidrop.drive.family import Drive, Framing
 from multidrop.drive.options import Option
-from multidrop.drive.declare import command, reading, setting
+from multidrop.drive.register import command, reading, setting
 
 class Toy(Drive):
     model = "toy"
@@ -296,8 +296,8 @@ def test_five_mistakes_in_one_file_are_all_reported_at_once(mistakes: Mistakes) 
         ),
         (
             HEAD + TOY + 'framing = "tcp"',
-            'line "L", drive "D": framing tcp is that of tcp:// ports, such as tcp://10.0.0.7:502, '
-            "and /dev/a is none",
+            'line "L", drive "D": framing tcp is for tcp:// ports, such as tcp://10.0.0.7:502, '
+            "not for /dev/a",
         ),
         (
             HEAD + "baudrate = 9600\n" + FIXED,

@@ -410,7 +410,7 @@ def broken() -> dict[str, tuple[Plant, str]]:
         ),
         "another's register": (
             plant(hall(alien)),
-            'line "hall", drive "alien": this output_current is no register of alien, which is a INVT CHE',
+            'line "hall", drive "alien": this output_current is not a register of alien, which is a INVT CHE',
         ),
         "not readable": (
             plant(yard(*fans(0.5)), hall(polled(Toy(1, name="pump-1"), (*ALL, Toy.control), 0.1), other)),

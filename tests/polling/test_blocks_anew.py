@@ -10,8 +10,7 @@ from lines import polled
 from tables import table
 from toy import Toy
 
-from multidrop.drive.declare import reading
-from multidrop.drive.table import HOLDING
+from multidrop.drive.register import HOLDING, reading
 from multidrop.polling.batch import Row
 from multidrop.polling.jobs import JobMaker
 from multidrop.sim import Faults, SimulatedDrive

@@ -106,7 +106,7 @@ def test_what_cannot_come_or_go(port: str) -> None:
         for polled_drive, sentence in (
             (pump(1, "other"), "address 1 is taken by pump-1"),
             (pump(2, "pump-1"), "another drive is called pump-1; give every one its own name"),
-            (polled(InvtCHE(3), [CURRENT]), "this output_current is no register of invt-che@3"),
+            (polled(InvtCHE(3), [CURRENT]), "this output_current is not a register of invt-che@3"),
         ):
             with pytest.raises(ValueError, match=sentence):
                 poller.add("line", polled_drive)

@@ -17,8 +17,8 @@ from multidrop.control.stop_all import stop_together
 from multidrop.control.stop_attempt import StopAttempt
 from multidrop.core import Latch, Message
 from multidrop.drive import Drive
+from multidrop.drive.register import HOLDING
 from multidrop.drive.script import Insist, Script
-from multidrop.drive.table import HOLDING
 from multidrop.planning.blocks import planned
 from multidrop.planning.prediction import predict
 from multidrop.planning.schedule import Job, Schedule

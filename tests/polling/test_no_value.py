@@ -8,8 +8,7 @@ from lines import line, plant, polled, rows_of, until
 
 from multidrop.core import NumberFormat
 from multidrop.drive import Drive
-from multidrop.drive.declare import reading, setting
-from multidrop.drive.table import HOLDING, HOLDING_MULTIPLE, INPUT
+from multidrop.drive.register import HOLDING, HOLDING_MULTIPLE, INPUT, reading, setting
 from multidrop.planning.blocks import blocks
 from multidrop.poller import Poller
 from multidrop.polling.batch import Row

@@ -16,8 +16,7 @@ from lines import line, plant, polled, rows_of, until
 
 from multidrop.core import Framing, Message, build_reply, parse_request
 from multidrop.drive import Drive
-from multidrop.drive.declare import reading
-from multidrop.drive.table import HOLDING
+from multidrop.drive.register import HOLDING, reading
 from multidrop.errors import LineError, PollingFailed
 from multidrop.families import InvtCHE
 from multidrop.poller import Poller

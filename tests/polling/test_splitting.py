@@ -14,7 +14,7 @@ from picky import Picky, family, right
 
 from multidrop.core import NumberFormat
 from multidrop.drive import Drive
-from multidrop.drive.declare import reading
+from multidrop.drive.register import reading
 from multidrop.planning.blocks import blocks
 from multidrop.planning.splitting import halves
 from multidrop.polling import refusals

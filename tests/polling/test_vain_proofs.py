@@ -10,8 +10,7 @@ from clocked_lines import ClockedLines, ClockedWire
 from lines import polled
 from toy import Toy
 
-from multidrop.drive.register import Register
-from multidrop.drive.table import HOLDING
+from multidrop.drive.register import HOLDING, Register
 from multidrop.sim import EncodedDrive, Faults, SimulatedDrive
 
 POLLED = bytes((1, 3, 0, 1, 0, 1))  # output_frequency

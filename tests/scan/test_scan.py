@@ -13,9 +13,8 @@ from toy import Toy, Unsure
 
 from multidrop.core import Completion, Exchange, Framing, build_reply, build_request, parse_request
 from multidrop.drive import Drive, Script, write
-from multidrop.drive.declare import command, setting
-from multidrop.drive.table import Kept
-from multidrop.drive.timing import Settings
+from multidrop.drive.line_settings import Settings
+from multidrop.drive.register import Kept, command, setting
 from multidrop.drive.verbs import verb
 from multidrop.errors import LineError
 from multidrop.families import MODELS

@@ -7,9 +7,18 @@ from tables import table
 
 from multidrop.core import Message, NumberFormat
 from multidrop.drive import Drive
-from multidrop.drive.declare import command, reading, setting
-from multidrop.drive.register import Register
-from multidrop.drive.table import COIL, DISCRETE, HOLDING, INPUT, Kept, Table
+from multidrop.drive.register import (
+    COIL,
+    DISCRETE,
+    HOLDING,
+    INPUT,
+    Kept,
+    Register,
+    Table,
+    command,
+    reading,
+    setting,
+)
 from multidrop.sim import EncodedDrive, SimulatedDrive, encoded, simulated
 
 ON, OFF = b"\xff\x00", b"\x00\x00"

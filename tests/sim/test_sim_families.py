@@ -12,8 +12,7 @@ from tables import table
 
 from multidrop.core import Framing, Message, build_request, parse_reply
 from multidrop.drive import Drive
-from multidrop.drive.declare import setting
-from multidrop.drive.table import Carrier
+from multidrop.drive.register import Carrier, setting
 from multidrop.families.delixi_modbus import DelixiModbus
 from multidrop.families.delixi_native import PARAMETER, DelixiNative
 from multidrop.families.erman_er_g_220 import ErmanERG220

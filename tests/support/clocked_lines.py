@@ -30,7 +30,7 @@ from multidrop.core import (
     Transactions,
 )
 from multidrop.drive import Drive
-from multidrop.drive.network import speaks_tcp
+from multidrop.drive.line_settings import speaks_tcp
 from multidrop.errors import LineError
 from multidrop.plant.model import Plant, PolledDrive
 from multidrop.poller import Poller

@@ -21,8 +21,7 @@ from pathlib import Path
 from multidrop import Plant, PlantLine, Polled, PolledDrive, Poller
 from multidrop.core import Mastership
 from multidrop.drive import Drive, Framing
-from multidrop.drive.declare import reading
-from multidrop.drive.table import HOLDING
+from multidrop.drive.register import HOLDING, reading
 
 
 class Counted(Drive):

@@ -20,8 +20,7 @@ from pathlib import Path
 from multidrop.control.eeprom_ledger import Ledger
 from multidrop.core import NumberFormat
 from multidrop.drive import Drive, Framing
-from multidrop.drive.declare import reading, setting
-from multidrop.drive.table import HOLDING
+from multidrop.drive.register import HOLDING, reading, setting
 from multidrop.plant.model import Plant, PlantLine, Polled, PolledDrive
 from multidrop.poller import Poller
 from multidrop.recording import open_writer

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from multidrop.core import NumberFormat
 from multidrop.drive import Drive
-from multidrop.drive.declare import reading
-from multidrop.drive.register import Register
-from multidrop.drive.table import HOLDING, INPUT
+from multidrop.drive.register import HOLDING, INPUT, Register, reading
 
 _PHASES = ("voltage", "current", "power", "apparent_power", "reactive_power", "power_factor")
 _TOTALS = {

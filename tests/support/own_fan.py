@@ -5,7 +5,7 @@ from __future__ import annotations
 from enum import IntEnum
 
 from multidrop.drive import Condition, Direction, Drive, Script, State, insist, read, write
-from multidrop.drive.declare import reading, setting
+from multidrop.drive.register import reading, setting
 from multidrop.drive.verbs import verb
 
 

@@ -16,7 +16,7 @@ from multidrop import bus
 from multidrop.bus import Bus
 from multidrop.core import Completion, Exchange
 from multidrop.drive import Drive
-from multidrop.drive.network import speaks_tcp
+from multidrop.drive.line_settings import speaks_tcp
 from multidrop.errors import BusError
 from multidrop.sim import SimulatedDrive
 from multidrop.transport import clock, former_peers

@@ -7,7 +7,7 @@ from typing import Any
 
 from multidrop.core import Message
 from multidrop.drive import Drive
-from multidrop.drive.declare import reading
+from multidrop.drive.register import reading
 from multidrop.sim import SimulatedDrive
 from multidrop.sim.protocol import Reason, Refusal
 

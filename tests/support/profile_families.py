@@ -8,8 +8,7 @@ from functools import partial
 
 from multidrop.core import Message, NumberFormat
 from multidrop.drive import Drive
-from multidrop.drive.declare import command, reading, setting
-from multidrop.drive.table import Kept
+from multidrop.drive.register import Kept, command, reading, setting
 from multidrop.families.profiles import CiA402, DanfossFC, Delta, Invt, Optidrive, Profidrive
 from multidrop.families.registry import shipped_family
 

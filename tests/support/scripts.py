@@ -11,8 +11,7 @@ from typing import Any
 from multidrop.control.rules import conditions, raw_count
 from multidrop.core import Message, build_request
 from multidrop.drive import Drive, Read, Script, Wait
-from multidrop.drive.register import Register
-from multidrop.drive.table import COIL, Carrier
+from multidrop.drive.register import COIL, Carrier, Register
 
 
 def frame(drive: Drive, register: Register[Any], value: Any) -> str:

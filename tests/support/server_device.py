@@ -2,8 +2,7 @@
 
 from multidrop.core import NumberFormat
 from multidrop.drive import Drive, Framing
-from multidrop.drive.declare import reading, setting
-from multidrop.drive.table import COIL, DISCRETE, HOLDING, INPUT
+from multidrop.drive.register import COIL, DISCRETE, HOLDING, INPUT, reading, setting
 
 
 class Device(Drive):

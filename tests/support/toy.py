@@ -3,9 +3,8 @@
 from enum import IntEnum, IntFlag
 
 from multidrop.drive import Condition, Direction, Drive, Framing, Script, State, read, write
-from multidrop.drive.declare import command, reading, setting
 from multidrop.drive.options import Option
-from multidrop.drive.table import HOLDING, Kept
+from multidrop.drive.register import HOLDING, Kept, command, reading, setting
 from multidrop.drive.verbs import verb
 
 

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from multidrop.core import Framing
 from multidrop.drive import Drive
-from multidrop.drive.declare import setting
-from multidrop.drive.table import HOLDING
+from multidrop.drive.register import HOLDING, setting
 from multidrop.sim import Wire
 
 

@@ -91,10 +91,10 @@ def test_a_copy_of_the_request_is_no_reply(simulated: SimulatedBus) -> None:
 
 
 WRONG = {
-    (6, 1, 1): "function = 6 is none of those that read: 1, 2, 3 and 4",
-    (0, 1, 1): "function = 0 is none",
-    (3, -1, 1): "start = -1 is no address from 0 to 65535",
-    (3, 65536, 1): "start = 65536 is no address",
+    (6, 1, 1): "function = 6 does not read; 1, 2, 3 and 4 do",
+    (0, 1, 1): "function = 0 does not read",
+    (3, -1, 1): "start = -1 is not an address from 0 to 65535",
+    (3, 65536, 1): "start = 65536 is not an address",
     (3, 65535, 2): r"start \+ count = 65537: the last address is 65535",
     (3, 1, 0): "count = 0 is not from 1 to 10, which toy@7 reads in one request",
     (3, 1, 11): "count = 11 is not from 1 to 10",  # the family's own limit
@@ -116,7 +116,7 @@ def test_what_cannot_be_asked_is_told_and_nothing_is_sent(
 @pytest.mark.parametrize("asked", [(True, 1, 1), (3, 1.0, 1), (3, 1, "2")])
 def test_what_is_no_number_is_told(simulated: SimulatedBus, asked: tuple[int, int, int]) -> None:
     bus, (toy,) = simulated.bus, simulated.bus.drives
-    with pytest.raises(TypeError, match="is no whole number"):
+    with pytest.raises(TypeError, match="is not a whole number"):
         bus.ask(toy, *asked)
     for expiry in (0, -1, float("nan"), float("inf"), True):
         with pytest.raises(ValueError, match="is not a number of seconds above 0"):

@@ -13,8 +13,7 @@ from hypothesis import strategies as st
 
 from multidrop.core import Completion, Message, NumberFormat
 from multidrop.drive import Drive
-from multidrop.drive.declare import reading
-from multidrop.drive.table import HOLDING
+from multidrop.drive.register import HOLDING, reading
 from multidrop.planning.blocks import Block
 from multidrop.transport.block_decoder import BlockDecoder, decoder_of
 

@@ -13,7 +13,7 @@ from toy import PatientToy, Toy
 
 from multidrop.bus import Bus
 from multidrop.core import Completion, Exchange
-from multidrop.drive.timing import Settings
+from multidrop.drive.line_settings import Settings
 from multidrop.errors import NoReply
 from multidrop.planning.bus_time import silence
 from multidrop.sim import SimulatedDrive, Simulator, Wire

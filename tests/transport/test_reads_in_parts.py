@@ -12,7 +12,7 @@ from picky import Picky, family, right
 from simulated_bus import SimulatedBus
 
 from multidrop.core import NumberFormat
-from multidrop.drive.declare import reading
+from multidrop.drive.register import reading
 from multidrop.errors import BadReply, DriveException, NoReply
 
 WIDE = 24

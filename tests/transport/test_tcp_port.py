@@ -15,8 +15,7 @@ from tables import table
 from multidrop.bus import Bus
 from multidrop.core import Framing, Message, build_reply, build_request, parse_request
 from multidrop.drive import Drive
-from multidrop.drive.declare import reading
-from multidrop.drive.table import HOLDING
+from multidrop.drive.register import HOLDING, reading
 from multidrop.errors import BadReply, LineError, NoReply, NoSuchPort, PortLost, WriteForbidden
 from multidrop.families import YD1000, DelixiNative, InnovertIBD
 from multidrop.plant.loader import PlantError, load_plant
@@ -126,8 +125,8 @@ def test_another_framing_on_tcp_is_a_sentence(port: str, drive: Drive, sentence:
 @pytest.mark.parametrize(
     ("drive", "sentence"),
     [
-        (InnovertIBD(1, framing="tcp"), "framing tcp is that of tcp:// ports, such as tcp://10.0.0.7:502"),
-        (Meter(0), "framing tcp is that of tcp:// ports"),
+        (InnovertIBD(1, framing="tcp"), "framing tcp is for tcp:// ports, such as tcp://10.0.0.7:502"),
+        (Meter(0), "framing tcp is for tcp:// ports"),
     ],
 )
 def test_tcp_on_a_serial_port_is_a_sentence(drive: Drive, sentence: str) -> None:
@@ -186,7 +185,7 @@ def test_a_plant_file_tells_each_mistake(tmp_path: Path) -> None:
     assert """transaction 'skip' is none of "match" and "ignore\"""" in said
     assert "framing rtu is a serial line's, and tcp://10.0.0.7 speaks Modbus TCP" in said
     assert "transaction is a fact of tcp:// ports, and /dev/ttyUSB0 is none" in said
-    assert "framing tcp is that of tcp:// ports" in said
+    assert "framing tcp is for tcp:// ports" in said
 
 
 # ---- several lines of one gateway ----

@@ -31,9 +31,7 @@ from multidrop.core import (
 )
 from multidrop.drive.family import Drive
 from multidrop.drive.number_format import bits_in
-from multidrop.drive.register import Register
-from multidrop.drive.row_field import row_field
-from multidrop.drive.table import Carrier
+from multidrop.drive.register import Carrier, Register, row_field
 from multidrop.iso_time import format_time
 from multidrop.plant.model import Plant, PlantLine
 from multidrop.polling.batch import Batch

@@ -18,8 +18,7 @@ from multidrop.cli.support.values import counted, wrapped
 from multidrop.control.eeprom_ledger import BUDGET, LEAST_INTERVAL
 from multidrop.control.rules import wears
 from multidrop.drive.family import Drive
-from multidrop.drive.register import Access, Register
-from multidrop.drive.table import Kept
+from multidrop.drive.register import Access, Kept, Register
 from multidrop.drive.verbs import MOVING
 from multidrop.families import MODELS
 from multidrop.families.files.errors import FamilyError

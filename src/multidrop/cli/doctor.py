@@ -55,8 +55,7 @@ from multidrop.core import (
     parse_reply,
 )
 from multidrop.drive.family import Drive
-from multidrop.drive.network import speaks_tcp
-from multidrop.drive.timing import Settings
+from multidrop.drive.line_settings import Settings, speaks_tcp
 from multidrop.errors import LineError
 from multidrop.families.registry import find_model
 from multidrop.planning.blocks import first_block

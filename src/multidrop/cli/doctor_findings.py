@@ -14,7 +14,7 @@ from pathlib import Path
 from multidrop.cli.support.values import counted
 from multidrop.core import RS485, Completion
 from multidrop.drive.family import Drive
-from multidrop.drive.timing import Settings
+from multidrop.drive.line_settings import Settings
 from multidrop.transport.port_identity import of_name
 
 LATENCY_MS = 1  # a larger latency timer is worth changing

@@ -17,9 +17,8 @@ from multidrop.cli.support.values import LONGEST_NAME, aligned, wrapped
 from multidrop.core import Framing, NumberFormat
 from multidrop.drive.family import Drive
 from multidrop.drive.options import Option
-from multidrop.drive.read_limits import read_limit, stated_limit
-from multidrop.drive.register import Access, Register
-from multidrop.drive.table import Carrier, Kept, Table
+from multidrop.drive.register import Access, Carrier, Kept, Register, Table
+from multidrop.drive.request import read_limit, stated_limit
 from multidrop.drive.text import Text
 from multidrop.drive.verbs import VERBS
 from multidrop.families import MODELS

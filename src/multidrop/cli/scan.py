@@ -24,10 +24,9 @@ from multidrop.cli.support.files import check_writable
 from multidrop.cli.support.output import print_text
 from multidrop.cli.support.values import counted
 from multidrop.core import RS485
-from multidrop.drive.fact_check import UNIT_IDS
+from multidrop.drive.declaration_check import UNIT_IDS
 from multidrop.drive.family import Drive
-from multidrop.drive.line_facts import SERIAL_ADDRESSES
-from multidrop.drive.network import speaks_tcp
+from multidrop.drive.line_settings import SERIAL_ADDRESSES, speaks_tcp
 from multidrop.families import MODELS
 from multidrop.families.registry import find_model
 from multidrop.printable import plain_whole

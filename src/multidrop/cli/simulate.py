@@ -8,7 +8,7 @@ from pathlib import Path
 from urllib.parse import urlsplit
 
 from multidrop.cli.support.output import print_text
-from multidrop.drive.network import speaks_tcp
+from multidrop.drive.line_settings import speaks_tcp
 from multidrop.plant.loader import load_plant
 from multidrop.plant.model import PlantLine
 from multidrop.sim import FaultyWire, SimulatedDrive, Simulator, load_faults, serve, simulated

@@ -31,7 +31,7 @@ from multidrop.cli.support.files import check_capture
 from multidrop.cli.support.output import print_text
 from multidrop.cli.support.signals import noting_signals
 from multidrop.core import FrameSpan, Kind, Splitter, Stream, must_take, refused_names, set_settings
-from multidrop.drive.timing import Settings
+from multidrop.drive.line_settings import Settings
 from multidrop.errors import LineError
 from multidrop.plant.loader import load_plant
 from multidrop.plant.model import Plant, PlantLine

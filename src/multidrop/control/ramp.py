@@ -11,10 +11,9 @@ from math import inf
 from multidrop.control.rules import conditions, raw_count, wears
 from multidrop.core import PAUSE_NS
 from multidrop.drive.family import Drive
-from multidrop.drive.register import Register
+from multidrop.drive.register import Kept, Register
 from multidrop.drive.script import Script, Write, read, wait
 from multidrop.drive.state import Direction
-from multidrop.drive.table import Kept
 from multidrop.errors import WriteForbidden
 
 HEARD_S = PAUSE_NS / 2e9  # after PAUSE_NS nobody knows whether a drive has lost its power (identity.py)

@@ -20,8 +20,7 @@ from multidrop.control.outcome import Effect, Stopped
 from multidrop.control.rules import refused
 from multidrop.core import Message, build_request
 from multidrop.drive.family import Drive
-from multidrop.drive.register import Register
-from multidrop.drive.table import Kept
+from multidrop.drive.register import Kept, Register
 from multidrop.errors import Advice
 from multidrop.transport import clock
 from multidrop.transport.aside_log import AsideThread, log_aside

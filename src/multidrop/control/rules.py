@@ -7,12 +7,10 @@ from __future__ import annotations
 
 from typing import Any, TypeVar
 
-from multidrop.drive.family import Drive
-from multidrop.drive.own import check_own
-from multidrop.drive.register import Access, Register
+from multidrop.drive.family import Drive, check_own
+from multidrop.drive.register import Access, Carrier, Kept, Register
 from multidrop.drive.script import Script, read
 from multidrop.drive.state import Condition
-from multidrop.drive.table import Carrier, Kept
 from multidrop.drive.verbs import VERBS
 from multidrop.errors import Advice, Unsupported, WriteForbidden
 

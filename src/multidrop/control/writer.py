@@ -16,10 +16,9 @@ from multidrop.control.records import WriteRecords
 from multidrop.control.rules import check_known, conditions, raw_count, wears
 from multidrop.core import Completion, Failure, Message, build_request
 from multidrop.drive.family import Drive
-from multidrop.drive.register import Register
+from multidrop.drive.register import Kept, Register
 from multidrop.drive.request import write_request
 from multidrop.drive.script import Step, Wait, Write, carry_out
-from multidrop.drive.table import Kept
 from multidrop.errors import (
     BadReply,
     BusError,

@@ -9,17 +9,17 @@ from multidrop.drive.known_state import can_show_fault as can_show_fault
 from multidrop.drive.named_verbs import verb_arguments as verb_arguments
 from multidrop.drive.named_verbs import verbs_of as verbs_of
 from multidrop.drive.options import Option
+from multidrop.drive.register import COIL as COIL
+from multidrop.drive.register import DISCRETE as DISCRETE
+from multidrop.drive.register import HOLDING as HOLDING
+from multidrop.drive.register import HOLDING_MULTIPLE as HOLDING_MULTIPLE
+from multidrop.drive.register import INPUT as INPUT
 from multidrop.drive.register import Access as Access
+from multidrop.drive.register import Carrier as Carrier
+from multidrop.drive.register import Kept as Kept
+from multidrop.drive.register import Table as Table
 from multidrop.drive.script import Read, Script, Wait, carry_out, insist, read, until, wait, write
 from multidrop.drive.state import Condition, Direction, State
-from multidrop.drive.table import COIL as COIL
-from multidrop.drive.table import DISCRETE as DISCRETE
-from multidrop.drive.table import HOLDING as HOLDING
-from multidrop.drive.table import HOLDING_MULTIPLE as HOLDING_MULTIPLE
-from multidrop.drive.table import INPUT as INPUT
-from multidrop.drive.table import Carrier as Carrier
-from multidrop.drive.table import Kept as Kept
-from multidrop.drive.table import Table as Table
 from multidrop.drive.text import Text as Text
 from multidrop.drive.verbs import verb
 from multidrop.errors import (

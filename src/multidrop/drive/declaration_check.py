@@ -1,25 +1,33 @@
-"""Check the declarations of a drive's class: all that is wrong with them is found when the class is made."""
+"""Check a drive's class when it is made: a table of rules for its facts, and tables for its registers."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Collection, Iterator, Mapping
 from enum import IntEnum, IntFlag
+from fractions import Fraction
 from numbers import Real
 from typing import Any
 
-from multidrop.core import MOST_INVALID, NumberFormat
-from multidrop.drive.number_check import number_errors
-from multidrop.drive.number_format import ORDERS, WORDS
-from multidrop.drive.register import Access, Register
-from multidrop.drive.table import Carrier, Kept, Table
+from multidrop.core import MOST_INVALID, Framing, NumberFormat
+from multidrop.drive.line_settings import LONGEST_SILENCE, Settings
+from multidrop.drive.number_format import FLOATS, ORDERS, WORDS, width
+from multidrop.drive.options import Option
+from multidrop.drive.register import Access, Carrier, Kept, Register, Table
+from multidrop.drive.request import LONGEST_INTERVAL, STANDARD_LIMITS, may_be_crossed, read_limit
+from multidrop.drive.text import Text
 
 LAST_ADDRESS = 0xFFFF
-_TEXTS = ("unit", "scale_register", "at_least", "at_most", "never", "place", "outside", "note")
-_TRUTHS = ("while_running", "moves")
-_COUNTS = ("broadcast", "harmless", "never_together")
+LONGEST_TIME = 60.0  # s; a larger number was meant in ms
+MOST_CHARACTERS = 1000
+UNIT_IDS = range(256)  # of Modbus TCP; a serial line has fewer
+EXCEPTION_CODES = range(1, 256)
 # Function codes that write the same registers: one at a time, and several at once.
 _SAME_SPACE = {0x05: 0x0F, 0x06: 0x10}
+_TAKEN = "reserved name; every drive has it for something else"
+
+# A fact, the test of a right value, and the rest of the sentence "FACT = VALUE …" about a wrong one.
+Rules = tuple[tuple[str, Callable[[Any], Any], str], ...]
 
 
 class DeclarationError(ValueError):
@@ -30,65 +38,11 @@ class DeclarationError(ValueError):
         self.mistakes = tuple(mistakes)
 
 
-def declaration_errors(
-    registers: Mapping[str, Register[Any]], taken: Collection[str], bounds: Collection[str]
-) -> list[str]:
-    """Return a sentence for each error in a class's registers.
-
-    `taken` are names that every drive uses for something else; `bounds` are those of the class's options.
-    """
-    found, sound = [], []
-    for name, register in registers.items():
-        if name in taken:
-            found.append(f"{name}: this is a name that every drive has for something else; call it otherwise")
-        if register.name != name:
-            found.append(f"{name}: this is the register {register.name} already; declare one of its own")
-        wrong = [sentence for check in _CHECKS for sentence in check(register)]
-        wrong = wrong or list(_later(register, registers, bounds))
-        found += [f"{name}: {sentence}" for sentence in wrong]
-        if not wrong:
-            sound.append(register)
-    return [*found, *_shared(sound)]
+# ---- tests of values ----
 
 
-# ---- one register, each fact by itself ----
-
-
-def _kinds(register: Register[Any]) -> Iterator[str]:
-    if not isinstance(register.table, Table):
-        yield f"table = {register.table!r} is no table: HOLDING, INPUT, COIL, DISCRETE or a Table(…)"
-    if register.order not in ORDERS:
-        yield f"order = {register.order!r} is none of {', '.join(ORDERS)}"
-    if not isinstance(register.number_format, NumberFormat):
-        given = register.number_format
-        yield f"number_format = {given!r} is no number format: write {' or '.join(_near(given))}"
-    if not isinstance(register.kept, Kept):
-        yield f"kept = {register.kept!r} is none of Kept.RAM, Kept.EEPROM and Kept.UNKNOWN"
-    for name in _TEXTS:
-        if not isinstance(getattr(register, name), str):
-            yield f"{name} = {getattr(register, name)!r} is no text"
-    for name in _TRUTHS:
-        if getattr(register, name) not in (None, True, False):
-            yield f"{name} = {getattr(register, name)!r} is neither True nor False"
-    for name in _COUNTS:
-        if (counts := getattr(register, name)) is not None and not _are_counts(counts):
-            yield f"{name} = {counts!r} is no tuple of raw counts, such as (0,)"
-    values = register.values
-    if values is not None and not (isinstance(values, type) and issubclass(values, (IntEnum, IntFlag))):
-        yield f"{values!r} is neither a unit nor an IntEnum or IntFlag of its values"
-
-
-def _near(number_format: object) -> list[str]:
-    named = (
-        [str(number_format).upper()]
-        if str(number_format).upper() in NumberFormat.__members__
-        else list(NumberFormat.__members__)
-    )
-    return [f"NumberFormat.{name}" for name in named]
-
-
-def _are_counts(counts: object) -> bool:
-    return isinstance(counts, (tuple, list, range, frozenset)) and all(_is_whole(count) for count in counts)
+def _is_a(kind: type | tuple[type, ...]) -> Callable[[Any], bool]:
+    return lambda value: isinstance(value, kind)
 
 
 def _is_whole(number: object) -> bool:
@@ -103,167 +57,421 @@ def _is_number(number: object) -> bool:
     return isinstance(number, Real) and not isinstance(number, bool) and math.isfinite(number)
 
 
-def _step(register: Register[Any]) -> Iterator[str]:
-    step = register.step
-    if step is not None and not _is_number(step):
-        yield f"step = {step!r} is no number, such as 0.1; where the manual does not state it, it is None"
-    elif step == 0:
-        yield "step = 0: every value would be 0; where the manual does not state it, it is None"
+def _is_number_to(most: float) -> Callable[[Any], bool]:
+    return lambda value: _is_number(value) and 0 <= value <= most
 
 
-def _offset(register: Register[Any]) -> Iterator[str]:
-    if not _is_number(register.offset):
-        yield f"offset = {register.offset!r} is no number, such as -40"
+def _is_truth(value: object) -> bool:
+    return value is True or value is False
 
 
-def _invalid(register: Register[Any]) -> Iterator[str]:
-    counts = register.invalid
-    if not isinstance(counts, (tuple, list, frozenset)) or not all(_is_real(count) for count in counts):
-        yield f"invalid = {counts!r} is no tuple of raw counts, such as (0x7FFF,)"
-    elif len(counts) > MOST_INVALID // 2:
-        yield f"invalid has {len(counts)} counts, and the most is {MOST_INVALID // 2}"
+def _is_sequence(right: Callable[[Any], bool]) -> Callable[[Any], bool]:
+    return lambda given: isinstance(given, (tuple, list, range)) and bool(given) and all(map(right, given))
 
 
-def _part(register: Register[Any]) -> Iterator[str]:
-    part = register.part
-    if part is None:
-        return
-    if not isinstance(part, (tuple, list)) or len(part) != 2 or not all(_is_whole(bit) for bit in part):
-        yield f"part = {part!r} is not the lowest and the highest bit, such as (0, 7)"
-    elif not 0 <= part[0] <= part[1]:
-        yield f"part = ({part[0]}, {part[1]}) is the wrong way round, or below bit 0"
+def _is_pair(given: Any, right: Callable[[Any], bool]) -> bool:
+    return _is_sequence(right)(given) and len(given) == 2 and bool(given[0] <= given[1])
 
 
-def _span(register: Register[Any]) -> Iterator[str]:
-    span = register.span
-    if span is None:
-        return
-    if not (isinstance(span, (tuple, list)) and len(span) == 2 and all(_is_number(end) for end in span)):
-        yield f"span = {span!r} is not two numbers, such as (0, 50)"
-    elif span[0] > span[1]:
-        yield f"span = ({span[0]:g}, {span[1]:g}) is the wrong way round: the smallest comes first"
-    elif register.default is not None and not _is_number(register.default):
-        return
-    elif register.default is not None and not span[0] <= register.default <= span[1]:
-        yield f"default = {register.default:g} is outside its span of {span[0]:g} to {span[1]:g}"
+def _is_set(given: object, right: Callable[[Any], bool]) -> bool:
+    return isinstance(given, (tuple, list, range, set, frozenset)) and all(map(right, given))
 
 
-def _default(register: Register[Any]) -> Iterator[str]:
-    if register.default is not None and not _is_number(register.default):
-        yield f"default = {register.default!r} is no number"
+def _is_mapping(key: Callable[[Any], bool], value: Callable[[Any], bool]) -> Callable[[Any], bool]:
+    return lambda given: isinstance(given, Mapping) and all(key(a) and value(b) for a, b in given.items())
 
 
-def _places(register: Register[Any]) -> Iterator[str]:
-    for name in ("address", "ram_address"):
-        at = getattr(register, name)
-        if at is None and name == "ram_address":
-            continue
-        if not _is_whole(at) or not 0 <= at <= LAST_ADDRESS:
-            shown = f"{at:X}H" if _is_whole(at) and at >= 0 else repr(at)
-            yield f"{name} {shown} is outside 0 to FFFFH"
+def _is_settings(baudrate: Any, format: Any) -> bool:
+    try:
+        Settings(baudrate, format)
+    except (TypeError, ValueError):
+        return False
+    return True
 
 
-_CHECKS: tuple[Callable[[Register[Any]], Iterator[str]], ...] = (
-    *(_kinds, _step, _offset, _invalid, _part, _span, _default, _places),
+def _wrong_facts(owner: Any, rules: Rules) -> dict[str, str]:
+    """Return the sentence for each wrong fact, by its name."""
+    facts = ((name, getattr(owner, name), is_right, rest) for name, is_right, rest in rules)
+    return {
+        name: f"{name} = {value!r} {rest}" for name, value, is_right, rest in facts if not is_right(value)
+    }
+
+
+# ---- what a class says besides its registers ----
+
+_TIMES = {
+    "silence": LONGEST_SILENCE,
+    "response_delay": LONGEST_TIME,
+    "answering_time": LONGEST_TIME,
+    "turnaround_delay": LONGEST_TIME,
+    "least_interval": LONGEST_INTERVAL,
+}
+_CHARACTERS = ("silence_characters", "response_delay_characters")
+_TEXTS = (
+    "model",
+    "title",
+    "manual",
+    "remote",
+    "line_terminals",
+    "line_parameters",
+    "no_broadcasts",
+    "watchdog",
+)
+_TRUTHS = ("answers_every_read", "broadcasts", "identify_recognises")
+_CLASS_RULES: Rules = (
+    *(
+        (name, _is_number_to(most), f"is not a number of s from 0 to {most:g}")
+        for name, most in _TIMES.items()
+    ),
+    *(
+        (name, _is_number_to(MOST_CHARACTERS), f"is not a number of characters from 0 to {MOST_CHARACTERS}")
+        for name in _CHARACTERS
+    ),
+    (
+        "response_timeout",
+        lambda value: _is_number_to(LONGEST_TIME)(value) and value > 0,
+        f"is not a number of s above 0, up to {LONGEST_TIME:g}",
+    ),
+    (
+        "addresses",
+        _is_sequence(lambda each: _is_whole(each) and each in UNIT_IDS),
+        "is not a range of addresses, such as range(1, 248)",
+    ),
+    (
+        "baudrates",
+        _is_sequence(lambda each: _is_whole(each) and _is_settings(each, "8N1")),
+        "is not a tuple of baud rates, such as (9600, 19200)",
+    ),
+    ("framings", _is_sequence(_is_a(Framing)), "is not a tuple of framings, such as (Framing.RTU,)"),
+    (
+        "formats",
+        _is_mapping(_is_a(Framing), _is_sequence(lambda each: _is_settings(9600, each))),
+        'is not a mapping, such as {Framing.RTU: ("8N1", "8E1")}',
+    ),
+    (
+        "exceptions",
+        _is_mapping(lambda code: _is_whole(code) and code in EXCEPTION_CODES, _is_a(str)),
+        'is not a mapping of codes, such as {1: "illegal function"}',
+    ),
+    *(
+        (name, lambda given: _is_set(given, _is_whole), "is not a set of codes, such as frozenset({6})")
+        for name in ("damaged", "later")
+    ),
+    ("most_registers", _is_mapping(_is_a(Table), _is_a(object)), "is not a mapping, such as {HOLDING: 16}"),
+    (
+        "readable_gaps",
+        _is_mapping(_is_a(Table), _is_a(range)),
+        "is not a mapping, such as {HOLDING: range(0, 16)}",
+    ),
+    *((name, _is_truth, "is neither True nor False") for name in _TRUTHS),
+    *((name, _is_a(str), "is not a text") for name in _TEXTS),
+    ("setpoint_name", _is_a(str), "is not the name of a register"),
+    ("options", _is_a(Mapping), 'is not a mapping, such as {"stop_time": Option("s", (1, 60), "…")}'),
 )
 
 
-# ---- one register, its facts together ----
+def fact_errors(family: Any) -> list[str]:
+    """Return a sentence for each error in what a class says besides its registers."""
+    wrong = _wrong_facts(family, _CLASS_RULES)
+    is_known = not wrong.keys() & {"formats", "framings"}
+    if is_known and family.formats and (first := family.framings[0]) not in family.formats:
+        wrong["formats"] = f"formats has none for {first}, its first framing"
+    if "options" not in wrong:
+        for name, option in family.options.items():
+            if not isinstance(name, str) or not isinstance(option, Option):
+                wrong["options"] = (
+                    f'options[{name!r}] = {option!r} is not an option, such as Option("s", (1, 60), "…")'
+                )
+            elif not _is_pair(option.span, _is_number):
+                wrong["options"] = (
+                    f"options[{name!r}]: span = {option.span!r} is not the smallest and the largest value"
+                )
+    registers = {*family.registers, *family.texts}  # reported as such if one has a fact's name
+    return [sentence for name, sentence in wrong.items() if name not in registers]
 
 
-def _later(
+def text_errors(texts: Mapping[str, Text], taken: Collection[str]) -> list[str]:
+    """Return a sentence for each error in a class's texts; `taken` are the reserved names."""
+    found = [f"{name}: {_TAKEN}; rename the text" for name in texts if name in taken]
+    return found + [
+        f"{name}: this is the text {text.name} already; declare one of its own"
+        for name, text in texts.items()
+        if text.name != name
+    ]
+
+
+# ---- a register, each fact by itself ----
+
+
+def _or_none(right: Callable[[Any], bool]) -> Callable[[Any], bool]:
+    return lambda value: value is None or right(value)
+
+
+def _is_address(at: object) -> bool:
+    return _is_whole(at) and at in range(LAST_ADDRESS + 1)
+
+
+def _is_names(values: object) -> bool:
+    return isinstance(values, type) and issubclass(values, (IntEnum, IntFlag))
+
+
+MOST_COUNTS = MOST_INVALID // 2
+_REGISTER_RULES: Rules = (
+    ("table", _is_a(Table), "is not a table: HOLDING, INPUT, COIL, DISCRETE or a Table(…)"),
+    ("order", lambda value: isinstance(value, str) and value in ORDERS, f"is not one of {', '.join(ORDERS)}"),
+    ("number_format", _is_a(NumberFormat), f"is not a NumberFormat: {', '.join(NumberFormat.__members__)}"),
+    ("kept", _is_a(Kept), "is not one of Kept.RAM, Kept.EEPROM and Kept.UNKNOWN"),
+    ("values", _or_none(_is_names), "is neither a unit nor an IntEnum or IntFlag"),
+    (
+        "step",
+        _or_none(lambda value: _is_number(value) and value != 0),
+        "is not a number, such as 0.1; if the manual states none, it is None",
+    ),
+    ("offset", _is_number, "is not a number, such as -40"),
+    (
+        "invalid",
+        lambda value: _is_set(value, _is_real) and len(value) <= MOST_COUNTS,
+        f"is not a tuple of at most {MOST_COUNTS} raw counts, such as (0x7FFF,)",
+    ),
+    (
+        "part",
+        _or_none(lambda value: _is_pair(value, _is_whole) and value[0] >= 0),
+        "is not the lowest and the highest bit, such as (0, 7)",
+    ),
+    (
+        "span",
+        _or_none(lambda value: _is_pair(value, _is_number)),
+        "is not the smallest and the largest value, such as (0, 50)",
+    ),
+    ("default", _or_none(_is_number), "is not a number"),
+    ("address", _is_address, "is not an address from 0 to FFFFH"),
+    ("ram_address", _or_none(_is_address), "is not an address from 0 to FFFFH"),
+    *(
+        (name, _is_a(str), "is not a text")
+        for name in ("unit", "scale_register", "at_least", "at_most", "never", "place", "outside", "note")
+    ),
+    *((name, _or_none(_is_truth), "is neither True nor False") for name in ("while_running", "moves")),
+    *(
+        (
+            name,
+            _or_none(lambda value: _is_set(value, _is_whole)),
+            "is not a tuple of raw counts, such as (0,)",
+        )
+        for name in ("broadcast", "harmless", "never_together")
+    ),
+)
+
+
+# ---- a register, its facts together ----
+
+
+def _errors_together(
     register: Register[Any], registers: Mapping[str, Register[Any]], bounds: Collection[str]
 ) -> Iterator[str]:
-    yield from _format(register)
-    yield from _functions(register)
-    yield from _access(register)
+    yield from _table_errors(register)
+    if _fits_table(register):
+        yield from _number_errors(register)
+        yield from _written_errors(register)
     for name in filter(None, (register.at_least, register.at_most)):
         other = registers.get(name)
         if name not in bounds and (other is None or not other.readable or other.values is not None):
             yield f"its bound {name} is neither an option nor a number that can be read"
 
 
-def _format(register: Register[Any]) -> Iterator[str]:
-    carrier, number_format = register.table.carrier, register.number_format
-    wanted = {
-        Carrier.BIT: (NumberFormat.BIT,),
-        Carrier.WORD: tuple(WORDS),
-    }.get(carrier, (NumberFormat.U32,))
-    if number_format not in wanted:
-        yield f"number_format = NumberFormat.{number_format.name} does not fit a {register.table.name}"
-        return
+# The function codes that read and write bits, and words (application protocol V1.1b3, section 6).
+_READS = {Carrier.BIT: (0x01, 0x02), Carrier.WORD: (0x03, 0x04)}
+_WRITES = {Carrier.BIT: (0x05, 0x0F), Carrier.WORD: (0x06, 0x10)}
+
+
+def _table_errors(register: Register[Any]) -> Iterator[str]:
+    """Find a number format, a function code or an access that does not fit the table."""
+    table, access = register.table, register.access
+    if not _fits_table(register):
+        yield f"number_format = NumberFormat.{register.number_format.name} does not fit a {table.name}"
+    for verb, code, known in (("read", table.read, _READS), ("write", table.write, _WRITES)):
+        if code is not None and table.carrier in known and code not in known[table.carrier]:
+            codes = " or ".join(f"{each:02X}H" for each in known[table.carrier])
+            yield f"function {code!r} cannot {verb} a {table.carrier.value}: its table has {codes} for it"
+    name = f"an {table.name}" if table.name[0] in "aeiou" else f"a {table.name}"
+    if access is not Access.COMMAND and table.read is None:
+        yield f"{name} cannot be read, and so holds no {access.value}"
+    if access is not Access.READING and table.write is None and not register.never:
+        yield f"{name} cannot be written, and so holds no {access.value}"
+    if access is Access.READING and (register.harmless or register.broadcast or register.moves):
+        yield "a reading is never written: leave out harmless, broadcast and moves"
+
+
+def _fits_table(register: Register[Any]) -> bool:
+    if register.table.carrier is Carrier.WORD:
+        return register.number_format in WORDS
+    wanted = NumberFormat.BIT if register.table.carrier is Carrier.BIT else NumberFormat.U32
+    return register.number_format is wanted
+
+
+# Whole numbers that may have parts.
+_PARTED = frozenset(
+    {
+        *(NumberFormat.U16, NumberFormat.U32, NumberFormat.U64),
+        *(NumberFormat.I16, NumberFormat.I32, NumberFormat.I64),
+    }
+)
+# Facts of numbers in words, with the value that says nothing.
+_OF_WORDS = {"part": None, "invalid": (), "order": "ABCD", "scale_register": ""}
+
+
+def _number_errors(register: Register[Any]) -> Iterator[str]:
+    """Find what does not fit the number format, which fits its table."""
+    number_format, is_reading = register.number_format, register.access is Access.READING
     for name, at in (("address", register.address), ("ram_address", register.ram_address)):
         if at is not None and at + register.words - 1 > LAST_ADDRESS:
             yield f"{name} {at:04X}H: its {register.words} words reach beyond FFFFH"
     if register.ram_address == register.address:
         yield "its ram_address is its own address, which is the one that wears the EEPROM"
-    yield from number_errors(register)
+    if register.table.carrier is not Carrier.WORD:
+        for name, common in _OF_WORDS.items():
+            if getattr(register, name) != common:
+                yield f"{name} is for numbers in words, and a {register.table.name} holds none"
+        return
     if register.is_float and register.values is not None:
         names = register.values.__name__
         yield f"number_format = {number_format.name} is for numbers, and {names} names whole ones"
+    if register.order == "BA" and register.words > 1:
+        yield f"order = 'BA' is for one word, and this has {register.words}: CDAB, BADC or DCBA"
+    if number_format is NumberFormat.I8 and not is_reading:
+        yield "number_format = I8 is one byte of a word, whose other byte is unknown: it is never written"
+    if number_format is NumberFormat.U32_EITHER and (register.order != "ABCD" or register.invalid):
+        yield "number_format = U32_EITHER leaves the order of its words open: leave out order and invalid"
     if number_format is NumberFormat.U32_EITHER and register.writable:
         yield "number_format = U32_EITHER leaves the order of its words open: it is never written"
-    if register.span is not None and register.writable and register.values is None:
-        for end in register.span:
-            try:
-                register.encode(end)
-            except ValueError as mistake:
-                yield f"an end of its span cannot be written: {mistake}"
+    if register.part is not None:
+        if number_format not in _PARTED:
+            yield f"part is for whole numbers, not for number_format = {number_format.name}"
+        elif register.part[1] >= width(number_format):
+            bits = width(number_format) - 1
+            yield f"its part ends at bit {register.part[1]}, and its number has bits 0 to {bits}"
+        if not is_reading:
+            yield "a part is never written, as the other bits of its word would be too: declare a reading"
+    yield from _invalid_errors(register)
+    yield from _name_errors(register)
 
 
-# The function codes that read and write bits, and words (application protocol V1.1b3, section 6).
-_FUNCTIONS = {Carrier.BIT: ((0x01, 0x02), (0x05, 0x0F)), Carrier.WORD: ((0x03, 0x04), (0x06, 0x10))}
+def _is_flags(register: Register[Any]) -> bool:
+    return register.values is not None and issubclass(register.values, IntFlag)
 
 
-def _functions(register: Register[Any]) -> Iterator[str]:
-    table = register.table
-    for word, code, known in zip(
-        ("read", "write"), (table.read, table.write), _FUNCTIONS.get(table.carrier, ()), strict=False
-    ):
-        if code is not None and code not in known:
-            codes = " or ".join(f"{each:02X}H" for each in known)
-            yield f"function {code!r} cannot {word} a {table.carrier.value}: its table has {codes} for it"
+def _counts(register: Register[Any]) -> tuple[Fraction, Fraction]:
+    """Return the least and the greatest raw count; flags have no sign."""
+    if _is_flags(register):  # also in a signed format, whose highest bit may have a name
+        return Fraction(0), Fraction((1 << register.coding.mask.bit_count()) - 1)
+    return register.coding.raw_span
 
 
-def _access(register: Register[Any]) -> Iterator[str]:
-    """Find accesses for which the table has no function code."""
-    table, word = register.table, register.access.value
-    if register.access is not Access.COMMAND and table.read is None:
-        yield f"{_a(table.name)} cannot be read, and so holds no {word}"
-    if register.access is not Access.READING and table.write is None and not register.never:
-        yield f"{_a(table.name)} cannot be written, and so holds no {word}"
-    if register.access is Access.READING and (register.harmless or register.broadcast or register.moves):
-        yield "a reading is never written: nothing can be harmless or move anything"
+def _written_errors(register: Register[Any]) -> Iterator[str]:
+    """Find counts that no write can send: they would allow or forbid something else."""
+    least, most = _counts(register)
+    for key in ("harmless", "broadcast"):
+        for count in getattr(register, key) or ():
+            if not least <= count <= most:
+                yield f"{key} = {count} is not within {least} to {most}, which its number can be"
+    for mask in register.never_together:
+        if not _is_flags(register):
+            yield f"never_together = {mask:04X}H forbids nothing: only bits with names are checked; name them"
+        elif not 0 < mask <= most:
+            yield f"never_together = {mask:X}H is not a mask of its bits"
+    if register.values is not None:
+        return
+    lowest, highest = register.span or (-math.inf, math.inf)
+    if register.default is not None and not lowest <= register.default <= highest:
+        yield f"default = {register.default:g} is outside its span of {lowest:g} to {highest:g}"
+    elif register.default is not None and (mistake := _encode_error(register, register.default)):
+        yield f"its default cannot be: {mistake}"
+    for end in register.span if register.span is not None and register.writable else ():
+        if mistake := _encode_error(register, end):
+            yield f"an end of its span cannot be written: {mistake}"
 
 
-def _a(name: str) -> str:
-    return f"an {name}" if name[0] in "aeiou" else f"a {name}"
+def _encode_error(register: Register[Any], value: Any) -> str:
+    try:
+        register.encode(value)
+    except ValueError as mistake:
+        return str(mistake)
+    return ""
 
 
-# ---- several registers ----
+def _invalid_errors(register: Register[Any]) -> Iterator[str]:
+    if register.number_format in FLOATS or register.number_format is NumberFormat.U32_EITHER:
+        return
+    bits = width(register.number_format)
+    for count in register.invalid:
+        if count != count:
+            yield "invalid = nan is for floats, and this is a whole number"
+        elif not -(1 << bits - 1) <= count < 1 << bits or count != int(count):
+            yield f"invalid = {count:g} is not a count of {bits} bits"
 
 
-def _shared(registers: list[Register[Any]]) -> Iterator[str]:
-    """Find registers that are written at the same address and do not mean the same there.
+def _name_errors(register: Register[Any]) -> Iterator[str]:
+    """Find names of counts that the register cannot hold: such a fault would never be seen."""
+    if register.values is None or (register.part is not None and register.number_format not in _PARTED):
+        return
+    least, most = _counts(register)
+    for member in register.values:
+        if least <= member.value <= most:
+            continue
+        if _is_flags(register) and member.value > 0 and member.value.bit_count() == 1:
+            last = register.coding.mask.bit_count() - 1
+            yield f"{member.name} is bit {member.value.bit_length() - 1}, and its number has bits 0 to {last}"
+        else:
+            yield f"{member.name} = {member.value} is not within {least} to {most}, which its number can be"
 
-    A reading may share its address with anything, and different tables may use the same addresses. A register
-    that commands the motor shares its address with no alias in RAM, and with no register that has other
-    harmless counts: a plain write would send what only verbs may send.
+
+# ---- registers together ----
+
+
+def declaration_errors(
+    registers: Mapping[str, Register[Any]], taken: Collection[str], bounds: Collection[str]
+) -> list[str]:
+    """Return a sentence for each error in a class's registers.
+
+    `taken` are the reserved names; `bounds` are the names of the class's options.
+    """
+    found, sound = [], []
+    for name, register in registers.items():
+        if name in taken:
+            found.append(f"{name}: {_TAKEN}; rename the register")
+        if register.name != name:
+            found.append(f"{name}: this is the register {register.name} already; declare one of its own")
+        wrong = [*_wrong_facts(register, _REGISTER_RULES).values()] or list(
+            _errors_together(register, registers, bounds)
+        )
+        found += [f"{name}: {sentence}" for sentence in wrong]
+        if not wrong:
+            sound.append(register)
+    return [*found, *_sharing_errors(sound)]
+
+
+def _sharing_errors(registers: list[Register[Any]]) -> Iterator[str]:
+    """Find registers that are written at the same address with different meanings.
+
+    A reading may share its address with any register, and different tables may use the same addresses. A
+    register that commands the motor shares its address neither with a RAM alias nor with a register that has
+    other harmless counts: a plain write would send what only verbs may send.
     """
     written = [one for one in registers if one.access is not Access.READING and one.table.write is not None]
     at: dict[tuple[object, int], list[Register[Any]]] = {}
     for other in written:
-        places = [(_space(other.table), address) for address in _addresses(other)]
+        places = [(_space(other.table), address) for address in _addresses(other, other.address)]
         for one in dict.fromkeys(one for place in places for one in at.get(place, ())):
             if _meaning(one) != _meaning(other):
                 yield (
                     f"{other.name}: {one.name} is written at the same address "
-                    f"with another format, step, access or harmless counts; one of the two is wrong"
+                    "with another format, step, access or harmless counts; one of the two is wrong"
                 )
         for place in places:
             at.setdefault(place, []).append(other)
-    for one in (each for each in written if each.ram_address is not None):
-        alias = {(_space(one.table), address + _to_alias(one)) for address in _addresses(one)}
+    for one in written:
+        if one.ram_address is None:
+            continue
+        alias = {(_space(one.table), address) for address in _addresses(one, one.ram_address)}
         for other in dict.fromkeys(other for place in alias for other in at.get(place, ())):
             if other.commands:
                 yield f"{one.name}: its ram_address is that of {other.name}, which commands the motor"
@@ -274,15 +482,108 @@ def _space(table: Table) -> object:
     return (table.carrier, _SAME_SPACE.get(table.write or 0, table.write)) if modbus else table
 
 
-def _to_alias(register: Register[Any]) -> int:
-    return (register.ram_address or 0) - register.address
-
-
-def _addresses(register: Register[Any]) -> range:
-    return range(register.address, register.address + register.words)
+def _addresses(register: Register[Any], start: int) -> range:
+    return range(start, start + register.words)
 
 
 def _meaning(register: Register[Any]) -> object:
     coding = register.coding
     harmless = frozenset(register.harmless or ())
     return register.address, coding.core_format, coding.factors, register.access, register.commands, harmless
+
+
+# ---- requests: scale registers, limits, registers that are read together ----
+
+
+def request_errors(family: Any) -> list[str]:
+    """Tie registers to their scale registers; return a sentence for each error in what one request reads."""
+    wrong = list(_scale_errors(family)) or list(_limit_errors(family))
+    if wrong:
+        return wrong
+    seen: set[str] = set()
+    for group in family.read_together:
+        wrong += _group_errors(family, group, seen)
+        seen.update(name for name in group if isinstance(name, str))
+    return wrong
+
+
+def _scale_errors(family: Any) -> Iterator[str]:
+    for name, register in family.registers.items():
+        if not register.scale_register:
+            continue
+        wrong = list(_tie_errors(register, family.registers))
+        if not wrong:
+            object.__setattr__(register, "scaled_by", family.registers[register.scale_register])
+            vars(register).pop("reach", None)
+            wrong = list(_reach_errors(register, family))
+        yield from (f"{name}: {sentence}" for sentence in wrong)
+
+
+def _tie_errors(register: Register[Any], registers: Mapping[str, Register[Any]]) -> Iterator[str]:
+    scale = registers.get(register.scale_register)
+    if scale is None:
+        yield f"its scale register {register.scale_register} is not declared"
+        return
+    if scale.number_format is not NumberFormat.I16 or not scale.readable:
+        yield f"its scale register {scale.name} is not a readable I16: it holds a power of ten"
+    elif scale.part or scale.offset or scale.step != 1 or scale.scale_register or scale.values:
+        yield f"its scale register {scale.name} is not a plain count: it holds a power of ten"
+    if scale.table.read_space != register.table.read_space:
+        yield f"its scale register {scale.name} is in another table: one request reads both"
+    if register.access is not Access.READING:
+        yield "a register with a scale register is never written: the device may change the scale"
+    if register.values is not None or register.offset:
+        yield "a register with a scale register has neither names nor an offset"
+    if register.scaled_by not in (None, scale):
+        yield f"its scale register {scale.name} was declared again: declare this one again as well"
+
+
+def _reach_errors(register: Register[Any], family: Any) -> Iterator[str]:
+    limit = read_limit(family, register.table)
+    if len(register.reach) > limit:
+        shown = f"{len(register.reach)} registers with its scale register {register.scale_register}"
+        yield f"one request reads at most {limit} registers, and these are {shown}"
+        return
+    own = {*_addresses(register, register.address), register.scaled_by and register.scaled_by.address}
+    between = (address for address in register.reach if address not in own)
+    unknown = [address for address in between if not may_be_crossed(family, register.table, [address])]
+    if unknown:
+        yield (
+            f"address {unknown[0]:04X}H between it and its scale register {register.scale_register} is not "
+            "declared: declare it, or the gap in readable_gaps"
+        )
+
+
+def _limit_errors(family: Any) -> Iterator[str]:
+    for table, most in family.most_registers.items():
+        standard = STANDARD_LIMITS[table.carrier]
+        if not _is_whole(most) or not 1 <= most <= standard:
+            yield f"most_registers[{table.name}] = {most!r} is not a number from 1 to {standard}"
+    groups = family.read_together
+    if not isinstance(groups, (tuple, list)) or not all(isinstance(group, (tuple, list)) for group in groups):
+        yield f'read_together = {groups!r} is not a tuple of groups, such as (("energy_high", "energy_low"),)'
+
+
+def _group_errors(family: Any, group: Collection[Any], seen: Collection[str]) -> Iterator[str]:
+    shown = f"read_together: {', '.join(map(str, group))}"
+    known = [family.registers.get(name) for name in group if isinstance(name, str)]
+    registers = [register for register in known if register is not None and register.readable]
+    if not registers or len(registers) < len(group):
+        yield f"{shown}: each must be the name of a readable register"
+        return
+    if again := {*seen} & {*group}:
+        yield f"{shown}: {', '.join(sorted(again))} is in another group too; merge the two groups"
+    table = registers[0].table
+    if any(register.table.read_space != table.read_space for register in registers):
+        yield f"{shown}: one request reads one table, and these are in several"
+        return
+    start = min(register.reach.start for register in registers)
+    stop = max(register.reach.stop for register in registers)
+    longest, limit = max(len(register.reach) for register in registers), read_limit(family, table)
+    if stop - start > max(limit, longest):
+        yield f"{shown}: they take {stop - start} addresses, and one request reads {limit} at most"
+    elif not may_be_crossed(family, table, range(start, stop)):
+        yield (
+            f"{shown}: between them are addresses that are not declared; "
+            "one request may read across them only if readable_gaps says so"
+        )

@@ -1,67 +1,138 @@
-"""Drive: the base of all families: registers, and the verbs that command the motor.
+"""Drive: the base of all families: facts of the manual, registers, and the verbs that command the motor.
 
-A family is a subclass that declares registers. Its verbs are scripts; a verb of a drive that is attached
-to a bus is carried out there.
+A family is a subclass that declares registers. Its verbs are scripts; if the drive is attached to a bus, the
+bus runs them.
 """
 
 from __future__ import annotations
 
+import difflib
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import Any
+from typing import Any, ClassVar, TypeVar
 
-from multidrop.core import Framing
-from multidrop.drive.declaration_check import DeclarationError, declaration_errors
-from multidrop.drive.fact_check import fact_errors
-from multidrop.drive.known_setpoint import KnownSetpoint
-from multidrop.drive.manual_facts import ManualFacts
+from multidrop.core import MODBUS, Framing
+from multidrop.drive.declaration_check import (
+    DeclarationError,
+    declaration_errors,
+    fact_errors,
+    request_errors,
+    text_errors,
+)
+from multidrop.drive.line_settings import Settings, check_agreed_silence, framing_on
 from multidrop.drive.options import Option, checked_options, confirmation, doubt
-from multidrop.drive.read_limits import limit_errors
-from multidrop.drive.register import Access, Register
-from multidrop.drive.scale_check import scale_errors
+from multidrop.drive.register import Access, Kept, Register, Table
 from multidrop.drive.script import Script, read, until, write
-from multidrop.drive.state import Condition, Direction, State
-from multidrop.drive.text import Text, text_errors
+from multidrop.drive.state import Condition, Direction, KnownSetpoint, State
+from multidrop.drive.text import Text
 from multidrop.drive.verbs import MOVING, CalledStop, UnattachedStop, verb, verb_errors
 from multidrop.errors import Advice, NotAttached, NotVerified, Unconfirmed, Unsupported, WriteForbidden
 
-START_TIME = 5.0  # s, after which a motor that was started must be seen to run
-REVERSAL_TIME = 60.0  # s, for the ramps of a motor that turned the other way, without the option `stop_time`
+START_TIME = 5.0  # s within which a started motor must be seen to run
+REVERSAL_TIME = 60.0  # s for the ramps of a motor that turned the other way, without the option `stop_time`
 _SETPOINT_FIRST = Advice("call set_frequency before start", "add --frequency HZ")
-
 _TURNING = (Condition.RUNNING, Condition.ACCELERATING, Condition.DECELERATING)
 
+A = TypeVar("A")
 
-class Drive(ManualFacts):
+
+class Drive:
     """One drive on a line; its class is the family, with the manual's tables in the manual's order.
 
-    `address` is 1 to 247, or fewer in some families; on a tcp:// port it is a unit id, 0 to 255 where the
-    family has all of them. Baud rate, format and framing default to the family's; on a tcp:// port
-    the framing is TCP, and baud rate and format are those of the wire behind the gateway. `silence`, in s,
-    takes the place of the standard's t3.5 where all drives on the line bear it; what the family's document
-    demands is kept all the same. Options are facts that only the owner knows (see `options`); `ram` names
-    registers that the owner knows to be kept in RAM although the document does not say so. Raises
-    ValueError for anything the family's document does not allow.
+    `address` is 1 to 247, or fewer in some families; on a tcp:// port it is a unit id, 0 to 255 if the family
+    has all of them. Baud rate, format and framing default to the family's. On a tcp:// port the framing is
+    TCP, and baud rate and format are those of the wire behind the gateway. `silence`, in s, replaces the
+    standard's t3.5 if all drives on the line tolerate it; a longer silence in the family's document still
+    applies. Options are facts that only the owner knows (see `options`). `ram` names registers that the owner
+    knows to be kept in RAM although the document does not say so. Raises ValueError for values that the
+    family's document does not allow.
     """
 
-    bus: Any = None  # the one that it is attached to
+    title: ClassVar[str] = ""
+    model: ClassVar[str] = ""
+    declared_in: ClassVar[str] = ""  # name of the family file; such a family is untested
+    manual: ClassVar[str] = ""
+
+    # ---- the line ----
+
+    framings: ClassVar[tuple[Framing, ...]] = (Framing.RTU,)
+    formats: ClassVar[Mapping[Framing, tuple[str, ...]]] = {}  # the first is the default
+    baudrates: ClassVar[tuple[int, ...]] = (9600, 1200, 2400, 4800, 19200, 38400, 57600, 115200)
+    addresses: ClassVar[range] = range(1, 248)
+    line_terminals: ClassVar[str] = ""  # the drive's two terminals for the line
+    most_devices: ClassVar[int] = 0  # on a line with such a drive; 0: not stated
+
+    silence: ClassVar[float] = 0.0  # s, before and after a frame; with RTU at least t3.5
+    silence_characters: ClassVar[float] = 0.0  # the same, in characters
+    response_delay: float = 0.005  # s, typical, from the request's end to the reply's start
+    response_delay_characters: ClassVar[float] = 0.0  # the same in characters, if that is longer
+    response_timeout: ClassVar[float] = 0.3  # s without a reply before an exchange fails
+    answering_time: ClassVar[float] = 0.0  # s that the document gives the drive for a reply; 0: not stated
+    turnaround_delay: ClassVar[float] = 0.1  # s, after a broadcast
+    least_interval: ClassVar[float] = 0.0  # s, from the end of an exchange to the next request to the drive
+    # True if the drive answers or refuses each read of its tables. A late reply could then pass for another
+    # register's, so a proof is read before the first value.
+    answers_every_read: ClassVar[bool] = False
+
+    # ---- registers, exceptions and commands ----
+
+    most_registers: ClassVar[Mapping[Table, int]] = {}  # in one read; by default the standard's limit
+    readable_gaps: ClassVar[Mapping[Table, range]] = {}  # reserved addresses that one read may include
+    read_together: ClassVar[tuple[tuple[str, ...], ...]] = ()  # registers that share a request, in this order
+    exceptions: ClassVar[Mapping[int, str]] = {
+        1: "illegal function",
+        2: "illegal address",
+        3: "illegal value",
+        4: "device failure",
+        5: "acknowledged, still working",
+        6: "busy",
+    }
+    damaged: ClassVar[frozenset[int]] = frozenset()  # codes for a request that arrived damaged
+    later: ClassVar[frozenset[int]] = frozenset({5, 6})  # codes of a drive that will answer later
+    broadcasts: ClassVar[bool] = False  # True if the document defines broadcasts
+    identify_recognises: ClassVar[bool] = False  # True if another make never passes `identify`
+    identity_proofs: ClassVar[tuple[Any, ...]] = ()  # of a family file: registers with their values
+    options: ClassVar[Mapping[str, Option]] = {}
+    setpoint_name: ClassVar[str] = "frequency"  # the register that set_frequency writes
+    remote: ClassVar[str] = "the drive must take its commands from the line"  # to be set on its keypad
+    line_parameters: ClassVar[str] = ""  # the parameters for its address, baud rate and format
+    no_broadcasts: ClassVar[str] = "none documented"  # in words, if there are none
+    watchdog: ClassVar[str] = "The document names no watchdog: the motor runs on when the client dies."
+
+    registers: ClassVar[Mapping[str, Register[Any]]] = {}
+    texts: ClassVar[Mapping[str, Text]] = {}
+
+    bus: Any = None  # the bus that it is attached to
+
+    # ---- the class ----
 
     def __init_subclass__(cls) -> None:
-        """Collect the registers. Raises DeclarationError with all that is wrong with the class."""
+        """Collect the registers. Raises DeclarationError with all errors in the class."""
         super().__init_subclass__()
-        found = cls._declared(Register)
-        cls.registers = found
+        cls.registers = cls._declared(Register)
         cls.texts = cls._declared(Text)
         wrong = fact_errors(cls) + verb_errors(cls)
         options = cls.options = cls._all_options() if isinstance(cls.options, Mapping) else {}
-        wrong += declaration_errors(found, TAKEN_NAMES, options) + text_errors(cls.texts, TAKEN_NAMES)
-        if wrong := wrong or scale_errors(cls) or list(limit_errors(cls)):
+        wrong += declaration_errors(cls.registers, TAKEN_NAMES, options) + text_errors(cls.texts, TAKEN_NAMES)
+        if wrong := wrong or request_errors(cls):
             raise DeclarationError(cls.__name__, wrong)
         if not cls.formats:
             cls.formats = dict.fromkeys(cls.framings, ("8N1", "8E1", "8O1", "8N2"))
 
     @classmethod
+    def _declared(cls, kind: type[A]) -> dict[str, A]:
+        """Return the class's attributes of a kind by name, without those that a subclass has replaced."""
+        found: dict[str, A] = {}
+        for owner in reversed(cls.__mro__):
+            for name, attribute in vars(owner).items():
+                if isinstance(attribute, kind):
+                    found[name] = attribute
+                else:
+                    found.pop(name, None)
+        return found
+
+    @classmethod
     def _all_options(cls) -> Mapping[str, Option]:
-        """Return the class's options, and `confirmed` where a command needs that: see `check_confirmed`."""
+        """Return the class's options, with `confirmed` if a command needs it: see `check_confirmed`."""
         commands = any(
             register.commands or register.access is Access.COMMAND for register in cls.registers.values()
         )
@@ -74,22 +145,46 @@ class Drive(ManualFacts):
     def _identifies(cls) -> bool:
         return cls.identify is not Drive.identify
 
-    def check_confirmed(self, what: str) -> None:
-        """Raise WriteForbidden for a drive that must be confirmed and is not.
+    @classmethod
+    def _kind(cls) -> str:
+        """Return the family's title, or its class name."""
+        return cls.title or cls.__name__
 
-        It must be where its class cannot identify its drives: the same address means different things to
-        different makes, and may start their motor. It must be too where a file declares the class, which
-        nobody has tested.
-        """
-        if "confirmed" not in self.options or self.option.get("confirmed"):
-            return
-        kind = self.title or type(self).__name__
-        if why := doubt(kind, self.declared_in, identifies=self._identifies()):
-            raise WriteForbidden(
-                f"{what} is not sent to {self.name}: {why}, and declare confirmed = 1",
-                rule="nobody has confirmed what it is",
-                advice=Advice.declare("confirmed", 1),
-            )
+    @classmethod
+    def register(cls, name: str) -> Register[Any]:
+        """Return the register of this name. Raises ValueError with the nearest names if there is none."""
+        if not isinstance(name, str):
+            first = next(iter(cls.registers), "speed")
+            raise TypeError(f"a register has a name, such as {first!r}, not {name!r}")
+        try:
+            return cls.registers[name]
+        except KeyError:
+            near = difflib.get_close_matches(name, cls.registers, n=3)
+            hint = f"did you mean {' or '.join(near)}?" if near else f"see `multidrop models {cls.model}`"
+            raise ValueError(f"{cls._kind()} has no register {name!r}; {hint}") from None
+
+    @classmethod
+    def readings(cls) -> tuple[Register[Any], ...]:
+        """Return the registers that are polled by default."""
+        return tuple(
+            register
+            for register in cls.registers.values()
+            if register.access is Access.READING and register.readable
+        )
+
+    @classmethod
+    def speaks(cls, framing: Framing) -> bool:
+        """Return True for the document's framings, and for TCP if one of them is Modbus."""
+        return framing in cls.framings or (
+            framing is Framing.TCP and any(one in MODBUS for one in cls.framings)
+        )
+
+    @classmethod
+    def formats_in(cls, framing: Framing) -> tuple[str, ...]:
+        """Return the formats of a framing; with TCP those of the wire behind the gateway."""
+        return cls.formats.get(framing) or cls.formats[cls.framings[0]]
+
+    # ---- one drive ----
 
     def __init__(
         self,
@@ -104,12 +199,26 @@ class Drive(ManualFacts):
         **options: float,
     ) -> None:
         if type(self) is Drive:
-            raise TypeError("Drive is no family: take one, such as YD1000, or a class of yours that derives")
-        super().__init__(address, framing, baudrate, format, silence)
+            raise TypeError("Drive is the base class: use a family, such as YD1000, or your own subclass")
+        self.address = self._one_of("address", address, self.addresses)
+        self.framing = self._framing(framing)
+        self._declared_framing = None if framing is None else self.framing
+        formats = self.formats_in(self.framing)
+        self.settings = Settings(
+            self._one_of("baud rate", self.baudrates[0] if baudrate is None else baudrate, self.baudrates),
+            self._one_of("format", formats[0] if format is None else format, formats),
+        )
+        self.agreed_silence = silence
+        if silence is not None:
+            own = self._own_silence() if self.framing is Framing.RTU else None
+            check_agreed_silence(silence, self.settings, own)
+        self.response_delay = max(
+            self.response_delay, self.response_delay_characters * self.settings.character
+        )
         self.name = name or f"{self.model or type(self).__name__}@{address}"
         if not self.name.isprintable():  # a truncated line of a text recording must be recognised
             raise ValueError(f"the name {name!r} is not one line of printable characters")
-        self.option = checked_options(self.title or type(self).__name__, self.options, options)
+        self.option = checked_options(self._kind(), self.options, options)
         self.ram = frozenset(self._in_ram(name) for name in ram)
         self._known_setpoint = KnownSetpoint()
         self.perform: Callable[[Script[Any]], Any] = self._perform_nowhere
@@ -121,14 +230,125 @@ class Drive(ManualFacts):
             lambda verb, make, seconds: UnattachedStop(self, make)
         )
 
+    @classmethod
+    def _one_of(cls, what: str, value: Any, allowed: Any) -> Any:
+        if value in allowed and not isinstance(value, bool | float):  # True equals 1, and so does 1.0
+            return value
+        choices = (
+            f"{allowed[0]} to {allowed[-1]}"
+            if isinstance(allowed, range)
+            else ", ".join(str(choice) for choice in allowed)
+        )
+        raise ValueError(f"{what} {value!r} is not one of {cls._kind()}: {choices}")
+
+    @classmethod
+    def _framing(cls, framing: Framing | str | None) -> Framing:
+        if framing is None:
+            return cls.framings[0]
+        if isinstance(framing, str):
+            framing = {str(known): known for known in Framing}.get(framing.lower(), framing)
+        if framing in cls.framings or (framing is Framing.TCP and cls.speaks(framing)):
+            return Framing(framing)
+        known = ", ".join(str(one) for one in cls.framings)
+        hint = f"; write {known}, or leave it out" if len(cls.framings) == 1 else ""
+        raise ValueError(f"framing {str(framing)!r} is not one of {cls._kind()}: {known}{hint}")
+
+    @classmethod
+    def _in_ram(cls, name: str) -> str:
+        if not isinstance(name, str):
+            raise TypeError(f"ram takes names of registers, not {name!r}")
+        register = cls.register(name)
+        if register.kept is Kept.EEPROM:
+            raise ValueError(f"{name} of {cls._kind()} is in EEPROM, as its document says")
+        return register.name
+
+    def take_framing_of(self, port: str) -> None:
+        """Use the framing of this port: TCP on tcp://, and the declared one on others.
+
+        Raises ValueError if the drive cannot be used on the port.
+        """
+        self.framing = framing_on(
+            port,
+            self._declared_framing,
+            self.framings[0],
+            self.address,
+            family=self._kind(),
+            speaks_modbus=self.speaks(Framing.TCP),
+        )
+
+    def needed_silence(self) -> float:
+        """Return the silence in s that this drive needs before a request and after its reply."""
+        if self.framing is Framing.TCP:  # the gateway keeps it
+            return 0.0
+        if self.framing is not Framing.RTU:
+            return self._own_silence()
+        agreed = self.settings.t3_5 if self.agreed_silence is None else self.agreed_silence
+        return max(agreed, self._own_silence())
+
+    def _own_silence(self) -> float:
+        return max(self.silence, self.silence_characters * self.settings.character)
+
+    def __setattr__(self, name: str, value: object) -> None:
+        if name in self.registers:
+            raise AttributeError(f"{name} is a register, which bus.write(drive, drive.{name}, VALUE) writes")
+        if name in self.texts:
+            raise AttributeError(f"{name} is a text, which bus.read_text(drive, drive.{name}) reads")
+        super().__setattr__(name, value)
+
     def __repr__(self) -> str:
         where = f"on {self.bus.line.port}" if self.bus else "not attached"
         line = f"{self.framing}, {self.settings}"
         return f"<{type(self).__name__} {self.name!r}, address {self.address}, {line}, {where}>"
 
     @property
+    def ledger_name(self) -> str:
+        """Name under which its EEPROM writes are counted; two files of one name differ by their titles."""
+        if self.declared_in:
+            return f"{self.model}: {self.title}"
+        return self.model or type(self).__name__
+
+    @property
+    def echo_probe(self) -> Register[Any] | None:
+        """Register whose reply is never a copy of its request; None if the family has none.
+
+        It is read first while it is unknown whether the adapter echoes.
+        """
+        return None
+
+    def known_counts(self) -> Mapping[Register[Any], tuple[int, int]]:
+        """Return registers whose raw counts lie in a known range: the least and the greatest count of each.
+
+        If a family reads one register at a time, only the value distinguishes one register's late reply from
+        another's. So no two of the ranges may overlap.
+        """
+        return {}
+
+    def exception(self, code: int) -> str:
+        """Return the meaning of an exception code in this family."""
+        return self.exceptions.get(code, "a code that the document does not explain")
+
+    def is_passing(self, code: int) -> bool:
+        """Return True for a temporary exception: the request arrived damaged, or the drive was busy."""
+        return code in self.exceptions and code in self.damaged | self.later
+
+    def check_confirmed(self, what: str) -> None:
+        """Raise WriteForbidden if the drive must be confirmed and is not.
+
+        Two kinds of families need it: those that cannot identify their drives, because the same address may
+        start the motor of another make; and those from a file, which are untested.
+        """
+        if "confirmed" not in self.options or self.option.get("confirmed"):
+            return
+        if why := doubt(self._kind(), self.declared_in, identifies=self._identifies()):
+            raise WriteForbidden(
+                f"{what} is not sent to {self.name}: {why}, and declare confirmed = 1",
+                rule="nobody has confirmed what it is",
+                advice=Advice.declare("confirmed", 1),
+            )
+
+    @property
     def commanded(self) -> float | None:
-        """The setpoint that was written last; None where it is not known that the drive holds it."""
+        """The setpoint that was written last; None unless the drive is known to hold it."""
         return self._known_setpoint.value
 
     @commanded.setter
@@ -136,7 +356,10 @@ class Drive(ManualFacts):
         self._known_setpoint.value = held
 
     def begin_setpoint(self) -> Callable[[], None]:
-        """Know no setpoint until a write of it has ended; return what takes that back, as it was not sent."""
+        """Forget the setpoint until its write ends; return a callback that restores it if nothing was sent.
+
+        See `KnownSetpoint`.
+        """
         return self._known_setpoint.begin_write()
 
     def _move_nowhere(self, script: Script[Any], call: Any) -> Any:
@@ -145,25 +368,25 @@ class Drive(ManualFacts):
     def _perform_nowhere(self, script: Script[Any]) -> Any:
         raise NotAttached(f"{self.name} is not attached to a bus: use bus.attach(...)")
 
-    # ---- verbs; each family replaces those that its document has ----
+    # ---- for verbs ----
 
     def _unsupported(self, what: str) -> Unsupported:
-        return Unsupported(f"{self.name}: the document of {self.title or type(self).__name__} has no {what}")
+        return Unsupported(f"{self.name}: the document of {self._kind()} has no {what}")
 
-    def _stopped(self, look: Callable[[], Script[bool]], limit: float) -> Script[None]:
-        """Wait until the drive is seen to have stopped; Unconfirmed after `limit` seconds."""
-        if not (yield from until(look, limit=limit)):
+    def _stopped(self, check: Callable[[], Script[bool]], limit: float) -> Script[None]:
+        """Wait until `check` sees that the drive has stopped. Raises Unconfirmed after `limit` seconds."""
+        if not (yield from until(check, limit=limit)):
             raise Unconfirmed(self.name, "the stop", f"after {limit:g} s it is not seen to have stopped")
 
     def _hold(self, register: Register[float], value: float) -> Script[None]:
-        """Write the setpoint; NotVerified when the drive then holds another value."""
+        """Write the setpoint. Raises NotVerified if the drive then holds another value."""
         held = yield from write(register, value)
         if held != register.decode(register.encode(value)):
             what = f"{register.name} = {register.format(value)}"
             raise NotVerified(self.name, what, f"the drive holds {register.format(held)}")
 
     def _setpoint_in_force(self) -> Script[None]:
-        """Raise WriteForbidden unless the setpoint is known, not 0, and still the one that was written."""
+        """Raise WriteForbidden unless the setpoint is known, not 0, and still the value written last."""
         register = self.register(self.setpoint_name)
         held = (yield from read(register)) if register.readable else self.commanded
         if held is None:
@@ -172,7 +395,7 @@ class Drive(ManualFacts):
             why = f"the setpoint of {self.name} is 0:"
         elif self.commanded is not None and held != self.commanded:
             shown = f"{register.format(held)} and not {register.format(self.commanded)}"
-            why = f"{self.name} holds {shown} as it was told: it may have lost its power;"
+            why = f"{self.name} holds {shown} as written: it may have lost its power;"
         else:
             return
         raise WriteForbidden(f"{why} call set_frequency before start", advice=_SETPOINT_FIRST)
@@ -182,14 +405,14 @@ class Drive(ManualFacts):
 
     def _reset_first(self, fault: str = "") -> WriteForbidden:
         shown = f"a fault, {fault}" if fault else "a fault"
-        why = f"{self.name} has {shown}: see to it, then call reset_fault()"
+        why = f"{self.name} has {shown}: remove its cause, then call reset_fault()"
         return WriteForbidden(why, advice=Advice.call("reset_fault"))
 
     def _started(self, direction: Direction | None = None) -> Script[None]:
         """Wait until the motor is seen to run, and in `direction` if the drive shows one.
 
-        A motor that turned the other way has the time of its ramps for that. Raises NotVerified if the drive
-        trips, Unconfirmed if it is not seen to run so.
+        A motor that turned the other way gets the time of its ramps. Raises NotVerified if the drive trips,
+        Unconfirmed if it is not seen to run in time.
         """
         if not (yield from until(self._runs, limit=START_TIME)):
             seen = f"after {START_TIME:g} s it is not seen to run; stop it, or it may start later"
@@ -207,7 +430,7 @@ class Drive(ManualFacts):
         return state.condition in _TURNING
 
     def _turns_in(self, direction: Direction) -> Script[bool]:
-        """Return True if the motor is seen to turn in this direction, or if the drive shows none."""
+        """Return True if the motor turns in this direction, or turns and the drive shows no direction."""
         state = yield from self._without_trip()
         if state.direction is None:
             return (yield from self._runs())
@@ -219,22 +442,24 @@ class Drive(ManualFacts):
             raise NotVerified(self.name, "the start", f"it tripped: {state.fault or 'it shows a fault'}")
         return state
 
+    # ---- verbs; each family replaces those that its document has ----
+
     @verb
     def identify(self) -> Script[None]:
-        """Check by reading that this is a drive of the family; WriteForbidden when it is another.
+        """Check by reading that this is a drive of the family. Raises WriteForbidden if it is another.
 
-        A drive that passes is not proven to be one: few families say who they are.
+        A drive that passes is not proven to be one: few families identify themselves.
         """
         yield from ()
 
     def resembles(self) -> Script[bool]:
-        """Return True where a drive that `identify` refuses reads like the family: enough for a guess."""
+        """Return True if a drive that `identify` refuses still reads like the family: enough for a guess."""
         yield from ()
         return False
 
     @verb
     def start(self, direction: Direction | None = None) -> Script[None]:
-        """Start the motor at the setpoint in force; without a direction, in the one in force."""
+        """Start the motor at the present setpoint, and in the present direction unless one is given."""
         raise self._unsupported("start command")
         yield
 
@@ -246,13 +471,13 @@ class Drive(ManualFacts):
 
     @verb
     def coast(self) -> Script[None]:
-        """Take the voltage off and let the motor run out."""
+        """Remove the voltage and let the motor coast."""
         raise self._unsupported("coast command")
         yield
 
     @verb
     def emergency_stop(self) -> Script[None]:
-        """Stop the motor as the drive's own emergency stop does."""
+        """Stop the motor with the drive's own emergency stop."""
         raise self._unsupported("emergency stop")
         yield
 
@@ -276,13 +501,13 @@ class Drive(ManualFacts):
 
     @verb
     def release_control(self) -> Script[None]:
-        """Give the command over the motor back to the drive's panel or terminals; at rest only."""
-        raise self._unsupported("way to give the command back")
+        """Return control of the motor to the drive's panel or terminals; only at rest."""
+        raise self._unsupported("way to return control")
         yield
 
     @verb
     def state(self) -> Script[State]:
-        """Report condition, direction and fault."""
+        """Return condition, direction and fault."""
         raise self._unsupported("state")
         yield
 
@@ -292,3 +517,42 @@ TAKEN_NAMES = frozenset(
     {*dir(Drive), *("address", "framing", "settings", "agreed_silence", "response_delay", "name")}
     | {"option", "ram", "perform"}
 )
+
+
+# ---- a drive's own registers: at the same address another family has something else ----
+
+
+def check_drive(drive: Drive) -> None:
+    """Raise TypeError unless this is a drive."""
+    if not isinstance(drive, Drive):
+        raise TypeError(f"{drive!r} is not a drive: use the one that attach returns")
+
+
+def check_own(drive: Drive, register: Register[Any]) -> None:
+    """Raise ValueError for another family's register: the same address means something else there.
+
+    Raises TypeError for anything else, such as a name.
+    """
+    check_drive(drive)
+    if not isinstance(register, Register):
+        hint = "use its attribute, or drive.register(NAME)"
+        raise TypeError(f"{register!r} is not a register of {drive.name}: {hint}")
+    if drive.registers.get(register.name) is not register:
+        raise ValueError(
+            f"this {register.name} is not a register of {drive.name}, which is a {drive._kind()}"
+        )
+
+
+def check_readable(drive: Drive, register: Register[Any]) -> None:
+    """Raise ValueError if the register cannot be read."""
+    if not register.readable:
+        raise ValueError(f"{register.name} of {drive.name} cannot be read: it is a {register.access.value}")
+
+
+def check_own_text(drive: Drive, text: Text) -> None:
+    """Raise ValueError for another family's text, TypeError for anything else."""
+    check_drive(drive)
+    if not isinstance(text, Text):
+        raise TypeError(f"{text!r} is not a text of {drive.name}: use its attribute, or drive.texts[NAME]")
+    if drive.texts.get(text.name) is not text:
+        raise ValueError(f"this {text.name} is not a text of {drive.name}, which is a {drive._kind()}")

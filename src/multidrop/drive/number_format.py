@@ -1,10 +1,15 @@
-"""Number formats: their width, order and span, and how their bits become numbers and back."""
+"""Number formats: how a device encodes a quantity in its words, and how to decode it.
+
+The core decodes by the same rules.
+"""
 
 from __future__ import annotations
 
 import math
 import struct
+from dataclasses import dataclass
 from fractions import Fraction
+from functools import cached_property
 
 from multidrop.core import LOW_BYTE_FIRST, LOW_WORD_FIRST
 from multidrop.core import NumberFormat as NumberFormat
@@ -26,8 +31,8 @@ WORDS = {  # of 16 bits
 }
 FLOATS = {NumberFormat.F16: ">e", NumberFormat.F32: ">f", NumberFormat.F64: ">d"}
 SHORT_FLOATS = frozenset({NumberFormat.F16, NumberFormat.F32})  # a float64 holds each exactly
-WHOLE = frozenset({NumberFormat.U64, NumberFormat.I64})  # numbers that a float does not hold exactly
-# The bytes as they come on the wire, A the most significant; in a single word only their swap counts.
+WHOLE = frozenset({NumberFormat.U64, NumberFormat.I64})  # a float does not hold these exactly
+# The order of the bytes on the wire, A the most significant; a single word has AB or BA.
 ORDERS = {
     "AB": 0,
     "BA": LOW_BYTE_FIRST,
@@ -47,7 +52,7 @@ _LARGEST = {
 
 
 def width(number_format: NumberFormat) -> int:
-    """Return the bits of a number."""
+    """Return the number of bits in this format."""
     if number_format in (NumberFormat.BIT, NumberFormat.I8):
         return 1 if number_format is NumberFormat.BIT else 8
     return 16 * WORDS[number_format]
@@ -68,7 +73,7 @@ def raw_span(number_format: NumberFormat) -> tuple[Fraction, Fraction]:
 
 
 def arranged(data: bytes, order: str) -> bytes:
-    """Return the bytes of a number from the wire with the most significant first, or the other way round."""
+    """Convert a number's bytes from wire order to most significant first, or back."""
     flags = ORDERS[order]
     words = [data[at : at + 2] for at in range(0, len(data), 2)]
     if flags & LOW_BYTE_FIRST:
@@ -77,7 +82,7 @@ def arranged(data: bytes, order: str) -> bytes:
 
 
 def bits_in(data: bytes, at: int, number_format: NumberFormat, order: str) -> int | None:
-    """Return the bits of the number at word (BIT: bit) `at` of a reply's data; None where it ends before."""
+    """Return the bits of the number at word (BIT: bit) `at` of a reply's data; None if it ends earlier."""
     if number_format is NumberFormat.BIT:
         return data[at // 8] >> at % 8 & 1 if at // 8 < len(data) else None
     size = 2 * WORDS[number_format]
@@ -86,7 +91,7 @@ def bits_in(data: bytes, at: int, number_format: NumberFormat, order: str) -> in
 
 
 def number_of(bits: int, number_format: NumberFormat) -> float | None:
-    """Return the number that these bits mean; None where they mean none."""
+    """Return the number that these bits encode; None if they encode no number."""
     if number_format in FLOATS:
         (number,) = struct.unpack(FLOATS[number_format], bits.to_bytes(2 * WORDS[number_format]))
         return None if math.isnan(number) else float(number)
@@ -107,7 +112,7 @@ def signed(bits: int, count: int) -> int:
 
 
 def bits_of(number: float, number_format: NumberFormat) -> int:
-    """Return the bits of this number; a whole number loses those that do not fit."""
+    """Return the bits of this number; the high bits of a whole number are cut off if they do not fit."""
     if number_format in FLOATS:
         number = nearest_or_infinite(number, number_format)
         return int.from_bytes(struct.pack(FLOATS[number_format], number))
@@ -149,3 +154,121 @@ def shortest(value: float, scale: Fraction, number_format: NumberFormat) -> str:
     else:
         found = float(f"{value:.{MOST_DIGITS}g}")
     return repr(found + 0.0).removesuffix(".0")
+
+
+MOST_POWER = 22  # of ten that a float64 holds exactly
+
+
+@dataclass(frozen=True)
+class Coding:
+    """The encoding of one quantity: format, byte order, part, invalid counts and exact scale."""
+
+    number_format: NumberFormat
+    order: str = "ABCD"
+    part: tuple[int, int] | None = None
+    invalid: tuple[float, ...] = ()
+    step: Fraction = Fraction(1)
+    offset: Fraction = Fraction(0)
+
+    @cached_property
+    def core_format(self) -> int:
+        """The number format with its order, for the core."""
+        return self.number_format + (0 if self.number_format is NumberFormat.BIT else ORDERS[self.order])
+
+    @cached_property
+    def factors(self) -> tuple[int, int, int]:
+        """Multiplier, addend and divisor: the value is exactly (raw * multiplier + addend) / divisor."""
+        divisor = math.lcm(self.step.denominator, self.offset.denominator)
+        return int(self.step * divisor), int(self.offset * divisor), divisor
+
+    @cached_property
+    def raw_span(self) -> tuple[Fraction, Fraction]:
+        """The least and the greatest raw count."""
+        if self.part is None:
+            return raw_span(self.number_format)
+        bits = self._part_width
+        least = -(1 << bits - 1) if self.number_format in SIGNED else 0
+        return Fraction(least), Fraction(least + (1 << bits) - 1)
+
+    @property
+    def _part_width(self) -> int:
+        low, high = self.part or (0, width(self.number_format) - 1)
+        return high - low + 1
+
+    @cached_property
+    def mask(self) -> int:
+        """The bits of the whole number that belong to the part."""
+        return ((1 << self._part_width) - 1) << (self.part[0] if self.part else 0)
+
+    @cached_property
+    def invalid_patterns(self) -> tuple[tuple[int, int], ...]:
+        """Mask and bit pattern of each invalid count; NaN is always invalid.
+
+        A count that fits into the part is compared with the part, a larger one with the whole number. A count
+        outside the format's span gives the bits themselves, such as 8000H of a signed number.
+        """
+        return tuple(self._pattern(count) for count in self.invalid if count == count)
+
+    def _pattern(self, count: float) -> tuple[int, int]:
+        whole = (1 << width(self.number_format)) - 1
+        if self.number_format in FLOATS:
+            mask = whole >> 1 if count == 0 else whole  # a zero has no sign
+            return mask, bits_of(count, self.number_format) & mask
+        if self.part and self.raw_span[0] <= count < 1 << self._part_width:
+            return self.mask, int(count) << self.part[0] & self.mask
+        low, high = raw_span(self.number_format)
+        bits = bits_of(count, self.number_format) if low <= count <= high else int(count)
+        return whole, bits & whole
+
+    # ---- reading ----
+
+    def raw_in(self, data: bytes, at: int) -> float | None:
+        """Return the raw count at word (BIT: bit) `at` of a reply's data; None for an invalid count."""
+        bits = bits_in(data, at, self.number_format, self.order)
+        return None if bits is None else self.raw_of(bits)
+
+    def raw_of(self, bits: int) -> float | None:
+        """Return the raw count of a number's bits; None for an invalid count."""
+        if any(bits & mask == pattern for mask, pattern in self.invalid_patterns):
+            return None
+        if self.part is None:
+            return number_of(bits, self.number_format)
+        found = (bits & self.mask) >> self.part[0]
+        return signed(found, self._part_width) if self.number_format in SIGNED else found
+
+    def value_of(self, raw: float, power: int = 0) -> float:
+        """Return the value of a raw count, times 10 to the `power`.
+
+        A whole 64-bit number is an int, because a float would not hold it exactly.
+        """
+        multiplier, addend, divisor = self.factors
+        multiplier *= int(10 ** max(power, 0))
+        divisor *= int(10 ** max(-power, 0))
+        if divisor == 1 and self.number_format in WHOLE and isinstance(raw, int):
+            return raw * multiplier + addend
+        return (raw * multiplier + addend) / divisor + 0.0  # never -0.0
+
+    # ---- writing ----
+
+    def count_of(self, value: float) -> float:
+        """Return the nearest raw count; in a float format, the nearest float of that size.
+
+        Raises OverflowError beyond the largest float.
+        """
+        count = self.exact_count(value)
+        return nearest(count, self.number_format) if self.number_format in FLOATS else round(count)
+
+    def exact_count(self, value: float) -> Fraction:
+        """Return the raw count of a value, unrounded.
+
+        A float is read as its shortest decimal: 0.3 is three tenths. A float that is a whole count is taken
+        exactly, because a 64-bit count needs that.
+        """
+        count = (Fraction(value) - self.offset) / self.step
+        return count if count.denominator == 1 else (Fraction(str(value)) - self.offset) / self.step
+
+    def pack(self, raw: float) -> bytes:
+        """Return the bytes of a raw count in wire order."""
+        bits = int(raw) & 0xFFFF if self.number_format is NumberFormat.I8 else None
+        whole = bits_of(raw, self.number_format) if bits is None else bits
+        return arranged(whole.to_bytes(2 * WORDS[self.number_format]), self.order)

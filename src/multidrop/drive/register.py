@@ -1,25 +1,78 @@
-"""Registers: what a drive's manual says about one quantity, and its values in a reply and in a request.
+"""Registers: what a drive's manual says about one quantity, and its values in replies and requests.
 
-`Register[float]` has a unit and a step, `Register[E]` the names of an enumeration. `reading`, `setting` and
-`command` (drive/declare.py) make them.
+`Register[float]` has a unit and a step, `Register[E]` the names of an enumeration. Declare them with
+`reading`, `setting` and `command`.
 """
 
 from __future__ import annotations
 
 import math
 import sys
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from decimal import Decimal
-from enum import Enum, Flag, IntEnum
+from enum import Enum, Flag, IntEnum, IntFlag
 from fractions import Fraction
 from functools import cached_property
-from typing import Any, Generic, Self, TypeVar, cast
+from typing import Any, Generic, Protocol, Self, TypedDict, TypeVar, Unpack, cast, overload
 
-from multidrop.core import NumberFormat
-from multidrop.drive.coding import MOST_POWER, Coding
-from multidrop.drive.number_format import FLOATS, SHORT_FLOATS, WHOLE, WORDS, bits_of, shortest
-from multidrop.drive.table import HOLDING, Carrier, Kept, Table
+from multidrop.core import Extra, Field, NumberFormat
+from multidrop.drive.number_format import (
+    FLOATS,
+    MOST_POWER,
+    SHORT_FLOATS,
+    WHOLE,
+    WORDS,
+    Coding,
+    bits_of,
+    shortest,
+)
 from multidrop.printable import plain_number, plain_whole
+
+
+class Kept(Enum):
+    """Memory in which a drive keeps what is written; EEPROM bears a limited number of writes."""
+
+    RAM = "RAM"
+    EEPROM = "EEPROM"
+    UNKNOWN = "not stated"
+
+    __hash__ = object.__hash__  # each member is one object: ten times as fast as by name, which Enum takes
+
+
+class Carrier(Enum):
+    """Field of a frame that carries a table's values."""
+
+    BIT = "bit"
+    WORD = "word"
+    LONG = "four bytes"  # Delixi's D3..D0
+    NUMBER = "parameter number"  # Delixi's P1P0
+
+    __hash__ = object.__hash__  # as above
+
+
+@dataclass(frozen=True)
+class Table:
+    """One of a drive's address spaces, and the function codes that read and write it."""
+
+    name: str
+    read: int | None
+    write: int | None
+    carrier: Carrier = Carrier.WORD
+    kept: Kept = Kept.UNKNOWN  # where the function code alone decides it
+
+    @property
+    def read_space(self) -> tuple[Carrier, int | None]:
+        """Key of the tables that are read alike: their registers may share a request."""
+        return self.carrier, self.read
+
+
+HOLDING = Table("holding register", 0x03, 0x06)
+HOLDING_MULTIPLE = Table("holding register", 0x03, 0x10)  # also one register is written by 10H
+INPUT = Table("input register", 0x04, None)
+COIL = Table("coil", 0x01, 0x05, Carrier.BIT)
+DISCRETE = Table("discrete input", 0x02, None, Carrier.BIT)
+
 
 T = TypeVar("T", bound=float)
 ACRONYMS = frozenset({"DC", "EEPROM", "PID", "PWM"})  # in the names of values
@@ -333,3 +386,104 @@ def _number_in(text: str) -> float:
 def _short(value: float) -> str:
     """Return a number for a sentence; it may be larger than any float."""
     return f"{value:g}" if abs(value) <= sys.float_info.max else "a number of this size"
+
+
+E = TypeVar("E", bound=IntEnum | IntFlag)
+
+
+class Details(TypedDict, total=False):
+    """Facts of a declaration besides address and unit; each may be left out."""
+
+    step: float | None  #: value of one raw count; None where the document does not state it
+    offset: float  #: value of the raw count 0: value = raw * step + offset
+    #: Raw counts that mean "no value". One outside the format's span names the bits: 0x8000 of an I16.
+    invalid: float | tuple[float, ...]
+    #: Lowest and highest bit of a reading that is only a part of the number in its words. `invalid` counts
+    #: that do not fit into the part are compared with the whole number.
+    part: tuple[int, int]
+    order: str  #: bytes as they come on the wire, A the most significant: ABCD, CDAB, BADC, DCBA; AB, BA
+    scale_register: str  #: reading whose signed count is this one's power of ten; one request reads both
+    span: tuple[float, float]  #: smallest and largest value that may be written
+    at_least: str  #: register or option whose present value is the least that may be written
+    at_most: str  #: register or option whose present value is the most
+    number_format: NumberFormat  #: width, sign and kind of the number in the frame
+    table: Table  #: address space and function codes
+    kept: Kept  #: RAM or EEPROM; that of the table where the table has one
+    ram_address: int  #: address at which the same quantity is written without wearing the EEPROM
+    default: float  #: value from the factory
+    while_running: bool  #: may be changed while the motor turns; None where not stated
+    broadcast: tuple[int, ...]  #: raw counts that are documented and harmless as a broadcast
+    #: A write may start, stop or reset something, so only verbs write it. Unless stated, this holds for
+    #: commands, and for settings that have `harmless`.
+    moves: bool
+    #: Of a register that moves the motor, the raw counts that anyone may write at any time, and again when
+    #: the reply is lost. All others are for verbs, which send them once.
+    harmless: tuple[int, ...]
+    never: str  #: reason why the library never writes it
+    never_together: tuple[int, ...]  #: masks of bits that are never set in one write
+    place: str  #: section of the manual
+    outside: str  #: source, where it is not the family's own document
+    note: str  #: further facts for users
+
+
+class Declaration(Protocol):
+    """A function that declares registers, each with its unit or the enumeration of its values."""
+
+    @overload
+    def __call__(self, address: int, unit: str = "", /, **details: Unpack[Details]) -> Register[float]: ...
+    @overload
+    def __call__(self, address: int, values: type[E], /, **details: Unpack[Details]) -> Register[E]: ...
+
+
+def declaration(declare: Callable[..., Register[Any]]) -> Declaration:
+    """Decorate a function that takes an address, a unit or an enumeration, and details."""
+    return cast(Declaration, declare)
+
+
+@declaration
+def reading(address: int, what: str | type = "", /, **details: Unpack[Details]) -> Register[Any]:
+    """Declare a quantity that can only be read, with its unit or the enumeration of its values."""
+    return _declare(Access.READING, address, what, details)
+
+
+@declaration
+def setting(address: int, what: str | type = "", /, **details: Unpack[Details]) -> Register[Any]:
+    """Declare a quantity that can be read and written, with its unit or the enumeration of its values."""
+    return _declare(Access.SETTING, address, what, details)
+
+
+@declaration
+def command(address: int, what: str | type = "", /, **details: Unpack[Details]) -> Register[Any]:
+    """Declare a quantity that can only be written, with its unit or the enumeration of its values."""
+    return _declare(Access.COMMAND, address, what, details)
+
+
+def _declare(access: Access, address: int, what: Any, given: Details) -> Register[Any]:
+    details = cast(Any, given)
+    if isinstance(details.get("invalid"), (int, float)):
+        details = {**details, "invalid": (details["invalid"],)}
+    if isinstance(what, str):
+        return Register(address, access, unit=what, **details)
+    return Register(address, access, values=what, **details)
+
+
+def row_field(register: Register[Any], at: int, code: int) -> Field:
+    """Return the field of a register at word (coils: bit) `at` of a reply; `code` is that of its name."""
+    multiplier, _, divisor = register.coding.factors
+    return Field(at, register.coding.core_format, code, multiplier, divisor, _extra(register, at))
+
+
+def _extra(register: Register[Any], at: int) -> Extra | None:
+    coding, power = register.coding, register.scaled_by
+    if not (register.offset or register.part or coding.invalid_patterns or power):
+        return None
+    low, high = register.part or (0, -1)
+    return Extra(
+        addend=coding.factors[1],
+        low=low,
+        bits=high - low + 1,
+        scale_at=at + power.address - register.address if power else None,
+        scale_format=power.coding.core_format if power else 0,
+        invalid=coding.invalid_patterns,
+        scale_invalid=power.coding.invalid_patterns if power else (),
+    )

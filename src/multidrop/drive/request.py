@@ -1,22 +1,83 @@
-"""Build the requests that read and write registers."""
+"""Requests that read and write registers, and the limits of one read.
+
+A `family` is a drive's class, or a drive, which may have limits of its own.
+"""
 
 from __future__ import annotations
 
 import struct
+from collections.abc import Iterable
+from functools import lru_cache
 from typing import Any
 
 from multidrop.core import Framing, Message
-from multidrop.drive.family import Drive
-from multidrop.drive.read_limits import FUNCTIONS, function_limit
-from multidrop.drive.register import Register
-from multidrop.drive.table import Carrier, Table
+from multidrop.drive.register import Carrier, Register, Table
 
-_WRITE_COILS, _WRITE_WORDS = 0x0F, 0x10  # several at once
-_ADDRESSES = 0x10000  # of each of a drive's four tables (application protocol V1.1b3, 4.3)
+# Registers in one read (application protocol V1.1b3, 6.1 to 6.4); a frame of Delixi's protocol holds one.
+STANDARD_LIMITS = {Carrier.BIT: 2000, Carrier.WORD: 125, Carrier.LONG: 1, Carrier.NUMBER: 1}
+FUNCTIONS = {1: Carrier.BIT, 2: Carrier.BIT, 3: Carrier.WORD, 4: Carrier.WORD}  # function codes that read
+LONGEST_INTERVAL = 10.0  # s
 
 
-def read_request(drive: Drive, table: Table, start: int, count: int) -> Message:
-    """Return the request that reads `count` addresses of a table; ValueError where none can."""
+def stated_limit(family: Any, table: Table) -> int | None:
+    """Return the stated limit of registers in one read of this table; None if none is stated."""
+    stated = [most for other, most in family.most_registers.items() if other.read_space == table.read_space]
+    return min(stated, default=None)
+
+
+def read_limit(family: Any, table: Table) -> int:
+    """Return how many registers one read of this table may take: the stated limit, or the standard's."""
+    stated = stated_limit(family, table)
+    return STANDARD_LIMITS[table.carrier] if stated is None else stated
+
+
+def function_limit(family: Any, function: int) -> int:
+    """Return how many addresses one read by this function may take, declared or not.
+
+    This is the smallest limit that the family states, but enough for its longest register.
+    """
+    standard = STANDARD_LIMITS[FUNCTIONS[function]]
+    stated: list[int] = [most for table, most in family.most_registers.items() if table.read == function]
+    if not stated:
+        return standard
+    held = [len(register.reach) for register in family.registers.values() if register.table.read == function]
+    return min(standard, max(min(stated), *held, 1))
+
+
+def stated_gaps(family: Any, table: Table) -> list[range]:
+    """Return the addresses without registers that may be read across."""
+    return [gap for other, gap in family.readable_gaps.items() if other.read_space == table.read_space]
+
+
+@lru_cache(maxsize=256)
+def readable_addresses(family: Any, table: Table) -> frozenset[int]:
+    """Return the addresses of the family's readable registers in this table."""
+    return frozenset(
+        address
+        for register in family.registers.values()
+        if register.table.read_space == table.read_space and register.readable
+        for address in range(register.address, register.address + register.words)
+    )
+
+
+def may_be_crossed(family: Any, table: Table, addresses: Iterable[int]) -> bool:
+    """Return True if one read may include all these addresses."""
+    declared = family if isinstance(family, type) else type(family)
+    readable, gaps = readable_addresses(declared, table), stated_gaps(family, table)
+    return all(at in readable or any(at in gap for gap in gaps) for at in addresses)
+
+
+# ---- requests ----
+
+_WRITE_COILS, _WRITE_WORDS = 0x0F, 0x10  # multiple coils, multiple registers
+_ADDRESSES = 0x10000  # in each of the four tables (application protocol V1.1b3, 4.3)
+
+
+def read_request(drive: Any, table: Table, start: int, count: int) -> Message:
+    """Return the request that reads `count` addresses of a table.
+
+    Raises ValueError if the table cannot be read.
+    """
     if table.read is None:
         raise ValueError(f"a {table.name} cannot be read")
     if table.carrier in (Carrier.LONG, Carrier.NUMBER):
@@ -24,11 +85,11 @@ def read_request(drive: Drive, table: Table, start: int, count: int) -> Message:
     return Message(drive.address, table.read, start, count)
 
 
-def write_request(drive: Drive, register: Register[Any], raw: float, address: int | None = None) -> Message:
-    """Return the request that writes a raw count to a register, or to its RAM alias where it has one.
+def write_request(drive: Any, register: Register[Any], raw: float, address: int | None = None) -> Message:
+    """Return the request that writes a raw count to a register, or to its RAM alias if it has one.
 
-    `address` takes the place of the drive's own, for a broadcast. Raises ValueError where the register
-    cannot be written.
+    `address` replaces the drive's own address, for a broadcast. Raises ValueError if the register cannot be
+    written.
     """
     table = register.table
     if not register.writable or table.write is None:
@@ -51,34 +112,31 @@ def write_request(drive: Drive, register: Register[Any], raw: float, address: in
     return Message(to, _WRITE_WORDS, at, count=register.words, data=words)
 
 
-def check_no_read(drive: Drive, request: Message) -> None:
-    """Raise ValueError for a read of Modbus.
-
-    One that waits as long as a write may return the late reply to another read.
-    """
+def check_no_read(drive: Any, request: Message) -> None:
+    """Raise ValueError for a Modbus read: as a raw request it could return another read's late reply."""
     if drive.framing is not Framing.DELIXI and request.function in FUNCTIONS:
         asked = f"{request.function}, {request.start}, {request.count}"
         raise ValueError(
             f"function {request.function:02X}H is a read, which bus.raw does not send: call "
-            f"bus.ask(drive, {asked}), which returns no late reply to another request"
+            f"bus.ask(drive, {asked}), which cannot return another request's late reply"
         )
 
 
-def any_read(drive: Drive, function: int, start: int, count: int) -> Message:
-    """Return the request that reads addresses by one of Modbus' functions 01 to 04, declared or not.
+def any_read(drive: Any, function: int, start: int, count: int) -> Message:
+    """Return the request that reads addresses, declared or not, by one of the Modbus functions 01 to 04.
 
-    Raises TypeError for what is no whole number, and ValueError for another function, a drive that speaks no
-    Modbus, and a span that no request, or no request to this family, can read.
+    Raises TypeError unless all three are whole numbers. Raises ValueError for another function, for a drive
+    that does not speak Modbus, and for more addresses than one request to this family may read.
     """
     for name, number in (("function", function), ("start", start), ("count", count)):
         if isinstance(number, bool) or not isinstance(number, int):
-            raise TypeError(f"{name} = {number!r} is no whole number")
+            raise TypeError(f"{name} = {number!r} is not a whole number")
     if drive.framing is Framing.DELIXI:
-        raise ValueError(f"{drive.name} speaks Delixi's own protocol, which has none of Modbus' functions")
+        raise ValueError(f"{drive.name} speaks Delixi's own protocol, which has no Modbus functions")
     if function not in FUNCTIONS:
-        raise ValueError(f"function = {function} is none of those that read: 1, 2, 3 and 4")
+        raise ValueError(f"function = {function} does not read; 1, 2, 3 and 4 do")
     if not 0 <= start < _ADDRESSES:
-        raise ValueError(f"start = {start} is no address from 0 to {_ADDRESSES - 1}")
+        raise ValueError(f"start = {start} is not an address from 0 to {_ADDRESSES - 1}")
     most = function_limit(drive, function)
     if not 1 <= count <= most:
         raise ValueError(f"count = {count} is not from 1 to {most}, which {drive.name} reads in one request")

@@ -1,7 +1,8 @@
-"""State: condition, direction and fault, as a drive reports them."""
+"""State: condition, direction and fault, as a drive reports them; and the setpoint written last."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
 
@@ -17,12 +18,12 @@ class Condition(Enum):
     ACCELERATING = "accelerating"
     DECELERATING = "decelerating"
     FAULT = "fault"
-    UNKNOWN = "unknown"  # the drive cannot say; never to be taken for stopped
+    UNKNOWN = "unknown"  # the drive cannot say; never treat it as stopped
 
 
 @dataclass(frozen=True)
 class State:
-    """A drive's report of itself: never more than its document lets it say."""
+    """A drive's state, as far as its document defines it."""
 
     condition: Condition
     direction: Direction | None = None
@@ -38,3 +39,38 @@ class State:
         if self.note:
             words.append(f"- {self.note}")
         return " ".join(words)
+
+
+class _PendingWrite:
+    """A write of the setpoint whose result is not known."""
+
+    def __init__(self, before: float | _PendingWrite | None) -> None:
+        self.before = before
+
+
+class KnownSetpoint:
+    """The setpoint of one drive: None unless the drive is known to hold the value written last."""
+
+    def __init__(self) -> None:
+        self._held: float | _PendingWrite | None = None
+
+    @property
+    def value(self) -> float | None:
+        return None if isinstance(self._held, _PendingWrite) else self._held
+
+    @value.setter
+    def value(self, value: float | None) -> None:
+        self._held = value
+
+    def begin_write(self) -> Callable[[], None]:
+        """Forget the setpoint until the write ends; return a callback that restores it if nothing was sent.
+
+        A value that another thread wrote in between stays.
+        """
+        write = self._held = _PendingWrite(self._held)
+
+        def restore() -> None:
+            if self._held is write:
+                self._held = write.before
+
+        return restore

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 
-from multidrop.drive.table import HOLDING, Table
+from multidrop.drive.register import HOLDING, Table
 
 _LAST_ADDRESS = 0xFFFF
 MOST_WORDS = 125  # of one request
@@ -77,20 +76,6 @@ def text(address: int, length: int, *, table: Table = HOLDING, order: str = "AB"
     Order "B" is one character in each, in its low byte.
     """
     return Text(address, length, table, order, place)
-
-
-def text_errors(texts: Mapping[str, Text], taken: Collection[str]) -> list[str]:
-    """Return a sentence for each error in a class's texts; `taken` are names that drives have already."""
-    found = [
-        f"{name}: this is a name that every drive has for something else; call it otherwise"
-        for name in texts
-        if name in taken
-    ]
-    return found + [
-        f"{name}: this is the text {text.name} already; declare one of its own"
-        for name, text in texts.items()
-        if text.name != name
-    ]
 
 
 def _is_whole(number: object) -> bool:

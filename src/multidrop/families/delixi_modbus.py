@@ -7,11 +7,9 @@ from enum import IntEnum
 from typing import Any
 
 from multidrop.drive import Framing, WriteForbidden
-from multidrop.drive.declare import command, setting
-from multidrop.drive.register import Register
+from multidrop.drive.register import HOLDING, Kept, Register, command, setting
 from multidrop.drive.script import Script, insist, read, write
 from multidrop.drive.state import Condition, Direction, State
-from multidrop.drive.table import HOLDING, Kept
 from multidrop.drive.verbs import verb
 from multidrop.families.delixi_parameters import KEYPAD, DelixiBaudrate, DelixiParameters, parameter
 

@@ -6,11 +6,9 @@ from enum import IntEnum
 from typing import Any
 
 from multidrop.drive import Framing, NotVerified, WriteForbidden
-from multidrop.drive.declare import command, reading, setting
-from multidrop.drive.register import Register
+from multidrop.drive.register import Carrier, Kept, Register, Table, command, reading, setting
 from multidrop.drive.script import Script, insist, read, write
 from multidrop.drive.state import Condition, Direction, State
-from multidrop.drive.table import Carrier, Kept, Table
 from multidrop.drive.verbs import verb
 from multidrop.families.delixi_parameters import KEYPAD, DelixiParameters, parameter
 

@@ -6,11 +6,9 @@ from dataclasses import replace
 from enum import IntEnum
 
 from multidrop.drive import Drive, WriteForbidden
-from multidrop.drive.declare import reading, setting
 from multidrop.drive.options import Option
-from multidrop.drive.register import Register, Worded
+from multidrop.drive.register import Register, Table, Worded, reading, setting
 from multidrop.drive.script import Script, read
-from multidrop.drive.table import Table
 
 STOP_TIME = 60.0  # s; the deceleration time's number is not known
 

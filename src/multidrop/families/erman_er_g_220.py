@@ -6,13 +6,21 @@ from enum import IntEnum, IntFlag
 from typing import Any, Unpack
 
 from multidrop.drive import Advice, BusError, Drive, DriveException, Unconfirmed, WriteForbidden
-from multidrop.drive.declare import Details, command, declaration, reading, setting
 from multidrop.drive.number_format import NumberFormat
 from multidrop.drive.options import Option
-from multidrop.drive.register import Register
+from multidrop.drive.register import (
+    COIL,
+    HOLDING,
+    INPUT,
+    Details,
+    Register,
+    command,
+    declaration,
+    reading,
+    setting,
+)
 from multidrop.drive.script import Script, insist, read, write
 from multidrop.drive.state import Condition, Direction, State
-from multidrop.drive.table import COIL, HOLDING, INPUT
 from multidrop.drive.verbs import verb
 
 STOP_MARGIN = 5.0  # s, on top of the deceleration time

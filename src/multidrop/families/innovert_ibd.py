@@ -5,11 +5,10 @@ from __future__ import annotations
 from enum import IntEnum, IntFlag
 
 from multidrop.drive import Advice, BusError, Drive, DriveException, Framing, WriteForbidden
-from multidrop.drive.declare import command, reading, setting
 from multidrop.drive.options import Option
+from multidrop.drive.register import HOLDING, command, reading, setting
 from multidrop.drive.script import Script, insist, read, write
 from multidrop.drive.state import Condition, Direction, State
-from multidrop.drive.table import HOLDING
 from multidrop.drive.verbs import verb
 
 STOP_MARGIN = 5.0  # s, on top of the deceleration time

@@ -15,13 +15,21 @@ from multidrop.drive import (
     NotVerified,
     WriteForbidden,
 )
-from multidrop.drive.declare import Details, command, declaration, reading, setting
 from multidrop.drive.number_format import NumberFormat
 from multidrop.drive.options import Option
-from multidrop.drive.register import Register, Worded
+from multidrop.drive.register import (
+    HOLDING,
+    Details,
+    Kept,
+    Register,
+    Worded,
+    command,
+    declaration,
+    reading,
+    setting,
+)
 from multidrop.drive.script import Script, insist, read, write
 from multidrop.drive.state import Condition, Direction, State
-from multidrop.drive.table import HOLDING, Kept
 from multidrop.drive.verbs import verb
 
 CHE100 = "CHE100 manual v1.4, p. 117"

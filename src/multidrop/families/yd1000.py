@@ -9,12 +9,10 @@ from enum import IntEnum, IntFlag
 from typing import Any, Unpack
 
 from multidrop.drive import BusError, Drive, DriveException, NotVerified, Unconfirmed, WriteForbidden
-from multidrop.drive.declare import Details, command, reading, setting
 from multidrop.drive.options import Option
-from multidrop.drive.register import Register
+from multidrop.drive.register import HOLDING, Details, Kept, Register, command, reading, setting
 from multidrop.drive.script import Pulse, Script, insist, read, until, wait, write
 from multidrop.drive.state import Condition, Direction, State
-from multidrop.drive.table import HOLDING, Kept
 from multidrop.drive.verbs import verb
 
 STOP_MARGIN = 5.0  # s, on top of the deceleration time

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from enum import Enum
 from typing import Any
 
-from multidrop.drive.fact_check import UNIT_IDS
+from multidrop.drive.declaration_check import UNIT_IDS
 from multidrop.drive.family import TAKEN_NAMES
 from multidrop.families.files.names import OF_ENUMERATIONS, unusable
 from multidrop.importers.line_settings import UNKNOWN_LINE, LineSettings

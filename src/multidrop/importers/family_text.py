@@ -6,7 +6,7 @@ import json
 from collections.abc import Iterator
 from typing import Any
 
-from multidrop.drive.line_facts import SERIAL_ADDRESSES
+from multidrop.drive.line_settings import SERIAL_ADDRESSES
 from multidrop.families.files.addresses import sent_as
 from multidrop.families.files.csv_table import MOST_BYTES
 from multidrop.importers.device import ImportedDevice, ImportedRegister

@@ -8,8 +8,7 @@ from typing import Any
 
 from multidrop.drive.declaration_check import DeclarationError, declaration_errors
 from multidrop.drive.family import TAKEN_NAMES, Drive
-from multidrop.drive.register import Access, Register
-from multidrop.drive.table import HOLDING
+from multidrop.drive.register import HOLDING, Access, Register
 from multidrop.drive.text import Text
 from multidrop.families.files.addresses import Counting
 from multidrop.families.files.registers import MOST_REGISTERS, Declared

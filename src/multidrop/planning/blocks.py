@@ -10,12 +10,9 @@ from itertools import accumulate
 from typing import Any
 
 from multidrop.core import Framing, Message
-from multidrop.drive.family import Drive
-from multidrop.drive.own import check_readable
-from multidrop.drive.read_limits import may_be_crossed, read_limit, read_span
-from multidrop.drive.register import Register
-from multidrop.drive.request import read_request
-from multidrop.drive.table import Carrier, Table
+from multidrop.drive.family import Drive, check_readable
+from multidrop.drive.register import Carrier, Register, Table
+from multidrop.drive.request import may_be_crossed, read_limit, read_request
 from multidrop.drive.text import Text
 from multidrop.planning.bus_time import characters, silence
 
@@ -33,7 +30,7 @@ class Block:
     @classmethod
     def of(cls, drive: Drive, registers: Sequence[Register[Any]]) -> Block:
         """Return the block that reads these registers of one read space and what lies between them."""
-        spans = [read_span(drive, register) for register in registers]
+        spans = [register.reach for register in registers]
         table, start = registers[0].table, min(span.start for span in spans)
         count = max(span.stop for span in spans) - start
         return cls(table, start, count, tuple(registers), read_request(drive, table, start, count))
@@ -192,7 +189,7 @@ def _neighbours(drive: Drive, registers: Iterable[Register[Any]]) -> list[_Neigh
     spaces: dict[object, list[tuple[range, Register[Any]]]] = {}
     for register in dict.fromkeys(registers):
         check_readable(drive, register)
-        spaces.setdefault(register.table.read_space, []).append((read_span(drive, register), register))
+        spaces.setdefault(register.table.read_space, []).append((register.reach, register))
     return [_side_by_side(drive, wanted) for wanted in spaces.values()]
 
 

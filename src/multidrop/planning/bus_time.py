@@ -7,7 +7,7 @@ from itertools import pairwise
 
 from multidrop.core import Framing
 from multidrop.drive.family import Drive
-from multidrop.drive.table import Carrier
+from multidrop.drive.register import Carrier
 
 # Characters of a read's request and reply without its data, and of each byte of that.
 _FRAMES = {

@@ -13,8 +13,7 @@ from functools import lru_cache
 from typing import Any
 
 from multidrop.drive.family import Drive
-from multidrop.drive.register import Access, Register
-from multidrop.drive.table import Carrier
+from multidrop.drive.register import Access, Carrier, Register
 from multidrop.planning.blocks import Block, all_requests
 
 MOST_PROOFS = 4  # each costs memory for every drive

@@ -8,9 +8,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from multidrop.drive.family import Drive
-from multidrop.drive.read_limits import readable_addresses, stated_gaps
-from multidrop.drive.register import Register
-from multidrop.drive.table import COIL, DISCRETE, HOLDING, HOLDING_MULTIPLE, INPUT, Table
+from multidrop.drive.register import COIL, DISCRETE, HOLDING, HOLDING_MULTIPLE, INPUT, Register, Table
+from multidrop.drive.request import readable_addresses, stated_gaps
 from multidrop.planning.blocks import Planned, planned, sending
 from multidrop.planning.bus_time import silence
 

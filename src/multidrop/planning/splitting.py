@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 from multidrop.drive.family import Drive
-from multidrop.drive.read_limits import read_span, stated_limit
 from multidrop.drive.register import Register
+from multidrop.drive.request import stated_limit
 from multidrop.planning.blocks import Block
 
 
@@ -29,7 +29,7 @@ def _units(drive: Drive, block: Block) -> list[list[Register[Any]]]:
     groups = {name: place for place, group in enumerate(drive.read_together) for name in group}
     found: dict[object, list[Register[Any]]] = {}
     for register in block.registers:
-        span = read_span(drive, register)
+        span = register.reach
         found.setdefault(groups.get(register.name, (span.start, span.stop)), []).append(register)
     return list(found.values())
 

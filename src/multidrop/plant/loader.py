@@ -11,8 +11,7 @@ from typing import Any
 
 from multidrop.core import RS485, Echo, TransactionIds
 from multidrop.drive.family import Drive
-from multidrop.drive.network import check_port, check_settle, speaks_tcp
-from multidrop.drive.timing import Settings
+from multidrop.drive.line_settings import Settings, check_port, check_settle, speaks_tcp
 from multidrop.families import MODELS
 from multidrop.families.files.errors import FamilyError
 from multidrop.families.registry import find_model

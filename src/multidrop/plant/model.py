@@ -10,7 +10,7 @@ from typing import Any, NoReturn
 
 from multidrop.core import RS485, Echo, TransactionIds
 from multidrop.drive.family import Drive
-from multidrop.drive.network import check_port
+from multidrop.drive.line_settings import check_port
 from multidrop.drive.register import Register
 from multidrop.plant import metadata
 from multidrop.toml_check import check_period

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from multidrop.bus import Bus
 from multidrop.control.exit_hook import exit_hook
 from multidrop.drive.family import Drive
-from multidrop.drive.network import speaks_tcp
+from multidrop.drive.line_settings import speaks_tcp
 from multidrop.errors import LineError
 from multidrop.plant.model import Plant, PlantLine
 from multidrop.polling.changes import DriveChanges, check_plant, drive_changes, has_same_port

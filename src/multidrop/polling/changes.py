@@ -7,9 +7,8 @@ from copy import copy
 from functools import partial
 from typing import Any, NamedTuple
 
-from multidrop.drive.family import Drive
-from multidrop.drive.network import speaks_tcp
-from multidrop.drive.own import check_own, check_readable
+from multidrop.drive.family import Drive, check_own, check_readable
+from multidrop.drive.line_settings import speaks_tcp
 from multidrop.drive.register import Register
 from multidrop.plant.loader import PlantError
 from multidrop.plant.model import Plant, PlantLine, PolledDrive

@@ -7,9 +7,8 @@ from dataclasses import dataclass
 
 from multidrop.bus import Bus
 from multidrop.core import Exchange, Names, RowLayout
-from multidrop.drive.family import Drive
-from multidrop.drive.own import check_own
-from multidrop.drive.row_field import row_field
+from multidrop.drive.family import Drive, check_own
+from multidrop.drive.register import row_field
 from multidrop.planning.blocks import Block, Plan, plan, sending
 from multidrop.planning.bus_time import kind, silence
 from multidrop.planning.schedule import Job

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import PercentFormatter
 
 from multidrop.core import UNASKED, Framing, Message, build_request, characters_on_wire, reply_length
-from multidrop.drive.timing import Settings
+from multidrop.drive.line_settings import Settings
 from multidrop.report.load import Array, Recording, Series
 from multidrop.report.style import (
     COLOURS,

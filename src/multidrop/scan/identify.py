@@ -11,10 +11,10 @@ from typing import Any, Protocol, TypeVar
 
 from multidrop.core import STATUSES, Completion, Failure, FrameFault, Framing, Message, Peer, crc16
 from multidrop.drive.family import Drive
+from multidrop.drive.line_settings import Settings
 from multidrop.drive.register import Register
 from multidrop.drive.script import Read, Script, Step, carry_out
 from multidrop.drive.text import Text
-from multidrop.drive.timing import Settings
 from multidrop.errors import BusError, NoValue, WriteForbidden
 from multidrop.planning.blocks import blocks, text_blocks
 from multidrop.scan.results import GUESS, Found

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from multidrop.core import Framing
-from multidrop.drive.timing import Settings
+from multidrop.drive.line_settings import Settings
 
 GUESS = "it only reads like one: look at its name plate"
 

@@ -12,9 +12,8 @@ from weakref import WeakKeyDictionary
 
 from multidrop.core import MODBUS, Framing, Message, build_request
 from multidrop.drive.family import Drive
-from multidrop.drive.register import Access, Register
-from multidrop.drive.table import Carrier, Table
-from multidrop.drive.timing import Settings
+from multidrop.drive.line_settings import Settings
+from multidrop.drive.register import Access, Carrier, Register, Table
 from multidrop.planning.blocks import Block
 from multidrop.planning.bus_time import silence
 from multidrop.transport.peers import LEAST_TIMEOUT

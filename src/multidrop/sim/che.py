@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from multidrop.core import Message
-from multidrop.drive.table import HOLDING
+from multidrop.drive.register import HOLDING
 from multidrop.sim.memory import MemoryCell
 from multidrop.sim.motor_drive import MotorDrive
 from multidrop.sim.protocol import MODBUS, Reason, Refusal

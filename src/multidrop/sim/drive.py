@@ -14,9 +14,8 @@ from typing import Any, ClassVar, NamedTuple
 
 from multidrop.core import Framing, Message
 from multidrop.drive.family import Drive
-from multidrop.drive.read_limits import STANDARD_LIMITS, read_limit
-from multidrop.drive.register import Access, Register
-from multidrop.drive.table import Carrier, Kept, Table
+from multidrop.drive.register import Access, Carrier, Kept, Register, Table
+from multidrop.drive.request import STANDARD_LIMITS, read_limit
 from multidrop.sim.memory import Memory, MemoryCell, decode, pack
 from multidrop.sim.protocol import PROTOCOLS, Reason, Refusal
 from multidrop.sim.receiver import Frame

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from multidrop.core import Message
-from multidrop.drive.table import COIL
+from multidrop.drive.register import COIL
 from multidrop.sim.motor import Phase
 from multidrop.sim.motor_drive import MotorDrive
 from multidrop.sim.protocol import Reason

@@ -16,8 +16,7 @@ from typing import Any
 from multidrop.core import Framing
 from multidrop.drive.family import Drive
 from multidrop.drive.number_format import arranged, bits_of
-from multidrop.drive.register import Access, Register
-from multidrop.drive.table import Carrier, Table
+from multidrop.drive.register import Access, Carrier, Register, Table
 from multidrop.drive.text import Text
 
 _ALSO_WRITES = {0x05: 0x0F, 0x06: 0x10}  # the same cells, several at once

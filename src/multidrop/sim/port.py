@@ -10,7 +10,7 @@ from urllib.parse import urlsplit
 
 from multidrop.control.eeprom_ledger import default_path
 from multidrop.core import get_settings, set_settings
-from multidrop.drive.timing import Settings
+from multidrop.drive.line_settings import Settings
 from multidrop.transport.port_identity import of_address
 from multidrop.transport.simulated_ports import SimulatedPort
 

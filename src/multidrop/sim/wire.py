@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from multidrop.core import Framing, build_reply
-from multidrop.drive.timing import Settings
+from multidrop.drive.line_settings import Settings
 from multidrop.sim.drive import SimulatedDrive
 from multidrop.sim.port import SimulatedEnd, open_port
 from multidrop.sim.receiver import Frame, Receiver

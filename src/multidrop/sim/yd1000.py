@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from multidrop.core import Message
-from multidrop.drive.table import HOLDING
+from multidrop.drive.register import HOLDING
 from multidrop.sim.memory import MemoryCell, decode
 from multidrop.sim.motor_drive import MotorDrive
 from multidrop.sim.protocol import Reason, Refusal

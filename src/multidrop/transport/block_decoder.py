@@ -7,8 +7,7 @@ from typing import Any
 
 from multidrop.core import Completion, RowLayout
 from multidrop.drive.number_format import FLOATS
-from multidrop.drive.register import Register
-from multidrop.drive.row_field import row_field
+from multidrop.drive.register import Register, row_field
 from multidrop.planning.blocks import Block
 
 MOST_EXACT = 1 << 53  # a float holds every whole number up to it

@@ -21,7 +21,7 @@ from multidrop.core import (
 )
 from multidrop.core.fork import register_at_fork
 from multidrop.core.undisturbed import undisturbed
-from multidrop.drive.network import check_settle, speaks_tcp
+from multidrop.drive.line_settings import check_settle, speaks_tcp
 from multidrop.errors import LineError, NoSuchPort, PortLost
 from multidrop.transport.aside_log import flush, words_of
 from multidrop.transport.bridge import PORT_FAILURES

@@ -8,7 +8,7 @@ from __future__ import annotations
 from urllib.parse import urlsplit
 
 from multidrop.core import crc16
-from multidrop.drive.network import MODBUS_PORT
+from multidrop.drive.line_settings import MODBUS_PORT
 
 _HEAD = 6  # bytes of Modbus TCP's header before the unit id
 _LEAST, _MOST_RTU = 5, 256  # bytes of an RTU frame: an exception is the shortest reply

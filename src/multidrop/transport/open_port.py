@@ -16,7 +16,7 @@ from multidrop.core import (
     is_pseudo_terminal,
     must_take,
 )
-from multidrop.drive.network import speaks_tcp
+from multidrop.drive.line_settings import speaks_tcp
 from multidrop.errors import LineError
 from multidrop.transport import clock
 from multidrop.transport.bridge import PORT_FAILURES, Bridge, hand_on_nothing_late, set_up

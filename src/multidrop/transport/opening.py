@@ -13,7 +13,7 @@ from urllib.parse import SplitResult
 import serial
 
 from multidrop.core import Failure, Mastership, Port
-from multidrop.drive.network import MODBUS_PORT, SCHEMES, URLS, url_of
+from multidrop.drive.line_settings import MODBUS_PORT, SCHEMES, URLS, url_of
 from multidrop.errors import NoSuchPort
 from multidrop.transport import port_identity
 from multidrop.transport.mixed_up import mixed_up

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from multidrop.core import Completion, Exchange, Framing, Peer, TransactionIds
-from multidrop.drive.family import Drive
-from multidrop.drive.own import check_drive
+from multidrop.drive.family import Drive, check_drive
 from multidrop.errors import NotAttached
 from multidrop.planning.bus_time import silence
 from multidrop.planning.proofs import proofs

@@ -9,7 +9,7 @@ import sys
 from pathlib import Path
 from urllib.parse import urlsplit
 
-from multidrop.drive.network import MODBUS_PORT, speaks_tcp
+from multidrop.drive.line_settings import MODBUS_PORT, speaks_tcp
 from multidrop.transport.usb_adapter import adapter_of
 
 BY_ID = Path("/dev/serial/by-id")  # links that udev makes, with each adapter's serial number

@@ -7,8 +7,7 @@ from typing import Any
 
 from multidrop import core
 from multidrop.core import Completion, Exchange, Message, Peer
-from multidrop.drive.family import Drive
-from multidrop.drive.own import check_own
+from multidrop.drive.family import Drive, check_own
 from multidrop.drive.register import Register
 from multidrop.planning.blocks import Block, blocks
 from multidrop.planning.bus_time import silence

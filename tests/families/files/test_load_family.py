@@ -15,8 +15,7 @@ from tables import table
 from multidrop import Drive, FamilyError, load_family
 from multidrop.core import NumberFormat
 from multidrop.drive import Kept
-from multidrop.drive.register import Register
-from multidrop.drive.table import HOLDING, INPUT
+from multidrop.drive.register import HOLDING, INPUT, Register
 from multidrop.families.files.facts import FAMILY_KEYS
 from multidrop.families.files.loader import SECTIONS
 from multidrop.families.files.register_keys import REGISTER_KEYS

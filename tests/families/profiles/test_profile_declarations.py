@@ -13,8 +13,7 @@ from tables import table
 from multidrop.core import NumberFormat
 from multidrop.drive import Drive, DriveException, WriteForbidden
 from multidrop.drive.declaration_check import DeclarationError
-from multidrop.drive.declare import command, reading, setting
-from multidrop.drive.table import COIL
+from multidrop.drive.register import COIL, command, reading, setting
 from multidrop.drive.verbs import VERBS
 from multidrop.families.profiles import PROFILES, Delta, Profidrive
 

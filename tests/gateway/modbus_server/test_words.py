@@ -20,10 +20,7 @@ from tables import table
 
 from multidrop.core import Columns, Names, NumberFormat, RowLayout
 from multidrop.drive import Drive
-from multidrop.drive.declare import reading
-from multidrop.drive.register import Register
-from multidrop.drive.row_field import row_field
-from multidrop.drive.table import COIL, DISCRETE, HOLDING, INPUT
+from multidrop.drive.register import COIL, DISCRETE, HOLDING, INPUT, Register, reading, row_field
 from multidrop.gateway.modbus_server.words import DriveWords, Lack, exact_data
 from multidrop.plant.model import Polled, PolledDrive
 from multidrop.polling.batch import Batch

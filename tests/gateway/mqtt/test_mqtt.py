@@ -33,7 +33,7 @@ from lines import until
 from peers import require_module
 
 from multidrop import Drive, InvtCHE, PolledDrive
-from multidrop.drive.declare import reading, setting
+from multidrop.drive.register import reading, setting
 from multidrop.families import MODELS
 from multidrop.gateway.clock import boottime_ns
 from multidrop.gateway.commands import Told

@@ -12,8 +12,7 @@ from multidrop.bus import Bus
 from multidrop.cli.support.output import command_line
 from multidrop.core import RS485, Echo
 from multidrop.drive.family import Drive
-from multidrop.drive.network import check_port
-from multidrop.drive.timing import Settings
+from multidrop.drive.line_settings import Settings, check_port
 from multidrop.families.registry import find_model
 from multidrop.plant.drive_names import drive_meant
 from multidrop.plant.loader import load_plant

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from multidrop.drive.table import COIL, DISCRETE, HOLDING, INPUT, Table
+from multidrop.drive.register import COIL, DISCRETE, HOLDING, INPUT, Table
 
 TABLES: Mapping[str, Table] = {"holding": HOLDING, "input": INPUT, "coil": COIL, "discrete": DISCRETE}
 _TABLE_OF_DIGIT = {"0": "coil", "1": "discrete", "3": "input", "4": "holding"}

@@ -6,11 +6,10 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from multidrop.core import Framing
-from multidrop.drive.fact_check import UNIT_IDS
-from multidrop.drive.line_facts import LONGEST_SILENCE
-from multidrop.drive.read_limits import LONGEST_INTERVAL, STANDARD_LIMITS
-from multidrop.drive.table import Table
-from multidrop.drive.timing import Settings
+from multidrop.drive.declaration_check import UNIT_IDS
+from multidrop.drive.line_settings import LONGEST_SILENCE, Settings
+from multidrop.drive.register import Table
+from multidrop.drive.request import LONGEST_INTERVAL, STANDARD_LIMITS
 from multidrop.families.files.addresses import TABLES, Counting
 from multidrop.families.files.register_keys import WRITES, shown
 from multidrop.toml_check import Key, TomlPlace, duration_of

@@ -12,8 +12,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from multidrop.core import NumberFormat
-from multidrop.drive.register import Access
-from multidrop.drive.table import Kept
+from multidrop.drive.register import Access, Kept
 from multidrop.families.files import cells
 from multidrop.families.files.addresses import TABLES
 

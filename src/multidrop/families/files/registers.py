@@ -6,10 +6,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from multidrop.drive.declare import command, reading, setting
 from multidrop.drive.family import TAKEN_NAMES
-from multidrop.drive.register import Access, Register
-from multidrop.drive.table import HOLDING_MULTIPLE, Carrier
+from multidrop.drive.register import HOLDING_MULTIPLE, Access, Carrier, Register, command, reading, setting
 from multidrop.families.files.addresses import TABLES, Counting
 from multidrop.families.files.names import enumeration, flags, unusable
 from multidrop.families.files.register_keys import DEFAULT_KEYS, NOT_DETAILS, REGISTER_KEYS, converted, shown

@@ -12,8 +12,7 @@ from enum import IntEnum, IntFlag
 from typing import Any, cast
 
 from multidrop.drive.number_format import NumberFormat
-from multidrop.drive.register import Access, Register
-from multidrop.drive.table import Carrier
+from multidrop.drive.register import Access, Carrier, Register
 
 _CODED = "what the profile itself says; leave it out"
 

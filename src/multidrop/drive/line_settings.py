@@ -1,0 +1,161 @@
+"""Line settings: names of ports, baud rate and character format, and the durations that follow from them."""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import dataclass
+from functools import cached_property
+from urllib.parse import SplitResult, urlsplit
+
+from multidrop.core import Framing
+from multidrop.errors import NoSuchPort
+from multidrop.printable import masked
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Baud rate and character format of a line, such as 9600 and "8N1"."""
+
+    baudrate: int
+    format: str
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.baudrate, int) or not 50 <= self.baudrate <= 4_000_000:
+            raise ValueError(f"baud rate {self.baudrate!r} is outside 50 to 4000000")
+        if not re.fullmatch("[78][NEO][12]", self.format):
+            raise ValueError(
+                f"format {self.format!r} is not data bits, parity and stop bits, such as 8N1, 8E1 or 7N2"
+            )
+
+    @property
+    def databits(self) -> int:
+        return int(self.format[0])
+
+    @property
+    def parity(self) -> str:
+        return self.format[1]
+
+    @property
+    def stopbits(self) -> int:
+        return int(self.format[2])
+
+    @cached_property
+    def character(self) -> float:
+        """Seconds of one character: start bit, data bits, parity bit if any, stop bits."""
+        bits = 1 + self.databits + (self.parity != "N") + self.stopbits
+        return bits / self.baudrate
+
+    @cached_property
+    def t3_5(self) -> float:
+        """Silence between RTU frames, s: 3.5 characters, fixed above 19200 (serial-line guide 2.5.1.1)."""
+        return 1.75e-3 if self.baudrate > 19200 else 3.5 * self.character
+
+    @property
+    def bit(self) -> float:
+        return 1 / self.baudrate
+
+    def __str__(self) -> str:
+        return f"{self.baudrate} {self.format}"
+
+
+MODBUS_PORT = 502  # if a URL names none
+SCHEMES = ("tcp", "socket", "rfc2217")  # not all of pyserial's: its spy:// writes to any file
+URLS = "tcp://10.0.0.7, socket://10.0.0.7:4001 or rfc2217://10.0.0.7:4001"
+
+
+def check_port(port: str) -> str:
+    """Return a port's name from a file or a command line.
+
+    Raises NoSuchPort for a URL with another scheme, with a user or a password, or without its host or port
+    number.
+    """
+    scheme, is_url, _ = port.partition("://")
+    if is_url and scheme.lower() not in SCHEMES:
+        raise NoSuchPort(masked(port), f"there is no {scheme}://; a URL is such as {URLS}")
+    if is_url and url_of(port).username is not None:
+        raise NoSuchPort(masked(port), "it has a user or a password, which no port takes: remove it")
+    url_of(port)
+    return port
+
+
+def speaks_tcp(port: str) -> bool:
+    """Return True for a Modbus TCP port."""
+    return port.partition("://")[0].lower() == "tcp"
+
+
+def url_of(port: str) -> SplitResult:
+    """Return the parts of a port's name. Raises NoSuchPort for a URL without its host or port number."""
+    try:
+        url = urlsplit(port)
+        host, number = url.hostname, url.port
+    except ValueError as mistake:
+        raise NoSuchPort(port, str(mistake)) from mistake
+    if url.scheme == "tcp" and (not host or number == 0):
+        raise NoSuchPort(port, f"it needs a host, such as tcp://10.0.0.7 or tcp://10.0.0.7:{MODBUS_PORT}")
+    if url.scheme in ("socket", "rfc2217") and not (host and number):
+        raise NoSuchPort(port, f"it needs a host and a port number, such as {url.scheme}://10.0.0.7:4001")
+    return url
+
+
+MOST_SETTLE = 10.0  # s; a process that ends may have to wait this long
+
+
+def check_settle(settle: float) -> None:
+    """Raise ValueError unless a line may wait this many seconds after its port is opened."""
+    is_number = isinstance(settle, int | float) and not isinstance(settle, bool)
+    if not (is_number and 0 <= settle <= MOST_SETTLE):
+        raise ValueError(f"settle = {settle!r} is not a number of seconds from 0 to {MOST_SETTLE:g}")
+
+
+# ---- one drive on a line ----
+
+LONGEST_SILENCE = 1.0  # s
+SERIAL_ADDRESSES = range(1, 248)  # 0 is the broadcast address
+
+
+def framing_on(
+    port: str, declared: Framing | None, default: Framing, address: int, *, family: str, speaks_modbus: bool
+) -> Framing:
+    """Return the framing of a drive on this port: TCP on tcp://, else the declared one or the default.
+
+    Raises ValueError if the drive cannot be used on the port.
+    """
+    wanted = default if declared is None else declared
+    if speaks_tcp(port):
+        if declared not in (None, Framing.TCP):
+            raise ValueError(
+                f"framing {wanted} is a serial line's, and {port} speaks Modbus TCP: leave "
+                "framing out, or name the port socket:// if the far end passes serial bytes on"
+            )
+        if not speaks_modbus:
+            raise ValueError(
+                f"{family} does not speak Modbus, and {port} carries "
+                "nothing else: name the port socket://, and have the far end pass serial bytes on"
+            )
+        return Framing.TCP
+    if wanted is Framing.TCP:
+        raise ValueError(f"framing tcp is for tcp:// ports, such as tcp://10.0.0.7:502, not for {port}")
+    if address not in SERIAL_ADDRESSES:
+        raise ValueError(
+            f"address {address} is a unit id of Modbus TCP; on {port} it must be "
+            f"{SERIAL_ADDRESSES[0]} to {SERIAL_ADDRESSES[-1]}"
+        )
+    return wanted
+
+
+def check_agreed_silence(agreed: float, settings: Settings, own: float | None) -> None:
+    """Raise ValueError unless `agreed` is a valid silence in s.
+
+    `own` is the silence in s of an RTU drive's document. If both are shorter than 1.5 characters, such a
+    silence may also occur within a frame.
+    """
+    is_number = isinstance(agreed, (int, float)) and not isinstance(agreed, bool)
+    if not (is_number and 0 <= agreed <= LONGEST_SILENCE):
+        raise ValueError(f"silence {agreed!r} is not a time from 0 to {LONGEST_SILENCE:g} s")
+    least = 1.5 * settings.character
+    if own is not None and max(agreed, own) < least:
+        raise ValueError(
+            f"silence {agreed * 1e6:g} us is shorter than 1.5 characters at {settings}, which may "
+            f"pass within a frame: it must be {math.ceil(least * 1e6)} us or more"
+        )
