@@ -230,8 +230,9 @@ def spaced(line: str) -> str:
 
 
 def shape(line: str) -> str:
-    """Return the same without its numbers' digits and its times' units: they are measured."""
-    return spaced(re.sub(r"\d+(\.\d+)?( (ms|us))?", "0", line))
+    """Return the line with each number as 0 and without its unit of time, because they are measured."""
+    plural = re.sub(r"\b1 miss\b", "1 misses", line)
+    return spaced(re.sub(r"\d+(\.\d+)?( (ms|us))?", "0", plural))
 
 
 @pytest.fixture
