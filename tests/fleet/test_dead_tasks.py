@@ -54,7 +54,7 @@ STARTERS = {
 }
 WAITED_FOR = {  # modules that start tasks and threads, and themselves wait for them
     *("direct_gets", "fleet_commands", "forwarder", "gateway", "hub", "leaders", "line_keeper", "member"),
-    *("observer", "owner_records", "own_thread", "page_part", "servers", "shares", "stop_asking"),
+    *("observer", "owner_records", "page_part", "servers", "shares", "stop_asking"),
     *("command_log", "fleet_lines"),  # whose callers wait for their threads
     "spool",  # whose thread the gateway watches
 }
@@ -289,7 +289,7 @@ def test_metrics_that_fail_are_an_error_of_the_server(caplog: pytest.LogCaptureF
 
 def test_a_stop_that_fails_in_the_desk_is_answered(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with desks(tmp_path) as desk:
-        monkeypatch.setattr(desk.stops, "_begin", lambda *details: asyncio.run(fail()))
+        monkeypatch.setattr(desk.stops._repeated, "begin", lambda *details: asyncio.run(fail()))
         answer = asyncio.run(desk.stop())
     assert answer is not None
     assert (answer.outcome, answer.is_done) == (CommandOutcome.UNKNOWN, False)

@@ -17,8 +17,8 @@ from simulated_bus import one
 from tables import table
 
 from multidrop import Bus, InvtCHE, Plant, Seen, Stopped, Unconfirmed
-from multidrop.control import Ledger
-from multidrop.gateway.commands import Commands, Told
+from multidrop.control import CommandResult, Ledger
+from multidrop.gateway.commands import Commands
 from multidrop.gateway.http.rights import Caller, May, Right
 from multidrop.gateway.live.views import look_at
 
@@ -73,8 +73,10 @@ def test_a_command_s_end_is_known(command: Callable[[Commands], Awaitable[Any]])
     ],
     ids=["a write", "a verb"],
 )
-def test_a_drive_that_has_left_its_line_is_told_of(command: Callable[[Commands], Awaitable[Told]]) -> None:
-    async def carry_out() -> Told:
+def test_a_drive_that_left_its_line_is_named_in_the_result(
+    command: Callable[[Commands], Awaitable[CommandResult]],
+) -> None:
+    async def carry_out() -> CommandResult:
         return await command(Commands(UnopenedLines(), MAY))
 
     told = asyncio.run(carry_out())
@@ -97,7 +99,7 @@ def test_a_number_that_is_none_is_told_of(
     lines.plant = plant_of(("hall", mill))
     may = May(write=frozenset({"mill.control", "mill.setpoint"}))
 
-    async def carry_out() -> Told:
+    async def carry_out() -> CommandResult:
         return await Commands(lines, may).write("mill", register, value, CALLER)
 
     told = asyncio.run(carry_out())
@@ -125,7 +127,7 @@ def test_a_stop_finds_its_drive_by_another_spelling_and_a_start_does_not(
     may = May(write=frozenset({f"{spelt}.setpoint"}), verbs=frozenset({f"{spelt}.start", f"{fan}.coast"}))
     commands = Commands(lines, may)
 
-    async def carry_out() -> list[Told]:
+    async def carry_out() -> list[CommandResult]:
         started = [
             await commands.act(spelt, "start", {}, CALLER),
             await commands.write(spelt, "setpoint", 10.0, CALLER),

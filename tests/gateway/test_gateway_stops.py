@@ -12,7 +12,6 @@ import threading
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from errno import ENOSPC
-from functools import partial
 from importlib.resources import files
 from pathlib import Path
 from time import monotonic
@@ -25,13 +24,12 @@ from lines import PATIENCE, until
 from tables import table
 
 from multidrop import Drive, PlantError
+from multidrop.control import CommandOutcome, CommandResult
 from multidrop.control.audit_log import AuditLog
-from multidrop.gateway import drive_commands as drive_works
-from multidrop.gateway import parts
-from multidrop.gateway.command_results import Told
-from multidrop.gateway.command_threads import begin_stops
+from multidrop.control.commands import Results
+from multidrop.gateway import commands, parts
 from multidrop.gateway.http import messages
-from multidrop.gateway.http.rights import Caller, Right
+from multidrop.gateway.http.rights import Right
 from multidrop.gateway.settings import read_settings
 
 MAY = """[serve.may]
@@ -84,7 +82,7 @@ def test_the_head_of_the_answer_confirms_a_stop_that_is_not_over(
 
     async def slow(*args: object, **options: object) -> object:
         await asyncio.to_thread(held.wait, PATIENCE)
-        told = Told(True, "stopped: seen to stand")
+        told = CommandResult(CommandOutcome.DONE, "stopped: seen to stand")
         return told if path == "/api/act" else {"pump-1": told}
 
     with served(tmp_path, MAY) as gateway:
@@ -112,7 +110,7 @@ def test_a_stop_goes_on_when_its_asker_leaves(tmp_path: Path, monkeypatch: pytes
     ends: list[str] = []
     held = threading.Event()
 
-    async def slow(*args: object, **options: object) -> dict[str, Told]:
+    async def slow(*args: object, **options: object) -> dict[str, CommandResult]:
         try:
             await asyncio.to_thread(held.wait, PATIENCE)
             ends.append("over")
@@ -385,32 +383,6 @@ def test_a_stop_is_sent_where_the_system_gives_no_thread(tmp_path: Path) -> None
         assert stands(gateway, "pump-1")
 
 
-@pytest.mark.parametrize("failure", [RuntimeError("can't start new thread"), MemoryError()])
-def test_without_threads_all_stops_are_sent_before_one_is_waited_for(
-    monkeypatch: pytest.MonkeyPatch, failure: Exception
-) -> None:
-    """The system gives one thread more."""
-    done: list[tuple[str, float | None]] = []
-    caller = Caller("anna", "page", "10.0.0.1", Right.STOP)
-
-    class LastThread(threading.Thread):
-        def start(self) -> None:
-            if done:
-                raise failure
-            self.run()
-
-    def work(seconds: float | None, line: str) -> str:
-        done.append((line, seconds))
-        return f"{line} stands"
-
-    async def begin() -> list[str]:
-        return await asyncio.gather(*begin_stops([partial(work, line=line) for line in "abc"], caller))
-
-    monkeypatch.setattr("multidrop.supervisor.threading", SimpleNamespace(Thread=LastThread))
-    assert asyncio.run(begin()) == ["a stands", "b stands", "c stands"]
-    assert done == [("a", None), ("b", 0.0), ("c", 0.0), ("b", None), ("c", None)]
-
-
 @pytest.mark.long
 @pytest.mark.slow
 def test_a_silent_drives_stop_says_so_and_holds_no_other_up(tmp_path: Path) -> None:
@@ -449,13 +421,13 @@ def test_of_many_coasts_of_a_silent_drive_one_is_repeated(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     repeated: list[float | None] = []
-    act = drive_works.act_one
+    stop = commands.stop_drive_by
 
-    def noted(drive: Drive, verb: str, arguments: dict[str, float | None]) -> Told:
-        repeated.append(arguments["seconds"])
-        return act(drive, verb, arguments)
+    def noted(verb: str, drive: Drive, seconds: float | None) -> Results:
+        repeated.append(seconds)
+        return stop(verb, drive, seconds)
 
-    monkeypatch.setattr(drive_works, "act_one", noted)
+    monkeypatch.setattr(commands, "stop_drive_by", noted)
     coast = {"drive": "pump-1", "verb": "coast", "options": {}}
     with served(tmp_path, MAY) as gateway, ThreadPoolExecutor(9) as callers:
         gateway.sims["pump-1"].deaf_until = float("inf")

@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 from peers import require_module, require_program
 
 from multidrop import Drive, InvtCHE, Plant, PlantLine, Polled, PolledDrive
-from multidrop.gateway.commands import Told
+from multidrop.control import CommandOutcome, CommandResult
 from multidrop.gateway.http.rights import Caller, May
 from multidrop.gateway.live.hub import Known, Shown
 from multidrop.gateway.parts import PartContext
@@ -232,20 +232,22 @@ class NotedCommands:
         self.stopped_at: dict[str, int] = {}  # ns of CLOCK_MONOTONIC, by drive
         self.plant_ns: int | None = None
 
-    async def stop(self, drives: Sequence[str] | None, caller: Caller) -> dict[str, Told]:
+    async def stop(self, drives: Sequence[str] | None, caller: Caller) -> dict[str, CommandResult]:
         self.noted.append(("stop", drives))
-        return dict.fromkeys(drives or ["pump-1"], Told(True, "stopped"))
+        return dict.fromkeys(drives or ["pump-1"], CommandResult(CommandOutcome.DONE, "stopped"))
 
     def stopped_ns(self, drive: str) -> int | None:
         return self.stopped_at.get(drive)
 
-    async def write(self, drive: str, register: str, value: float, caller: Caller) -> Told:
+    async def write(self, drive: str, register: str, value: float, caller: Caller) -> CommandResult:
         self.noted.append(("write", drive, register, value))
-        return Told(True, "done")
+        return CommandResult(CommandOutcome.DONE, "done")
 
-    async def act(self, drive: str, verb: str, options: Mapping[str, object], caller: Caller) -> Told:
+    async def act(
+        self, drive: str, verb: str, options: Mapping[str, object], caller: Caller
+    ) -> CommandResult:
         self.noted.append(("act", drive, verb, dict(options)))
-        return Told(True, "done")
+        return CommandResult(CommandOutcome.DONE, "done")
 
 
 def inside(folder: Path, fan: Drive = FAN) -> Any:

@@ -14,8 +14,7 @@ from unittest.mock import patch
 from fleets import HandClock
 
 from multidrop import YD1000, Bus
-from multidrop.control import read_audit, written_before
-from multidrop.fleet.commands import desk as command_desk
+from multidrop.control import commands, read_audit, written_before
 from multidrop.fleet.commands.desk import CommandDesk
 from multidrop.fleet.commands.log import CommandLog
 from multidrop.fleet.commands.stop_desk import StopDesk
@@ -121,7 +120,7 @@ def _patiently(patience_s: float) -> AbstractContextManager[Any]:
     def patient(limit: Callable[[], float]) -> AbstractContextManager[None]:
         return written_before(lambda: (until := limit()) and until + patience_s * 1e9)
 
-    return patch.object(command_desk, "written_before", patient)
+    return patch.object(commands, "written_before", patient)
 
 
 @contextmanager

@@ -12,8 +12,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
+from multidrop.control import CommandOutcome, CommandResult
 from multidrop.drive import Drive
-from multidrop.gateway.commands import Told
 from multidrop.gateway.http.rights import Caller
 from multidrop.gateway.modbus_server.server import ModbusServer
 from multidrop.gateway.modbus_server.settings import ModbusSettings
@@ -56,29 +56,29 @@ class FakeHub:
         return self.states.get(drive, "unknown")
 
 
-DONE = Told(True, "done")
+DONE = CommandResult(CommandOutcome.DONE, "done")
 
 
 class FakeCommands:
     """Notes what it is told to do, and says of it what the test wants."""
 
     def __init__(self) -> None:
-        self.told: Told | Callable[[], Awaitable[Told]] = DONE
+        self.told: CommandResult | Callable[[], Awaitable[CommandResult]] = DONE
         self.written: list[tuple[str, str, float, Caller]] = []
         self.stopped: list[tuple[Sequence[str] | None, Caller]] = []
         self.ended: dict[str, int] = {}
 
-    async def _end(self, *drives: str) -> Told:
+    async def _end(self, *drives: str) -> CommandResult:
         try:
-            return self.told if isinstance(self.told, Told) else await self.told()
+            return self.told if isinstance(self.told, CommandResult) else await self.told()
         finally:
             self.ended |= dict.fromkeys(drives, time.monotonic_ns())
 
-    async def stop(self, drives: Sequence[str] | None, caller: Caller) -> dict[str, Told]:
+    async def stop(self, drives: Sequence[str] | None, caller: Caller) -> dict[str, CommandResult]:
         self.stopped.append((drives, caller))
         return dict.fromkeys(drives or (), await self._end(*(drives or ())))
 
-    async def write(self, drive: str, register: str, value: float, caller: Caller) -> Told:
+    async def write(self, drive: str, register: str, value: float, caller: Caller) -> CommandResult:
         self.written.append((drive, register, value, caller))
         return await self._end(drive)
 

@@ -11,10 +11,10 @@ from lines import PATIENCE
 from modbus_gateway import plant_of
 
 from multidrop import Drive, InvtCHE, Plant, WriteForbidden
+from multidrop.control import CommandOutcome, CommandResult
 from multidrop.gateway import commands
-from multidrop.gateway.commands import BUSY, Commands, Told
+from multidrop.gateway.commands import BUSY, STOPPING, VERBS, Commands
 from multidrop.gateway.http.rights import NEVER_THIS_WAY, NOT_ALLOWED, NOT_LISTED, Caller, May, Right
-from multidrop.gateway.verb_rules import STOPPING, VERBS
 
 ALL = May(write=frozenset({"mill.setpoint"}), verbs=frozenset(f"mill.{verb}" for verb in VERBS))
 WAYS = ("page", "http", "mqtt", "modbus")
@@ -87,9 +87,9 @@ def test_a_line_has_a_few_writes_under_way_and_takes_any_stop(monkeypatch: pytes
     """Each has a thread, and a line that stands still would have any number of them."""
     go_on = threading.Event()
 
-    def slow(drive: Drive, **command: object) -> Told:
+    def slow(drive: Drive, **command: object) -> CommandResult:
         assert go_on.wait(PATIENCE)
-        return Told(True, "done")
+        return CommandResult(CommandOutcome.DONE, "done")
 
     async def carry_out() -> None:
         control = Commands(GuardedLines(), ALL)  # type: ignore[arg-type]
@@ -109,7 +109,7 @@ def test_a_line_has_a_few_writes_under_way_and_takes_any_stop(monkeypatch: pytes
         await asyncio.gather(*some)
         assert (await control.write("mill", "setpoint", 9.0, writer)).is_done  # there is room again
 
-    for work in ("write_one", "act_one"):
+    for work in ("write_register", "carry_out_verb"):
         monkeypatch.setattr(commands, work, slow)
     try:
         asyncio.run(carry_out())

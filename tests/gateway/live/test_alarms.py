@@ -24,7 +24,7 @@ from multidrop.drive import can_show_fault
 from multidrop.errors import Advice
 from multidrop.families import MODELS
 from multidrop.families.erman_er_g_220 import ErmanFault
-from multidrop.gateway.command_results import in_words
+from multidrop.gateway.commands import in_words
 from multidrop.gateway.gateway import Gateway
 from multidrop.gateway.http.rights import Right
 from multidrop.gateway.live.alarm_file import AlarmFile, alarm_in
@@ -419,4 +419,4 @@ def test_a_stop_that_was_called_here_is_no_alarm_and_another_is(tmp_path: Path) 
     ],
 )
 def test_no_page_says_what_a_program_would_call(failure: BusError, said: str) -> None:
-    assert in_words(failure) == said
+    assert in_words(str(failure), failure) == said

@@ -19,9 +19,9 @@ from lines import PATIENCE, until
 from peers import require_program
 
 from multidrop import Drive, WriteForbidden
+from multidrop.control import CommandResult
 from multidrop.gateway import commands as commands_module
 from multidrop.gateway.clock import boottime_ns
-from multidrop.gateway.commands import Told
 from multidrop.gateway.http.rights import Right
 from multidrop.gateway.live.frames import (
     ANOTHER_PLANT,
@@ -225,13 +225,13 @@ def test_a_stop_that_is_called_as_a_start_begins_ends_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with served(tmp_path, MAY) as gateway:
-        act = commands_module.act_one
+        act = commands_module.carry_out_verb
 
-        def act_after_a_stop(drive: Drive, **given: Any) -> Told:
+        def act_after_a_stop(drive: Drive, **given: Any) -> CommandResult:
             gateway.gateway.commands._note_stop([drive.name])
             return act(drive, **given)
 
-        monkeypatch.setattr(commands_module, "act_one", act_after_a_stop)
+        monkeypatch.setattr(commands_module, "carry_out_verb", act_after_a_stop)
         told = gateway.command("/api/act", START, authorization=gateway.bearer(Right.WRITE)).json
         assert (told["done"], "start was not sent" in told["text"]) == (False, True)
         assert commands(gateway) == []

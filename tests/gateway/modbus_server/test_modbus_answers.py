@@ -30,11 +30,12 @@ from multidrop import (
     reading,
     setting,
 )
+from multidrop.control import CommandOutcome, CommandResult
 from multidrop.core import NumberFormat
 from multidrop.drive import COIL, Kept
 from multidrop.errors import PortLost
 from multidrop.families import DelixiNative, ErmanERG220, InnovertIBD, InvtCHE
-from multidrop.gateway.commands import BUSY, Told
+from multidrop.gateway.commands import BUSY
 from multidrop.gateway.http.rights import NOT_ALLOWED, NOT_LISTED, Caller, Right
 from multidrop.gateway.modbus_server.line_share import PassingBusy
 from multidrop.gateway.modbus_server.server import MOST_STOPS
@@ -314,7 +315,7 @@ OUTCOMES = [
 
 @pytest.mark.parametrize(("failure", "expected"), OUTCOMES, ids=lambda one: str(one)[:40])
 def test_what_became_of_a_write_has_its_code(gateway: Gateway, failure: Any, expected: int) -> None:
-    gateway.commands.told = Told(False, str(failure), failure)
+    gateway.commands.told = CommandResult(CommandOutcome.FAILED, str(failure), failure)
     assert code(gateway, 1, 6, CHE_SETPOINT, 5000) == expected
 
 
@@ -438,10 +439,10 @@ def stop_slowly(gateway: Gateway, seconds: float) -> threading.Event:
     """Have stops take so long; return what is set when one has ended."""
     ended = threading.Event()
 
-    async def slowly() -> Told:
+    async def slowly() -> CommandResult:
         await asyncio.sleep(seconds)
         ended.set()
-        return Told(True, "stopped")
+        return CommandResult(CommandOutcome.DONE, "stopped")
 
     gateway.commands.told = slowly
     return ended
@@ -469,13 +470,13 @@ def test_a_stop_waits_for_nothing_that_its_client_asked_before(gateway: Gateway)
     stopped = threading.Event()
     hang = threading.Event()
 
-    async def hanging() -> Told:
+    async def hanging() -> CommandResult:
         if gateway.commands.stopped:
             stopped.set()
-            return Told(True, "stopped")
+            return CommandResult(CommandOutcome.DONE, "stopped")
         while not hang.is_set():
             await asyncio.sleep(0.01)
-        return Told(True, "written")
+        return CommandResult(CommandOutcome.DONE, "written")
 
     gateway.commands.told = hanging
     with gateway.client() as client:
@@ -497,10 +498,10 @@ def test_a_stop_waits_for_nothing_that_its_client_asked_before(gateway: Gateway)
 def test_a_flood_of_stops_is_bounded_and_each_is_answered(gateway: Gateway) -> None:
     release = threading.Event()
 
-    async def hanging() -> Told:
+    async def hanging() -> CommandResult:
         while not release.is_set():
             await asyncio.sleep(0.01)
-        return Told(True, "stopped")
+        return CommandResult(CommandOutcome.DONE, "stopped")
 
     gateway.commands.told = hanging
     with gateway.client() as client:
@@ -517,14 +518,14 @@ def test_a_flood_of_stops_is_bounded_and_each_is_answered(gateway: Gateway) -> N
     [(BusError("not seen to stand"), 0x0B), (NoReply("mill"), 0x0B), (PortLost("/dev/x", "gone"), 0x0A)],
 )
 def test_a_stop_that_failed_says_so(gateway: Gateway, failure: BusError, expected: int) -> None:
-    gateway.commands.told = Told(False, str(failure), failure)
+    gateway.commands.told = CommandResult(CommandOutcome.FAILED, str(failure), failure)
     assert code(gateway, 1, 6, CHE_CONTROL, 5) == expected
 
 
 def test_a_stop_that_fails_beyond_all_rules_is_told_too(
     gateway: Gateway, caplog: pytest.LogCaptureFixture
 ) -> None:
-    async def fails() -> Told:
+    async def fails() -> CommandResult:
         raise RuntimeError("a mistake of ours")
 
     gateway.commands.told = fails

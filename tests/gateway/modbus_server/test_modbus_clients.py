@@ -13,8 +13,8 @@ import pytest
 from controlled_loop import ControlledLoop, run_controlled
 from modbus_gateway import DONE, PATIENCE, RawClient, plant_of, request, serving
 
+from multidrop.control import CommandResult
 from multidrop.families import InvtCHE
-from multidrop.gateway.commands import Told
 from multidrop.gateway.modbus_server import clients as modbus_clients
 from multidrop.gateway.modbus_server.clients import ModbusClient, ModbusPort
 from multidrop.gateway.modbus_server.protocol import MbapRequest, take_request
@@ -423,7 +423,7 @@ def test_a_stop_waits_neither_for_earlier_requests_nor_for_a_client_that_reads()
     with serving(plant, ModbusSettings(listen="127.0.0.1:0", may="stop")) as gateway:
         stopped = threading.Event()
 
-        async def stop() -> Told:
+        async def stop() -> CommandResult:
             stopped.set()
             return DONE
 

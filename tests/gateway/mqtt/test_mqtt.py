@@ -33,10 +33,10 @@ from lines import until
 from peers import require_module
 
 from multidrop import Drive, InvtCHE, PolledDrive
+from multidrop.control import CommandOutcome, CommandResult
 from multidrop.drive.register import reading, setting
 from multidrop.families import MODELS
 from multidrop.gateway.clock import boottime_ns
-from multidrop.gateway.commands import Told
 from multidrop.gateway.mqtt.broker import MOST_UNDER_WAY
 from multidrop.gateway.mqtt.home_assistant import discovery, discovery_topic
 from multidrop.gateway.mqtt.json_topics import JsonTopics
@@ -803,7 +803,7 @@ def test_all_words_of_topics_are_reserved_names(tmp_path: Path) -> None:
     topics = JsonTopics(MqttSettings(commands=True), inside(tmp_path), now_ms)
     topics.outbox = PutMessages()
     topics.connected()
-    topics._tell(FAN.name, "stop", Told(True, "done"))
+    topics._tell(FAN.name, "stop", CommandResult(CommandOutcome.DONE, "done"))
     said = {message.topic for message in topics.outbox.put_in} | {topic for topic, _ in topics.topics()}
     words = {word for topic in said for word in topic.removeprefix("multidrop/").split("/")}
     ours = words - {"+", FAN.name, "pump-1"}

@@ -11,15 +11,13 @@ import logging
 import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from functools import partial
 from typing import Any
 
 from multidrop import Unsupported
-from multidrop.control import written_before, written_by
+from multidrop.control import CommandResult, begin_command, written_by
 from multidrop.fleet.commands.drive_commands import Prepared, prepare
 from multidrop.fleet.commands.log import CommandLog
 from multidrop.fleet.commands.offers import Offer, Offers
-from multidrop.fleet.commands.own_thread import in_own_thread
 from multidrop.fleet.commands.words import (
     CommandAnswer,
     CommandOutcome,
@@ -133,7 +131,11 @@ class CommandDesk:
             await self._note(offer, "begun", {})
         except OSError as failure:
             return offer.unsent(f"the log of commands cannot be written: {failure}")
-        answer = await in_own_thread(partial(self._send, offer))
+        with written_by(offer.request.by, WAY):
+            result = await begin_command(
+                offer.prepared.work, lambda: self._limit_ns(offer), lambda: self._refusal(offer)
+            )
+        answer = CommandAnswer.of(offer.request.drive, result)
         _log.info("%s, asked for by %s: %s", offer.request.words, offer.request.by, answer.text)
         try:
             await self._note(offer, "over", answer.as_json())
@@ -141,15 +143,14 @@ class CommandDesk:
             _log.warning("the log of commands cannot be written: %s", failure)
         return answer
 
-    def _send(self, offer: Offer) -> CommandAnswer:
-        """Send it on a thread of its own, unless it is too late: a process that stood still sends nothing."""
-        now_ns = time.monotonic_ns()  # before the other clock is read: a pause between them shortens the time
-        until_ns = now_ns + self.offers.left_ns(offer)
+    def _limit_ns(self, offer: Offer) -> float:
+        """Return until when it may be sent (CLOCK_MONOTONIC); 0 once it is void."""
+        now_ns = time.monotonic_ns()  # read before the offer's clock: a pause between them shortens the time
+        return 0 if offer.why_void else now_ns + self.offers.left_ns(offer)
+
+    def _refusal(self, offer: Offer) -> CommandResult | None:
         why = self._why_not(offer)
-        if why:
-            return offer.unsent(why)
-        with written_before(lambda: 0 if offer.why_void else until_ns), written_by(offer.request.by, WAY):
-            return offer.prepared.work()
+        return CommandResult(CommandOutcome.NOT_SENT, offer.unsent(why).text) if why else None
 
     def _why_not(self, offer: Offer) -> str:
         """Return why it must not be sent now, or an empty text."""

@@ -13,13 +13,10 @@ from functools import partial
 from hashlib import sha256
 from typing import Any
 
-from multidrop import Bus, Drive
-from multidrop.control import RepeatedStops, written_by
+from multidrop.control import LineStop, RepeatedStops, stop_line, written_by
 from multidrop.fleet.commands.desk import HOLD_S, WAY
-from multidrop.fleet.commands.drive_commands import answers_of_stops, stop_drive
 from multidrop.fleet.commands.log import CommandLog
 from multidrop.fleet.commands.offers import Offers
-from multidrop.fleet.commands.own_thread import Answers, StopWork, begin_stops
 from multidrop.fleet.commands.words import (
     CommandAnswer,
     CommandOutcome,
@@ -47,7 +44,7 @@ class StopDesk:
         self._offers = offers
         self._log = log
         self._stops: dict[tuple[int, object], asyncio.Task[CommandAnswer]] = {}  # by line and message
-        self._repeated = RepeatedStops(stop_drive)
+        self._repeated = RepeatedStops()
 
     async def stop(self, line: str, data: bytes) -> CommandAnswer | None:
         """Stop drives of a line now; None where we are not its master and must keep silent.
@@ -103,33 +100,23 @@ class StopDesk:
         self._offers.void(held.name, request.drives, CALLED)
         drives = held.drives
         names = list(drives) if request.drives is None else list(dict.fromkeys(request.drives))
-        waited = self._begin(held.bus, drives, names, request.by)
+        asked = [drives[name] for name in names if name in drives]
+        whole = partial(stop_line, lambda: held.bus, [*drives]) if len(asked) == len(drives) else None
+        with written_by(request.by, WAY):
+            waited = self._repeated.begin([LineStop(asked, whole)])
         printed = [spelt(name) for name in names]
         _log.warning("stop of %s, asked for by %s", ", ".join(printed), request.by)
         record = {"id": request.id, "line": held.name, "what": "stop", "drives": printed, "by": request.by}
         self._note({"step": "begun", **record, "gateway": self.gateway})
         there = f"line {held.name} has no such drive; it has {', '.join(drives) or 'none'}"
         missing = CommandAnswer(CommandOutcome.REFUSED, f"no stop was sent: {there}")
-        found: Answers = {name: missing for name in names if name not in drives}
-        for answers in await asyncio.gather(*waited):
-            found |= answers
+        found = {name: missing for name in names if name not in drives}
+        for results in await asyncio.gather(*waited):
+            found |= {name: CommandAnswer.of(name, result) for name, result in results.items()}
         text = "; ".join(answer.text for answer in found.values()) or f"line {held.name} has no drives"
         answer = CommandAnswer(worst(list(found.values())), text, self.gateway, drives=found)
         self._note({"step": "over", **record, **answer.as_json()})
         return answer
-
-    def _begin(
-        self, bus: Bus, drives: Mapping[str, Drive], names: list[str], by: str
-    ) -> list[asyncio.Future[Answers]]:
-        new, once = self._repeated.divided(drives[name] for name in names if name in drives)
-        whole: list[tuple[StopWork, list[Drive]]] = [(partial(_stop_line, bus), new)]
-        single = [(partial(stop_drive, drive), [drive]) for drive in new]
-        works = whole if drives and len(new) == len(drives) else single
-        begun = begin_stops([partial(_stopped_by, by, work) for work, _ in works])
-        for number, (_, stopped) in enumerate(works):  # the last one may be of several, without threads
-            self._repeated.note(stopped, begun[min(number, len(begun) - 1)])
-        again = partial(_begin_stop, by)
-        return [*begun, *(self._repeated.send_once(drive, again) for drive in once)]
 
     def _note(self, record: Mapping[str, Any]) -> None:
         """Note it, in the order of the calls, whoever waits for the stop."""
@@ -140,20 +127,3 @@ class StopDesk:
             await self._log.note(record)
         except Exception as failure:
             _log.warning("a stop is not in the log of commands: %s", failure)
-
-
-def _begin_stop(by: str, work: StopWork) -> asyncio.Future[Answers]:
-    return begin_stops([partial(_stopped_by, by, work)])[0]
-
-
-def _stopped_by(by: str, work: StopWork, seconds: float | None) -> Answers:
-    with written_by(by, WAY):
-        return work(seconds)
-
-
-def _stop_line(bus: Bus, seconds: float | None) -> Answers:
-    try:
-        return answers_of_stops(bus.stop_all(seconds=seconds))
-    except Exception as failure:  # whatever it is: everybody must see it
-        text = f"it is not known whether the stop was sent: {type(failure).__name__}: {failure}"
-        return {drive.name: CommandAnswer(CommandOutcome.UNKNOWN, text) for drive in bus.drives}

@@ -4,24 +4,15 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from enum import StrEnum
 from math import isfinite
 from typing import Any, NamedTuple
+
+from multidrop.control import CommandOutcome as CommandOutcome
+from multidrop.control import CommandResult, with_name
 
 MOST_BYTES = 64 * 1024  # of a request
 MOST_CHARACTERS = 200  # of a name, an id or a value's text
 NOBODY = "somebody"  # who gives no name
-
-
-class CommandOutcome(StrEnum):
-    """End of a command, by what is known of it."""
-
-    DONE = "done"
-    FAILED = "failed"  # it was sent; the drive refused it, or is seen not to do it
-    REFUSED = "refused"  # by the library's rules or the plant's lists: nothing was sent
-    NOT_SENT = "not sent"  # for certain
-    UNKNOWN = "unknown"  # it may have been carried out
-    UNDER_WAY = "under way"  # ask again
 
 
 class CommandAnswer(NamedTuple):
@@ -39,6 +30,11 @@ class CommandAnswer(NamedTuple):
     @property
     def is_done(self) -> bool:
         return self.outcome is CommandOutcome.DONE
+
+    @classmethod
+    def of(cls, drive: str, result: CommandResult) -> CommandAnswer:
+        """Return the answer for a command's result on a drive."""
+        return cls(result.outcome, with_name(drive, result.text), held=result.held)
 
     def as_json(self) -> dict[str, Any]:
         """Return it for a message or a log, without what is empty."""

@@ -17,10 +17,11 @@ from starlette.routing import Route
 from starlette.types import ASGIApp, Receive, Scope, Send
 
 from multidrop import WriteForbidden
+from multidrop.control import CommandResult
 from multidrop.exposition import expose_metrics
 from multidrop.gateway.audit import MOST_RECORDS, newest_records, time_asked
 from multidrop.gateway.clock import utc_ms
-from multidrop.gateway.commands import Admit, Told
+from multidrop.gateway.commands import STOPPING, Admit
 from multidrop.gateway.http.exports import Exports
 from multidrop.gateway.http.guard import COOKIE, HAS_WRONG_TOKEN, SHUT, WRONG, Guard, Needed
 from multidrop.gateway.http.messages import (
@@ -39,7 +40,6 @@ from multidrop.gateway.live.descriptions import describe
 from multidrop.gateway.live.frames import WHOLE, Frames
 from multidrop.gateway.live.views import figures_of, health_of, look_at, look_at_lines
 from multidrop.gateway.metrics import families_of
-from multidrop.gateway.verb_rules import STOPPING
 from multidrop.supervisor import Hung, supervisor
 
 if TYPE_CHECKING:
@@ -130,21 +130,21 @@ async def _denied(request: Request, failure: Exception) -> Response:
     return _error(getattr(failure, "status", 400), str(failure))
 
 
-def _told(told: Told) -> dict[str, Any]:
+def _told(told: CommandResult) -> dict[str, Any]:
     return {"done": told.is_done, "text": told.text}
 
 
-def _answer(told: Told) -> Response:
+def _answer(told: CommandResult) -> Response:
     """Return what became of a command: 403 where a right was missing, else 200 with what happened."""
     is_denied = isinstance(told.error, WriteForbidden) and told.error.rule in RIGHTS_RULES
     return JsonResponse(_told(told) | ({"error": told.text} if is_denied else {}), 403 if is_denied else 200)
 
 
-async def _answer_one(work: Coroutine[Any, Any, Told]) -> Response:
+async def _answer_one(work: Coroutine[Any, Any, CommandResult]) -> Response:
     return _answer(await work)
 
 
-async def _answer_all(work: Coroutine[Any, Any, Mapping[str, Told]]) -> Response:
+async def _answer_all(work: Coroutine[Any, Any, Mapping[str, CommandResult]]) -> Response:
     return JsonResponse({name: _told(one) for name, one in (await work).items()})
 
 

@@ -14,9 +14,9 @@ from functools import partial
 from typing import Any, Protocol
 
 from multidrop import Batch, BusError, Plant, Register
+from multidrop.control import CommandResult
 from multidrop.drive import Carrier
 from multidrop.gateway.clock import monotonic_ns
-from multidrop.gateway.commands import Told
 from multidrop.gateway.http.connections import listen
 from multidrop.gateway.http.rights import Caller, Right
 from multidrop.gateway.modbus_server.clients import SWEEP_S, Answer, ModbusClient, ModbusPort, RoundShare
@@ -48,8 +48,8 @@ _log = logging.getLogger("multidrop.gateway")
 class ModbusCommands(Protocol):
     """The part of Commands that the server needs."""
 
-    async def stop(self, drives: Sequence[str] | None, caller: Caller) -> dict[str, Told]: ...
-    async def write(self, drive: str, register: str, value: float, caller: Caller) -> Told: ...
+    async def stop(self, drives: Sequence[str] | None, caller: Caller) -> dict[str, CommandResult]: ...
+    async def write(self, drive: str, register: str, value: float, caller: Caller) -> CommandResult: ...
     def ended_ns(self, drive: str) -> int: ...
 
 

@@ -12,14 +12,14 @@ from functools import partial
 from typing import Any, NamedTuple
 
 from multidrop import Plant
-from multidrop.gateway.commands import Told
+from multidrop.control import CommandResult
+from multidrop.gateway.commands import STOPPING
 from multidrop.gateway.live.hub import SILENT
 from multidrop.gateway.mqtt.broker import Publication
+from multidrop.gateway.mqtt.broker_commands import BrokerCommands
 from multidrop.gateway.mqtt.home_assistant import DISCOVERY, discovery, discovery_topic, object_id
 from multidrop.gateway.mqtt.settings import MqttSettings, fresh_values
-from multidrop.gateway.offers import Orders
 from multidrop.gateway.parts import PartContext
-from multidrop.gateway.verb_rules import STOPPING
 from multidrop.plant import drive_meant
 
 ONLINE, OFFLINE = b"online", b"offline"
@@ -121,7 +121,7 @@ class JsonTopics:
         self._context = context
         self._hub = context.hub
         self._plant = context.plant
-        self._orders = Orders(context.commands, settings.caller, utc_ms, self._tell)
+        self._orders = BrokerCommands(context.commands, settings.caller, utc_ms, self._tell)
         self._available: dict[str, bytes] = {}
         self._left: set[str] = set()  # drives of which the broker is to keep nothing
         self._left_behind = LeftBehind(settings.prefix, home_assistant=settings.home_assistant)
@@ -261,7 +261,7 @@ class JsonTopics:
         }
         return json.dumps(said, ensure_ascii=False).encode()
 
-    def _tell(self, drive: str, what: str, told: Told) -> None:
+    def _tell(self, drive: str, what: str, told: CommandResult) -> None:
         said = json.dumps({"what": what, "done": told.is_done, "text": told.text}, ensure_ascii=False)
         self.outbox.put(Publication(self._topic(drive, "told"), said.encode))
 

@@ -7,9 +7,10 @@ from collections.abc import Callable
 from typing import Any
 
 from multidrop import Plant, Register
-from multidrop.gateway.commands import Told
+from multidrop.control import CommandResult
 from multidrop.gateway.live.hub import SILENT
 from multidrop.gateway.mqtt.broker import Publication
+from multidrop.gateway.mqtt.broker_commands import BrokerCommands
 from multidrop.gateway.mqtt.settings import MqttSettings, fresh_values
 from multidrop.gateway.mqtt.sparkplug import (
     BIRTH_DEATH,
@@ -22,7 +23,6 @@ from multidrop.gateway.mqtt.sparkplug import (
     payload,
     read_command,
 )
-from multidrop.gateway.offers import Orders
 from multidrop.gateway.parts import PartContext
 
 STATE, FAULT, STOP = "state", "fault", "Device Control/Stop"
@@ -45,7 +45,7 @@ class SparkplugNode:
         self._plant = context.plant
         self._utc_ms = utc_ms
         self._node = settings.node or context.plant.path.stem
-        self._orders = Orders(context.commands, settings.caller, utc_ms, self._tell)
+        self._orders = BrokerCommands(context.commands, settings.caller, utc_ms, self._tell)
         self._birth = -1  # bdSeq
         self._seq = 0
         self._said: dict[str, dict[str, Value]] = {}  # by drive that is born
@@ -232,7 +232,7 @@ class SparkplugNode:
         known = {number: name for (owner, name), number in self._aliases.items() if owner == drive}
         return known.get(alias or 0, f"alias {alias}")
 
-    def _tell(self, drive: str, what: str, told: Told) -> None:
+    def _tell(self, drive: str, what: str, told: CommandResult) -> None:
         (_log.info if told.is_done else _log.warning)("%s of %s: %s", what, drive, told.text)
 
 

@@ -1,4 +1,4 @@
-"""Orders: commands that come by a broker, which may hold them up, keep them, and deliver them twice.
+"""BrokerCommands: commands that come by a broker, which may hold them up, keep them, and deliver them twice.
 
 A write or a verb is carried out only when it was sent within the last seconds, after the latest stop of its
 drive and the latest reload of the plant, and did not come before; a stop by any verb is carried out always.
@@ -11,8 +11,9 @@ from collections import deque
 from collections.abc import Callable, Coroutine, Mapping, Sequence
 from typing import Any
 
+from multidrop.control import CommandOutcome, CommandResult
 from multidrop.gateway.clock import boottime_ns
-from multidrop.gateway.commands import MOST_AGE_S, Commands, Told
+from multidrop.gateway.commands import MOST_AGE_S, Commands
 from multidrop.gateway.http.rights import Caller
 from multidrop.supervisor import supervisor
 
@@ -22,10 +23,10 @@ MOST_UNDER_WAY = 16  # without stops
 REMEMBERED = 1_000
 
 _log = logging.getLogger("multidrop.gateway.mqtt.part")
-Tell = Callable[[str, str, Told], None]  # the drive, what was asked, what became of it
+Tell = Callable[[str, str, CommandResult], None]  # the drive, what was asked, what became of it
 
 
-class Orders:
+class BrokerCommands:
     """Checks commands and carries them out; `tell` says what became of each.
 
     `utc_ms` is the time of day.
@@ -65,7 +66,7 @@ class Orders:
     def refuse(self, drive: str, what: str, why: str) -> None:
         """Tell that a command was not carried out."""
         _log.warning("%s of %s was not carried out: %s", what, drive, why)
-        self._tell(drive, what, Told(False, f"not sent: {why}"))
+        self._tell(drive, what, CommandResult(CommandOutcome.FAILED, f"not sent: {why}"))
 
     @staticmethod
     def _may_be_before(at_ns: int | None, age_ms: int) -> bool:
@@ -97,7 +98,7 @@ class Orders:
         for drive, told in (await self._commands.stop(drives, self._caller)).items():
             self._tell(drive, "stop", told)
 
-    async def _do(self, drive: str, what: str, work: Coroutine[Any, Any, Told]) -> None:
+    async def _do(self, drive: str, what: str, work: Coroutine[Any, Any, CommandResult]) -> None:
         self._tell(drive, what, await work)
 
     async def _counted(self, work: Coroutine[Any, Any, None]) -> None:

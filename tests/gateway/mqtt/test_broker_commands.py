@@ -1,4 +1,4 @@
-"""Orders: how many of a broker's commands are under way, and what that holds up."""
+"""BrokerCommands: how many of a broker's commands are under way, and what that holds up."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ import asyncio
 from collections.abc import Sequence
 from typing import Any
 
-from multidrop.gateway.commands import Told
+from multidrop.control import CommandOutcome, CommandResult
 from multidrop.gateway.http.rights import Caller, Right
-from multidrop.gateway.offers import MOST_UNDER_WAY, Orders
+from multidrop.gateway.mqtt.broker_commands import MOST_UNDER_WAY, BrokerCommands
 
 CALLER = Caller("anyone", "mqtt", "broker", Right.WRITE)
 NOW_MS = 1_000_000
@@ -27,14 +27,14 @@ class HeldCommands:
     def stopped_ns(self, drive: str) -> None:
         return None
 
-    async def write(self, drive: str, register: str, value: float, caller: Caller) -> Told:
+    async def write(self, drive: str, register: str, value: float, caller: Caller) -> CommandResult:
         self.begun.append(value)
         await self.go_on.wait()
-        return Told(True, "done")
+        return CommandResult(CommandOutcome.DONE, "done")
 
-    async def stop(self, drives: Sequence[str] | None, caller: Caller) -> dict[str, Told]:
+    async def stop(self, drives: Sequence[str] | None, caller: Caller) -> dict[str, CommandResult]:
         self.stopped.append(drives)
-        return {"pump-1": Told(True, "stopped")}
+        return {"pump-1": CommandResult(CommandOutcome.DONE, "stopped")}
 
 
 def test_a_broker_s_writes_are_bounded_and_no_stop_is() -> None:
@@ -42,7 +42,7 @@ def test_a_broker_s_writes_are_bounded_and_no_stop_is() -> None:
 
     async def receive() -> None:
         commands: Any = HeldCommands()
-        orders = Orders(
+        orders = BrokerCommands(
             commands, CALLER, lambda: NOW_MS, lambda drive, what, end: told.append((what, end.text))
         )
         for value in range(MOST_UNDER_WAY + 2):

@@ -1,0 +1,128 @@
+"""CommandResult: the outcome of a command, by what is certain about its effect. Pure."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from enum import StrEnum
+from typing import NamedTuple
+
+from multidrop.control.outcome import Effect, Outcome, Seen, Stopped
+from multidrop.errors import (
+    BadReply,
+    BusError,
+    CancelledByStop,
+    DriveException,
+    Expired,
+    LineError,
+    NoReply,
+    NotAttached,
+    NotMaster,
+    NotVerified,
+    Unsupported,
+    WriteForbidden,
+)
+
+
+class CommandOutcome(StrEnum):
+    """The end of a command, by what is known about it."""
+
+    DONE = "done"
+    FAILED = "failed"  # sent, but the drive refused it, or was seen not to do it
+    REFUSED = "refused"  # forbidden by the library's rules or the plant's lists; not sent
+    NOT_SENT = "not sent"  # certainly
+    UNKNOWN = "unknown"  # it may have been carried out
+    UNDER_WAY = "under way"  # ask again
+
+
+class CommandResult(NamedTuple):
+    """The end of a command: `text` is one sentence for a person, `error` the library's error if it failed.
+
+    `held` is the value that the drive holds after a write, as text with its unit.
+    """
+
+    outcome: CommandOutcome
+    text: str
+    error: BusError | ValueError | None = None
+    held: str = ""
+
+    @property
+    def is_done(self) -> bool:
+        return self.outcome is CommandOutcome.DONE
+
+
+_OUTCOMES: tuple[tuple[type[BaseException], CommandOutcome], ...] = (  # the first match counts
+    (WriteForbidden, CommandOutcome.REFUSED),
+    (Unsupported, CommandOutcome.REFUSED),
+    (NotAttached, CommandOutcome.NOT_SENT),
+    (Expired, CommandOutcome.NOT_SENT),
+    (CancelledByStop, CommandOutcome.NOT_SENT),
+    (DriveException, CommandOutcome.FAILED),
+    (NotVerified, CommandOutcome.FAILED),
+    (NoReply, CommandOutcome.NOT_SENT),  # to a read before the first write
+    (BadReply, CommandOutcome.NOT_SENT),
+)
+_STOP_OUTCOMES = {
+    Seen.STOPPED: CommandOutcome.DONE,
+    Seen.SENT: CommandOutcome.UNKNOWN,
+    Seen.REFUSED: CommandOutcome.FAILED,
+    Seen.FAILED: CommandOutcome.NOT_SENT,
+}
+SURE_OF_A_STOP = (WriteForbidden, NotMaster, Unsupported)
+
+
+def result_of_failure(failure: BaseException) -> CommandResult:
+    """Return the result of a command that raised this; UNKNOWN unless the error is certain."""
+    return _failed(failure, _outcome_of(failure))
+
+
+def result_of_failed_stop(failure: BaseException) -> CommandResult:
+    """Return the result of a stop that raised this.
+
+    A stop is repeated, so its last error says little about the frames before it.
+    """
+    if isinstance(failure, DriveException):  # each time that it was sent
+        return _failed(failure, CommandOutcome.FAILED)
+    is_certain = isinstance(failure, SURE_OF_A_STOP)
+    return _failed(failure, _outcome_of(failure) if is_certain else CommandOutcome.UNKNOWN)
+
+
+def result_of_stop(stopped: Stopped) -> CommandResult:
+    """Return the result of one drive's stop."""
+    outcome = _STOP_OUTCOMES[stopped.seen]
+    if outcome is CommandOutcome.DONE:
+        return CommandResult(outcome, f"stopped: seen to stand after {stopped.seconds:.1f} s")
+    return CommandResult(outcome, f"{stopped.seen.value}: {stopped.why}", BusError(stopped.why))
+
+
+def result_of_write(outcome: Outcome) -> CommandResult:
+    """Return the result of a plain write."""
+    text = str(outcome)
+    if outcome.failure is not None:
+        return CommandResult(_outcome_of(outcome.failure), text, outcome.failure)
+    held = outcome.register.format(outcome.asked if outcome.held is None else outcome.held)
+    if outcome.effect is Effect.DONE:
+        return CommandResult(CommandOutcome.DONE, text, held=held)
+    return CommandResult(CommandOutcome.FAILED, text, BusError(text), held)
+
+
+def in_one_text(results: Mapping[str, CommandResult]) -> str:
+    """Return one sentence for the results of several drives, each with its drive's name."""
+    return "; ".join(with_name(name, result.text) for name, result in results.items())
+
+
+def with_name(drive: str, text: str) -> str:
+    """Return a result's text with the drive's name in front, once."""
+    return text if text.startswith(f"{drive}: ") else f"{drive}: {text}"
+
+
+def _failed(failure: BaseException, outcome: CommandOutcome) -> CommandResult:
+    if not isinstance(failure, (BusError, ValueError)):
+        failure = ValueError(str(failure) or type(failure).__name__)
+    return CommandResult(outcome, str(failure) or type(failure).__name__, failure)
+
+
+def _outcome_of(failure: BaseException) -> CommandOutcome:
+    if isinstance(failure, (LineError, NotMaster)):  # both know whether a frame may have left
+        return CommandOutcome.UNKNOWN if failure.is_sent else CommandOutcome.NOT_SENT
+    found = (outcome for kind, outcome in _OUTCOMES if isinstance(failure, kind))
+    return next(found, CommandOutcome.UNKNOWN)

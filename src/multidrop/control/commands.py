@@ -1,0 +1,190 @@
+"""Commands: carry out a verb, a write or a stop on a drive, for a server with many clients.
+
+Each command has a thread of its own, so that a stop waits for no other command. The thread inherits its
+caller's context: who writes (`written_by`) and until when (`written_before`). A command never raises: its
+CommandResult says what is known.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from math import isfinite
+from typing import Any, TypeVar
+
+from multidrop.control.command_results import (
+    CommandOutcome,
+    CommandResult,
+    result_of_failed_stop,
+    result_of_failure,
+    result_of_stop,
+    result_of_write,
+)
+from multidrop.control.outcome import Outcome, Stopped
+from multidrop.control.time_limit import written_before
+from multidrop.drive.family import Drive
+from multidrop.drive.register import Register
+from multidrop.errors import NotAttached
+from multidrop.supervisor import supervisor
+
+COMMAND_S = 60.0  # after which a command is reported as hanging; a stop is repeated for 30 s
+AGAIN_S = 0.2  # between turns of stops that have no thread
+TURN_S = 0.2  # length of such a turn; it blocks the loop
+STOP_S = 30.0  # for which such a stop is repeated
+
+R = TypeVar("R")
+Results = dict[str, CommandResult]  # by drive
+StopWork = Callable[[float | None], Results]  # takes for how many seconds stops are repeated; None: as usual
+
+
+# ---- on a drive ----
+
+
+def carry_out_verb(drive: Drive, verb: str, arguments: Mapping[str, Any]) -> CommandResult:
+    """Carry out a verb that may move the motor."""
+    try:
+        getattr(drive, verb)(**arguments)
+    except Exception as failure:  # of any kind: the caller must see it
+        return result_of_failure(failure)
+    return CommandResult(CommandOutcome.DONE, f"{drive.name}: {verb} is done")
+
+
+def write_register(drive: Drive, name: str, value: float | str) -> CommandResult:
+    """Write a register; a choice by its name or its raw count."""
+    try:
+        register = drive.register(name)
+        typed = typed_value(register, value)
+    except (ValueError, TypeError) as mistake:
+        return result_of_failure(mistake)._replace(outcome=CommandOutcome.REFUSED)
+    try:
+        outcome: Outcome = _bus_of(drive).try_write(drive, register, typed)
+    except Exception as failure:  # of any kind: the caller must see it
+        return result_of_failure(failure)
+    return result_of_write(outcome)
+
+
+def typed_value(register: Register[Any], value: float | str) -> Any:
+    """Return a value as the register takes it. Raises ValueError for a raw count that is not whole."""
+    if isinstance(value, str):
+        return register.parse(value)
+    if register.values is None:
+        return value
+    if isinstance(value, float) and (not isfinite(value) or value != int(value)):
+        raise ValueError(f"{register.name} takes a choice's name or its whole number, not {value!r}")
+    return register.decode(value)
+
+
+def stop_drive(drive: Drive, seconds: float | None) -> Results:
+    """Stop one drive."""
+    try:
+        drive.stop(seconds=seconds)
+    except Exception as failure:  # of any kind: everybody must see it
+        return {drive.name: result_of_failed_stop(failure)}
+    return {drive.name: CommandResult(CommandOutcome.DONE, "stopped: seen to stand")}
+
+
+def stop_drive_by(verb: str, drive: Drive, seconds: float | None) -> Results:
+    """Stop one drive by another verb than `stop`, such as `coast`."""
+    try:
+        getattr(drive, verb)(seconds=seconds)
+    except Exception as failure:  # of any kind: everybody must see it
+        return {drive.name: result_of_failed_stop(failure)}
+    return {drive.name: CommandResult(CommandOutcome.DONE, f"{drive.name}: {verb} is done")}
+
+
+def stop_line(bus: Callable[[], Any], names: Sequence[str], seconds: float | None) -> Results:
+    """Stop all drives of a line; `bus` returns its bus, `names` are those of the drives meant."""
+    try:
+        found: Mapping[str, Stopped] = bus().stop_all(seconds=seconds)
+    except Exception as failure:  # of any kind: everybody must see it
+        return dict.fromkeys(names, result_of_failed_stop(failure))
+    gone = result_of_failure(NotAttached("it is no longer on its line"))
+    return {name: result_of_stop(found[name]) if name in found else gone for name in names}
+
+
+def _bus_of(drive: Drive) -> Any:
+    if drive.bus is None:
+        raise NotAttached(f"{drive.name} is no longer on a line")
+    return drive.bus
+
+
+# ---- on threads ----
+
+
+def in_thread(work: Callable[[], R]) -> asyncio.Future[R]:
+    """Do work in a thread of its own, to its end even if nobody waits for it.
+
+    Raises RuntimeError or MemoryError if the system has no thread left.
+    """
+    return supervisor().thread("command", COMMAND_S, work)
+
+
+def begin_command(
+    work: Callable[[], CommandResult],
+    limit_ns: Callable[[], float],
+    why_not: Callable[[], CommandResult | None],
+) -> asyncio.Future[CommandResult]:
+    """Carry out a command in a thread, if its first frame leaves before `limit_ns` (CLOCK_MONOTONIC).
+
+    `why_not` is called in that thread: if it returns a result, nothing is sent. Without a thread the result
+    says that nothing was sent.
+    """
+
+    def checked() -> CommandResult:
+        if (refusal := why_not()) is not None:
+            return refusal
+        with written_before(limit_ns):
+            return work()
+
+    try:
+        return in_thread(checked)
+    except (RuntimeError, MemoryError) as failure:
+        future: asyncio.Future[CommandResult] = asyncio.get_running_loop().create_future()
+        future.set_result(result_of_failure(failure)._replace(outcome=CommandOutcome.NOT_SENT))
+        return future
+
+
+def begin_stops(works: Sequence[StopWork]) -> list[asyncio.Future[Results]]:
+    """Start stops, each in a thread of its own; return a future for each.
+
+    Without a thread a stop is sent all the same: those that are left share one task in the loop.
+    """
+    begun: list[asyncio.Future[Results]] = []
+    try:
+        for work in works:
+            future = in_thread(partial(work, None))
+            begun.append(future)
+    except (RuntimeError, MemoryError):
+        left = works[len(begun) :]
+        rest = supervisor().start("stop", _stop_without_threads(left))
+        begun += [asyncio.shield(rest) for _ in left]  # it goes on if its callers are cancelled
+    return begun
+
+
+async def _stop_without_threads(works: Sequence[StopWork]) -> Results:
+    """Send all stops before waiting for any motor; then repeat them in turns, or in threads that come free.
+
+    The loop runs between them: a fleet's gateway must renew the lease without which it may not send a stop.
+    """
+    loop = asyncio.get_running_loop()
+    found: Results = {}
+    for work in works:
+        found |= work(0.0)
+        await asyncio.sleep(0)
+    left, waited = deque(works), []
+    ends = loop.time() + STOP_S
+    while left and loop.time() < ends:
+        await asyncio.sleep(AGAIN_S)
+        work = left.popleft()
+        try:
+            waited.append(in_thread(partial(work, None)))
+        except (RuntimeError, MemoryError):
+            results = work(TURN_S)
+            found |= results
+            if not all(result.is_done for result in results.values()):
+                left.append(work)
+    for results in await asyncio.gather(*waited):
+        found |= results
+    return found

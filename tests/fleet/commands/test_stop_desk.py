@@ -1,0 +1,53 @@
+"""Stops at the gateway that many clients call at once."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+from functools import partial
+from math import inf
+from pathlib import Path
+from typing import Any
+
+import pytest
+from command_desks import LINE, Desks, desks
+from lines import PATIENCE
+
+from multidrop.control.commands import Results, begin_stops, stop_drive, stop_line
+from multidrop.control.repeated_stops import RepeatedStops
+from multidrop.fleet.commands import stop_desk
+from multidrop.fleet.commands.words import CommandAnswer, CommandOutcome
+
+
+@pytest.mark.slow
+def test_of_many_stops_of_a_silent_drive_one_is_repeated(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Each is sent after its call, and all have the answer of the one that is repeated."""
+    repeated: list[float | None] = []
+
+    def noted(*details: Any, stop: Callable[..., Results]) -> Results:
+        repeated.append(details[-1])
+        return stop(*details)
+
+    monkeypatch.setattr(stop_desk, "stop_line", partial(noted, stop=stop_line))
+    monkeypatch.setattr(
+        RepeatedStops.__init__, "__defaults__", (partial(noted, stop=stop_drive), begin_stops)
+    )
+
+    async def stopped(desk: Desks) -> list[CommandAnswer | None]:
+        desk.sim.deaf_until = inf
+        called = [asyncio.create_task(desk.stop())]
+        async with asyncio.timeout(PATIENCE):
+            while not desk.lines.for_stop(LINE).bus.stops_under_way():  # type: ignore[union-attr]
+                await asyncio.sleep(0.002)
+            called += [asyncio.create_task(desk.stop()) for _ in range(8)]
+            while len(repeated) < 3 or desk.stops._repeated._sent:
+                await asyncio.sleep(0.002)
+        desk.sim.deaf_until = 0.0
+        return await asyncio.gather(*called)
+
+    with desks(tmp_path) as desk:
+        answers = asyncio.run(stopped(desk))
+    assert [answer.outcome for answer in answers if answer] == [CommandOutcome.DONE] * 9
+    assert repeated == [None, 0.0, 0.0]  # the second of these for seven that waited for the first one's reply
