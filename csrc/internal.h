@@ -101,6 +101,9 @@ int md_reason(int framing, const struct md_message *request, const uint8_t *byte
 /* Return the time after a request, beside its reply's own, before which it is not worth looking for that. */
 int64_t md_look_ns(const struct md_exchange *exchange);
 int64_t md_timeout_ns(const struct md_exchange *exchange);
+/* Return the time after a request by which its reply begins, with a margin; 0 if the drive is not steady, or
+ * not known well enough. */
+int64_t md_reply_due_ns(const struct md_exchange *exchange);
 /* Learn from a reply's delay (the longest possible, where the reply was whole when first looked at);
  * return what to take for its delay. */
 int64_t md_learn_delay(const struct md_exchange *exchange, int64_t delay_ns, int is_whole);

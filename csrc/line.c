@@ -301,9 +301,13 @@ int md_line_want(struct md_line *line, int64_t now_ns)
             return MD_WAIT;
         }
         line->wake_ns = md_reply_has_begun(line) ? line->give_up_ns : line->begun_by_ns;
-        line->looks++;
+        if (line->looks++ && line->rx_len < line->tx_len)
+            line->missing_ns = line->looked_ns;
+        line->looked_ns = now_ns;
         if (now_ns >= line->wake_ns) /* it may be late to look at all */
             md_line_go(line, MD_TIME_OUT);
+        else if (now_ns < line->copy_by_ns)
+            line->wake_ns = sooner(line->wake_ns, line->copy_by_ns);
         return MD_READ;
     case MD_LAST_LOOK:
         finish(line, line->transactions ? md_tcp_missed(line) : md_reply_missed(line, now_ns));

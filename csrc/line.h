@@ -59,6 +59,9 @@ struct md_line {
     int64_t wake_ns;
     int64_t give_up_ns;  /* end of the wait for a babbling line to fall silent, or for the reply */
     int64_t begun_by_ns; /* the reply has begun by then, or it does not come in time */
+    int64_t looked_ns;   /* the last look at what came */
+    int64_t missing_ns;  /* the last look at which less than a copy of the request had come; 0: none */
+    int64_t copy_by_ns;  /* an echo would be whole by then; 0: unknown */
     int64_t ready_ns;    /* before then nothing is worth reading */
     struct md_drive *late; /* the first drive with late replies due */
     struct md_tap *tap;  /* gets all that goes over the line; NULL: none */

@@ -15,7 +15,7 @@
 enum { MOST_LONE_COPIES = 2 }; /* taken for replies before an echo probe is sent again */
 
 /* An adapter may begin to echo at any time. A write whose confirmation is a copy is read back; a read that
- * may be answered by a copy waits for the reply behind it. */
+ * may be answered by a copy waits for the reply behind it, unless the copy came too late for an echo. */
 int md_echo_is_due(const struct md_line *line, int reply_len)
 {
     const struct md_exchange *exchange = line->exchange;
@@ -41,6 +41,20 @@ static void learn(struct md_line *line, int echo)
         line->echo = (uint8_t)echo;
 }
 
+/* Return when an echo of the request under way would be whole, on a line not known to echo; 0 if the drive's
+ * delay is not known well enough. */
+static int64_t echo_whole_ns(const struct md_line *line)
+{
+    int64_t due_ns = line->echo == MD_NO_ECHO ? md_reply_due_ns(line->exchange) : 0;
+    return due_ns ? line->quiet_ns + due_ns : 0;
+}
+
+/* The copy was not whole when an echo would have been: it is the reply. */
+static int is_timely_copy(const struct md_line *line)
+{
+    return line->copy_by_ns && line->missing_ns >= line->copy_by_ns;
+}
+
 /* A copy that goes before replies shows on this line, and so do two copies, unless there was no echo so far:
  * then the reply may have come twice. A few stray bytes are no echo, but what is left of one where there is
  * known to be one. */
@@ -54,7 +68,7 @@ static void learn_echo(struct md_line *line, size_t reply_at)
     for (size_t at = 0; at + line->tx_len <= reply_at && !md_late_is_repeated(line->exchange); at++)
         if (md_echo_is_copy(line, at))
             learn(line, shown);
-    if (!is_copy)
+    if (!is_copy || is_timely_copy(line))
         line->lone_copies = 0;
 }
 
@@ -125,6 +139,8 @@ void md_reply_await(struct md_line *line, int reply_len)
         if (line->begun_by_ns + begun_ns < line->ready_ns) /* a look is cheaper than so long a wait in vain */
             line->ready_ns = line->begun_by_ns;
     }
+    line->missing_ns = 0;
+    line->copy_by_ns = line->echo_due ? echo_whole_ns(line) : 0;
     line->waited = 0;
     line->looks = 0;
     line->sight = 0;
@@ -328,7 +344,7 @@ int md_reply_find(struct md_line *line, int64_t now_ns, struct md_ending *ending
         int used = md_reply_parse(line, at, &reply);
         if (used > 0 && line->echo_due && may_become_copy(line, at))
             used = MD_INCOMPLETE;
-        if (used > 0 && line->echo_due && md_echo_is_copy(line, at)) {
+        if (used > 0 && line->echo_due && md_echo_is_copy(line, at) && !is_timely_copy(line)) {
             line->echo_due = 0; /* the adapter's, or it cannot be told from that */
             at += line->tx_len;
             first_open = SIZE_MAX;

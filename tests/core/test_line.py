@@ -749,6 +749,93 @@ def test_a_value_of_0_is_taken_when_no_reply_comes_behind_it(line: LineDriver) -
     assert line.echo == lib.MD_NO_ECHO
 
 
+VALUE = build_reply(Framing.DELIXI, replace(QUERY, data=b"\0\0\x13\x88"))
+DELAY = 10 * MS
+
+
+@pytest.fixture
+def steady() -> Peer:
+    return Peer(least_timeout=TIMEOUT / 1e9, most_timeout=TIMEOUT / 1e9)
+
+
+def send_query(line: LineDriver, peer: Peer, *, insists: bool = False) -> int:
+    """Ask a Delixi drive for a parameter; return when the request's last character has left."""
+    line.begin(
+        Exchange(
+            Framing.DELIXI,
+            QUERY,
+            peer,
+            baudrate=9600,
+            format="8N1",
+            character=CHARACTER / 1e9,
+            silence=SILENCE / 1e9,
+            insists=insists,
+        )
+    )
+    line.wait_until_write()
+    return line.now + len(ECHO) * CHARACTER
+
+
+def make_steady(line: LineDriver, peer: Peer) -> None:
+    """Let a drive answer often enough for its response delay to be well known."""
+    for _ in range(10):
+        receive_at_pace(line, send_query(line, peer) + DELAY, VALUE)
+
+
+def receive_at_pace(line: LineDriver, begin: int, frame: bytes) -> None:
+    """Give the line the characters that have come when it looks, until the exchange is over."""
+    came = 0
+    while (want := line.want) != "done":
+        there = min(max(0, (line.now - begin) // CHARACTER), len(frame))
+        if want == "wait":
+            line.now = line.wake
+        elif there > came:
+            line.receive(frame[came:there])
+            came = there
+        elif came < len(frame):
+            line.now = min(line.wake, begin + (came + 1) * CHARACTER)
+        else:
+            line.now = line.wake
+
+
+def test_a_paced_value_of_0_ends_the_exchange_of_a_steady_drive(line: LineDriver, steady: Peer) -> None:
+    """An echo would have been whole before the last character of the reply came."""
+    make_steady(line, steady)
+    for _ in range(5):
+        end = send_query(line, steady)
+        receive_at_pace(line, end + DELAY, ECHO)
+        assert (line.completion.reply.data, line.echo) == (bytes(4), lib.MD_NO_ECHO)
+        assert line.now - end - DELAY <= (len(ECHO) + 1) * CHARACTER
+
+
+@pytest.mark.parametrize("insists", [False, True])
+def test_a_copy_that_may_be_an_echo_waits_for_the_whole_time_out(
+    line: LineDriver, steady: Peer, insists: bool
+) -> None:
+    """It was whole before a paced reply can be; and a stop's read believes no times."""
+    make_steady(line, steady)
+    end = send_query(line, steady, insists=insists)
+    if insists:
+        receive_at_pace(line, end + DELAY, ECHO)
+    else:
+        line.receive(ECHO)
+        line.wait_until_done()
+    assert line.completion.reply.data == bytes(4)
+    assert line.now - end >= TIMEOUT
+
+
+@pytest.mark.parametrize("later", [0, 10 * MS, TIMEOUT // 2])
+def test_the_first_echo_of_a_steady_drive_s_line_is_no_value_of_0(
+    line: LineDriver, steady: Peer, later: int
+) -> None:
+    make_steady(line, steady)
+    end = send_query(line, steady)
+    line.receive(ECHO)
+    receive_at_pace(line, end + DELAY + later, VALUE)
+    assert (line.completion.reply.data, line.completion.skipped) == (b"\0\0\x13\x88", 21)
+    assert line.echo == lib.MD_ECHO
+
+
 def test_a_value_of_0_that_comes_twice_leaves_the_echo_open(line: LineDriver) -> None:
     query(line)
     answer(line, ECHO + ECHO)
