@@ -30,7 +30,7 @@ from multidrop.drive.state import State
 from multidrop.drive.text import Text
 from multidrop.drive.verbs import TRIES
 from multidrop.errors import BusError
-from multidrop.transport.exchange import READ_ATTEMPTS, Exchanges
+from multidrop.transport.exchange import Exchanges
 from multidrop.transport.line import Line
 from multidrop.transport.line_meter import LineMeter
 from multidrop.transport.statistics import LineStatistics
@@ -279,7 +279,7 @@ class Bus:
         """Return values by register name, in as few exchanges as the family allows; raises as `read`."""
         wanted = tuple(registers)
         try:
-            return self._exchanges.values(drive, wanted, READ_ATTEMPTS)
+            return self._exchanges.read(drive, wanted)
         except TypeError:  # what cannot be looked up is no register, or no drive
             for register in wanted:
                 check_own(drive, register)
@@ -291,7 +291,7 @@ class Bus:
         Raises NoReply, BadReply, DriveException or LineError; ValueError for another family's text.
         """
         check_own_text(drive, text)
-        return self._exchanges.text(drive, text)
+        return self._exchanges.read_text(drive, text)
 
     def ask(self, drive: Drive, function: int, start: int, count: int, *, expiry: float = 1.0) -> bytes:
         """Return what the drive has at any addresses, declared or not: a read past its register table.

@@ -6,6 +6,7 @@ import socket
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -15,8 +16,9 @@ from tables import table
 from multidrop.bus import Bus
 from multidrop.core import Framing, Message, build_reply, build_request, parse_request
 from multidrop.drive import Drive
-from multidrop.drive.register import HOLDING, reading
-from multidrop.errors import BadReply, LineError, NoReply, NoSuchPort, PortLost, WriteForbidden
+from multidrop.drive.register import HOLDING, reading, setting
+from multidrop.drive.text import Text
+from multidrop.errors import BadReply, LineError, NoReply, NoSuchPort, PortLost, Unconfirmed, WriteForbidden
 from multidrop.families import YD1000, DelixiNative, InnovertIBD
 from multidrop.plant.loader import PlantError, load_plant
 from multidrop.poller import Poller
@@ -307,3 +309,83 @@ def test_only_the_other_way_s_shape_is_taken_for_it(kind: str) -> None:
     assert mixed_up(port, other)
     assert not any(mixed_up(port, came) for came in (own, b"", b"\0" * 4, b"HTTP/1.1 400 Bad Request"))
     assert not any(mixed_up("/dev/ttyUSB0", came) for came in (rtu, tcp))
+
+
+# ---- peers that close ----
+
+
+class TwoBlocks(Drive):
+    """A device whose registers no single request reads."""
+
+    title = "Two blocks"
+    framings = (Framing.TCP,)
+    first = reading(1, table=HOLDING)
+    second = reading(0x1000, table=HOLDING)
+    third = reading(0x2000, table=HOLDING)
+    target = setting(0x3000, table=HOLDING)
+    serial = Text(0x4142, 2, table=HOLDING)
+
+
+@contextmanager
+def closing_peer(replies: int) -> Iterator[tuple[str, list[Message]]]:
+    """A Modbus TCP peer that closes each connection at its request after `replies` replies."""
+    asked: list[Message] = []
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+
+        def serve() -> None:
+            while True:
+                try:
+                    connection, _ = listener.accept()
+                except OSError:
+                    return
+                with connection, suppress(OSError):
+                    for number in range(replies + 1):
+                        if not (frame := connection.recv(1024)):
+                            break
+                        request = parse_request(Framing.TCP, frame)[1]
+                        asked.append(request)
+                        if number == replies:
+                            break
+                        connection.sendall(answered(frame, request))
+                        if number + 1 == replies:
+                            break
+
+        thread = threading.Thread(target=serve, daemon=True)
+        thread.start()
+        yield f"tcp://127.0.0.1:{listener.getsockname()[1]}", asked
+        listener.shutdown(socket.SHUT_RDWR)
+    thread.join()
+
+
+def answered(frame: bytes, request: Message) -> bytes:
+    """The reply whose registers hold their addresses."""
+    words = b"".join((request.start + at).to_bytes(2) for at in range(request.count))
+    reply = build_reply(Framing.TCP, replace(request, data=words))
+    return frame[:2] + reply[2:]
+
+
+def test_a_read_goes_on_when_the_peer_closes_after_each_reply() -> None:
+    with closing_peer(1) as (port, asked), Bus(port) as bus:
+        drive = bus.attach(TwoBlocks(1))
+        for _ in range(2):
+            found = bus.read_many(drive, [drive.second, drive.first, drive.third])
+            assert found == {"second": 0x1000, "first": 1, "third": 0x2000}
+        assert bus.read_text(drive, drive.serial) == "ABAC"
+        assert len(asked) <= 12
+
+
+def test_a_read_raises_where_the_peer_closes_before_any_reply() -> None:
+    with closing_peer(0) as (port, asked), Bus(port) as bus:
+        drive = bus.attach(TwoBlocks(1))
+        with pytest.raises(PortLost):
+            bus.read(drive, drive.first)
+        assert len(asked) == 1
+
+
+def test_a_write_is_not_repeated_on_a_port_that_is_opened_again() -> None:
+    with closing_peer(1) as (port, asked), Bus(port) as bus:
+        drive = bus.attach(TwoBlocks(1))
+        assert bus.read(drive, drive.first) == 1
+        with pytest.raises((PortLost, Unconfirmed)):
+            bus.write(drive, drive.target, 5)
+        assert all(request.function == 3 for request in asked)

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any, TypeVar
 
 from multidrop.core import Completion, Exchange, Failure, Message, Peer, Permit, build_request
 from multidrop.drive.family import Drive
 from multidrop.drive.register import Register
 from multidrop.drive.request import any_read
 from multidrop.drive.text import Text
-from multidrop.errors import BadReply, DriveException, Expired, NoReply, NotMaster, PortLost
+from multidrop.errors import BadReply, DriveException, Expired, NoReply, NotMaster, NoValue, PortLost
 from multidrop.planning.blocks import Block, blocks, text_blocks
 from multidrop.planning.splitting import halves, least
 from multidrop.transport import clock
@@ -24,6 +25,8 @@ from multidrop.transport.prepared import (
     make_read,
 )
 from multidrop.transport.replies import check_master, good_reply, no_reply, no_value, refusal_of
+
+T = TypeVar("T")
 
 READ_ATTEMPTS = 3
 WRITE_TIMEOUT = 1.0  # s: a write that is wrongly reported as unconfirmed costs more than the wait
@@ -77,6 +80,58 @@ class Exchanges:
         return self._answered_on.get(drive, self) is self.line.queue
 
     # ---- reading ----
+
+    def read(self, drive: Drive, registers: Sequence[Register[Any]]) -> dict[str, Any]:
+        """Return registers' values by name, as `values`, also from a peer that closes after each reply.
+
+        A port that is lost after the drive has answered on it is opened again, and the blocks are read one
+        by one. A block that loses the port twice in a row raises PortLost.
+        """
+        try:
+            return self.values(drive, registers, READ_ATTEMPTS)
+        except PortLost:
+            if not self.has_answered(drive):
+                raise
+        found: dict[str, Any] = {}
+        for block in blocks(drive, registers):
+            try:
+                found |= self._again(partial(self.values, drive, block.registers, READ_ATTEMPTS))
+            except NoValue as lack:
+                found |= {register.name: lack.values.get(register.name) for register in block.registers}
+        found = {register.name: found[register.name] for register in registers}
+        if None in found.values():
+            raise no_value(drive, found)
+        return found
+
+    def read_text(self, drive: Drive, text: Text) -> str:
+        """Return a text, as `text`; a port that is lost after the drive has answered is opened again."""
+        try:
+            return self.text(drive, text)
+        except PortLost:
+            if not self.has_answered(drive):
+                raise
+        return text.decode(
+            b"".join(
+                self._again(partial(self._read_block, drive, block)).data
+                for block in text_blocks(drive, text)
+            )
+        )
+
+    def _again(self, read: Callable[[], T]) -> T:
+        """Open a lost port again and read; once more if the peer closes again. For reads of the user alone.
+
+        A script's reads do not come here: its writes need the identity check that follows a reopening.
+        """
+        self._regain()
+        try:
+            return read()
+        except PortLost:
+            self._regain()
+            return read()
+
+    def _regain(self) -> None:
+        if not self.line.why_closing:
+            self.line.regain()
 
     def values(
         self,
@@ -180,6 +235,9 @@ class Exchanges:
         peer = self.peer(drive)
         reads = [make_read(drive, block, peer, insists=insists) for block in text_blocks(drive, text)]
         return text.decode(b"".join(self._ask(drive, read, attempts).data for read in reads))
+
+    def _read_block(self, drive: Drive, block: Block) -> Completion:
+        return self._ask(drive, make_read(drive, block, self.peer(drive)), READ_ATTEMPTS)
 
     def _prepare(self, drive: Drive) -> PreparedReads:
         """Return what is prepared for this drive; anew where anything that it depends on has changed."""
