@@ -11,7 +11,7 @@ from multidrop.drive import Drive
 from multidrop.drive.declaration_check import DeclarationError
 from multidrop.drive.register import Access, Register
 from multidrop.importers.device import ONLY_WRITTEN, ImportedDevice, ImportedRegister
-from multidrop.importers.settling import declare
+from multidrop.importers.family_writer import declare
 
 DETAILS = {  # of an entry, in the words of the table that is printed
     "offset": "offset",

@@ -35,7 +35,7 @@ from multidrop.families import DelixiNative as DelixiNative
 from multidrop.families import ErmanERG220 as ErmanERG220
 from multidrop.families import InnovertIBD as InnovertIBD
 from multidrop.families import InvtCHE as InvtCHE
-from multidrop.families.files.errors import FamilyError as FamilyError
+from multidrop.families.files import FamilyError as FamilyError
 from multidrop.families.files.loader import load_family as load_family
 from multidrop.history.history import History as History
 from multidrop.plant.loader import PlantError as PlantError

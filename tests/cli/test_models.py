@@ -93,7 +93,7 @@ def test_a_link_to_what_is_no_python_file_is_said(tmp_path: Path) -> None:
         ("raise SystemExit(3)\n", "line 1: SystemExit: 3"),
         (
             FAN.replace("reading(1", "reading(70000"),
-            "line 4: DeclarationError: Fan.speed: address 11170H is outside 0 to FFFFH",
+            "line 4: DeclarationError: Fan.speed: address = 70000 is not an address from 0 to FFFFH",
         ),
     ],
 )

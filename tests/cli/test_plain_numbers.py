@@ -9,7 +9,7 @@ import pytest
 
 from multidrop.cli import main
 from multidrop.families import InvtCHE
-from multidrop.families.files import cells
+from multidrop.families.files import notation
 from multidrop.gateway.http.messages import Denied, number_in
 from multidrop.importers.numbers import count, number
 from multidrop.printable import plain_number, plain_whole
@@ -38,8 +38,8 @@ def test_other_digits_are_refused_in_requests_and_files(text: str) -> None:
     row = ["2026-11-21T09:30:00.000000000Z", "1", "", "pump", "speed", text, "ok"]
     attempts: list[tuple[Any, Any]] = [
         (InvtCHE(1).setpoint.parse, text),
-        (cells.number, text),
-        (cells.whole, text),
+        (notation.number, text),
+        (notation.whole, text),
         (count, text),
         (number, (text, 0)),
         (_parse, row),

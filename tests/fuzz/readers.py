@@ -19,7 +19,7 @@ from multidrop.core import Splitter
 from multidrop.drive.declaration_check import UNIT_IDS
 from multidrop.drive.line_settings import SERIAL_ADDRESSES
 from multidrop.drive.register import Access
-from multidrop.families.files.errors import FamilyError
+from multidrop.families.files import FamilyError
 from multidrop.families.files.loader import load_family
 from multidrop.fleet.samples.message import MOST_ROWS, ROWS, MessageError, unpack
 from multidrop.importers import SUFFIXES, ImportedDevice, family_text, plant_text, read_devices

@@ -28,9 +28,9 @@ from imported import (
 
 from multidrop import load_family
 from multidrop.drive.register import Access, Register
-from multidrop.importers import family_text, plant_text, read_devices, settling
+from multidrop.importers import family_text, family_writer, plant_text, read_devices
 from multidrop.importers.device import ImportedDevice, ImportedRegister
-from multidrop.importers.settling import declare
+from multidrop.importers.family_writer import declare
 
 
 def loaded(folder: Path, device: ImportedDevice, *names: str) -> dict[str, Register[Any]]:
@@ -268,8 +268,8 @@ def test_no_more_is_declared_than_a_family_holds(tmp_path: Path, monkeypatch: py
         declared.append(found.name)
         return declare(found)
 
-    monkeypatch.setattr(settling, "MOST_REGISTERS", 2)
-    monkeypatch.setattr(settling, "declare", noted)
+    monkeypatch.setattr(family_writer, "MOST_REGISTERS", 2)
+    monkeypatch.setattr(family_writer, "declare", noted)
     rows = "".join(f"r{address},{address},uint16\n" for address in (1, 99_999, 2, 3, 4))
     device = only(tmp_path, "a.csv", f"name,address,type\n{rows}")
     assert [register.name for register in device.registers] == ["r1", "r2"]

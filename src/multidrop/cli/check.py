@@ -21,7 +21,7 @@ from multidrop.drive.family import Drive
 from multidrop.drive.register import Access, Kept, Register
 from multidrop.drive.verbs import MOVING
 from multidrop.families import MODELS
-from multidrop.families.files.errors import FamilyError
+from multidrop.families.files import FamilyError
 from multidrop.families.files.loader import load_family
 from multidrop.families.registry import find_model
 from multidrop.plant.loader import PlantError, load_plant, port_or_address

@@ -11,9 +11,8 @@ from typing import Any
 from multidrop.importers.csv_tables import read_table
 from multidrop.importers.device import ImportedDevice
 from multidrop.importers.esphome import is_esphome, read_esphome
-from multidrop.importers.family_text import family_text, plant_text
+from multidrop.importers.family_writer import family_text, plant_text, settle
 from multidrop.importers.home_assistant import read_home_assistant
-from multidrop.importers.settling import settle
 from multidrop.importers.sunspec import is_sunspec, read_sunspec
 from multidrop.importers.telegraf import read_telegraf
 from multidrop.importers.wb import json_without_comments, read_wb

@@ -9,10 +9,10 @@ import csv
 import io
 import re
 from collections.abc import Mapping
+from dataclasses import dataclass
 from fractions import Fraction
 
-from multidrop.families.files.addresses import Counting
-from multidrop.importers import neuron
+from multidrop.families.files.notation import Counting
 from multidrop.importers.device import ImportedDevice, ImportedRegister, unit_address
 from multidrop.importers.modpoll import read_modpoll
 from multidrop.importers.numbers import (
@@ -196,7 +196,7 @@ class _Layout:
     def gaps(self, cells: Cells, further: set[str]) -> list[str]:
         """Return what the columns of a row leave open."""
         columns = further & _VALUE_COLUMNS
-        if neuron.parse_tag(cells["at"]):
+        if _parse_tag(cells["at"]):
             columns -= {"precision"}  # digits that are shown there
         found = [f"the column {name} was not carried over" for name in sorted(columns)]
         is_text = cells.get("type", "").lower().startswith("str")
@@ -236,7 +236,7 @@ def _places(header: list[str]) -> dict[str, int]:
 
 
 def _row(devices: dict[int | None, ImportedDevice], cells: Cells, gaps: list[str], stem: str) -> None:
-    tag = neuron.parse_tag(cells["at"])
+    tag = _parse_tag(cells["at"])
     slave = unit_address(tag.slave if tag else cells.get("slave") or None, "slave")
     device = devices.setdefault(slave, ImportedDevice(stem, slave))
     name = cells.get("name") or f"register_{tag.address if tag else cells['at']}"
@@ -246,7 +246,7 @@ def _row(devices: dict[int | None, ImportedDevice], cells: Cells, gaps: list[str
         _fill(device, register, cells, tag)
 
 
-def _placed(name: str, cells: Cells, tag: neuron.Tag | None) -> ImportedRegister:
+def _placed(name: str, cells: Cells, tag: _Tag | None) -> ImportedRegister:
     """Return the register at its address, with the gaps of its table and its numbering."""
     register = ImportedRegister(name, 0)
     stated = _table(register, cells)
@@ -331,7 +331,7 @@ def _named_table(given: str) -> str | None:
     return next((table for beginning, table in _NAMED_TABLES if words.startswith(beginning)), None)
 
 
-def _fill(device: ImportedDevice, register: ImportedRegister, cells: Cells, tag: neuron.Tag | None) -> None:
+def _fill(device: ImportedDevice, register: ImportedRegister, cells: Cells, tag: _Tag | None) -> None:
     """Add the register, a text or a number, as its cells say."""
     kind = cells.get("type", "").lower()
     if note := cells.get("note"):
@@ -342,7 +342,7 @@ def _fill(device: ImportedDevice, register: ImportedRegister, cells: Cells, tag:
         register.gaps.append("it scales other registers, which are not named: `scale_register`")
     _access(register, cells.get("access", ""))
     if tag and kind == "string":
-        neuron.add_text(device, register, tag)
+        _add_tag_text(device, register, tag)
     elif kind.startswith(("string", "str", "ascii", "char", "text")):
         _text(device, register, cells.get("length", ""), kind)
     elif register.table in ("coil", "discrete"):
@@ -384,7 +384,7 @@ def _text(device: ImportedDevice, register: ImportedRegister, length: str, kind:
 # ---- numbers ----
 
 
-def _number(device: ImportedDevice, register: ImportedRegister, cells: Cells, tag: neuron.Tag | None) -> None:
+def _number(device: ImportedDevice, register: ImportedRegister, cells: Cells, tag: _Tag | None) -> None:
     kind = re.sub(r"[\s_-]+", "", cells.get("type", "").lower())
     order: str | None = None
     if part := _part(register, kind, cells, tag):
@@ -400,7 +400,7 @@ def _number(device: ImportedDevice, register: ImportedRegister, cells: Cells, ta
         device.lose(register.name, f"its type {given[:40]} has no number format")
         return
     if tag:
-        order = neuron.order_of(register, tag, found)
+        order = _tag_order(register, tag, found)
     elif order is None and words_of(found) > 1:
         order = _order(register, cells.get("order", ""))
     elif order is None and cells.get("order") and _ORDERS.get(cells["order"].lower()) != "":
@@ -414,7 +414,7 @@ def _number(device: ImportedDevice, register: ImportedRegister, cells: Cells, ta
     device.add(register)
 
 
-def _part(register: ImportedRegister, kind: str, cells: Cells, tag: neuron.Tag | None) -> str:
+def _part(register: ImportedRegister, kind: str, cells: Cells, tag: _Tag | None) -> str:
     """Return the bits of the word that it is; "" for all. A bit that is not stated is a gap."""
     if tag and tag.part:
         return tag.part
@@ -513,3 +513,57 @@ def _step(register: ImportedRegister, key: str, given: str, *, is_neuron: bool) 
     elif key == "gain" or (key == "scale" and abs(amount) > 1):
         register.gaps.append(f"its {key} {given} was taken as a factor; in some tables it is a divisor")
     return amount
+
+
+# ---- tags of EMQX Neuron's Modbus plugins: SLAVE!ADDRESS[.BIT][#ENDIAN][.LEN[H][L][D][E]] ----
+
+_TAG = re.compile(r"([0-9]{1,6})!([0-9]{1,9})(?:[.](\d{1,6})([HLDE]?))?(?:#([A-Z]{1,2}))?")
+_TAG_ORDERS = {  # Neuron's Modbus TCP page, #ENDIAN: LL is 1,2,3,4
+    **{"L": "", "LL": "", "LB": "BADC", "BL": "CDAB", "BB": "DCBA", "B": "DCBA"},
+}
+_TAG_TEXT_ORDERS = {"": "", "H": "", "L": "BA", "D": "B"}  # E is one character a register, in its high byte
+
+
+@dataclass(frozen=True)
+class _Tag:
+    """The parts of a tag's address; `part` is a bit, or a text's bytes."""
+
+    slave: int
+    address: str
+    part: str
+    of_text: str
+    order: str
+
+
+def _parse_tag(cell: str) -> _Tag | None:
+    """Return the parts of such an address; None for a cell that is none."""
+    match = _TAG.fullmatch(cell)
+    if match is None:
+        return None
+    return _Tag(int(match[1]), match[2], match[3] or "", match[4] or "", match[5] or "")
+
+
+def _tag_order(register: ImportedRegister, tag: _Tag, number: str) -> str:
+    """Return the order of a number's bytes; notes a gap where the tag leaves it to its node."""
+    if tag.order in _TAG_ORDERS:
+        return _TAG_ORDERS[tag.order]
+    if tag.order:
+        register.lacks = f"its order of bytes #{tag.order}"
+    elif words_of(number) > 1:
+        register.gaps.append("its order of bytes is its node's; ABCD was assumed, as Neuron does")
+    return ""
+
+
+def _add_tag_text(device: ImportedDevice, register: ImportedRegister, tag: _Tag) -> None:
+    if not tag.part:
+        device.lose(register.name, "a text of unknown length")
+        return
+    if tag.of_text not in _TAG_TEXT_ORDERS:
+        device.lose(register.name, "a text of one character a register, in its high byte")
+        return
+    register.details.pop("note", None)
+    length = int(tag.part)
+    register.details["length"] = length if tag.of_text == "D" else (length + 1) // 2
+    if order := _TAG_TEXT_ORDERS[tag.of_text]:
+        register.details["order"] = order
+    device.add(register, is_text=True)

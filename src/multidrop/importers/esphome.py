@@ -10,8 +10,16 @@ from collections.abc import Iterator, Mapping
 from fractions import Fraction
 from typing import Any
 
-from multidrop.importers.device import ImportedDevice, ImportedRegister, key_table, uncarried, unit_address
-from multidrop.importers.line_settings import UNKNOWN_LINE, LineSettings, serial_settings
+from multidrop.importers.device import (
+    UNKNOWN_LINE,
+    ImportedDevice,
+    ImportedRegister,
+    LineSettings,
+    key_table,
+    serial_settings,
+    uncarried,
+    unit_address,
+)
 from multidrop.importers.numbers import bits_text, number, put_number, scaled, whole, words_of
 from multidrop.importers.yaml_text import YamlTag
 

@@ -10,8 +10,17 @@ from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from typing import Any
 
-from multidrop.importers.device import ImportedDevice, ImportedRegister, key_table, uncarried, unit_address
-from multidrop.importers.line_settings import UNKNOWN_LINE, LineSettings, network_settings, serial_settings
+from multidrop.importers.device import (
+    UNKNOWN_LINE,
+    ImportedDevice,
+    ImportedRegister,
+    LineSettings,
+    key_table,
+    network_settings,
+    serial_settings,
+    uncarried,
+    unit_address,
+)
 from multidrop.importers.numbers import count, put_number, scaled, whole, words_of
 from multidrop.importers.yaml_text import YamlTag
 

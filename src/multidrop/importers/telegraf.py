@@ -9,8 +9,16 @@ from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
 from urllib.parse import urlsplit
 
-from multidrop.importers.device import ImportedDevice, ImportedRegister, key_table, uncarried, unit_address
-from multidrop.importers.line_settings import LineSettings, network_settings, serial_settings
+from multidrop.importers.device import (
+    ImportedDevice,
+    ImportedRegister,
+    LineSettings,
+    key_table,
+    network_settings,
+    serial_settings,
+    uncarried,
+    unit_address,
+)
 from multidrop.importers.numbers import TABLES, number_format, put_number, scaled, whole, words_of
 
 _REGISTER_STYLE = {

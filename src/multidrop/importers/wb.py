@@ -11,14 +11,17 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from multidrop.importers.device import (
+    UNKNOWN_LINE,
     ImportedDevice,
     ImportedRegister,
+    LineSettings,
     Treatment,
     key_table,
+    network_settings,
+    serial_settings,
     uncarried,
     unit_address,
 )
-from multidrop.importers.line_settings import UNKNOWN_LINE, LineSettings, network_settings, serial_settings
 from multidrop.importers.numbers import bits_text, count, float_of_bits, put_number, scaled, whole, words_of
 
 # Comments, and a comma before the end of a list: what JSON does not have. Strings are left as they are; what

@@ -13,7 +13,7 @@ from multidrop.core import RS485, Echo, TransactionIds
 from multidrop.drive.family import Drive
 from multidrop.drive.line_settings import Settings, check_port, check_settle, speaks_tcp
 from multidrop.families import MODELS
-from multidrop.families.files.errors import FamilyError
+from multidrop.families.files import FamilyError
 from multidrop.families.registry import find_model
 from multidrop.plant.drive_names import check_drive_name
 from multidrop.plant.model import Plant, PlantLine, Polled, PolledDrive

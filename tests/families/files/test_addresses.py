@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from tables import table
 
-from multidrop.families.files.addresses import Counting, sent_as
+from multidrop.families.files.notation import Counting, sent_as
 
 
 @table(

@@ -16,9 +16,9 @@ from multidrop import Drive, FamilyError, load_family
 from multidrop.core import NumberFormat
 from multidrop.drive import Kept
 from multidrop.drive.register import HOLDING, INPUT, Register
-from multidrop.families.files.facts import FAMILY_KEYS
 from multidrop.families.files.loader import SECTIONS
-from multidrop.families.files.register_keys import REGISTER_KEYS
+from multidrop.families.files.registers import REGISTER_KEYS
+from multidrop.families.files.sections import FAMILY_KEYS
 
 HEAD = '[family]\ntitle = "T"\nmanual = "M"\ncounts_from = 0\n'
 

@@ -12,15 +12,25 @@ from typing import Any
 from multidrop.drive.declaration_check import DeclarationError, declaration_errors
 from multidrop.drive.family import TAKEN_NAMES, Drive
 from multidrop.drive.register import Access
-from multidrop.families.files.addresses import Counting
-from multidrop.families.files.csv_table import MOST_BYTES, beside, declare_rows
-from multidrop.families.files.errors import FamilyError
-from multidrop.families.files.facts import FAMILY_KEYS, facts_of
-from multidrop.families.files.identity import identify_by, proofs_of
-from multidrop.families.files.options import options_of
-from multidrop.families.files.register_keys import shown
-from multidrop.families.files.registers import MOST_REGISTERS, Declared, defaults_of
-from multidrop.families.files.texts import texts_of
+from multidrop.families.files import FamilyError
+from multidrop.families.files.notation import Counting
+from multidrop.families.files.registers import (
+    MOST_BYTES,
+    MOST_REGISTERS,
+    Declared,
+    beside,
+    declare_rows,
+    defaults_of,
+    shown,
+)
+from multidrop.families.files.sections import (
+    FAMILY_KEYS,
+    facts_of,
+    identify_by,
+    options_of,
+    proofs_of,
+    texts_of,
+)
 from multidrop.toml_check import TomlPlace, parse_document
 
 SECTIONS = ("family", "default", *(access.value for access in Access), "text", "option", "identify")

@@ -1,17 +1,252 @@
-"""Registers of a family's file: each entry becomes a declaration, or sentences on its mistakes."""
+"""Registers of a family file: their keys in TOML and CSV, and the declarations made from them."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import csv
+import difflib
+import io
+import keyword
+import math
+import re
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from enum import IntEnum, IntFlag
+from pathlib import Path, PureWindowsPath
+from typing import Any, cast
 
+from multidrop.core import NumberFormat
 from multidrop.drive.family import TAKEN_NAMES
-from multidrop.drive.register import HOLDING_MULTIPLE, Access, Carrier, Register, command, reading, setting
-from multidrop.families.files.addresses import TABLES, Counting
-from multidrop.families.files.names import enumeration, flags, unusable
-from multidrop.families.files.register_keys import DEFAULT_KEYS, NOT_DETAILS, REGISTER_KEYS, converted, shown
+from multidrop.drive.register import (
+    HOLDING_MULTIPLE,
+    Access,
+    Carrier,
+    Kept,
+    Register,
+    command,
+    reading,
+    setting,
+)
+from multidrop.families.files import notation
+from multidrop.families.files.notation import TABLES, Counting
 from multidrop.toml_check import TomlPlace
+
+LONGEST_NAME = 60
+MOST_VALUES = 500
+MOST_BITS = 64
+_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
+OF_ENUMERATIONS = frozenset({*dir(IntEnum), *dir(IntFlag), *dir(int), "mro", "name", "value"})
+
+
+def unusable(name: str) -> str:
+    """Return why a name cannot be an attribute in Python, with one that can; "" where it can."""
+    if len(name) > LONGEST_NAME:
+        return f"it has more than {LONGEST_NAME} characters; give it a shorter one"
+    if keyword.iskeyword(name):
+        return f"it is a word of Python; write {name}_ or another one"
+    if _NAME.fullmatch(name):
+        return ""
+    words = re.sub(r"\W+|_+", "_", name, flags=re.ASCII).strip("_").lower()
+    right = words if _NAME.fullmatch(words) else f"r_{words}".rstrip("_")
+    return f"it is not letters of a to z, digits and _, after a letter; write {right}"
+
+
+def enumeration(owner: str, given: Mapping[str, Any]) -> type[IntEnum]:
+    """Return the enumeration of a register's values. Raises ValueError with all that is wrong with it."""
+    _check("values", given, MOST_VALUES, range(-(1 << 63), 1 << 64), "a whole number")
+    make: Any = IntEnum
+    return cast(type[IntEnum], make(owner, given))
+
+
+def flags(owner: str, given: Mapping[str, Any]) -> type[IntFlag]:
+    """Return the flags of a register, of the number of each bit. Raises ValueError for all that is wrong."""
+    _check("bits", given, MOST_BITS, range(MOST_BITS), f"a bit's number, 0 to {MOST_BITS - 1}")
+    make: Any = IntFlag
+    return cast(type[IntFlag], make(owner, {name: 1 << bit for name, bit in given.items()}))
+
+
+def _check(key: str, given: Mapping[str, Any], most: int, allowed: range, right: str) -> None:
+    if wrong := list(_mistakes(key, given, most, allowed, right)):
+        raise ValueError("; ".join(wrong))
+
+
+def _mistakes(key: str, given: Mapping[str, Any], most: int, allowed: range, right: str) -> Iterator[str]:
+    if not given:
+        yield f"{key} is empty; leave it out, or write {key} = {{ off = 0, on = 1 }}"
+    if len(given) > most:
+        yield f"{key} has {len(given)} names, and {most} are the most"
+        return
+    spelt: dict[str, str] = {}
+    numbered: dict[int, str] = {}
+    for name, number in given.items():
+        if why := unusable(name):
+            yield f"{key}: {name!r} is no name: {why}"
+        elif name in OF_ENUMERATIONS:
+            yield f"{key}: {name!r} is a name that all enumerations have; write {name}_"
+        elif name.lower() in spelt:
+            yield f"{key}: {name} and {spelt[name.lower()]} differ in capitals alone; call one otherwise"
+        spelt[name.lower()] = name
+        if isinstance(number, bool) or not isinstance(number, int) or number not in allowed:
+            yield f"{key}: {name} = {number!r} is not {right}"
+        elif number in numbered:
+            yield f"{key}: {name} and {numbered[number]} are both {number}; each has its own"
+        else:
+            numbered[number] = name
+
+
+LONGEST_TEXT = 1000
+MOST_LISTED = 100  # raw counts of one key
+NOT_STATED = "unknown"
+ORDERS = ("ABCD", "CDAB", "BADC", "DCBA", "AB", "BA")
+WRITES = ("single", "multiple")
+ACCESSES = {access.value: access for access in Access}
+_KEPT = {"ram": Kept.RAM, "eeprom": Kept.EEPROM, NOT_STATED: Kept.UNKNOWN}
+
+
+@dataclass(frozen=True)
+class RegisterKey:
+    """One key: it raises ValueError for what it does not take, and `example` is what it does."""
+
+    convert: Callable[[Any], Any]
+    example: str
+    cell: Callable[[str], Any] = notation.text
+
+
+def _text(value: Any) -> str:
+    if not isinstance(value, str):
+        raise ValueError("is no text")
+    if not value.isprintable():
+        raise ValueError("has characters that do not print; leave them out")
+    if len(value) > LONGEST_TEXT:
+        raise ValueError(f"has more than {LONGEST_TEXT} characters")
+    return value
+
+
+def _number(value: Any) -> float:
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        raise ValueError("is no number")
+    if not math.isfinite(value):
+        raise ValueError("is no finite number")
+    return value
+
+
+def _step(value: Any) -> Any:
+    if value == NOT_STATED:
+        return None
+    if _number(value) == 0:
+        raise ValueError("makes every value 0")
+    return value
+
+
+def _truth(value: Any) -> bool:
+    if not isinstance(value, bool):
+        raise ValueError("is neither true nor false")
+    return value
+
+
+def _span(value: Any) -> tuple[float, float]:
+    if not isinstance(value, list) or len(value) != 2:
+        raise ValueError("is not two numbers")
+    low, high = map(_number, value)
+    if low > high:
+        raise ValueError("is the wrong way round: the smallest comes first")
+    return low, high
+
+
+def _counts(value: Any) -> tuple[int, ...]:
+    if not isinstance(value, list) or not all(
+        isinstance(each, int) and not isinstance(each, bool) for each in value
+    ):
+        raise ValueError("is no list of raw counts")
+    if len(value) > MOST_LISTED:
+        raise ValueError(f"has more than {MOST_LISTED} counts")
+    return tuple(value)
+
+
+def _invalid(value: Any) -> tuple[float, ...]:
+    listed = value if isinstance(value, list) else [value]
+    if not listed or len(listed) > MOST_LISTED:
+        raise ValueError(f"is not 1 to {MOST_LISTED} raw counts")
+    return tuple(math.nan if each in ("NaN", "nan") else _number(each) for each in listed)
+
+
+def _part(value: Any) -> tuple[int, int]:
+    first, dash, last = str(value).partition("-")
+    ends = [end.strip() for end in (first, last if dash else first)]
+    if isinstance(value, (bool, float)) or not all(end.isascii() and end.isdecimal() for end in ends):
+        raise ValueError("is no bit, nor its first and last")
+    low, high = (int(end[:4]) for end in ends)
+    if low > high:
+        raise ValueError("is the wrong way round: the lowest bit comes first")
+    return low, high
+
+
+def _one_of(known: Mapping[str, Any], spelling: Callable[[str], str] = str) -> Callable[[Any], Any]:
+    def convert(value: Any) -> Any:
+        name = spelling(value) if isinstance(value, str) else ""
+        if name in known:
+            return known[name]
+        near = difflib.get_close_matches(str(name), known, n=1) if name else []
+        hint = f"did you mean {near[0]}?" if near else f"it is one of {', '.join(known)}"
+        raise ValueError(f"is not known: {hint}")
+
+    return convert
+
+
+def _named(value: Any) -> Mapping[str, Any]:
+    if not isinstance(value, dict):
+        raise ValueError("is no table of names with their numbers")
+    return value
+
+
+REGISTER_KEYS: Mapping[str, RegisterKey] = {
+    "at": RegisterKey(lambda value: value, 'at = 0x2000, 8192, "2000H" or "40001"'),
+    "unit": RegisterKey(_text, 'unit = "Hz"'),
+    "values": RegisterKey(_named, "values = { off = 0, on = 1 }", notation.named),
+    "bits": RegisterKey(_named, "bits = { ready = 0, tripped = 3 }", notation.named),
+    "step": RegisterKey(
+        _step, 'step = 0.1, or "unknown" where the manual does not state it', notation.number_or_word
+    ),
+    "offset": RegisterKey(_number, "offset = -40", notation.number),
+    "span": RegisterKey(_span, "span = [0, 50]", notation.numbers),
+    "number_format": RegisterKey(_one_of(NumberFormat.__members__, str.upper), 'number_format = "F32"'),
+    "order": RegisterKey(_one_of(dict(zip(ORDERS, ORDERS, strict=True)), str.upper), 'order = "CDAB"'),
+    "part": RegisterKey(_part, 'part = "3" or "0-7"'),
+    "invalid": RegisterKey(_invalid, 'invalid = 0x7FFF, [0x7FFF, 0x8000] or "NaN"', notation.numbers),
+    "scale_register": RegisterKey(_text, 'scale_register = "power_of_ten"'),
+    "table": RegisterKey(_one_of({name: name for name in TABLES}, str.lower), 'table = "input"'),
+    "write": RegisterKey(_one_of(dict(zip(WRITES, WRITES, strict=True))), 'write = "multiple"'),
+    "kept": RegisterKey(_one_of(_KEPT, str.lower), 'kept = "ram", "eeprom" or "unknown"'),
+    "ram_address": RegisterKey(lambda value: value, "ram_address = 0x1005"),
+    "default": RegisterKey(_number, "default = 50", notation.number),
+    "at_least": RegisterKey(_text, 'at_least = "minimum_frequency"'),
+    "at_most": RegisterKey(_text, 'at_most = "maximum_frequency"'),
+    "while_running": RegisterKey(_truth, "while_running = false", notation.truth),
+    "moves": RegisterKey(_truth, "moves = false", notation.truth),
+    "harmless": RegisterKey(_counts, "harmless = [0x0476]", notation.counts),
+    "broadcast": RegisterKey(_counts, "broadcast = [0]", notation.counts),
+    "never": RegisterKey(_text, 'never = "the reason"'),
+    "never_together": RegisterKey(_counts, "never_together = [0x0088]", notation.counts),
+    "place": RegisterKey(_text, 'place = "table 12"'),
+    "outside": RegisterKey(_text, 'outside = "another document"'),
+    "note": RegisterKey(_text, 'note = "Of the motor."'),
+}
+NOT_DETAILS = frozenset({"at", "unit", "values", "bits", "table", "write", "ram_address"})
+DEFAULT_KEYS = ("table", "unit", "step", "number_format", "order", "invalid", "write", "kept")
+
+
+def converted(key: str, value: Any) -> Any:
+    """Return what the key's value becomes. Raises ValueError with what was wrong and what would be right."""
+    try:
+        return REGISTER_KEYS[key].convert(value)
+    except ValueError as mistake:
+        raise ValueError(f"{key} = {shown(value)} {mistake}; write {REGISTER_KEYS[key].example}") from None
+
+
+def shown(value: Any) -> str:
+    """Return a value as a sentence shows it."""
+    text = str(value).lower() if isinstance(value, bool) else repr(value)
+    return text if len(text) <= 60 else f"{text[:57]}..."
+
 
 MOST_REGISTERS = 2000
 SECTIONS = tuple(access.value for access in Access)
@@ -172,3 +407,113 @@ def defaults_of(table: Any, place: TomlPlace) -> dict[str, Any]:
         except ValueError as mistake:
             place.wrong(mistake)
     return good
+
+
+MOST_BYTES = 2_000_000
+_DELIMITERS = (",", ";", "\t")
+_OWN_COLUMNS = ("name", "access")  # of a CSV file, besides the keys of a register
+COLUMNS = dict.fromkeys((*_OWN_COLUMNS, *REGISTER_KEYS))
+NEEDED = ("name", "at")
+
+
+def declare_rows(data: bytes, declared: Declared, place: TomlPlace) -> None:
+    """Declare the registers of a CSV file's bytes; every mistake has its line and column."""
+    text = _decoded(data, place)
+    if text is None:
+        return
+    rows = _rows(text, place)
+    header = next(rows, None)
+    if header is None:
+        place.wrong("is empty; its first line names the columns, such as name,at,unit")
+        return
+    columns = _columns(header[1], place.within(f"line {header[0]}"))
+    if columns is None:
+        return
+    for number, cells in rows:
+        _declare(columns, cells, declared, place.within(f"line {number}"))
+        if len(declared.places) > MOST_REGISTERS:
+            place.wrong(f"has more than {MOST_REGISTERS} registers; leave out those that nobody reads")
+            return
+
+
+def _decoded(data: bytes, place: TomlPlace) -> str | None:
+    if len(data) > MOST_BYTES:
+        place.wrong(f"has more than {MOST_BYTES} bytes")
+        return None
+    try:
+        text = data.decode("utf-8-sig")
+    except UnicodeDecodeError as failure:
+        place.wrong(f"is not text in UTF-8, from byte {failure.start} on; save it as CSV UTF-8")
+        return None
+    if "\0" in text:
+        place.wrong("has zero bytes; save it as CSV UTF-8")
+        return None
+    return text
+
+
+def _rows(text: str, place: TomlPlace) -> Iterator[tuple[int, list[str]]]:
+    """Yield each line that has a cell, with its number."""
+    first = text.lstrip("\r\n").splitlines()[:1]
+    delimiter = max(_DELIMITERS, key=first[0].count) if first else ","
+    reader = csv.reader(io.StringIO(text, newline=""), delimiter=delimiter, strict=True)
+    try:
+        for cells in reader:
+            stripped = [cell.strip() for cell in cells]
+            if any(stripped):
+                yield reader.line_num, stripped
+    except csv.Error as failure:
+        place.within(f"line {reader.line_num}").wrong(f"is not CSV: {failure}")
+
+
+def _columns(header: list[str], place: TomlPlace) -> list[str] | None:
+    """Return the columns' names; None where they are wrong."""
+    columns = [name.lower().replace(" ", "_") for name in header]
+    while columns and not columns[-1]:  # of a spreadsheet with an empty column
+        columns.pop()
+    before = len(place.config_errors)
+    meant = place.unknown(dict.fromkeys(columns), COLUMNS) if set(columns) - COLUMNS.keys() else set()
+    for name in {name for name in columns if columns.count(name) > 1}:
+        place.wrong(f"two columns are called {name!r}; each has a name of its own")
+    for name in NEEDED:
+        if name not in columns and name not in meant:
+            place.wrong(
+                f"no column is called {name!r}; the first line names the columns: {', '.join(COLUMNS)}"
+            )
+    return None if len(place.config_errors) > before else columns
+
+
+def _declare(columns: list[str], row: list[str], declared: Declared, place: TomlPlace) -> None:
+    if any(row[len(columns) :]):
+        place.wrong(
+            f"has {len(row)} cells, and the first line has {len(columns)}: "
+            "a comma in a number or a text? write 0.1, and texts in quotes"
+        )
+        return
+    filled = {name: cell for name, cell in zip(columns, row, strict=False) if cell}
+    name, access = filled.pop("name", ""), filled.pop("access", Access.READING.value).lower()
+    if not name:
+        place.within("column name").wrong("the register's name is missing; every line has one")
+        return
+    if access not in ACCESSES:
+        place.within("column access").wrong(f"{shown(access)} is not known; write {', '.join(ACCESSES)}")
+        access = Access.READING.value
+    given: dict[str, Any] = {}
+    for key, cell in filled.items():
+        try:
+            given[key] = REGISTER_KEYS[key].cell(cell)
+        except ValueError as mistake:
+            place.within(f"column {key}").wrong(mistake)
+    at = place.within(name[:60])
+    declared.add(name, ACCESSES[access], given, at, declared.counting.address_in_cell)
+
+
+def beside(path: Path, name: Any) -> Path:
+    """Return the path of a CSV file beside the family's. Raises ValueError for any other place."""
+    if not isinstance(name, str) or not name.lower().endswith((".csv", ".tsv")):
+        raise ValueError(
+            f'registers has {shown(name)}, which is no CSV file; write registers = ["meter.csv"]'
+        )
+    place = PureWindowsPath(name)  # which knows the roots of all systems, and both separators
+    if place.anchor or ".." in place.parts or not name.isprintable():
+        raise ValueError(f"registers has {shown(name)}; a CSV file is beside the family's, or below it")
+    return path.parent / name

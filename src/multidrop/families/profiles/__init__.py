@@ -12,8 +12,7 @@ from multidrop.families.profiles.delta import Delta
 from multidrop.families.profiles.invt import Invt
 from multidrop.families.profiles.optidrive import Optidrive
 from multidrop.families.profiles.profidrive import Profidrive
-from multidrop.families.profiles.profile import Profile
-from multidrop.families.profiles.role import Role
+from multidrop.families.profiles.profile import Profile, Role
 
 __all__ = [
     "PROFILES",

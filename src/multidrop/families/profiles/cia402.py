@@ -10,8 +10,7 @@ from multidrop.drive import NotVerified, WriteForbidden
 from multidrop.drive.register import Access
 from multidrop.drive.script import Script, insist, until
 from multidrop.drive.state import Condition, Direction
-from multidrop.families.profiles.profile import Profile
-from multidrop.families.profiles.role import COMMON, Role
+from multidrop.families.profiles.profile import COMMON, Profile, Role
 
 READY_TIME = 1.0  # s, for each step up to "switched on"
 

@@ -8,8 +8,7 @@ from typing import ClassVar
 from multidrop.drive import WriteForbidden
 from multidrop.drive.register import Access
 from multidrop.drive.state import Direction
-from multidrop.families.profiles.profile import Profile
-from multidrop.families.profiles.role import COMMON, Role
+from multidrop.families.profiles.profile import COMMON, Profile, Role
 
 
 class DanfossControl(IntFlag):

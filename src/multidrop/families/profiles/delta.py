@@ -9,8 +9,7 @@ from multidrop.drive.register import Access
 from multidrop.drive.script import Script, read, write
 from multidrop.drive.state import Condition, Direction
 from multidrop.drive.verbs import verb
-from multidrop.families.profiles.profile import Profile
-from multidrop.families.profiles.role import COMMON, READING, Role
+from multidrop.families.profiles.profile import COMMON, READING, Profile, Role
 
 STOPPED, STOPPING, STANDBY, RUNNING = range(4)  # bits 1 and 0 of the status
 FORWARD, TO_FORWARD, TO_REVERSE, REVERSE = range(4)  # bits 4 and 3

@@ -12,8 +12,7 @@ from multidrop.drive.register import Access
 from multidrop.drive.script import Script, insist, write
 from multidrop.drive.state import Condition, Direction
 from multidrop.drive.verbs import verb
-from multidrop.families.profiles.profile import Profile
-from multidrop.families.profiles.role import COMMON, Role
+from multidrop.families.profiles.profile import COMMON, Profile, Role
 
 
 class InvtControl(IntEnum):

@@ -9,8 +9,7 @@ from multidrop.drive import WriteForbidden
 from multidrop.drive.register import Access
 from multidrop.drive.script import Script
 from multidrop.drive.state import Direction
-from multidrop.families.profiles.profile import Profile
-from multidrop.families.profiles.role import COMMON, Role
+from multidrop.families.profiles.profile import COMMON, Profile, Role
 
 
 class OptidriveControl(IntFlag):

@@ -9,8 +9,7 @@ from multidrop.drive import NotVerified, WriteForbidden
 from multidrop.drive.register import Access
 from multidrop.drive.script import Script, insist, until, wait, write
 from multidrop.drive.state import Condition, Direction
-from multidrop.families.profiles.profile import Profile
-from multidrop.families.profiles.role import COMMON, Role
+from multidrop.families.profiles.profile import COMMON, Profile, Role
 
 READY_TIME = 1.0  # s, in which it must be ready to be switched on
 BETWEEN = 0.1  # s, at least, between "ready to switch on" and the next word (ACS550-02/U2 manual, p. 246)

@@ -1,17 +1,25 @@
-"""The section [family]: what the manual says of the line and of the device as a whole."""
+"""Sections of a family file besides its registers: [family], [option], [text] and [[identify]]."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass
+from math import inf
 from typing import Any
 
 from multidrop.core import Framing
 from multidrop.drive.declaration_check import UNIT_IDS
+from multidrop.drive.family import TAKEN_NAMES, Drive
 from multidrop.drive.line_settings import LONGEST_SILENCE, Settings
-from multidrop.drive.register import Table
+from multidrop.drive.options import Option
+from multidrop.drive.register import Register, Table
 from multidrop.drive.request import LONGEST_INTERVAL, STANDARD_LIMITS
-from multidrop.families.files.addresses import TABLES, Counting
-from multidrop.families.files.register_keys import WRITES, shown
+from multidrop.drive.script import Script, read
+from multidrop.drive.text import Text, text
+from multidrop.drive.verbs import Verb, verb
+from multidrop.errors import WriteForbidden
+from multidrop.families.files.notation import TABLES, Counting
+from multidrop.families.files.registers import WRITES, converted, shown, unusable
 from multidrop.toml_check import Key, TomlPlace, duration_of
 
 FAMILY_KEYS = {
@@ -193,3 +201,169 @@ def _gap(table: str, value: Any, counting: Counting) -> range | None:
     if first > last:
         raise ValueError(f"gaps: {table} = {shown(value)} is the wrong way round: the lowest comes first")
     return range(first, last + 1)
+
+
+_OPTION_KEYS = {
+    "unit": Key(str, 'unit = "Hz"'),
+    "span": Key(list, "span = [1, 600]", needed=True),
+    "meaning": Key(str, 'meaning = "parameter 1105, of which 20000 is 100 %"', needed=True),
+}
+# What a drive in a plant file, and its class, have for something else.
+_NOT_OPTIONS = frozenset(
+    {"name", "model", "address", "framing", "baudrate", "format", "silence", "ram", "every", "poll"}
+    | {"confirmed"}
+)
+
+
+def options_of(table: Any, registers: Collection[str], place: TomlPlace) -> dict[str, Option]:
+    """Return the options of this table; its mistakes are reported at `place`."""
+    if not isinstance(table, dict):
+        place.wrong("[option] is no table; write [option] and NAME = { unit, span, meaning }")
+        return {}
+    options = {}
+    for name, given in table.items():
+        at = place.within(f"[option] {name[:60]}")
+        why = unusable(name)
+        if why or name in _NOT_OPTIONS:
+            at.wrong(
+                f"{shown(name)} cannot be an option's name: {why or 'every drive has it for something else'}"
+            )
+        if name in registers:
+            at.wrong("a register has this name too; call one of the two otherwise")
+        good = at.check(given, _OPTION_KEYS)
+        span = good.get("span", [])
+        if span and (len(span) != 2 or not all(map(_is_number, span)) or span[0] > span[1]):
+            at.wrong(f"span = {shown(span)} is not right; write the least and the most, span = [1, 600]")
+        elif span and "meaning" in good:
+            options[name] = Option(good.get("unit", ""), (span[0], span[1]), good["meaning"])
+    return options
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) < float("inf")
+
+
+MOST_TEXTS = 100
+TEXT_KEYS = {
+    "at": Key((int, str), 'at = 0xFC00, 8192, "2000H" or "40001"', needed=True),
+    "length": Key(int, "length = 8, registers of two characters", needed=True),
+    "table": Key(str, 'table = "input"'),
+    "order": Key(str, 'order = "BA", where the second character comes first'),
+    "place": Key(str, 'place = "table 9"'),
+}
+
+
+def texts_of(
+    section: Any, counting: Counting, registers: Mapping[str, TomlPlace], place: TomlPlace
+) -> dict[str, Text]:
+    """Return the texts of [text] by name; each mistake is a sentence."""
+    if not isinstance(section, dict):
+        place.wrong("[text] is no table; write [text] and NAME = { at = 0xFC00, length = 8 }")
+        return {}
+    if len(section) > MOST_TEXTS:
+        place.wrong(f"[text] has {len(section)} texts, and {MOST_TEXTS} are the most")
+        return {}
+    found: dict[str, Text] = {}
+    for name, given in section.items():
+        at = place.within(f"[text] {name[:60]}")
+        why = unusable(name)
+        if why:
+            at.wrong(f"{shown(name)} cannot be a text's name: {why}")
+        elif name in TAKEN_NAMES:
+            at.wrong("every drive has this name for something else; call it otherwise")
+        elif name in registers:
+            at.wrong("a register has this name too; call one of the two otherwise")
+        declared = _text(at.check(given, TEXT_KEYS), counting, at)
+        if declared is not None and not why and name not in TAKEN_NAMES:
+            found[name] = declared
+    return found
+
+
+def _text(good: dict[str, Any], counting: Counting, place: TomlPlace) -> Text | None:
+    if not {"at", "length"} <= good.keys():
+        return None
+    given = place.attempt(converted, "table", good["table"]) if "table" in good else None
+    address = place.attempt(counting.address, good["at"], given, "holding")
+    if address is None:
+        return None
+    details = {key: good[key] for key in ("order", "place") if key in good}
+
+    def make() -> Text:
+        return text(address[0], good["length"], table=TABLES[address[1]], **details)
+
+    return place.attempt(make)
+
+
+MOST_PROOFS = 20
+PROOF_KEYS = {
+    "register": Key(str, 'register = "device"', needed=True),
+    "is": Key(list, "is = [0x010A]"),
+    "above": Key((int, float), "above = 71.5"),
+    "below": Key((int, float), "below = 76.5"),
+}
+
+
+@dataclass(frozen=True)
+class Proof:
+    """A register, and the values that it has in a drive of the family: some numbers, or a range."""
+
+    register: str
+    values: tuple[float, ...]  # empty: any value in the range
+    above: float
+    below: float
+
+    @property
+    def example(self) -> float:
+        """A value that proves the family, such as a simulated drive has."""
+        if self.values:
+            return self.values[0]
+        ends = [end for end in (self.above, self.below) if abs(end) < inf]
+        return sum(ends) / 2 if len(ends) == 2 else ends[0] + (1 if self.below == inf else -1)
+
+    def holds(self, value: float) -> bool:
+        return self.above < value < self.below and (not self.values or value in self.values)
+
+
+def proofs_of(section: Any, registers: Mapping[str, Register[Any]], place: TomlPlace) -> tuple[Proof, ...]:
+    """Return the proofs that [[identify]] declares, without those that have a mistake."""
+    tables = section if isinstance(section, list) else [section]
+    if len(tables) > MOST_PROOFS:
+        place.wrong(f"[[identify]] has {len(tables)} tables, at most {MOST_PROOFS} are allowed")
+        return ()
+    found = (_proof(table, registers, at) for table, at in place.inside("identify", tables))
+    return tuple(proof for proof in found if proof is not None)
+
+
+def _proof(table: Any, registers: Mapping[str, Register[Any]], place: TomlPlace) -> Proof | None:
+    good = place.check(table, PROOF_KEYS)
+    name, values = good.get("register"), good.get("is", [])
+    if name is None:
+        return None
+    if name not in registers or not registers[name].readable:
+        place.wrong(f"register = {name!r} is not a readable register of this file")
+        return None
+    if not all(isinstance(value, int | float) and not isinstance(value, bool) for value in values):
+        place.wrong(f"is = {values!r} is not right; write {PROOF_KEYS['is'].example}")
+        return None
+    if not good.keys() & {"is", "above", "below"}:
+        place.wrong("says no value; add is = [0x010A], or above and below")
+        return None
+    return Proof(name, tuple(values), good.get("above", -inf), good.get("below", inf))
+
+
+def identify_by(proofs: Sequence[Proof]) -> Verb[[], None]:
+    """Return the method `identify` of a drive that has these proofs."""
+
+    @verb
+    def identify(self: Drive) -> Script[None]:
+        """Check that the registers of [[identify]] have their values; raise WriteForbidden if one has not."""
+        for proof in proofs:
+            register = self.register(proof.register)
+            value = yield from read(register)
+            if not proof.holds(value):
+                shown = f"{register.name} = {register.format(value)}"
+                raise WriteForbidden(
+                    f"{self.name} shows {shown}: it is no {self.title or type(self).__name__}"
+                )
+
+    return identify
