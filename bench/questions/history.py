@@ -28,8 +28,7 @@ from multidrop.history import HistoryWriter
 from multidrop.history.compact import ROWS, TENS, compact
 from multidrop.history.database import TABLE, connect, copy_out, rows_of
 from multidrop.history.folder import STEM, file_name, parquet_files
-from multidrop.polling.batch import Batch
-from multidrop.polling.gathered import GatheredRows
+from multidrop.polling.batch import Batch, GatheredRows
 from multidrop.recording.rows import from_rows
 from multidrop.recording.segments import SegmentWriter
 

@@ -32,8 +32,7 @@ from multidrop.drive.verbs import TRIES
 from multidrop.errors import BusError
 from multidrop.transport.exchange import Exchanges
 from multidrop.transport.line import Line
-from multidrop.transport.line_meter import LineMeter
-from multidrop.transport.statistics import LineStatistics
+from multidrop.transport.statistics import LineMeter, LineStatistics
 
 D = TypeVar("D", bound=Drive)
 T = TypeVar("T", bound=float)

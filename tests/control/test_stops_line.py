@@ -20,7 +20,7 @@ from multidrop.core import Message
 from multidrop.drive import Condition
 from multidrop.errors import BusError, CancelledByStop, LineError, NoReply, PortLost, Unconfirmed
 from multidrop.poller import Poller
-from multidrop.polling.reopening import Reopening
+from multidrop.polling.polled_line import Reopening
 from multidrop.sim import MotorDrive, Simulator, Wire, simulated
 from multidrop.transport import clock
 from multidrop.transport import exchange as exchanges

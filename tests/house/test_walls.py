@@ -70,7 +70,7 @@ OPEN = {
 }
 TIED = (  # files that name each other in annotations, each group understood as one
     {"drive/family.py", "drive/verbs.py"},
-    {"polling/batch.py", "polling/wide.py"},
+    {"polling/batch.py", "polling/tables.py"},
     {"sim/drive.py", "sim/protocol.py"},
     {f"gateway/{name}.py" for name in ("gateway", "reload", "live/views", "http/routes")},
 )

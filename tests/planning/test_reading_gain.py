@@ -14,7 +14,7 @@ from multidrop.drive.register import HOLDING, INPUT, reading
 from multidrop.families import MODELS
 from multidrop.families.files.loader import load_family
 from multidrop.families.registry import SHIPPED
-from multidrop.planning.reading_gain import reading_gain
+from multidrop.planning.suggestions import reading_gain
 
 SUPPORT = Path(__file__).parents[1] / "support"
 PLANT = f"""

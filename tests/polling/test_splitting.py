@@ -15,8 +15,7 @@ from picky import Picky, family, right
 from multidrop.core import NumberFormat
 from multidrop.drive import Drive
 from multidrop.drive.register import reading
-from multidrop.planning.blocks import blocks
-from multidrop.planning.splitting import halves
+from multidrop.planning.blocks import blocks, halves
 from multidrop.polling import refusals
 from multidrop.polling.batch import Row
 from multidrop.sim import Faults

@@ -15,7 +15,7 @@ from multidrop.core import Completion, Message, NumberFormat
 from multidrop.drive import Drive
 from multidrop.drive.register import HOLDING, reading
 from multidrop.planning.blocks import Block
-from multidrop.transport.block_decoder import BlockDecoder, decoder_of
+from multidrop.transport.prepared import BlockDecoder, decoder_of
 
 
 class Mode(IntEnum):

@@ -31,8 +31,7 @@ from multidrop.errors import Unconfirmed
 from multidrop.transport import bridge as bridge_module
 from multidrop.transport.bridge import MOST_AGE, MOST_STALL_MS, Bridge, hand_on_nothing_late
 from multidrop.transport.exchange import WRITE_TIMEOUT
-from multidrop.transport.rfc2217 import MOST_CHUNKS, MOST_RECEIVED, RFC2217Port, Telnet
-from multidrop.transport.socket_port import SocketPort
+from multidrop.transport.network_port import MOST_CHUNKS, MOST_RECEIVED, RFC2217Port, SocketPort, Telnet
 
 SERVER = Path(__file__).parents[1] / "support" / "servers" / "network_server.py"
 IAC, SB, SE = rfc2217.IAC, rfc2217.SB, rfc2217.SE

@@ -16,11 +16,9 @@ from multidrop.cli.support.output import print_text
 from multidrop.cli.support.values import Row, aligned, counted, shortened, wrapped
 from multidrop.families.registry import is_users_own
 from multidrop.planning.prediction import Prediction, Rate, predict
-from multidrop.planning.reading_gain import reading_gain
-from multidrop.planning.suggestions import Suggestions, duration_text, suggest
+from multidrop.planning.suggestions import Suggestions, duration_text, reading_gain, suggest
 from multidrop.plant.loader import load_plant
-from multidrop.plant.metadata import planned_on
-from multidrop.plant.model import PlantLine
+from multidrop.plant.model import PlantLine, planned_on
 
 LONG_CYCLE = 1.0  # s; polling all readings for longer than this may not have been meant
 _NAMES = 3  # registers named in a sentence

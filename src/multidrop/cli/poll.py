@@ -28,8 +28,7 @@ from multidrop.cli.support.polling import LiveDrive, LivePlant, Rotation, pollin
 from multidrop.cli.support.signals import Interruption
 from multidrop.cli.support.values import aligned, columns_of, counted, cut_to, shortened
 from multidrop.planning.prediction import Prediction, predict
-from multidrop.plant.metadata import planned_on
-from multidrop.plant.model import Plant, PlantLine
+from multidrop.plant.model import Plant, PlantLine, planned_on
 from multidrop.poller import Poller
 from multidrop.polling.batch import Rows
 from multidrop.printable import printable

@@ -36,7 +36,7 @@ from multidrop.errors import LineError
 from multidrop.plant.loader import load_plant
 from multidrop.plant.model import Plant, PlantLine
 from multidrop.transport.bridge import PORT_FAILURES
-from multidrop.transport.opening import reason_of, unopened
+from multidrop.transport.open_port import reason_of, unopened
 
 _SILENT_S = 0.5  # longer than any pause within a frame
 _GIVEN_UP_S = 1.5  # longer than any master waits for a reply

@@ -33,8 +33,7 @@ from multidrop.errors import (
     Unconfirmed,
 )
 from multidrop.transport import clock
-from multidrop.transport.exchange import Exchanges
-from multidrop.transport.replies import good_reply
+from multidrop.transport.exchange import Exchanges, good_reply
 
 ACKNOWLEDGED = 5  # the exception code of what is accepted and takes longer
 

@@ -14,8 +14,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from multidrop.history.folder import STEM, listing, stored_files
-from multidrop.polling.batch import Batch
-from multidrop.polling.gathered import GatheredRows, gather
+from multidrop.polling.batch import Batch, GatheredRows, gather
 from multidrop.recording.format import Metadata
 from multidrop.recording.segments import SegmentWriter, outlived, segments_of
 from multidrop.transport import clock

@@ -12,7 +12,7 @@ from typing import Any
 from multidrop.core import Framing, Message
 from multidrop.drive.family import Drive, check_readable
 from multidrop.drive.register import Carrier, Register, Table
-from multidrop.drive.request import may_be_crossed, read_limit, read_request
+from multidrop.drive.request import may_be_crossed, read_limit, read_request, stated_limit
 from multidrop.drive.text import Text
 from multidrop.planning.bus_time import characters, silence
 
@@ -265,3 +265,37 @@ def _even(drive: Drive, few: _Way, many: _Way) -> float:
     """Return the response delay in s at which few requests take as long as many."""
     saved = (few.characters - many.characters) * drive.settings.character
     return saved / (many.requests - few.requests) - silence(drive)
+
+
+def halves(drive: Drive, block: Block) -> tuple[Block, ...]:
+    """Return two blocks that read these registers between them; none where one would still read them all.
+
+    Registers at the same addresses stay together, and so do those of a group in `read_together`. Splitting
+    again and again ends: of n registers there are at most 2 n - 1 blocks, the whole included.
+    """
+    units = _units(drive, block)
+    if len(units) < 2:
+        return ()
+    middle = len(units) // 2
+    parts = units[:middle], units[middle:]
+    return tuple(Block.of(drive, [register for unit in part for register in unit]) for part in parts)
+
+
+def _units(drive: Drive, block: Block) -> list[list[Register[Any]]]:
+    """Return the registers that no request can tell apart, by rising address."""
+    groups = {name: place for place, group in enumerate(drive.read_together) for name in group}
+    found: dict[object, list[Register[Any]]] = {}
+    for register in block.registers:
+        span = register.reach
+        found.setdefault(groups.get(register.name, (span.start, span.stop)), []).append(register)
+    return list(found.values())
+
+
+def may_be_too_long(drive: Drive, block: Block) -> bool:
+    """Return True where a drive may be silent because so much was asked: its class states no limit."""
+    return stated_limit(drive, block.table) is None and len(_units(drive, block)) > 1
+
+
+def least(drive: Drive, block: Block) -> Block:
+    """Return the block that reads the first of these registers, and what cannot be told apart from it."""
+    return Block.of(drive, _units(drive, block)[0])

@@ -5,15 +5,23 @@ from __future__ import annotations
 import difflib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
+from enum import Flag
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, Final, NoReturn
 
 from multidrop.core import RS485, Echo, TransactionIds
 from multidrop.drive.family import Drive
 from multidrop.drive.line_settings import check_port
+from multidrop.drive.named_verbs import verbs_of
 from multidrop.drive.register import Register
-from multidrop.plant import metadata
-from multidrop.toml_check import check_period
+from multidrop.planning.blocks import Planned, planned
+from multidrop.planning.prediction import prediction_metadata
+from multidrop.toml_check import Key, check_period
+
+MAY_LISTS: Final = {
+    "write": Key(list, 'write = ["pump-1.frequency_setpoint"]'),
+    "verbs": Key(list, 'verbs = ["pump-1.start"]'),
+}
 
 
 @dataclass(frozen=True)
@@ -122,4 +130,79 @@ class Plant:
 
     def metadata(self) -> dict[str, Any]:
         """Return what a reader of a recording must know that its rows do not say."""
-        return metadata.of_plant(self)
+        return _metadata(self)
+
+
+def planned_on(line: PlantLine, delays: Mapping[Drive, float] | None = None) -> list[Planned]:
+    """Return all that is polled on a line; `delays` are response delays in s that were measured."""
+    known = delays or {}
+    return [
+        each
+        for polled in line.drives
+        for each in planned(polled.drive, polled.wanted, known.get(polled.drive))
+    ]
+
+
+def _metadata(plant: Plant) -> dict[str, Any]:
+    from importlib.metadata import version  # takes a fifth of the time in which a poller is imported
+
+    return {
+        "multidrop": version("multidrop"),
+        "plant": str(plant.path),
+        "planned": {line.name: prediction_metadata(planned_on(line), line.switching) for line in plant.lines},
+        "drives": {
+            polled.drive.name: _of_drive(line, polled) for line in plant.lines for polled in line.drives
+        },
+    }
+
+
+def _of_drive(line: PlantLine, polled: PolledDrive) -> dict[str, Any]:
+    drive = polled.drive
+    return {
+        "line": line.name,
+        "model": drive.model,
+        "address": drive.address,
+        "settings": str(drive.settings),
+        "framing": str(drive.framing),
+        "registers": {poll.register.name: _of_register(poll.register) for poll in polled.polls},
+    }
+
+
+def _of_register(register: Register[Any]) -> dict[str, Any]:
+    values = register.values
+    return {
+        "unit": register.unit,
+        "step": register.step,
+        "values": {member.name: member.value for member in values} if values else None,
+        "bits": values is not None and issubclass(values, Flag),
+        "function": register.table.read,
+        "address": register.reach.start,
+        "words": len(register.reach),
+    }
+
+
+def check_listed(plant: Plant, key: str, entry: object) -> bool:
+    """Check an entry of a list: a register that can be written, or a verb that its drive has.
+
+    `stop` is no verb of a list: it needs none. Returns True. Raises ValueError.
+    """
+    name, dot, rest = entry.rpartition(".") if isinstance(entry, str) else ("", "", "")
+    if not dot:
+        raise ValueError(f"{key}: {entry!r} is not right; write {MAY_LISTS[key].example}")
+    try:
+        _, drive = plant.find_drive(name)
+    except ValueError as unknown:
+        raise ValueError(f"{key}: {str(unknown).replace(f'{plant.path} has', 'there is')}") from None
+    if key == "write":
+        try:
+            register = drive.register(rest)
+        except ValueError as unknown:
+            raise ValueError(f"{key}: {entry}: {unknown}") from None
+        if not register.writable:
+            raise ValueError(f"{key}: {entry} is never written: {register.never or 'it can only be read'}")
+        return True
+    listed = [verb for verb in verbs_of(drive) if verb != "stop"]
+    if rest not in listed:
+        known = ", ".join(listed) or "none"
+        raise ValueError(f"{key}: {name} has no verb {rest!r} that a list allows; it has {known}")
+    return True

@@ -1,4 +1,4 @@
 """Polling: jobs of a line, their turn on its port, registers that are refused, and batches of rows."""
 
 from multidrop.polling.batch import BatchColumns as BatchColumns
-from multidrop.polling.wide import WideRows as WideRows
+from multidrop.polling.tables import WideRows as WideRows

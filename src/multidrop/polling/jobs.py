@@ -9,10 +9,9 @@ from multidrop.bus import Bus
 from multidrop.core import Exchange, Names, RowLayout
 from multidrop.drive.family import Drive, check_own
 from multidrop.drive.register import row_field
-from multidrop.planning.blocks import Block, Plan, plan, sending
+from multidrop.planning.blocks import Block, Plan, may_be_too_long, plan, sending
 from multidrop.planning.bus_time import kind, silence
 from multidrop.planning.schedule import Job
-from multidrop.planning.splitting import may_be_too_long
 from multidrop.plant.model import PolledDrive
 from multidrop.transport.prepared import make_read
 

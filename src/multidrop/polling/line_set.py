@@ -20,7 +20,7 @@ from multidrop.plant.model import PlantLine
 from multidrop.polling.jobs import RowNames
 from multidrop.polling.polled_line import PolledLine
 from multidrop.transport import clock
-from multidrop.transport.opening import check_port
+from multidrop.transport.open_port import check_port
 
 OPENING = 32  # ports at a time: one that takes its time holds up no other
 ENDING_NS = 1_000_000_000  # for which exchanges under way are waited for

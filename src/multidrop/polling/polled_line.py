@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import logging
 import threading
+from collections.abc import Mapping
+from contextlib import suppress
 from typing import Any
 
 from multidrop.bus import Bus
-from multidrop.core import Port, RowQueue, Status
+from multidrop.core import Peer, Port, RowQueue, Status
 from multidrop.core.fork import register_at_fork
 from multidrop.drive.family import Drive
 from multidrop.drive.register import Register
+from multidrop.errors import LineError
 from multidrop.planning.bus_time import in_order
 from multidrop.planning.schedule import Schedule
 from multidrop.plant.model import PlantLine, PolledDrive
@@ -18,11 +21,79 @@ from multidrop.polling.jobs import JobMaker, PolledJob, RowNames
 from multidrop.polling.line_drives import LineDrives
 from multidrop.polling.port_queue import PortQueue, Slot
 from multidrop.polling.refusals import Refusals
-from multidrop.polling.reopening import Reopening
-from multidrop.polling.summary import line_summary
 from multidrop.transport import clock
 from multidrop.transport.aside_log import log_aside, traceback_of, words_of
 from multidrop.transport.peers import GONE_S
+from multidrop.transport.statistics import Statistics, line_statistics
+
+_log = logging.getLogger("multidrop.polling")
+
+
+class Reopening:
+    """Attempts to open the port of a bus again, one at a time."""
+
+    def __init__(self, bus: Bus) -> None:
+        self._bus = bus
+        self._thread: threading.Thread | None = None
+
+    @property
+    def is_under_way(self) -> bool:
+        return self._thread is not None and self._thread.is_alive()
+
+    def begin(self) -> None:
+        """Begin an attempt. Where the system gives no thread a stop opens the port, until there is one."""
+        thread = threading.Thread(target=self._attempt, name="multidrop reopening", daemon=True)
+        self._thread = None
+        with suppress(RuntimeError, MemoryError):
+            thread.start()
+            self._thread = thread
+        self._bus.tended(self._thread is not None)
+
+    def join(self) -> None:
+        """Wait for the end of an attempt that is under way."""
+        if self._thread is not None:
+            self._thread.join()
+
+    def _attempt(self) -> None:
+        try:
+            self._bus.line.regain()
+        except LineError:
+            pass  # the line has logged it
+        except BaseException as failure:
+            log_aside(
+                _log, logging.ERROR, "%s: not opened again\n%s", self._bus.line.port, traceback_of(failure)
+            )
+
+
+def line_summary(seconds: float, peers: Mapping[str, Peer]) -> dict[str, Any]:
+    """Return what came of a line's exchanges in so many seconds, in all and by drive."""
+    line = line_statistics(seconds, {name: peer.counters() for name, peer in peers.items()}, None)
+    return {
+        "seconds": round(seconds, 3),
+        "exchanges": line.counters.exchanges,
+        "samples": line.samples,
+        "misses": dict(line.misses),
+        "late_replies": line.late_replies,
+        "stray_bytes": line.skipped_bytes,
+        "utilisation": round(line.utilisation, 4),
+        "drives": {
+            name: _drive_summary(line.drives[name], peer.response_delay) for name, peer in peers.items()
+        },
+    }
+
+
+def _drive_summary(drive: Statistics, response_delay: float) -> dict[str, Any]:
+    return {
+        "exchanges": drive.counters.exchanges,
+        "samples": drive.samples,
+        "exchanges_per_second": round(drive.counters.answered / drive.seconds, 2),
+        "samples_per_second": round(drive.samples / drive.seconds, 2),
+        "response_delay_ms": round(response_delay * 1e3, 3),
+        "timeout_ms": round(drive.timeout * 1e3, 3),
+        "p99_delay_ms": round(drive.delays.p99 * 1e3, 3),
+        "misses": dict(drive.misses),
+    }
+
 
 LEARN_NS = 1_000_000_000  # between looks at how long exchanges take
 RELEARN_NS = 2_000_000_000  # the same, where the core repeats the bus cycle

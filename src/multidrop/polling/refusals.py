@@ -12,9 +12,8 @@ import logging
 
 from multidrop.core import RowLayout
 from multidrop.drive.family import Drive
-from multidrop.planning.blocks import Block
+from multidrop.planning.blocks import Block, halves, least
 from multidrop.planning.schedule import Schedule
-from multidrop.planning.splitting import halves, least
 from multidrop.polling.jobs import JobMaker, PolledJob
 from multidrop.transport.aside_log import log_aside
 

@@ -12,8 +12,7 @@ from pathlib import Path
 from typing import Any, Self
 
 from multidrop.polling.batch import Rows, schema
-from multidrop.polling.table import ArrowTable
-from multidrop.polling.wide import WideRows
+from multidrop.polling.tables import ArrowTable, WideRows
 
 Metadata = Mapping[str, Any]
 METADATA_KEY = "multidrop"  # of an Arrow schema's metadata

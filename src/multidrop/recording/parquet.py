@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from multidrop.polling.batch import Rows, schema
-from multidrop.polling.table import nanoarrow
+from multidrop.polling.tables import nanoarrow
 from multidrop.recording.format import (
     METADATA_KEY,
     Metadata,

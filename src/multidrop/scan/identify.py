@@ -19,8 +19,8 @@ from multidrop.errors import BusError, NoValue, WriteForbidden
 from multidrop.planning.blocks import blocks, text_blocks
 from multidrop.scan.results import GUESS, Found
 from multidrop.scan.sweep import Sweep
+from multidrop.transport.exchange import good_reply
 from multidrop.transport.peers import LEAST_TIMEOUT
-from multidrop.transport.replies import good_reply
 
 R = TypeVar("R")
 Ask = Callable[[Drive, Message], Message]  # sends a request; raises BusError without a good reply

@@ -6,11 +6,49 @@ import os
 import re
 import socket
 import sys
+from dataclasses import dataclass
 from pathlib import Path
 from urllib.parse import urlsplit
 
 from multidrop.drive.line_settings import MODBUS_PORT, speaks_tcp
-from multidrop.transport.usb_adapter import adapter_of
+
+TTYS = Path("/sys/class/tty")
+_INTERFACE = re.compile(r"[\d.-]+:(\d+\.\d+)")  # 1-4.2:1.0: of what is plugged in at 1-4.2
+
+
+@dataclass(frozen=True)
+class USBAdapter:
+    """One port of an adapter: where that is plugged in, and its serial number, if it has one."""
+
+    place: str
+    serial: str
+
+    def is_same(self, other: USBAdapter) -> bool:
+        if self.serial and other.serial:
+            return self.serial == other.serial
+        return self.place == other.place
+
+    def __str__(self) -> str:
+        return self.serial or f"at {self.place}"
+
+
+def adapter_of(device: str) -> USBAdapter | None:
+    """Return the adapter that has this device's name now; None where there is none, or nothing is told."""
+    found = (TTYS / Path(device).name / "device").resolve()
+    for part in (found, *found.parents):
+        if interface := _INTERFACE.fullmatch(part.name):
+            number = f"{interface[1]}.{_text(found / 'port_number') or 0}"  # of the adapter's ports
+            serial = _text(part.parent / "serial")
+            return USBAdapter(f"{part.parent.name}:{number}", serial and f"{serial}:{number}")
+    return None
+
+
+def _text(file: Path) -> str:
+    try:
+        return file.read_text("ascii", errors="replace").strip()
+    except OSError:
+        return ""
+
 
 BY_ID = Path("/dev/serial/by-id")  # links that udev makes, with each adapter's serial number
 _PEER = re.compile(r"(\[[^\]]+\]|[\w.-]+):\d+")

@@ -15,10 +15,9 @@ from multidrop import Poller
 from multidrop.errors import LineError, PortLost
 from multidrop.families import InnovertIBD
 from multidrop.sim import EncodedDrive, Simulator, Wire
-from multidrop.transport import open_port, port_identity, usb_adapter
+from multidrop.transport import open_port, port_identity
 from multidrop.transport.line import Line
-from multidrop.transport.port_identity import lasting_name
-from multidrop.transport.usb_adapter import USBAdapter, adapter_of
+from multidrop.transport.port_identity import USBAdapter, adapter_of, lasting_name
 
 USB = "devices/pci0000:00/0000:00:14.0/usb1"
 
@@ -29,7 +28,7 @@ class Sysfs:
     def __init__(self, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         self.folder = folder
         (folder / "class" / "tty").mkdir(parents=True)
-        monkeypatch.setattr(usb_adapter, "TTYS", folder / "class" / "tty")
+        monkeypatch.setattr(port_identity, "TTYS", folder / "class" / "tty")
 
     def add(self, tty: str, device: str, serial: str = "", port_number: str = "") -> None:
         found = self.folder / device
