@@ -30,11 +30,11 @@ def main() -> None:
     handler["temperature"], handler["pressure"], handler["alarms"] = 21.4, 180, Alarm.FILTER
     with Simulator([Wire([handler])]) as line, Bus(line.wires[0].path) as bus:
         device = bus.attach(AirHandler, address=7, name="roof")
-        for name, value in bus.read_many(device, device.readings()).items():
+        for name, value in device.read_many(device.readings()).items():
             print(f"{name:12} {device.register(name).format(value)}")
-        print("target is now", bus.write(device, device.target, 22.5))
+        print("target is now", device.write(device.target, 22.5))
         try:
-            bus.write(device, device.target, 60)
+            device.write(device.target, 60)
         except ValueError as mistake:
             print("refused:", mistake)
 

@@ -20,7 +20,7 @@ def run(port: str, seconds: float) -> None:
         pump.set_frequency(30.0)
         pump.start()
         for _ in range(round(seconds)):
-            print(pump.state(), pump.output_frequency.format(bus.read(pump, pump.output_frequency)))
+            print(pump.state(), pump.output_frequency.format(pump.read(pump.output_frequency)))
             sleep(1.0)
 
 

@@ -109,7 +109,7 @@ def reading(job: Job) -> Iterator[Callable[[int], dict[str, float]]]:
     registers = family.readings()
     with Bus(job.port, baudrate=job.port_baudrate) as bus:
         drives = {address: bus.attach(family, address) for address in range(1, job.drives + 1)}
-        yield lambda address: bus.read_many(drives[address], registers)
+        yield lambda address: drives[address].read_many(registers)
 
 
 def lateness_ms(job: Job) -> tuple[int, numpy.ndarray]:

@@ -45,7 +45,7 @@ def leased(job: Job) -> Iterator[Poll]:
 
 @contextmanager
 def reading_by_hand(job: Job) -> Iterator[Read]:
-    """`bus.read_many` in a loop, in place of multidrop's poller."""
+    """`drive.read_many` in a loop, in place of multidrop's poller."""
     from bench.masters import adapter
 
     with adapter.reading(job) as read:
@@ -171,13 +171,13 @@ IN_PYTHON = {
     "multidrop": multidrop,
     **{name: in_turn(reader) for name, reader in READERS.items()},
     "pymodbus-async": pymodbus_async,
-    "bus.read_many": in_turn(reading_by_hand),
+    "read_many": in_turn(reading_by_hand),
     "multidrop, leased": leased,
 }
 MASTERS = (*IN_PYTHON, "libmodbus")
 
 INSTALL = {
-    "bus.read_many": "multidrop",
+    "read_many": "multidrop",
     "multidrop, leased": "multidrop",
     "pymodbus": "pymodbus==3.16.1",
     "pymodbus-async": "pymodbus==3.16.1",

@@ -1,7 +1,7 @@
 """Polling of a line beside threads that read by hand without pause.
 
-16 drives at the pace of a wire are polled as fast as the line allows. Each thread calls `bus.read_many` again
-and again, and such exchanges go ahead of the polling.
+16 drives at the pace of a wire are polled as fast as the line allows. Each thread calls `drive.read_many`
+again and again, and such exchanges go ahead of the polling.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ def measured(threads: int, baudrate: int, seconds: float) -> dict[str, float]:
         def read(drive: Any) -> None:
             while not stop.is_set():
                 begun = time.monotonic()
-                bus.read_many(drive, drive.readings())
+                drive.read_many(drive.readings())
                 took.append(time.monotonic() - begun)
 
         time.sleep(1.0)  # until delays are learnt
@@ -60,7 +60,7 @@ def main() -> None:
             [str(threads), f"{polled:.1f}", f"{by_hand:.1f}", f"{share:.1%}", f"{1e3 * found['longest']:.1f}"]
         )
     tables.show(("threads", "polled/s", "by hand/s", "polled", "longest ms"), rows)
-    print("\nlongest: that a call of bus.read_many took.")
+    print("\nlongest: that a call of drive.read_many took.")
 
 
 if __name__ == "__main__":

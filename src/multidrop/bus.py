@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, TypeVar, cast
+from typing import Any, TypeVar
 
 from multidrop.control.attached import Attached, made
 from multidrop.control.audit_log import AuditLog
@@ -14,20 +14,18 @@ from multidrop.control.eeprom_ledger import Ledger
 from multidrop.control.exit_hook import give_signals_back, without_internals
 from multidrop.control.latches import Latches
 from multidrop.control.leaving import Leaving
-from multidrop.control.outcome import Outcome, Stopped
+from multidrop.control.outcome import Stopped
 from multidrop.control.performer import Performer
 from multidrop.control.records import WriteRecords
 from multidrop.control.stop_all import Stopper, StopRun
 from multidrop.control.time_limit import checked_expiry
 from multidrop.control.writer import Writer
-from multidrop.core import RS485, Echo, Mastership, Message, Peer, TransactionIds
+from multidrop.core import RS485, Echo, Mastership, Peer, TransactionIds
 from multidrop.core.fork import register_at_fork
 from multidrop.core.undisturbed import undisturbed
-from multidrop.drive.family import Drive, check_drive, check_own, check_own_text
+from multidrop.drive.family import Drive, check_drive
 from multidrop.drive.register import Register
-from multidrop.drive.script import Script
 from multidrop.drive.state import State
-from multidrop.drive.text import Text
 from multidrop.drive.verbs import TRIES
 from multidrop.errors import BusError
 from multidrop.transport.exchange import Exchanges
@@ -35,7 +33,6 @@ from multidrop.transport.line import Line
 from multidrop.transport.statistics import LineMeter, LineStatistics
 
 D = TypeVar("D", bound=Drive)
-T = TypeVar("T", bound=float)
 
 EXPIRY = 1.0  # s
 
@@ -265,86 +262,7 @@ class Bus:
         """Learnt answers of each drive that is on this bus now."""
         return self._exchanges.peers
 
-    # ---- reading ----
-
-    def read(self, drive: Drive, register: Register[T]) -> T:
-        """Return the register's value in engineering units.
-
-        Raises NoReply, NoValue, BadReply, DriveException or LineError; ValueError if it cannot be read.
-        """
-        return cast(T, self.read_many(drive, [register])[register.name])
-
-    def read_many(self, drive: Drive, registers: Iterable[Register[Any]]) -> dict[str, Any]:
-        """Return values by register name, in as few exchanges as the family allows; raises as `read`."""
-        wanted = tuple(registers)
-        try:
-            return self._exchanges.read(drive, wanted)
-        except TypeError:  # what cannot be looked up is no register, or no drive
-            for register in wanted:
-                check_own(drive, register)
-            raise
-
-    def read_text(self, drive: Drive, text: Text) -> str:
-        """Return a text of the drive, such as its serial number.
-
-        Raises NoReply, BadReply, DriveException or LineError; ValueError for another family's text.
-        """
-        check_own_text(drive, text)
-        return self._exchanges.read_text(drive, text)
-
-    def ask(self, drive: Drive, function: int, start: int, count: int, *, expiry: float = 1.0) -> bytes:
-        """Return what the drive has at any addresses, declared or not: a read past its register table.
-
-        `function` is 1 (coils), 2 (discrete inputs), 3 (holding registers) or 4 (input registers); `start`
-        the address as it is sent, from 0; `count` that of words or bits, at most as many as the family states
-        for one request, else 125 words or 2000 bits (application protocol V1.1b3, 6.1 to 6.4). The data is
-        as in the reply: words of two bytes, the most significant first; bits in whole bytes, the first bit
-        the least significant of the first byte.
-
-        Sent once, ahead of any polling, and never when it could not begin within `expiry` seconds. It is no
-        write: none is audited, no identity is checked, and a lost reply is NoReply. A late reply to another
-        request is never returned. An address to which the drive keeps silent costs its time-out and counts as
-        a failure of the drive. Raises NoReply, BadReply, DriveException, Expired or LineError; ValueError or
-        TypeError, and nothing is sent, for what no such request can say.
-        """
-        return self._exchanges.ask(drive, function, start, count, checked_expiry(expiry, "a read"))
-
-    # ---- writing ----
-
-    def write(self, drive: Drive, register: Register[T], value: T) -> T:
-        """Write a value and return what the drive then holds, where that can be read, else `value`.
-
-        Sent once; not at all where a register that may be in EEPROM holds the value already, nor when
-        its turn does not come within `expiry` seconds. Before the first write to a drive its identity is
-        checked. Raises WriteForbidden (also a ValueError) for what the library does not send, TypeError for
-        what is no value, Expired, DriveException when the drive says no, and Unconfirmed when its answer is
-        lost and the write may have happened.
-        """
-        return cast(T, self.try_write(drive, register, value).value)
-
-    def try_write(self, drive: Drive, register: Register[T], value: T) -> Outcome:
-        """Write as `write`, and return the outcome of a write that was sent, whatever it is."""
-        return self._performer.write(drive, register, value)
-
-    def raw(self, drive: Drive, function: int, start: int, data: bytes = b"", *, count: int = 0) -> bytes:
-        """Send any request but a Modbus read once, past every rule, and return the data of the reply.
-
-        The one deliberate way round: no check of the drive's identity, no span, no budget. It may start a
-        motor. Raises Unconfirmed when no answer comes, and DriveException; CancelledByStop and Expired as
-        `write`; ValueError for functions 1 to 4, which `ask` sends.
-        """
-        check_drive(drive)
-        if not isinstance(data, bytes | bytearray):
-            raise TypeError(f"data = {data!r} is no bytes, such as b'\\x00\\x01'")
-        return self._performer.raw(drive, Message(drive.address, function, start, count, data))
-
-    def perform(self, drive: Drive, script: Script[Any]) -> Any:
-        """Carry out a script's steps, none of which is written once a stop was called.
-
-        A read that fails after something was written is Unconfirmed: NoReply would say that nothing was
-        written, and DriveException that the drive did not do it.
-        """
-        return self._performer.perform(script, self._performer.call(drive))
+    # ---- commands ----
 
     def check_identity(self, drive: Drive) -> None:
         """Check that the drive at this address is of its declared family, as far as the family can tell.
@@ -368,7 +286,7 @@ class Bus:
 
     # ---- all drives at once ----
 
-    def broadcast(self, register: Register[T], value: T) -> dict[str, State | BusError]:
+    def broadcast(self, register: Register[Any] | str, value: Any) -> dict[str, State | BusError]:
         """Write to every drive on the line at once; nobody answers, so each drive is asked afterwards.
 
         The same address means different things to different families. So all drives on the line must be of

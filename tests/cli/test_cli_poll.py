@@ -70,7 +70,7 @@ def test_simulate_brings_the_faults_of_its_file(tmp_path: Path) -> None:
     with running(*words) as (_, out):
         out.readline()
         with Bus(str(ports / "hall-1")) as bus, pytest.raises(NoReply):
-            bus.read(bus.attach(Toy, 1), Toy.output_current)
+            bus.attach(Toy, 1).read(Toy.output_current)
 
 
 @pytest.mark.long

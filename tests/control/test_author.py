@@ -50,7 +50,7 @@ def test_every_kind_of_write_has_its_author(audited: Audited) -> None:
         drive.set_frequency(20)
         drive.start()
         drive.stop()
-        bus.raw(drive, 6, 0x1000, b"\0\5")
+        drive.send_raw(6, 0x1000, b"\0\5")
         bus.broadcast(drive.control, CHEControl.STOP)
         bus.stop_all()
     with written_by("boris"):
@@ -153,8 +153,8 @@ def test_under_a_name_that_would_spoil_the_log_a_stop_alone_is_sent(
         for call in (
             lambda: drive.set_frequency(20),
             drive.start,
-            lambda: bus.raw(drive, 6, 0x1000, b"\0\5"),
-            lambda: bus.write(drive, drive.setpoint, 20.0),
+            lambda: drive.send_raw(6, 0x1000, b"\0\5"),
+            lambda: drive.write(drive.setpoint, 20.0),
             lambda: bus.broadcast(drive.setpoint, 0.0),
             lambda: start_staggered([drive], gap=1.0),
         ):
@@ -166,7 +166,7 @@ def test_under_a_name_that_would_spoil_the_log_a_stop_alone_is_sent(
         drive.stop()
         bus.stop_all()
         bus.broadcast(drive.control, CHEControl.STOP)
-        bus.write(drive, drive.control, CHEControl.STOP)
+        drive.write(drive.control, CHEControl.STOP)
         assert drive.state().condition is Condition.STOPPED
     stops = audited.noted()[before:]
     by = ("anna", noted) if is_way else (noted, "web")

@@ -72,7 +72,7 @@ def test_a_stop_of_all_is_a_broadcast_where_all_are_alike(
     line, drives, _ = line_of(monkeypatch, model, model)
     line.bus.stop_all()
     (sent,) = broadcasts(line)
-    line.bus.write(drives[0], drives[0].control, stop_of(drives[0]))
+    drives[0].write(drives[0].control, stop_of(drives[0]))
     assert (sent.start, sent.data) == (line.frames[-2][0].start, line.frames[-2][0].data)
 
 

@@ -97,10 +97,10 @@ def test_one_value_in_its_unit() -> None:
     rig["torque"] = 33.3
     with unpaced(rig) as sim, Bus(path(sim)) as bus:
         ours = bus.attach(Rig, 1)
-        assert bus.read(ours, ours.torque) == 33.3
-        assert bus.read(ours, ours.fault) is Fault.NONE
+        assert ours.read(ours.torque) == 33.3
+        assert ours.read(ours.fault) is Fault.NONE
         rig["fault"] = Fault.OVERCURRENT
-        assert bus.read(ours, ours.fault) is Fault.OVERCURRENT
+        assert ours.read(ours.fault) is Fault.OVERCURRENT
 
 
 @patient
@@ -108,7 +108,7 @@ def test_many_values_in_the_order_asked_for() -> None:
     with unpaced(EncodedDrive(Rig(1))) as sim, Bus(path(sim)) as bus:
         ours = bus.attach(Rig, 1)
         asked = [ours.gain, ours.speed, ours.limit, ours.torque, ours.gain]
-        found = bus.read_many(ours, asked)
+        found = ours.read_many(asked)
         assert list(found) == ["gain", "speed", "limit", "torque"]
         assert found == {register.name: proof(ours, register) for register in asked}
 
@@ -129,10 +129,10 @@ def test_all_readings_in_as_few_requests_as_the_family_allows(family: type[Drive
     there = EncodedDrive(family(1))
     with unpaced(there) as sim, Bus(path(sim)) as bus:
         ours = bus.attach(family, 1)
-        bus.read(ours, ours.readings()[0])  # the first value is asked for again
+        ours.read(ours.readings()[0])  # the first value is asked for again
         before = bus.peer(ours).counters()
         requests = there.counters.requests
-        found = bus.read_many(ours, ours.readings())
+        found = ours.read_many(ours.readings())
         counters = bus.peer(ours).counters()
     assert found == {register.name: proof(ours, register) for register in ours.readings()}
     assert counters.answered - before.answered == REQUESTS[family]
@@ -156,7 +156,7 @@ def test_drives_of_all_families_at_their_own_baud_rate_and_format() -> None:
     with Simulator([Wire([EncodedDrive(drive) for drive in drives])]) as sim, Bus(path(sim)) as bus:
         for ours in [bus.attach(drive) for drive in drives] * 2:
             register = ours.readings()[-1]
-            assert bus.read(ours, register) == proof(ours, register)
+            assert ours.read(register) == proof(ours, register)
 
 
 def test_the_bus_has_defaults_for_drives_without_their_own() -> None:
@@ -178,7 +178,7 @@ def test_a_bus_has_a_silence_for_drives_without_their_own() -> None:
             drive = bus.attach(ErmanERG220, at)
             assert drive.needed_silence() == 600e-6
             assert make_exchange(drive, Message(at, 4, 1, 1), bus.peer(drive)).c.silence_ns == 626042
-            bus.read(drive, drive.output_current)
+            drive.read(drive.output_current)
         assert bus.attach(ErmanERG220, 3, silence=1e-3).needed_silence() == 1e-3
         assert bus.attach(ErmanERG220, 4, silence=None).needed_silence() == 1.75e-3
         with pytest.raises(ValueError, match=r"^silence 300 us is shorter than 1\.5 characters at 38400 8N1"):
@@ -190,8 +190,8 @@ def test_a_write_returns_what_the_drive_then_holds() -> None:
     rig = simulated(Rig(1))
     with unpaced(rig) as sim, Bus(path(sim)) as bus:
         ours = bus.attach(Rig, 1)
-        assert bus.write(ours, ours.gain, 1.234) == 1.23
-        assert bus.write(ours, ours.target, 1500) == 1500  # cannot be read: what was written
+        assert ours.write(ours.gain, 1.234) == 1.23
+        assert ours.write(ours.target, 1500) == 1500  # cannot be read: what was written
     assert (rig["gain"], rig["target"]) == (1.23, 1500)
     assert sent(rig)[0x06] == 2
 
@@ -202,7 +202,7 @@ def test_a_value_that_the_drive_clamps() -> None:
     ibd = simulated(InnovertIBD(1))
     with unpaced(ibd) as sim, Bus(path(sim)) as bus:
         ours = bus.attach(InnovertIBD, 1)
-        assert bus.write(ours, ours.acceleration_time, 4000.0) == 3600.0
+        assert ours.write(ours.acceleration_time, 4000.0) == 3600.0
 
 
 @patient
@@ -211,10 +211,10 @@ def test_eeprom_is_written_on_change_only() -> None:
     rig["limit"] = 10.0
     with unpaced(rig) as sim, Bus(path(sim)) as bus:
         ours = bus.attach(Rig, 1)
-        assert bus.write(ours, ours.limit, 10.0) == 10.0
+        assert ours.write(ours.limit, 10.0) == 10.0
         assert not rig.counters.writes
-        assert bus.write(ours, ours.limit, 12.5) == 12.5
-        assert bus.write(ours, ours.limit, 12.5) == 12.5
+        assert ours.write(ours.limit, 12.5) == 12.5
+        assert ours.write(ours.limit, 12.5) == 12.5
     assert rig.counters.eeprom_writes == {"limit": 1}
 
 
@@ -224,7 +224,7 @@ def test_the_alias_in_ram_is_written_where_there_is_one() -> None:
     with unpaced(che) as sim, Bus(path(sim)) as bus:
         ours = bus.attach(MyCHE, 1)
         for seconds in (5.0, 6.0, 7.0):
-            assert bus.write(ours, ours.acceleration_time, seconds) == seconds
+            assert ours.write(ours.acceleration_time, seconds) == seconds
     assert [(write.address, write.raw) for write in che.counters.writes] == [
         (0x8008, 50),
         (0x8008, 60),
@@ -235,42 +235,42 @@ def test_the_alias_in_ram_is_written_where_there_is_one() -> None:
 
 MISTAKES: dict[str, tuple[Callable[[Bus, Rig], Any], type[Exception], str]] = {
     "a reading is written": (
-        lambda bus, rig: bus.write(rig, rig.speed, 1),
+        lambda bus, rig: rig.write(rig.speed, 1),
         WriteForbidden,
         "speed of pump is not written: it is a reading",
     ),
     "a sealed setting is written": (
-        lambda bus, rig: bus.write(rig, rig.sealed, 1),
+        lambda bus, rig: rig.write(rig.sealed, 1),
         WriteForbidden,
         "sealed of pump is not written: it is the maker's",
     ),
     "above the span": (
-        lambda bus, rig: bus.write(rig, rig.target, 3001),
+        lambda bus, rig: rig.write(rig.target, 3001),
         ValueError,
         "target = 3001 is outside 0 to 3000 rpm",
     ),
     "no finite number": (
-        lambda bus, rig: bus.write(rig, rig.gain, float("nan")),
+        lambda bus, rig: rig.write(rig.gain, float("nan")),
         ValueError,
         "gain takes a finite number, not nan",
     ),
     "no number": (
-        lambda bus, rig: bus.write(rig, rig.gain, "1"),
+        lambda bus, rig: rig.write(rig.gain, "1"),
         TypeError,
         "gain takes a number, not '1'",
     ),
     "a truth value": (
-        lambda bus, rig: bus.write(rig, rig.gain, True),
+        lambda bus, rig: rig.write(rig.gain, True),
         TypeError,
         "gain takes a number, not True",
     ),
     "a command is read": (
-        lambda bus, rig: bus.read(rig, rig.target),
+        lambda bus, rig: rig.read(rig.target),
         ValueError,
         "target of pump cannot be read: it is a command",
     ),
     "one of many cannot be read": (
-        lambda bus, rig: bus.read_many(rig, [rig.speed, rig.target]),
+        lambda bus, rig: rig.read(rig.speed, rig.target),
         ValueError,
         "target of pump cannot be read: it is a command",
     ),
@@ -295,34 +295,44 @@ MISTAKES: dict[str, tuple[Callable[[Bus, Rig], Any], type[Exception], str]] = {
         "attach(Toy, address=...): which address does it have?",
     ),
     "a drive of another bus": (
-        lambda bus, rig: bus.read(Toy(5), Toy.status),
+        lambda bus, rig: Toy(5).read(Toy.status),
         ValueError,
         "toy@5 is not attached to this bus: use bus.attach(...)",
     ),
     "another family's register is read": (
-        lambda bus, rig: bus.read(rig, InvtCHE.output_current),
+        lambda bus, rig: rig.read(InvtCHE.output_current),
         ValueError,
         "this output_current is not a register of pump, which is a Rig",
     ),
     "another family's register is written": (
-        lambda bus, rig: bus.write(rig, YD1000.acceleration_time, 5.0),
+        lambda bus, rig: rig.write(YD1000.acceleration_time, 5.0),
         ValueError,
         "this acceleration_time is not a register of pump, which is a Rig",
     ),
-    "a name is read": (
-        lambda bus, rig: bus.read(rig, "target"),
-        TypeError,
-        "'target' is not a register of pump: use its attribute, or drive.register(NAME)",
+    "an unknown name is read": (
+        lambda bus, rig: rig.read("targets"),
+        ValueError,
+        "Rig has no register 'targets'; did you mean target?",
     ),
-    "a name is written": (
-        lambda bus, rig: bus.write(rig, "target", 5.0),
-        TypeError,
-        "'target' is not a register of pump: use its attribute, or drive.register(NAME)",
+    "an unknown name is written": (
+        lambda bus, rig: rig.write("targets", 5.0),
+        ValueError,
+        "Rig has no register 'targets'; did you mean target?",
     ),
-    "a name of a drive is read": (
-        lambda bus, rig: bus.read("pump", rig.target),
+    "a number is read": (
+        lambda bus, rig: rig.read(5),
         TypeError,
-        "'pump' is not a drive: use the one that attach returns",
+        "5 is not a register of pump: use its attribute, or drive.register(NAME)",
+    ),
+    "a list is read": (
+        lambda bus, rig: rig.read([rig.target]),
+        TypeError,
+        "is not a register of pump: use its attribute, or drive.register(NAME)",
+    ),
+    "nothing is read": (
+        lambda bus, rig: rig.read(),
+        TypeError,
+        "read of pump takes registers or their names; read_all() reads all",
     ),
     "a list's watchdog is asked for": (
         lambda bus, rig: bus.watchdog([rig]),
@@ -334,15 +344,10 @@ MISTAKES: dict[str, tuple[Callable[[Bus, Rig], Any], type[Exception], str]] = {
         TypeError,
         "is not a drive: use the one that attach returns",
     ),
-    "a frame goes to an address": (
-        lambda bus, rig: bus.raw(1, 3, 0, count=1),
-        TypeError,
-        "1 is not a drive: use the one that attach returns",
-    ),
     "a frame has a number in place of its data": (
-        lambda bus, rig: bus.raw(rig, 16, 0, 5),
+        lambda bus, rig: rig.send_raw(16, 0, 5),
         TypeError,
-        r"data = 5 is no bytes, such as b'\x00\x01'",
+        r"data = 5: it must be bytes, such as b'\x00\x01'",
     ),
     "a register is named by its number": (
         lambda bus, rig: rig.register(5),
@@ -363,11 +368,6 @@ MISTAKES: dict[str, tuple[Callable[[Bus, Rig], Any], type[Exception], str]] = {
         lambda bus, rig: bus.attach(Toy(3, name="pump"), 2),
         TypeError,
         "pump is made already: what it is to be goes into Toy(…)",
-    ),
-    "a script for a name": (
-        lambda bus, rig: bus.perform(cast(Any, "pump"), rig.stop.script()),
-        TypeError,
-        "'pump' is not a drive: use the one that attach returns",
     ),
     "a name is detached": (
         lambda bus, rig: bus.detach(cast(Any, "pump")),
@@ -431,7 +431,7 @@ def test_a_confirmation_that_is_lost_and_cannot_be_looked_up() -> None:
     with faulty(rig, losing(0x06)) as sim, Bus(path(sim)) as bus:
         ours = bus.attach(Rig, 1)
         with pytest.raises(Unconfirmed) as caught:
-            bus.write(ours, ours.target, 1500)
+            ours.write(ours.target, 1500)
     assert str(caught.value) == "Rig@1: it is not known whether target = 1500 rpm took effect: no reply"
     assert (caught.value.drive, caught.value.what) == ("Rig@1", "target = 1500 rpm")
     assert sent(rig)[0x06] == 1
@@ -444,7 +444,7 @@ def test_a_confirmation_that_is_lost_and_nothing_can_be_read_back() -> None:
     with faulty(rig, losing(0x03, 0x06)) as sim, Bus(path(sim)) as bus:
         ours = bus.attach(Rig, 1)
         with pytest.raises((Unconfirmed, NoReply)):
-            bus.write(ours, ours.gain, 2.0)
+            ours.write(ours.gain, 2.0)
     assert sent(rig).get(0x06, 0) <= 1
 
 
@@ -454,7 +454,7 @@ def test_a_drive_that_says_nothing_is_asked_a_few_times() -> None:
     with faulty(rig, losing(0x03)) as sim, Bus(path(sim)) as bus:
         ours = bus.attach(Rig, 1, name="pump")
         with pytest.raises(NoReply) as caught:
-            bus.read(ours, ours.speed)
+            ours.read(ours.speed)
         until(lambda: rig.counters.requests >= READ_ATTEMPTS)
     assert str(caught.value).startswith("pump does not answer: check its address, ")
     assert caught.value.drive == "pump"
@@ -469,7 +469,7 @@ def test_a_damaged_reply_is_shown() -> None:
     with faulty(rig, lambda reply: reply[:-1] + b"\0") as sim, Bus(path(sim)) as bus:
         ours = bus.attach(Rig, 1, name="pump")
         with pytest.raises(BadReply) as caught:
-            bus.read(ours, ours.speed)
+            ours.read(ours.speed)
     good = checksums.rtu("01 03 02 00 00")
     assert caught.value.reason == "bad checksum"
     assert caught.value.frame == good[:-1] + b"\0"
@@ -485,7 +485,7 @@ def test_a_read_is_repeated_after_noise() -> None:
     rig["speed"] = 1480
     with faulty(rig, lambda reply: next(fates)(reply)) as sim, Bus(path(sim)) as bus:
         ours = bus.attach(Rig, 1)
-        assert bus.read(ours, ours.speed) == 1480
+        assert ours.read(ours.speed) == 1480
 
 
 WRONG = {  # pymodbus, libmodbus and minimalmodbus each take some of these for the reply
@@ -503,7 +503,7 @@ def test_a_wrong_reply_is_never_data(wrong: str) -> None:
     with faulty(simulated(Rig(1)), lambda reply: WRONG[wrong]) as sim, Bus(path(sim)) as bus:
         ours = bus.attach(Rig, 1)
         with pytest.raises((BadReply, NoReply)):  # where this machine is late
-            bus.read(ours, ours.speed)
+            ours.read(ours.speed)
 
 
 WRONG_ECHOES = {
@@ -526,7 +526,7 @@ def test_a_wrong_confirmation_confirms_nothing(wrong: str) -> None:
     with faulty(rig, fate) as sim, Bus(path(sim)) as bus:
         ours = bus.attach(Rig, 1)
         with pytest.raises(Unconfirmed):
-            bus.write(ours, ours.target, 1500)
+            ours.write(ours.target, 1500)
     assert sent(rig)[0x06] == 1
 
 
@@ -553,7 +553,7 @@ def test_a_refusal_has_its_family_s_meaning(
     with faulty(there, lambda _: checksums.rtu(reply)) as sim, Bus(path(sim)) as bus:
         bus.attach(drive)
         with pytest.raises(DriveException) as caught:
-            bus.read(drive, register)
+            drive.read(register)
     assert caught.value.code == code
     assert caught.value.meaning.startswith(meaning)
     assert str(caught.value).startswith(f"{drive.name} refuses {register.name}: code {code:02X}H, {meaning}")
@@ -623,7 +623,7 @@ def test_two_threads_on_one_bus() -> None:
             truth = {register.name: proof(drive, register) for register in drive.readings()}
             for _ in range(15):
                 try:
-                    found = bus.read_many(drive, drive.readings())
+                    found = drive.read_many(drive.readings())
                 except BusError as failure:
                     wrong.append(failure)
                 else:
@@ -639,7 +639,7 @@ def test_two_threads_on_one_bus() -> None:
 
 def read_for_ever(bus: Bus, rig: Rig) -> None:
     while True:
-        bus.read(rig, rig.speed)
+        rig.read(rig.speed)
 
 
 def read_until_closed(bus: Bus, rig: Rig) -> None:
@@ -663,7 +663,7 @@ def test_a_bus_that_is_closed_while_others_use_it() -> None:
             threads = [threading.Thread(target=read_until_closed, args=(bus, ours)) for _ in range(3)]
             for thread in threads:
                 thread.start()
-            bus.read(ours, ours.speed)
+            ours.read(ours.speed)
             bus.close()
             for thread in threads:
                 thread.join()
@@ -702,7 +702,7 @@ def test_a_read_of_several_requests_ends_where_its_drive_leaves() -> None:
         peer = bus.peer(pump)
         when_asked(bus, lambda: bus.detach(pump))
         with pytest.raises(NotAttached):
-            bus.read_many(pump, [Single.output_frequency, Single.output_current, Single.fault])
+            pump.read(Single.output_frequency, Single.output_current, Single.fault)
         assert peer.exchanges == 1  # at its address may be another family now
 
 
@@ -711,7 +711,7 @@ def test_a_drive_that_takes_another_s_place_knows_what_a_thread_has_asked_that()
     sim = simulated(Single(1))
     with Simulator([Wire([sim], unpaced=True)]) as simulator, Bus(simulator.wires[0].path) as bus:
         pump = bus.attach(Single, 1)
-        bus.read(pump, Single.output_current)
+        pump.read(Single.output_current)
         sim.deaf_until = float("inf")
         taken: list[Drive] = []
         taking = threading.Thread(target=lambda: taken.append(bus.attach(Successor, 1)))
@@ -724,7 +724,7 @@ def test_a_drive_that_takes_another_s_place_knows_what_a_thread_has_asked_that()
 
         when_asked(bus, exchange_it)
         with pytest.raises((NoReply, NotAttached)):
-            bus.read(pump, Single.mystery)
+            pump.read(Single.mystery)
         taking.join(PATIENCE)
         assert bus.peer(taken[0]).late_until_ns
 

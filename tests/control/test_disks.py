@@ -153,13 +153,13 @@ def test_what_must_be_noted_first_is_not_sent_on_a_full_disk_and_a_stop_is(
             for write in (
                 lambda: drive.set_frequency(25),
                 drive.start,
-                lambda: line.bus.raw(drive, 6, 0x1000, b"\0\1"),
+                lambda: drive.send_raw(6, 0x1000, b"\0\1"),
             ):
                 with pytest.raises(OSError, match=r"was not sent: the audit log cannot be written: \S"):
                     write()
             assert len(line.written) == before
             drive.stop()
-            line.bus.write(drive, drive.control, drive.control.decode(5))
+            drive.write(drive.control, drive.control.decode(5))
             line.bus._records.flush(PATIENCE_S)
         drive.set_frequency(25)
     line.bus.close()

@@ -422,7 +422,7 @@ with ExitStack() as stack:
         for hz in (15, 20):
             pump.set_frequency(hz)
     while sys.argv[1] == "read":
-        bus.read(pump, pump.output_current)
+        pump.read(pump.output_current)
 """
 
 

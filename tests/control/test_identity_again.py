@@ -43,7 +43,7 @@ def known(model: str) -> Iterator[tuple[Bus, Any, ReceivedRequests]]:
 def be_silent(bus: Bus, drive: Any, received: ReceivedRequests) -> None:
     received.loses = lambda request: True
     with pytest.raises(NoReply):
-        bus.read(drive, next(register for register in drive.registers.values() if register.readable))
+        drive.read(next(register for register in drive.registers.values() if register.readable))
     until(lambda: len(received.requests) == bus.statistics().counters.sent)  # the last is heard late perhaps
     received.loses = lambda request: False
     received.requests.clear()
@@ -96,7 +96,7 @@ def test_a_drive_of_which_nothing_was_heard_for_ten_seconds_is_looked_at_once(
         )
         if pause == "read since":  # which says nothing of who answers
             bus.peer(drive).c.answered_ns -= 2 * PAUSE_NS
-            bus.read(drive, next(register for register in drive.registers.values() if register.readable))
+            drive.read(next(register for register in drive.registers.values() if register.readable))
         else:
             for name in ("boottime_ns", "now_ns")[: 1 + (pause == "idle")]:
                 at_ns = getattr(clock, name)
@@ -146,7 +146,7 @@ def _idle(bus: Bus, drive: Any, monkeypatch: pytest.MonkeyPatch) -> None:
 
 def _read_since(bus: Bus, drive: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     bus.peer(drive).c.answered_ns -= 2 * PAUSE_NS
-    bus.read(drive, next(register for register in drive.registers.values() if register.readable))
+    drive.read(next(register for register in drive.registers.values() if register.readable))
 
 
 def _on_another_port(bus: Bus, drive: Any, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -307,7 +307,7 @@ def test_something_is_read_once_before_the_first_stop_and_waits_for_nothing(
         drive.stop()
         assert asked[0] == (True, True)
     bus.queue = object()  # the port was opened again
-    bus.bus.read(drive, drive.speed)
+    drive.read(drive.speed)
     asked.clear()
     drive.stop()
     assert asked[0] == (True, True)  # it has answered since

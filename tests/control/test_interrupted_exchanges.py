@@ -69,7 +69,7 @@ def test_an_interrupted_exchange_does_not_hold_the_port_up(monkeypatch: pytest.M
         for nth in count(1):
             bus = Bus(simulator.wires[0].path)
             drive = bus.attach(InvtCHE, address=1, baudrate=BAUDRATE)
-            interruption = interrupted(partial(bus.read, drive, drive.status), nth)
+            interruption = interrupted(partial(drive.read, drive.status), nth)
             with monkeypatch.context() as patched:
                 patched.setattr(clock, "sleep", waits.append)
                 bus.close()

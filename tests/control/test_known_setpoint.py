@@ -123,11 +123,11 @@ def test_a_stored_setpoint_that_is_held_already_is_known_without_a_write(
 
 def test_a_plain_write_tells_the_setpoint_too(monkeypatch: pytest.MonkeyPatch) -> None:
     bus, drive = told(monkeypatch, lambda: InnovertIBD(1, maximum_frequency=50))
-    bus.bus.write(drive, drive.register("frequency"), 30)
+    drive.write(drive.register("frequency"), 30)
     assert drive.commanded == 30
     bus.loses = is_write
     with pytest.raises(BusError):
-        bus.bus.write(drive, drive.register("frequency"), 40)
+        drive.write(drive.register("frequency"), 40)
     assert drive.commanded is None
 
 

@@ -36,7 +36,7 @@ def toys(port: str = "pty") -> Simulator:
 def write(port: str, seconds: float, ledger: Ledger | None = None) -> None:
     with Bus(port, ledger=ledger, expiry=60.0) as bus:
         toy = bus.attach(Toy, 1)
-        bus.write(toy, toy.acceleration_time, seconds)
+        toy.write(toy.acceleration_time, seconds)
 
 
 # ---- what a port is ----
@@ -167,9 +167,9 @@ def test_what_cannot_wear_is_not_counted(tmp_path: Path, monkeypatch: pytest.Mon
     line = SimulatedBus(monkeypatch, sim, ledger=ledger)
     fan = line.attach(Fan(1, ram=["known"]))
     for register in (fan.relay, fan.speed, fan.known):
-        line.bus.write(fan, register, 1)
+        fan.write(register, 1)
     assert ledger.wear(0) == []
-    line.bus.write(fan, fan.latch, 1)
+    fan.write(fan.latch, 1)
     assert [each.cell.register for each in ledger.wear(0)] == ["latch"]
     assert set(sim.counters.eeprom_writes) == {"known", "latch"}  # what its owner knows, its class does not
 
@@ -194,7 +194,7 @@ def test_a_user_without_a_home_may_stop_and_not_wear_an_eeprom(monkeypatch: pyte
     drive = line.attach(Toy(1))
     drive.stop()
     with pytest.raises(OSError, match=r"EEPROM writes /dev/null/multidrop/wear\.sqlite cannot be kept"):
-        line.bus.write(drive, drive.acceleration_time, 12.0)
+        drive.write(drive.acceleration_time, 12.0)
     assert toy.counters.eeprom_writes == {}
 
 

@@ -115,13 +115,13 @@ def scene(tmp_path: Path) -> Iterator[Scene]:
 
 
 CALLS: dict[str, Callable[[Scene], object]] = {
-    "read": lambda scene: scene.bus.read(scene.drive, Toy.output_current),
-    "write": lambda scene: scene.bus.write(scene.drive, Toy.acceleration_time, 20.0),
-    "ask": lambda scene: scene.bus.ask(scene.drive, 3, 1, 1),
-    "raw": lambda scene: scene.bus.raw(scene.drive, 6, 0x15, b"\x00\x01"),
+    "read": lambda scene: scene.drive.read(Toy.output_current),
+    "write": lambda scene: scene.drive.write(Toy.acceleration_time, 20.0),
+    "ask": lambda scene: scene.drive.read_raw(3, 1, 1),
+    "raw": lambda scene: scene.drive.send_raw(6, 0x15, b"\x00\x01"),
     "start": lambda scene: scene.drive.start(),
     "stop": lambda scene: scene.drive.stop(),
-    "step of a stop": lambda scene: scene.bus.perform(scene.drive, halt()),
+    "step of a stop": lambda scene: scene.drive.perform(halt()),
 }
 
 
@@ -142,7 +142,7 @@ def test_nothing_is_sent_before_it_is_master(scene: Scene, call: Callable[[Scene
 @pytest.mark.parametrize("call", usually("start", *(call for call in CALLS if call != "start")))
 def test_nothing_is_sent_after_it_was_master(scene: Scene, call: str) -> None:
     scene.become_master()
-    scene.bus.read(scene.drive, Toy.output_current)
+    scene.drive.read(Toy.output_current)
     before = scene.requests
     scene.mastership.end()
     with pytest.raises(NotMaster):
@@ -153,7 +153,7 @@ def test_nothing_is_sent_after_it_was_master(scene: Scene, call: str) -> None:
 def test_a_lost_mastership_is_no_failure_of_the_drive(scene: Scene) -> None:
     for _ in range(3):
         with pytest.raises(NotMaster):
-            scene.bus.read(scene.drive, Toy.output_current)
+            scene.drive.read(Toy.output_current)
     assert scene.bus.peer(scene.drive).failures == 0
     assert scene.bus.statistics().counters.ended == {Missed.NOT_MASTER: 3}
 
@@ -167,16 +167,16 @@ def test_a_deadline_that_passes_is_enough(scene: Scene) -> None:
     mastership.extend(until_ns := now_ns() + 11 * S)
     with Bus(path, mastership=mastership) as bus, ended(mastership):
         drive = bus.attach(Brief(1, name="pump"))
-        bus.read(drive, Toy.output_current)
+        drive.read(Toy.output_current)
         assert now_ns() < until_ns, "the machine is too busy for this"
-        reads = (bus.read(drive, Toy.output_current) for _ in count())
+        reads = (drive.read(Toy.output_current) for _ in count())
         with pytest.raises(NotMaster):
             deque(reads, maxlen=0)
         assert now_ns() >= until_ns
         sent = bus.statistics().counters.sent  # one more than was answered, where a reply was late
         for _ in range(3):
             with pytest.raises(NotMaster):
-                bus.read(drive, Toy.output_current)
+                drive.read(Toy.output_current)
         assert bus.statistics().counters.sent == sent
         assert scene.requests <= sent
 
@@ -253,7 +253,7 @@ def test_a_write_of_which_a_part_has_left_is_unconfirmed(
     scene.become_master()
     hold_back(monkeypatch, scene, sent_ns=1, after=0)
     with pytest.raises(Unconfirmed, match="it is not known whether acceleration_time = 20"):
-        scene.bus.write(scene.drive, Toy.acceleration_time, 20.0)
+        scene.drive.write(Toy.acceleration_time, 20.0)
     (entry,) = read_audit(scene.audit)
     assert "this process may not send on " in str(entry)
 
@@ -271,7 +271,7 @@ def test_a_script_that_is_held_back_at_its_second_write_says_so(
         yield from write(Toy.frequency, 6.0)
 
     with pytest.raises(NotMaster):
-        scene.bus.perform(scene.drive, both())
+        scene.drive.perform(both())
     assert len([*read_audit(scene.audit)]) == 1
 
 
@@ -343,7 +343,7 @@ def waits(far: int, bus: Bus, drive: Slow) -> float:
 
     def ask() -> None:
         with suppress(NoReply):
-            bus.ask(drive, 3, 1, 1, expiry=60)
+            drive.read_raw(3, 1, 1, expiry=60)
 
     begun = time.monotonic()
     asking = threading.Thread(target=ask)
@@ -366,7 +366,7 @@ def test_the_line_is_listened_to_where_another_one_may_have_been_master(
     assert waits(far, bus, drives[1]) < listening
     mastership.end()
     with pytest.raises(NotMaster):
-        bus.ask(drives[1], 3, 1, 1, expiry=60)
+        drives[1].read_raw(3, 1, 1, expiry=60)
     mastership.extend(now_ns() + 1000 * S)
     assert waits(far, bus, drives[2]) >= listening
 
@@ -380,8 +380,8 @@ def test_another_master_is_told_and_nothing_is_sent(
     other = Babbler(far)
     try:
         for call in (
-            lambda: bus.ask(drive, 3, 1, 1, expiry=60),
-            lambda: bus.write(drive, Toy.frequency, 5.0),
+            lambda: drive.read_raw(3, 1, 1, expiry=60),
+            lambda: drive.write(Toy.frequency, 5.0),
         ):
             with pytest.raises(NotMaster) as failure:
                 call()
@@ -396,7 +396,7 @@ def test_another_master_is_told_and_nothing_is_sent(
 
     def is_asked() -> bool:
         try:
-            bus.ask(drive, 3, 1, 1, expiry=60)
+            drive.read_raw(3, 1, 1, expiry=60)
         except NotMaster:  # the last of what the other one said was still to be read
             return False
         except NoReply:
@@ -428,13 +428,13 @@ def test_a_network_s_port_is_held_back_too(port: str) -> None:
     with simulator, Bus(simulator.wires[0].path, mastership=mastership) as bus:
         drive = bus.attach(Brief(1))
         begun = time.monotonic()
-        bus.read(drive, Toy.output_current)
+        drive.read(Toy.output_current)
         # a gateway of Modbus TCP is its line's one master, and hands on no other's bytes
         assert port.startswith("tcp") or time.monotonic() - begun >= LISTENING
         asked = sim.counters.requests
         mastership.end()
         with pytest.raises(NotMaster):
-            bus.read(drive, Toy.output_current)
+            drive.read(Toy.output_current)
         assert sim.counters.requests == asked > 0
 
 
@@ -477,4 +477,4 @@ def test_an_unmastered_bus_is_as_before(scene: Scene) -> None:
     path = scene.simulator.wires[0].path
     scene.bus.close()
     with Bus(path) as bus:
-        assert bus.read(bus.attach(Brief(1)), Toy.output_current) == 0.0
+        assert bus.attach(Brief(1)).read(Toy.output_current) == 0.0

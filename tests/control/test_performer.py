@@ -120,7 +120,7 @@ def test_what_a_reset_wrote_is_taken_back_after_a_stop_and_noted(
 
 def test_what_a_plain_write_stopped_is_noted(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     line, drive, _ = one(monkeypatch, InvtCHE(1), audit=tmp_path / "audit")
-    line.bus.write(drive, drive.control, CHEControl.STOP)
+    drive.write(drive.control, CHEControl.STOP)
     line.bus._records.flush(60)
     (entry,) = read_audit(tmp_path / "audit")
     assert (entry["write"], entry["outcome"]) == ("control = STOP", "done")
@@ -130,7 +130,7 @@ def test_what_a_plain_write_stopped_is_noted(monkeypatch: pytest.MonkeyPatch, tm
 def test_a_raw_request_is_noted_at_once(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     line, drive, _ = one(monkeypatch, InvtCHE(1), audit=tmp_path / "audit")
     assert line.bus.audit_trouble == ""
-    line.bus.raw(drive, 6, 0x1000, b"\0\5")
+    drive.send_raw(6, 0x1000, b"\0\5")
     (entry,) = read_audit(tmp_path / "audit")
     assert (entry["sent"], entry["outcome"]) == ("01 06 10 00 00 05 4D 09", "done")
     line.bus.close()
@@ -139,7 +139,7 @@ def test_a_raw_request_is_noted_at_once(monkeypatch: pytest.MonkeyPatch, tmp_pat
 def test_nothing_is_even_read_for_a_write_that_is_too_late(monkeypatch: pytest.MonkeyPatch) -> None:
     line, drive, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
     with written_before(lambda: 0.0), pytest.raises(Expired, match=r"setpoint = 10\.00 %"):
-        line.bus.write(drive, drive.setpoint, 10.0)
+        drive.write(drive.setpoint, 10.0)
     assert line.frames == []
 
 
@@ -223,10 +223,10 @@ def test_a_write_is_told_to_the_log_with_who_asked_for_it(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level(logging.INFO, "multidrop.control")
-    line, drive, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
+    _, drive, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
     for who in ((), ("anna",), ("anna", "web")):
         with written_by(*who) if who else nullcontext():
-            line.bus.write(drive, drive.setpoint, 10.0)
+            drive.write(drive.setpoint, 10.0)
     told = [record.getMessage() for record in caplog.records if "setpoint" in record.getMessage()]
     sentence = "invt-che@1: setpoint = 10.00 %: done"
     assert told == [sentence, f"{sentence} (by anna)", f"{sentence} (by anna, web)"]
@@ -262,14 +262,14 @@ def test_a_write_that_its_budget_holds_back_says_that_it_may_be_sent_later(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     line, drive, _ = one(monkeypatch, DelixiModbus(1), ledger=tmp_path / "wear")
-    line.bus.write(drive, drive.frequency, 12.0)
+    drive.write(drive.frequency, 12.0)
     with pytest.raises(WriteForbidden, match="was written 0 s ago") as refusal:
-        line.bus.write(drive, drive.frequency, 13.0)
+        drive.write(drive.frequency, 13.0)
     assert refusal.value.is_budget
     line.sleep(61)
-    line.bus.write(drive, drive.frequency, 13.0)
+    drive.write(drive.frequency, 13.0)
     with pytest.raises(WriteForbidden, match="does not fit") as refusal:
-        line.bus.write(drive, drive.frequency, 1e9)
+        drive.write(drive.frequency, 1e9)
     assert not refusal.value.is_budget
 
 

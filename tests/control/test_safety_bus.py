@@ -73,7 +73,7 @@ def test_a_plain_write_never_starts_a_motor_nor_resets_a_fault(
                 continue
             refusals += 1
             with pytest.raises(WriteForbidden, match=r"commands the motor.*use start\(\)") as refusal:
-                line.bus.write(drive, register, value)
+                drive.write(register, value)
             assert refusal.value.register == register.name
             assert refusal.value.place
     assert refusals >= 3
@@ -82,8 +82,8 @@ def test_a_plain_write_never_starts_a_motor_nor_resets_a_fault(
 
 
 def test_a_stop_may_be_written_plainly(monkeypatch: pytest.MonkeyPatch) -> None:
-    line, drive, _ = one(monkeypatch, InvtCHE(1))
-    assert line.bus.write(drive, drive.control, CHEControl.STOP) is CHEControl.STOP
+    _, drive, _ = one(monkeypatch, InvtCHE(1))
+    assert drive.write(drive.control, CHEControl.STOP) is CHEControl.STOP
 
 
 @pytest.mark.parametrize(
@@ -122,7 +122,7 @@ def test_what_is_against_a_rule_is_refused_and_not_sent(
     line, _, _ = one(monkeypatch, drive)
     register = drive.register(name)
     with pytest.raises(WriteForbidden, match=sentence) as refusal:
-        line.bus.write(drive, register, value)
+        drive.write(register, value)
     assert isinstance(refusal.value, ValueError)  # a mistake of the caller's
     assert (refusal.value.register, bool(refusal.value.rule), bool(refusal.value.place)) == (name, True, True)
     assert line.written == []
@@ -137,20 +137,20 @@ def test_what_changes_only_at_rest_is_refused_while_the_motor_turns(monkeypatch:
     with pytest.raises(
         WriteForbidden, match=r"maximum_frequency .* only while the motor stands; state: running.*FH"
     ):
-        line.bus.write(drive, drive.maximum_frequency, 90)
+        drive.write(drive.maximum_frequency, 90)
     assert line.written == before
     drive.stop()
-    assert line.bus.write(drive, drive.maximum_frequency, 90) == 90
+    assert drive.write(drive.maximum_frequency, 90) == 90
     assert sim["maximum_frequency"] == 90
 
 
 def test_raw_goes_past_every_rule_and_is_called_that(monkeypatch: pytest.MonkeyPatch) -> None:
     line, drive, _ = one(monkeypatch, YD1000(1))
-    assert line.bus.raw(drive, 6, 0x0000, b"\x00\x01") == b"\x00\x01"
+    assert drive.send_raw(6, 0x0000, b"\x00\x01") == b"\x00\x01"
     assert line.written == ["01 06 00 00 00 01 48 0A"]
     line.loses = lambda request: True
     with pytest.raises(Unconfirmed, match="raw request 01 06 00 00 00 01"):
-        line.bus.raw(drive, 6, 0x0000, b"\x00\x01")
+        drive.send_raw(6, 0x0000, b"\x00\x01")
     assert len(line.written) == 2  # once each
 
 
@@ -241,23 +241,23 @@ def test_an_ibd_that_cannot_be_told_apart_needs_its_owner_s_word(monkeypatch: py
 
 def test_done_taken_refused_unconfirmed(monkeypatch: pytest.MonkeyPatch) -> None:
     line, drive, _ = one(monkeypatch, InnovertIBD(1))
-    outcome = line.bus.try_write(drive, drive.acceleration_time, 20.0)
+    outcome = drive.try_write(drive.acceleration_time, 20.0)
     assert (outcome.effect, outcome.held) == (Effect.DONE, 20.0)
     assert str(outcome) == "innovert-ibd@1: acceleration_time = 20.0 s: done (read back)"
-    outcome = line.bus.try_write(drive, drive.acceleration_time, 6000.0)
+    outcome = drive.try_write(drive.acceleration_time, 6000.0)
     assert (outcome.effect, outcome.held, outcome.value) == (Effect.TAKEN_AS, 3600.0, 3600.0)
     assert str(outcome) == "innovert-ibd@1: acceleration_time = 6000.0 s: taken as 3600.0 s"
-    outcome = line.bus.try_write(drive, drive.frequency, 20.0)
+    outcome = drive.try_write(drive.frequency, 20.0)
     assert str(outcome).endswith("frequency = 20.00 Hz: done (cannot be read back)")
     line.loses = lambda request: request.function == 6
-    outcome = line.bus.try_write(drive, drive.frequency, 25.0)
+    outcome = drive.try_write(drive.frequency, 25.0)
     assert (outcome.effect, outcome.held) == (Effect.UNCONFIRMED, None)
     assert str(outcome).startswith("innovert-ibd@1: frequency = 25.00 Hz: unconfirmed: innovert-ibd@1: ")
     with pytest.raises(Unconfirmed, match="no reply"):
         assert outcome.value
-    assert line.bus.try_write(drive, drive.acceleration_time, 10.0).effect is Effect.DONE  # it was looked up
+    assert drive.try_write(drive.acceleration_time, 10.0).effect is Effect.DONE  # it was looked up
     line.deafens = line.loses
-    outcome = line.bus.try_write(drive, drive.acceleration_time, 30.0)
+    outcome = drive.try_write(drive.acceleration_time, 30.0)
     assert (outcome.effect, outcome.held) == (Effect.UNCONFIRMED, 10.0)
 
 
@@ -302,7 +302,7 @@ def test_refused_by_the_drive_has_the_family_s_meaning(monkeypatch: pytest.Monke
     line.bus.check_identity(drive)
     refusal = build_reply(Framing.RTU, Message(1, 6, exception=0x12))
     line.answers = lambda request: refusal if request.function == 6 else None
-    outcome = line.bus.try_write(drive, drive.setpoint, 50.0)
+    outcome = drive.try_write(drive.setpoint, 50.0)
     assert outcome.effect is Effect.REFUSED
     with pytest.raises(DriveException, match="code 12H, write not allowed: out of range"):
         assert outcome.value
@@ -316,7 +316,7 @@ def test_a_raw_request_that_is_refused_is_noted_as_that(
     refusal = build_reply(Framing.RTU, Message(1, 6, exception=0x12))
     line.answers = lambda request: refusal if request.function == 6 else None
     with pytest.raises(DriveException, match="code 12H"):
-        line.bus.raw(drive, 6, 0x1000, b"\0\5")
+        drive.send_raw(6, 0x1000, b"\0\5")
     line.bus.close()
     assert [entry["outcome"] for entry in read_audit(tmp_path / "audit")] == ["refused by the drive"]
 
@@ -328,7 +328,7 @@ def test_what_became_of_a_raw_request_is_noted(
     line, drive, _ = one(monkeypatch, YD1000(1), audit=tmp_path / "audit")
     line.loses = lambda request: is_lost
     with pytest.raises(Unconfirmed) if is_lost else nullcontext():
-        line.bus.raw(drive, 6, 0x0000, b"\x00\x01")
+        drive.send_raw(6, 0x0000, b"\x00\x01")
     line.bus.close()
     (entry,) = read_audit(tmp_path / "audit")
     assert entry["write"] == "raw request 01 06 00 00 00 01 48 0A"
@@ -607,7 +607,7 @@ def test_the_ram_alias_is_written_and_not_counted(monkeypatch: pytest.MonkeyPatc
 
     ledger = Ledger(tmp_path / "wear")
     line, drive, sim = one(monkeypatch, Mine(1), ledger=ledger)
-    line.bus.write(drive, Mine.acceleration_time, 20.0)
+    drive.write(Mine.acceleration_time, 20.0)
     assert line.written == ["01 06 80 0C 00 C8 61 9F"]
     assert not sim.counters.eeprom_writes
     assert ledger.wear(0) == []
@@ -879,7 +879,7 @@ def test_a_ramp_goes_on_from_a_setpoint_that_was_plainly_written(monkeypatch: py
     """It cannot be read: from the one of set_frequency it would be a jump."""
     line, drive, _ = one(monkeypatch, InnovertIBD(1, confirmed=1))
     drive.set_frequency(40)
-    line.bus.write(drive, drive.frequency, 10.0)
+    drive.write(drive.frequency, 10.0)
     line.frames.clear()
     ramp(drive, 14, rate=4.0)
     assert [int(each[12:17].replace(" ", ""), 16) / 100 for each in line.written] == [12.0, 14.0]
@@ -890,7 +890,7 @@ def test_a_ramp_goes_on_from_no_setpoint_that_is_in_doubt(monkeypatch: pytest.Mo
     drive.set_frequency(40)
     line.loses = is_write
     with pytest.raises(Unconfirmed):
-        line.bus.write(drive, drive.frequency, 10.0)
+        drive.write(drive.frequency, 10.0)
     for act in (lambda: ramp(drive, 14, rate=4.0), drive.start):
         with pytest.raises(WriteForbidden, match="cannot say its setpoint"):
             act()
@@ -1053,7 +1053,7 @@ ENDINGS: dict[str, tuple[BaseException, int, Callable[[SimulatedBus, Any], objec
     "port lost in a raw request": (
         LOST,
         6,
-        lambda line, drive: line.bus.raw(drive, 6, 0x1000, b"\0\5"),
+        lambda line, drive: drive.send_raw(6, 0x1000, b"\0\5"),
         "raw request 01 06 10 00 00 05 4D 09",
     ),
     "port lost in a broadcast": (
@@ -1135,7 +1135,7 @@ def test_a_family_of_one_s_own_is_looked_at_too(monkeypatch: pytest.MonkeyPatch)
     line = SimulatedBus(monkeypatch)
     drive = line.attach(Mine(1))
     with pytest.raises(NoReply):
-        line.bus.write(drive, Mine.speed, 10)
+        drive.write(Mine.speed, 10)
     assert line.written == []
 
 
@@ -1183,7 +1183,7 @@ def test_what_changes_only_at_rest_is_not_written_where_nobody_can_say_what_rest
     line = SimulatedBus(monkeypatch, simulated(Mute(1)))
     drive = line.attach(Mute(1, name="mute"))
     with pytest.raises(WriteForbidden) as refusal:
-        line.bus.write(drive, Mute.ratio, 3)
+        drive.write(Mute.ratio, 3)
     assert str(refusal.value) == (
         "ratio of mute is not written: it changes only while the motor stands, which the family cannot say"
     )
@@ -1194,6 +1194,6 @@ def test_the_bus_needs_no_ledger_before_the_first_write(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     line, drive, _ = one(monkeypatch, ErmanERG220(1), ledger=tmp_path / "none" / "wear")
-    assert line.bus.read(drive, drive.frequency) == 0
+    assert drive.read(drive.frequency) == 0
     assert not (tmp_path / "none").exists()
     assert isinstance(line.bus, Bus)

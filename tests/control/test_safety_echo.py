@@ -37,10 +37,10 @@ def test_a_plain_stop_that_may_be_an_echo_is_not_confirmed(
     line, drive, _ = one(monkeypatch, type(declared)(1, **declared.option))
     stop = next(register for register in drive.registers.values() if register.harmless)
     value = stop.decode(stop.harmless[-1])
-    assert line.bus.try_write(drive, stop, value).effect is Effect.DONE
+    assert drive.try_write(stop, value).effect is Effect.DONE
     dies_and_echoes(line, drive)
     with pytest.raises(Unconfirmed, match="echo"):
-        line.bus.write(drive, stop, value)
+        drive.write(stop, value)
 
 
 @pytest.mark.parametrize("family", [InnovertIBD, DelixiNative])
@@ -51,7 +51,7 @@ def test_a_setpoint_that_may_be_an_echo_is_not_confirmed(
     line, drive, _ = one(monkeypatch, family(1))
     drive.set_frequency(20)
     dies_and_echoes(line, drive)
-    for write in (lambda: line.bus.write(drive, drive.frequency, 25.0), lambda: drive.set_frequency(25.0)):
+    for write in (lambda: drive.write(drive.frequency, 25.0), lambda: drive.set_frequency(25.0)):
         with pytest.raises(Unconfirmed, match="echo"):
             write()
         assert drive.commanded is None  # neither a start nor a ramp trusts it
@@ -67,7 +67,7 @@ def test_an_echo_that_shows_at_the_next_read_confirmed_nothing(monkeypatch: pyte
         return build_request(drive.framing, request) if is_write(request) else None
 
     line.answers = echo
-    outcome = line.bus.try_write(drive, drive.frequency, 25.0)
+    outcome = drive.try_write(drive.frequency, 25.0)
     assert outcome.effect is Effect.UNCONFIRMED
     assert "the reply was the adapter's echo" in str(outcome.failure)
 
@@ -76,10 +76,10 @@ def test_a_raw_request_that_may_be_an_echo_is_not_confirmed(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     line, drive, _ = one(monkeypatch, InnovertIBD(1), audit=tmp_path / "audit")
-    line.bus.raw(drive, 6, 0x2001, b"\x07\xd0")
+    drive.send_raw(6, 0x2001, b"\x07\xd0")
     dies_and_echoes(line, drive)
     with pytest.raises(Unconfirmed, match="echo"):
-        line.bus.raw(drive, 6, 0x2001, b"\x07\xd0")
+        drive.send_raw(6, 0x2001, b"\x07\xd0")
     line.bus.close()
     assert [entry["outcome"] for entry in read_audit(tmp_path / "audit")] == ["done", "unconfirmed"]
 
@@ -92,4 +92,4 @@ def test_what_is_told_of_an_adapter_that_is_known_to_echo_is_believed(
     line.has_echo = True
     drive.set_frequency(20)
     line.loses = lambda request: not is_write(request)
-    assert line.bus.try_write(drive, drive.frequency, 25.0).effect is Effect.DONE
+    assert drive.try_write(drive.frequency, 25.0).effect is Effect.DONE

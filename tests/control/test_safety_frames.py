@@ -139,7 +139,7 @@ def calls(draw: st.DrawFn, model: str) -> tuple[str, Callable[[SimulatedBus, Any
         register = draw(st.one_of(st.sampled_from(moving), st.sampled_from(registers)))
         value = draw(values(register))
         if name == "write":
-            return name, lambda line, drive: line.bus.write(drive, register, value)
+            return name, lambda line, drive: drive.write(register, value)
         return name, lambda line, drive: line.bus.broadcast(register, value)
     if name == "stop_all":
         return name, lambda line, drive: line.bus.stop_all()

@@ -243,4 +243,4 @@ def test_the_echo_is_not_the_drive_s_answer_to_a_write() -> None:
     with echoing(hears) as port, Bus(port) as bus:
         pump = bus.attach(InvtCHE(1))
         with pytest.raises(Unconfirmed, match="no reply"):
-            bus.write(pump, pump.setpoint, 50.0)
+            pump.write(pump.setpoint, 50.0)

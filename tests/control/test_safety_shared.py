@@ -109,7 +109,7 @@ class Stranger:
                 sleep(self._chance.uniform(0.0, 0.04))
 
     def _look(self) -> None:
-        self._bus.read(self._first, self._first.readings()[0])
+        self._first.read(self._first.readings()[0])
 
     def _set(self) -> None:
         self._second.set_frequency(self._chance.randint(1, 40))

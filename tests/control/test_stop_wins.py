@@ -114,7 +114,7 @@ class Stops(RuleBasedStateMachine):
         self.line.troubles.clear()
         begun = len(self.line.log)
         with suppress(BusError):
-            self.bus.read(drive, drive.register(KINDS[self.kind].mark))
+            drive.read(drive.register(KINDS[self.kind].mark))
         assert len(self.line.log) > begun
         self.begun = len(self.line.log)
         self.staggered = False

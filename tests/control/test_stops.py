@@ -146,7 +146,7 @@ def started_while(
 ACTS: dict[str, Callable[[SimulatedBus, Any], object]] = {
     "stop": lambda line, drive: drive.stop(),
     "stop_all": lambda line, drive: line.bus.stop_all(),
-    "a plain stop": lambda line, drive: line.bus.write(drive, *plain_stop(drive)),
+    "a plain stop": lambda line, drive: drive.write(*plain_stop(drive)),
     "leave": lambda line, drive: line.bus.leave(),
     "close": lambda line, drive: line.bus.close(),
     "detach": lambda line, drive: line.bus.detach(drive),
@@ -279,8 +279,8 @@ def test_after_closing_nothing_that_moves_is_sent(monkeypatch: pytest.MonkeyPatc
         drive.start,
         drive.jog,
         lambda: drive.set_frequency(30),
-        lambda: line.bus.write(drive, drive.setpoint, 10.0),
-        lambda: line.bus.raw(drive, 6, 0x1000, b"\0\1"),
+        lambda: drive.write(drive.setpoint, 10.0),
+        lambda: drive.send_raw(6, 0x1000, b"\0\1"),
     ):
         with pytest.raises(CancelledByStop, match="the bus was left"):
             call()
@@ -456,7 +456,7 @@ def test_one_value_that_does_not_fit_its_family_withholds_a_start_and_no_stop(
         (stopped,) = line.bus.stop_all().values()
         assert stopped.seen is Seen.STOPPED
     else:
-        line.bus.write(drive, drive.control, drive.control.decode(drive.control.broadcast[0]))
+        drive.write(drive.control, drive.control.decode(drive.control.broadcast[0]))
     assert STOPS[model](writes(line)[0])
 
 
@@ -739,10 +739,10 @@ def test_a_plain_stop_is_withheld_where_another_family_answers_twice(
     odd = build_reply(Framing.RTU, Message(1, 3, data=b"\x01\x0a"))  # a Goodrive300L
     line.answers = lambda request: odd if len(line.frames) <= suspicions else None
     if suspicions == 1:
-        line.bus.write(drive, drive.control, CHEControl.STOP)
+        drive.write(drive.control, CHEControl.STOP)
     else:
         with pytest.raises(WriteForbidden, match="no stop was sent"):
-            line.bus.write(drive, drive.control, CHEControl.STOP)
+            drive.write(drive.control, CHEControl.STOP)
     assert len(line.written) == 2 - suspicions
 
 
@@ -787,7 +787,7 @@ def test_a_port_that_was_lost_is_waited_for_and_opened_where_nobody_else_does(
     line.is_lost, line.answers, vars(line)["regain"] = True, lost, regain
     line.bus.tended(tended)
     with pytest.raises(LineError):
-        line.bus.read(drive, drive.status)
+        drive.read(drive.status)
     assert opened == []  # only a stop does
     with pytest.raises(LineError):
         drive.stop(seconds=1)
@@ -873,7 +873,7 @@ def test_a_write_that_a_stop_keeps_back_is_not_counted(
         line, drive, sim = one(monkeypatch, DelixiModbus(1), ledger=ledger)
         meanwhile = Meanwhile(line, frames, lambda drive=drive: drive.stop())
         with suppress(CancelledByStop):
-            line.bus.write(drive, drive.frequency, 12.0)
+            drive.write(drive.frequency, 12.0)
         written = sim.counters.eeprom_writes["frequency"]
         assert sum(wear.writes for wear in ledger.wear(line.seconds)) == written
         if written:
@@ -1021,10 +1021,10 @@ def test_the_rest_of_a_drive_makes_no_write_late(
     line.bus.check_identity(drive)
     line.queue_time = waits
     if is_sent:
-        line.bus.write(drive, drive.ratio, 3.0)
+        drive.write(drive.ratio, 3.0)
     else:
         with pytest.raises(Expired):
-            line.bus.write(drive, drive.ratio, 3.0)
+            drive.write(drive.ratio, 3.0)
     assert len(line.written) == is_sent
 
 
@@ -1071,7 +1071,7 @@ def test_a_port_that_is_lost_when_a_write_is_read_back(monkeypatch: pytest.Monke
         return None
 
     line.answers = lost
-    outcome = line.bus.try_write(drive, drive.setpoint, 10.0)
+    outcome = drive.try_write(drive.setpoint, 10.0)
     assert outcome.effect is Effect.UNCONFIRMED
     with pytest.raises(Unconfirmed, match="confirmed, but not read back"):
         assert outcome.value
@@ -1082,7 +1082,7 @@ def test_a_drive_that_is_taken_off_while_it_is_written_to(monkeypatch: pytest.Mo
     line.bus.check_identity(drive)
     Meanwhile(line, 1, lambda: line.bus.detach(drive))
     with pytest.raises(Unconfirmed, match=r"confirmed, but not read back: .*not attached"):
-        line.bus.write(drive, drive.setpoint, 10.0)
+        drive.write(drive.setpoint, 10.0)
 
 
 # ---- interruptions ----
@@ -1190,7 +1190,7 @@ def test_an_interrupted_stop_that_looks_first_is_sent_and_what_it_waits_for_is_n
 ) -> None:
     line = SimulatedBus(monkeypatch, simulated(Careful(1)))
     drive = line.attach(Careful(1))
-    line.bus.write(drive, drive.ratio, 3.0)
+    drive.write(drive.ratio, 3.0)
     line.bus.check_identity(drive)
     begun, pressed = len(line.frames), [KeyboardInterrupt()]
 

@@ -52,11 +52,11 @@ def line(model: str) -> Iterator[tuple[Bus, Any, ReceivedRequests, Delayed]]:
 @pytest.mark.parametrize("model", usually(*MAKE))
 def test_a_constant_delay_keeps_no_stop_back(model: str) -> None:
     """Each answer comes after the next question: the look before the stop has another's."""
-    with line(model) as (bus, drive, received, wire):
+    with line(model) as (_, drive, received, wire):
         received.sim.motor.run(1)
         wire.delay = 0.6
         with suppress(BusError):
-            bus.read(drive, next(register for register in drive.registers.values() if register.readable))
+            drive.read(next(register for register in drive.registers.values() if register.readable))
         with suppress(Unconfirmed):  # whether the motor stands may never be seen
             drive.stop(seconds=1)
         until(lambda: received.writes and not received.sim.motor.energised)
@@ -86,8 +86,8 @@ def test_what_was_sent_is_unconfirmed_when_another_thread_closes(
         drive.set_frequency(20)
         acts: dict[str, Callable[[], object]] = {
             "start": drive.start,
-            "write": lambda: bus.write(drive, drive.setpoint, 50.0),
-            "raw": lambda: bus.raw(drive, 6, 0x1000, b"\0\1"),
+            "write": lambda: drive.write(drive.setpoint, 50.0),
+            "raw": lambda: drive.send_raw(6, 0x1000, b"\0\1"),
         }
         begun, came = len(received.writes), threading.Event()
 
@@ -208,7 +208,7 @@ def test_a_stop_opens_a_port_that_was_lost(tmp_path: Path, ending: str) -> None:
                 bus.stop_on_exit()
             elif ending == "write":
                 with suppress(Unconfirmed):  # a busy machine may be late with the reply
-                    bus.write(drive, drive.control, drive.control.values(5))
+                    drive.write(drive.control, drive.control.values(5))
                 until(lambda: stands(drive))
             else:
                 getattr(drive if ending == "stop" else bus, ending)()

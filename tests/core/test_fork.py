@@ -99,7 +99,7 @@ def wire(port: str = "pty") -> Wire:
 
 def current(bus: Bus) -> float:
     drive = bus.drives[0] if bus.drives else bus.attach(Toy, 1)
-    return bus.read(drive, Toy.output_current)
+    return drive.read(Toy.output_current)
 
 
 def is_polled(poller: Poller) -> bool:
@@ -290,7 +290,7 @@ with Simulator([Wire([simulated(Toy(1))], unpaced=True)]) as simulator:
     os.waitpid(child, 0)
     assert simulator._thread.is_alive()
     with Bus(simulator.wires[0].path) as bus:
-        print(bus.read(bus.attach(Toy, 1), Toy.status))
+        print(bus.attach(Toy, 1).read(Toy.status))
 """
 
 

@@ -179,12 +179,12 @@ def test_a_whole_number_is_written_held_and_read_back(
         drive = line.attach(family(1))
         value = register.decode(raw)
         if Fraction(value) == Fraction(raw) * Fraction(str(step)) + Fraction(str(offset)) or abs(raw) < 2**50:
-            outcome = line.bus.try_write(drive, register, value)
+            outcome = drive.try_write(register, value)
             assert (outcome.effect, outcome.held) == (Effect.DONE, value)
             assert bytes.fromhex(line.written[-1])[-2 - len(data) : -2] == data
         sim.memory.set_raw(register, int.from_bytes(most_significant_first(number_format, raw)))
         assert sim.read(3, 7, len(data) // 2) == list(words_of(data))
-        assert line.bus.read(drive, register) == value == sim["level"]
+        assert drive.read(register) == value == sim["level"]
 
 
 @pytest.mark.parametrize("number_format", FLOATS)
@@ -203,7 +203,7 @@ def test_a_float_is_written_held_and_read_back(
         sim = SimulatedDrive(family(1))
         line = SimulatedBus(monkeypatch, sim)
         drive = line.attach(family(1))
-        assert line.bus.write(drive, register, raw) == raw == sim["level"]
+        assert drive.write(register, raw) == raw == sim["level"]
         held = on_the_wire(number_format, order, raw or 0.0)  # a zero has no sign
         assert sim.read(3, 7, len(held) // 2) == list(words_of(held))
         assert register.encode(register.parse(register.format(raw).removesuffix(" m"))) == raw
@@ -354,11 +354,11 @@ def test_a_register_without_a_value_is_told_by_the_bus(monkeypatch: pytest.Monke
     sim["level"], sim["speed"], sim["limit"] = None, 20, None
     assert sim.read(3, 0, 3) == [0x7FFF, 20, 0xFFFF]
     with pytest.raises(NoValue, match=r"^tank: level holds no valid value at present$") as lack:
-        line.bus.read_many(drive, [drive.level, drive.speed])
+        drive.read(drive.level, drive.speed)
     assert (lack.value.register, dict(lack.value.values)) == ("level", {"speed": 20})
-    assert line.bus.write(drive, drive.limit, 7) == 7  # though it held none
+    assert drive.write(drive.limit, 7) == 7  # though it held none
     with pytest.raises(ValueError, match=r"limit = 65535 is the count that means no value$"):
-        line.bus.write(drive, drive.limit, 0xFFFF)
+        drive.write(drive.limit, 0xFFFF)
     assert sim["limit"] == 7
 
 

@@ -105,13 +105,13 @@ def attached() -> Any:
 def test_a_number_is_written_held_and_read_back(
     attached: Any, register: Register[float], data: st.DataObject
 ) -> None:
-    line, meter, sim = attached
+    _, meter, sim = attached
     number = data.draw(numbers(register))
-    outcome = line.bus.try_write(meter, register, number)
+    outcome = meter.try_write(register, number)
     assert (outcome.effect, outcome.held) == (Effect.DONE, number)
-    assert line.bus.read(meter, register) == number == sim[register.name]
+    assert meter.read(register) == number == sim[register.name]
     sim[register.name] = number  # as from its keypad
-    assert line.bus.read(meter, register) == number
+    assert meter.read(register) == number
 
 
 @settings(max_examples=examples(50))
@@ -119,9 +119,9 @@ def test_a_number_is_written_held_and_read_back(
 @example(12.1)
 @example(16_777_217)
 def test_the_nearest_float32_is_what_was_taken(attached: Any, value: float) -> None:
-    line, meter, sim = attached
+    _, meter, sim = attached
     (nearest,) = struct.unpack(">f", struct.pack(">f", value))
-    assert line.bus.write(meter, Meter.f32, value) == nearest == sim["f32"]
+    assert meter.write(Meter.f32, value) == nearest == sim["f32"]
     assert Meter.f32.encode(value) == nearest
 
 
@@ -131,7 +131,7 @@ def test_what_no_number_format_holds_is_refused(attached: Any, name: str, value:
     line, meter, _ = attached
     before = len(line.written)
     with pytest.raises(WriteForbidden, match=rf"{name} (takes a finite number, not|= .* does not fit:)"):
-        line.bus.write(meter, meter.register(name), value)
+        meter.write(meter.register(name), value)
     assert len(line.written) == before
 
 
@@ -168,10 +168,10 @@ def test_a_half_float_is_shown_as_short_as_it_reads_back(capsys: pytest.CaptureF
 
 
 def test_an_end_of_a_span_that_no_float32_is_can_be_written(attached: Any) -> None:
-    line, meter, _ = attached
-    assert line.bus.write(meter, Meter.narrow, 0.1) == pytest.approx(0.1)
+    _, meter, _ = attached
+    assert meter.write(Meter.narrow, 0.1) == pytest.approx(0.1)
     with pytest.raises(WriteForbidden, match=r"narrow = 0\.10001 is outside 0 to 0\.1 V"):
-        line.bus.write(meter, Meter.narrow, 0.10001)
+        meter.write(Meter.narrow, 0.10001)
 
 
 def test_a_simulated_drive_keeps_to_the_span_of_a_float() -> None:
@@ -213,9 +213,9 @@ def test_a_number_without_a_scale_is_watched_with_all_its_digits(value: float, t
 
 
 def test_a_long_register_is_read_where_no_limit_is_stated(attached: Any) -> None:
-    line, meter, sim = attached
+    _, meter, sim = attached
     sim["total"] = 0x12345
-    assert line.bus.read(meter, Meter.total) == 0x12345
+    assert meter.read(Meter.total) == 0x12345
 
 
 @pytest.mark.parametrize("order", [1, -1])
@@ -224,8 +224,8 @@ def test_a_reading_and_a_command_share_an_address(monkeypatch: pytest.MonkeyPatc
     both = type("Both", (Drive,), dict(declared))
     line = SimulatedBus(monkeypatch, SimulatedDrive(both(1)))
     drive = line.attach(both(1, confirmed=1))
-    assert line.bus.write(drive, drive.control, 3) == 3
-    assert line.bus.read(drive, drive.status) == 3
+    assert drive.write(drive.control, 3) == 3
+    assert drive.read(drive.status) == 3
     reply = line.sims[0].answer(Message(1, 6, 5, data=bytes([0, 8])), line.seconds)
     assert reply is not None
     assert reply.exception == 3  # the command's span holds
@@ -234,18 +234,18 @@ def test_a_reading_and_a_command_share_an_address(monkeypatch: pytest.MonkeyPatc
 def test_a_single_register_of_a_table_that_is_written_several_at_once(attached: Any) -> None:
     line, meter, sim = attached
     assert write_request(meter, Meter.alone, 7) == Message(1, 0x10, 22, 1, bytes([0, 7]))
-    assert line.bus.write(meter, Meter.alone, 7) == 7
-    assert line.bus.write(meter, Meter.lamp, 1) == 1
+    assert meter.write(Meter.alone, 7) == 7
+    assert meter.write(Meter.lamp, 1) == 1
     assert (sim["alone"], sim["lamp"]) == (7, 1)
     assert line.frames[-2][0].function == 0x0F
 
 
 def test_a_step_may_be_negative(attached: Any) -> None:
-    line, meter, sim = attached
-    assert line.bus.write(meter, Meter.downwards, -5.0) == -5.0 == sim["downwards"]
+    _, meter, sim = attached
+    assert meter.write(Meter.downwards, -5.0) == -5.0 == sim["downwards"]
     assert Meter.downwards.format(Meter.downwards.decode(0.0)) == "0.0 V"
     with pytest.raises(WriteForbidden, match=r"downwards = 5 does not fit: -6553\.5 to 0 V$"):
-        line.bus.write(meter, Meter.downwards, 5)
+        meter.write(Meter.downwards, 5)
 
 
 @table(

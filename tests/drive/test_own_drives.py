@@ -87,7 +87,7 @@ def written(line: SimulatedBus) -> list[str]:
 def test_an_ordinary_setting_needs_no_ceremony(monkeypatch: pytest.MonkeyPatch) -> None:
     line = SimulatedBus(monkeypatch, simulated(Fan(1)))
     fan = line.attach(Fan(1))
-    assert line.bus.write(fan, fan.frequency, 25.0) == 25.0
+    assert fan.write(fan.frequency, 25.0) == 25.0
     assert "confirmed" not in Fan.options
 
 
@@ -99,7 +99,7 @@ def test_a_command_of_which_nothing_is_said_is_not_plainly_written(
     line = SimulatedBus(monkeypatch, simulated(Pump(1)))
     pump = line.attach(Pump(1, name="pump", confirmed=confirmed))
     with pytest.raises(WriteForbidden) as refusal:
-        line.bus.write(pump, pump.control, word)
+        pump.write(pump.control, word)
     assert str(refusal.value) == (
         f"control of pump is not written: {word.name} commands the motor, which verbs alone do: "
         "use start(), stop()"
@@ -119,7 +119,7 @@ def test_where_there_is_no_verb_its_author_is_told_what_to_say(monkeypatch: pyte
     with pytest.raises(
         WriteForbidden, match=r"its class does not say .*: declare harmless = \(…\), moves = False, or"
     ):
-        line.bus.write(bare, bare.run, 1)
+        bare.write(bare.run, 1)
     assert line.frames == []
 
 
@@ -131,9 +131,9 @@ def test_what_is_harmless_needs_no_confirmation(monkeypatch: pytest.MonkeyPatch)
 
     line = SimulatedBus(monkeypatch, simulated(Stoppable(1)))
     pump = line.attach(Stoppable(1))
-    line.bus.write(pump, pump.control, Word.STOP)
+    pump.write(pump.control, Word.STOP)
     with pytest.raises(WriteForbidden, match="RUN commands the motor"):
-        line.bus.write(pump, pump.control, Word.RUN)
+        pump.write(pump.control, Word.RUN)
     assert written(line) == [STOP]
 
 
@@ -145,7 +145,7 @@ def test_what_may_move_the_motor_of_an_unknown_drive_needs_its_owner_s_word(
         acts = {
             "start": pump.start,
             "set_frequency": lambda: pump.set_frequency(20.0),
-            "target": lambda: line.bus.write(pump, pump.target, 20.0),
+            "target": lambda: pump.write(pump.target, 20.0),
         }
         acts[name]()
 
@@ -257,8 +257,8 @@ def test_a_setting_may_be_said_to_move_the_motor(monkeypatch: pytest.MonkeyPatch
     drive = line.attach(Readable(1, confirmed=1))
     for register, value in ((drive.control, Word.RUN), (drive.mode, 1)):
         with pytest.raises(WriteForbidden, match="commands the motor"):
-            line.bus.write(drive, register, value)
-    line.bus.write(drive, drive.control, Word.STOP)
+            drive.write(register, value)
+    drive.write(drive.control, Word.STOP)
     assert len(line.written) == 1
 
 

@@ -65,7 +65,7 @@ def test_a_text_of_a_simulated_drive_is_read_over_the_line(declared: Text, value
         line = SimulatedBus(monkeypatch, sim)
         drive = line.attach(Meter(1))
         sim[declared.name] = value
-        assert line.bus.read_text(drive, declared) == value == sim[declared.name]
+        assert drive.read(declared) == value == sim[declared.name]
         counts = [request.count for request, _ in line.frames]
         assert counts == ([5, 5, 2] if declared is Meter.serial else [3])
 
@@ -89,10 +89,10 @@ def test_a_text_says_what_a_device_is(monkeypatch: pytest.MonkeyPatch, maker: st
     line = SimulatedBus(monkeypatch, sim)
     drive = line.attach(Known(1, name="em-1"))
     if maker == "ABB":
-        assert line.bus.write(drive, drive.limit, 3) == 3
+        assert drive.write(drive.limit, 3) == 3
     else:
         with pytest.raises(WriteForbidden, match="em-1 is of ABC"):
-            line.bus.write(drive, drive.limit, 3)
+            drive.write(drive.limit, 3)
     assert (line.written != []) == (maker == "ABB")
 
 
@@ -119,10 +119,8 @@ def test_a_text_is_never_polled_nor_another_s(monkeypatch: pytest.MonkeyPatch) -
     assert [register.name for register in Meter.readings()] == ["level"]
     assert list(Meter.texts) == ["serial", "maker"]
     with pytest.raises(ValueError, match=r"^this serial is not a text of em-1"):
-        line.bus.read_text(drive, Other.serial)
-    with pytest.raises(TypeError, match="is not a text of em-1"):
-        line.bus.read_text(drive, Meter.level)
-    with pytest.raises(AttributeError, match=r"serial is a text, which bus.read_text"):
+        drive.read(Other.serial)
+    with pytest.raises(AttributeError, match=r"serial is a text, which drive.read"):
         drive.serial = "x"
     with pytest.raises(ValueError, match="maker holds 6 characters, not 7"):
         line.sims[0]["maker"] = "1234567"

@@ -376,12 +376,12 @@ def test_a_parameter_may_be_declared_as_stored(monkeypatch: pytest.MonkeyPatch, 
         stored_parameter(512)
     ledger = Ledger(tmp_path / "wear", budget=100)
     line, drive, sim = one(monkeypatch, Mine(2), ledger=ledger)
-    line.bus.write(drive, drive.ramp, 3.0)
+    drive.write(drive.ramp, 3.0)
     assert ledger.wear(line.seconds) == []
-    line.bus.write(drive, drive.jump, 0x1388)
+    drive.write(drive.jump, 0x1388)
     assert line.written[-1] == "02 06 00 08 13 88 05 6D"  # worked out by hand from section 11.6.2
     with pytest.raises(WriteForbidden, match="less often"):
-        line.bus.write(drive, drive.jump, 0x1389)
+        drive.write(drive.jump, 0x1389)
     assert sim.counters.eeprom_writes == {"jump": 1}
 
 

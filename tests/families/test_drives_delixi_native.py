@@ -273,12 +273,12 @@ def test_what_is_not_stored_is_not_counted_and_what_is_waits_its_minute(
     ledger = Ledger(tmp_path / "wear", budget=1000)
     line, drive, sim = one(monkeypatch, Owned(1), ledger=ledger)
     for seconds in (1.0, 2.0, 3.0):
-        line.bus.write(drive, drive.ramp, seconds)
+        drive.write(drive.ramp, seconds)
     assert ledger.wear(line.seconds) == []
     assert not sim.counters.eeprom_writes
-    line.bus.write(drive, drive.stored_ramp, 1.0)
+    drive.write(drive.stored_ramp, 1.0)
     with pytest.raises(WriteForbidden, match="less often"):
-        line.bus.write(drive, drive.stored_ramp, 2.0)
+        drive.write(drive.stored_ramp, 2.0)
     assert sim.counters.eeprom_writes == {"stored_ramp": 1}
 
 

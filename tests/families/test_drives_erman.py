@@ -341,7 +341,7 @@ def test_coils_are_read_one_byte_at_a_time_and_only_when_they_are_asked_for(
     line, drive, _ = one(monkeypatch, ErmanERG220(1))
     coils = [drive.start_held, drive.stop_held, drive.emergency_stop_held, drive.fault_reset_held]
     assert not set(coils) & set(drive.readings())
-    held = line.bus.read_many(drive, coils)
+    held = drive.read_many(coils)
     assert held == dict.fromkeys((coil.name for coil in coils), Coil.OFF)
     asked = [frame for request, frame in line.frames if request.function == 1]
     assert asked == [
@@ -349,23 +349,23 @@ def test_coils_are_read_one_byte_at_a_time_and_only_when_they_are_asked_for(
     ]
     drive.set_frequency(20)
     drive.start()
-    assert line.bus.read(drive, drive.start_held) is Coil.ON
+    assert drive.read(drive.start_held) is Coil.ON
     drive.stop()
-    assert line.bus.read(drive, drive.start_held) is Coil.OFF
-    assert line.bus.read(drive, drive.stop_held) is Coil.ON
+    assert drive.read(drive.start_held) is Coil.OFF
+    assert drive.read(drive.stop_held) is Coil.ON
     for register in coils:
         with pytest.raises(WriteForbidden, match="it is a reading"):
-            line.bus.write(drive, register, Coil.ON)
+            drive.write(register, Coil.ON)
 
 
 def test_diagnostics_as_printed(monkeypatch: pytest.MonkeyPatch) -> None:
     """Function 08 by raw (section 8), its error reply as printed and as it should be."""
     line, drive, _ = one(monkeypatch, ErmanERG220(1))
-    assert line.bus.raw(drive, 0x08, 0x0000, b"\xa5\x37") == b"\xa5\x37"
+    assert drive.send_raw(0x08, 0x0000, b"\xa5\x37") == b"\xa5\x37"
     asked, read = (frame for _, frame in line.frames)
     assert asked == "01 08 00 00 A5 37 DA 8D"
     assert read.startswith("01 04")  # that was a copy, as an adapter's echo is
     for refusal in ("01 89 01 86 50", "01 88 01 87 C0"):
         line.answers = lambda request, refusal=refusal: bytes.fromhex(refusal)  # type: ignore[misc]
         with pytest.raises(DriveException, match="unknown command"):
-            line.bus.raw(drive, 0x08, 0x0000, b"\xa5\x37")
+            drive.send_raw(0x08, 0x0000, b"\xa5\x37")

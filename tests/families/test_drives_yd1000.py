@@ -556,9 +556,9 @@ def test_the_line_keeps_the_command_if_its_release_is_in_doubt(is_sent: bool) ->
 
 
 def test_the_panel_commands_the_motor_again_once_it_has_the_command(monkeypatch: pytest.MonkeyPatch) -> None:
-    line, drive, sim = one(monkeypatch, YD1000(1))
+    _, drive, sim = one(monkeypatch, YD1000(1))
     assert isinstance(sim, SimulatedYD1000)
-    line.bus.write(drive, drive.panel_frequency, 20.0)
+    drive.write(drive.panel_frequency, 20.0)
     drive.stop()  # which takes the command
     sim.panel_runs = True
     assert not sim.motor.energised
@@ -660,16 +660,16 @@ def test_a_start_after_an_emergency_stop_at_rest_names_reset_fault_too(
 
 
 def test_the_watchdog_is_set_over_the_line_while_the_motor_stands(monkeypatch: pytest.MonkeyPatch) -> None:
-    line, drive, sim = one(monkeypatch, YD1000(1))
-    assert line.bus.write(drive, drive.communication_timeout, 5) == 5
+    _, drive, sim = one(monkeypatch, YD1000(1))
+    assert drive.write(drive.communication_timeout, 5) == 5
     assert sim["communication_timeout"] == 5
     for wrong in (-1, 101, 0.5):
         with pytest.raises(WriteForbidden, match="communication_timeout"):
-            line.bus.write(drive, drive.communication_timeout, wrong)
+            drive.write(drive.communication_timeout, wrong)
     drive.set_frequency(30)
     drive.start()
     with pytest.raises(WriteForbidden, match="only while the motor stands"):
-        line.bus.write(drive, drive.communication_timeout, 2)
+        drive.write(drive.communication_timeout, 2)
 
 
 @pytest.mark.parametrize("speed", range(1, 8))

@@ -94,7 +94,7 @@ def frequency(hz: float) -> Callable[[SimulatedBus, Any, Any], None]:
 
 
 def write(name: str, value: Any) -> Callable[[SimulatedBus, Any, Any], object]:
-    return lambda line, drive, sim: line.bus.write(drive, drive.register(name), value)
+    return lambda line, drive, sim: drive.write(drive.register(name), value)
 
 
 def broadcast(name: str, value: Any) -> Callable[[SimulatedBus, Any, Any], object]:
@@ -203,7 +203,7 @@ HAZARDS = [
     Hazard(
         "E5: the order of bytes in a reply to 01 is doubtful, so that one byte at most is asked for",
         erman,
-        lambda line, drive, sim: line.bus.read_many(drive, [drive.start_held, drive.fault_reset_held]),
+        lambda line, drive, sim: drive.read(drive.start_held, drive.fault_reset_held),
         naive="01 01 00 00 00 0C",
     ),
     Hazard(
@@ -323,7 +323,7 @@ HAZARDS = [
     Hazard(
         "N8: 2000H and 2001H may only be written",
         ibd,
-        lambda line, drive, sim: line.bus.read(drive, drive.control),
+        lambda line, drive, sim: drive.read(drive.control),
         naive="01 03 20 00 00 01",
         refuses="cannot be read",
         error=ValueError,
@@ -512,7 +512,7 @@ def reply_to(request: Message, frame: str) -> tuple[int, Message | None]:
 
 def test_e1_the_checksum_is_computed_and_not_copied(monkeypatch: pytest.MonkeyPatch) -> None:
     line, drive, _ = one(monkeypatch, ErmanERG220(1))
-    line.bus.read_many(drive, [drive.output_frequency, drive.output_current, drive.dc_bus_voltage])
+    drive.read(drive.output_frequency, drive.output_current, drive.dc_bus_voltage)
     assert [frame for _, frame in line.frames] == ["01 04 00 01 00 05 61 C9"]
 
 
@@ -521,7 +521,7 @@ def test_e2_a_reply_with_another_byte_count_is_no_reply(monkeypatch: pytest.Monk
     line, drive, _ = one(monkeypatch, ErmanERG220(1))
     line.answers = lambda request: bytes.fromhex(printed)
     with pytest.raises(BadReply):
-        line.bus.read_many(drive, [drive.output_frequency, drive.output_current, drive.dc_bus_voltage])
+        drive.read(drive.output_frequency, drive.output_current, drive.dc_bus_voltage)
 
 
 @pytest.mark.parametrize("code", [2, 3, 4])
@@ -547,7 +547,7 @@ def test_i4_a_fault_frame_for_a_damaged_request_is_asked_again(monkeypatch: pyte
     line, drive, _ = one(monkeypatch, InvtCHE(1))
     damaged = build_reply(Framing.RTU, Message(1, 3, exception=0x11))
     line.answers = lambda request: damaged if len(line.frames) == 1 else None
-    assert line.bus.read(drive, drive.output_frequency) == 0
+    assert drive.read(drive.output_frequency) == 0
     assert len(line.frames) == 2
 
 
@@ -588,7 +588,7 @@ def test_i6_the_example_without_a_meaning_cannot_be_said() -> None:
 
 def test_n3_n6_at_most_four_registers_of_an_ibd(monkeypatch: pytest.MonkeyPatch) -> None:
     line, drive, _ = one(monkeypatch, InnovertIBD(1))
-    line.bus.read_many(drive, [register for register in drive.registers.values() if register.readable])
+    drive.read_many([register for register in drive.registers.values() if register.readable])
     assert max(request.count for request, _ in line.frames) <= 4
     assert reply_to(Message(1, 3, 0x16, 1), "01 03 02 18 00 B2 44")[1] is not None
 
@@ -630,7 +630,7 @@ def test_d13_y15_any_exception_is_a_refusal(monkeypatch: pytest.MonkeyPatch, cod
         refusal = build_reply(Framing.RTU, Message(1, 3, exception=code))
         line.answers = lambda request, refusal=refusal: refusal
         with pytest.raises(DriveException) as told:
-            line.bus.read(drive, drive.output_frequency)
+            drive.read(drive.output_frequency)
         assert told.value.code == code
 
 
@@ -661,7 +661,7 @@ def test_y8_a_frozen_state_is_not_taken_for_running(monkeypatch: pytest.MonkeyPa
     drive.state()
     sim.pass_time(line.seconds)
     sim.trip(5)
-    assert line.bus.read(drive, drive.status)  # still says that it runs
+    assert drive.read(drive.status)  # still says that it runs
     assert drive.state().condition is Condition.FAULT
     drive.stop()
 

@@ -78,7 +78,7 @@ def test_a_gateway_that_is_interrupted_anywhere_ends(drive: Counting, tmp_path: 
         falls_silent(drive)
         gc.collect()
         with Bus(plant.lines[0].port, baudrate=38400) as bus:  # the port is free
-            bus.read(bus.attach(InvtCHE, 1), InvtCHE.registers["output_current"])
+            bus.attach(InvtCHE, 1).read(InvtCHE.registers["output_current"])
         return bool(found)
 
     assert every(step, act) > 1

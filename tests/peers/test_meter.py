@@ -90,7 +90,7 @@ def test_all_40_values_of_a_poll_are_the_server_s(tmp_path: Path, stated: bool) 
 def test_all_40_values_read_by_hand_are_the_server_s(tmp_path: Path) -> None:
     meter = load_family(FAMILY)
     with served(tmp_path) as port, Bus(port) as bus:
-        assert bus.read_many(bus.attach(meter, UNIT), meter.registers.values()) == HELD
+        assert bus.attach(meter, UNIT).read_many(meter.registers.values()) == HELD
 
 
 @pytest.mark.parametrize(("stated", "requests"), [(True, 4), (False, 8)])

@@ -60,7 +60,7 @@ def test_registers_and_coils_are_read(server: tuple[str, str]) -> None:
     port, framing = server
     with Bus(port) as bus:
         device = bus.attach(Device, ADDRESS, framing=framing)
-        assert bus.read_many(device, Device.registers.values()) == {
+        assert device.read_many(Device.registers.values()) == {
             "current": 101.0,  # input register 10 holds 1010
             "voltage": 1011,
             "temperature": 1012,
@@ -79,11 +79,11 @@ def test_any_address_may_be_asked_for(server: tuple[str, str]) -> None:
     with Bus(port) as bus:
         device = bus.attach(Device, ADDRESS, framing=framing)
         for function in (3, 4):
-            assert bus.ask(device, function, 50, 3) == struct.pack(">3H", 1050, 1051, 1052)
+            assert device.read_raw(function, 50, 3) == struct.pack(">3H", 1050, 1051, 1052)
         for function in (1, 2):
-            assert bus.ask(device, function, 1, 10) == bytes([0b01010101, 0b01])
+            assert device.read_raw(function, 1, 10) == bytes([0b01010101, 0b01])
         with pytest.raises(DriveException) as refusal:
-            bus.ask(device, 3, 40000, 1)
+            device.read_raw(3, 40000, 1)
         assert refusal.value.code == 2
 
 
@@ -94,7 +94,7 @@ def test_what_is_written_is_what_is_read_back(server: tuple[str, str]) -> None:
     with Bus(port) as bus:
         device = bus.attach(Device, ADDRESS, framing=framing)
         for name, value in (("frequency", 28.5), ("energy", 1234567.89), ("relay", 0), ("relay", 1)):
-            assert bus.write(device, device.register(name), value) == value
+            assert device.write(device.register(name), value) == value
 
 
 @pytest.mark.slow
@@ -104,7 +104,7 @@ def test_an_exception_is_the_device_s_refusal(server: tuple[str, str]) -> None:
     with Bus(port) as bus:
         device = bus.attach(find_model(DEVICE.replace("Device", "Mistaken")), ADDRESS, framing=framing)
         with pytest.raises(DriveException, match="illegal address") as refusal:
-            bus.read(device, device.register("absent"))
+            device.read(device.register("absent"))
         assert refusal.value.code == 2
 
 
@@ -114,7 +114,7 @@ def test_another_address_is_silence(server: tuple[str, str]) -> None:
     with Bus(port) as bus:
         device = bus.attach(Device, ADDRESS + 1, framing=framing)
         with pytest.raises(NoReply):
-            bus.read(device, device.register("current"))
+            device.read(device.register("current"))
 
 
 @pytest.mark.slow

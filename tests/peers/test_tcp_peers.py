@@ -63,7 +63,7 @@ def server(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[str]:
 def test_registers_and_coils_are_read(server: str) -> None:
     with Bus(server) as bus:
         device = bus.attach(Device, ADDRESS)
-        assert bus.read_many(device, Device.registers.values()) == HELD
+        assert device.read_many(Device.registers.values()) == HELD
 
 
 @pytest.mark.slow
@@ -72,7 +72,7 @@ def test_what_is_written_is_what_is_read_back(server: str) -> None:
     with Bus(server) as bus:
         device = bus.attach(Device, ADDRESS)
         for name, value in (("frequency", 28.5), ("energy", 1234567.89), ("relay", 0), ("relay", 1)):
-            assert bus.write(device, device.register(name), value) == value
+            assert device.write(device.register(name), value) == value
 
 
 @pytest.mark.slow
@@ -81,7 +81,7 @@ def test_an_exception_is_the_device_s_refusal(server: str) -> None:
     with Bus(server) as bus:
         device = bus.attach(find_model(DEVICE.replace("Device", "Mistaken")), ADDRESS)
         with pytest.raises(DriveException, match="illegal address") as refusal:
-            bus.read(device, device.register("absent"))
+            device.read(device.register("absent"))
         assert refusal.value.code == 2
 
 
@@ -117,7 +117,7 @@ def test_another_unit_of_pymodbus_is_silence(tmp_path: Path) -> None:
         assert process.stdout is not None
         port = f"tcp://127.0.0.1:{process.stdout.readline().split()[1]}"
         with Bus(port) as bus, pytest.raises(NoReply, match=r"name the port socket://127\.0\.0\.1:\d+"):
-            bus.read(bus.attach(Device, ADDRESS + 1), Device.registers["current"])
+            bus.attach(Device, ADDRESS + 1).read(Device.registers["current"])
         process.kill()
 
 

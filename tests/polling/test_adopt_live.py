@@ -395,16 +395,16 @@ def test_a_line_that_goes_twice_at_a_time_goes_once(both: TwoLines) -> None:
 
 def test_calls_on_what_has_gone_say_so(both: TwoLines) -> None:
     with Poller(plant(both.hall(), both.yard())) as poller:
-        bus, (pump_1, pump_2) = poller.bus("hall"), poller.bus("hall").drives
-        gone_bus, (fan, _) = poller.bus("yard"), poller.bus("yard").drives
+        pump_1, pump_2 = poller.bus("hall").drives
+        fan, _ = poller.bus("yard").drives
         poller.adopt(plant(both.hall(1)))
         with pytest.raises(LineError, match="its line is polled no more"):
-            gone_bus.read(fan, CURRENT)
+            fan.read(CURRENT)
         with pytest.raises(CancelledByStop):
             fan.start()
         with pytest.raises(NotAttached, match="pump-2 is not attached to this bus"):
-            bus.read(pump_2, CURRENT)
-        assert bus.read(pump_1, CURRENT) >= 0
+            pump_2.read(CURRENT)
+        assert pump_1.read(CURRENT) >= 0
     assert not runs(both.fans[1])
 
 
@@ -416,7 +416,7 @@ def test_a_read_that_waits_for_a_line_that_goes_fails(both: TwoLines) -> None:
 
         def read() -> None:
             try:
-                poller.bus("yard").read(slow.drive, CURRENT)
+                slow.drive.read(CURRENT)
             except LineError as failure:
                 found.append(failure)
 
@@ -619,13 +619,13 @@ def test_a_hundred_adoptions_leave_nothing_behind(both: TwoLines) -> None:
 
         def read_one() -> None:
             with suppress(NoReply):  # on a busy machine
-                poller.bus("hall").read(pump, CURRENT)
+                pump.read(CURRENT)
 
         def read_all() -> None:
             for bus in poller.buses.values():
                 for drive in bus.drives:
                     with suppress(LineError, NotAttached, NoReply):
-                        bus.read(drive, CURRENT)
+                        drive.read(CURRENT)
 
         def take() -> None:
             for batch in poller.batches(seconds=0.05):

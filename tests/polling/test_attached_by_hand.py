@@ -33,7 +33,7 @@ def test_it_is_beside_the_polled_ones(tmp_path: Path) -> None:
         poller = Poller(load_plant(path))
         extra = poller.bus("a").attach(YD1000, 9)
         with poller:
-            assert poller.bus("a").read(extra, extra.output_frequency) == 0
+            assert extra.read(extra.output_frequency) == 0
             until(lambda: any(row.drive == "pump" for row in poller.take() or ()))
             with pytest.raises(ValueError, match="is not polled here; there are pump"):
                 poller.set_rate(extra, None, 1.0)

@@ -128,12 +128,12 @@ def test_a_drive_of_which_nothing_is_polled_disturbs_nobody(port: str) -> None:
 def test_nothing_is_asked_of_a_drive_that_was_detached(port: str) -> None:
     with Bus(port) as bus:
         ours = bus.attach(Toy, address=1, name="pump-1")
-        assert bus.read(ours, CURRENT) == proof(Toy(1), CURRENT)
+        assert ours.read(CURRENT) == proof(Toy(1), CURRENT)
         peer = bus.peer(ours)
         proofs = peer.proofs
         bus.detach(ours)
         assert bus.drives == []
-        for do in (lambda: bus.read(ours, CURRENT), ours.stop, lambda: bus.detach(ours)):
+        for do in (lambda: ours.read(CURRENT), ours.stop, lambda: bus.detach(ours)):
             with pytest.raises(ValueError, match="pump-1 is not attached to this bus"):
                 do()
         again = bus.attach(Toy, address=1, name="pump-1")
@@ -146,7 +146,7 @@ def test_a_drive_of_another_family_gets_no_late_answer_of_the_one_before(port: s
     with Bus(port) as bus:
         gone = bus.attach(Toy, address=9)
         with pytest.raises(NoReply):
-            bus.read(gone, CURRENT)
+            gone.read(CURRENT)
         due_ns = bus.peer(gone).late_until_ns
         assert due_ns > 0
         bus.detach(gone)

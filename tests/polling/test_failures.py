@@ -234,7 +234,7 @@ def test_a_poller_that_failed_says_so_wherever_it_is_asked(
 def test_a_poller_that_failed_polls_nothing_more_and_commands_go_on(failed: Two) -> None:
     exchanges = failed.poller.statistics()["ill"].counters.exchanges
     bus = failed.poller.bus("ill")
-    bus.read(bus.drives[0], CURRENT)
+    bus.drives[0].read(CURRENT)
     assert failed.poller.statistics()["ill"].counters.exchanges - exchanges <= 2  # one was under way
 
 

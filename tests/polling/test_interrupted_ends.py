@@ -75,7 +75,7 @@ def ended(poller: Poller, hall: Received) -> None:
     assert not any(bus.is_open for bus in poller.buses.values())
     falls_silent(hall)
     with Bus(hall.path) as bus:  # the port is free
-        bus.read(bus.attach(Toy, 1), CURRENT)
+        bus.attach(Toy, 1).read(CURRENT)
 
 
 STEPS = [STRIDE, pytest.param(1, marks=pytest.mark.slow)]
@@ -138,12 +138,12 @@ def test_a_bus_is_closed_though_that_is_interrupted(hall: Received, step: int, d
             gc.collect()  # one that was interrupted on its way to its owner
         else:
             bus = Bus(hall.path)
-            bus.read(bus.attach(Toy, 1), CURRENT)
+            bus.attach(Toy, 1).read(CURRENT)
             was = interrupted(bus.close, nth, set())
             bus.close()
             assert not bus.is_open
         with Bus(hall.path) as again:
-            again.read(again.attach(Toy, 1), CURRENT)
+            again.attach(Toy, 1).read(CURRENT)
         return was
 
     assert every(step, act) > 1

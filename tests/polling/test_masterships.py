@@ -127,7 +127,7 @@ def test_a_plant_is_polled_while_its_mastership_holds(mastership: Mastership, ev
         rows.until("fan", NOT_MASTER)
         assert "ok" not in rows.statuses("pump")
         with pytest.raises(NotMaster):
-            poller.bus("hall").read(poller.bus("hall").drives[0], CURRENT)
+            poller.bus("hall").drives[0].read(CURRENT)
         assert [sim.counters.requests for sim in sims] == asked
         hold(mastership)
         rows.settle("pump", "fan")
@@ -371,11 +371,11 @@ def test_a_line_is_listened_to_again_after_a_lapse_in_which_nothing_was_asked(ma
     wire = Wire([simulated(Quick(1))], unpaced=True)
     with Simulator([wire]), Bus(wire.path, mastership=mastership) as bus:
         pump = bus.attach(Quick(1))
-        bus.read(pump, CURRENT)
+        pump.read(CURRENT)
         mastership.end()
         hold(mastership)
         begun = time.monotonic()
-        bus.read(pump, CURRENT)
+        pump.read(CURRENT)
         assert time.monotonic() - begun >= mastership.guard_s
 
 

@@ -288,9 +288,9 @@ def test_commands_go_ahead_while_the_line_is_polled(port: str, pump: SimulatedDr
         for hz in (10.0, 20.0, 30.0):
             polling.until("ok")
             with suppress(Unconfirmed):  # where this machine looked too late at the answer
-                bus.write(ours, Quick.frequency, hz)
+                ours.write(Quick.frequency, hz)
             assert pump["frequency"] == hz
-        assert bus.read(ours, Quick.output_current) == 3.25
+        assert ours.read(Quick.output_current) == 3.25
         with pytest.raises(ValueError, match=r"^there is no line 'hall-2'; there are hall-1$"):
             polling.poller.bus("hall-2")
     assert polling.statuses().keys() <= {"ok"} | HOST_LATE

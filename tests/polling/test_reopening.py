@@ -126,7 +126,7 @@ def test_a_stop_opens_the_port_once_the_poller_has_failed(
     monkeypatch.setattr(PolledLine, "tend", fail)
     hall.poller._thread.join()
     with pytest.raises(LineError):
-        hall.poller.bus("hall").read(hall.drive, hall.drive.status)
+        hall.drive.read(hall.drive.status)
     hall.stack.enter_context(hall.there())
     hall.stop()
     with pytest.raises(PollingFailed):

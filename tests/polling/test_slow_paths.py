@@ -112,9 +112,9 @@ def test_what_a_bus_is_asked_for_over_a_slow_path_is_true(
                 for turn, register in enumerate(registers):
                     try:
                         if turn % 2:
-                            assert opened.read(drive, register) == proof(drive, register)
+                            assert drive.read(register) == proof(drive, register)
                             continue
-                        data = opened.ask(drive, register.table.read, register.address, 1, expiry=30.0)
+                        data = drive.read_raw(register.table.read, register.address, 1, expiry=30.0)
                     except BusError:
                         line.sleep(0.05)
                     else:
@@ -145,7 +145,7 @@ def test_what_became_of_a_write_over_a_slow_path_is_true(
         for turn in range(30):
             asked = float(10 + turn % 3)
             try:
-                outcome = opened.try_write(drive, register, asked)
+                outcome = drive.try_write(register, asked)
             except BusError:
                 line.sleep(0.05)
                 continue
@@ -175,9 +175,9 @@ def test_a_write_has_the_time_that_reads_did_not_need(
     monkeypatch.setattr(sim, "write", write_slowly)
     with opened:
         for _ in range(12):
-            opened.read(drive, register)
+            drive.read(register)
         assert opened.peer(drive).timeout < 0.15
-        assert opened.try_write(drive, register, 11.0).effect is Effect.DONE
+        assert drive.try_write(register, 11.0).effect is Effect.DONE
         assert not any(slow)
         assert (opened.peer(drive).counters().late, opened.peer(drive).silences) == (0, 0)
 
@@ -189,7 +189,7 @@ def test_reads_of_a_delixi_have_the_80_ms_of_its_document(
         opened, _ = path_of([simulated(drive)], constant(0.0))
         with opened:
             for _ in range(30):
-                opened.read(drive, drive.register("fault"))
+                drive.read(drive.register("fault"))
             assert opened.peer(drive).timeout == 0.08
 
 

@@ -159,7 +159,7 @@ def test_what_became_of_a_write_over_a_slow_path_is_true(
         for turn in range(30):
             asked = float(10 + turn % 3)
             try:
-                outcome = opened.try_write(drive, drive.acceleration_time, asked)
+                outcome = drive.try_write(drive.acceleration_time, asked)
             except BusError:
                 line.sleep(0.05)
                 continue

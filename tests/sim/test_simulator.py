@@ -64,9 +64,9 @@ def test_a_drive_that_fails_is_silent_and_the_other_wires_go_on(caplog: pytest.L
         with simulator, Bus(wires[0].path) as ill, Bus(wires[1].path) as well:
             for _ in range(2):
                 with pytest.raises(NoReply):
-                    ill.read(ill.drives[0] if ill.drives else ill.attach(Toy, 1), Toy.output_current)
+                    (ill.drives[0] if ill.drives else ill.attach(Toy, 1)).read(Toy.output_current)
                 drive = well.drives[0] if well.drives else well.attach(Toy, 1)
-                well.read(drive, Toy.output_current)
+                drive.read(Toy.output_current)
             assert isinstance(simulator.failure, Ill)
 
     with pytest.raises(Ill, match="of this drive"):

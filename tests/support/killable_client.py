@@ -58,13 +58,12 @@ def live(port: str, directory: Path, life: str, number: int) -> None:
     writers = [open_writer(directory / f"{life}{suffix}", METADATA) for suffix in (".arrows", ".csv")]
     told.write(b"rows 0\n")
     with Poller(plant, ledger=ledger(directory), audit=audit(directory)) as poller:
-        bus = poller.bus("line")
         for at in count(number):
             while batch := poller.take():
                 for writer in writers:
                     writer.write(batch)
                 told.write(b"rows %d\n" % writers[0].rows)
-            bus.write(drive, Counted.number, at)
+            drive.write(Counted.number, at)
             told.write(b"wrote %d\n" % at)
 
 

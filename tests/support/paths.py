@@ -174,7 +174,7 @@ def read_truly(opened: Bus, line: PathLine, drives: Sequence[Drive]) -> None:
         for _ in range(24):
             for drive, register in asked:
                 try:
-                    value = opened.read(drive, register)
+                    value = drive.read(register)
                 except BusError:
                     line.sleep(0.05)
                 else:

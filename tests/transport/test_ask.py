@@ -1,4 +1,4 @@
-"""`Bus.ask`: a read past the register table, which is no write."""
+"""`Drive.read_raw`: a read past the register table, which is no write."""
 
 from __future__ import annotations
 
@@ -34,60 +34,60 @@ def simulated(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Simul
 
 def test_the_frame_and_the_words_are_modbus(simulated: SimulatedBus) -> None:
     """Application protocol V1.1b3, 6.3: 7BH = 123 tenths, 96H = 150 hundredths; CRC by any calculator."""
-    bus, (toy,) = simulated.bus, simulated.bus.drives
-    assert bus.ask(toy, 3, 1, 2) == bytes.fromhex("007B 0096")
+    (toy,) = simulated.bus.drives
+    assert toy.read_raw(3, 1, 2) == bytes.fromhex("007B 0096")
     assert [frame for _, frame in simulated.frames] == ["07 03 00 01 00 02 95 AD"]
 
 
 def test_it_is_no_write(simulated: SimulatedBus, tmp_path: Path) -> None:
     """Neither audited nor retried nor in doubt, and no identity check goes before it."""
-    bus, (toy,) = simulated.bus, simulated.bus.drives
+    (toy,) = simulated.bus.drives
     simulated.loses = lambda request: True
     with pytest.raises(NoReply):
-        bus.ask(toy, 3, 1, 2)
+        toy.read_raw(3, 1, 2)
     assert len(simulated.frames) == 1
     assert list(read_audit(tmp_path / "audit.jsonl")) == []
 
 
 def test_an_exception_is_the_drives_refusal(simulated: SimulatedBus) -> None:
-    bus, (toy,) = simulated.bus, simulated.bus.drives
+    (toy,) = simulated.bus.drives
     with pytest.raises(DriveException) as refusal:
-        bus.ask(toy, 3, 0x4000, 1)
+        toy.read_raw(3, 0x4000, 1)
     assert refusal.value.code == 2
 
 
 def test_it_must_begin_in_time(simulated: SimulatedBus) -> None:
-    bus, (toy,) = simulated.bus, simulated.bus.drives
+    (toy,) = simulated.bus.drives
     simulated.queue_time = 0.3
     with pytest.raises(Expired, match=r"a read of 2 from 1 by function 03H was not sent: .* within 0.2 s"):
-        bus.ask(toy, 3, 1, 2, expiry=0.2)
+        toy.read_raw(3, 1, 2, expiry=0.2)
     assert simulated.frames == []
-    assert bus.ask(toy, 3, 1, 2, expiry=0.4) == bytes.fromhex("007B 0096")
+    assert toy.read_raw(3, 1, 2, expiry=0.4) == bytes.fromhex("007B 0096")
 
 
 def test_a_late_answer_is_awaited_no_longer_than_the_read_may_take(
     monkeypatch: pytest.MonkeyPatch, simulated: SimulatedBus
 ) -> None:
-    bus, (toy,) = simulated.bus, simulated.bus.drives
+    (toy,) = simulated.bus.drives
     found = completed(int(Failure.LATE_ANSWER_DUE), Message(0, 0), b"", at_ns=0)
     found.c.late_until_ns = round((simulated.seconds + 60) * 1e9)
     monkeypatch.setattr(simulated, "carry_out", lambda exchange, **times: found)
     begun = simulated.seconds
     with pytest.raises(Expired, match=r"was not sent: .* within 0.2 s"):
-        bus.ask(toy, 3, 1, 2, expiry=0.2)
+        toy.read_raw(3, 1, 2, expiry=0.2)
     assert simulated.seconds - begun < 0.21
 
 
 def test_a_copy_of_the_request_is_no_reply(simulated: SimulatedBus) -> None:
     """A read of 17 coils from 03xxH has a reply of its own request's length and first three bytes."""
-    bus, (toy,) = simulated.bus, simulated.bus.drives
+    (toy,) = simulated.bus.drives
     echo = checksums.rtu(bytes.fromhex("07 01 03 20 00 11"))
     simulated.answers = lambda request: echo
     with pytest.raises(BadReply, match="copy of the request"):
-        bus.ask(toy, 1, 0x320, 17)
+        toy.read_raw(1, 0x320, 17)
     assert simulated.frames[0][1] == echo.hex(" ").upper()
     simulated.has_echo = True  # the line has told the two apart
-    assert bus.ask(toy, 1, 0x320, 17) == bytes.fromhex("20 00 11")
+    assert toy.read_raw(1, 0x320, 17) == bytes.fromhex("20 00 11")
 
 
 WRONG = {
@@ -107,44 +107,43 @@ WRONG = {
 def test_what_cannot_be_asked_is_told_and_nothing_is_sent(
     simulated: SimulatedBus, asked: tuple[int, int, int]
 ) -> None:
-    bus, (toy,) = simulated.bus, simulated.bus.drives
+    (toy,) = simulated.bus.drives
     with pytest.raises(ValueError, match=WRONG[asked]):
-        bus.ask(toy, *asked)
+        toy.read_raw(*asked)
     assert simulated.frames == []
 
 
 @pytest.mark.parametrize("asked", [(True, 1, 1), (3, 1.0, 1), (3, 1, "2")])
 def test_what_is_no_number_is_told(simulated: SimulatedBus, asked: tuple[int, int, int]) -> None:
-    bus, (toy,) = simulated.bus, simulated.bus.drives
+    (toy,) = simulated.bus.drives
     with pytest.raises(TypeError, match="is not a whole number"):
-        bus.ask(toy, *asked)
+        toy.read_raw(*asked)
     for expiry in (0, -1, float("nan"), float("inf"), True):
         with pytest.raises(ValueError, match="is not a number of seconds above 0"):
-            bus.ask(toy, 3, 1, 1, expiry=expiry)
+            toy.read_raw(3, 1, 1, expiry=expiry)
     assert simulated.frames == []
 
 
 @pytest.mark.parametrize("function", [1, 2, 3, 4])
 def test_a_raw_request_is_no_read(simulated: SimulatedBus, function: int) -> None:
     """It waits as long as a write may take: a late reply to the one before could then be its own."""
-    bus, (toy,) = simulated.bus, simulated.bus.drives
+    (toy,) = simulated.bus.drives
     with pytest.raises(
-        ValueError, match=rf"{function:02X}H is a read.*call bus.ask\(drive, {function}, 80, 2\)"
+        ValueError, match=rf"{function:02X}H is a read.*call drive.read_raw\({function}, 80, 2\)"
     ):
-        bus.raw(toy, function, 80, count=2)
+        toy.send_raw(function, 80, count=2)
     assert simulated.frames == []
 
 
 def test_limits_of_families(monkeypatch: pytest.MonkeyPatch) -> None:
-    bus, native, _ = one(monkeypatch, DelixiNative(1))
+    _, native, _ = one(monkeypatch, DelixiNative(1))
     with pytest.raises(ValueError, match="speaks Delixi's own protocol"):
-        bus.bus.ask(native, 3, 1, 1)
+        native.read_raw(3, 1, 1)
     bus, modbus, _ = one(monkeypatch, DelixiModbus(1))
     with pytest.raises(ValueError, match="count = 2 is not from 1 to 1"):
-        bus.bus.ask(modbus, 3, 1, 2)
-    bus, _, _ = one(monkeypatch, InnovertIBD(1))
-    with pytest.raises(NotAttached):
-        bus.bus.ask(modbus, 3, 1, 1)
+        modbus.read_raw(3, 1, 2)
+    with pytest.raises(NotAttached, match="fan is not attached to a bus: use bus"):
+        InnovertIBD(1, name="fan").read_raw(3, 1, 1)
     assert bus.frames == []
 
 
@@ -157,11 +156,10 @@ def test_a_line_that_is_polled_is_asked_between_the_polls() -> None:
     answers = Counter[bytes]()
     with Simulator([Wire([EncodedDrive(Toy(1))], unpaced=True)]) as sim:
         with Poller(plant(line(sim.wires[0].path, drive))) as poller:
-            bus = poller.bus("line")
 
             def asked() -> bool:
                 with suppress(NoReply, BadReply):
-                    answers[bus.ask(drive.drive, 3, Toy.status.address, 1, expiry=60.0)] += 1
+                    answers[drive.drive.read_raw(3, Toy.status.address, 1, expiry=60.0)] += 1
                 return answers.total() >= 20
 
             until(asked)

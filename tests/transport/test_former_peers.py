@@ -60,7 +60,7 @@ def leave_a_reply_behind(wire: HoldingWire, port: str) -> None:
     """Close a bus whose drive has yet to answer what it was asked."""
     with Bus(port) as bus:
         pump = bus.attach(Quick, 1)
-        assert bus.read(pump, Quick.output_current) == 1.11
+        assert pump.read(Quick.output_current) == 1.11
         wire.holds = True
         with pytest.raises(NoReply):
             bus._exchanges.values(pump, [Quick.mystery], 1)
@@ -76,7 +76,7 @@ def test_a_port_that_is_opened_again_gives_no_value_of_another_register(
     with Bus(wire.path) as bus:
         pump = bus.attach(family, 1)
         assert bus.peer(pump).owes
-        assert bus.read(pump, family.output_current) == 1.11
+        assert pump.read(family.output_current) == 1.11
         assert bus.peer(pump).late == 1
 
 
@@ -113,7 +113,7 @@ def test_a_pseudo_terminal_of_the_same_number_is_another_port() -> None:
 def test_what_nobody_owes_is_not_kept(wire: HoldingWire) -> None:
     before = dict(former_peers._former)
     with Bus(wire.path) as bus:
-        bus.read(bus.attach(Quick, 1), Quick.output_current)
+        bus.attach(Quick, 1).read(Quick.output_current)
     assert former_peers._former == before
 
 

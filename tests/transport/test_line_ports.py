@@ -39,8 +39,8 @@ def wire(port: str = "pty") -> Wire:
 
 def read_and_write(bus: Bus) -> None:
     toy = bus.attach(PatientToy, 1)
-    assert bus.read(toy, toy.output_current) == 3.25
-    assert bus.write(toy, toy.frequency, 25.0) == 25.0
+    assert toy.read(toy.output_current) == 3.25
+    assert toy.write(toy.frequency, 25.0) == 25.0
 
 
 # ---- the kinds of ports ----
@@ -62,7 +62,7 @@ def test_every_documented_baud_rate_can_be_read(family: type[Drive], baudrate: i
     with Simulator([Wire([drive], unpaced=True)]) as sim, Bus(sim.wires[0].path) as bus:
         attached = bus.attach(family, 1, baudrate=baudrate)
         first = next(iter(attached.readings()))
-        assert bus.read(attached, first) == drive[first.name]
+        assert attached.read(first) == drive[first.name]
 
 
 @pytest.mark.skipif(not hasattr(socket, "TCP_USER_TIMEOUT"), reason="this system knows no such time-out")
@@ -295,7 +295,7 @@ def test_a_port_that_is_flooded_before_its_first_exchange_and_after_it() -> None
             for _ in range(4):
                 os.write(master, b"\xff" * 1000)
             with pytest.raises(NoReply):
-                bus.read(toy, toy.output_current)
+                toy.read(toy.output_current)
     os.close(slave)
     os.close(master)
 
@@ -309,14 +309,14 @@ def test_a_port_that_is_lost_in_mid_exchange(make: Callable[[], tuple[str, Calla
         toy = bus.attach(PatientToy, 1)
         for _ in range(2):  # and it stays lost
             with pytest.raises(LineError) as caught:
-                bus.read(toy, toy.output_current)
+                toy.read(toy.output_current)
             assert str(caught.value).startswith(f"{path}: the port was lost (")
             assert "\n" not in str(caught.value)
         thread.join()
         with pytest.raises(LineError):
             bus.line.reopen()
         with pytest.raises(LineError, match=r": it is closed$"):
-            bus.read(toy, toy.output_current)
+            toy.read(toy.output_current)
 
 
 @pytest.mark.parametrize("make", [vanishing_pty, vanishing_socket])
@@ -329,10 +329,10 @@ def test_a_write_on_a_port_that_is_lost_may_have_happened(
     with Bus(path) as bus:
         toy = bus.attach(PatientToy, 1)
         with pytest.raises(Unconfirmed, match=r"it is not known whether .* took effect: the port was lost"):
-            bus.raw(toy, 6, 0x15, bytes(2))
+            toy.send_raw(6, 0x15, bytes(2))
         thread.join()
         with pytest.raises(LineError):  # and this has not
-            bus.raw(toy, 6, 0x15, bytes(2))
+            toy.send_raw(6, 0x15, bytes(2))
 
 
 def test_a_port_is_opened_again_under_its_link(tmp_path: Path) -> None:
@@ -344,7 +344,7 @@ def test_a_port_is_opened_again_under_its_link(tmp_path: Path) -> None:
     with Simulator([wire(str(link))]):
         assert link.readlink() != first
         bus.line.reopen()
-        assert bus.read(bus.drives[0], Toy.output_current) == 3.25
+        assert bus.drives[0].read(Toy.output_current) == 3.25
         bus.close()
     os.close(held)
 
@@ -359,7 +359,7 @@ def test_a_tapped_port_is_tapped_when_it_is_opened_again(tmp_path: Path) -> None
         toy = bus.attach(PatientToy, 1)
         tapped.collect()
         bus.line.reopen()
-        assert bus.read(toy, toy.output_current) == 3.25
+        assert toy.read(toy.output_current) == 3.25
     with Capture(tmp_path / "a.pcapng") as capture:
         assert [(row.register, row.value) for rows in Decoding(capture) for row in rows] == [
             ("holding_register_2", 325)
@@ -372,11 +372,11 @@ def test_a_bridged_port_has_its_settings_when_it_is_opened_again() -> None:
         path = sim.wires[0].path
         with Bus(f"spy://{path}", baudrate=19200) as bus:
             toy = bus.attach(Toy, 1)
-            assert bus.read(toy, toy.output_current) == 0
+            assert toy.read(toy.output_current) == 0
             with Path(path).open("rb", buffering=0) as port:
                 set_settings(port.fileno(), 9600, "8N1")
             bus.line.reopen()
-            assert bus.read(toy, toy.output_current) == 0
+            assert toy.read(toy.output_current) == 0
 
 
 def test_a_bridged_port_that_cannot_be_set_up_is_a_sentence() -> None:
@@ -387,7 +387,7 @@ def test_a_bridged_port_that_cannot_be_set_up_is_a_sentence() -> None:
         os.close(slave)
         os.close(master)
         with pytest.raises(LineError) as caught:
-            bus.read(toy, toy.output_current)
+            toy.read(toy.output_current)
     assert caught.value.port == port
     assert os.strerror(errno.EIO) in caught.value.reason
     assert "\n" not in str(caught.value)
@@ -419,7 +419,7 @@ def test_a_closed_bus_says_so() -> None:
             toy = bus.attach(Toy, 1)
         bus.close()  # twice is no mistake
         with pytest.raises(LineError) as caught:
-            bus.read(toy, toy.output_current)
+            toy.read(toy.output_current)
         assert str(caught.value) == f"{sim.wires[0].path}: it is closed"
 
 
@@ -432,7 +432,7 @@ def test_closing_ends_what_waits_for_a_reply() -> None:
 
     def wait() -> None:
         with pytest.raises(LineError) as caught:
-            bus.read(slow, slow.output_current)
+            slow.read(slow.output_current)
         failures.append(caught.value)
 
     waiting = threading.Thread(target=wait)

@@ -70,7 +70,7 @@ def test_a_port_that_is_lost_and_regained(caplog: pytest.LogCaptureFixture, tmp_
             os.close(end)
         for _ in range(3):
             with pytest.raises(LineError):
-                bus.read(drive, drive.output_current)
+                drive.read(drive.output_current)
         ends = plugged_in()
         bus.line.regain()
         flush(PATIENCE)
@@ -89,10 +89,10 @@ def test_frames_are_logged_at_debug_alone(caplog: pytest.LogCaptureFixture) -> N
     ):
         drive = bus.attach(PatientToy, 1)
         with caplog.at_level(logging.INFO, "multidrop"):
-            bus.read(drive, drive.output_current)
+            drive.read(drive.output_current)
         assert messages(caplog, "multidrop.line") == []
         with caplog.at_level(logging.DEBUG, "multidrop"):
-            bus.read(drive, drive.output_current)
+            drive.read(drive.output_current)
             flush(PATIENCE)
     (_, request), (_, reply) = messages(caplog, "multidrop.line")[:2]
     assert request.startswith(f"{bus.line.port} > ")
@@ -111,7 +111,7 @@ def test_writes_refusals_and_stops_are_logged(
     with caplog.at_level(logging.INFO, "multidrop"):
         drive.set_frequency(20)
         with pytest.raises(WriteForbidden):
-            bus.write(drive, drive.register("setpoint"), 1e6)
+            drive.write(drive.register("setpoint"), 1e6)
         bus.stop_all()
         flush(PATIENCE)
     told = [text for _, text in messages(caplog, "multidrop.control")]

@@ -388,10 +388,10 @@ START = "010600140001"  # write 1, which starts it, to the control register of d
 
 def start_into_the_cut(bus: Bus, toy: Toy, network: FarNetwork) -> None:
     """Send a START that is given up. What was confirmed before lets it leave: nothing is owed."""
-    bus.raw(toy, 6, 0x14, bytes([0, 2]))
+    toy.send_raw(6, 0x14, bytes([0, 2]))
     network.cut()
     with pytest.raises(Unconfirmed):
-        bus.raw(toy, 6, 0x14, bytes([0, Status.RUNNING]))
+        toy.send_raw(6, 0x14, bytes([0, Status.RUNNING]))
 
 
 @pytest.mark.long

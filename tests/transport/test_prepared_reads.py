@@ -78,36 +78,36 @@ def given(
 @pytest.mark.slow
 def test_registers_that_are_read_again_are_planned_once(bus: Bus, counted: Counted) -> None:
     one, other = bus.attach(PatientToy, 1), bus.attach(PatientToy, 2)
-    first = bus.read_many(one, WANTED)
+    first = one.read_many(WANTED)
     assert counted.since() == (1, 2)
-    assert [bus.read_many(one, WANTED) for _ in range(5)] == 5 * [first]
+    assert [one.read_many(WANTED) for _ in range(5)] == 5 * [first]
     assert counted.since() == (0, 0)
-    bus.read(one, Toy.acceleration_time)  # the block is one of those above
+    one.read(Toy.acceleration_time)  # the block is one of those above
     assert counted.since() == (1, 0)
-    bus.read_many(other, WANTED)
+    other.read_many(WANTED)
     assert counted.since() == (1, 2)
 
 
 @pytest.mark.slow
 def test_a_drive_that_left_leaves_nothing_behind(bus: Bus, counted: Counted) -> None:
     drive = bus.attach(PatientToy, 1)
-    bus.read_many(drive, WANTED)
+    drive.read_many(WANTED)
     bus.detach(drive)
     with pytest.raises(ValueError, match="is not attached to this bus"):
-        bus.read_many(drive, WANTED)
+        drive.read_many(WANTED)
     assert bus._exchanges._prepared == {}
     counted.since()
     bus.attach(drive)
-    bus.read_many(drive, WANTED)
+    drive.read_many(WANTED)
     assert counted.since() == (1, 2)
 
 
 def test_a_port_that_was_opened_again_is_asked_anew(bus: Bus, counted: Counted) -> None:
     drive = bus.attach(PatientToy, 1)
-    bus.read_many(drive, WANTED)
+    drive.read_many(WANTED)
     bus.line.reopen()
     counted.since()
-    bus.read_many(drive, WANTED)
+    drive.read_many(WANTED)
     assert counted.since() == (1, 2)
 
 
@@ -133,7 +133,7 @@ def test_no_more_is_kept_than_there_is_room_for(bus: Bus, monkeypatch: pytest.Mo
     monkeypatch.setattr(prepared_reads, "MOST_PREPARED", 3)
     drive = bus.attach(PatientToy, 1)
     for wanted in permutations(WANTED):
-        assert set(bus.read_many(drive, wanted)) == {register.name for register in WANTED}
+        assert set(drive.read_many(wanted)) == {register.name for register in WANTED}
     prepared = bus._exchanges._prepare(drive)
     assert prepared.of.cache_info().currsize == 3
 
@@ -141,8 +141,8 @@ def test_no_more_is_kept_than_there_is_room_for(bus: Bus, monkeypatch: pytest.Mo
 def test_each_read_fills_its_completion_in_again_and_again(bus: Bus, monkeypatch: pytest.MonkeyPatch) -> None:
     drive = bus.attach(PatientToy, 1)
     asked = given(bus, monkeypatch)
-    first = bus.read_many(drive, WANTED)
-    assert [bus.read_many(drive, WANTED) for _ in range(3)] == 3 * [first]
+    first = drive.read_many(WANTED)
+    assert [drive.read_many(WANTED) for _ in range(3)] == 3 * [first]
     assert len(asked) == 8
     assert len(set(asked)) == 2
     assert asked[:2] * 4 == asked
@@ -150,11 +150,11 @@ def test_each_read_fills_its_completion_in_again_and_again(bus: Bus, monkeypatch
 
 def test_reads_at_once_go_into_completions_of_their_own(bus: Bus, monkeypatch: pytest.MonkeyPatch) -> None:
     drive = bus.attach(PatientToy, 1)
-    value = bus.read(drive, Toy.acceleration_time)
+    value = drive.read(Toy.acceleration_time)
     both = Barrier(2)
     asked = given(bus, monkeypatch, lambda: both.wait(60))
     with ThreadPoolExecutor(2) as threads:
-        found = [*threads.map(lambda drive: bus.read(drive, Toy.acceleration_time), 2 * [drive])]
+        found = [*threads.map(lambda drive: drive.read(Toy.acceleration_time), 2 * [drive])]
     assert found == 2 * [value]
     assert len(set(asked)) == 2
 

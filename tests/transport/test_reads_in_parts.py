@@ -23,15 +23,15 @@ def test_a_refusal_splits_and_is_remembered(monkeypatch: pytest.MonkeyPatch) -> 
     sim = Picky(drive, most=8)
     bus = SimulatedBus(monkeypatch, sim)
     bus.attach(drive)
-    first = bus.bus.read_many(drive, drive.registers.values())
+    first = drive.read_many(drive.registers.values())
     assert first == right(range(WIDE))
     assert [count for _, count in sim.asked] == [24, 12, 6, 6, 12, 6, 6]
     sim.asked.clear()
-    assert bus.bus.read_many(drive, drive.registers.values()) == first
+    assert drive.read_many(drive.registers.values()) == first
     assert [count for _, count in sim.asked] == [6] * 4
     bus.queue = object()  # the port was opened again
     sim.asked.clear()
-    assert bus.bus.read_many(drive, drive.registers.values()) == first
+    assert drive.read_many(drive.registers.values()) == first
     assert sim.asked[0] == (0, WIDE)
 
 
@@ -41,18 +41,18 @@ def test_a_refused_register_is_refused_by_itself(monkeypatch: pytest.MonkeyPatch
     bus = SimulatedBus(monkeypatch, sim)
     bus.attach(drive)
     with pytest.raises(DriveException, match=r"^pump-1 refuses r3: ") as caught:
-        bus.bus.read_many(drive, drive.registers.values())
+        drive.read_many(drive.registers.values())
     assert caught.value.register == "r3"
     assert sim.asked[-1] == (3, 1)
     assert len(sim.asked) <= 11
     sim.asked.clear()
     with pytest.raises(DriveException, match=r"^pump-1 refuses r3: "):
-        bus.bus.read_many(drive, drive.registers.values())
+        drive.read_many(drive.registers.values())
     assert sim.asked == [(3, 1)]  # what comes to nothing costs the line no more
     sim.missing.clear()
-    assert bus.bus.read_many(drive, drive.registers.values()) == right(range(WIDE))
+    assert drive.read_many(drive.registers.values()) == right(range(WIDE))
     others = [register for register in drive.registers.values() if register.address != 3]
-    assert bus.bus.read_many(drive, others) == right(set(range(WIDE)) - {3})
+    assert drive.read_many(others) == right(set(range(WIDE)) - {3})
 
 
 @given(st.sets(st.integers(0, 5), max_size=2), st.integers(1, 6), st.sets(st.integers(0, 5), min_size=1))
@@ -64,10 +64,10 @@ def test_all_comes_or_what_is_refused_is_named(refused: set[int], most: int, ask
         registers = [drive.register(f"r{at}") for at in sorted(asked)]
         for _ in range(2):  # then the parts are known
             if not refused & asked:
-                assert bus.read_many(drive, registers) == right(asked)
+                assert drive.read_many(registers) == right(asked)
                 continue
             with pytest.raises(DriveException) as caught:
-                bus.read_many(drive, registers)
+                drive.read_many(registers)
             assert caught.value.register in {f"r{at}" for at in refused & asked}
 
 
@@ -79,7 +79,7 @@ def test_busy_splits_nothing(code: int, monkeypatch: pytest.MonkeyPatch) -> None
     sim.limit = 0
     monkeypatch.setattr(sim, "_code", lambda reason: code)
     with pytest.raises(DriveException):
-        bus.bus.read_many(drive, drive.registers.values())
+        drive.read_many(drive.registers.values())
     assert sim.asked == [(0, WIDE)]
 
 
@@ -91,7 +91,7 @@ def test_no_register_is_named_where_several_were_asked_for(monkeypatch: pytest.M
     sim.limit = 0
     monkeypatch.setattr(sim, "_code", lambda reason: 6)
     with pytest.raises(DriveException, match=r"^pump-1 refuses: ") as caught:
-        bus.bus.read_many(drive, [drive.register("r1"), drive.register("flow")])
+        drive.read(drive.register("r1"), drive.register("flow"))
     assert caught.value.register is None
 
 
@@ -101,9 +101,9 @@ def test_silence_to_a_long_request_splits_where_a_short_one_is_answered(
     drive = family(WIDE)(1, name="pump-1")
     bus = SimulatedBus(monkeypatch, sim := Picky(drive, silent_beyond=8))
     bus.attach(drive)
-    assert bus.bus.read_many(drive, drive.registers.values()) == right(range(WIDE))
+    assert drive.read_many(drive.registers.values()) == right(range(WIDE))
     sim.asked.clear()
-    assert bus.bus.read_many(drive, drive.registers.values()) == right(range(WIDE))
+    assert drive.read_many(drive.registers.values()) == right(range(WIDE))
     assert [count for _, count in sim.asked] == [6] * 4
 
 
@@ -112,14 +112,14 @@ def test_a_dead_drive_costs_one_request_more(monkeypatch: pytest.MonkeyPatch) ->
     bus = SimulatedBus(monkeypatch, sim := Picky(drive, silent_beyond=0))
     bus.attach(drive)
     with pytest.raises(NoReply):
-        bus.bus.read_many(drive, drive.registers.values())
+        drive.read_many(drive.registers.values())
     assert sim.asked == [(0, WIDE)] * 3 + [(0, 1)]
     sim.silent_beyond = 125
-    assert bus.bus.read_many(drive, drive.registers.values()) == right(range(WIDE))
+    assert drive.read_many(drive.registers.values()) == right(range(WIDE))
     sim.asked.clear()
     sim.silent_beyond = 1  # noise, say: it has answered the whole
     with pytest.raises(NoReply):
-        bus.bus.read_many(drive, drive.registers.values())
+        drive.read_many(drive.registers.values())
     assert sim.asked == [(0, WIDE)] * 3
 
 
@@ -134,4 +134,4 @@ def test_bytes_that_came_for_one_attempt_are_told(monkeypatch: pytest.MonkeyPatc
     bus.loses = lambda request: next(attempts) in silent
     bus.answers = lambda request: foreign
     with pytest.raises(BadReply, match="another address"):
-        bus.bus.read_many(drive, drive.registers.values())
+        drive.read_many(drive.registers.values())

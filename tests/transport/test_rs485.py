@@ -56,7 +56,7 @@ with Simulator([Wire([simulated(Toy(1))])]) as sim:
         with Bus(sim.wires[0].path, rs485=sys.argv[1]) as bus:
             toy = bus.attach(Toy, 1)
             for _ in range(int(sys.argv[2])):
-                said.append(bus.read(toy, toy.output_current))
+                said.append(toy.read(toy.output_current))
             message = Message(0, 0x10, 0x15, 20, data=bytes(40))
             peer = Peer(least_timeout=0.1, most_timeout=0.1)
             settings = {"baudrate": 9600, "format": "8N1", "character": 10 / 9600, "silence": 0.004}
@@ -162,7 +162,7 @@ def test_a_pseudo_terminal_goes_without() -> None:
     for mode in RS485:
         with Simulator([Wire([simulated(Toy(1))])]) as sim, Bus(sim.wires[0].path, rs485=mode) as bus:
             toy = bus.attach(Toy, 1)
-            assert bus.read(toy, toy.output_current) is not None
+            assert toy.read(toy.output_current) is not None
 
 
 def test_the_word_is_one_of_four_and_the_port_a_device() -> None:

@@ -222,9 +222,9 @@ def toy() -> SimulatedDrive:
 def test_a_bus_has_statistics(toy: SimulatedDrive) -> None:
     with Simulator([Wire([toy], unpaced=True)]) as sim, Bus(sim.wires[0].path) as bus:
         pump, nobody = bus.attach(Toy, 1, name="pump"), bus.attach(Toy, 2, name="nobody")
-        bus.read_many(pump, pump.readings())
+        pump.read_many(pump.readings())
         with pytest.raises(TimeoutError):
-            bus.read(nobody, Toy.output_current)
+            nobody.read(Toy.output_current)
         found = bus.statistics()
         asked = found.drives["pump"].exchanges  # more than were answered, where the machine was slow
         assert asked >= found.drives["pump"].delays.replies > 0
@@ -232,7 +232,7 @@ def test_a_bus_has_statistics(toy: SimulatedDrive) -> None:
         assert found.exchanges == asked + 3
         bus.reset_statistics()
         assert bus.statistics().exchanges == 0
-        bus.read(pump, Toy.output_current)
+        pump.read(Toy.output_current)
         assert bus.statistics().delays.replies == 1
     assert bus.statistics() == bus.statistics()  # it stands still once the bus is closed
     assert bus.statistics().delays.replies == 1
@@ -266,7 +266,7 @@ def test_drives_that_were_renamed_or_exchanged_count_from_the_reset_on(toy: Simu
         known = [bus.attach(Toy, address=address, name=name) for address, name in ((1, "a"), (2, "b"))]
         for drive, times in zip(known, (7, 3), strict=True):
             for _ in range(times):
-                bus.read(drive, Toy.output_current)
+                drive.read(Toy.output_current)
         bus.reset_statistics()
         for drive in known:
             bus.detach(drive)
@@ -274,7 +274,7 @@ def test_drives_that_were_renamed_or_exchanged_count_from_the_reset_on(toy: Simu
             bus.attach(Toy, address=address, name=name) for address, name in ((1, "c"), (2, "a"), (3, "b"))
         ]
         for drive in again:
-            bus.read(drive, Toy.output_current)
+            drive.read(Toy.output_current)
         found = bus.statistics()
         assert {name: drive.exchanges for name, drive in found.drives.items()} == {"c": 1, "a": 1, "b": 1}
         assert found.exchanges == 3

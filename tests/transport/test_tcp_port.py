@@ -104,11 +104,11 @@ def test_every_drive_takes_the_port_s_framing_and_gives_it_back(port: str) -> No
     with Bus(port) as bus:
         bus.attach(drive)
         assert drive.framing is Framing.TCP
-        assert bus.read(drive, drive.output_current) == 0
+        assert drive.read(drive.output_current) == 0
     with Simulator([Wire([simulated(InnovertIBD(1))])]) as line, Bus(line.wires[0].path) as bus:
         bus.attach(drive)
         assert drive.framing is Framing.RTU
-        assert bus.read(drive, drive.output_current) == 0
+        assert drive.read(drive.output_current) == 0
 
 
 @pytest.mark.parametrize(
@@ -155,7 +155,7 @@ def test_every_unit_id_is_read(unit: int) -> None:
     sim["voltage"] = 230
     wire = Wire([sim], port="tcp://127.0.0.1:0", unpaced=True)
     with Simulator([wire]), Bus(wire.path) as bus:
-        assert bus.read(bus.attach(Meter, unit), Meter.voltage) == 230
+        assert bus.attach(Meter, unit).read(Meter.voltage) == 230
 
 
 def test_nothing_is_broadcast() -> None:
@@ -252,11 +252,11 @@ def test_rtu_over_tcp_behind_tcp_is_told_and_ends_the_connection() -> None:
     with responder(answer) as (place, came), Bus(f"tcp://{place}") as bus:
         drive = bus.attach(InnovertIBD, 1)
         with pytest.raises(PortLost, match=f"has the shape of RTU over TCP: name the port socket://{place}"):
-            bus.read(drive, drive.output_current)
+            drive.read(drive.output_current)
         assert parse_request(Framing.TCP, came[0])[0] == len(came[0])
         bus.line.regain()
         with pytest.raises(PortLost):
-            bus.read(drive, drive.output_current)
+            drive.read(drive.output_current)
         until(lambda: len(came) == 2)  # on a connection of its own
 
 
@@ -276,7 +276,7 @@ def test_silence_names_the_other_way() -> None:
             with Bus(f"{kind}://{place}") as bus:
                 drive = bus.attach(InnovertIBD, 1)
                 with pytest.raises(NoReply, match=f"{other}://{place}"):
-                    bus.read(drive, drive.output_current)
+                    drive.read(drive.output_current)
 
 
 def test_what_a_gateway_cannot_reach_is_no_reply() -> None:
@@ -296,7 +296,7 @@ def test_what_a_gateway_cannot_reach_is_no_reply() -> None:
         with Bus(f"tcp://127.0.0.1:{listener.getsockname()[1]}") as bus:
             drive = bus.attach(InnovertIBD, 1)
             with pytest.raises(NoReply, match=r"behind the gateway, which says so \(exception 0BH\)"):
-                bus.read(drive, drive.output_current)
+                drive.read(drive.output_current)
             assert bus.peer(drive).failures == 3
     thread.join()
 
@@ -368,9 +368,9 @@ def test_a_read_goes_on_when_the_peer_closes_after_each_reply() -> None:
     with closing_peer(1) as (port, asked), Bus(port) as bus:
         drive = bus.attach(TwoBlocks(1))
         for _ in range(2):
-            found = bus.read_many(drive, [drive.second, drive.first, drive.third])
+            found = drive.read(drive.second, drive.first, drive.third)
             assert found == {"second": 0x1000, "first": 1, "third": 0x2000}
-        assert bus.read_text(drive, drive.serial) == "ABAC"
+        assert drive.read(drive.serial) == "ABAC"
         assert len(asked) <= 12
 
 
@@ -378,14 +378,14 @@ def test_a_read_raises_where_the_peer_closes_before_any_reply() -> None:
     with closing_peer(0) as (port, asked), Bus(port) as bus:
         drive = bus.attach(TwoBlocks(1))
         with pytest.raises(PortLost):
-            bus.read(drive, drive.first)
+            drive.read(drive.first)
         assert len(asked) == 1
 
 
 def test_a_write_is_not_repeated_on_a_port_that_is_opened_again() -> None:
     with closing_peer(1) as (port, asked), Bus(port) as bus:
         drive = bus.attach(TwoBlocks(1))
-        assert bus.read(drive, drive.first) == 1
+        assert drive.read(drive.first) == 1
         with pytest.raises((PortLost, Unconfirmed)):
-            bus.write(drive, drive.target, 5)
+            drive.write(drive.target, 5)
         assert all(request.function == 3 for request in asked)

@@ -6,7 +6,6 @@ import argparse
 import json
 from typing import Any
 
-from multidrop.bus import Bus
 from multidrop.cli.support.arguments import add_json_argument, add_target_arguments, target_of
 from multidrop.cli.support.output import print_text
 from multidrop.cli.support.values import Row, aligned, as_json, as_row
@@ -34,9 +33,9 @@ def run(arguments: argparse.Namespace) -> int:
     if not names:
         texts = list(drive.texts.values())
         wanted = [register for register in drive.registers.values() if register.readable]
-    with target.open_bus() as bus:
-        values = _read(bus, drive, wanted)
-        read_texts = {text: _read_text(bus, drive, text) for text in texts}
+    with target.open_bus():
+        values = _read(drive, wanted)
+        read_texts = {text: _read_text(drive, text) for text in texts}
     if arguments.json:
         record = {"drive": drive.name, "model": drive.model, "address": drive.address}
         shown = {register.name: _as_json(register, value) for register, value in values.items()}
@@ -50,29 +49,29 @@ def run(arguments: argparse.Namespace) -> int:
     return 1 if any(isinstance(answer, DriveException) for answer in answers) else 0
 
 
-def _read(bus: Bus, drive: Drive, wanted: list[Register[Any]]) -> dict[Register[Any], Any]:
+def _read(drive: Drive, wanted: list[Register[Any]]) -> dict[Register[Any], Any]:
     """Return each register's value, the drive's refusal, or None where it has no valid value."""
     try:
-        found = bus.read_many(drive, wanted)
+        found = drive.read_many(wanted)
     except NoValue as lack:
         found = dict(lack.values)
     except DriveException:  # which register, only single reads show
-        return {register: _read_one(bus, drive, register) for register in wanted}
+        return {register: _read_one(drive, register) for register in wanted}
     return {register: found.get(register.name) for register in wanted}
 
 
-def _read_one(bus: Bus, drive: Drive, register: Register[Any]) -> Any:
+def _read_one(drive: Drive, register: Register[Any]) -> Any:
     try:
-        return bus.read(drive, register)
+        return drive.read(register)
     except NoValue:
         return None
     except DriveException as refusal:
         return refusal
 
 
-def _read_text(bus: Bus, drive: Drive, text: Text) -> str | DriveException:
+def _read_text(drive: Drive, text: Text) -> str | DriveException:
     try:
-        return bus.read_text(drive, text)
+        return drive.read(text)
     except DriveException as refusal:
         return refusal
 

@@ -39,9 +39,9 @@ def run(arguments: argparse.Namespace) -> int:
     value = nearest_value(register, register.parse(words[1]))
     check_plain(drive, register, raw_count(drive, register, value))  # before a port is opened
     confirm(f"Write {register.name} = {register.format(value)} to {drive.name} on {target.port}?", arguments)
-    with telling_what_was_sent(drive, "write") as known, target.open_bus(arguments.audit) as bus:
+    with telling_what_was_sent(drive, "write") as known, target.open_bus(arguments.audit):
         known.clear()
-        outcome = bus.try_write(drive, register, value)
+        outcome = drive.try_write(register, value)
         known.append(str(outcome))
     if arguments.json:
         held = outcome.asked if outcome.held is None else outcome.held

@@ -7,10 +7,14 @@ from collections.abc import Iterable
 from typing import Any, TypeVar
 
 from multidrop.control.latches import Latches
+from multidrop.control.outcome import Outcome
 from multidrop.control.performer import Performer
 from multidrop.control.stop_all import Stopper
-from multidrop.core import Latch
-from multidrop.drive.family import Drive
+from multidrop.control.time_limit import checked_expiry
+from multidrop.core import Latch, Message
+from multidrop.drive.family import Drive, check_own, check_own_text
+from multidrop.drive.register import Register
+from multidrop.drive.text import Text
 from multidrop.transport.exchange import Exchanges
 
 D = TypeVar("D", bound=Drive)
@@ -33,6 +37,38 @@ def made(drive: D | type[D], address: int | None, line: dict[str, Any], details:
     return drive
 
 
+class BusLink:
+    """Link of the drives of a bus."""
+
+    def __init__(self, exchanges: Exchanges, performer: Performer) -> None:
+        self._exchanges = exchanges
+        self._performer = performer
+
+    def values(self, drive: Drive, registers: tuple[Any, ...]) -> dict[str, Any]:
+        try:
+            return self._exchanges.read(drive, registers)
+        except TypeError:  # an unhashable argument cannot be a register
+            for register in registers:
+                if not isinstance(register, str):
+                    check_own(drive, register)
+            raise
+
+    def text(self, drive: Drive, text: Text) -> str:
+        check_own_text(drive, text)
+        return self._exchanges.read_text(drive, text)
+
+    def write(self, drive: Drive, register: Register[Any], value: Any) -> Outcome:
+        return self._performer.write(drive, register, value)
+
+    def read_raw(self, drive: Drive, function: int, start: int, count: int, expiry: float) -> bytes:
+        return self._exchanges.ask(drive, function, start, count, checked_expiry(expiry, "a read"))
+
+    def send_raw(self, drive: Drive, function: int, start: int, data: bytes, count: int) -> bytes:
+        if not isinstance(data, bytes | bytearray):
+            raise TypeError(f"data = {data!r}: it must be bytes, such as b'\\x00\\x01'")
+        return self._performer.raw(drive, Message(drive.address, function, start, count, data))
+
+
 class Attached:
     """The drives of a bus, which come and go on any thread."""
 
@@ -46,6 +82,7 @@ class Attached:
         self._latches = latches
         self._performer = performer
         self._stopper = stopper
+        self._link = BusLink(exchanges, performer)
 
     def forked(self) -> None:
         """Let them be attached to a bus of the child."""
@@ -70,7 +107,8 @@ class Attached:
     def _give_verbs(self, drive: Drive, latch: Latch) -> None:
         bus, performer, stopper = self._bus, self._performer, self._stopper
         drive.bus = bus
-        drive.perform = lambda script: bus.perform(drive, script)
+        drive.link = self._link
+        drive.perform = lambda script: performer.perform(script, performer.call(drive))
         drive.stops_called = latch.c
         drive.begin_call = lambda verb, seen: performer.call(drive, verb, seen)
         drive.carry_out_move = performer.move

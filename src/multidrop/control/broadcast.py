@@ -31,9 +31,13 @@ class Broadcaster:
         self._latches = latches
 
     def write(
-        self, drives: Sequence[Drive], register: Register[Any], value: Any
+        self, drives: Sequence[Drive], register: Register[Any] | str, value: Any
     ) -> dict[str, State | BusError]:
         """Write to all; then read each one's state, or why it says none. Raises WriteForbidden."""
+        if isinstance(register, str):
+            if not drives:
+                raise ValueError("no drive is attached to this bus")
+            register = drives[0].register(register)
         if drives and drives[0].framing is Framing.TCP:
             raise WriteForbidden(
                 f"{register.name} cannot be broadcast over Modbus TCP: unit id 0 is the gateway or the "

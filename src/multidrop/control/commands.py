@@ -58,8 +58,10 @@ def write_register(drive: Drive, name: str, value: float | str) -> CommandResult
         typed = typed_value(register, value)
     except (ValueError, TypeError) as mistake:
         return result_of_failure(mistake)._replace(outcome=CommandOutcome.REFUSED)
+    if drive.bus is None:
+        return result_of_failure(NotAttached(f"{drive.name} is no longer on a line"))
     try:
-        outcome: Outcome = _bus_of(drive).try_write(drive, register, typed)
+        outcome: Outcome = drive.try_write(register, typed)
     except Exception as failure:  # of any kind: the caller must see it
         return result_of_failure(failure)
     return result_of_write(outcome)
@@ -102,12 +104,6 @@ def stop_line(bus: Callable[[], Any], names: Sequence[str], seconds: float | Non
         return dict.fromkeys(names, result_of_failed_stop(failure))
     gone = result_of_failure(NotAttached("it is no longer on its line"))
     return {name: result_of_stop(found[name]) if name in found else gone for name in names}
-
-
-def _bus_of(drive: Drive) -> Any:
-    if drive.bus is None:
-        raise NotAttached(f"{drive.name} is no longer on a line")
-    return drive.bus
 
 
 # ---- on threads ----

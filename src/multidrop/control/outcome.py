@@ -21,7 +21,7 @@ class Effect(Enum):
 class Outcome:
     """One write's effect: `held` is what the drive then said it holds, None where that cannot be read.
 
-    `failure` is the error that `Bus.write` raises for it.
+    `failure` is the error that `Drive.write` raises for it.
     """
 
     drive: str

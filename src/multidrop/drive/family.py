@@ -19,13 +19,14 @@ from multidrop.drive.declaration_check import (
     text_errors,
 )
 from multidrop.drive.line_settings import Settings, check_agreed_silence, framing_on
+from multidrop.drive.link import NO_LINK, Link, RegisterAccess, not_attached
 from multidrop.drive.options import Option, checked_options, confirmation, doubt
 from multidrop.drive.register import Access, Kept, Register, Table
 from multidrop.drive.script import Script, read, until, write
 from multidrop.drive.state import Condition, Direction, KnownSetpoint, State
 from multidrop.drive.text import Text
 from multidrop.drive.verbs import MOVING, CalledStop, UnattachedStop, verb, verb_errors
-from multidrop.errors import Advice, NotAttached, NotVerified, Unconfirmed, Unsupported, WriteForbidden
+from multidrop.errors import Advice, NotVerified, Unconfirmed, Unsupported, WriteForbidden
 
 START_TIME = 5.0  # s within which a started motor must be seen to run
 REVERSAL_TIME = 60.0  # s for the ramps of a motor that turned the other way, without the option `stop_time`
@@ -35,7 +36,7 @@ _TURNING = (Condition.RUNNING, Condition.ACCELERATING, Condition.DECELERATING)
 A = TypeVar("A")
 
 
-class Drive:
+class Drive(RegisterAccess):
     """One drive on a line; its class is the family, with the manual's tables in the manual's order.
 
     `address` is 1 to 247, or fewer in some families; on a tcp:// port it is a unit id, 0 to 255 if the family
@@ -222,6 +223,7 @@ class Drive:
         self.ram = frozenset(self._in_ram(name) for name in ram)
         self._known_setpoint = KnownSetpoint()
         self.perform: Callable[[Script[Any]], Any] = self._perform_nowhere
+        self.link: Link = NO_LINK
         self.stops_called: Sequence[int] = (0,)  # its first item counts them
         # A call's permit, which a stop ends that is called after `seen` of them.
         self.begin_call: Callable[[str, int], Any] = lambda verb, seen: None
@@ -290,9 +292,9 @@ class Drive:
 
     def __setattr__(self, name: str, value: object) -> None:
         if name in self.registers:
-            raise AttributeError(f"{name} is a register, which bus.write(drive, drive.{name}, VALUE) writes")
+            raise AttributeError(f"{name} is a register, which drive.write({name!r}, VALUE) writes")
         if name in self.texts:
-            raise AttributeError(f"{name} is a text, which bus.read_text(drive, drive.{name}) reads")
+            raise AttributeError(f"{name} is a text, which drive.read({name!r}) reads")
         super().__setattr__(name, value)
 
     def __repr__(self) -> str:
@@ -366,7 +368,7 @@ class Drive:
         return self.perform(script)
 
     def _perform_nowhere(self, script: Script[Any]) -> Any:
-        raise NotAttached(f"{self.name} is not attached to a bus: use bus.attach(...)")
+        raise not_attached(self)
 
     # ---- for verbs ----
 
@@ -515,7 +517,7 @@ class Drive:
 # Names that a register cannot have.
 TAKEN_NAMES = frozenset(
     {*dir(Drive), *("address", "framing", "settings", "agreed_silence", "response_delay", "name")}
-    | {"option", "ram", "perform"}
+    | {"option", "ram", "perform", "link"}
 )
 
 

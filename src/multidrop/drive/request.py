@@ -117,8 +117,8 @@ def check_no_read(drive: Any, request: Message) -> None:
     if drive.framing is not Framing.DELIXI and request.function in FUNCTIONS:
         asked = f"{request.function}, {request.start}, {request.count}"
         raise ValueError(
-            f"function {request.function:02X}H is a read, which bus.raw does not send: call "
-            f"bus.ask(drive, {asked}), which cannot return another request's late reply"
+            f"function {request.function:02X}H is a read, which send_raw does not send: call "
+            f"drive.read_raw({asked}), which cannot return another request's late reply"
         )
 
 

@@ -111,7 +111,7 @@ class ErmanERG220(Drive):
       them, and not polled unless that is asked for. They show what was commanded. Whether the
       motor runs is read from 0400H, whose bits 0 and 1 are one number and not two flags.
     - Of the diagnostics, function 08, only the example is described, subfunction 0, and its error reply
-      has the code 89H instead of 88H. `bus.raw(drive, 0x08, 0x0000, b"\\xa5\\x37")` sends it. The reply is
+      has the code 89H instead of 88H. `drive.send_raw(0x08, 0x0000, b"\\xa5\\x37")` sends it. The reply is
       a copy of the request, as an adapter's echo is: it does not prove that a drive is there.
     - The order of the two words at 0400H and 0402H is not stated; one of them is always 0.
     - 0402H is the last fault, and nothing says that a reset clears it, or that it is still in

@@ -373,10 +373,9 @@ class Gateway:
         return self.poller.bus(line)
 
     async def ask(self, drive: str, function: int, start: int, count: int, expiry_s: float) -> list[int]:
-        """Return words, or bits, that a drive has at any addresses; see `Bus.ask`."""
-        line, known = self.plant.find_drive(drive)
-        bus = self.bus(line.name)
-        work = partial(bus.ask, known, function, start, count, expiry=expiry_s)
+        """Return words, or bits, that a drive has at any addresses; see `Drive.read_raw`."""
+        _, known = self.plant.find_drive(drive)
+        work = partial(known.read_raw, function, start, count, expiry=expiry_s)
         data = await supervisor().within("passed requests", ASKED_S, work, most=MOST_ASKED)
         if function in (1, 2):
             return [data[bit // 8] >> bit % 8 & 1 for bit in range(count)]

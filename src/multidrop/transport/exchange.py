@@ -134,7 +134,7 @@ class Exchanges:
 
     # ---- reading ----
 
-    def read(self, drive: Drive, registers: Sequence[Register[Any]]) -> dict[str, Any]:
+    def read(self, drive: Drive, registers: Sequence[Register[Any] | Text | str]) -> dict[str, Any]:
         """Return registers' values by name, as `values`, also from a peer that closes after each reply.
 
         A port that is lost after the drive has answered on it is opened again, and the blocks are read one
@@ -145,13 +145,15 @@ class Exchanges:
         except PortLost:
             if not self.has_answered(drive):
                 raise
+        known = [drive.register(one) if isinstance(one, str) else one for one in registers]
+        wanted = [one for one in known if isinstance(one, Register)]
         found: dict[str, Any] = {}
-        for block in blocks(drive, registers):
+        for block in blocks(drive, wanted):
             try:
                 found |= self._again(partial(self.values, drive, block.registers, READ_ATTEMPTS))
             except NoValue as lack:
                 found |= {register.name: lack.values.get(register.name) for register in block.registers}
-        found = {register.name: found[register.name] for register in registers}
+        found = {register.name: found[register.name] for register in wanted}
         if None in found.values():
             raise no_value(drive, found)
         return found
@@ -189,22 +191,22 @@ class Exchanges:
     def values(
         self,
         drive: Drive,
-        registers: Sequence[Register[Any]],
-        attempts: int,
+        registers: Sequence[Register[Any] | Text | str],
+        attempts: int = READ_ATTEMPTS,
         *,
         insists: bool = False,
         timeout: float = 0.0,
     ) -> dict[str, Any]:
-        """Return registers' values by name, each block asked for up to `attempts` times.
+        """Return the values of registers, or of registers' names, by name; try each block `attempts` times.
 
         A read that insists does not wait for an earlier answer, which may then pass for its own; for its own
         it waits, where answers are known to be late, up to `timeout` seconds. A block that the drive refuses
         as a whole, or keeps silent to, is asked for in parts from then on, until the port is opened again.
-        Raises NoValue where a register has none.
+        Raises NoValue if a register holds no value, and TextWanted if one of them is a text.
         """
         prepared = self._prepare(drive)
         plan = prepared.newest
-        if plan.registers is not registers:
+        if plan.wanted is not registers:
             plan = prepared.newest = prepared.of(tuple(registers))
         found: dict[str, Any] = {}
         wanted = [*plan.reads]

@@ -8,8 +8,10 @@ from typing import Any
 from multidrop import core
 from multidrop.core import Completion, Exchange, Message, Peer, RowLayout
 from multidrop.drive.family import Drive, check_own
+from multidrop.drive.link import TextWanted
 from multidrop.drive.number_format import FLOATS
 from multidrop.drive.register import Register, row_field
+from multidrop.drive.text import Text
 from multidrop.planning.blocks import Block, blocks, may_be_too_long
 from multidrop.planning.bus_time import silence
 
@@ -117,21 +119,26 @@ class PreparedRead:
 
 
 class ReadPlan:
-    """Reads of a set of registers, the last one first, and the registers' names as they were asked for.
+    """The reads of `wanted`, which are registers or their names: the last read first.
 
-    `only`: the read that has all of them, named in that order; None where no single one has.
+    `only` is the single read that returns all of them in the order of `wanted`, or None.
     """
 
-    __slots__ = ("names", "only", "reads", "registers")
+    __slots__ = ("names", "only", "reads", "wanted")
 
-    def __init__(self, registers: tuple[Register[Any], ...], reads: tuple[PreparedRead, ...]) -> None:
-        self.registers = registers
+    def __init__(
+        self,
+        wanted: tuple[object, ...],
+        registers: tuple[Register[Any], ...],
+        reads: tuple[PreparedRead, ...],
+    ) -> None:
+        self.wanted = wanted
         self.reads = reads
         self.names = tuple(register.name for register in registers)
         self.only = reads[0] if len(reads) == 1 and reads[0].names == self.names else None
 
 
-NOTHING = ReadPlan((), ())
+NOTHING = ReadPlan((), (), ())
 
 
 class PreparedReads:
@@ -145,10 +152,13 @@ class PreparedReads:
             return PreparedRead(drive, block, peer)
 
         @lru_cache(MOST_PREPARED)
-        def of(registers: tuple[Register[Any], ...]) -> ReadPlan:
+        def of(wanted: tuple[Any, ...]) -> ReadPlan:
+            if any(isinstance(one, Text) or one in drive.texts for one in wanted):
+                raise TextWanted
+            registers = tuple(drive.register(one) if isinstance(one, str) else one for one in wanted)
             for register in registers:
                 check_own(drive, register)
-            return ReadPlan(registers, tuple(map(prepare, reversed(blocks(drive, registers)))))
+            return ReadPlan(wanted, registers, tuple(map(prepare, reversed(blocks(drive, registers)))))
 
         self.of = of
         self.newest = NOTHING  # the plan that was used last: found again without a look at each register

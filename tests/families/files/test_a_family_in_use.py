@@ -103,7 +103,7 @@ def test_values_are_those_of_a_class(plant: Path) -> None:
             drive[name] = value
         with Simulator([Wire([drive], port=ANY_PORT, unpaced=True)]) as line, Bus(line.wires[0].path) as bus:
             meter = bus.attach(family, address=1)
-            found.append({each.name: float(bus.read(meter, each)) for each in meter.readings()})
+            found.append({each.name: float(meter.read(each)) for each in meter.readings()})
     assert found[0] == found[1]
     assert (found[0]["voltage"], found[0]["power"], found[0]["energy"]) == (230.5, -12.3, 123456)
 
@@ -159,7 +159,7 @@ def test_a_file_that_could_move_a_motor_writes_nothing_unconfirmed(
     with Simulator([wire]) as line, Bus(wire.path) as bus:
         drive = bus.attach(pump, address=2)
         with pytest.raises(WriteForbidden, match=r"`multidrop check pump\.toml`") as refused:
-            bus.write(drive, drive.register(name), drive.register(name).parse(value))
+            drive.write(drive.register(name), drive.register(name).parse(value))
         assert refused.value.rule == "nobody has confirmed what it is"
         assert simulated_writes(line) == []
 
@@ -184,10 +184,10 @@ def test_a_confirmed_one_is_written_to(pump: type[Drive]) -> None:
     wire = Wire([simulated(pump(2))], port=ANY_PORT, unpaced=True)
     with Simulator([wire]) as line, Bus(wire.path) as bus:
         drive = bus.attach(pump, address=2, confirmed=1)
-        assert bus.write(drive, drive.register("ramp"), 5.0) == 5.0
+        assert drive.write(drive.register("ramp"), 5.0) == 5.0
         with pytest.raises(WriteForbidden, match="on commands the motor"):
-            bus.write(drive, drive.register("run"), drive.register("run").parse("on"))
-        bus.write(drive, drive.register("run"), drive.register("run").parse("off"))
+            drive.write(drive.register("run"), drive.register("run").parse("on"))
+        drive.write(drive.register("run"), drive.register("run").parse("off"))
         assert simulated_writes(line) == ["ramp", "run"]
 
 
@@ -237,7 +237,7 @@ def test_files_of_one_name_have_wear_of_their_own(plant: Path) -> None:
             Bus(line.wires[0].path, ledger=ledger) as bus,
         ):
             drive = bus.attach(family, address=2, confirmed=1)
-            bus.write(drive, drive.register("ramp"), 5.0)
+            drive.write(drive.register("ramp"), 5.0)
     assert sorted(wear.cell.model for wear in ledger.wear(0)) == [
         "pump.toml: Pump P-2",
         "pump.toml: Pump P-9",

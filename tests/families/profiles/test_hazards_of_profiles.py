@@ -310,7 +310,7 @@ def test_a_start_word_is_never_plainly_written(line: Line) -> None:
         if not line.is_start(request):
             continue
         with pytest.raises((WriteForbidden, TypeError)):
-            line.bus.bus.write(line.drive, control, control.decode(count))
+            line.drive.write(control, control.decode(count))
         if count > 0x900:
             break
     assert line.writes == []
@@ -321,8 +321,8 @@ def test_what_is_harmless_starts_nothing_at_any_time(line: Line) -> None:
     control = line.drive.control
     for before in control.harmless:
         for count in control.harmless:
-            line.bus.bus.write(line.drive, control, control.decode(before))
-            line.bus.bus.write(line.drive, control, control.decode(count))
+            line.drive.write(control, control.decode(before))
+            line.drive.write(control, control.decode(count))
             line.bus.sleep(1)
             assert not line.sim.motor.energised
 
@@ -422,7 +422,7 @@ def test_a_profidrive_is_not_started_through_an_off(name: str, monkeypatch: pyte
 def test_an_off2_in_a_run_is_told_and_not_overcome(monkeypatch: pytest.MonkeyPatch) -> None:
     line = Line(monkeypatch, "siemens-v20")
     line.runs()
-    line.bus.bus.write(line.drive, line.drive.control, line.drive.control.decode(0x047C))
+    line.drive.write(line.drive.control, line.drive.control.decode(0x047C))
     assert not line.sim.motor.energised
     assert line.drive.state().condition is Condition.STOPPED
 

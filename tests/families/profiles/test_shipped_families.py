@@ -171,7 +171,7 @@ def test_the_pump_controller_whose_map_leaves_too_much_open_is_only_read(
             call()
     assert bus.written == []
     sim["pressure"] = 2.5
-    assert bus.bus.read(drive, drive.register("pressure")) == 2.5
+    assert drive.read(drive.register("pressure")) == 2.5
     drive.perform(drive.identify.script())
     sim["minimum_frequency"] = 0
     with pytest.raises(WriteForbidden):
@@ -212,7 +212,7 @@ def test_a_motor_is_commanded_through_the_engine(name: str) -> None:
         drive.set_frequency(25)
         drive.start()
         assert sim.motor.energised
-        values = bus.read_many(drive, drive.readings())
+        values = drive.read_many(drive.readings())
         assert set(values) == {register.name for register in drive.readings()}
         drive.stop()
         assert drive.state().condition is Condition.STOPPED

@@ -55,8 +55,8 @@ class Lines(NamedTuple):
         return None  # nothing is reloaded
 
     async def ask(self, drive: str, function: int, start: int, count: int, expiry: float) -> list[int]:
-        line, known = self.plant.find_drive(drive)
-        data = await asyncio.to_thread(self.bus(line.name).ask, known, function, start, count, expiry=expiry)
+        _, known = self.plant.find_drive(drive)
+        data = await asyncio.to_thread(known.read_raw, function, start, count, expiry=expiry)
         if function < 3:
             return [data[bit // 8] >> bit % 8 & 1 for bit in range(count)]
         return list(struct.unpack(f">{count}H", data))
@@ -229,7 +229,7 @@ def direct_words(bus: Bus, drive: SimulatedDrive, register: Any) -> list[int]:
     data = b""
     while not data:
         try:
-            data = bus.ask(drive.drive, register.table.read, register.address, register.words, expiry=30)
+            data = drive.drive.read_raw(register.table.read, register.address, register.words, expiry=30)
         except BusError:
             assert monotonic() < end
     if register.table.carrier is Carrier.BIT:

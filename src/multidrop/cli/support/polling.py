@@ -257,7 +257,6 @@ class SideReader:
     def _read_all(self, chosen: LiveDrive, found: dict[str, SideRead]) -> None:
         drive = chosen.polled.drive
         polled = {poll.register.name for poll in chosen.polled.polls}
-        bus = self._poller.bus(chosen.line.name)
         for name, register in drive.registers.items():
             if not register.readable or name in polled:
                 continue
@@ -265,7 +264,7 @@ class SideReader:
                 return
             asked = time.monotonic()
             try:
-                text = value_text(register, bus.read(drive, register))
+                text = value_text(register, drive.read(register))
             except BusError as failure:
                 text = _in_words(failure)
             found[name] = SideRead(text, time.time_ns())

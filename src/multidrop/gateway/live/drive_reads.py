@@ -92,13 +92,13 @@ class SideReads:
     async def _read_in_turn(self, line: str, drive: Drive, register: str) -> None:
         begun = self._clock()
         if self._is_there(drive.name):
-            reading = partial(self._read_one, line, drive, register)
+            reading = partial(self._read_one, drive, register)
             self._found[drive.name][register] = await supervisor().within("side reads", READ_S, reading)
         await asyncio.sleep(max(PAUSE_S, SHARE * (self._clock() - begun)))
 
-    def _read_one(self, line: str, drive: Drive, register: str) -> list[Any]:
+    def _read_one(self, drive: Drive, register: str) -> list[Any]:
         try:
-            value = self._bus(line).read(drive, drive.registers[register])
+            value = drive.read(drive.registers[register])
         except NoReply:
             return [None, self._utc_ms(), UNANSWERED]
         except (BusError, ValueError) as failure:

@@ -1,0 +1,69 @@
+"""Users' scripts pass `mypy --strict`: each Python block of these pages, and the examples."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+PAGES = [ROOT / "README.md"]
+SCRIPTS = {
+    **{
+        f"{page.stem.replace('-', '_')}_{number}": block
+        for page in PAGES
+        for number, block in enumerate(re.findall(r"```python\n(.*?)```", page.read_text("utf-8"), re.DOTALL))
+    },
+    **{path.stem: path.read_text("utf-8") for path in (ROOT / "examples").glob("*.py")},
+}
+TYPES = """
+from multidrop import Bus, InnovertIBD
+
+with Bus("/dev/ttyUSB0") as bus:
+    pump = bus.attach(InnovertIBD, address=1)
+    reveal_type(pump.read(pump.output_current))
+    reveal_type(pump.read("output_current", pump.output_frequency))
+    reveal_type(pump.write(pump.acceleration_time, 20.0))
+    pump.write(pump.acceleration_time, "fast")
+    pump.red("output_current")
+"""
+FOUND = [
+    'note: Revealed type is "float"',
+    'note: Revealed type is "dict[str, Any]"',
+    'note: Revealed type is "float"',
+    'error: No overload variant of "write" of "RegisterAccess"',
+    'error: "InnovertIBD" has no attribute "red"',
+]
+
+
+def mypy(folder: Path) -> str:
+    """Return what mypy says of the scripts in a folder of a user's own."""
+    words = ["--strict", "--follow-imports=silent", "--config-file=", f"--cache-dir={folder / 'cache'}", "."]
+    done = subprocess.run(
+        [sys.executable, "-m", "mypy", *words],
+        cwd=folder,
+        env={"MYPYPATH": str(ROOT / "src")},
+        capture_output=True,
+        encoding="utf-8",
+        check=False,
+    )
+    return done.stdout + done.stderr
+
+
+def test_scripts_of_users_are_strictly_typed(tmp_path: Path) -> None:
+    pytest.importorskip("mypy")
+    for name, script in SCRIPTS.items():
+        (tmp_path / f"{name}.py").write_text(script, "utf-8")
+    found = mypy(tmp_path)
+    assert found.startswith("Success"), found
+
+
+def test_values_have_the_types_of_their_registers(tmp_path: Path) -> None:
+    pytest.importorskip("mypy")
+    (tmp_path / "script.py").write_text(TYPES, "utf-8")
+    found = mypy(tmp_path)
+    for sentence in FOUND:
+        assert sentence in found
