@@ -10,7 +10,7 @@ from multidrop.control.latches import Latches
 from multidrop.control.outcome import Outcome
 from multidrop.control.performer import Performer
 from multidrop.control.stop_all import Stopper
-from multidrop.control.time_limit import checked_expiry
+from multidrop.control.time_limit import MOST_EXPIRY_S, checked_expiry
 from multidrop.core import Latch, Message
 from multidrop.drive.family import Drive, check_own, check_own_text
 from multidrop.drive.register import Register
@@ -60,8 +60,17 @@ class BusLink:
     def write(self, drive: Drive, register: Register[Any], value: Any) -> Outcome:
         return self._performer.write(drive, register, value)
 
-    def read_raw(self, drive: Drive, function: int, start: int, count: int, expiry: float) -> bytes:
-        return self._exchanges.ask(drive, function, start, count, checked_expiry(expiry, "a read"))
+    def read_raw(
+        self,
+        drive: Drive,
+        function: int,
+        start: int,
+        count: int,
+        expiry: float = MOST_EXPIRY_S,
+        attempts: int = 1,
+    ) -> bytes:
+        checked_expiry(expiry, "a read")
+        return self._exchanges.ask(drive, function, start, count, expiry, attempts)
 
     def send_raw(self, drive: Drive, function: int, start: int, data: bytes, count: int) -> bytes:
         if not isinstance(data, bytes | bytearray):

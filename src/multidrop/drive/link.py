@@ -28,7 +28,9 @@ class Link(Protocol):
 
     def text(self, drive: Any, text: Text) -> str: ...
     def write(self, drive: Any, register: Register[Any], value: Any) -> Any: ...
-    def read_raw(self, drive: Any, function: int, start: int, count: int, expiry: float) -> bytes: ...
+    def read_raw(
+        self, drive: Any, function: int, start: int, count: int, expiry: float = ..., attempts: int = ...
+    ) -> bytes: ...
     def send_raw(self, drive: Any, function: int, start: int, data: bytes, count: int) -> bytes: ...
 
 
@@ -44,7 +46,9 @@ class NoLink:
     def write(self, drive: Any, register: Register[Any], value: Any) -> NoReturn:
         raise not_attached(drive)
 
-    def read_raw(self, drive: Any, function: int, start: int, count: int, expiry: float) -> NoReturn:
+    def read_raw(
+        self, drive: Any, function: int, start: int, count: int, expiry: float = 0.0, attempts: int = 1
+    ) -> NoReturn:
         raise not_attached(drive)
 
     def send_raw(self, drive: Any, function: int, start: int, data: bytes, count: int) -> NoReturn:

@@ -317,8 +317,13 @@ class Exchanges:
             raise no_value(drive, found)
         return found[register.name]
 
-    def ask(self, drive: Drive, function: int, start: int, count: int, expiry: float) -> bytes:
-        """Return the data of the reply to any read, sent once, and begun within `expiry` seconds."""
+    def ask(
+        self, drive: Drive, function: int, start: int, count: int, expiry: float, attempts: int = 1
+    ) -> bytes:
+        """Return the data of the reply to any read, sent up to `attempts` times.
+
+        Raises Expired if the first one cannot be sent within `expiry` seconds.
+        """
         request = any_read(drive, function, start, count)
         expires_ns = clock.boottime_ns() + round(expiry * 1e9)
         asked = make_exchange(drive, request, self.peer(drive), NO_ROWS)
@@ -326,6 +331,8 @@ class Exchanges:
         is_late = completion.result == Failure.LATE_ANSWER_DUE and clock.boottime_ns() >= expires_ns
         if is_late or completion.result == Failure.EXPIRED:
             raise Expired(drive.name, f"a read of {count} from {start} by function {function:02X}H", expiry)
+        if attempts > 1:
+            completion = self._good(drive, asked, attempts, completion)
         self._note_answer(drive, completion)
         if completion.raw == build_request(drive.framing, request) and not self.line.has_echo:
             raise BadReply(drive.name, "the reply is a copy of the request, as an echo is", completion.raw)

@@ -1,0 +1,214 @@
+"""ModbusDevice: any Modbus device, read and written by addresses alone."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from fractions import Fraction
+from typing import Literal
+
+from multidrop.core import Framing, NumberFormat
+from multidrop.drive import Drive
+from multidrop.drive.number_format import FLOATS, ORDERS, WORDS, Coding
+from multidrop.drive.request import function_limit
+from multidrop.errors import (
+    Advice,
+    BadReply,
+    DriveException,
+    LineError,
+    NoReply,
+    NotVerified,
+    NoValue,
+    Unconfirmed,
+    WriteForbidden,
+)
+
+Format = Literal["U16", "I16", "I8", "U32", "I32", "U64", "I64", "F16", "F32", "F64", "BCD16", "BCD32"]
+Order = Literal["AB", "BA", "ABCD", "CDAB", "BADC", "DCBA"]
+
+_FORMATS = {each.name: each for each in WORDS if each is not NumberFormat.U32_EITHER}
+_MOST_WORDS, _MOST_COILS = 123, 1968  # of one write (application protocol V1.1b3, 6.11 and 6.12)
+_CONFIRM = "pass confirm=True"
+
+
+class ModbusDevice(Drive):
+    """A Modbus device without a declared family: its tables are read and written by address.
+
+    Addresses are those on the wire, from 0. Numbers have the formats of family files, "U16" to "F64", and the
+    orders of bytes "ABCD", "CDAB", "BADC" and "DCBA". Reads and writes follow the same rules as those of a
+    family: silence, retries, proofs against late replies, and the audit log. A write needs
+    `confirm=True`, because it may start a motor.
+    """
+
+    title = "Modbus device"
+    framings = (Framing.RTU, Framing.ASCII)
+    addresses = range(256)
+    response_timeout = 1.0
+
+    def read_holding(
+        self, start: int, count: int = 1, format: Format = "U16", *, order: Order = "ABCD"
+    ) -> list[float]:
+        """Return `count` numbers from the holding registers that begin at `start`.
+
+        Raises NoReply, BadReply, DriveException or LineError if the read fails, and NoValue if a number is a
+        NaN or no decimal number.
+        """
+        return self._numbers(3, "holding register", start, count, format, order)
+
+    def read_input(
+        self, start: int, count: int = 1, format: Format = "U16", *, order: Order = "ABCD"
+    ) -> list[float]:
+        """Return `count` numbers from the input registers that begin at `start`; raises as `read_holding`."""
+        return self._numbers(4, "input register", start, count, format, order)
+
+    def read_coils(self, start: int, count: int = 1) -> list[bool]:
+        """Return `count` coils from `start`; raises as `read_holding`."""
+        return self._bits(1, start, count)
+
+    def read_discrete(self, start: int, count: int = 1) -> list[bool]:
+        """Return `count` discrete inputs from `start`; raises as `read_holding`."""
+        return self._bits(2, start, count)
+
+    def write_holding(
+        self,
+        start: int,
+        values: Sequence[float],
+        format: Format = "U16",
+        *,
+        order: Order = "ABCD",
+        confirm: bool = False,
+    ) -> list[float]:
+        """Write numbers to the holding registers from `start`; return the numbers that the device then holds.
+
+        One register is written by function 6, several by function 16. They are read back; registers that
+        cannot be read are returned as written. Raises WriteForbidden without `confirm=True`,
+        ValueError for a number that does not fit, NotVerified if the device holds other numbers, and
+        Unconfirmed if the write may have happened.
+        """
+        coding = _coding(format, order)
+        data = b"".join(coding.pack(_raw(value, format, coding)) for value in values)
+        words = len(data) // 2
+        what = (
+            f"holding registers {start} to {start + words - 1}" if words > 1 else f"holding register {start}"
+        )
+        self._check_write(what, words, _MOST_WORDS, confirm)
+        if words == 1:
+            self.send_raw(6, start, data)
+        else:
+            self.send_raw(16, start, data, count=words)
+        held = self._read_back(what, 3, start, words, data)
+        found = list(_decoded(held, coding, len(values)))
+        if held != data:
+            raise NotVerified(self.name, what, f"the device holds {found}")
+        return [float("nan") if number is None else number for number in found]
+
+    def write_coils(self, start: int, values: Sequence[bool], *, confirm: bool = False) -> list[bool]:
+        """Write coils from `start`, and return what the device then holds; raises as `write_holding`.
+
+        One coil is written by function 5, several by function 15.
+        """
+        for value in values:
+            if value not in (True, False):
+                raise TypeError(f"a coil is True or False, not {value!r}")
+        count = len(values)
+        what = _named("coil", start, count)
+        self._check_write(what, count, _MOST_COILS, confirm)
+        bits = sum(bool(value) << at for at, value in enumerate(values)).to_bytes((count + 7) // 8, "little")
+        if count == 1:
+            self.send_raw(5, start, b"\xff\x00" if values[0] else b"\x00\x00")
+        else:
+            self.send_raw(15, start, bits, count=count)
+        held = [*_bits_of(self._read_back(what, 1, start, count, bits), count)]
+        if held != [bool(value) for value in values]:
+            raise NotVerified(self.name, what, f"the device holds {held}")
+        return held
+
+    # ---- requests ----
+
+    def _numbers(
+        self, function: int, what: str, start: int, count: int, format: Format, order: Order
+    ) -> list[float]:
+        coding = _coding(format, order)
+        words = WORDS[coding.number_format]
+        most = max(1, function_limit(self, function) // words)
+        found: list[float | None] = []
+        for at, part in _parts(start, count, most, words):
+            found += _decoded(self.link.read_raw(self, function, at, part * words, attempts=3), coding, part)
+        for number, value in enumerate(found):
+            if value is None:
+                held = {f"{what} {start + i * words}": one for i, one in enumerate(found) if one is not None}
+                raise NoValue(self.name, f"{what} {start + number * words}", held)
+        return [value for value in found if value is not None]
+
+    def _bits(self, function: int, start: int, count: int) -> list[bool]:
+        found: list[bool] = []
+        for at, part in _parts(start, count, function_limit(self, function), 1):
+            found += _bits_of(self.link.read_raw(self, function, at, part, attempts=3), part)
+        return found
+
+    def _check_write(self, what: str, count: int, most: int, confirm: bool) -> None:
+        if not 1 <= count <= most:
+            raise ValueError(f"one write takes 1 to {most} registers or coils, not {count}")
+        if confirm is not True:
+            raise WriteForbidden(
+                f"{what} of {self.name} is not written: this device is unknown, and a write may start a "
+                f"motor. If it cannot, {_CONFIRM}",
+                rule="an unknown device is not written to",
+                advice=Advice(_CONFIRM, "declare its family"),
+            )
+
+    def _read_back(self, what: str, function: int, start: int, count: int, written: bytes) -> bytes:
+        """Return the data that the device holds after a write.
+
+        Only this read shows that an adapter's echo was not taken for the device's confirmation.
+        """
+        try:
+            return self.link.read_raw(self, function, start, count, attempts=3)
+        except DriveException:  # it is there, and does not let these be read
+            return written
+        except (NoReply, BadReply, LineError) as failure:
+            raise Unconfirmed(self.name, what, f"it could not be read back: {failure}") from failure
+
+
+def _named(kind: str, start: int, count: int) -> str:
+    return f"{kind}s {start} to {start + count - 1}" if count > 1 else f"{kind} {start}"
+
+
+def _parts(start: int, count: int, most: int, words: int) -> Iterator[tuple[int, int]]:
+    """Yield address and count of each request that reads part of the numbers."""
+    if isinstance(count, bool) or not isinstance(count, int) or count < 1:
+        raise ValueError(f"count = {count!r} is not 1 or more")
+    for done in range(0, count, most):
+        yield start + done * words, min(most, count - done)
+
+
+def _coding(format: str, order: str) -> Coding:
+    if format not in _FORMATS:
+        raise ValueError(f"format = {format!r} is not one of {', '.join(_FORMATS)}")
+    if order not in ORDERS:
+        raise ValueError(f"order = {order!r} is not one of {', '.join(ORDERS)}")
+    return Coding(_FORMATS[format], order)
+
+
+def _raw(value: float, format: str, coding: Coding) -> float:
+    """Return the number that goes over the wire. Raises TypeError or ValueError."""
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        raise TypeError(f"{value!r} is not a number")
+    if not abs(value) < float("inf"):
+        raise ValueError(f"{value!r} is not a finite number")
+    least, most = coding.raw_span
+    if not least <= Fraction(value) <= most:
+        raise ValueError(f"{value:g} does not fit into {format}: {float(least):g} to {float(most):g}")
+    if coding.number_format not in FLOATS and value != int(value):
+        raise ValueError(f"{value:g} is not a whole number, which {format} holds")
+    return coding.count_of(value)
+
+
+def _decoded(data: bytes, coding: Coding, count: int) -> Iterator[float | None]:
+    words = WORDS[coding.number_format]
+    for at in range(0, count * words, words):
+        raw = coding.raw_in(data, at)
+        yield raw if raw is None or coding.number_format in FLOATS else int(raw)
+
+
+def _bits_of(data: bytes, count: int) -> Iterator[bool]:
+    return (bool(data[bit // 8] >> bit % 8 & 1) for bit in range(count))
