@@ -14,6 +14,7 @@ import logging
 import sys
 import traceback
 from collections.abc import Callable, Mapping, Sequence
+from importlib.metadata import entry_points
 from pathlib import Path
 from threading import RLock
 from types import ModuleType
@@ -21,6 +22,7 @@ from types import ModuleType
 from multidrop.drive import Drive
 from multidrop.families import MODELS
 
+GROUP = "multidrop.families"  # of entry points of other packages; a built-in name goes before theirs
 _SHIPPED = Path(__file__).parent / "shipped"
 SHIPPED = tuple(sorted(path.stem for path in _SHIPPED.glob("*.toml")))  # each is read when it is asked for
 
@@ -44,15 +46,42 @@ def find_model(text: str, relative_to: Path | None = None) -> type[Drive]:
         return shipped_family(text)
     if text.endswith(".toml"):
         return _family_of((relative_to or Path()) / text)
+    if found := installed_family(text):
+        return found
     path, colon, name = text.rpartition(":")
     if not colon and text.endswith(".py"):
         path = text
     if not path.endswith(".py"):
-        known = (*MODELS, *SHIPPED)
+        known = (*MODELS, *SHIPPED, *(point.name for point in entry_points(group=GROUP)))
         near = difflib.get_close_matches(text.lower(), known, n=2)
         hint = f"did you mean {' or '.join(near)}?" if near else f"there are {', '.join(known)}"
         raise ValueError(f"there is no model {text!r}; {hint} (or write path/to/file.toml or file.py:Class)")
     return _drive(_load((relative_to or Path()) / path), path, name if colon else "")
+
+
+def installed_family(name: str) -> type[Drive] | None:
+    """Return the family of this name in another installed package, by its entry point in GROUP; None: none.
+
+    Raises ValueError if two packages have it, or if it cannot be loaded.
+    """
+    points = [*entry_points(group=GROUP, name=name)]
+    if not points:
+        return None
+    packages = [point.dist.name if point.dist else point.value for point in points]
+    if len(points) > 1:
+        raise ValueError(
+            f"model {name!r} is in several packages, {' and '.join(packages)}: uninstall all but one"
+        )
+    try:
+        found = points[0].load()
+    except Exception as failure:  # it is another package's code, and may raise anything
+        why = f"{type(failure).__name__}: {failure}"
+        raise ValueError(f"model {name!r} of package {packages[0]} cannot be loaded: {why}") from failure
+    if not (isinstance(found, type) and issubclass(found, Drive) and found.registers):
+        raise ValueError(
+            f"model {name!r} of package {packages[0]} is not a subclass of multidrop.Drive with registers"
+        )
+    return found
 
 
 def is_users_own(family: type[Drive]) -> bool:
