@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from inspect import signature
+from inspect import Signature, signature
 from numbers import Real
 from typing import TYPE_CHECKING, Any, Concatenate, Generic, ParamSpec, Protocol, TypeVar, cast, overload
 
@@ -77,6 +77,12 @@ class _BoundVerb(Generic[P, R]):
         self.name = name
         self.drive = drive
         self._script = script
+        self.__doc__ = script.__doc__
+
+    @property
+    def __signature__(self) -> Signature:
+        whole = signature(self._script)
+        return whole.replace(parameters=[*whole.parameters.values()][1:], return_annotation=Signature.empty)
 
     @overload
     def __call__(self, *args: P.args, **kwargs: P.kwargs) -> R: ...
@@ -160,7 +166,17 @@ class Verb(Generic[P, R]):
     def __init__(self, script: Callable[Concatenate[Any, P], Script[R]]) -> None:
         self._script = script
         self.__doc__ = script.__doc__
-        self.name = script.__name__
+        self.__module__ = script.__module__
+        self.__qualname__ = script.__qualname__
+        self.name = self.__name__ = script.__name__
+
+    @property
+    def __signature__(self) -> Signature:
+        return signature(self._script).replace(return_annotation=Signature.empty)
+
+    def __call__(self, drive: Drive, *args: P.args, **kwargs: P.kwargs) -> R:
+        """Carry it out on a drive: `YD1000.start(pump)` is `pump.start()`."""
+        return self.__get__(drive, type(drive))(*args, **kwargs)
 
     @overload
     def __get__(self, drive: None, owner: type) -> Verb[P, R]: ...
