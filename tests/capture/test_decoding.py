@@ -101,7 +101,9 @@ def test_a_request_without_a_reply_is_a_miss_with_its_reason(tmp_path: Path) -> 
         capture.write(exchange.frame[:-1] + b"\0", Side.ANSWERING, 3, "hall-1")
         capture.write(exchange.request_frame, Side.ASKING, 4, "hall-1")
         capture.write(exchange.frame, Side.ANSWERING, 6, "hall-1")
-    assert [(row.time, row.uncertainty_ns, row.value, row.status) for row in rows(tmp_path / "a.pcapng")] == [
+    assert [
+        (row.time_ns, row.uncertainty_ns, row.value, row.status) for row in rows(tmp_path / "a.pcapng")
+    ] == [
         (1, None, None, "no reply"),
         (2, None, None, "bad checksum"),
         (4, 2, 5000, "ok"),
@@ -183,5 +185,5 @@ def test_more_rows_than_a_batch_can_hold_are_more_batches(
     with Capture(path) as capture:
         batches = list(Decoding(capture))
     assert [len(batch) for batch in batches] == [65_500, 4_500]
-    found = [(row.time, row.register, row.value, row.status) for batch in batches for row in batch]
+    found = [(row.time_ns, row.register, row.value, row.status) for batch in batches for row in batch]
     assert found == [(2 * n, f"holding_register_{at}", *end) for n in range(700) for at in range(100)]

@@ -111,7 +111,7 @@ def by_exchange(rows: list[Row]) -> dict[int, list[tuple[object, ...]]]:
     for row in rows:
         if row.status not in NEVER_ON_THE_LINE:
             what = (row.drive, row.register, row.value, row.status, row.uncertainty_ns)
-            found.setdefault(row.time, []).append(what)
+            found.setdefault(row.time_ns, []).append(what)
     return {time: sorted(found[time], key=str) for time in found}
 
 
@@ -179,7 +179,7 @@ def test_wireshark_reads_what_was_recorded(mixed: Mixed) -> None:
             or register.number_format is not NumberFormat.U16
         ):
             continue
-        number, asked = by_time[epoch(row.time)]
+        number, asked = by_time[epoch(row.time_ns)]
         answered = replies[str(number)]
         for packet in (asked, answered):
             assert packet["frame.interface_name"] == "hall-1"
@@ -188,7 +188,7 @@ def test_wireshark_reads_what_was_recorded(mixed: Mixed) -> None:
             assert packet["mbrtu.crc16.status"] == "1"
         assert int(asked["frame.packet_flags_direction"], 0) == 2
         assert int(answered["frame.packet_flags_direction"], 0) == 1
-        assert answered["frame.time_epoch"] == epoch(row.time + (row.uncertainty_ns or 0))
+        assert answered["frame.time_epoch"] == epoch(row.time_ns + (row.uncertainty_ns or 0))
         (first,), (count,) = decimal(asked["modbus.reference_num"]), decimal(asked["modbus.word_cnt"])
         words = decimal(answered["modbus.regval_uint16"])
         assert len(words) == count

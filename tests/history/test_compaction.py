@@ -17,7 +17,7 @@ from examples import usually
 from histories import DAY, METADATA, NOON, SECOND, check_buckets, random_rows, record, rows_in
 from kills import BoundProcess
 
-from multidrop import read
+from multidrop import open_recording
 from multidrop.history import compact as compact_module
 from multidrop.history import database
 from multidrop.history.compact import compact, main
@@ -58,11 +58,11 @@ def test_a_parquet_file_has_the_rows_of_its_segment_by_drive_and_time(tmp_path: 
     compact(tmp_path, 2)
     (file,) = parquet_files(tmp_path / "rows")
     assert [path.name for path in tmp_path.glob("*.arrows")] == ["rows.00000002.arrows"]
-    recording = read(file.path)  # by pyarrow: it is a recording like any
+    recording = open_recording(file.path)  # by pyarrow: it is a recording like any
     assert recording.metadata == METADATA
     found = [row for batch in recording for row in batch]
-    assert found == sorted(rows, key=lambda row: (row.drive, row.time))
-    assert file.begin * SECOND <= rows[0].time <= rows[-1].time <= file.end * SECOND
+    assert found == sorted(rows, key=lambda row: (row.drive, row.time_ns))
+    assert file.begin * SECOND <= rows[0].time_ns <= rows[-1].time_ns <= file.end * SECOND
 
 
 @pytest.mark.slow
@@ -75,7 +75,7 @@ def test_tens_are_what_plain_python_reckons(tmp_path: Path) -> None:
     found = {tuple(row[:3]): row[3:] for row in duckdb.sql(query).fetchall()}
     expected: dict[tuple[object, ...], list[Row]] = {}
     for row in rows:
-        key = row.time // (10 * SECOND) * 10 * SECOND, row.drive, row.register
+        key = row.time_ns // (10 * SECOND) * 10 * SECOND, row.drive, row.register
         expected.setdefault(key, []).append(row)
     assert found.keys() == expected.keys()
     for key, some in expected.items():
@@ -241,7 +241,7 @@ def test_a_damaged_segment_is_read_as_far_as_it_can_be_and_kept(
 def _readable(path: Path) -> list[Row]:
     found: list[Row] = []
     try:
-        for batch in read(path):
+        for batch in open_recording(path):
             found += batch
     except ValueError:
         pass

@@ -20,7 +20,7 @@ from multidrop.gateway import historian
 from multidrop.gateway.historian import MOST_BUCKETS, HistorySettings, as_json, build
 from multidrop.gateway.http.exports import Exports
 from multidrop.history import Buckets
-from multidrop.recording import open_reader
+from multidrop.recording import open_recording
 
 MS = 1_000_000
 
@@ -138,7 +138,7 @@ def test_it_records_and_answers(tmp_path: Path) -> None:
         for kind in ("csv", "parquet"):
             path = tmp_path / f"got.{kind}"
             path.write_bytes(b"".join(part.export(["pump-1.speed"], begin, end, kind)))
-            assert [row for rows in open_reader(path) for row in rows] == list(taken)
+            assert [row for rows in open_recording(path) for row in rows] == list(taken)
         with pytest.raises(ValueError, match="is no series"):
             part.export(["pump"], begin, end, "csv")
         with pytest.raises(ValueError, match="neither csv nor parquet"):

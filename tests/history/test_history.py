@@ -22,7 +22,7 @@ from multidrop.history.compact import compact
 from multidrop.history.database import Database
 from multidrop.history.sources import Replaced, Sources
 from multidrop.polling.batch import Row
-from multidrop.recording import open_reader
+from multidrop.recording import open_recording
 from multidrop.recording.rows import from_rows
 from multidrop.recording.segments import SegmentWriter
 
@@ -69,7 +69,7 @@ def test_all_rows_in_the_order_of_recording(folder: Path, rows: list[list[Row]])
 @COMPACTED
 def test_a_series_in_a_range(folder: Path, rows: list[list[Row]]) -> None:
     dice = random.Random(5)
-    times = [row.time for row in flat(rows)]
+    times = [row.time_ns for row in flat(rows)]
     with History(folder) as history:
         for _ in range(examples(30)):
             begin, end = sorted(dice.sample(times, 2))
@@ -77,7 +77,7 @@ def test_a_series_in_a_range(folder: Path, rows: list[list[Row]]) -> None:
             wanted = [
                 row
                 for row in flat(rows)
-                if begin <= row.time < end and f"{row.drive}.{row.register}" in names
+                if begin <= row.time_ns < end and f"{row.drive}.{row.register}" in names
             ]
             assert rows_in(history, names, begin, end) == wanted
 
@@ -86,7 +86,7 @@ def test_a_series_in_a_range(folder: Path, rows: list[list[Row]]) -> None:
 @COMPACTED
 def test_buckets_are_what_plain_python_reckons(folder: Path, rows: list[list[Row]]) -> None:
     dice = random.Random(6)
-    times = [row.time for row in flat(rows)]
+    times = [row.time_ns for row in flat(rows)]
     with History(folder) as history:
         for _ in range(examples(30)):
             begin, end = sorted(dice.sample(times, 2))
@@ -117,12 +117,12 @@ def test_gaps_are_gaps(folder: Path) -> None:
 @COMPACTED
 def test_an_export_is_what_is_read(folder: Path, rows: list[list[Row]]) -> None:
     begin, end = NOON + 20 * SECOND, NOON + 320 * SECOND
-    wanted = [row for row in flat(rows) if begin <= row.time < end and row.drive == "pump-1"]
+    wanted = [row for row in flat(rows) if begin <= row.time_ns < end and row.drive == "pump-1"]
     names = ["pump-1.speed", "pump-1.current"]
     with History(folder) as history:
         for name in ("a.csv", "a.arrows", "a.parquet"):
             assert history.export(folder / name, names, begin, end) == len(wanted)
-            reader = open_reader(folder / name)
+            reader = open_recording(folder / name)
             assert sorted(row for batch in reader for row in batch) == sorted(wanted)
             assert reader.metadata == METADATA
             with pytest.raises(ValueError, match="is there already"):
@@ -132,8 +132,8 @@ def test_an_export_is_what_is_read(folder: Path, rows: list[list[Row]]) -> None:
     assert b"".join(line + b"\n" for line, _, _ in without) == (folder / "a.csv").read_bytes()
     assert {unit for _, _, unit in without} == {b"unit", b"rpm", b""}
     (folder / "units.csv").write_bytes(text)
-    assert [row for batch in open_reader(folder / "units.csv") for row in batch] == [
-        row for batch in open_reader(folder / "a.csv") for row in batch
+    assert [row for batch in open_recording(folder / "units.csv") for row in batch] == [
+        row for batch in open_recording(folder / "a.csv") for row in batch
     ]
 
 
@@ -153,7 +153,7 @@ def test_moments(tmp_path: Path) -> None:
     record(tmp_path, [rows])
     moment = datetime(2026, 11, 21, 12, 0, 20, tzinfo=UTC)
     with History(tmp_path) as history:
-        wanted = [row for row in rows if row.time >= NOON + 20 * SECOND]
+        wanted = [row for row in rows if row.time_ns >= NOON + 20 * SECOND]
         assert rows_in(history, None, moment) == wanted
         assert rows_in(history, None, moment.astimezone(timezone(timedelta(hours=3)))) == wanted
         with pytest.raises(ValueError, match="has no time zone"):

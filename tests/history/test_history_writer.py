@@ -13,7 +13,8 @@ import pytest
 from disks import full_at, read_only_directory
 from histories import DAY, METADATA, NOON, SECOND, batch, random_rows, record, rows_in
 
-from multidrop import History, Poller, Seen, load_plant
+from multidrop import History, Plant, Poller
+from multidrop.control import Seen
 from multidrop.core.columns import Names
 from multidrop.families import InnovertIBD
 from multidrop.history import HistoryWriter
@@ -178,7 +179,7 @@ def test_polling_and_stops_go_on_beside_a_full_disk(
             f'[[line]]\nname = "hall"\nport = "{line.wires[0].path}"\n[[line.drive]]\nname = "pump-1"\n'
             'model = "innovert-ibd"\naddress = 1\npoll = ["output_current"]\n'
         )
-        with full_at(10), Poller(load_plant(tmp_path / "plant.toml")) as poller:
+        with full_at(10), Poller(Plant.load(tmp_path / "plant.toml")) as poller:
             poller.on_batch(writer.take, every=0.02)
             until(lambda: writer.state().dropped > 20)
             stopped = poller.bus("hall").stop_all()["pump-1"]

@@ -173,7 +173,7 @@ def test_two_units_are_no_column(tmp_path: Path, how: str) -> None:
             if kind == "parquet":
                 pytest.importorskip("duckdb", reason="needs duckdb")
             history.export(path, [SERIES, OTHER], end=NOON + 300 * SECOND)
-            found = multidrop.read(path)
+            found = multidrop.open_recording(path)
             assert columns_of(found) == PARTED
             if kind != "csv":
                 assert found.metadata["drives"]["pump-1"]["registers"]["load [A]"]["unit"] == "A"

@@ -25,7 +25,7 @@ from lines import until
 
 from multidrop.control.audit_log import read_audit
 from multidrop.polling.batch import Row
-from multidrop.recording import open_reader
+from multidrop.recording import open_recording
 from multidrop.sim import SimulatedDrive, Simulator, Wire
 from multidrop.sim.memory import MemoryCell
 
@@ -124,7 +124,7 @@ def check_recordings(directory: Path, life: str, acknowledged: int | None) -> in
         path = directory / f"{life}{suffix}"
         if acknowledged is None and (not path.exists() or not path.stat().st_size):
             continue  # killed before it had begun the recording
-        reader = open_reader(path)
+        reader = open_recording(path)
         assert reader.metadata == METADATA
         rows = [row for batch in reader for row in batch]
         assert len(rows) >= (acknowledged or 0)

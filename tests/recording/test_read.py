@@ -1,7 +1,8 @@
-"""`multidrop.read`: a recording of any format as a table, whole or damaged."""
+"""`multidrop.open_recording`: a recording of any format as a table, whole or damaged."""
 
 from __future__ import annotations
 
+import re
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -12,8 +13,8 @@ from recordings import ABOUT, SCHEMA, record, recorded, row, rows_of
 from toy import Toy
 
 import multidrop
-from multidrop.drive.script import Read
-from multidrop.drive.text import text
+from multidrop import steps
+from multidrop.drive.script import Read, Wait
 from multidrop.polling.batch import Row
 from multidrop.recording import FORMATS, open_writer
 
@@ -32,22 +33,22 @@ def path(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
 
 @pytest.mark.slow
 def test_every_format_is_read_as_the_same_table(path: Path) -> None:
-    found = multidrop.read(path)
+    found = multidrop.open_recording(path)
     assert found.metadata == METADATA
     table = pa.table(found)
     assert table.schema.equals(SCHEMA)
     assert rows_of(table) == [*EXAMPLE, *counting(3000)]
-    assert [each for rows in multidrop.read(str(path)) for each in rows] == rows_of(table)
+    assert [each for rows in multidrop.open_recording(str(path)) for each in rows] == rows_of(table)
 
 
 @pytest.mark.slow
 def test_pandas_and_polars_get_times_with_their_type(path: Path) -> None:
     pytest.importorskip("pandas", reason="needs pandas")
     polars = pytest.importorskip("polars", reason="needs polars")
-    found = multidrop.read(path)
+    found = multidrop.open_recording(path)
     frame = found.to_pandas()
     assert str(frame["time"].dtype) == "datetime64[ns, UTC]"
-    assert [time.value for time in frame["time"]] == [each.time for each in recorded(path)]
+    assert [time.value for time in frame["time"]] == [each.time_ns for each in recorded(path)]
     other = found.to_polars()
     assert other.schema["time"] == polars.Datetime("ns", "UTC")
     assert [Row(*each) for each in other.with_columns(other["time"].to_physical()).iter_rows()] == recorded(
@@ -57,9 +58,11 @@ def test_pandas_and_polars_get_times_with_their_type(path: Path) -> None:
 
 @pytest.mark.slow
 def test_the_wide_form_joins_what_is_in_several_batches(path: Path) -> None:
-    wide = multidrop.read(path).wide("pump-1.output_frequency", "pump-1.motor_speed")
+    wide = multidrop.open_recording(path).wide("pump-1.output_frequency", "pump-1.motor_speed")
     table = pa.table(wide).drop(["time"]).to_pydict()
-    expected = {(each.time, each.register): each.value for each in recorded(path) if each.drive == "pump-1"}
+    expected = {
+        (each.time_ns, each.register): each.value for each in recorded(path) if each.drive == "pump-1"
+    }
     times = pa.table(wide).column("time").cast(pa.int64()).to_pylist()
     assert len(times) == len({time for time, _ in expected})
     for number, time in enumerate(times):
@@ -69,10 +72,10 @@ def test_the_wide_form_joins_what_is_in_several_batches(path: Path) -> None:
 
 def test_columns_that_are_in_the_metadata_may_have_no_row(tmp_path: Path) -> None:
     path = record(tmp_path / "run.arrows", [row(1, "pump", "output_frequency", 50.0)], ABOUT)
-    wide = multidrop.read(path).wide("fan.output_current", PUMP)
+    wide = multidrop.open_recording(path).wide("fan.output_current", PUMP)
     assert pa.table(wide).column("fan.output_current").to_pylist() == [None]
     with pytest.raises(ValueError, match=r"no column 'fan\.output_curent'; did you mean fan\.output_cu"):
-        multidrop.read(path).wide("fan.output_curent")
+        multidrop.open_recording(path).wide("fan.output_curent")
 
 
 @pytest.mark.parametrize(
@@ -80,7 +83,7 @@ def test_columns_that_are_in_the_metadata_may_have_no_row(tmp_path: Path) -> Non
 )
 def test_metadata_of_any_kind_harms_nothing(tmp_path: Path, about: dict[str, object]) -> None:
     path = record(tmp_path / "run.csv", [row(1, "pump", "output_frequency", 50.0)], about)
-    assert pa.table(multidrop.read(path).wide(PUMP)).column(PUMP).to_pylist() == [50.0]
+    assert pa.table(multidrop.open_recording(path).wide(PUMP)).column(PUMP).to_pylist() == [50.0]
 
 
 @pytest.mark.parametrize("suffix", [".arrows", ".csv"])
@@ -88,7 +91,7 @@ def test_a_truncated_end_is_left_out_and_counted(tmp_path: Path, suffix: str) ->
     path = record(tmp_path / f"run{suffix}", [row(at, "pump", "output_frequency", 50.0) for at in range(40)])
     whole = recorded(path)
     path.write_bytes(path.read_bytes()[:-5])
-    found = multidrop.read(path)
+    found = multidrop.open_recording(path)
     assert found.truncated > 0
     kept = rows_of(pa.table(found))
     assert kept == whole[: len(kept)]
@@ -103,26 +106,35 @@ def test_a_damaged_recording_is_told_as_its_reader_does(tmp_path: Path) -> None:
         if find_spec(library) is None:
             continue
         with pytest.raises(ValueError, match=r"run\.csv, line 2: not a row of a recording"):
-            getattr(multidrop.read(path), take)()
-
-
-def test_a_text_is_a_script_s_step_as_a_register_is() -> None:
-    serial = text(0xFC00, 8)
-    assert next(multidrop.read(serial)) == Read(serial)
-    assert next(multidrop.read(Toy.output_current)) == Read(Toy.output_current)
+            getattr(multidrop.open_recording(path), take)()
 
 
 def test_what_is_no_recording_is_told(tmp_path: Path) -> None:
     (tmp_path / "run.txt").write_text("")
     with pytest.raises(ValueError, match=r"a recording's name ends in \.arrows, \.csv, \.parquet"):
-        multidrop.read(tmp_path / "run.txt")
+        multidrop.open_recording(tmp_path / "run.txt")
     with pytest.raises(FileNotFoundError):
-        multidrop.read(tmp_path / "none.arrows")
-    with pytest.raises(TypeError, match=r"read takes a recording such as 'run\.arrows', or in a script"):
-        multidrop.read(3)  # type: ignore[call-overload]
+        multidrop.open_recording(tmp_path / "none.arrows")
+    with pytest.raises(TypeError, match=r"open_recording takes a file such as"):
+        multidrop.open_recording(3)  # type: ignore[arg-type]
 
 
-def test_a_script_s_read_is_still_the_step() -> None:
-    register = Toy.registers["output_current"]
-    step = next(multidrop.read(register))
-    assert step == next(multidrop.drive.read(register))
+def test_steps_of_a_script_are_in_a_module_of_their_own() -> None:
+    assert next(steps.read(Toy.output_current)) == Read(Toy.output_current)
+    assert next(steps.wait(2.0)) == Wait(2.0)
+
+
+def test_a_writer_replaces_a_recording_only_when_asked(path: Path) -> None:
+    with pytest.raises(FileExistsError, match=r"is there already: name another file, or remove it first"):
+        open_writer(path, METADATA)
+    with open_writer(path, {"second": True}, overwrite=True):
+        pass
+    found = multidrop.open_recording(path)
+    assert found.metadata == {"second": True}
+    assert sum(map(len, found)) == 0
+
+
+def test_a_recording_shows_its_rows_drives_and_span(tmp_path: Path) -> None:
+    about = r"^<recording .*run\.csv: 4 rows of 2 drives, 3\.000 s from .*>$"
+    path = record(tmp_path / "run.csv", [row(at, f"pump-{at % 2}", "speed", 1.0) for at in range(4)])
+    assert re.match(about, repr(multidrop.open_recording(path)))

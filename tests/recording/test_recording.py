@@ -31,7 +31,7 @@ from multidrop.recording import (
     RecordingReader,
     RecordingWriter,
     convert,
-    open_reader,
+    open_recording,
     open_writer,
     parquet,
     repair,
@@ -59,7 +59,7 @@ def rows(reader: RecordingReader) -> list[Row]:
 
 @every_format
 def test_what_is_written_is_read(tmp_path: Path, suffix: str) -> None:
-    reader = open_reader(record(tmp_path / f"a{suffix}"))
+    reader = open_recording(record(tmp_path / f"a{suffix}"))
     assert reader.metadata == METADATA
     assert reader.truncated == 0
     assert rows(reader) == RECORDED
@@ -70,16 +70,16 @@ def test_what_is_written_is_read(tmp_path: Path, suffix: str) -> None:
 def test_empty_recording(tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"a{suffix}"
     open_writer(path, {}).close()
-    assert rows(open_reader(path)) == []
+    assert rows(open_recording(path)) == []
     path = tmp_path / f"b{suffix}"
     with open_writer(path, {}) as writer:
         writer.write(counting(0))
-    assert rows(open_reader(path)) == []
+    assert rows(open_recording(path)) == []
 
 
 @every_format
 def test_batches_that_are_read_are_arrow_too(tmp_path: Path, suffix: str) -> None:
-    found = [pa.record_batch(batch) for batch in open_reader(record(tmp_path / f"a{suffix}"))]
+    found = [pa.record_batch(batch) for batch in open_recording(record(tmp_path / f"a{suffix}"))]
     for batch in found:
         batch.validate(full=True)
         assert batch.schema.equals(SCHEMA)
@@ -96,7 +96,7 @@ def test_a_recording_never_takes_the_place_of_another(tmp_path: Path, suffix: st
     other = record(tmp_path / "b.csv")
     with pytest.raises(ValueError, match=sentence):
         convert(other, path)
-    reader = open_reader(path)
+    reader = open_recording(path)
     assert (rows(reader), reader.metadata) == (RECORDED, METADATA)
 
 
@@ -104,10 +104,10 @@ def test_a_recording_never_takes_the_place_of_another(tmp_path: Path, suffix: st
 def test_every_batch_can_be_read_before_the_recording_is_closed(tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"a{suffix}"
     with open_writer(path, METADATA) as writer:
-        assert rows(open_reader(path)) == []
+        assert rows(open_recording(path)) == []
         for at in range(3):
             writer.write(counting(10, 10 * at))
-            assert rows(open_reader(path)) == list(counting(10 * at + 10))
+            assert rows(open_recording(path)) == list(counting(10 * at + 10))
 
 
 @pytest.mark.parametrize("suffix", [".arrows", ".csv"])
@@ -115,7 +115,7 @@ def test_reader_keeps_to_what_was_there_when_it_was_opened(tmp_path: Path, suffi
     path = tmp_path / f"a{suffix}"
     with open_writer(path, METADATA) as writer:
         writer.write(counting(10))
-        reader = open_reader(path)
+        reader = open_recording(path)
         writer.write(counting(10, 10))
         assert rows(reader) == list(counting(10))
 
@@ -143,7 +143,7 @@ def test_polars_opens_all(tmp_path: Path) -> None:
     assert [Row(*row) for row in parquet.iter_rows()] == RECORDED
     assert text.drop("time").rows() == [row[1:] for row in RECORDED]
     times = text["time"].str.to_datetime("%Y-%m-%dT%H:%M:%S%.9fZ", time_unit="ns").to_physical()
-    assert times.to_list() == [row.time for row in RECORDED]
+    assert times.to_list() == [row.time_ns for row in RECORDED]
 
 
 @pytest.mark.slow
@@ -153,7 +153,7 @@ def test_pandas_opens_parquet_and_csv(tmp_path: Path) -> None:
         pandas.read_parquet(record(tmp_path / "a.parquet")),
         pandas.read_csv(record(tmp_path / "a.csv"), parse_dates=["time"]),
     ):
-        assert [time.value for time in frame["time"]] == [row.time for row in RECORDED]
+        assert [time.value for time in frame["time"]] == [row.time_ns for row in RECORDED]
         assert list(frame["value"].isna()) == [row.value is None for row in RECORDED]
         assert list(frame["value"].dropna()) == [row.value for row in RECORDED if row.value is not None]
         assert list(frame["status"]) == [row.status for row in RECORDED]
@@ -182,7 +182,7 @@ def test_a_name_that_ends_within_a_character_is_damage(tmp_path: Path, is_before
     assert content.count(whole) == 1
     path.write_bytes(content.replace(whole, cut))
     with pytest.raises(ValueError, match="is damaged after row 0: its text is not UTF-8"):
-        list(open_reader(path))
+        list(open_recording(path))
 
 
 @pytest.mark.parametrize("name", ["monotonic_ns", "drive", "status"])
@@ -201,7 +201,7 @@ def test_a_row_without_what_every_row_has_is_damage(tmp_path: Path, suffix: str,
         with pa.ipc.new_stream(path, table.schema) as stream:
             stream.write_table(table)
     with pytest.raises(ValueError, match=f"is damaged after row 0: there is a row without a {name}"):
-        list(open_reader(path))
+        list(open_recording(path))
 
 
 def test_a_long_parquet_file_has_its_rows_in_groups(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -212,7 +212,7 @@ def test_a_long_parquet_file_has_its_rows_in_groups(tmp_path: Path, monkeypatch:
             writer.write(batch)
     about = pa.parquet.read_metadata(tmp_path / "a.parquet")
     assert [about.row_group(at).num_rows for at in range(about.num_row_groups)] == [8192, 1024]
-    assert [row for rows in open_reader(tmp_path / "a.parquet") for row in rows] == [*batch] * times
+    assert [row for rows in open_recording(tmp_path / "a.parquet") for row in rows] == [*batch] * times
 
 
 def test_names_are_dictionaries_in_parquet(tmp_path: Path) -> None:
@@ -239,7 +239,7 @@ def test_csv_as_it_stands(tmp_path: Path) -> None:
 def test_csv_without_its_metadata_is_read_all_the_same(tmp_path: Path) -> None:
     path = record(tmp_path / "a.csv")
     (tmp_path / "a.csv.json").unlink()
-    reader = open_reader(path)
+    reader = open_recording(path)
     assert (reader.metadata, rows(reader)) == ({}, RECORDED)
 
 
@@ -261,7 +261,7 @@ def test_any_rows(tmp_path_factory: pytest.TempPathFactory, suffix: str, some: l
     path = tmp_path_factory.mktemp("any") / f"a{suffix}"
     with open_writer(path, {}) as writer:
         writer.write(from_rows(some))
-    found = rows(open_reader(path))
+    found = rows(open_recording(path))
     assert len(found) == len(some)
     assert found == some or (suffix == ".arrows" and all(map(is_kept, found, some)))
 
@@ -280,7 +280,7 @@ def test_any_batches_converted(
             writer.write(from_rows(some))
     written = [row for some in batches for row in some]
     assert convert(folder / f"a{suffix}", folder / f"b{target}") == len(written)
-    found = rows(open_reader(folder / f"b{target}"))
+    found = rows(open_recording(folder / f"b{target}"))
     assert len(found) == len(written)
     is_rounded = ".arrows" in (suffix, target)
     assert repr(found) == repr(written) or (is_rounded and all(map(is_kept, found, written)))
@@ -306,7 +306,7 @@ def test_any_csv_means_the_same_to_another_reader(
     ]
     for row, expected in zip(found, some, strict=True):
         second = datetime.fromisoformat(row["time"][:19] + "+00:00")
-        assert int(second.timestamp()) * 10**9 + int(row["time"][20:29]) == expected.time
+        assert int(second.timestamp()) * 10**9 + int(row["time"][20:29]) == expected.time_ns
         assert (float(row["value"]) if row["value"] else None) == expected.value
 
 
@@ -323,7 +323,7 @@ def test_no_text_of_a_csv_is_a_formula_and_all_come_back(tmp_path: Path) -> None
     assert found == [(cell, cell, cell) for cell in cells]
     assert not [cell for cell in cells if cell.startswith(("=", "+", "-", "@", "\t", "\r"))]
     assert cells[6:] == ["''=1", "'" + "''-", "'old'", "a=b", ""]
-    assert rows(open_reader(tmp_path / "a.csv")) == some
+    assert rows(open_recording(tmp_path / "a.csv")) == some
 
 
 # ---- converting ----
@@ -333,7 +333,7 @@ def test_no_text_of_a_csv_is_a_formula_and_all_come_back(tmp_path: Path) -> None
 @pytest.mark.parametrize("target", FORMATS)
 def test_converting_keeps_everything(tmp_path: Path, suffix: str, target: str) -> None:
     assert convert(record(tmp_path / f"a{suffix}"), tmp_path / f"b{target}") == 2505
-    reader = open_reader(tmp_path / f"b{target}")
+    reader = open_recording(tmp_path / f"b{target}")
     assert (reader.metadata, rows(reader)) == (METADATA, RECORDED)
 
 
@@ -362,7 +362,7 @@ def test_nothing_is_converted_into_itself(tmp_path: Path) -> None:
     for target in (path, tmp_path / "link.arrows"):
         with pytest.raises(ValueError, match=r"a\.arrows cannot be converted into itself"):
             convert(path, target)
-    assert rows(open_reader(path)) == RECORDED
+    assert rows(open_recording(path)) == RECORDED
 
 
 def test_target_is_untouched_when_the_source_is_not_a_recording(tmp_path: Path) -> None:
@@ -372,7 +372,7 @@ def test_target_is_untouched_when_the_source_is_not_a_recording(tmp_path: Path) 
         convert(tmp_path / "a.csv", target)
     with pytest.raises(FileNotFoundError):
         convert(tmp_path / "c.csv", target)
-    assert rows(open_reader(target)) == RECORDED
+    assert rows(open_recording(target)) == RECORDED
 
 
 DAMAGED_AT = {".arrows": struct.pack("<6H", *(0, 1, 2) * 2), ".csv": b",ok", ".parquet": b"PAR1"}  # behind it
@@ -415,7 +415,7 @@ def test_a_conversion_that_is_broken_off_leaves_nothing(
 # ---- mistakes ----
 
 
-@table("act", [lambda path: open_writer(path, {}), open_reader, repair])
+@table("act", [lambda path: open_writer(path, {}), open_recording, repair])
 @table("name", ["a.xlsx", "a", "arrows", "a.arrow"])
 def test_unknown_suffix(tmp_path: Path, act: object, name: str) -> None:
     assert callable(act)
@@ -429,7 +429,7 @@ def test_metadata_that_json_cannot_hold(tmp_path: Path, suffix: str) -> None:
     path = record(tmp_path / f"a{suffix}")
     with pytest.raises(TypeError, match="not JSON serializable"):
         open_writer(path, {"drives": object()})
-    assert rows(open_reader(path)) == RECORDED
+    assert rows(open_recording(path)) == RECORDED
 
 
 @every_format
@@ -440,10 +440,10 @@ def test_closing_twice_is_harmless_and_nothing_is_written_afterwards(tmp_path: P
     writer.close()
     with pytest.raises(ValueError, match=r"closed|released"):
         writer.write(example())
-    assert rows(open_reader(tmp_path / f"a{suffix}")) == EXAMPLE
+    assert rows(open_recording(tmp_path / f"a{suffix}")) == EXAMPLE
 
 
-@pytest.mark.parametrize("act", [lambda path: open_writer(path, {}), open_reader])
+@pytest.mark.parametrize("act", [lambda path: open_writer(path, {}), open_recording])
 def test_parquet_without_pyarrow_names_the_extra(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, act: object
 ) -> None:
@@ -460,7 +460,7 @@ def test_neither_arrows_nor_csv_need_pyarrow(
 ) -> None:
     for name in ("pyarrow", "numpy", "pandas", "polars"):
         monkeypatch.setitem(sys.modules, name, None)
-    assert rows(open_reader(record(tmp_path / f"a{suffix}"))) == RECORDED
+    assert rows(open_recording(record(tmp_path / f"a{suffix}"))) == RECORDED
 
 
 # ---- dictionaries ----
@@ -469,10 +469,10 @@ def test_neither_arrows_nor_csv_need_pyarrow(
 def test_recordings_from_before_are_read_and_converted(tmp_path: Path) -> None:
     batches = (example(), counting(2000), counting(500, 2000))
     path = record_as_before(tmp_path / "a.arrows", *batches, metadata=json.dumps(METADATA).encode())
-    reader = open_reader(path)
+    reader = open_recording(path)
     assert (reader.metadata, reader.truncated, rows(reader)) == (METADATA, 0, RECORDED)
     assert convert(path, tmp_path / "b.arrows") == 2505
-    assert rows(open_reader(tmp_path / "b.arrows")) == RECORDED
+    assert rows(open_recording(tmp_path / "b.arrows")) == RECORDED
     assert (tmp_path / "b.arrows").stat().st_size < path.stat().st_size * 0.6
 
 
@@ -485,7 +485,7 @@ def test_pandas_and_duckdb_take_arrows_through_pyarrow(tmp_path: Path) -> None:
     assert isinstance(frame["drive"].dtype, pandas.CategoricalDtype)
     assert list(frame["drive"]) == [row.drive for row in RECORDED]
     columns = "epoch_ns(time), monotonic_ns, uncertainty_ns, drive, register, value, status"
-    for taken in (table, open_reader(tmp_path / "a.arrows")):
+    for taken in (table, open_recording(tmp_path / "a.arrows")):
         found = duckdb.from_arrow(taken).query("taken", f"select {columns} from taken").fetchall()
         assert [Row(*row) for row in found] == RECORDED
 
@@ -517,7 +517,7 @@ def test_drives_that_come_later_have_their_names_for_every_reader(tmp_path: Path
         for _ in range(150):
             writer.write(grown.batch())
     names = [row.drive for row in grown.rows]
-    assert [row.drive for row in rows(open_reader(path))] == names
+    assert [row.drive for row in rows(open_recording(path))] == names
     assert pa.ipc.open_stream(path.read_bytes()).read_all().column("drive").to_pylist() == names
     assert polars.read_ipc_stream(path)["drive"].to_list() == names
     with path.open("rb") as file:
@@ -531,13 +531,13 @@ def test_a_stream_that_another_program_wrote_anew_is_read(tmp_path: Path) -> Non
     table = pa.ipc.open_stream(path.read_bytes()).read_all()
     with pa.ipc.new_stream(tmp_path / "b.arrows", table.schema) as stream:
         stream.write_table(table)
-    reader = open_reader(tmp_path / "b.arrows")
+    reader = open_recording(tmp_path / "b.arrows")
     assert (reader.metadata, rows(reader)) == (METADATA, RECORDED)
     options = pa.ipc.IpcWriteOptions(emit_dictionary_deltas=True)
     with pa.ipc.new_stream(tmp_path / "c.arrows", FILE_SCHEMA, options=options) as stream:
         for _ in range(5):
             stream.write_batch(pa.record_batch(grown.batch()).cast(FILE_SCHEMA))
-    assert rows(open_reader(tmp_path / "c.arrows")) == grown.rows
+    assert rows(open_recording(tmp_path / "c.arrows")) == grown.rows
 
 
 @pytest.mark.parametrize("count", [255, 256, 257, 1000])
@@ -546,7 +546,7 @@ def test_more_statuses_than_a_byte_has_values(tmp_path: Path, count: int) -> Non
     path = tmp_path / "a.arrows"
     with open_writer(path, {}) as writer:
         writer.write(from_rows(some))
-    assert rows(open_reader(path)) == some
+    assert rows(open_recording(path)) == some
     assert rows_of(pa.ipc.open_stream(path.read_bytes()).read_all()) == some
 
 
@@ -565,7 +565,7 @@ def test_all_exceptions_of_a_line_at_once(tmp_path: Path) -> None:
         writer.write(batch)
         writer.write(batch)
         assert writer.rows == 2 * len(batch)
-    assert rows(open_reader(path)) == [*batch, *batch]
+    assert rows(open_recording(path)) == [*batch, *batch]
     assert rows_of(pa.ipc.open_stream(path.read_bytes()).read_all()) == [*batch, *batch]
 
 

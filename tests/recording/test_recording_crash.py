@@ -33,7 +33,7 @@ from multidrop.recording import (
     RecordingError,
     RecordingReader,
     arrow_decoder,
-    open_reader,
+    open_recording,
     open_writer,
     repair,
 )
@@ -72,7 +72,7 @@ def test_random_cuts_of_arrows_lose_only_what_is_not_whole(tmp_path: Path) -> No
     for cut in {*cuts, *lengths}:
         path.write_bytes(whole[:cut])
         batches = sum(length <= cut for length in lengths) - 1
-        reader = open_reader(path)
+        reader = open_recording(path)
         assert reader.truncated == cut - lengths[batches]
         assert reader.metadata == METADATA
         assert rows(reader) == expected[: batches * ROWS]
@@ -98,7 +98,7 @@ def test_a_cut_between_names_and_their_rows_leaves_what_all_can_read(tmp_path: P
         batches = sum(length <= cut for length in lengths) - 1
         assert repair(path) == cut - lengths[batches]
         expected = [f"pump-{batch}" for batch in range(batches)]
-        assert [row.drive for row in rows(open_reader(path))] == expected
+        assert [row.drive for row in rows(open_recording(path))] == expected
         assert pa.ipc.open_stream(path.read_bytes()).read_all().column("drive").to_pylist() == expected
         assert polars.read_ipc_stream(path)["drive"].to_list() == expected
 
@@ -122,7 +122,7 @@ def test_a_recording_behind_another_is_not_read_as_its_end(tmp_path: Path) -> No
         writer.write(example())
     first.write_bytes(first.read_bytes() + second.read_bytes())
     with pytest.raises(ValueError, match=f"is damaged after row {2 * ROWS}: there is a message that is not"):
-        rows(open_reader(first))
+        rows(open_recording(first))
 
 
 @pytest.mark.parametrize("part", usually(256, 1))
@@ -137,7 +137,7 @@ def test_names_that_would_fill_the_memory_are_damage(
         writer.write(from_rows([row] * 300))
     assert path.stat().st_size < 2**21
     with pytest.raises(ValueError, match="a batch of 300 rows with names too long for so many"):
-        rows(open_reader(path))
+        rows(open_recording(path))
 
 
 @pytest.mark.slow
@@ -149,7 +149,7 @@ def test_random_cuts_of_csv_lose_only_the_last_line(tmp_path: Path) -> None:
     for cut in random.Random(2).sample(range(lengths[0], len(whole) + 1), 200):
         path.write_bytes(whole[:cut])
         kept = whole[:cut].rpartition(b"\n")[0] + b"\n"
-        reader = open_reader(path)
+        reader = open_recording(path)
         assert reader.truncated == cut - len(kept)
         assert rows(reader) == expected[: kept.count(b"\n") - 1]
 
@@ -165,7 +165,7 @@ def test_long_torn_line_of_csv(tmp_path: Path) -> None:
     record(path, 1)
     with path.open("ab") as file:
         file.write(bytes(200_000))
-    reader = open_reader(path)
+    reader = open_recording(path)
     assert (reader.truncated, rows(reader)) == (200_000, list(counting(ROWS)))
 
 
@@ -197,7 +197,7 @@ def test_end_marker_of_other_writers_is_not_torn(tmp_path: Path) -> None:
     table = pa.table(example())
     with pa.ipc.new_stream(path, table.schema) as stream:
         stream.write_table(table)
-    reader = open_reader(path)
+    reader = open_recording(path)
     assert (reader.truncated, reader.metadata, rows(reader)) == (0, {}, list(example()))
 
 
@@ -238,7 +238,7 @@ def test_killed_while_writing(tmp_path: Path, suffix: str) -> None:
             writing.kill()
             told = [until, *map(int, writing.stdout.read().split())]
             assert writing.wait() == -signal.SIGKILL
-        reader = open_reader(path)
+        reader = open_recording(path)
         found = rows(reader)
         assert reader.metadata == METADATA
         assert len(found) >= (told[-1] + 1) * 500
@@ -252,7 +252,7 @@ def test_parquet_that_was_not_closed_says_so(tmp_path: Path) -> None:
     with open_writer(path, METADATA) as writer:
         writer.write(example())
         with pytest.raises(ValueError, match=r"not a recording: .* readable only once it is closed"):
-            open_reader(path)
+            open_recording(path)
 
 
 # ---- disks ----
@@ -298,7 +298,7 @@ def test_disk_that_becomes_full(tmp_path: Path, suffix: str) -> None:
         return
     assert int(saved) >= 500
     assert sentence.endswith(f"the {saved} rows before that can be read")
-    reader = open_reader(path)
+    reader = open_recording(path)
     assert (len(rows(reader)), reader.truncated) == (int(saved), 0)
 
 
@@ -327,7 +327,7 @@ def test_recording_goes_on_when_there_is_room_again(tmp_path: Path, suffix: str)
             writer.write(counting(ROWS, 40000))
         writer.write(counting(ROWS, ROWS))
         assert writer.rows == 2 * ROWS
-    assert rows(open_reader(path)) == list(counting(2 * ROWS))
+    assert rows(open_recording(path)) == list(counting(2 * ROWS))
 
 
 @pytest.mark.parametrize("suffix", FORMATS)
@@ -346,7 +346,7 @@ def test_directory_that_is_not_there(tmp_path: Path, suffix: str) -> None:
     with pytest.raises(RecordingError, match="No such file or directory"):
         open_writer(tmp_path / "none" / f"a{suffix}", METADATA)
     with pytest.raises(FileNotFoundError):
-        open_reader(tmp_path / f"a{suffix}")
+        open_recording(tmp_path / f"a{suffix}")
 
 
 def test_a_torn_piece_that_could_not_be_cut_off_is_before_the_next(
@@ -362,9 +362,9 @@ def test_a_torn_piece_that_could_not_be_cut_off_is_before_the_next(
             with full_at(path.stat().st_size + 100), pytest.raises(RecordingError):
                 writer.write(counting(ROWS, 40000))
         monkeypatch.setattr(AppendFile, "_cut", cut)
-        assert open_reader(path).truncated == 100
+        assert open_recording(path).truncated == 100
         writer.write(counting(ROWS, ROWS))
-    assert rows(open_reader(path)) == list(counting(2 * ROWS))
+    assert rows(open_recording(path)) == list(counting(2 * ROWS))
 
 
 def _fail(file: AppendFile) -> None:
@@ -384,7 +384,7 @@ def test_a_write_that_a_signal_breaks_off_leaves_nothing(tmp_path: Path, suffix:
             writer.write(counting(ROWS, 40000))
         growing_file._file = raw
         writer.write(counting(ROWS, ROWS))
-    assert rows(open_reader(path)) == list(counting(2 * ROWS))
+    assert rows(open_recording(path)) == list(counting(2 * ROWS))
 
 
 class Halving:
@@ -415,7 +415,7 @@ def test_csv_that_is_a_recording_has_its_metadata(tmp_path: Path, room: int) -> 
     except RecordingError:
         assert list(tmp_path.iterdir()) == []
     else:
-        assert open_reader(path).metadata == whole
+        assert open_recording(path).metadata == whole
     assert not list(tmp_path.glob("*.part"))
 
 
@@ -432,9 +432,9 @@ def test_a_clock_that_is_set_back_an_hour(tmp_path: Path, suffix: str) -> None:
             columns = Columns(1)
             assert add_rows(columns, block(0, 0), completion(at + 1, first_ns=at + 2, words=(at,)), offset)
             writer.write(Batch(columns, DRIVES, REGISTERS))
-    found = rows(open_reader(path))
+    found = rows(open_recording(path))
     assert [row.monotonic_ns for row in found] == [1, 2]
-    assert [row.time for row in found] == [UTC_0 + 1, UTC_0 + 2 - 3600 * SECOND]
+    assert [row.time_ns for row in found] == [UTC_0 + 1, UTC_0 + 2 - 3600 * SECOND]
 
 
 # ---- not a recording ----
@@ -455,7 +455,7 @@ GARBAGE = {
 def test_garbage(tmp_path: Path, suffix: str, content: bytes) -> None:
     path = tmp_path / f"a{suffix}"
     path.write_bytes(content)
-    for act in (open_reader, repair):
+    for act in (open_recording, repair):
         with pytest.raises(ValueError, match=r"is not a recording: [^\n]+$"):
             act(path)
     assert path.read_bytes() == content
@@ -471,7 +471,7 @@ def test_other_columns(tmp_path: Path, suffix: str) -> None:
     else:
         pa.parquet.write_table(other, path)
     with pytest.raises(ValueError, match=r"is not a recording: it is .* with other columns"):
-        open_reader(path)
+        open_recording(path)
 
 
 @pytest.mark.parametrize("uses_dictionary", [True, False])
@@ -492,7 +492,7 @@ def test_parquet_file_that_unpacks_to_gigabytes_is_refused(tmp_path: Path, uses_
         else "is not a recording: a group of its rows takes 6000[0-9]{5} bytes unpacked, at most 536870912"
     )
     with pytest.raises(ValueError, match=mistake):
-        list(open_reader(path))
+        list(open_recording(path))
 
 
 def test_compressed_batches_are_refused(tmp_path: Path) -> None:
@@ -501,7 +501,7 @@ def test_compressed_batches_are_refused(tmp_path: Path) -> None:
     with pa.ipc.new_stream(path, table.schema, options=pa.ipc.IpcWriteOptions(compression="zstd")) as stream:
         stream.write_table(table)
     with pytest.raises(ValueError, match="compressed, which only pyarrow and polars read"):
-        rows(open_reader(path))
+        rows(open_recording(path))
 
 
 def test_damaged_line_of_csv_is_named(tmp_path: Path) -> None:
@@ -511,7 +511,7 @@ def test_damaged_line_of_csv_is_named(tmp_path: Path) -> None:
     for damage in ("half a line\n", lines[3].replace("Z", "+", 1), lines[3].replace("Z,", "Z,x", 1)):
         path.write_text("".join([*lines[:3], damage, *lines[4:]]), encoding="utf-8")
         with pytest.raises(ValueError, match=r"a\.csv, line 4: not a row of a recording: [^\n]+$"):
-            rows(open_reader(path))
+            rows(open_recording(path))
 
 
 def test_damaged_metadata_of_csv_is_named(tmp_path: Path) -> None:
@@ -520,7 +520,7 @@ def test_damaged_metadata_of_csv_is_named(tmp_path: Path) -> None:
     for damage in ("", "{", "[]"):
         (tmp_path / "a.csv.json").write_text(damage)
         with pytest.raises(ValueError, match=r"a\.csv\.json is not a recording: its metadata"):
-            open_reader(path)
+            open_recording(path)
 
 
 @pytest.mark.long
@@ -538,7 +538,7 @@ def test_damage_anywhere_ends_in_a_sentence(tmp_path: Path, suffix: str) -> None
             damaged[chance.randrange(len(damaged))] = chance.choice((0, 1, 0x7F, 0xFF, chance.randrange(256)))
         path.write_bytes(damaged)
         with suppress_mistake_that_names(path):
-            for batch in open_reader(path):
+            for batch in open_recording(path):
                 pa.record_batch(batch).validate(full=True)
                 list(batch)
 
@@ -564,4 +564,4 @@ def test_a_batch_of_impossibly_many_rows(tmp_path: Path, rows: int) -> None:
     damaged = path.read_bytes().replace(struct.pack("<q", 77), struct.pack("<q", rows))
     path.write_bytes(damaged)
     with pytest.raises(ValueError, match=f"is damaged after row 0: there is a batch of {rows} rows"):
-        list(open_reader(path))
+        list(open_recording(path))

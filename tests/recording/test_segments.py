@@ -12,7 +12,7 @@ from recordings import ABOUT, row
 from tables import table
 
 from multidrop.polling.batch import Row
-from multidrop.recording import RecordingError, open_reader
+from multidrop.recording import RecordingError, open_recording
 from multidrop.recording import segments as segments_module
 from multidrop.recording.rows import RecordedRows, from_rows
 from multidrop.recording.segments import (
@@ -52,7 +52,7 @@ def names(folder: Path) -> list[str]:
 
 
 def read(path: Path) -> list[Row]:
-    return [found for batch in open_reader(path) for found in batch]
+    return [found for batch in open_recording(path) for found in batch]
 
 
 def test_a_segment_begins_when_the_last_is_old_enough(tmp_path: Path, hand: Hand) -> None:
@@ -67,7 +67,7 @@ def test_a_segment_begins_when_the_last_is_old_enough(tmp_path: Path, hand: Hand
     found = [read(path) for _, path in segments_of(tmp_path / "run.arrows")]
     assert found == [[*rows(0), *rows(1)], [*rows(2), *rows(3)], [*rows(4)]]
     for path in tmp_path.glob("*.arrows"):
-        assert open_reader(path).metadata == ABOUT
+        assert open_recording(path).metadata == ABOUT
         assert pa.ipc.open_stream(path.read_bytes()).read_all().num_rows in (3, 6)
 
 
@@ -97,7 +97,10 @@ def test_other_metadata_begins_a_segment(tmp_path: Path) -> None:
         writer.rotate({"plant": "other.toml"})
         writer.write(rows(1))
     (_, first), (_, second) = segments_of(tmp_path / "run.arrows")
-    assert (open_reader(first).metadata, open_reader(second).metadata) == (ABOUT, {"plant": "other.toml"})
+    assert (open_recording(first).metadata, open_recording(second).metadata) == (
+        ABOUT,
+        {"plant": "other.toml"},
+    )
 
 
 def test_one_process_records_at_a_time(tmp_path: Path) -> None:

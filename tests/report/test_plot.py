@@ -385,7 +385,7 @@ def test_a_fault_is_shaded_where_its_drive_is_drawn_alone(tmp_path: Path) -> Non
     drawn = {"pump": ("output_frequency", "output_current", "status"), "fan": ("output_current", "status")}
     rows += [row(at, name, one, 1.0) for at in range(10) for name in drawn for one in drawn[name]]
     rows += [row(at, "fan", "output_torque", 1.0) for at in range(10)]
-    figure, _ = plot(load(record(tmp_path / "it.arrows", sorted(rows, key=lambda row: row.time), about)))
+    figure, _ = plot(load(record(tmp_path / "it.arrows", sorted(rows, key=lambda row: row.time_ns), about)))
     shaded = {
         axes.get_title(loc="left"): [patch.get_y() for patch in axes.patches if patch.get_alpha() == 0.08]
         for axes in figure.axes
@@ -764,7 +764,7 @@ def test_values_that_no_axis_can_show(tmp_path: Path, register: str, value: floa
 def test_times_that_no_calendar_has_are_a_sentence(run: Run, tmp_path: Path, time: int) -> None:
     rows = [
         row(0, "pump", "output_frequency", 1.0),
-        row(1, "pump", "output_frequency", 1.0)._replace(time=time),
+        row(1, "pump", "output_frequency", 1.0)._replace(time_ns=time),
     ]
     path = record(tmp_path / "it.arrows", rows)
     for command in ("plot", "report"):

@@ -93,7 +93,7 @@ class History:
         They come in the order of recording. Where a name was another register's in a part of the range, with
         another unit or other names of its numbers, those rows are in a column of their own, such as
         "motor_load [A]", and `metadata` describes both. What it returns is a recording like
-        `multidrop.read` gives: `to_pandas()`, `to_polars()`, `wide()`, batches of rows, Arrow.
+        `multidrop.open_recording` gives: `to_pandas()`, `to_polars()`, `wide()`, batches of rows, Arrow.
         """
         first = ALWAYS[0] if begin is None else ns_of(begin)
         return HistoryRows(self, parsed_series(series), first, ALWAYS[1] if end is None else ns_of(end))

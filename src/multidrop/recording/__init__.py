@@ -57,18 +57,31 @@ from multidrop.recording.segments import parse_size as parse_size
 FORMATS = {".arrows": "arrows", ".csv": "csv", ".parquet": "parquet"}  # suffix: module
 
 
-def open_writer(path: str | os.PathLike[str], metadata: Metadata) -> RecordingWriter:
-    """Begin a recording in a new file; an existing one is never overwritten.
+def open_writer(
+    path: str | os.PathLike[str], metadata: Metadata, *, overwrite: bool = False
+) -> RecordingWriter:
+    """Return the writer of a new recording; with `overwrite`, remove an existing recording at `path` first.
 
-    Raises ValueError for another suffix or when there is a file at `path`, TypeError for metadata that
-    JSON cannot hold, and RecordingError when the file cannot be written.
+    Raises FileExistsError if there is a file at `path`, ValueError for another suffix, TypeError for
+    metadata that JSON cannot hold, and RecordingError if the file cannot be written.
     """
-    writer: RecordingWriter = _format(Path(path)).writer(Path(path), metadata)
+    place = Path(path)
+    module = _format(place)
+    if overwrite:
+        for old in (place, place.with_name(f"{place.name}.json")):
+            if old.is_file():
+                old.unlink()
+    writer: RecordingWriter = module.writer(place, metadata)
     return writer
 
 
-def open_reader(path: str | os.PathLike[str]) -> RecordingReader:
-    """Open a recording, finished or not. Raises ValueError for any other file, and OSError."""
+def open_recording(path: str | os.PathLike[str]) -> RecordingReader:
+    """Open a recording, finished or not: `open_recording("run.arrows").to_pandas()`, or batch after batch.
+
+    Raises ValueError for any other file, TypeError if `path` is not a path, and OSError.
+    """
+    if not isinstance(path, (str, os.PathLike)):
+        raise TypeError(f"open_recording takes a file such as 'run.arrows', not {path!r}")
     reader: RecordingReader = _format(Path(path)).reader(Path(path))
     return reader
 
@@ -76,11 +89,11 @@ def open_reader(path: str | os.PathLike[str]) -> RecordingReader:
 def convert(source: str | os.PathLike[str], target: str | os.PathLike[str]) -> int:
     """Write all rows and metadata of the recording `source` to `target`; return the number of rows.
 
-    Needs memory for a few batches only. Raises as open_reader and open_writer do, and then leaves no
+    Needs memory for a few batches only. Raises as open_recording and open_writer do, and then leaves no
     target.
     """
     _format(Path(target))
-    reader = open_reader(source)
+    reader = open_recording(source)
     if Path(target).exists() and Path(source).samefile(target):
         raise ValueError(f"{source} cannot be converted into itself: name another file")
     writer = open_writer(target, reader.metadata)
@@ -96,7 +109,7 @@ def convert(source: str | os.PathLike[str], target: str | os.PathLike[str]) -> i
 
 def repair(path: str | os.PathLike[str]) -> int:
     """Cut the truncated end off a recording that nobody is writing; return the number of bytes."""
-    truncated = open_reader(path).truncated
+    truncated = open_recording(path).truncated
     if truncated:
         os.truncate(path, Path(path).stat().st_size - truncated)
     return truncated

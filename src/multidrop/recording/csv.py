@@ -13,12 +13,12 @@ from pathlib import Path
 from typing import BinaryIO
 
 from multidrop.iso_time import format_time, parse_time
-from multidrop.polling.batch import Row, Rows
+from multidrop.polling.batch import ROW_COLUMNS, Row, Rows
 from multidrop.recording.format import AppendingWriter, Metadata, RecordingReader, dump_metadata, writing
 from multidrop.recording.rows import from_rows
 
-HEADER = ",".join(Row._fields) + "\n"
-WITH_UNITS = ",".join([*Row._fields, "unit"]) + "\n"  # of a text that has no metadata beside it
+HEADER = ",".join(ROW_COLUMNS) + "\n"
+WITH_UNITS = ",".join([*ROW_COLUMNS, "unit"]) + "\n"  # of a text that has no metadata beside it
 FORMULA = re.compile(r"'*[=+\-@\t\r\n]")  # a spreadsheet evaluates it unless an apostrophe is in front
 ESCAPED = re.compile(r"'+[=+\-@\t\r\n]")
 EXAMPLE = "2026-11-21T09:30:00.123456789Z,17,250000,pump-1,output_current,1.5,ok"
@@ -111,9 +111,9 @@ def _lines(file: BinaryIO, size: int) -> Iterator[str]:
 
 
 def _parse(cells: list[str]) -> Row:
-    if len(cells) - len(Row._fields) not in (0, 1):  # with or without a unit
+    if len(cells) - len(ROW_COLUMNS) not in (0, 1):  # with or without a unit
         raise ValueError(len(cells))
-    time, monotonic_ns, uncertainty_ns, drive, register, value, status = cells[: len(Row._fields)]
+    time, monotonic_ns, uncertainty_ns, drive, register, value, status = cells[: len(ROW_COLUMNS)]
     numbers = f"{monotonic_ns}{uncertainty_ns}{value}"
     if not numbers.isascii() or "_" in numbers:  # Python takes 1_0 for 10
         raise ValueError(numbers)

@@ -11,10 +11,11 @@ from io import FileIO
 from pathlib import Path
 from typing import Any, Self
 
-from multidrop.polling.batch import Rows, schema
+from multidrop.polling.batch import Rows, schema, shown_span
 from multidrop.polling.tables import ArrowTable, WideRows
 
 Metadata = Mapping[str, Any]
+MOST_SHOWN = 16 << 20  # bytes of a file that a repr reads
 METADATA_KEY = "multidrop"  # of an Arrow schema's metadata
 
 
@@ -37,6 +38,8 @@ def writing(path: Path, rows: int = 0) -> Iterator[None]:
     """Raise an OSError of the block as the RecordingError of a file that holds so many rows."""
     try:
         yield
+    except RecordingExists:
+        raise
     except OSError as failure:
         raise RecordingError(path, f"cannot be written: {failure.strerror or failure}", rows) from failure
 
@@ -120,6 +123,16 @@ class RecordingReader(ArrowTable):
     def __iter__(self) -> Iterator[Rows]:
         """Yield the rows, some thousands at a time. Raises ValueError where the file is damaged."""
 
+    def __repr__(self) -> str:
+        try:
+            size = self.path.stat().st_size
+            if size > MOST_SHOWN:
+                return f"<recording {self.path}: {size >> 20} MB>"
+            rows = [row for batch in self for row in batch]
+        except (OSError, ValueError) as failure:
+            return f"<recording {self.path}: {failure}>"
+        return f"<recording {self.path}: {shown_span(rows)}>"
+
     def __arrow_c_stream__(self, requested_schema: object = None) -> Any:
         layout = schema()  # says so where nanoarrow is missing
         from nanoarrow.c_array_stream import CArrayStream
@@ -171,14 +184,18 @@ def dump_metadata(metadata: Metadata) -> str:
     return json.dumps(metadata, ensure_ascii=False)
 
 
-def already_there(path: Path) -> ValueError:
-    return ValueError(f"{path} is there already: name another file, or remove it first")
+class RecordingExists(FileExistsError, ValueError):
+    """There is a file at the path of a new recording."""
+
+
+def already_there(path: Path) -> RecordingExists:
+    return RecordingExists(f"{path} is there already: name another file, or remove it first")
 
 
 def new_file(path: Path) -> FileIO:
     """Open a file that is not there yet: an existing one may hold months of data.
 
-    A device or a pipe exists and has no data to lose. Raises ValueError and OSError.
+    A device or a pipe exists and has no data to lose. Raises RecordingExists and OSError.
     """
     mode = "wb" if path.exists() and not path.is_file() else "xb"
     try:
@@ -188,7 +205,7 @@ def new_file(path: Path) -> FileIO:
 
 
 class AppendFile:
-    """A new file. Raises ValueError when there is one at this path, and OSError, as do its methods."""
+    """A new file. Raises RecordingExists if there is one at this path, and OSError, as do its methods."""
 
     def __init__(self, path: Path) -> None:
         self._file = new_file(path)

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from itertools import accumulate, pairwise
 from typing import Any
 
-from multidrop.polling.batch import Row, Rows, assemble
+from multidrop.polling.batch import Row, Rows, assemble, shown_span
 
 
 class RecordedRows(Rows):
@@ -24,7 +24,7 @@ class RecordedRows(Rows):
         return map(Row._make, zip(*map(_values, columns), strict=True))
 
     def __repr__(self) -> str:
-        return f"<{len(self)} recorded rows>"
+        return f"<Rows: {shown_span([*self])}>"
 
     def arrow(self) -> Any:
         return self._array

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from multidrop.polling.batch import Row
-from multidrop.recording import open_reader
+from multidrop.polling.batch import ROW_COLUMNS
+from multidrop.recording import open_recording
 
 RAW = "raw count"  # the unit where no document states the scale
 LARGEST = 1e150  # drawable value: axes compute with differences and products
@@ -181,12 +181,12 @@ class Recording:
 
 def load(path: str | Path) -> Recording:
     """Load a recording. Raises OSError, and ValueError for a file of another kind, empty, or too large."""
-    reader = open_reader(path)
+    reader = open_recording(path)
     codes: dict[str, dict[str, int]] = {"drive": {}, "register": {}, "status": {}}
     parts: list[list[Array]] = []
     rows = 0
     for batch in reader:
-        children = dict(zip(Row._fields, batch.arrow().view().children, strict=True))
+        children = dict(zip(ROW_COLUMNS, batch.arrow().view().children, strict=True))
         columns = [_codes(children[name], known) for name, known in codes.items()]
         parts.append(columns + [_numbers(children[name]) for name in ("time", "value", "uncertainty_ns")])
         rows += len(batch)
