@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import asyncio
 import sys
-from collections.abc import AsyncIterator
 
 from simulated_plant import simulated_plant
 
-from multidrop import Batch, Poller
+from multidrop import Poller
 
 PLANT = """
 [[line]]
@@ -23,24 +22,9 @@ poll = ["output_current", "motor_speed"]
 """
 
 
-async def batches(poller: Poller) -> AsyncIterator[Batch]:
-    """Yield batches as they come, without blocking the loop."""
-    loop = asyncio.get_running_loop()
-    ready = asyncio.Event()
-    loop.add_reader(poller.fileno(), ready.set)
-    try:
-        while True:
-            await ready.wait()
-            ready.clear()
-            while batch := poller.take():
-                yield batch
-    finally:
-        loop.remove_reader(poller.fileno())
-
-
 async def count(poller: Poller) -> None:
     """Print a line for each batch."""
-    async for batch in batches(poller):
+    async for batch in poller:
         print(f"{len(batch)} rows")
 
 

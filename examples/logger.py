@@ -10,7 +10,7 @@ from pathlib import Path
 
 from simulated_plant import simulated_plant
 
-from multidrop import Plant, Poller, load_plant, open_writer
+from multidrop import Plant, Poller, open_writer
 from multidrop.recording import convert
 
 PLANT = """
@@ -49,7 +49,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("log.parquet"))
     arguments = parser.parse_args()
     if arguments.plant:
-        rows = record(load_plant(arguments.plant), arguments.seconds, arguments.out)
+        rows = record(Plant.load(arguments.plant), arguments.seconds, arguments.out)
     else:
         with simulated_plant(PLANT) as plant:
             rows = record(plant, arguments.seconds, arguments.out)

@@ -14,13 +14,12 @@ from multidrop.sim import Simulator, Wire, simulated
 
 def run(port: str, seconds: float) -> None:
     """Start the pump of address 1 at this port, show what it does, and stop it."""
-    with Bus(port, audit="pump.jsonl") as bus:
-        bus.stop_on_exit()  # from here on leaving, Ctrl-C and SIGTERM stop the motor
+    with Bus(port, audit="pump.jsonl", stop_on_exit=True) as bus:  # also on Ctrl-C and SIGTERM
         pump = bus.attach(ErmanERG220, address=1, name="pump")
         pump.set_frequency(30.0)
         pump.start()
         for _ in range(round(seconds)):
-            print(pump.state(), pump.output_frequency.format(pump.read(pump.output_frequency)))
+            print(pump.state(), pump.read(pump.output_frequency), "Hz")
             sleep(1.0)
 
 

@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from multidrop import Plant, load_plant
+from multidrop import Plant
 from multidrop.sim import Simulator, Wire, simulated
 
 
@@ -20,7 +20,7 @@ def simulated_plant(text: str, wire_of: Callable[..., Wire] = Wire) -> Iterator[
     with TemporaryDirectory() as directory:
         path = Path(directory) / "plant.toml"
         path.write_text(text.replace("{ports}", directory))
-        plant = load_plant(path)
+        plant = Plant.load(path)
         wires = [
             wire_of([simulated(polled.drive) for polled in line.drives], port=line.port)
             for line in plant.lines

@@ -7,10 +7,11 @@ from __future__ import annotations
 
 import logging
 import threading
+from collections.abc import Iterable
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar, overload
 
 from multidrop.bus import Bus
 from multidrop.control.eeprom_ledger import Ledger
@@ -21,7 +22,7 @@ from multidrop.core.undisturbed import undisturbed
 from multidrop.drive.family import Drive
 from multidrop.drive.register import Register
 from multidrop.errors import LineError, PollingFailed
-from multidrop.plant.model import Plant, PlantLine, PolledDrive
+from multidrop.plant.model import Plant, PlantLine, Polled, PolledDrive
 from multidrop.polling.adoption import GONE, Adoption
 from multidrop.polling.line_set import LineSet
 from multidrop.polling.row_source import RowSource
@@ -37,6 +38,16 @@ MOST_FAILURES = 8  # of the thread itself, in a row, before it gives up
 FAILED_NS = 50_000_000  # between its attempts
 
 _log = logging.getLogger("multidrop.polling")
+
+D = TypeVar("D", bound=Drive)
+
+
+def _plant_of(plant: Plant | Path | str) -> Plant:
+    if isinstance(plant, Plant):
+        return plant
+    if not isinstance(plant, (Path, str)):
+        raise TypeError(f"Poller takes a Plant or a plant file such as 'plant.toml', not {plant!r}")
+    return Plant.load(plant)
 
 
 class Poller(RowSource):
@@ -56,14 +67,14 @@ class Poller(RowSource):
 
     def __init__(
         self,
-        plant: Plant,
+        plant: Plant | Path | str,
         *,
         ledger: Ledger | Path | str | None = None,
         audit: Path | str | None = None,
+        stop_on_exit: bool = False,
         mastership: Mastership | None = None,
     ) -> None:
-        if not isinstance(plant, Plant):
-            raise TypeError(f"Poller takes a Plant, such as load_plant('plant.toml') gives, not {plant!r}")
+        plant = _plant_of(plant)
         row_queue = RowQueue()
         self._lines = LineSet(row_queue, ledger, audit, mastership)
         super().__init__(row_queue, self._lines.names)
@@ -75,6 +86,8 @@ class Poller(RowSource):
         register_at_fork(self)
         try:
             self._fill(plant)
+            if stop_on_exit:
+                self.stop_on_exit()
         except BaseException:
             self._end()
             raise
@@ -222,7 +235,7 @@ class Poller(RowSource):
         """By name, since which `monotonic_ns` rows are of the drive that `plant` describes."""
         return {name: since_ns for line in self._lines for name, since_ns in line.since_ns.items()}
 
-    def adopt(self, plant: Plant) -> dict[str, LineError]:
+    def adopt(self, plant: Plant | Path | str) -> dict[str, LineError]:
         """Poll another plant from now on; return the lines whose port is not there, by name, and why.
 
         Every mistake in it raises ValueError (PlantError with all of them, NoSuchPort for a name that no port
@@ -244,10 +257,9 @@ class Poller(RowSource):
         Names in batches keep their codes. Returns when all is done; other lines are polled meanwhile. Any
         thread may call this, one at a time.
         """
-        if not isinstance(plant, Plant):
-            raise TypeError(f"adopt takes a Plant, such as load_plant('plant.toml') gives, not {plant!r}")
+        wanted = _plant_of(plant)
         self._take_signals()
-        return self._adopt(plant)
+        return self._adopt(wanted)
 
     @undisturbed
     def _adopt(self, plant: Plant) -> dict[str, LineError]:
@@ -307,12 +319,37 @@ class Poller(RowSource):
         if self.failure:
             raise self.failure
 
-    @undisturbed
-    def add(self, line: str, polled: PolledDrive) -> None:
-        """Poll one more drive on this line, from now on.
+    @overload
+    def add(self, line: str, drive: PolledDrive) -> Drive: ...
+    @overload
+    def add(
+        self,
+        line: str,
+        drive: D,
+        poll: Iterable[Polled | Register[Any] | str] | None = None,
+        *,
+        every: float | None = None,
+    ) -> D: ...
+    def add(
+        self,
+        line: str,
+        drive: Drive | PolledDrive,
+        poll: Iterable[Polled | Register[Any] | str] | None = None,
+        *,
+        every: float | None = None,
+    ) -> Drive:
+        """Poll one more drive on this line from now on; return the drive.
 
-        Raises ValueError when there is no such line, or its name or address is taken.
+        `poll` has registers or their names, and Polled for a register with a period of its own; without it,
+        all readings are polled. `every` is the period in s, None for as fast as the line allows. Raises
+        ValueError for an unknown line, or a name or an address that is taken.
         """
+        polled = drive if isinstance(drive, PolledDrive) else PolledDrive(drive, poll, every=every)
+        self._add(line, polled)
+        return polled.drive
+
+    @undisturbed
+    def _add(self, line: str, polled: PolledDrive) -> None:
         with self._changing:
             names = {drive.name for bus in self.buses.values() for drive in bus.drives}
             if polled.drive.name in names:
@@ -349,6 +386,13 @@ class Poller(RowSource):
                 raise ValueError("polling has ended: no rate can be set")
             line, known = self._lines.find_drive(drive)
             line.set_rate(known, known.register(register) if isinstance(register, str) else register, every)
+
+    def __getitem__(self, name: str) -> Drive:
+        """Return the polled drive of this name. Raises KeyError if there is none."""
+        try:
+            return self._lines.find_drive(name)[1]
+        except ValueError as unknown:
+            raise KeyError(str(unknown)) from None
 
     @property
     def buses(self) -> dict[str, Bus]:

@@ -494,10 +494,8 @@ def test_nothing_is_adopted_when_polling_has_ended() -> None:
 
 def test_what_is_no_plant() -> None:
     poller = Poller(plant())
-    with pytest.raises(
-        TypeError, match=r"adopt takes a Plant, such as load_plant\('plant.toml'\) gives, not 'p'"
-    ):
-        poller.adopt("p")  # type: ignore[arg-type]
+    with pytest.raises(TypeError, match=r"Poller takes a Plant or a plant file such as 'plant.toml', not 5"):
+        poller.adopt(5)  # type: ignore[arg-type]
     poller.close()
 
 

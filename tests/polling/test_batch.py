@@ -78,7 +78,7 @@ def test_pandas_takes_it() -> None:
     pandas = pytest.importorskip("pandas", reason="needs pandas")
     frame = pandas.DataFrame.from_arrow(example())
     assert str(frame["time"].dtype) == "datetime64[ns, UTC]"
-    assert [time.value for time in frame["time"]] == [row.time for row in EXAMPLE]
+    assert [time.value for time in frame["time"]] == [row.time_ns for row in EXAMPLE]
     assert list(frame["drive"]) == [row.drive for row in EXAMPLE]
     assert list(frame["value"].isna()) == [row.value is None for row in EXAMPLE]
     assert list(frame["value"].dropna()) == [49.99, 0.3]
@@ -89,7 +89,7 @@ def test_pandas_by_pyarrow_has_the_same_times() -> None:
     pytest.importorskip("pandas", reason="needs pandas")
     frame = pa.table(example()).to_pandas()
     assert str(frame["time"].dtype) == "datetime64[ns, UTC]"
-    assert [time.value for time in frame["time"]] == [row.time for row in EXAMPLE]
+    assert [time.value for time in frame["time"]] == [row.time_ns for row in EXAMPLE]
 
 
 @pytest.mark.parametrize("library", ["pandas", "numpy"])

@@ -191,7 +191,7 @@ def test_batches_for_a_while(port: str) -> None:
         rows = [row for batch in poller.batches(0.3, every=0.05) for row in batch]
         samples = [row for row in rows if row.value is not None]
         assert {row.value for row in samples if row.register == "output_current"} == {3.25}
-        assert all(row.time > row.monotonic_ns > 0 for row in rows)
+        assert all(row.time_ns > row.monotonic_ns > 0 for row in rows)
         assert all(row.uncertainty_ns is not None and row.uncertainty_ns > 0 for row in samples)
 
 

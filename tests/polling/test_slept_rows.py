@@ -35,13 +35,13 @@ poll = ["output_frequency"]
 """
 CLIENT = """
 import json, sys, time
-from multidrop import Poller, load_plant
+from multidrop import Plant, Poller
 rows = []
-with Poller(load_plant(sys.argv[1])) as poller:
-    while sum(row.status == "ok" and row.time > int(sys.argv[2]) for row in rows) < 300:
+with Poller(Plant.load(sys.argv[1])) as poller:
+    while sum(row.status == "ok" and row.time_ns > int(sys.argv[2]) for row in rows) < 300:
         rows += poller.take() or ()
         time.sleep(0.001)
-print(json.dumps([[row.time, row.monotonic_ns] for row in rows if row.status == "ok"]))
+print(json.dumps([[row.time_ns, row.monotonic_ns] for row in rows if row.status == "ok"]))
 """
 
 

@@ -15,7 +15,7 @@ from completions import add_miss, add_rows
 from recordings import row
 
 from multidrop.core import Columns, Names, Status
-from multidrop.polling.batch import Batch, Row
+from multidrop.polling.batch import ROW_COLUMNS, Batch, Row
 from multidrop.recording.rows import from_rows
 
 PUMP = "pump-1.output_frequency"
@@ -26,9 +26,9 @@ SPEED = "pump-1.motor_speed"
 def test_pandas_gets_times_with_their_type() -> None:
     pytest.importorskip("pandas", reason="needs pandas")
     frame = example().to_pandas()
-    assert list(frame.columns) == list(Row._fields)
+    assert list(frame.columns) == list(ROW_COLUMNS)
     assert str(frame["time"].dtype) == "datetime64[ns, UTC]"
-    assert [time.value for time in frame["time"]] == [row.time for row in EXAMPLE]
+    assert [time.value for time in frame["time"]] == [row.time_ns for row in EXAMPLE]
     assert list(frame["value"].isna()) == [row.value is None for row in EXAMPLE]
     assert list(frame["value"].dropna()) == [49.99, 0.3]
     assert list(frame["status"]) == [row.status for row in EXAMPLE]
@@ -79,7 +79,7 @@ def test_a_library_that_is_missing_is_told_with_its_extra(
 @pytest.mark.long
 def test_no_library_is_imported_before_it_is_needed() -> None:
     code = (
-        "import sys, multidrop; multidrop.Poller, multidrop.read, multidrop.Batch; "
+        "import sys, multidrop; multidrop.Poller, multidrop.open_recording, multidrop.Batch; "
         "import multidrop.cli.poll; print(*sys.modules)"
     )
     told = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
@@ -157,7 +157,10 @@ def test_rows_are_in_the_order_of_their_times_whatever_order_they_came_in() -> N
 
 def test_times_are_joined_only_where_they_are_the_same() -> None:
     early = row(1.0, "pump", "a", 1.0)
-    rows = [early, early._replace(register="b", time=early.time + 1, monotonic_ns=early.monotonic_ns + 1)]
+    rows = [
+        early,
+        early._replace(register="b", time_ns=early.time_ns + 1, monotonic_ns=early.monotonic_ns + 1),
+    ]
     rows.append(rows[1]._replace(drive="fan"))  # of another line, at the same nanosecond
     table = pa.table(from_rows(rows).wide())
     assert table.column("pump.a").to_pylist() == [1.0, None]

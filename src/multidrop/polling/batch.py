@@ -12,7 +12,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from array import array
 from collections.abc import Collection, Iterator, Sequence
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from functools import cache
 from typing import Any, NamedTuple, NoReturn
 
@@ -21,18 +21,40 @@ from multidrop.core.columns import COLUMNS
 from multidrop.polling.tables import ArrowTable, WideRows, nanoarrow
 
 _STATUSES = Names(STATUSES)
+EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 
 
 class Row(NamedTuple):
     """A sample, or a miss, which has no value and a status that says why."""
 
-    time: int  # UTC, ns: the request was sent
+    time_ns: int  # UTC: the request was sent
     monotonic_ns: int
-    uncertainty_ns: int | None  # the drive took the value between time and time + uncertainty_ns
+    uncertainty_ns: int | None  # the drive took the value between time_ns and time_ns + uncertainty_ns
     drive: str
     register: str
     value: float | None
     status: str  # "ok", or the reason
+
+    @property
+    def time(self) -> datetime:
+        """The UTC time at which the request was sent, to the microsecond."""
+        return EPOCH + timedelta(microseconds=self.time_ns // 1000)
+
+
+ROW_COLUMNS = ("time", *Row._fields[1:])  # names of the columns that hold rows
+
+
+def shown_span(rows: Sequence[Row]) -> str:
+    """Return the number of rows and drives and the span of time, for a repr."""
+    if not rows:
+        return "no rows"
+    first, last = min(row.time_ns for row in rows), max(row.time_ns for row in rows)
+    drives = len({row.drive for row in rows})
+    begin = datetime.fromtimestamp(first / 1e9, UTC).isoformat(timespec="milliseconds")
+    return (
+        f"{len(rows)} row{'s' * (len(rows) > 1)} of {drives} drive{'s' * (drives > 1)}, "
+        f"{(last - first) / 1e9:.3f} s from {begin}"
+    )
 
 
 class BatchColumns(NamedTuple):
@@ -145,13 +167,7 @@ class Batch(Rows):
         return [f"{drive}.{register}" for drive in drives for register in registers]
 
     def __repr__(self) -> str:
-        times = self._columns.array("time")
-        if not times:
-            return "<Batch: no rows>"
-        first, last = min(times), max(times)
-        drives = len(set(self._columns.array("drive")))
-        begin = datetime.fromtimestamp(first / 1e9, UTC).isoformat(timespec="milliseconds")
-        return f"<Batch: {len(self)} rows of {drives} drives, {(last - first) / 1e9:.3f} s from {begin}>"
+        return f"<Batch: {shown_span([*self])}>"
 
     def arrow(self) -> Any:
         column = self._columns.array

@@ -5,6 +5,7 @@ Rows gather in the core, in chunks of bounded number, and are taken from there, 
 
 from __future__ import annotations
 
+import asyncio
 import inspect
 import logging
 import threading
@@ -87,6 +88,7 @@ class BatchCaller:
 
 
 FILLING_NS = 10_000_000  # for which new rows gather before they are taken from a chunk that is not full
+ASYNC_LOOK_S = 0.05  # between looks for rows in an event loop
 
 
 class RowSource:
@@ -141,6 +143,24 @@ class RowSource:
             is_over = self._over.wait(min(every, left))
             while batch := self.take():
                 yield batch
+
+    def __iter__(self) -> Iterator[Batch]:
+        """Yield batches until the poller is closed; what `batches()` yields."""
+        return self.batches()
+
+    async def __aiter__(self) -> AsyncIterator[Batch]:
+        """Yield batches until the poller is closed, without blocking the event loop.
+
+        A batch is taken only when it is yielded: if the task is cancelled, rows that wait stay for the next
+        taker, also after the poller is closed.
+        """
+        is_over = False
+        while not is_over:
+            is_over = self._over.is_set()
+            while batch := self.take():
+                yield batch
+            if not is_over:
+                await asyncio.sleep(ASYNC_LOOK_S)
 
     @undisturbed
     def on_batch(self, function: Callable[[Batch], object], *, every: float = 0.1) -> None:
