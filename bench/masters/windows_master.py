@@ -12,7 +12,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from multidrop import Poller, load_plant
+from multidrop import Plant, Poller
 
 REPLAY = Path(__file__).parents[1] / "players" / "replay.py"
 
@@ -43,7 +43,7 @@ def main(job: dict[str, Any]) -> None:
     with TemporaryDirectory() as folder:
         path = Path(folder) / "plant.toml"
         path.write_text(plant_text(job), encoding="utf-8")
-        plant = load_plant(path)
+        plant = Plant.load(path)
     with Poller(plant) as poller:
         cpu = time.process_time()
         for batch in poller.batches(job["seconds"]):

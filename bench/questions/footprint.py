@@ -56,10 +56,10 @@ def poll(job: Job) -> dict[str, Any]:
     import multidrop
 
     imported = resident_kb()
-    names = [getattr(multidrop, name) for name in ("Bus", "Poller", "load_plant")]
+    names = [getattr(multidrop, name) for name in ("Bus", "Poller", "Plant")]
     loaded = resident_kb()
     if not job.ports:
-        return {"bare": bare, "import multidrop": imported, "and Bus, Poller, load_plant": loaded}
+        return {"bare": bare, "import multidrop": imported, "and Bus, Poller, Plant": loaded}
     from bench.players.replay import Played
     from multidrop.plant.model import Plant, PlantLine, Polled, PolledDrive
 

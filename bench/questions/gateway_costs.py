@@ -26,7 +26,7 @@ from gateway_users import COMMON, COMMON_WORDS, WORDS
 from simulated_pumps import FIRST_READING, POLLED, write_plant
 
 from bench.support import tables
-from multidrop import load_plant
+from multidrop import Plant
 from multidrop.core import Columns, Counters, Names, Status
 from multidrop.exposition import expose_metrics
 from multidrop.gateway.gateway import Gateway
@@ -87,7 +87,7 @@ class Worker:
     """A gateway that does not run, and the kinds of its work, each to be done once for all drives."""
 
     def __init__(self, folder: Path) -> None:
-        self.plant = load_plant(write_plant(folder, LINES))
+        self.plant = Plant.load(write_plant(folder, LINES))
         self.gateway = Gateway(self.plant, ServeSettings(port=0))
         self.drives = [polled.drive.name for line in self.plant.lines for polled in line.drives]
         self._names = Names(self.drives), Names(POLLED)

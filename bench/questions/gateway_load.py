@@ -32,7 +32,7 @@ from simulated_pumps import POLLED, SimulatedPumps, free_ports, simulated_pumps,
 
 from bench.support import tables
 from bench.support.programs import module
-from multidrop import Poller, load_plant
+from multidrop import Plant, Poller
 from multidrop.recording import SegmentWriter
 
 LINES = (8, 8, 8, 7)  # drives on each, at 115200 bit/s: `multidrop plan` says 78 % of the time
@@ -147,7 +147,7 @@ class Gateway(Polling):
 
 def poll(plant: Path, folder: Path) -> None:
     """Poll and record, and tell the counts for each line of standard input, until it ends."""
-    with Poller(load_plant(plant)) as poller, SegmentWriter(folder / "rows.arrows", {}, every=600) as writer:
+    with Poller(Plant.load(plant)) as poller, SegmentWriter(folder / "rows.arrows", {}, every=600) as writer:
         poller.on_batch(writer.write)
         for _ in sys.stdin:
             lines = poller.statistics().values()

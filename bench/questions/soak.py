@@ -28,7 +28,7 @@ from multidrop.plant.loader import load_plant
 from multidrop.plant.model import Plant
 from multidrop.poller import Poller
 from multidrop.polling.batch import Batch, Row
-from multidrop.recording import open_reader, open_writer
+from multidrop.recording import open_recording, open_writer
 from multidrop.sim import load_faults
 from multidrop.toml_check import parse_duration
 
@@ -155,7 +155,7 @@ class Soak:
         period.beyond += beyond
         whose = [name for name, value in self.truth.items() if value == row.value]
         sentence = (
-            f"{row.time / 1e9:.3f} {row.drive}.{row.register} = {row.value:g}, not "
+            f"{row.time_ns / 1e9:.3f} {row.drive}.{row.register} = {row.value:g}, not "
             f"{self.truth[row.drive, row.register]:g}: {', '.join(map('.'.join, whose[:4])) or 'no register'}"
         )
         print(f"{sentence}{', while the line was held up' if beyond else ''}", flush=True)
@@ -171,7 +171,7 @@ class Soak:
                 writer.write(batch)
                 period.descriptors.see(len(list(Path("/proc/self/fd").iterdir())))
                 period.threads.see(threading.active_count())
-        recorded = sum(len(batch) for batch in open_reader(self.out))
+        recorded = sum(len(batch) for batch in open_recording(self.out))
         if recorded != period.values + period.misses.total():
             self.faults.append(f"{recorded} rows in the recording, not those that were polled")
         period.memory_kb = resident_kb(os.getpid())

@@ -91,7 +91,7 @@ def _svg(screen: str) -> str:
 
 def plot(out: Path) -> None:
     """Record two simulated motors that start and stop, and have `multidrop plot` draw them."""
-    from multidrop import Poller, load_plant, open_writer
+    from multidrop import Plant, Poller, open_writer
 
     with TemporaryDirectory() as directory:
         plant_file, recording = Path(directory) / "hall.toml", Path(directory) / "hall.arrows"
@@ -101,7 +101,7 @@ def plot(out: Path) -> None:
             assert simulator.stdout is not None
             simulator.stdout.readline()
             try:
-                plant = load_plant(plant_file)
+                plant = Plant.load(plant_file)
                 with Poller(plant) as poller, open_writer(recording, plant.metadata()) as writer:
                     pump, fan = poller.bus("hall").drives
                     for do in (

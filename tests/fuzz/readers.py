@@ -27,7 +27,7 @@ from multidrop.planning.blocks import blocks
 from multidrop.plant.loader import PlantError, load_plant
 from multidrop.plant.model import Plant
 from multidrop.polling.batch import Row, Rows
-from multidrop.recording import Metadata, open_reader, open_writer, repair
+from multidrop.recording import Metadata, open_recording, open_writer, repair
 from multidrop.sim.faulty_wire import load_faults
 
 PLANT = """
@@ -127,7 +127,7 @@ def read_faults(path: Path) -> None:
 
 def read_recording(path: Path) -> None:
     with refused(ValueError, path):
-        reader = open_reader(path)
+        reader = open_recording(path)
         batches = list(reader)
         rows = _comparable(batches)
         again = _written_again(path, ".arrows", reader.metadata, batches)
@@ -135,7 +135,7 @@ def read_recording(path: Path) -> None:
         assert all(map(_is_kept, again, rows))
         if reader.truncated:
             assert repair(path) == reader.truncated
-            repaired = open_reader(path)
+            repaired = open_recording(path)
             assert (repaired.truncated, _comparable(repaired)) == (0, rows)
 
 
@@ -199,8 +199,8 @@ def _written_again(path: Path, suffix: str, metadata: Metadata, batches: list[Ro
     with open_writer(copy, metadata) as writer:
         for batch in batches:
             writer.write(batch)
-    assert json.dumps(open_reader(copy).metadata) == json.dumps(metadata)
-    return _comparable(open_reader(copy))
+    assert json.dumps(open_recording(copy).metadata) == json.dumps(metadata)
+    return _comparable(open_recording(copy))
 
 
 def _is_kept(found: Row, written: Row) -> bool:

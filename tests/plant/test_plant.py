@@ -620,3 +620,25 @@ def test_a_period_that_no_plant_file_may_have_is_refused(every: Any) -> None:
     with pytest.raises(ValueError, match=rf"^every = {every!r} is not a number of seconds from 0\.0001 to "):
         Polled(register, every)
     assert Polled(register, None).every is None
+
+
+def test_a_star_polls_all_readings_but_those_with_a_rate_of_their_own(load: Load) -> None:
+    def polls(entries: str) -> dict[str, float | None]:
+        (line,) = load(HEAD + TOY + f'every = "1 s"\npoll = {entries}').lines
+        return {poll.register.name: poll.every for poll in line.drives[0].polls}
+
+    assert polls('["*"]') == {"output_frequency": 1.0, "output_current": 1.0}
+    assert polls('["*", { register = "output_current", every = "10 s" }, "acceleration_time"]') == {
+        "output_frequency": 1.0,
+        "output_current": 10.0,
+        "acceleration_time": 1.0,
+    }
+    assert polls('[{ register = "*", every = "2 s" }, "output_current"]') == {
+        "output_frequency": 2.0,
+        "output_current": 1.0,
+    }
+
+
+def test_a_star_twice_is_a_mistake(mistakes: Mistakes) -> None:
+    (sentence,) = mistakes(HEAD + TOY + 'poll = ["*", "*"]')
+    assert sentence.endswith('poll number 2: "*" is there twice; keep it once')

@@ -82,7 +82,7 @@ def _by_place(plant: Plant) -> dict[tuple[str, int], Drive]:
 class _Latest:
     """The latest stop of one drive: the drive as it was then, or None, and the lines as they were."""
 
-    def __init__(self, drive: Drive | None, lines: tuple[PlantLine, ...]) -> None:
+    def __init__(self, drive: Drive | None, lines: Sequence[PlantLine]) -> None:
         self.drive = drive
         self.lines = lines
         self.has_failed = False
@@ -136,7 +136,7 @@ async def stop_as_changed(
             task.cancel()
 
 
-def _is_left(before: _Latest | None, drive: Drive | None, lines: tuple[PlantLine, ...]) -> bool:
+def _is_left(before: _Latest | None, drive: Drive | None, lines: Sequence[PlantLine]) -> bool:
     """Return True where this drive is to be stopped, or stopped again."""
     if before is None:
         return True

@@ -232,15 +232,27 @@ def _polls(
             place.wrong(f"{model.title or model.__name__} has no readings; say what to poll")
         return tuple(Polled(register, every) for register in model.readings())
     found = [_polled(entry, model, every, at) for entry, at in place.inside("poll", entries)]
-    return tuple(polled for polled in found if polled is not None)
+    named = {polled.register for polled in found if isinstance(polled, Polled)}
+    return tuple(
+        polled
+        for one in found
+        for polled in (one if isinstance(one, tuple) else (one,))
+        if polled is not None and (one is polled or polled.register not in named)
+    )
 
 
-def _polled(entry: Any, model: type[Drive], every: float | None, place: TomlPlace) -> Polled | None:
+def _polled(
+    entry: Any, model: type[Drive], every: float | None, place: TomlPlace
+) -> Polled | tuple[Polled, ...] | None:
+    """Return the poll of an entry; those of all readings for "*"."""
     if not isinstance(entry, (str, dict)):
         place.wrong(f'{entry!r} is not right; write "output_current" or {{ register = "output_current" }}')
         return None
     given = place.check({"register": entry} if isinstance(entry, str) else entry, _POLL)
     own = duration_of(given, "every", place) if "every" in given else every
+    if given.get("register") == "*":
+        place.once(place.labels[:-1], "*", sentence='"*" is there twice; keep it once')
+        return tuple(Polled(register, own) for register in model.readings())
     register = place.attempt(model.register, given["register"]) if "register" in given else None
     if register is None:
         return None

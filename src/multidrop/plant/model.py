@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import Flag
+from importlib import import_module
 from pathlib import Path
 from typing import Any, Final, NoReturn
 
@@ -32,19 +33,35 @@ class Polled:
     """
 
     register: Register[Any]
-    every: float | None
+    every: float | None = None
 
     def __post_init__(self) -> None:
         if self.every is not None:
             check_period(self.every)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, init=False)
 class PolledDrive:
-    """A drive and what is read from it, again and again."""
+    """A drive and the registers that are read from it again and again, each at its rate.
+
+    `polls` has registers of the drive or their names, and Polled for a register with a period of its own;
+    without it, all readings of the drive. `every` is the period of the others in s, None for as fast as the
+    line allows.
+    """
 
     drive: Drive
     polls: tuple[Polled, ...]
+
+    def __init__(
+        self,
+        drive: Drive,
+        polls: Iterable[Polled | Register[Any] | str] | None = None,
+        *,
+        every: float | None = None,
+    ) -> None:
+        wanted = drive.readings() if polls is None else polls
+        object.__setattr__(self, "drive", drive)
+        object.__setattr__(self, "polls", tuple(_polled(drive, one, every) for one in wanted))
 
     def __hash__(self) -> int:  # not that of all polls: it is looked up again and again
         return hash(self.drive)
@@ -68,20 +85,29 @@ class PolledDrive:
         return PolledDrive(self.drive, tuple(polls))
 
 
+def _polled(drive: Drive, wanted: Polled | Register[Any] | str, every: float | None) -> Polled:
+    if isinstance(wanted, Polled):
+        return wanted
+    return Polled(drive.register(wanted) if isinstance(wanted, str) else wanted, every)
+
+
 @dataclass(frozen=True)
 class PlantLine:
     """A port with its drives; its baud rate and format are already in the drives' settings."""
 
     name: str
     port: str
-    baudrate: int | None
-    format: str | None
-    drives: tuple[PolledDrive, ...]
+    baudrate: int | None = None
+    format: str | None = None
+    drives: Sequence[PolledDrive] = ()  # kept as a tuple
     switching: float = 0.0  # s that the port takes to change them
     echo: Echo = Echo.AUTO
     ids: TransactionIds = TransactionIds.MATCH
     rs485: RS485 = RS485.OFF
     settle: float = 0.0  # s after the port is opened, in which nothing is sent
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "drives", tuple(self.drives))
 
     def at(self, port: str) -> PlantLine:
         """Return the same line at another port; a network has no transceiver to switch."""
@@ -92,9 +118,18 @@ class PlantLine:
 class Plant:
     """All lines of a plant file, and its table `serve` as it stands: the gateway alone reads that."""
 
-    lines: tuple[PlantLine, ...]
-    path: Path
+    lines: Sequence[PlantLine]  # kept as a tuple
+    path: Path = Path("plant")  # of its file
     serve: Mapping[str, Any] = field(default_factory=dict, hash=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "lines", tuple(self.lines))
+
+    @classmethod
+    def load(cls, path: Path | str) -> Plant:
+        """Return the plant that a file describes; no port is opened. Raises PlantError with all mistakes."""
+        plant: Plant = import_module("multidrop.plant.loader").load_plant(path)  # it imports this module
+        return plant
 
     def find_line(self, name: str) -> PlantLine:
         """Return the line of this name; ValueError with the nearest names when there is none."""
