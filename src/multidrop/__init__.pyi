@@ -1,8 +1,6 @@
 """The public names, in one list: type checkers read it, and __init__.py loads each name from here."""
 
 from multidrop.bus import Bus as Bus
-from multidrop.control.outcome import Outcome as Outcome
-from multidrop.control.outcome import Seen as Seen
 from multidrop.control.outcome import Stopped as Stopped
 from multidrop.control.ramp import ramp as ramp
 from multidrop.drive import Condition as Condition
@@ -35,11 +33,10 @@ from multidrop.families import DelixiNative as DelixiNative
 from multidrop.families import ErmanERG220 as ErmanERG220
 from multidrop.families import InnovertIBD as InnovertIBD
 from multidrop.families import InvtCHE as InvtCHE
-from multidrop.families.files import FamilyError as FamilyError
 from multidrop.families.files.loader import load_family as load_family
 from multidrop.history.history import History as History
+from multidrop.modbus_device import ModbusDevice as ModbusDevice
 from multidrop.plant.loader import PlantError as PlantError
-from multidrop.plant.loader import load_plant as load_plant
 from multidrop.plant.model import Plant as Plant
 from multidrop.plant.model import PlantLine as PlantLine
 from multidrop.plant.model import Polled as Polled
@@ -47,7 +44,7 @@ from multidrop.plant.model import PolledDrive as PolledDrive
 from multidrop.poller import Poller as Poller
 from multidrop.polling.batch import Batch as Batch
 from multidrop.polling.batch import Row as Row
+from multidrop.recording import open_recording as open_recording
 from multidrop.recording import open_writer as open_writer
-from multidrop.recording.reading import read as read
 
 __version__: str

@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
 from multidrop.control.attached import Attached, made
 from multidrop.control.audit_log import AuditLog
@@ -34,11 +34,15 @@ from multidrop.transport.statistics import LineMeter, LineStatistics
 
 D = TypeVar("D", bound=Drive)
 
+EchoMode = Echo | Literal["auto", "on", "off"]
+TransactionMode = TransactionIds | Literal["match", "ignore"]
+RS485Mode = RS485 | Literal["off", "kernel", "rts-up", "rts-down"]
+
 EXPIRY = 1.0  # s
 
 
 def _facts(port: str, echo: str, transaction: str, rs485: str) -> tuple[Echo, TransactionIds, RS485]:
-    """Return what a line is told of its port. Raises ValueError."""
+    """Parse the port options. Raises ValueError for an invalid one."""
     switch = RS485(rs485)
     switch.check_port(port)
     return Echo(echo), TransactionIds(transaction), switch
@@ -79,13 +83,14 @@ class Bus:
         baudrate: int | None = None,
         format: str | None = None,
         silence: float | None = None,
-        echo: str = "auto",
-        transaction: str = "match",
-        rs485: str = "off",
+        echo: EchoMode = "auto",
+        transaction: TransactionMode = "match",
+        rs485: RS485Mode = "off",
         settle: float = 0.0,
         ledger: Ledger | Path | str | None = None,
         audit: Path | str | None = None,
         expiry: float = EXPIRY,
+        stop_on_exit: bool = False,
         mastership: Mastership | None = None,
     ) -> None:
         checked_expiry(expiry, "a write")
@@ -96,18 +101,24 @@ class Bus:
         line = Line(port, *facts, mastership, settle)
         try:
             self._begin(line.open(), ledger, audit, expiry)
-        except BaseException:  # also where the opening is interrupted
+        except BaseException:  # Ctrl-C too
             line.close()
             raise
+        if stop_on_exit:
+            try:
+                self.stop_on_exit()
+            except BaseException:
+                self.close()
+                raise
 
     @classmethod
     def awaiting(
         cls,
         port: str,
         *,
-        echo: str = "auto",
-        transaction: str = "match",
-        rs485: str = "off",
+        echo: EchoMode = "auto",
+        transaction: TransactionMode = "match",
+        rs485: RS485Mode = "off",
         settle: float = 0.0,
         ledger: Ledger | Path | str | None = None,
         audit: Path | str | None = None,

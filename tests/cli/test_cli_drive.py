@@ -34,7 +34,7 @@ from multidrop.core import Message
 from multidrop.errors import WriteForbidden
 from multidrop.families.innovert_ibd import InnovertIBD
 from multidrop.families.invt_che import InvtCHE
-from multidrop.recording import open_reader
+from multidrop.recording import open_recording
 from multidrop.sim import MotorDrive, simulated
 from multidrop.sim.drive import Reason, Refusal, SimulatedDrive
 from multidrop.sim.memory import MemoryCell
@@ -663,7 +663,7 @@ def test_a_stop_by_a_key_goes_on_until_its_end_where_the_terminal_is_closed(
     assert len(received.writes) >= begun + 4
     assert received.starts == received.starts[:1]
     until(lambda: received.sim["status"] == 3)
-    rows = [row for batch in open_reader(out) for row in batch]
+    rows = [row for batch in open_recording(out) for row in batch]
     assert rows[-1].register in {row.register for row in rows[:-1]}  # it was closed in good order
 
 

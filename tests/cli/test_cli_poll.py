@@ -24,7 +24,7 @@ from multidrop.capture import Capture, Decoding
 from multidrop.cli.support.demo_plant import DRIVES, start_motors
 from multidrop.core import Status
 from multidrop.errors import NoReply
-from multidrop.recording import open_reader, open_writer
+from multidrop.recording import open_recording, open_writer
 from multidrop.sim import Simulator, simulated
 
 SIMULATING = """
@@ -143,7 +143,7 @@ def test_poll_records_what_its_summary_counts(run: Run, plant: Path, tmp_path: P
 def test_a_recording_says_what_its_registers_are(run: Run, plant: Path, tmp_path: Path) -> None:
     out = tmp_path / "out.arrows"
     run("poll", plant, "--seconds", 0.1, "--out", out)
-    drive = open_reader(out).metadata["drives"]["pump-1"]
+    drive = open_recording(out).metadata["drives"]["pump-1"]
     assert (drive["line"], drive["model"], drive["address"], drive["settings"]) == (
         "hall-1",
         "toy",
@@ -286,8 +286,8 @@ def test_that_the_end_of_a_recording_is_missing_is_told(run: Run, tmp_path: Path
             writer.write(counting(100, 100 * at))
     with path.open("r+b") as file:
         file.truncate(path.stat().st_size - 7)
-    whole = sum(map(len, open_reader(path)))
-    missing = open_reader(path).truncated
+    whole = sum(map(len, open_recording(path)))
+    missing = open_recording(path).truncated
     assert 0 < missing < path.stat().st_size
     sentence = (
         f"multidrop: the end of {path} is missing: {whole} rows read, and its last {missing} bytes left "
@@ -317,7 +317,7 @@ def test_demo_reads_every_variant_of_every_family(tmp_path: Path) -> None:
     done = multidrop("demo", "--seconds", 2, "--out", out, "--capture", capture, "--json")
     assert (done.returncode, done.stderr) == (0, "")
     summary = json.loads(done.stdout)
-    drives = open_reader(out).metadata["drives"]
+    drives = open_recording(out).metadata["drives"]
     assert {(drive["model"], drive["framing"]) for drive in drives.values()} == {
         ("erman-er-g-220", "rtu"),
         ("invt-che", "rtu"),

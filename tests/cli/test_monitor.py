@@ -55,7 +55,7 @@ from multidrop.core import Counters, Status
 from multidrop.plant.loader import load_plant
 from multidrop.plant.model import Plant
 from multidrop.polling.batch import Row
-from multidrop.recording import open_reader
+from multidrop.recording import open_recording
 from multidrop.recording.rows import from_rows
 from multidrop.transport.statistics import LineStatistics, line_statistics
 
@@ -706,7 +706,7 @@ def test_what_it_shows_is_recorded(plant: Path, tmp_path: Path) -> None:
         await_both(terminal)
         terminal.press(b"q")
         assert terminal.process.wait(timeout=60) == 0
-    rows = [row for batch in open_reader(out) for row in batch]
+    rows = [row for batch in open_recording(out) for row in batch]
     assert {row.drive for row in rows} == {"pump-1", "pump-9"}
     with on_terminal("monitor", plant, "--out", out) as terminal:
         terminal.wait_for("seen.arrows")  # it is there already

@@ -384,10 +384,10 @@ MISTAKES: dict[str, tuple[Callable[[Bus, Rig], Any], type[Exception], str]] = {
         TypeError,
         "a port is a device such as '/dev/ttyUSB0' or a pyserial URL, not None",
     ),
-    "a file instead of its plant": (
-        lambda bus, rig: Poller(cast(Any, "plant.toml")),
+    "a number instead of a plant": (
+        lambda bus, rig: Poller(cast(Any, 5)),
         TypeError,
-        "Poller takes a Plant, such as load_plant('plant.toml') gives, not 'plant.toml'",
+        "Poller takes a Plant or a plant file such as 'plant.toml', not 5",
     ),
     "a broadcast that the document does not have": (
         lambda bus, rig: bus.broadcast(rig.target, 0),

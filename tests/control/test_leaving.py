@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import pytest
@@ -138,3 +139,19 @@ def test_a_bus_waits_for_all_stops_unless_they_are_cut_short(
     pair.bus.part()
     assert pair.turning == [False, False]
     assert waited == ([] if is_cut_short else [()])
+
+
+def test_a_bus_that_stops_on_exit_is_made_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    line = SimulatedBus(monkeypatch, simulated(InvtCHE(1)), stop_on_exit=True)
+    assert line.bus.stops_on_exit
+    line.bus.close()
+
+
+def test_only_the_main_thread_makes_a_bus_that_stops_on_exit(monkeypatch: pytest.MonkeyPatch) -> None:
+    closed: list[bool] = []
+    monkeypatch.setattr(SimulatedBus, "close", lambda self: closed.append(True))
+    with ThreadPoolExecutor(1) as threads:
+        made = threads.submit(SimulatedBus, monkeypatch, simulated(InvtCHE(1)), stop_on_exit=True)
+        with pytest.raises(ValueError, match="main thread"):
+            made.result()
+    assert closed

@@ -22,9 +22,9 @@ from examples import usually
 from lines import PATIENCE, until
 from toy import Status, Toy
 
-from multidrop import NotMaster, Seen
+from multidrop import NotMaster
 from multidrop.bus import Bus
-from multidrop.control import read_audit
+from multidrop.control import Seen, read_audit
 from multidrop.core import Completion, Exchange, Failure, Mastership
 from multidrop.core import Status as Missed
 from multidrop.drive import Script, insist, read, verb, write

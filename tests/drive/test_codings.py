@@ -27,7 +27,7 @@ from multidrop.drive.register import HOLDING, INPUT, Kept, reading, row_field, s
 from multidrop.errors import NoValue
 from multidrop.plant.model import PlantLine, PolledDrive
 from multidrop.polling.batch import Batch, Row
-from multidrop.recording import open_reader, open_writer
+from multidrop.recording import open_recording, open_writer
 from multidrop.sim import SimulatedDrive
 
 PACKED = {
@@ -443,7 +443,7 @@ def test_a_recording_holds_what_the_core_made(
     path = tmp_path / f"a{suffix}"
     with open_writer(path, {}) as writer:
         writer.write(batch)
-    rows = [row for part in open_reader(path) for row in part]
+    rows = [row for part in open_recording(path) for row in part]
     assert rows == list(batch)
     assert all(
         (row.status == "no valid value") == (case[4] == 1) for row, case in zip(rows, cases, strict=True)

@@ -128,7 +128,7 @@ def asked(row: Row) -> bool:
 
 
 def kept(row: Row) -> KeptRow:
-    return KeptRow(row.time, None if row.value is None else round(row.value))
+    return KeptRow(row.time_ns, None if row.value is None else round(row.value))
 
 
 def test_the_fleet_is_calm_once_no_line_has_moved_between_two_looks() -> None:

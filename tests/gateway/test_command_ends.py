@@ -16,8 +16,8 @@ from modbus_gateway import plant_of
 from simulated_bus import one
 from tables import table
 
-from multidrop import Bus, InvtCHE, Plant, Seen, Stopped, Unconfirmed
-from multidrop.control import CommandResult, Ledger
+from multidrop import Bus, InvtCHE, Plant, Stopped, Unconfirmed
+from multidrop.control import CommandResult, Ledger, Seen
 from multidrop.gateway.commands import Commands
 from multidrop.gateway.http.rights import Caller, May, Right
 from multidrop.gateway.live.views import look_at

@@ -19,7 +19,7 @@ from interruptions import every, interrupted_before
 from kills import BoundProcess
 from lines import PATIENCE, until
 
-from multidrop import Bus, InvtCHE, load_plant
+from multidrop import Bus, InvtCHE, Plant
 from multidrop.gateway.gateway import Gateway
 from multidrop.gateway.settings import ServeSettings
 from multidrop.sim import EncodedDrive, Simulator, Wire
@@ -66,7 +66,7 @@ def falls_silent(drive: Counting) -> None:
 @pytest.mark.parametrize("step", [1009, pytest.param(53, marks=pytest.mark.slow)])
 def test_a_gateway_that_is_interrupted_anywhere_ends(drive: Counting, tmp_path: Path, step: int) -> None:
     """KeyboardInterrupt before every so many bytecodes of the main thread, from its making to its end."""
-    plant = load_plant(tmp_path / "plant.toml")
+    plant = Plant.load(tmp_path / "plant.toml")
 
     def live() -> None:
         gateway = Gateway(plant, ServeSettings(port=0))

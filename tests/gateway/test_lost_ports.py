@@ -10,7 +10,7 @@ import pytest
 from gateways import Served, plant_text, running, tokens, written
 from lines import until
 
-from multidrop import InvtCHE, load_plant
+from multidrop import InvtCHE, Plant
 from multidrop.gateway.gateway import Gateway
 from multidrop.gateway.settings import read_settings
 from multidrop.sim import Simulator, Wire, simulated
@@ -26,7 +26,7 @@ def test_the_other_lines_are_polled_and_it_comes_when_its_port_does(tmp_path: Pa
         text = plant_text(simulator.wires[0].path, ["pump-1"])
         text += plant_text(str(port), ["fan-1"], SERVE).replace('"hall"', '"roof"')
         (tmp_path / "plant.toml").write_text(text)
-        plant = load_plant(tmp_path / "plant.toml")
+        plant = Plant.load(tmp_path / "plant.toml")
         gateway = Gateway(plant, read_settings(plant, {}))
         with running(gateway):
             served = Served(gateway, dict(zip(("pump-1", "fan-1"), sims, strict=True)), tokens()[0])

@@ -17,7 +17,7 @@ from gateways import POLL, Answer, Served, certificate, plant_text, running, ser
 from lines import HOST_LATE, PATIENCE, until
 
 import multidrop
-from multidrop import Batch, Bus, InvtCHE, LineError, Plant, load_plant
+from multidrop import Batch, Bus, InvtCHE, LineError, Plant
 from multidrop.gateway.clock import boottime_ns
 from multidrop.gateway.gateway import Gateway
 from multidrop.gateway.http.rights import Right, new_token
@@ -72,7 +72,7 @@ def two_lines(
     path = folder / "plant.toml"
 
     def read() -> tuple[Plant, ServeSettings]:
-        plant = load_plant(path)
+        plant = Plant.load(path)
         return plant, replace(read_settings(plant, {}), port=0, tokens=known)
 
     with Simulator([Wire([sim], unpaced=True) for sim in sims.values()]) as simulator:
@@ -244,7 +244,7 @@ def test_a_token_that_is_taken_away_counts_no_more_after_a_reload(tmp_path: Path
     with simulated_plant(tmp_path, serve) as path:
 
         def read() -> tuple[Plant, ServeSettings]:
-            plant = load_plant(path)
+            plant = Plant.load(path)
             return plant, replace(read_settings(plant, {}), port=0)
 
         gateway = Gateway(*read(), read=read)
@@ -481,7 +481,7 @@ def test_rows_amid_a_reload_are_described_as_what_they_were_read_as(
     found = set()
     segments = [path for _, path in segments_of(tmp_path / "history" / "rows.arrows")]
     for path in [*segments, *(tmp_path / "history" / "rows").glob("*.parquet")]:
-        recording = multidrop.read(path)
+        recording = multidrop.open_recording(path)
         about = recording.metadata["drives"]["fan-1"]["registers"].get("dc_bus_voltage")
         found |= {
             (about["unit"], about["step"], row.value)

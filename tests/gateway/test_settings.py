@@ -8,7 +8,7 @@ import pytest
 from gateways import certificate, plant_text, written
 from tables import table
 
-from multidrop import PlantError, load_plant
+from multidrop import Plant, PlantError
 from multidrop.gateway.http.connections import listen
 from multidrop.gateway.http.rights import Right, digest, new_token, read_tokens
 from multidrop.gateway.settings import read_plant, read_settings
@@ -122,7 +122,7 @@ units = { pump-1 = 7 }
     path = tmp_path / "plant.toml"
     path.write_text(plant_text("/dev/ttyUSB0", ["pump-1"], serve).replace("invt-che", "invt-chx"))
     with pytest.raises(PlantError) as wrong:
-        read_plant(lambda: load_plant(path), {})
+        read_plant(lambda: Plant.load(path), {})
     assert [mistake.split(": ")[1] for mistake in wrong.value.mistakes] == [
         'line "hall", drive "pump-1"',
         "[serve]",
@@ -131,7 +131,7 @@ units = { pump-1 = 7 }
     ]
     path.write_text("no TOML")
     with pytest.raises(PlantError, match="is not TOML"):
-        read_plant(lambda: load_plant(path), {})
+        read_plant(lambda: Plant.load(path), {})
 
 
 @pytest.mark.slow

@@ -15,7 +15,7 @@ from lines import until
 from peers import require_module
 
 import multidrop.gateway
-from multidrop import Poller, load_plant
+from multidrop import Plant, Poller
 from multidrop.gateway import historian
 from multidrop.gateway.gateway import Gateway
 from multidrop.gateway.settings import ServeSettings
@@ -151,7 +151,7 @@ def test_a_watched_thread_that_ends_makes_health_fail(gateway: Served) -> None:
 
 def test_a_web_server_that_ends_ends_the_gateway(tmp_path: Path) -> None:
     with simulated_plant(tmp_path, "") as path:
-        gateway = Gateway(load_plant(path), ServeSettings(port=0))
+        gateway = Gateway(Plant.load(path), ServeSettings(port=0))
         ended = pytest.raises(RuntimeError, match="the web server has ended: it was cancelled")
         with ended, running(gateway) as loop:
             in_loop(loop, lambda found: found.kept["web"].cancel())

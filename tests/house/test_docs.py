@@ -26,7 +26,7 @@ import pytest
 from examples import usually
 from tables import table
 
-from multidrop import core, load_plant
+from multidrop import Plant, core
 from multidrop.cli import COMMANDS, main
 from multidrop.families import MODELS, InnovertIBD
 from multidrop.sim import Simulator, Wire, simulated
@@ -168,7 +168,7 @@ class Session:
                 text = text.replace(f'"{line["port"]}"', f'"{link}"')
         Path(name).write_text(text)
         if "[[line]]" in text:
-            for line in load_plant(name).lines:
+            for line in Plant.load(name).lines:
                 if line.port in self._wires.values() and not Path(line.port).is_symlink():
                     self._serve(line.port, [polled.drive for polled in line.drives])
 

@@ -14,7 +14,7 @@ from tables import table
 
 from multidrop.cli import main
 from multidrop.control import read_audit
-from multidrop.recording import open_reader
+from multidrop.recording import open_recording
 
 ROOT = Path(__file__).parents[2]
 EXAMPLES = ROOT / "examples"
@@ -46,7 +46,7 @@ def test_an_example_is_linked_from_the_pages_and_run_here(path: Path) -> None:
 def test_a_logger_to_parquet(tmp_path: Path) -> None:
     pytest.importorskip("pyarrow")
     run(tmp_path, "logger.py", "--seconds", "1")
-    rows = [row for batch in open_reader(tmp_path / "log.parquet") for row in batch]
+    rows = [row for batch in open_recording(tmp_path / "log.parquet") for row in batch]
     assert {row.drive for row in rows if row.status == "ok"} == {"pump", "fan"}
 
 
@@ -90,4 +90,4 @@ def test_a_noise_hunt(tmp_path: Path) -> None:
     assert "bad checksum" in printed
     capture = tmp_path / "noise" / "all.pcapng"
     assert main(["decode", str(capture), "--out", str(tmp_path / "again.csv")]) == 0
-    assert sum(len(batch) for batch in open_reader(tmp_path / "again.csv"))
+    assert sum(len(batch) for batch in open_recording(tmp_path / "again.csv"))

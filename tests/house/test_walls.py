@@ -24,7 +24,7 @@ FLOORS = [
     {"toml_check"},
     {"core"},
     {"drive"},
-    {"families"},
+    {"families", "modbus_device", "steps"},
     {"planning"},
     {"transport", "plant"},
     {"control"},

@@ -19,7 +19,7 @@ from commands import MULTIDROP
 from kills import BoundProcess
 from lines import PATIENCE, until
 
-from multidrop import InvtCHE, Plant, load_plant
+from multidrop import InvtCHE, Plant
 from multidrop.gateway import gateway as gateway_module
 from multidrop.gateway import parts, reload
 from multidrop.gateway import settings as settings_module
@@ -149,7 +149,7 @@ def written(folder: Path, serve: str = "", *drives: str, port: str = "/dev/ttyUS
     """A plant from a file with this table `[serve]`; nothing is opened."""
     path = folder / "plant.toml"
     path.write_text(plant_text(port, drives or ("pump-1", "pump-2"), serve))
-    return load_plant(path)
+    return Plant.load(path)
 
 
 @contextmanager
@@ -165,7 +165,7 @@ def served(
         written(folder, serve, *names, port=simulator.wires[0].path)
 
         def read() -> tuple[Plant, ServeSettings]:
-            plant, found = read_plant(lambda: load_plant(folder / "plant.toml"), environment or {})
+            plant, found = read_plant(lambda: Plant.load(folder / "plant.toml"), environment or {})
             return plant, replace(found, port=0, **{"tokens": known, **settings})
 
         gateway = Gateway(*read(), read=read)

@@ -86,7 +86,7 @@ def check_buckets(found: Buckets, rows: Iterable[Row], series: str) -> None:
     mine: dict[int, list[float | None]] = {}
     for row in rows:
         if (row.drive, row.register) == (drive, register):
-            mine.setdefault((row.time - found.begin) // found.step, []).append(row.value)
+            mine.setdefault((row.time_ns - found.begin) // found.step, []).append(row.value)
     for number, begin in enumerate(found.times):
         assert begin == found.begin + number * found.step
         here = mine.get(number, [])

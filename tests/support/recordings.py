@@ -9,7 +9,7 @@ import pyarrow as pa
 from batches import SECOND, UTC_0
 
 from multidrop.polling.batch import Row
-from multidrop.recording import open_reader, open_writer
+from multidrop.recording import open_recording, open_writer
 from multidrop.recording.rows import from_rows
 
 FAULTS = {"NONE": 0, "OVERHEAT": 8, "OVERLOAD": 9}
@@ -97,8 +97,8 @@ def record_as_before(path: Path, *batches: Any, metadata: bytes = b"{}") -> Path
 def rows_of(table: pa.Table | pa.RecordBatch) -> list[Row]:
     """Return the rows as pyarrow sees them, with the time as a number."""
     numbers = table.set_column(0, "time", table.column("time").cast(pa.int64()))
-    return [Row(**row) for row in numbers.to_pylist()]
+    return [Row(*row.values()) for row in numbers.to_pylist()]
 
 
 def recorded(path: Path) -> list[Row]:
-    return [row for rows in open_reader(path) for row in rows]
+    return [row for rows in open_recording(path) for row in rows]

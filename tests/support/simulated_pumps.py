@@ -20,7 +20,7 @@ from typing import Any
 
 from kills import BoundProcess
 
-from multidrop import load_plant
+from multidrop import Plant
 from multidrop.families.profiles.delta import DeltaControl
 from multidrop.sim import MotorDrive, Wire, serve, simulated
 
@@ -186,7 +186,7 @@ def _make_waves(sims: dict[str, MotorDrive], late: list[float]) -> None:
 def main(path: str) -> None:
     """Simulate until terminated."""
     wires, sims = [], {}
-    for line in load_plant(path).lines:
+    for line in Plant.load(path).lines:
         here = [simulated(polled.drive) for polled in line.drives]
         for sim in here:
             assert isinstance(sim, MotorDrive)

@@ -20,7 +20,7 @@ from motors import ReceivedRequests
 from wine_console import Console, Wine
 
 from multidrop.families import InvtCHE
-from multidrop.recording import open_reader
+from multidrop.recording import open_recording
 from multidrop.sim import MotorDrive, Simulator, Wire, simulated
 
 FOLDER = os.environ.get("MULTIDROP_WINE", "")
@@ -274,4 +274,4 @@ def statuses(path: Path) -> list[str]:
     """Return the status of each row so far."""
     if not path.exists() or not path.stat().st_size:
         return []
-    return [row.status for batch in open_reader(path) for row in batch]
+    return [row.status for batch in open_recording(path) for row in batch]

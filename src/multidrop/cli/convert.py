@@ -8,7 +8,7 @@ from pathlib import Path
 from multidrop.cli.support.files import check_no_segments, refuse_overwriting, warn_truncated
 from multidrop.cli.support.output import print_text
 from multidrop.cli.support.values import counted
-from multidrop.recording import FORMATS, convert, open_reader
+from multidrop.recording import FORMATS, convert, open_recording
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -20,6 +20,6 @@ def run(arguments: argparse.Namespace) -> int:
     refuse_overwriting(arguments.target)
     check_no_segments(arguments.source)
     rows = convert(arguments.source, arguments.target)
-    warn_truncated(arguments.source, rows, open_reader(arguments.source).truncated)
+    warn_truncated(arguments.source, rows, open_recording(arguments.source).truncated)
     print_text(f"{counted(rows, 'row')} in {arguments.target}")
     return 0

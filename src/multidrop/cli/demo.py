@@ -13,7 +13,7 @@ from multidrop.cli.poll import add_polling_arguments, conclude, follow
 from multidrop.cli.support.demo_plant import DRIVES, demo_port, plant_file, simulator, start_motors
 from multidrop.cli.support.files import refuse_overwriting
 from multidrop.plant.loader import load_plant
-from multidrop.recording import open_reader
+from multidrop.recording import open_recording
 
 OUT, SECONDS = "demo.arrows", 10.0
 POLLED = ("output_frequency", "motor_speed", "output_current", "dc_bus_voltage")
@@ -59,7 +59,7 @@ def _check_web(arguments: argparse.Namespace) -> None:
 def _make_room(out: Path) -> None:
     """Remove an earlier demo's recording, and nothing else. Raises ValueError for any other file."""
     with suppress(ValueError, TypeError, OSError):  # no file, or no recording
-        if set(open_reader(out).metadata.get("drives", ())) == {name for name, *_ in DRIVES}:
+        if set(open_recording(out).metadata.get("drives", ())) == {name for name, *_ in DRIVES}:
             out.unlink()
     refuse_overwriting(out)
 

@@ -25,7 +25,6 @@ from multidrop.cli.support.files import refuse_overwriting, require_extra
 from multidrop.cli.support.output import logging_to, warn
 from multidrop.cli.support.polling import LiveDrive, LivePlant, PollingSession, SideReader, polling_session
 from multidrop.cli.support.values import counted
-from multidrop.control.outcome import Seen
 from multidrop.plant.model import Plant
 
 DRAW_S = 0.25
@@ -291,7 +290,7 @@ class Monitor:
 
     def _stop_all(self, line: str) -> tuple[str, list[str]]:
         stopped = self._session.poller.bus(line).stop_all().values()
-        doubtful = [str(stop) for stop in stopped if stop.seen is not Seen.STOPPED]
+        doubtful = [str(stop) for stop in stopped if not stop.ok]
         self._stop_results[line] = len(stopped) - len(doubtful), len(stopped)
         have, asked = map(sum, zip(*[*self._stop_results.values()], strict=True))
         lines, done = len(self._plant.plant.lines), len(self._stop_results)

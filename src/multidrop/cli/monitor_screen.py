@@ -204,7 +204,7 @@ def _register(
         row = drive.newest.get(name)
         value = drive.shown(name) or (miss.status if miss else "not yet")
         note = miss.status if miss and row else OLD_NOTE if drive.is_old(name, now_ns) else ""
-        return value, _age(None if row is None else (now_ns - row.time) / 1e9), note
+        return value, _age(None if row is None else (now_ns - row.time_ns) / 1e9), note
     other = others.get(name)
     return (other.text, _age((now_ns - other.time) / 1e9), NOT_POLLED) if other else ("...", "", NOT_POLLED)
 

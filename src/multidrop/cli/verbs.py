@@ -276,7 +276,7 @@ def stop_plant(arguments: argparse.Namespace, audit: str | None) -> int:
     if arguments.json:
         print_text(json.dumps([record for stop in stops for record in stop.records()], indent=2))
     results = [result for stop in stops for result in stop.results]
-    return DONE if all(result.seen is Seen.STOPPED for result in results) else FAILED
+    return DONE if all(result.ok for result in results) else FAILED
 
 
 def _lines(plant: Plant, arguments: argparse.Namespace) -> Sequence[PlantLine]:

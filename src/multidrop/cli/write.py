@@ -16,7 +16,6 @@ from multidrop.cli.support.arguments import (
 from multidrop.cli.support.output import print_text
 from multidrop.cli.support.values import as_json, nearest_value
 from multidrop.cli.support.writing import confirm, telling_what_was_sent
-from multidrop.control.outcome import Effect
 from multidrop.control.rules import check_plain, raw_count, refused
 
 _FURTHER = ("REGISTER", "VALUE")
@@ -48,5 +47,5 @@ def run(arguments: argparse.Namespace) -> int:
         record = {"drive": drive.name, "register": register.name} | as_json(register, held)
         print_text(json.dumps(record | {"outcome": outcome.effect.value}, indent=2))
     else:
-        print_text(outcome, file=sys.stdout if outcome.effect is Effect.DONE else sys.stderr)
-    return 0 if outcome.effect is Effect.DONE else 1
+        print_text(outcome, file=sys.stdout if outcome.ok else sys.stderr)
+    return 0 if outcome.ok else 1

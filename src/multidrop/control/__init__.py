@@ -17,6 +17,8 @@ from multidrop.control.commands import typed_value as typed_value
 from multidrop.control.commands import write_register as write_register
 from multidrop.control.eeprom_ledger import Ledger as Ledger
 from multidrop.control.outcome import Effect as Effect
+from multidrop.control.outcome import Outcome as Outcome
+from multidrop.control.outcome import Seen as Seen
 from multidrop.control.ramp import start_staggered as start_staggered
 from multidrop.control.repeated_stops import LineStop as LineStop
 from multidrop.control.repeated_stops import RepeatedStops as RepeatedStops

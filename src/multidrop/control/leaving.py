@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 
 from multidrop.control.exit_hook import LastAct, exit_hook
 from multidrop.control.latches import Latches
-from multidrop.control.outcome import Seen, Stopped
+from multidrop.control.outcome import Stopped
 from multidrop.control.stop_all import Stopper
 from multidrop.drive.family import Drive
 from multidrop.transport.aside_log import log_aside
@@ -79,5 +79,5 @@ class Leaving:
 def _warn_of(found: Mapping[str, Stopped]) -> None:
     """Log each drive that is not seen to stand."""
     for stopped in found.values():
-        if stopped.seen is not Seen.STOPPED:
+        if not stopped.ok:
             log_aside(_log, logging.WARNING, "%s", stopped)

@@ -32,8 +32,13 @@ class Outcome:
     failure: BusError | None = None
 
     @property
+    def ok(self) -> bool:
+        """True if the drive took the value."""
+        return self.effect is Effect.DONE
+
+    @property
     def value(self) -> Any:
-        """The value that the drive holds, as far as that is known; raises the failure where there is one."""
+        """The value that the drive holds, as far as it is known. Raises `failure` if there is one."""
         if self.failure is not None:
             raise self.failure
         return self.asked if self.held is None else self.held
@@ -64,6 +69,11 @@ class Stopped:
     seen: Seen
     seconds: float
     why: str = ""
+
+    @property
+    def ok(self) -> bool:
+        """True if the motor is seen to stand."""
+        return self.seen is Seen.STOPPED
 
     def __str__(self) -> str:
         why = f": {self.why}" if self.why else ""

@@ -193,7 +193,7 @@ class Line:
             raise
         except PORT_FAILURES as failure:
             self._let_go()
-            raise LineError(self.port, reason_of(failure)) from failure
+            raise LineError(self.port, reason_of(failure)) from None
 
     def drop(self) -> None:
         """Carry out nothing more; what is queued and not yet sent never will be. `close` closes the port."""

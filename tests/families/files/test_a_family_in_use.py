@@ -12,12 +12,12 @@ from lines import ANY_PORT
 from peers import require_module
 from simulated_bus import SimulatedBus
 
-from multidrop import Bus, Drive, WriteForbidden, load_family, load_plant
+from multidrop import Bus, Drive, Plant, WriteForbidden, load_family
 from multidrop.control.eeprom_ledger import Ledger
 from multidrop.drive import INPUT
 from multidrop.families.registry import find_model
 from multidrop.planning.blocks import blocks
-from multidrop.recording import open_reader
+from multidrop.recording import open_recording
 from multidrop.sim import Simulator, Wire, simulated
 
 pytestmark = pytest.mark.usefixtures("_turns_awaited")
@@ -73,7 +73,7 @@ def pump(plant: Path) -> type[Drive]:
 
 
 def test_a_model_s_path_begins_at_the_plant_file(plant: Path, pump: type[Drive]) -> None:
-    drives = [polled.drive for polled in load_plant(plant).lines[0].drives]
+    drives = [polled.drive for polled in Plant.load(plant).lines[0].drives]
     assert type(drives[1]) is pump
     assert find_model("families/pump.toml", plant.parent) is pump
     assert [drive.model for drive in drives] == ["meter.toml", "pump.toml"]
@@ -115,7 +115,7 @@ def test_a_plant_of_two_files_from_the_wire_to_the_report(
     run: Run, plant: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(plant.parent)
-    lines = load_plant(plant).lines
+    lines = Plant.load(plant).lines
     drives = [simulated(polled.drive) for polled in lines[0].drives]
     drives[0]["voltage"], drives[1]["pressure"] = 230.5, 1.25
     with Simulator([Wire(drives, port=str(plant.parent / "hall"), unpaced=True)]):
@@ -129,9 +129,9 @@ def test_a_plant_of_two_files_from_the_wire_to_the_report(
     assert [(each["address"], each["models"]) for each in found["drives"] if each["models"]] == [
         (2, ["pump.toml"])
     ]
-    (scanned,) = load_plant("found.toml").lines[0].drives
+    (scanned,) = Plant.load("found.toml").lines[0].drives
     assert type(scanned.drive) is find_model("families/pump.toml")
-    reader = open_reader("run.arrows")
+    reader = open_recording("run.arrows")
     assert reader.metadata["drives"]["meter-1"]["model"] == "meter.toml"
     values = {(row.drive, row.register): row.value for batch in reader for row in batch}
     assert values["meter-1", "voltage"] == 230.5
@@ -139,7 +139,7 @@ def test_a_plant_of_two_files_from_the_wire_to_the_report(
     assert run("convert", "run.arrows", "run.csv")[0] == 0
     assert run("decode", "run.pcapng", "--plant", plant, "--out", "decoded.arrows")[0] == 0
     decoded = {
-        (row.drive, row.register): row.value for batch in open_reader("decoded.arrows") for row in batch
+        (row.drive, row.register): row.value for batch in open_recording("decoded.arrows") for row in batch
     }
     assert decoded["meter-1", "voltage"] == 230.5
     require_module("matplotlib")

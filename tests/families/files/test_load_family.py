@@ -12,10 +12,11 @@ import pytest
 from families import METER, METER_CSV, Meter, write_meter
 from tables import table
 
-from multidrop import Drive, FamilyError, load_family
+from multidrop import Drive, load_family
 from multidrop.core import NumberFormat
 from multidrop.drive import Kept
 from multidrop.drive.register import HOLDING, INPUT, Register
+from multidrop.families.files import FamilyError
 from multidrop.families.files.loader import SECTIONS
 from multidrop.families.files.registers import REGISTER_KEYS
 from multidrop.families.files.sections import FAMILY_KEYS

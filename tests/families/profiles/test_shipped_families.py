@@ -13,7 +13,7 @@ from profile_families import SHIPPED_AS, shipped
 from scripts import rows, typed
 from simulated_bus import SimulatedBus, one
 
-from multidrop import Bus, load_plant
+from multidrop import Bus, Plant
 from multidrop.cli import main
 from multidrop.drive import Condition, Drive, Unsupported, WriteForbidden
 from multidrop.drive.register import Access
@@ -230,7 +230,7 @@ def test_a_plant_file_names_them(tmp_path: Path) -> None:
             for address, name in enumerate(SHIPPED, 1)
         )
     )
-    (line,) = load_plant(plant).lines
+    (line,) = Plant.load(plant).lines
     assert [type(polled.drive).model for polled in line.drives] == list(SHIPPED)
 
 

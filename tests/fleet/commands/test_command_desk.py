@@ -17,8 +17,8 @@ from lines import patient
 from peers import require_module
 from tables import table
 
-from multidrop import Seen, Stopped
-from multidrop.control import audit_log, read_audit
+from multidrop import Stopped
+from multidrop.control import Seen, audit_log, read_audit
 
 require_module("nats")
 

@@ -85,7 +85,7 @@ def judge(drives: list[NumberedDrive], gateways: list[Gateway]) -> list[Answers]
     return [
         judge_drive(
             [
-                KeptRow(row.time, None if row.value is None else round(row.value))
+                KeptRow(row.time_ns, None if row.value is None else round(row.value))
                 for row in rows
                 if row.drive == drive.drive.name
             ],

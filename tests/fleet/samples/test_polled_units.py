@@ -182,16 +182,16 @@ def test_rows_of_a_hubs_folder_have_a_column_for_each_unit(kept: Path, tmp_path:
         everything = history.read(None, BEGIN, END)
         about = everything.metadata["drives"]["pump-1"]["registers"]
         assert about["value_2"]["unit"] == "names of meter.toml"
-        for found in (rows, multidrop.read(tmp_path / "out.parquet"), everything):
+        for found in (rows, multidrop.open_recording(tmp_path / "out.parquet"), everything):
             columns: dict[str, set[int]] = {}
             for batch in found:
                 for row in batch:
                     if row.drive == "pump-1" and "value_1" in row.register.split(" "):
-                        columns.setdefault(row.register, set()).add((row.time - NOON) // STEP)
+                        columns.setdefault(row.register, set()).add((row.time_ns - NOON) // STEP)
             assert (max(columns["value_1 [V]"]), min(columns["value_1"])) == (16, 20)
 
 
 @pytest.mark.slow
 def test_a_file_of_a_hub_is_read_by_its_folder(kept: Path) -> None:
     with pytest.raises(ValueError, match="a file of `multidrop hub`: read its folder by"):
-        multidrop.read(min((kept / "rows").iterdir()))
+        multidrop.open_recording(min((kept / "rows").iterdir()))

@@ -11,7 +11,7 @@ import pytest
 from fleets import MemoryBucket
 from peers import require_module
 
-from multidrop import load_plant
+from multidrop import Plant
 
 require_module("nats")
 
@@ -76,7 +76,7 @@ def test_lines_come_out_as_they_went_in(tmp_path: Path) -> None:
     path = tmp_path / "plant.toml"
     path.write_text(PLANT, "utf-8")
     again = lines_again(path, tmp_path / "gateway")
-    assert [as_text(line) for line in again] == [as_text(line) for line in load_plant(path).lines]
+    assert [as_text(line) for line in again] == [as_text(line) for line in Plant.load(path).lines]
 
 
 def test_a_family_file_goes_with_its_line(tmp_path: Path) -> None:
@@ -89,7 +89,7 @@ def test_a_family_file_goes_with_its_line(tmp_path: Path) -> None:
         'model = "families/own.toml"\naddress = 1\n'
     )
     [again] = lines_again(path, tmp_path / "gateway")
-    assert as_text(again) == as_text(load_plant(path).lines[0])
+    assert as_text(again) == as_text(Plant.load(path).lines[0])
     assert (tmp_path / "gateway" / "hall" / "families" / "own.toml").exists()
 
 

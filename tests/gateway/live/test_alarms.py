@@ -18,7 +18,7 @@ from gateways import POLL, Served, plant_text, running, served, written
 from lines import until
 from tables import table
 
-from multidrop import BusError, WriteForbidden, load_plant
+from multidrop import BusError, Plant, WriteForbidden
 from multidrop.core import Columns, Field, Names, NumberFormat, RowLayout
 from multidrop.drive import can_show_fault
 from multidrop.errors import Advice
@@ -45,7 +45,7 @@ def hub_of(folder: Path, model: str, poll: str) -> Hub:
     start = text.index("poll = ")
     path = folder / f"{model}.toml"
     path.write_text(f"{text[:start]}poll = {poll}\n")
-    return Hub(load_plant(path), lambda: (now_ns[0], 0))
+    return Hub(Plant.load(path), lambda: (now_ns[0], 0))
 
 
 now_ns = [0]  # by the clock of rows
@@ -364,7 +364,7 @@ def test_alarms_that_cannot_be_kept_are_in_the_health(tmp_path: Path) -> None:
 
 def test_a_lost_port_is_one_alarm_of_its_line(tmp_path: Path) -> None:
     (tmp_path / "plant.toml").write_text(plant_text(str(tmp_path / "none"), ["pump-1", "pump-2"]))
-    plant = load_plant(tmp_path / "plant.toml")
+    plant = Plant.load(tmp_path / "plant.toml")
     gateway = Gateway(plant, replace(read_settings(plant, {}), port=0))
     with running(gateway):
         page = Served(gateway, {}, {})

@@ -11,7 +11,7 @@ from gateways import written
 from hypothesis import given
 from hypothesis import strategies as st
 
-from multidrop import load_plant
+from multidrop import Plant
 from multidrop.core import Columns, Field, Names, NumberFormat, RowLayout, Status
 from multidrop.gateway.live.alarms import Alarms
 from multidrop.gateway.live.frames import frame_of, lost_of
@@ -196,7 +196,7 @@ def test_two_clocks_that_are_not_read_at_once_are_no_sleep(tmp_path: Path) -> No
 def test_what_is_read_seldom_is_fresh_for_longer(tmp_path: Path, clock: HubClock) -> None:
     path = written(tmp_path).path
     path.write_text(path.read_text().replace("100 ms", "10 s"))
-    hub = Hub(load_plant(path), clock)
+    hub = Hub(Plant.load(path), clock)
     hub.take(all_of(10, FORWARD, 25))
     clock.now_ns = (10 + 300) * PERIOD
     assert is_fresh(hub)
@@ -210,7 +210,7 @@ def test_what_an_overfull_line_reads_holds_until_three_rounds_are_over(
 ) -> None:
     path = written(tmp_path, "", *(f"pump-{n}" for n in range(1, 31))).path
     path.write_text(path.read_text().replace("baudrate = 38400", "baudrate = 1200"))
-    hub = Hub(load_plant(path), clock)
+    hub = Hub(Plant.load(path), clock)
     cycle_s = hub.plant.metadata()["planned"]["hall"]["cycle_ms"] / 1000
     assert cycle_s > 1  # where 0.1 s are asked for
     hub.take(all_of(10, FORWARD, 25))

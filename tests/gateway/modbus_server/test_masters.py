@@ -19,7 +19,7 @@ from lines import until
 from modbus_gateway import in_thread
 from modbus_masters import Master, master_of
 
-from multidrop import Batch, Bus, BusError, Plant, Poller, load_plant
+from multidrop import Batch, Bus, BusError, Plant, Poller
 from multidrop.drive import Carrier
 from multidrop.gateway.commands import Commands
 from multidrop.gateway.http.rights import May
@@ -91,7 +91,7 @@ def plant_text(ports: list[str]) -> str:
 def rig(tmp_path_factory: pytest.TempPathFactory, _patient_module: None) -> Iterator[Rig]:
     folder = tmp_path_factory.mktemp("rig")
     (folder / "plant.toml").write_text(plant_text(["/dev/ttyUSB0", "/dev/ttyUSB1"]))
-    declared = load_plant(folder / "plant.toml")
+    declared = Plant.load(folder / "plant.toml")
     known = {polled.drive.address: polled.drive for line in declared.lines for polled in line.drives}
     drives = {
         unit: simulated(drive) if unit == COMMANDED else SimulatedDrive(drive)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from multidrop import load_plant
+from multidrop import Plant
 from multidrop.gateway.modbus_server import clients as modbus_clients
 from multidrop.gateway.modbus_server import common_block
 from multidrop.gateway.modbus_server import line_share as passing
@@ -26,7 +26,7 @@ PLANTS = re.findall(r"```toml\n# ([\w-]+\.toml)\n(.*?)```", HOWTO, re.DOTALL)
 def test_a_plant_file_of_the_page_is_taken(tmp_path: Path, name: str, text: str) -> None:
     path = tmp_path / name
     path.write_text(text)
-    assert isinstance(read_settings(load_plant(path), {}).parts["modbus"], ModbusSettings)
+    assert isinstance(read_settings(Plant.load(path), {}).parts["modbus"], ModbusSettings)
 
 
 def rows(heading: str) -> dict[str, str]:

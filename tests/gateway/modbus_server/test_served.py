@@ -15,7 +15,7 @@ from lines import until
 from modbus_gateway import RawClient, RawReply, request
 from peers import require_module
 
-from multidrop import InvtCHE, PlantError, load_plant
+from multidrop import InvtCHE, Plant, PlantError
 from multidrop.control import read_audit
 from multidrop.gateway.settings import read_settings
 from multidrop.sim import SimulatedDrive, Simulator, Wire, simulated
@@ -61,7 +61,7 @@ def gateway_of(path: Path) -> Iterator[Any]:
     loop = asyncio.new_event_loop()
 
     async def main() -> None:
-        plant = load_plant(path)
+        plant = Plant.load(path)
         gateway = Gateway(plant, read_settings(plant, {}))
         found.append(gateway)
         await gateway.run(ready.set)
@@ -148,11 +148,11 @@ def test_mistakes_in_the_table_are_told_with_their_place(tmp_path: Path) -> None
             text.replace('may = "write"', 'may = "root"\npassing = 3').replace("mill = 21", "mil = 21")
         )
         with pytest.raises(PlantError) as mistakes:
-            read_settings(load_plant(path), {})
+            read_settings(Plant.load(path), {})
         shown = str(mistakes.value)
         assert "[serve.modbus]" in shown
         assert 'passing = 3 is not right; write passing = "declared"' in shown
         assert "may = 'root' is none of look, stop, write" in shown
         path.write_text(text.replace("mill = 21", "mil = 21"))
         with pytest.raises(PlantError, match="units: there is no drive 'mil'; did you mean mill"):
-            read_settings(load_plant(path), {})
+            read_settings(Plant.load(path), {})

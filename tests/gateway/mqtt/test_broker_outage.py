@@ -24,7 +24,7 @@ from gateways import Served, plant_text, running, tokens
 from lines import HOST_LATE, until
 from peers import require_module
 
-from multidrop import Batch, InvtCHE, load_plant
+from multidrop import Batch, InvtCHE, Plant
 from multidrop.gateway.gateway import Gateway
 from multidrop.gateway.settings import read_settings
 from multidrop.sim import Simulator, Wire, simulated
@@ -76,7 +76,7 @@ def gateway_of(folder: Path, broker: Broker) -> Iterator[tuple[Served, Slots]]:
         text = plant_text(simulator.wires[0].path, DRIVES, SERVE.format(broker.address))
         path = folder / "plant.toml"
         path.write_text(text.replace('every = "100 ms"', f'every = "{PERIOD_S * 1000:g} ms"'))
-        plant = load_plant(path)
+        plant = Plant.load(path)
         gateway, slots = Gateway(plant, replace(read_settings(plant, {}), port=0)), Slots()
         gateway.feeds["slots"] = slots
         with running(gateway):

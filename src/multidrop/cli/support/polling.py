@@ -119,13 +119,13 @@ class LiveDrive:
 
     def age(self, now_ns: int) -> float | None:
         """Return the seconds since the newest sample."""
-        newest = max((row.time for row in self.newest.values()), default=None)
+        newest = max((row.time_ns for row in self.newest.values()), default=None)
         return None if newest is None else max(0.0, (now_ns - newest) / 1e9)
 
     def is_old(self, name: str, now_ns: int) -> bool:
         """Return True where a register's newest value is not the present one any more."""
         row = self.newest.get(name)
-        age = 0.0 if row is None else (now_ns - row.time) / 1e9
+        age = 0.0 if row is None else (now_ns - row.time_ns) / 1e9
         return age > (MISSED if name in self.missed else self._holds(name))
 
     def _holds(self, name: str) -> float:
@@ -138,7 +138,7 @@ class LiveDrive:
         """Return the reason for the misses, where every polled register is missed."""
         if not self.missed or len(self.missed) < len(self.polled.polls):
             return ""
-        return self.last_miss or max(self.missed.values(), key=lambda row: row.time).status
+        return self.last_miss or max(self.missed.values(), key=lambda row: row.time_ns).status
 
     @property
     def fault(self) -> str:

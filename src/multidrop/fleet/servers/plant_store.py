@@ -13,7 +13,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from multidrop import Plant, PlantError, PlantLine, load_plant
+from multidrop import Plant, PlantError, PlantLine
 from multidrop.fleet.servers import names
 from multidrop.fleet.servers.buckets import Bucket, Follower, Record
 from multidrop.plant import MAY_LISTS, check_listed
@@ -31,7 +31,7 @@ def read_plant(path: Path) -> tuple[Plant, dict[str, Any]]:
     Raises ValueError (PlantError for mistakes of the file) for what a fleet cannot poll: a port that only
     one machine has, or that a thread serves; a line's name that no subject can have; a family in Python.
     """
-    plant = load_plant(path)
+    plant = Plant.load(path)
     document = tomllib.loads(path.read_text("utf-8"))
     for line in plant.lines:
         try:
@@ -131,7 +131,7 @@ def line_of(record: Record, folder: Path) -> PlantLine:
         (home / path).write_text(text, "utf-8")
     plant = home / "line.plant"  # no family file ends so
     plant.write_text(f"line = [{_toml(value['line'])}]\n", "utf-8")
-    return load_plant(plant).lines[0]
+    return Plant.load(plant).lines[0]
 
 
 def _toml(value: Any) -> str:
