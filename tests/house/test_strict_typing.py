@@ -1,4 +1,4 @@
-"""Users' scripts pass `mypy --strict`: each Python block of these pages, and the examples."""
+"""Users' scripts pass `mypy --strict`: the Python blocks of these pages, and the examples."""
 
 from __future__ import annotations
 
@@ -10,12 +10,13 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[2]
-PAGES = [ROOT / "README.md"]
+PAGES = [ROOT / "README.md", ROOT / "docs" / "howto" / "coming-from.md"]
 SCRIPTS = {
     **{
-        f"{page.stem.replace('-', '_')}_{number}": block
+        page.stem.replace("-", "_"): "".join(
+            re.findall(r"```python\n(.*?)```", page.read_text("utf-8"), re.DOTALL)
+        )
         for page in PAGES
-        for number, block in enumerate(re.findall(r"```python\n(.*?)```", page.read_text("utf-8"), re.DOTALL))
     },
     **{path.stem: path.read_text("utf-8") for path in (ROOT / "examples").glob("*.py")},
 }
