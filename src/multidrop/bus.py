@@ -17,7 +17,7 @@ from multidrop.control.leaving import Leaving
 from multidrop.control.outcome import Stopped
 from multidrop.control.performer import Performer
 from multidrop.control.records import WriteRecords
-from multidrop.control.stop_all import Stopper, StopRun
+from multidrop.control.stops import Stopper, StopRun
 from multidrop.control.time_limit import checked_expiry
 from multidrop.control.writer import Writer
 from multidrop.core import RS485, Echo, Mastership, Peer, TransactionIds

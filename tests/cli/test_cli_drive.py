@@ -481,7 +481,7 @@ def pressed_at(place: str, monkeypatch: pytest.MonkeyPatch) -> None:
 
 @patient
 @pytest.mark.parametrize(
-    ("place", "told"), [("__init__", "nothing of the start was sent"), ("close", "start is done")]
+    ("place", "told"), [("__init__", "the start was not sent"), ("close", "start is done")]
 )
 def test_an_interruption_at_either_end_of_the_port_says_what_was_sent(
     run: Run, che: Che, monkeypatch: pytest.MonkeyPatch, place: str, told: str
@@ -497,7 +497,7 @@ def test_an_interruption_at_either_end_of_the_port_says_what_was_sent(
 @pytest.mark.parametrize(
     ("place", "status", "told"),
     [
-        ("__init__", Status(0), "toy@1: nothing of the write was sent\n"),
+        ("__init__", Status(0), "toy@1: the write was not sent\n"),
         ("close", Status(0), "toy@1: acceleration_time = 20.0 s: done (read back)\n"),
         (
             "close",

@@ -159,7 +159,7 @@ def test_under_a_name_that_would_spoil_the_log_a_stop_alone_is_sent(
             lambda: start_staggered([drive], gap=1.0),
         ):
             before = len(audited.noted())
-            with pytest.raises((TypeError, ValueError), match=r"is no text|is not 1 to 200 printable"):
+            with pytest.raises((TypeError, ValueError), match=r"is not text|is not 1 to 200 printable"):
                 call()
             assert {write for write, *_ in audited.noted()[before:]} <= {"control = STOP", "stop"}
         before = len(audited.noted())

@@ -374,7 +374,7 @@ def test_a_ledger_with_a_time_that_is_none_keeps_the_write_back(tmp_path: Path, 
     with closing(sqlite3.connect(ledger.path)) as file:
         file.execute(f"update writes set time = {time}")
         file.commit()
-    why = "cannot be kept: it has a write of acceleration_time at a time that is none"
+    why = "cannot be kept: it has a write of acceleration_time at an invalid time"
     with pytest.raises(OSError, match=why):
         ledger.enter(cell, 1000.0, 60.0)
     assert main(["wear", "--ledger", str(ledger.path)]) == 1

@@ -12,8 +12,15 @@ from controlled_loop import run_controlled
 from lines import PATIENCE
 
 from multidrop.control.command_results import CommandOutcome, CommandResult
-from multidrop.control.commands import Results, StopWork
-from multidrop.control.repeated_stops import BEGINNING_S, REPEATED_S, LineStop, RepeatedStops, StopFuture
+from multidrop.control.commands import (
+    BEGINNING_S,
+    REPEATED_S,
+    LineStop,
+    RepeatedStops,
+    Results,
+    StopFuture,
+    StopWork,
+)
 
 STANDS = CommandResult(CommandOutcome.DONE, "stopped")
 SILENT = CommandResult(CommandOutcome.UNKNOWN, "no reply")

@@ -20,11 +20,11 @@ from own_fan import Fan
 from simulated_bus import SimulatedBus, is_write
 
 import multidrop
-from multidrop.control import eeprom_ledger, ramp, stop_all
+from multidrop.control import eeprom_ledger, ramp, stops
 from multidrop.control.eeprom_ledger import Ledger
 from multidrop.control.outcome import Seen
 from multidrop.control.ramp import start_staggered
-from multidrop.control.stop_attempt import LEAST_S, StopAttempt
+from multidrop.control.stops import LEAST_S, StopAttempt
 from multidrop.core import Completion, Exchange
 from multidrop.drive import Script, verb
 from multidrop.errors import CancelledByStop, Unconfirmed, WriteForbidden
@@ -252,8 +252,8 @@ class NoRoom:
     def __init__(self, monkeypatch: pytest.MonkeyPatch, times: int, fault: Exception) -> None:
         self.left = times
         self._fault = fault
-        self._make = stop_all.StopAttempt
-        monkeypatch.setattr(stop_all, "StopAttempt", self.make)
+        self._make = stops.StopAttempt
+        monkeypatch.setattr(stops, "StopAttempt", self.make)
 
     def make(self, *details: Any) -> StopAttempt:
         self.left -= 1

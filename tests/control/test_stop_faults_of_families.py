@@ -18,7 +18,7 @@ from simulated_bus import SimulatedBus, one
 
 import multidrop
 from multidrop.control.records import WriteRecords
-from multidrop.control.stop_all import stop_together
+from multidrop.control.stops import stop_together
 from multidrop.drive import Drive
 from multidrop.sim import MotorDrive
 
@@ -33,8 +33,8 @@ FAILURES: dict[str, Callable[[], BaseException]] = {
     "no descriptors": lambda: OSError(EMFILE, "Too many open files"),
 }
 HOME = Path(multidrop.__file__).parent
-SCRIPTS = tuple(str(HOME / name) for name in ("drives", "profiles", "drive/script.py"))
-ATTEMPT = (str(HOME / "control/stop_attempt.py"), str(HOME / "drive/family.py"))
+SCRIPTS = tuple(str(HOME / name) for name in ("families", "drive/script.py"))
+ATTEMPT = (str(HOME / "control/stops.py"), str(HOME / "drive/family.py"))
 
 
 @cache

@@ -21,7 +21,7 @@ from multidrop.bus import Bus
 from multidrop.control.eeprom_ledger import Ledger
 from multidrop.control.outcome import Effect, Seen
 from multidrop.control.ramp import ramp, start_staggered
-from multidrop.control.stop_attempt import AT_ONCE, LEAST_S, PAUSE_S
+from multidrop.control.stops import AT_ONCE, LEAST_S, PAUSE_S
 from multidrop.core import Completion, Exchange, Framing, Message, build_reply
 from multidrop.drive import Condition, Direction, Drive, Script, State, insist, read, wait, write
 from multidrop.drive.register import Kept, reading, setting
@@ -528,9 +528,7 @@ def test_a_stop_gives_up_when_its_caller_says_so_and_tells_what_is_known(
     drive.start()
     line.sleep(20)
     begun = line.seconds
-    with pytest.raises(
-        Unconfirmed, match=r"after 2 s, all that it was given, it is not seen to have stopped"
-    ):
+    with pytest.raises(Unconfirmed, match=r"it was not seen to stop within its 2 s"):
         drive.stop(seconds=2)
     assert 2 <= line.seconds - begun < 2.2
     line.deafens = lambda request: True
@@ -549,14 +547,7 @@ def test_a_stop_gives_up_when_its_caller_says_so_and_tells_what_is_known(
     assert len(writes(line)) == sent + 1
 
 
-class Unfit(int):
-    """A number of a caller's own that does not compare."""
-
-    def __ge__(self, other: object) -> bool:
-        raise ZeroDivisionError
-
-
-SENSELESS = [-1, float("nan"), float("-inf"), Decimal("sNaN"), True, "5", [5], 5j, Unfit(5)]
+SENSELESS = [-1, float("nan"), float("-inf"), Decimal("sNaN"), True, "5", [5], 5j]
 
 
 @pytest.mark.parametrize("seconds", SENSELESS, ids=map(repr, SENSELESS))
@@ -576,7 +567,7 @@ def test_a_stop_with_a_senseless_time_is_sent_as_one_without_and_says_so(
         getattr(drive, stops)(seconds=seconds)
     assert not sim.motor.energised
     flush(60)
-    assert "is no time for a stop: it is repeated for 30 s at least, as without one" in caplog.text
+    assert "is not a time for a stop: it is repeated for 30 s at least, as without one" in caplog.text
 
 
 def test_a_stop_that_is_called_wrongly_is_sent_before_it_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -613,7 +604,7 @@ def test_a_stop_s_own_waits_take_no_longer_than_it_is_given(monkeypatch: pytest.
     line = SimulatedBus(monkeypatch, simulated(Patient(1)))
     drive = line.attach(Patient(1))
     begun = line.seconds
-    with pytest.raises(Unconfirmed, match="after 2 s, all that it was given"):
+    with pytest.raises(Unconfirmed, match="it was not seen to stop within its 2 s"):
         drive.stop(seconds=2)
     assert 2 <= line.seconds - begun < 2.5
     assert len(line.written) == 1
@@ -1227,9 +1218,9 @@ def test_a_second_interruption_ends_it(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize(
     ("moment", "note"),
     [
-        ("look", "nothing of the start was sent"),
-        ("start", "control = FORWARD may have been sent, and nothing is known of its effect"),
-        ("after", "control = FORWARD was sent and confirmed; what came of it was not seen"),
+        ("look", "the start was not sent"),
+        ("start", "control = FORWARD may have been sent; its effect is unknown"),
+        ("after", "control = FORWARD was sent and confirmed, but its effect was not seen"),
     ],
 )
 def test_a_start_that_is_interrupted_says_what_was_sent(

@@ -35,7 +35,7 @@ def test_a_stop_says_what_is_known_of_it_while_the_motor_runs_out(monkeypatch: p
     drive.stop()
     assert told == [
         f"{drive.name}: no stop was sent yet",
-        f"{drive.name}: the stop was confirmed, and the motor is not seen to stand yet",
+        f"{drive.name}: the stop was confirmed, but the motor is not yet seen to stand",
     ]
     assert line.bus.stops_under_way() == {}
 
@@ -47,7 +47,7 @@ def test_what_is_lost_is_told_as_sent(monkeypatch: pytest.MonkeyPatch) -> None:
     assert line.bus.stop_all(seconds=5)[drive.name].seen is Seen.SENT
     assert told[:2] == [
         f"{drive.name}: no stop was sent yet",
-        f"{drive.name}: the stop was sent, and is not confirmed yet",
+        f"{drive.name}: the stop was sent, but is not yet confirmed",
     ]
     assert all(text.startswith(told[1]) for text in told[2:])
     assert "it is not known whether" in told[2]
@@ -89,4 +89,4 @@ def test_a_stop_that_the_drive_refuses_each_time_is_not_told_as_unsent(
     assert str(found).startswith(f"{drive.name}: refused by the drive after 2.")
     with pytest.raises(DriveException):
         drive.stop(seconds=1)
-    assert any(text.startswith(f"{drive.name}: the stop was sent, and is not confirmed yet") for text in told)
+    assert any(text.startswith(f"{drive.name}: the stop was sent, but is not yet confirmed") for text in told)

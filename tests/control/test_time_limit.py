@@ -150,7 +150,7 @@ def test_under_what_is_no_function_a_stop_alone_is_sent(monkeypatch: pytest.Monk
     line, drive, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
     with written_before(limit):
         for call in (lambda: drive.set_frequency(20), drive.start):
-            with pytest.raises(TypeError, match=r"is no function that returns a time"):
+            with pytest.raises(TypeError, match=r"must be a function that returns a time"):
                 call()
         assert not written(line)
         drive.stop()

@@ -19,7 +19,7 @@ from toy import Toy
 
 from multidrop.bus import Bus
 from multidrop.control.outcome import Seen, Stopped
-from multidrop.control.stop_attempt import StopAttempt
+from multidrop.control.stops import StopAttempt
 from multidrop.drive import Drive
 from multidrop.drive.script import Step
 from multidrop.errors import CancelledByStop, LineError, NoReply, NotAttached

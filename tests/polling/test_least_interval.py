@@ -13,8 +13,7 @@ from tables import table
 from toy import Toy
 
 from multidrop.control.call import Call
-from multidrop.control.stop_all import stop_together
-from multidrop.control.stop_attempt import StopAttempt
+from multidrop.control.stops import StopAttempt, stop_together
 from multidrop.core import Latch, Message
 from multidrop.drive import Drive
 from multidrop.drive.register import HOLDING

@@ -31,7 +31,7 @@ from multidrop.cli.support.values import as_json, nearest_value
 from multidrop.cli.support.writing import confirm, telling_what_was_sent
 from multidrop.control.audit_log import AuditLog
 from multidrop.control.outcome import Seen, Stopped
-from multidrop.control.stop_attempt import LEAST_S
+from multidrop.control.stops import LEAST_S
 from multidrop.drive.family import Drive
 from multidrop.drive.script import Script, Write
 from multidrop.drive.state import Direction, State

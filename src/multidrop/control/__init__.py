@@ -9,6 +9,8 @@ from multidrop.control.command_results import CommandResult as CommandResult
 from multidrop.control.command_results import in_one_text as in_one_text
 from multidrop.control.command_results import result_of_failure as result_of_failure
 from multidrop.control.command_results import with_name as with_name
+from multidrop.control.commands import LineStop as LineStop
+from multidrop.control.commands import RepeatedStops as RepeatedStops
 from multidrop.control.commands import begin_command as begin_command
 from multidrop.control.commands import carry_out_verb as carry_out_verb
 from multidrop.control.commands import stop_drive_by as stop_drive_by
@@ -20,6 +22,4 @@ from multidrop.control.outcome import Effect as Effect
 from multidrop.control.outcome import Outcome as Outcome
 from multidrop.control.outcome import Seen as Seen
 from multidrop.control.ramp import start_staggered as start_staggered
-from multidrop.control.repeated_stops import LineStop as LineStop
-from multidrop.control.repeated_stops import RepeatedStops as RepeatedStops
 from multidrop.control.time_limit import written_before as written_before

@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 from multidrop.control.latches import Latches
 from multidrop.control.outcome import Outcome
 from multidrop.control.performer import Performer
-from multidrop.control.stop_all import Stopper
+from multidrop.control.stops import Stopper
 from multidrop.control.time_limit import MOST_EXPIRY_S, checked_expiry
 from multidrop.core import Latch, Message
 from multidrop.drive.family import Drive, check_own, check_own_text

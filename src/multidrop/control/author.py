@@ -1,4 +1,4 @@
-"""Author of a write: who asked for it and in which way, for the audit log."""
+"""Author of a write, for the audit log: a person or program, and the interface it used."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class Author(NamedTuple):
 
 
 class _Named(NamedTuple):
-    """The author of a block, in words that a log can have, and what is wrong with those that were given."""
+    """The author of a block in printable words, and the mistake in the given ones."""
 
     author: Author
     mistake: Exception | None
@@ -32,12 +32,12 @@ _noted_first: ContextVar[bool] = ContextVar("multidrop noted first", default=Fal
 
 
 def present_author() -> Author:
-    """Return the author of what is written now in this context; empty where none was named."""
+    """Return the author of writes in this context; empty if none was named."""
     return _named.get(_NOBODY).author
 
 
 def check_author() -> None:
-    """Raise what is wrong with the name of the present author, as `written_by` says. No stop asks this."""
+    """Raise the mistake in the present author's name, as `written_by` says. Not called for stops."""
     mistake = _named.get(_NOBODY).mistake
     if mistake is not None:
         raise mistake
@@ -45,14 +45,14 @@ def check_author() -> None:
 
 @contextmanager
 def written_by(who: str, way: str = "") -> Iterator[None]:
-    """Note `who` as the author, and the way in, of all that is written within the block.
+    """Record `who` as the author of all writes within the block, and `way` as the interface used.
 
-    Each write's audit record then has `by` and, unless it is empty, `way`, such as "anna" and "web,
-    10.0.0.7". Stops are noted as all other writes. It holds for this thread and what it calls, or this task
-    of asyncio and `asyncio.to_thread`; another thread, such as one of `run_in_executor`, names its own. The
-    innermost block counts. It gives no right to anybody. Under what is no text nothing is written and each
-    write raises TypeError; ValueError under one that is empty, longer than 200 characters, or not printable.
-    A stop is sent all the same: its record has what can be printed of it.
+    The audit record of a write or a stop then has `by`, such as "anna", and unless it is empty `way`, such as
+    "web, 10.0.0.7". It applies to this thread, or to this task and `asyncio.to_thread`; other threads, such
+    as those of `run_in_executor`, need a block of their own. The innermost block counts. It grants no rights.
+
+    Within the block a write raises TypeError if the name is not text, and ValueError if it is empty, longer
+    than 200 characters or not printable. A stop is sent all the same, and recorded with the printable part.
     """
     mistake = _mistake("who", who) or (_mistake("way", way) if way != "" else None)
     token = _named.set(_Named(Author(_spelt(who), _spelt(way)), mistake))
@@ -64,10 +64,10 @@ def written_by(who: str, way: str = "") -> Iterator[None]:
 
 @contextmanager
 def noted_first() -> Iterator[None]:
-    """Send no write within the block before the bus's audit log has a line of it; a stop is always sent.
+    """Within the block, write a record with the outcome "called" to the audit log before each write.
 
-    The `outcome` of that line is "called"; another one says what came of it. A write whose line cannot be
-    written raises OSError, and nothing is sent. It holds for this thread or task, as `written_by` does.
+    A second record has the real outcome. If the first one cannot be written, the write raises OSError and is
+    not sent; a stop is always sent. It applies to this thread or task, as `written_by` does.
     """
     token = _noted_first.set(True)
     try:
@@ -83,14 +83,14 @@ def is_noted_first() -> bool:
 
 def _mistake(name: str, text: object) -> Exception | None:
     if not isinstance(text, str):
-        return TypeError(f"{name} = {_spelt(text)} is no text")
+        return TypeError(f"{name} = {_spelt(text)} is not text")
     if not text.strip() or len(text) > MOST_CHARACTERS or not text.isprintable():
         return ValueError(f"{name} = {text!r} is not 1 to {MOST_CHARACTERS} printable characters")
     return None
 
 
 def _spelt(given: object) -> str:
-    """Return a name, whatever was given as one, as a log can have it."""
+    """Return any object, given as a name, as printable text."""
     try:
         text = given if isinstance(given, str) else repr(given)
     except Exception:  # it is a caller's own

@@ -1,7 +1,7 @@
-"""Broadcaster: writes to all drives of a bus at once, where that is harmless to each of them.
+"""Broadcaster: write to all drives of a bus at once, if that is harmless to each one.
 
-The same address means different things to different families (a stop of one may be the run of another):
-so all drives must be of one family, share settings and framing, and be known to be of that family.
+The same address means different things to different families: a stop of one may be the run of another. So
+all drives must be known to be of one family, and must share settings and framing.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ class Broadcaster:
     def write(
         self, drives: Sequence[Drive], register: Register[Any] | str, value: Any
     ) -> dict[str, State | BusError]:
-        """Write to all; then read each one's state, or why it says none. Raises WriteForbidden."""
+        """Write to all; return each one's state, or the error of reading it. Raises WriteForbidden."""
         if isinstance(register, str):
             if not drives:
                 raise ValueError("no drive is attached to this bus")
@@ -41,8 +41,7 @@ class Broadcaster:
         if drives and drives[0].framing is Framing.TCP:
             raise WriteForbidden(
                 f"{register.name} cannot be broadcast over Modbus TCP: unit id 0 is the gateway or the "
-                "device itself, and what it does with a write is its maker's choice; write to one after "
-                "another",
+                "device itself, and its maker decides what a write does; write to one drive after another",
                 register=register.name,
                 rule="Modbus TCP has no broadcast",
             )
@@ -76,14 +75,14 @@ class Broadcaster:
         return {drive.name: self._state(drive) for drive in drives}
 
     def _checked_call(self, drives: Sequence[Drive], what: str) -> Call:
-        """Check each drive as before a write to it alone; return the first one's call, made now."""
+        """Check each drive as before a write to it alone; return the first one's call, restarted."""
         check_author()
         calls = [self._performer.call(drive) for drive in drives]
         for call in calls:
             self._writer.identity_check.check(call.drive, call.look)
         for call in calls:
             call.check(what)
-        return calls[0].anew()
+        return calls[0].restarted()
 
     def _state(self, drive: Drive) -> State | BusError:
         try:
@@ -92,7 +91,7 @@ class Broadcaster:
             return failure
 
     def stop(self, drives: Sequence[Drive]) -> bool:
-        """Broadcast a stop where all drives are known and have one; True where it may have been sent."""
+        """Broadcast a stop if all drives are known and have one; return True if it may have been sent."""
         known = all(self._writer.identity_check.is_known(drive) for drive in drives)
         control = drives[0].registers.get("control") if drives else None
         if len(drives) < 2 or not _are_alike(drives) or not known or drives[0].framing is Framing.TCP:
@@ -101,7 +100,7 @@ class Broadcaster:
             return False
         try:
             self._writer.broadcast(drives[0], control, control.broadcast[0])
-        except Exception as failure:  # each drive has its own stop still
+        except Exception as failure:  # each drive is still sent its own stop
             return isinstance(failure, Unconfirmed)
         return True
 

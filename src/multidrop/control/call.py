@@ -1,4 +1,4 @@
-"""Call: one call that may move a motor: until when it may be sent, and what of it was sent."""
+"""Call: the deadline and the progress of one call that may move a motor."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ _log = logging.getLogger("multidrop.control")
 
 
 class Call:
-    """One call of a verb, `verb`, or of a plain write.
+    """One call of the verb `verb`, or of a plain write.
 
-    Nothing of it is written once a stop was called, nor when it is late by more than `expiry` seconds.
-    Its lateness is the time since it began, less what its own steps may take: its reads and writes, by the
-    drive's document, and the waits of its script. So a process that was held up sends nothing, nor does one
-    whose machine slept. Its first write is not sent after `limit_ns` either, a time of CLOCK_BOOTTIME.
+    It sends no write after a stop was called, nor when it is late by more than `expiry` seconds. Lateness is
+    the time since the call, minus the time that its own reads, writes and waits may take. So a process that
+    was suspended sends no write, nor does a machine that slept. The first write is not sent after `limit_ns`
+    (CLOCK_BOOTTIME) either.
     """
 
     def __init__(
@@ -34,26 +34,26 @@ class Call:
         self.drive = drive
         self.permit = permit
         self.verb = verb
-        self.sent = ""  # the latest write that may have left
-        self.is_confirmed = False  # that one
-        self.unverified: Outcome | None = None  # of that one, if nothing was read of the drive after it
+        self.sent = ""  # the latest write that may have been sent
+        self.is_confirmed = False  # that write
+        self.unverified: Outcome | None = None  # of that write, until something else is read
         self.expiry = expiry
         self._due_ns = clock.boottime_ns()
         self._limit_ns = limit_ns
 
-    def anew(self) -> Call:
-        """Return the same call, made now. Stops that were called since the first one still end it."""
+    def restarted(self) -> Call:
+        """Return the same call with its time restarted. Stops since the first call still end it."""
         return Call(self.drive, self.permit, self.expiry, self.verb, self._limit_ns)
 
     @property
     def expires_ns(self) -> int:
-        """The time of CLOCK_BOOTTIME after which nothing is sent; its drive may be given a rest before."""
+        """The CLOCK_BOOTTIME after which it is not sent; includes the rest that the drive needs before."""
         expires_ns = self._due_ns + round((self.expiry + self.drive.least_interval) * 1e9)
         return expires_ns if self.sent else int(min(expires_ns, self._limit_ns))
 
     @contextmanager
     def step(self, seconds: float) -> Iterator[None]:
-        """Account for a step that may take so long; any time beyond that makes the call late."""
+        """Allow a step this many seconds; only the time beyond them makes the call late."""
         begun_ns = clock.boottime_ns()
         try:
             yield
@@ -61,32 +61,32 @@ class Call:
             self._due_ns += min(clock.boottime_ns() - begun_ns, round(seconds * 1e9))
 
     def look(self) -> AbstractContextManager[None]:
-        """Account for one exchange with the drive."""
+        """Allow the time of one exchange with the drive."""
         drive = self.drive
         wire = 2 * drive.needed_silence() + MOST_CHARACTERS * drive.settings.character
         return self.step(drive.least_interval + drive.response_timeout + wire)
 
     def check(self, what: str) -> None:
-        """Raise CancelledByStop once a stop was called, and Expired where the limit of its caller is over."""
+        """Raise CancelledByStop if a stop was called, Expired if the caller's limit is over."""
         if not self.permit.is_good:
-            raise self.overtaken(what)
+            raise self.cancelled(what)
         if not self.sent and clock.boottime_ns() >= self._limit_ns:
             raise Expired(self.drive.name, what, self.expiry)
 
-    def overtaken(self, what: str) -> CancelledByStop:
+    def cancelled(self, what: str) -> CancelledByStop:
         return CancelledByStop(self.drive.name, what, self.permit.latch.why)
 
     def unsent(self, what: str) -> CancelledByStop | Expired:
-        """Return the reason why the core did not send it."""
+        """Return the error for a write that the core did not send."""
         return (
-            self.overtaken(what) if not self.permit.is_good else Expired(self.drive.name, what, self.expiry)
+            self.cancelled(what) if not self.permit.is_good else Expired(self.drive.name, what, self.expiry)
         )
 
     @contextmanager
     def noted(self) -> Iterator[None]:
-        """Log a refusal; add what was sent, and what is known of it, to an interruption.
+        """Log a refusal; on Ctrl-C, add a note on what was already sent.
 
-        What a signal's stops ended raises what the signal does, such as KeyboardInterrupt.
+        If a signal's stops ended the call, raise the signal's own effect, such as KeyboardInterrupt.
         """
         try:
             yield
@@ -102,7 +102,7 @@ class Call:
 
     def _known(self) -> str:
         if not self.sent:
-            return f"nothing of the {self.verb or 'write'} was sent"
+            return f"the {self.verb or 'write'} was not sent"
         if self.is_confirmed:
-            return f"{self.sent} was sent and confirmed; what came of it was not seen"
-        return f"{self.sent} may have been sent, and nothing is known of its effect"
+            return f"{self.sent} was sent and confirmed, but its effect was not seen"
+        return f"{self.sent} may have been sent; its effect is unknown"

@@ -1,7 +1,7 @@
-"""Ledger: counts writes of each register that a drive may keep in EEPROM, across restarts.
+"""Ledger: count the writes of each register that a drive may keep in EEPROM, across restarts.
 
-It is a file that several processes share. A drive is known by its port's identity and its address there.
-EEPROM bears some 10,000 writes; a budget makes them last for ten years.
+Several processes share the file. It identifies a drive by its port's identity and its address. An EEPROM
+survives about 10,000 writes; a yearly budget makes them last for ten years.
 """
 
 from __future__ import annotations
@@ -17,19 +17,19 @@ from multidrop.transport.port_identity import of_name
 from multidrop.transport.simulated_ports import is_simulated, ledger_of
 
 YEAR = 365 * 86400.0  # s
-CYCLES = 10_000  # that an EEPROM bears (Toshiba's figure for a relative of the YD1000)
+CYCLES = 10_000  # writes that an EEPROM survives (Toshiba's figure for a relative of the YD1000)
 YEARS = 10
 BUDGET = CYCLES // YEARS  # writes of one register in a year
-NO_HOME = Path("/nonexistent")  # as the user "nobody" has it
-LATEST = 6e10  # UTC in s: a time beyond it, or as far before 0, is damage
-LEAST_INTERVAL = 60.0  # s between two writes of a register that is known to be in EEPROM
+NO_HOME = Path("/nonexistent")  # the home of a user without one
+LATEST = 6e10  # UTC in s: later times, or as long before 1970, are damage
+LEAST_INTERVAL = 60.0  # s between two writes of a register that is kept in EEPROM
 
 
 @dataclass(frozen=True)
 class LedgerCell:
     """One register of one drive in a ledger.
 
-    `port` is the port's identity (see port_identity), `spelt` its name, which older entries may have.
+    `port` is the port's identity (see port_identity), `spelt` its name, which older entries use.
     """
 
     port: str
@@ -41,18 +41,18 @@ class LedgerCell:
 
 @dataclass(frozen=True)
 class Wear:
-    """Writes of a cell until some time."""
+    """The writes of a cell, counted at some time."""
 
     cell: LedgerCell
     writes: int  # in all
-    this_year: int  # in the year before
-    last: float  # UTC, s, of the latest entry, whatever the clock said at others
+    this_year: int  # within the last year
+    last: float  # UTC in s of the latest entry
 
 
 def default_path() -> Path:
     """Return the path for state that survives restarts (XDG base directory specification).
 
-    A user without a home, as in a container, has none that can be kept: a stop needs none.
+    A user without a home, as in a container, gets a path that cannot be written; stops do not need it.
     """
     try:
         state = Path(os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state")
@@ -62,29 +62,29 @@ def default_path() -> Path:
 
 
 class Ledger:
-    """The ledger in this file, which is created at its first entry. Times are UTC in s."""
+    """The ledger in this file, created at the first entry. Times are UTC in s."""
 
     def __init__(self, path: Path | str | None = None, *, budget: int = BUDGET) -> None:
         self.path = Path(path) if path else default_path()
         self.budget = budget
-        self._is_the_user_s = not path
+        self._is_default_path = not path
 
     def at(self, port: str) -> Ledger:
-        """Return the ledger for this port: a simulated one has its own, and leaves the user's alone."""
-        if self._is_the_user_s and is_simulated(port):
+        """Return the ledger for this port; simulated ports have a ledger of their own."""
+        if self._is_default_path and is_simulated(port):
             return Ledger(ledger_of(port, self.path.parent), budget=self.budget)
         return self
 
     def enter(self, cell: LedgerCell, now: float, least_interval: float) -> str:
-        """Count a write that is about to be sent, or return why it must not be and count nothing.
+        """Count a write that is about to be sent; or return why it must not be sent, without counting it.
 
-        The check and the entry are one transaction, so that two processes cannot both have the last
-        of the budget. Raises OSError where the file cannot be kept.
+        Check and entry are one transaction, so two processes cannot both use the last of the budget. Raises
+        OSError if the file cannot be kept.
         """
         with self._opened() as ledger:
             ledger.execute("begin immediate")
             wear = _wear(ledger, cell, _names(ledger, cell), now)
-            since = now - wear.last  # below 0: the clock was set back, and the true time is unknown
+            since = now - wear.last  # below 0 if the clock was set back; the real time is unknown
             if wear.writes and 0 <= since < least_interval:
                 return (
                     f"it is kept in EEPROM, was written {since:.0f} s ago and is written once in "
@@ -92,17 +92,17 @@ class Ledger:
                 )
             if wear.this_year >= self.budget:
                 return (
-                    f"it was written {wear.this_year} times in a year, and its EEPROM bears {CYCLES} writes "
-                    f"in all: {self.budget} a year for {YEARS} years"
+                    f"it was written {wear.this_year} times in a year, and its EEPROM survives {CYCLES} "
+                    f"writes: {self.budget} a year for {YEARS} years"
                 )
             ledger.execute("insert into writes values (?, ?, ?, ?, ?)", (*_key(cell), now))
             ledger.commit()
         return ""
 
     def note(self, cells: Sequence[LedgerCell], now: float) -> None:
-        """Count stops, which no budget holds back, in one transaction: a file that others hold is waited for.
+        """Count stops, which no budget limits, in one transaction.
 
-        Raises OSError where the file cannot be kept.
+        Waits if another process has locked the file. Raises OSError if the file cannot be kept.
         """
         with self._opened() as ledger:
             ledger.execute("begin immediate")
@@ -110,7 +110,7 @@ class Ledger:
             ledger.commit()
 
     def wear(self, now: float) -> list[Wear]:
-        """Return every cell that was ever written, the most worn in the last year first."""
+        """Return every cell that was ever written, the most written in the last year first."""
         if not self.path.exists():
             return []
         with self._opened() as ledger:
@@ -171,5 +171,5 @@ def _wear(ledger: sqlite3.Connection, cell: LedgerCell, ports: list[str], now: f
     ).fetchone()
     (last,) = ledger.execute("select time from writes where rowid = ?", (latest,)).fetchone() or (0.0,)
     if not isinstance(last, float) or not abs(last) < LATEST:
-        raise sqlite3.DataError(f"it has a write of {cell.register} at a time that is none: {last!r}")
+        raise sqlite3.DataError(f"it has a write of {cell.register} at an invalid time: {last!r}")
     return Wear(replace(cell, spelt=""), writes, this_year, last)

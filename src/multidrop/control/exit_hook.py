@@ -1,7 +1,7 @@
-"""ExitHook: does what buses asked for before this process ends, by itself or by SIGINT, SIGTERM or SIGHUP.
+"""ExitHook: stop the drives of all buses that asked for it before this process ends.
 
-There is one in a process. A signal only begins the last acts, which run in threads of their own, side by
-side: a handler that waited for them could wait for a lock of the very thread that it interrupts.
+A process has one, for its exit and for SIGINT, SIGTERM and SIGHUP. A signal only starts the last acts, which
+run in threads of their own: a handler that waited for them could wait for a lock of the thread it interrupts.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ from multidrop.core.fork import register_at_fork
 from multidrop.errors import BusError
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
-IMPATIENT = 3  # signals within a second, after which nothing is waited for
-HANDLING_S = 0.05  # the longest that a signal waits to be handled
+IMPATIENT = 3  # signals within a second that give up waiting for the stops
+HANDLING_S = 0.05  # the longest time until a signal is handled
 PACKAGE = __name__.partition(".")[0]
 MOST_NAMES = 20  # of drives in a message
 CUT_SHORT = "the stops were cut short by a third signal: motors may still be turning"
@@ -37,9 +37,9 @@ STOPPING = "{} received: stopping {}; Ctrl-C three times within a second gives u
 
 
 def _ending() -> tuple[signal.Signals, ...]:
-    """Return the signals that are taken.
+    """Return the signals to take.
 
-    SIGHUP, of a terminal that was closed, is one unless the program has a use for it, or nohup ignores it.
+    SIGHUP, of a terminal that was closed, is one unless the program handles it or nohup ignores it.
     """
     if sys.platform != "win32" and signal.getsignal(signal.SIGHUP) == signal.SIG_DFL:
         return (*_SIGNALS, signal.SIGHUP)
@@ -47,14 +47,14 @@ def _ending() -> tuple[signal.Signals, ...]:
 
 
 def _send(number: int, ident: int) -> None:
-    """Send the signal to the main thread. On Windows it is that one's wherever it is raised."""
+    """Send the signal to the main thread, which is where Windows always delivers it."""
     if sys.platform == "win32":
         signal.raise_signal(number)
     else:
         signal.pthread_kill(ident, number)
 
 
-def _tell(sentence: str) -> None:
+def _print_error(sentence: str) -> None:
     """Write a sentence to standard error at once; skip it if that is closed or would block."""
     with suppress(OSError, ValueError):
         if sys.platform == "win32" or select.select([], [2], [], 0)[1]:
@@ -70,7 +70,7 @@ _log = logging.getLogger("multidrop.control")
 
 
 class LastAct:
-    """Work that is done once, by a thread that waits for its turn from now on.
+    """Work that is done once at the end, by a thread that already waits for it.
 
     `drives` returns the names of the drives that it stops.
     """
@@ -86,9 +86,9 @@ class LastAct:
         self._on_begin = begin
         self._work = work
         self._on_over = over
-        self._calls: SimpleQueue[None] = SimpleQueue()  # a signal handler may put to it; not so an Event
+        self._calls: SimpleQueue[None] = SimpleQueue()  # unlike an Event, a signal handler may use it
         self._over = threading.Event()
-        self.is_cut_short = False  # nobody waits for it any more
+        self.is_cut_short = False  # the wait for it was given up
         threading.Thread(target=self._run, name="multidrop exit", daemon=True).start()
 
     @property
@@ -96,18 +96,18 @@ class LastAct:
         return self.is_cut_short or self._over.is_set()
 
     def begin(self) -> None:
-        """Let it be done, without waiting for that."""
+        """Start it without waiting."""
         self._on_begin()
         self._calls.put(None)
 
     def finish(self) -> None:
-        """Let it be done, and wait until it is."""
+        """Start it, and wait until it is done."""
         self.begin()
-        while not self.is_over:  # a signal that another thread was given is handled here
+        while not self.is_over:  # handle signals that other threads received
             self._over.wait(HANDLING_S)
 
     def forget(self) -> None:
-        """Leave it to the parent: this is the child of a fork."""
+        """Give it up in the child of a fork; the parent does it."""
         self._over = threading.Event()
         self.is_cut_short = True
 
@@ -123,18 +123,18 @@ class LastAct:
 
 
 class ExitHook:
-    """Begins all last acts at exit, or on one of these signals, and holds the signal until they are over.
+    """Starts all last acts at exit or on a signal, and holds the signal until they are over.
 
-    Standard error says at once which drives are being stopped, and how to give up. Then the signal has the
-    effect that it had before; at once if IMPATIENT of them come within a second.
+    Standard error says at once which drives are being stopped, and how to give up. After the stops the signal
+    has its earlier effect; IMPATIENT signals within a second cut the wait short.
     """
 
     def __init__(self) -> None:
-        self._acts: list[LastAct] = []  # changed in one step: lines come and go on any thread
-        self._before: dict[signal.Signals, Any] = {}  # their effect, when they were taken last
+        self._acts: list[LastAct] = []  # changed in one step, because any thread may add and remove lines
+        self._before: dict[signal.Signals, Any] = {}  # their handlers before ours
         self._has_taken = False
-        self._held: int | None = None  # the first signal that came
-        self._came: list[float] = []  # when it and others did
+        self._held: int | None = None  # the first signal
+        self._came: list[float] = []  # times of recent signals
         self._passing = threading.Lock()
         self._has_passed = False
         self._is_passing_on = False
@@ -154,34 +154,34 @@ class ExitHook:
         work: Callable[[], object],
         drives: Callable[[], list[str]] = list,
     ) -> LastAct:
-        """Do `work` before the process ends, and call `begin` as its end begins, also in a signal handler.
+        """Do `work` before the process ends; `begin` is called first, possibly in a signal handler.
 
-        Raises ValueError outside the main thread, unless the signals are taken already.
+        Raises ValueError outside the main thread, unless the signals are already taken.
         """
         self.take_signals()
         act = LastAct(begin, work, self._one_is_over, drives)
         self._acts.append(act)
         try:
-            self.take_signals()  # the end of another one may have let them go
+            self.take_signals()  # another bus may have returned them at its end
         except ValueError:
             self._acts.remove(act)
             raise
         self._warn_of_replaced()
-        if self._held is not None:  # the end has begun without it
+        if self._held is not None:  # the process is already ending
             act.begin()
         return act
 
     def take_signals(self) -> None:
-        """Take these signals from any other handler, which has its turn after the stops.
+        """Install our handler; the one before it is called after the stops.
 
-        Raises ValueError outside the main thread, the only one that may, unless they were taken before.
+        Raises ValueError outside the main thread, unless the signals are already taken.
         """
         if self._has_taken and threading.current_thread() is not threading.main_thread():
             return
         for number in _ending():
             had = signal.getsignal(number)
             if had != self._on_signal:
-                self._before[number] = had  # noted first: the signal may come at once
+                self._before[number] = had  # first, because the signal may come at once
                 signal.signal(number, self._on_signal)
         self._has_taken = True
 
@@ -191,17 +191,17 @@ class ExitHook:
             _log.warning(REPLACED, " and ".join(lost))
 
     def finish(self, act: LastAct) -> None:
-        """Do it now, and forget it."""
+        """Do it now, and remove it."""
         act.finish()
-        with suppress(ValueError):  # another thread has finished it too
+        with suppress(ValueError):  # another thread has already removed it
             self._acts.remove(act)
         self.rest()
 
     def rest(self) -> None:
-        """Give the signals back once no last act is left; only the main thread may, others return."""
+        """In the main thread, restore the handlers if no last act is left."""
         if not self._acts and self._held is None and threading.current_thread() is threading.main_thread():
             self._let_go()
-            if self._acts:  # another one came meanwhile
+            if self._acts:  # another one was added in between
                 self.take_signals()
 
     def _at_exit(self) -> None:
@@ -212,9 +212,9 @@ class ExitHook:
             act.finish()
 
     def _on_signal(self, number: int, frame: FrameType | None) -> None:
-        """Begin the last acts. Take no lock here: the main thread may hold it."""
+        """Start the last acts. Takes no lock, because the main thread may hold it."""
         now = time.monotonic()
-        if number in _SIGNALS:  # a terminal that goes may send several, and nobody is impatient
+        if number in _SIGNALS:  # a closing terminal may send several SIGHUPs
             self._came = [*(at for at in self._came if now - at < 1.0), now]
         is_first = self._held is None
         if is_first:
@@ -224,17 +224,17 @@ class ExitHook:
             act.begin()
         names = [name for act in acts if not act.is_over for name in act.drives()]
         if is_first and names:
-            _tell(STOPPING.format(signal.Signals(number).name, _listed(names)))
+            _print_error(STOPPING.format(signal.Signals(number).name, _listed(names)))
         if all(act.is_over for act in acts):
             self._pass_on(number, frame)
         elif len(self._came) >= IMPATIENT:
-            _tell(CUT_SHORT)
+            _print_error(CUT_SHORT)
             for act in acts:
                 act.is_cut_short = True
             self._pass_on(number, frame)
 
     def _one_is_over(self) -> None:
-        """Send the signal that is held to the main thread, once all last acts are over."""
+        """Once all last acts are over, send the held signal to the main thread."""
         with self._passing:
             held, ident = self._held, threading.main_thread().ident
             if self._has_passed or held is None or ident is None:
@@ -245,16 +245,16 @@ class ExitHook:
         _send(held, ident)
 
     def await_effect(self) -> None:
-        """In the main thread, wait until a signal that is held has its effect, such as KeyboardInterrupt."""
+        """In the main thread, wait until a held signal has its effect, such as KeyboardInterrupt."""
         if threading.current_thread() is not threading.main_thread():
             return
         while self._held is not None:
             time.sleep(HANDLING_S)
 
     def _pass_on(self, number: int, frame: FrameType | None) -> None:
-        """Give the signal the effect that it had before these stops.
+        """Give the signal its earlier effect.
 
-        A handler of the program that was set since may have called ours: it is not called again.
+        If the program has set a handler since, which called ours, that one is not called again.
         """
         installed, before = signal.getsignal(number), self._before.get(signal.Signals(number))
         self._let_go()
@@ -278,9 +278,9 @@ class ExitHook:
 
 
 def without_internals(interruption: BaseException) -> None:
-    """Cut the traceback of an interruption before its first frame of this package.
+    """Cut an interruption's traceback before its first frame of this package.
 
-    A command that the stops ended is not shown as its cause.
+    A command that the stops cancelled is not shown as its cause.
     """
     if isinstance(interruption.__context__, BusError):
         interruption.__context__ = None
@@ -292,13 +292,13 @@ def without_internals(interruption: BaseException) -> None:
 
 
 def give_signals_back() -> None:
-    """In the main thread, give the signals back once no bus has to be stopped at exit."""
+    """In the main thread, restore the handlers if no bus has to be stopped at exit."""
     if _hook is not None:
         _hook.rest()
 
 
 def await_signal() -> None:
-    """In the main thread, wait until a signal that began the stops has its effect; without one, return."""
+    """In the main thread, wait until a signal that started the stops has its effect."""
     if _hook is not None:
         _hook.await_effect()
 

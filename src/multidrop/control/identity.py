@@ -1,4 +1,8 @@
-"""IdentityCheck: finds out before a write that the drive at an address is of its declared family."""
+"""IdentityCheck and EchoCheck: find out which device answers at a drive's address.
+
+IdentityCheck confirms that it is of its declared family. EchoCheck distinguishes a drive's confirmation from
+its adapter's echo: many confirmations are copies of their requests, and so is an echo.
+"""
 
 from __future__ import annotations
 
@@ -6,58 +10,108 @@ from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext, suppress
 from typing import NamedTuple
 
-from multidrop.control.echo_check import EchoCheck
 from multidrop.core import PAUSE_NS
 from multidrop.drive.family import Drive
 from multidrop.drive.script import Read, Step, Wait, carry_out
-from multidrop.errors import ANOTHER_FAMILY, BusError, CheckAgain, DriveException, WriteForbidden
+from multidrop.errors import (
+    ANOTHER_FAMILY,
+    BadReply,
+    BusError,
+    CheckAgain,
+    DriveException,
+    LineError,
+    NoReply,
+    NotAttached,
+    NotMaster,
+    NoValue,
+    WriteForbidden,
+)
 from multidrop.families import MODELS
 from multidrop.transport import clock
-from multidrop.transport.exchange import READ_ATTEMPTS, Exchanges
+from multidrop.transport.exchange import READ_ATTEMPTS, WRITE_TIMEOUT, Exchanges
 
-SURE = 2  # times that a drive must answer as another would, before a stop is withheld from it
+SURE = 2  # times that a drive must answer like another family before a stop is withheld
 
 Timed = Callable[[], AbstractContextManager[None]]
-Suspicion = tuple[str, bool]  # why it may be of another family, and whether that is certain
+Suspicion = tuple[str, bool]  # why it may be of another family; whether that is certain
 
 
-class _Look(NamedTuple):
-    """The state of things when a drive was found to be of its family."""
+class EchoCheck:
+    """Reads from drives that show whether the line's adapter repeats what it sends."""
+
+    def __init__(self, exchanges: Exchanges) -> None:
+        self._exchanges = exchanges
+
+    def read_any(self, drive: Drive, attempts: int, *, insists: bool = False, timeout: float = 0.0) -> None:
+        """Read one register: its reply is never a copy of its request. An exception is a reply too."""
+        readable = (register for register in drive.registers.values() if register.readable)
+        register = drive.echo_probe or next(readable, None)
+        if register is not None:
+            with suppress(DriveException, NoValue):
+                self._exchanges.values(drive, [register], attempts, insists=insists, timeout=timeout)
+
+    def probe(self, drive: Drive, *, insists: bool = False) -> None:
+        """Read once, so that the line learns whether the copy of a request was an echo.
+
+        Another client that sends the same request looks like an echo. Without this read the line would then
+        ignore the drive's confirmations of writes, which are copies too.
+        """
+        with suppress(NoReply, BadReply, LineError, NotAttached, NotMaster):
+            self.read_any(drive, 1, insists=insists, timeout=WRITE_TIMEOUT)
+
+    def why_doubtful(self, drive: Drive) -> str:
+        """Return why the reply to a write may be the adapter's echo; "" if it is not.
+
+        An echo may start at any time, and the drive may be dead, so a register is read after the write. If
+        the adapter is known to echo, the core has already distinguished the two.
+        """
+        line = self._exchanges.line
+        if line.has_echo:
+            return ""
+        try:
+            self.read_any(drive, READ_ATTEMPTS)
+        except (NoReply, BadReply, LineError, NotAttached, NotMaster) as failure:
+            return f"the reply may be the adapter's echo, because the drive has not answered since: {failure}"
+        return "the reply was the adapter's echo" if line.has_echo else ""
+
+
+class _Confirmed(NamedTuple):
+    """The circumstances when a drive was confirmed to be of its family."""
 
     port: object  # as it was opened
-    silences: int  # times that it had not answered before
-    pauses: int  # in which it was not asked, until then
+    silences: int  # unanswered requests until then
+    pauses: int  # pauses in polling until then
     at_ns: int
-    slept_ns: int  # for which the machine had slept before
+    slept_ns: int  # time that the machine had slept
 
 
 class IdentityCheck:
-    """The drives that were checked, each on the port as it was opened last."""
+    """The drives that were checked since their port was opened."""
 
     def __init__(self, exchanges: Exchanges, echo: EchoCheck) -> None:
         self._exchanges = exchanges
         self._echo = echo
-        self._known: dict[Drive, _Look] = {}  # those that were found to be of their families
-        self._stoppable: dict[Drive, object] = {}  # the open port on which nothing was found against a stop
+        self._known: dict[Drive, _Confirmed] = {}  # confirmed drives
+        self._stoppable: dict[Drive, object] = {}  # the open port on which a stop is allowed
         self._suspected: dict[Drive, tuple[object, Suspicion]] = {}  # the port, and the first suspicion
 
     def is_known(self, drive: Drive) -> bool:
-        look = self._known.get(drive)
-        return look is not None and look.port is self._exchanges.line.queue
+        last = self._known.get(drive)
+        return last is not None and last.port is self._exchanges.line.queue
 
     def _was_heard(self, drive: Drive) -> bool:
-        """Return True where it was known on this port, and PAUSE_NS without an answer never passed since."""
-        look = self._known.get(drive)
-        if look is None or look.port is not self._exchanges.line.queue:
+        """Return True if it was confirmed on this port, and was never silent for PAUSE_NS since."""
+        last = self._known.get(drive)
+        if last is None or last.port is not self._exchanges.line.queue:
             return False
         peer = self._exchanges.peer(drive)
-        idle_ns = clock.now_ns() - max(look.at_ns, peer.answered_ns)
-        return look.pauses == peer.pauses and idle_ns + _slept_ns() - look.slept_ns < PAUSE_NS
+        idle_ns = clock.now_ns() - max(last.at_ns, peer.answered_ns)
+        return last.pauses == peer.pauses and idle_ns + _slept_ns() - last.slept_ns < PAUSE_NS
 
     def _has_answered_all(self, drive: Drive) -> bool:
-        """Return True where it answered all that it was asked since it was known."""
-        look = self._known.get(drive)
-        return look is not None and look.silences == self._exchanges.peer(drive).silences
+        """Return True if it answered every request since it was confirmed."""
+        last = self._known.get(drive)
+        return last is not None and last.silences == self._exchanges.peer(drive).silences
 
     def forget(self, drive: Drive) -> None:
         self._known.pop(drive, None)
@@ -67,16 +121,15 @@ class IdentityCheck:
     # ---- before a write that may move a motor ----
 
     def check(self, drive: Drive, timed: Timed = nullcontext) -> None:
-        """Check once; WriteForbidden when it is of another family, NoReply when it does not answer.
+        """Check once. Raises WriteForbidden if it is of another family, NoReply if it does not answer.
 
-        At least one value is read, so that the echo of an adapter is known before it could be taken for
-        the drive's confirmation of a write. It is checked again after the port was opened again, after it
-        did not answer, and after PAUSE_NS without an answer: something else may be there. Each read is
-        within `timed`.
+        Reads at least one value, so that an adapter's echo is detected before it could pass for the drive's
+        confirmation. The check is repeated after the port was reopened, after a missing reply, and after
+        PAUSE_NS without a reply, because the drive may have been replaced. Each read is within `timed`.
         """
         was_heard = self._was_heard(drive)
         if was_heard and self._has_answered_all(drive):
-            return  # nobody has changed it
+            return  # it cannot have been replaced
 
         def do(step: Step) -> object:
             if isinstance(step, Wait):
@@ -91,7 +144,7 @@ class IdentityCheck:
             kind = drive.title or type(drive).__name__
             raise WriteForbidden(
                 f"nothing is written to {drive.name}: it refuses what every {kind} answers ({refusal})",
-                rule="it does not look like its family",
+                rule="it does not last like its family",
             ) from refusal
         if not self._exchanges.has_answered(drive):
             with timed():
@@ -99,29 +152,29 @@ class IdentityCheck:
         self._know(drive, port, silences, was_heard=was_heard)
 
     def _know(self, drive: Drive, port: object, silences: int, *, was_heard: bool) -> None:
-        """Know it by what it has just answered; it `was_heard` all the time until then."""
+        """Note that it was confirmed now; `was_heard` if it never fell silent before."""
         before, pauses = self._known.get(drive), self._exchanges.peer(drive).pauses
         if not was_heard or before is None or before.pauses != pauses:
             _forget_setpoint(drive)
-        self._known[drive] = _Look(port, silences, pauses, clock.now_ns(), _slept_ns())
+        self._known[drive] = _Confirmed(port, silences, pauses, clock.now_ns(), _slept_ns())
 
     def _read(self, drive: Drive, step: Step, attempts: int, *, insists: bool = False) -> object:
         if not isinstance(step, Read):
-            raise WriteForbidden(f"{drive.name}: a look at its identity must not write")
+            raise WriteForbidden(f"{drive.name}: an identity check must not write")
         return self._exchanges.value(drive, step.register, attempts, insists=insists)
 
     # ---- before a stop ----
 
     def check_before_stop(self, drive: Drive) -> None:
-        """Check once, without waiting for anything; only proof of another family is WriteForbidden.
+        """Check once, without waits. Raises WriteForbidden only on proof of another family.
 
-        Raises CheckAgain after the first suspicion: call this again, after the stops of other drives.
+        Raises CheckAgain after the first suspicion: call this again after the stops of other drives.
 
-        The stop of one family may be another's run. But a failed check proves nothing: a parameter such as
-        an address or a baud rate may hold a value that is not in force, and a reply may be the answer to an
-        earlier request. The stop is sent then. It is withheld only if `identify` fails SURE times in a row,
-        every request was answered so far, and either the drive is recognised as one of another built-in
-        family, or `identify` itself is certain: it raised WriteForbidden by the rule ANOTHER_FAMILY.
+        The stop of one family may be another's run. But a failed check is no proof: a parameter such as an
+        address or a baud rate may hold a value that is not in force, and a reply may belong to an earlier
+        request. Then the stop is sent. It is withheld only if `identify` fails SURE times in a row, every
+        request was answered so far, and either another built-in family recognises the drive, or `identify`
+        itself is certain: it raised WriteForbidden with the rule ANOTHER_FAMILY.
         """
         port = self._exchanges.line.queue
         if self.is_known(drive) or self._stoppable.get(drive, self) is port:
@@ -138,19 +191,19 @@ class IdentityCheck:
         self._stoppable[drive] = port
 
     def _is_in_step(self, drive: Drive) -> bool:
-        """Return True where an answer from its address can only belong to the request sent now."""
+        """Return True if a reply from its address can only belong to the present request."""
         peer = self._exchanges.peer(drive)
         return not (peer.counters().late or peer.silences or peer.late_until_ns)
 
     def _suspicion(self, drive: Drive) -> Suspicion | None:
-        """Run the family's `identify` once; None where nothing says that it is another."""
+        """Run the family's `identify` once; return None unless it suspects another family."""
         port, refused = self._exchanges.line.queue, None
         silences = self._exchanges.peer(drive).silences
 
         def do(step: Step) -> object:
             nonlocal refused
             if isinstance(step, Wait):
-                return None  # a stop waits for nothing
+                return None  # a stop does not wait
             try:
                 return self._read(drive, step, 1, insists=True)
             except DriveException as refusal:
@@ -165,19 +218,19 @@ class IdentityCheck:
             if refused and drive.is_passing(refused.code):
                 return None
             return str(refusal), isinstance(refusal, WriteForbidden) and refusal.rule == ANOTHER_FAMILY
-        except Exception:  # no answer; or the family's own code failed, which must not keep a stop back
+        except Exception:  # no reply, or an error in the family's own code: the stop is sent
             return None
         if self._is_in_step(drive):
-            self._know(drive, port, silences, was_heard=False)  # else it was known
+            self._know(drive, port, silences, was_heard=False)  # else it is already known
         return None
 
     def _lookalike(self, drive: Drive) -> Drive | None:
-        """Return a drive of the built-in family whose identity check this drive passes SURE times."""
+        """Return a drive of the built-in family that recognises this drive SURE times."""
         settings = drive.settings
         for family in MODELS.values():
             if isinstance(drive, family) or not family.identify_recognises:
                 continue
-            with suppress(ValueError):  # it could not be on this line
+            with suppress(ValueError):  # it cannot be on this line
                 other = family(
                     drive.address, framing=drive.framing, baudrate=settings.baudrate, format=settings.format
                 )
@@ -201,7 +254,7 @@ class IdentityCheck:
 
 
 def _forget_setpoint(drive: Drive) -> None:
-    """Forget what a drive cannot say: unheard for so long, asked or not, it may have lost its power."""
+    """Forget a setpoint that cannot be read: after such a silence the drive may have lost its power."""
     if drive.setpoint_name in drive.registers and not drive.register(drive.setpoint_name).readable:
         drive.commanded = None
 

@@ -1,4 +1,4 @@
-"""Latches: end what may move a motor once its stop was called, and hold others back while stops run."""
+"""Latches: cancel calls that may move a motor when its stop is called, and block new ones until it ends."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from multidrop.transport.exchange import Exchanges
 STOPPED = "a stop was called"
 REMOVED = "the drive was taken off the bus"
 LEFT = "the bus was left"
-LOOK_S = 0.005  # between looks whether stops are over
+POLL_S = 0.005  # between checks for the end of stops
 
 
 class Latches:
@@ -27,64 +27,64 @@ class Latches:
         self._forget_stops()
 
     def _forget_stops(self) -> None:
-        # Under way, each with its thread's number and its drives.
+        # by stop: the number of its thread, and its drives
         self._stops: dict[object, tuple[int, frozenset[Drive]]] = {}
 
     def forked(self) -> None:
-        """Send nothing in the child, where nothing is under way."""
+        """Shut all latches in a forked child, and forget the parent's stops."""
         self._forget_stops()
         self.shut()
 
     def add(self, drive: Drive) -> Latch:
         latch = self._latches[drive] = Latch()
-        if self.is_shut:  # looked at afterwards: a thread that shuts them later sees this latch
+        if self.is_shut:  # checked after adding it: a later `shut` sees this latch
             latch.shut(LEFT)
         return latch
 
     def end(self, drives: Iterable[Drive]) -> None:
-        """End what moves these drives, which are about to leave: from now on nothing of it begins."""
+        """Cancel the calls of these drives, which are about to be removed, and refuse new ones."""
         for drive in drives:
             self.latch(drive).shut(REMOVED)
 
     def remove(self, drive: Drive) -> None:
-        """End what moves this drive, and wait for its stops that are under way."""
+        """Cancel this drive's calls, and wait for its stops under way."""
         self.end([drive])
         self.await_stops([drive])
         self._latches.pop(drive, None)
 
     def shut(self) -> None:
-        """Send nothing any more that moves a motor. Takes no lock: a signal handler may call it."""
+        """Cancel all calls for good. Takes no lock, because a signal handler may call it."""
         self.is_shut = True
         for latch in list(self._latches.values()):
             latch.shut(LEFT)
 
     def await_stops(self, drives: Collection[Drive] | None = None) -> None:
-        """Wait until no stop is under way, of these drives or of any; a thread waits for none of its own."""
+        """Wait for the stops of these drives, or all; not for those of the calling thread."""
         own, asked = threading.get_ident(), None if drives is None else frozenset(drives)
         while any(
             thread != own and (asked is None or not asked.isdisjoint(stopped))
             for thread, stopped in self._stops.copy().values()
         ):
-            time.sleep(LOOK_S)  # no condition, whose lock a signal's exception could leave locked
+            time.sleep(POLL_S)  # a Condition's lock could stay locked after a signal's exception
 
     def latch(self, drive: Drive) -> Latch:
-        """Return a drive's latch; NotAttached for one that is not on this bus."""
+        """Return a drive's latch. Raises NotAttached if the drive is not on this bus."""
         self._exchanges.peer(drive)  # raises it too
         latch = self._latches.get(drive)
-        if latch is None:  # it leaves just now
+        if latch is None:  # it is being removed
             raise NotAttached(f"{drive.name} is not attached to this bus: use bus.attach(...)")
         return latch
 
     def rise(self, drives: Sequence[Drive]) -> None:
-        """End all that moves these drives: a stop is about to be written."""
+        """Cancel the calls of these drives: a stop is about to be written."""
         for drive in drives:
             self.latch(drive).rise(STOPPED)
 
     def begin(self, stop: object, drives: Sequence[Drive]) -> None:
-        """Until `over` nothing that moves these drives begins or goes on, and none of them leaves.
+        """Cancel the calls of these drives, refuse new ones and keep the drives attached, until `over`.
 
-        It may be called again. Neither this nor `over` takes a lock, and each step of them is one that a
-        signal's exception comes before or after.
+        May be repeated. Neither this nor `over` takes a lock, and a signal's exception comes between their
+        steps, never within one.
         """
         self._stops[stop] = threading.get_ident(), frozenset(drives)
         for drive in drives:
@@ -92,7 +92,7 @@ class Latches:
                 latch.hold(stop, STOPPED)
 
     def over(self, stop: object) -> None:
-        """Let the drives go. It may be called again, and without a beginning."""
+        """Release the drives. May be repeated, and called without `begin`."""
         for latch in [*self._latches.values()]:
             latch.let_go(stop)
         self._stops.pop(stop, None)

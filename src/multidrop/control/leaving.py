@@ -1,4 +1,4 @@
-"""Leaving: what becomes of the motors when a bus is left, or the process ends."""
+"""Leaving: what happens to the motors when a bus is closed or the process exits."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from multidrop.control.exit_hook import LastAct, exit_hook
 from multidrop.control.latches import Latches
 from multidrop.control.outcome import Stopped
-from multidrop.control.stop_all import Stopper
+from multidrop.control.stops import Stopper
 from multidrop.drive.family import Drive
 from multidrop.transport.aside_log import log_aside
 
@@ -16,7 +16,7 @@ _log = logging.getLogger("multidrop.bus")
 
 
 class Leaving:
-    """Ends all that moves the motors of a bus, and stops them where that was asked for."""
+    """Cancels all calls of a bus at its end, and stops its drives if `stop_on_exit` was called."""
 
     def __init__(
         self,
@@ -46,13 +46,13 @@ class Leaving:
             )
 
     def begin(self) -> None:
-        """End all that moves a motor, and begin to stop the drives if that was asked for."""
+        """Cancel all calls, and start to stop the drives if `stop_on_exit` was called."""
         self._latches.shut()
         if self._last_act is not None:
             self._last_act.begin()
 
     def finish(self) -> None:
-        """Do that, and wait for all stops under way."""
+        """Do the same, and wait for all stops under way."""
         self.begin()
         if self._last_act is not None:
             exit_hook().finish(self._last_act)
@@ -60,11 +60,11 @@ class Leaving:
             self._latches.await_stops()
 
     def part_with(self, drives: Sequence[Drive], to_stop: Sequence[Drive]) -> None:
-        """End all that moves drives which are about to be detached, and wait for their stops.
+        """Cancel the calls of drives that are about to be detached, and wait for their stops.
 
-        First some of them are stopped, if all were to be stopped at the end.
+        The drives `to_stop` are stopped first if `stop_on_exit` was called.
         """
-        self._latches.end(drives)  # before the stops: a start after its drive's would not be stopped
+        self._latches.end(drives)  # before the stops: a start after them would not be stopped
         if to_stop and self.stops:
             run = self._stopper.stop_all(to_stop, lambda: False, None)
             try:
@@ -77,7 +77,7 @@ class Leaving:
 
 
 def _warn_of(found: Mapping[str, Stopped]) -> None:
-    """Log each drive that is not seen to stand."""
+    """Log each drive that was not seen to stop."""
     for stopped in found.values():
         if not stopped.ok:
             log_aside(_log, logging.WARNING, "%s", stopped)

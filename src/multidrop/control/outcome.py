@@ -1,4 +1,4 @@
-"""Outcome and Stopped: exactly what is known of the effect of a write, and of a stop."""
+"""Outcome and Stopped: the known effect of a write, and of a stop."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class Effect(Enum):
 
 @dataclass(frozen=True)
 class Outcome:
-    """One write's effect: `held` is what the drive then said it holds, None where that cannot be read.
+    """One write's effect: `held` is the value read back, None if that is not possible.
 
     `failure` is the error that `Drive.write` raises for it.
     """
@@ -55,7 +55,7 @@ class Outcome:
 
 
 class Seen(Enum):
-    STOPPED = "stopped"  # seen to stand
+    STOPPED = "stopped"  # and seen to stand still
     SENT = "sent but unknown"
     REFUSED = "refused by the drive"  # each time that it was sent
     FAILED = "failed"  # no stop was sent
@@ -63,7 +63,7 @@ class Seen(Enum):
 
 @dataclass(frozen=True)
 class Stopped:
-    """One drive's stop: what was seen of it, after how many seconds, and why it is not seen to stand."""
+    """One drive's stop: its result, its duration, and why the motor was not seen to stop."""
 
     drive: str
     seen: Seen

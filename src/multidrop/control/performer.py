@@ -1,4 +1,4 @@
-"""Performer: carries out plain writes and the verbs of a line's drives, until a stop comes."""
+"""Performer: carry out plain writes and verbs on a line's drives, until a stop is called."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from multidrop.control.exit_hook import await_signal
 from multidrop.control.latches import Latches
 from multidrop.control.outcome import Outcome
 from multidrop.control.rules import check_plain, is_harmless, raw_count
-from multidrop.control.stop_all import Stopper
+from multidrop.control.stops import Stopper
 from multidrop.control.writer import Writer
 from multidrop.core import Message
 from multidrop.drive.family import Drive
@@ -34,16 +34,16 @@ from multidrop.transport.exchange import Exchanges
 _log = logging.getLogger("multidrop.control")
 
 
-# The failures of a read that say nothing of what was written before it.
+# failures of a read, which leave the effect of the write before it unknown
 _ENDING = (NoReply, BadReply, DriveException, LineError, NotAttached, NotMaster)
 
 
 class _Over(Exception):
-    """The script went on after CancelledByStop was raised in it."""
+    """The script continued after CancelledByStop was raised in it."""
 
 
 class Performer:
-    """Carries out scripts on one bus; `expiry` is the time in s within which a write's turn must come."""
+    """Carries out scripts on one bus; a write must be sent within `expiry` seconds of its call."""
 
     def __init__(
         self, exchanges: Exchanges, writer: Writer, stopper: Stopper, latches: Latches, expiry: float
@@ -55,9 +55,9 @@ class Performer:
         self._expiry = expiry
 
     def call(self, drive: Drive, verb: str = "", seen: int | None = None) -> Call:
-        """Begin a call: all that it writes has the permit and the time of this moment.
+        """Return a new call; a stop from now on cancels its writes, and its time starts now.
 
-        `seen`: how many stops of the drive had been called when the call began, if that was earlier.
+        `seen` is the drive's number of stops so far, if the call started earlier.
         """
         permit = self._latches.latch(drive).permit(seen)
         if self._latches.is_shut:
@@ -65,17 +65,16 @@ class Performer:
         return Call(drive, permit, self._expiry, verb, time_limit.present_limit_ns())
 
     def move(self, script: Script[Any], call: Call) -> Any:
-        """Carry out a verb that may move the motor: a stop ends it at whatever step it is.
+        """Carry out a verb that may move the motor; a stop ends it at any step.
 
-        Raises CancelledByStop then, where nothing was sent, and Unconfirmed where something was, as
-        `perform`.
+        Raises CancelledByStop if a stop came before the first write, Unconfirmed if it came later.
         """
         with call.noted():
             call.check(f"the {call.verb}")
             self._look_at_identity(call.drive, call)
             result = self.perform(script, call)
             if not call.permit.is_good:
-                raise _unseen(call, call.overtaken(f"the {call.verb}"))
+                raise _unseen(call, call.cancelled(f"the {call.verb}"))
             if call.unverified:
                 with call.look():
                     outcome = self._writer.verified(call.drive, call.unverified)
@@ -84,7 +83,7 @@ class Performer:
             return result
 
     def write(self, drive: Drive, register: Register[Any], value: Any) -> Outcome:
-        """Carry out a plain write. One that stops the motor is sent at once, and nothing holds it back."""
+        """Carry out a plain write. One that stops the motor is sent at once, past all other rules."""
         raw = raw_count(drive, register, value)
         check_plain(drive, register, raw)
         step = Write(register, value)
@@ -102,14 +101,14 @@ class Performer:
                 return self._writer.verified(drive, outcome)
 
     def raw(self, drive: Drive, request: Message) -> bytes:
-        """Send any request once, and return the data of the reply; ValueError for a Modbus read."""
+        """Send any request once; return the reply's data. Raises ValueError if it is a Modbus read."""
         check_no_read(drive, request)
         call = self.call(drive)
         with call.noted():
             return self._writer.raw(drive, request, call)
 
     def check_identity(self, drive: Drive) -> None:
-        """Check once that it is of its family; the first check also logs what its watchdog does."""
+        """Check once that a drive is of its family; the first check also logs its watchdog."""
         if not self._writer.identity_check.is_known(drive):
             self._look_at_identity(drive, self.call(drive))
 
@@ -122,7 +121,7 @@ class Performer:
                 _log.info("%s: %s", drive.name, self.watchdog(drive))
 
     def watchdog(self, drive: Drive) -> str:
-        """Say what the motor does when this client dies, as far as the drive can tell."""
+        """Return a sentence on what the motor does if this client dies, as far as the drive says."""
         register = drive.registers.get("communication_timeout")
         if register is None or not register.readable:
             return drive.watchdog
@@ -137,15 +136,15 @@ class Performer:
     def perform(self, script: Script[Any], call: Call) -> Any:
         """Carry out a script's steps.
 
-        A read that fails after something was written is Unconfirmed: NoReply would say that nothing was
-        written, and DriveException that the drive did not do it.
+        If a read fails after a write, raises Unconfirmed: NoReply would mean that the write was not sent,
+        and DriveException that the drive refused it.
         """
-        unseen: list[Exception] = []  # why something was not read
-        overtaken: list[CancelledByStop] = []
+        unseen: list[Exception] = []  # failures of steps other than writes
+        cancelled: list[CancelledByStop] = []
 
         def do(step: Step) -> Any:
             try:
-                _check(step, call, overtaken)
+                _check(step, call, cancelled)
                 return self._do(step, call)
             except Exception as failure:
                 if not isinstance(step, Write):
@@ -155,7 +154,7 @@ class Performer:
         try:
             return carry_out(script, do)
         except (*_ENDING, CancelledByStop, _Over) as failure:
-            why: Exception = overtaken[0] if isinstance(failure, _Over) else failure
+            why: Exception = cancelled[0] if isinstance(failure, _Over) else failure
             if not call.sent or why not in unseen:
                 raise why from None if why is failure else failure
             raise _unseen(call, why) from why
@@ -177,18 +176,18 @@ class Performer:
         return self._writer.put(drive, step, call).value
 
 
-def _check(step: Step, call: Call, overtaken: list[CancelledByStop]) -> None:
-    """End a script once a stop was called: at its next write, and if it may move a motor at any step.
+def _check(step: Step, call: Call, cancelled: list[CancelledByStop]) -> None:
+    """End a script after a stop was called: at its next write, or at any step if it may move a motor.
 
-    A write that does no harm may still take something back.
+    A harmless write may still follow: it undoes an earlier one.
     """
     if isinstance(step, Insist) or not (call.verb or isinstance(step, Write)) or call.permit.is_good:
         return
-    if overtaken:
+    if cancelled:
         raise _Over
     what = step.register.name if isinstance(step, Write) and not call.verb else f"the {call.verb}"
-    overtaken.append(call.overtaken(what))
-    raise overtaken[0]
+    cancelled.append(call.cancelled(what))
+    raise cancelled[0]
 
 
 def _unseen(call: Call, why: Exception) -> Unconfirmed:

@@ -16,18 +16,18 @@ from multidrop.drive.script import Script, Write, read, wait
 from multidrop.drive.state import Direction
 from multidrop.errors import WriteForbidden
 
-HEARD_S = PAUSE_NS / 2e9  # after PAUSE_NS nobody knows whether a drive has lost its power (identity.py)
+HEARD_S = PAUSE_NS / 2e9  # after PAUSE_NS of silence a drive may have lost its power (identity.py)
 
 
 def start_staggered(drives: Sequence[Drive], gap: float, direction: Direction | None = None) -> None:
     """Start drives one after another, `gap` seconds apart.
 
-    When one fails, it and all that were started before are stopped, and its failure is raised. None is
-    started whose stop was called, on any thread, after this call began. Those that wait for their turn are
-    looked at meanwhile: the setpoint of one that cannot say it counts as lost where nothing is heard of it.
+    If one fails, stop it and all that were started before, and raise its failure. A drive whose stop is
+    called on any thread during this call is not started. Drives that wait for their turn are read regularly,
+    because a setpoint that cannot be read back counts as lost after a silence.
     """
     if not 0 <= gap < inf:
-        raise ValueError(f"gap = {gap:g} s is no time between two starts")
+        raise ValueError(f"gap = {gap:g} s: it must be 0 or more")
     for drive in drives:
         drive.check_confirmed("start")
     calls = [drive.begin_call("start", drive.stops_called[0]) for drive in drives]
@@ -36,14 +36,14 @@ def start_staggered(drives: Sequence[Drive], gap: float, direction: Direction | 
         try:
             if number:
                 unheard_s = _await_turn(drives[number:], gap, unheard_s)
-            drive.carry_out_move(drive.start.script(direction), call and call.anew())
+            drive.carry_out_move(drive.start.script(direction), call and call.restarted())
         except BaseException:
             _stop(drives[: number + 1])
             raise
 
 
 def _await_turn(waiting: Sequence[Drive], gap: float, unheard_s: float) -> float:
-    """Wait, and look at those that wait before they are unheard for too long; return how long they are."""
+    """Wait for `gap` s, and read the waiting drives every HEARD_S; return the time since the last read."""
     while gap > 0:
         rest = min(gap, HEARD_S - unheard_s)
         waiting[0].perform(wait(rest))
@@ -51,20 +51,20 @@ def _await_turn(waiting: Sequence[Drive], gap: float, unheard_s: float) -> float
         if unheard_s >= HEARD_S:
             unheard_s = 0.0
             for drive in waiting:
-                with suppress(Exception):  # its start tells
+                with suppress(Exception):  # its start will report it
                     drive.identify()
     return unheard_s
 
 
 def _stop(drives: Sequence[Drive]) -> None:
-    """Stop them all at once: they may be on several buses, and one may be silent.
+    """Stop all in parallel: they may be on several buses, and one may be silent.
 
-    Where the system gives no more threads, each of the others is sent its stop before any is waited for. At
-    an interruption each that has no thread yet is sent its stop once more, unless a second one comes.
+    If the system has no thread left, the others are each sent a stop before any is waited for. On an
+    interruption those without a thread are sent a stop once more.
     """
 
     def stop(drive: Drive, seconds: float | None = None) -> None:
-        with suppress(Exception):  # whatever it is: the others are stopped too
+        with suppress(Exception):  # of any kind: the others are stopped too
             drive.stop(seconds=seconds)
 
     threads: list[threading.Thread] = []
@@ -88,11 +88,11 @@ def _stop(drives: Sequence[Drive]) -> None:
 
 
 def ramp(drive: Drive, hz: float, *, rate: float | None = None, every: float = 0.5) -> None:
-    """Bring the setpoint to `hz` in steps, one in `every` seconds, at `rate` Hz/s.
+    """Change the setpoint to `hz` in steps, one every `every` seconds, at `rate` Hz/s.
 
-    The rate is the drive's own (maximum frequency / acceleration time) where these can be read and
-    none is given, and never above it. WriteForbidden for a setpoint that every step would store in EEPROM.
-    For one that the drive does not take nothing is sent, and this raises as `set_frequency`.
+    The default rate is the drive's own (maximum frequency / acceleration time), which is also the highest.
+    Raises WriteForbidden if each step would be stored in EEPROM, or the rate is unknown. If the drive would
+    not take `hz`, raises as `set_frequency` before the first step.
     """
     drive.perform(_ramp(drive, hz, rate, every))
 
@@ -124,20 +124,20 @@ def _ramp(drive: Drive, hz: float, rate: float | None, every: float) -> Script[N
 
 
 def _check(drive: Drive, hz: float) -> Script[None]:
-    """Raise what keeps this setpoint from being written: else the ramp would go up to the limit first."""
+    """Raise now if this setpoint is not allowed; else the ramp would run up to the limit first."""
     script = drive.set_frequency.script(hz)
     try:
         step = next(script)
         while not isinstance(step, Write):
             step = script.send((yield step))
-    except StopIteration:  # it would write nothing
+    except StopIteration:  # it writes no setpoint
         return
     raw = raw_count(drive, step.register, step.value)
     yield from conditions(drive, step.register, step.register.decode(raw))
 
 
 def _own_rate(drive: Drive) -> Script[float | None]:
-    """Return the slope of the drive's own ramp in Hz/s, None where it is unknown."""
+    """Return the slope of the drive's own ramp in Hz/s; None if it is unknown."""
     most = drive.option.get("maximum_frequency")
     if most is None and "maximum_frequency" in drive.registers:
         most = yield from read(drive.register("maximum_frequency"))

@@ -1,7 +1,7 @@
 """WriteRecords: the audit log and the EEPROM ledger of one line's writes.
 
-A write is counted before it is sent. A stop is recorded by threads of their own, for which no stop waits: a
-disk may hang, and a ledger be locked.
+A write is counted before it is sent. A stop is recorded on separate threads, because a disk may hang and a
+ledger may be locked; the stop does not wait for them.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ from multidrop.transport.aside_log import AsideThread, log_aside
 from multidrop.transport.line import Line
 
 CALLED = "called"  # the outcome of a stop that is about to be sent
-CALLED_S = 0.05  # that a stop waits for its record at most
-CLOSING_NS = 1_000_000_000  # that closing waits for other threads' records
+CALLED_S = 0.05  # the longest that a stop waits for its record
+CLOSING_NS = 1_000_000_000  # the longest that closing waits for records of other threads
 
 _log = logging.getLogger("multidrop.control")
 _audit_thread = AsideThread("multidrop audit")
@@ -40,15 +40,15 @@ class WriteRecords:
 
     def __init__(self, line: Line, ledger: Ledger, audit: AuditLog | None) -> None:
         self.audit = audit
-        self.audit_trouble = ""  # why the newest record is not in the log
+        self.audit_trouble = ""  # why the newest record could not be written
         self._line = line
         self._ledger = ledger
         self._uncounted: deque[LedgerCell] = deque()
-        self._unlogged: deque[tuple[int, dict[str, Any]]] = deque()  # each with its time, UTC in ns
-        self._writers: list[None] = []  # in `catch_up`; a list grows and shrinks without a lock
+        self._unlogged: deque[tuple[int, dict[str, Any]]] = deque()  # each with its UTC in ns
+        self._writers: list[None] = []  # threads in `catch_up`; a list needs no lock
 
     def count(self, drive: Drive, register: Register[Any], kept: Kept) -> None:
-        """Count a write in the ledger before it is sent; WriteForbidden when it must not be."""
+        """Count a write in the ledger before it is sent. Raises WriteForbidden if it must not be sent."""
         least = LEAST_INTERVAL if kept is Kept.EEPROM else 0.0
         ledger = self._ledger.at(self._line.identity)
         why = ledger.enter(self._cell(drive, register), clock.utc_ns() / 1e9, least)
@@ -69,21 +69,18 @@ class WriteRecords:
     def log(
         self, drive: Drive, request: Message, what: str, effect: Effect, why: str = "", held: Any = None
     ) -> None:
-        """Note a write in the audit log; a failure is logged as a warning."""
+        """Record a write in the audit log; a failure is logged as a warning."""
         self._put(self._record(drive, request, what, effect.value, why, held), _log.log)
         self.catch_up()
 
     def log_later(
         self, drive: Drive, request: Message, what: str, effect: Effect, why: str = "", held: Any = None
     ) -> None:
-        """Queue the note until `catch_up` or `catch_up_aside`, and log it aside."""
+        """Queue the record until `catch_up` or `catch_up_aside`, and log it aside."""
         self._put(self._record(drive, request, what, effect.value, why, held), partial(log_aside, _log))
 
     def note_called(self, drive: Drive, request: Message, what: str) -> None:
-        """Write that this is about to be sent, if the present context says so (see `noted_first`).
-
-        Raises OSError if the audit log cannot be written.
-        """
+        """Within `noted_first`, record that this is about to be sent. Raises OSError if that fails."""
         if self.audit is None or not is_noted_first():
             return
         record = self._record(drive, request, what, CALLED, "", None)
@@ -93,7 +90,7 @@ class WriteRecords:
             raise OSError(f"{what} was not sent: the audit log cannot be written: {self.audit_trouble}")
 
     def note_stops_called(self, verb: str, drives: Sequence[Drive]) -> None:
-        """Note that these drives are about to be stopped. A disk that hangs delays them by CALLED_S, once."""
+        """Record that these drives are about to be stopped; wait CALLED_S at most, once for a hung disk."""
         of_one = {"model": drives[0].model, "address": drives[0].address} if len(drives) == 1 else {}
         names = ", ".join(drive.name for drive in drives)
         self._put({"drive": names, **of_one, "write": verb, "outcome": CALLED}, partial(log_aside, _log))
@@ -104,7 +101,7 @@ class WriteRecords:
     def note_stop_ended(
         self, verb: str, drive: Drive, stopped: Stopped, frames: int, newest: Message | None
     ) -> None:
-        """Note what is known of one drive's stop at its end, and how many frames it took."""
+        """Record the result of one drive's stop, and how many frames it took."""
         record = self._record(drive, newest, verb, stopped.seen.value, stopped.why, None)
         self._put({**record, "frames": frames}, partial(log_aside, _log), str(stopped))
         self.catch_up_aside()
@@ -126,7 +123,7 @@ class WriteRecords:
         return record | {"outcome": outcome} | known
 
     def _put(self, record: dict[str, Any], log: Callable[..., None], text: str = "") -> None:
-        """Queue a record for the audit log, and log it, or this text for it."""
+        """Queue a record for the audit log, and log it, as `text` if given."""
         record = self._complete(record)
         if self.audit is not None:
             self._unlogged.append((clock.utc_ns(), record))
@@ -142,28 +139,28 @@ class WriteRecords:
         return {"port": self._line.port, **record, **author}
 
     def catch_up(self) -> None:
-        """Write and count what was queued; a failure is logged as a warning."""
+        """Write and count all that is queued; a failure is logged as a warning."""
         self._write_queued()
         self._count_queued()
 
     def catch_up_aside(self) -> None:
-        """Do so soon, on threads of their own."""
+        """Do the same soon, on separate threads."""
         if self._uncounted:
             _ledger_thread.put(self._count_queued)
         if self._unlogged:
             _audit_thread.put(self._write_queued)
 
     def flush(self, seconds: float) -> None:
-        """Do so, and wait for each of the threads for `seconds` s at most."""
+        """Do the same, and wait up to `seconds` for each thread."""
         self.catch_up_aside()
         for thread in (_audit_thread, _ledger_thread):
             if not thread.hangs(seconds) and not thread.flush(seconds) and not thread.hangs(seconds):
-                self.catch_up()  # there is no thread
+                self.catch_up()  # the system has no thread left
 
     def _write_queued(self) -> None:
-        self._writers.append(None)  # before a record is taken: `close` then waits for this thread
+        self._writers.append(None)  # before taking a record, so that `close` waits for this thread
         try:
-            with suppress(IndexError):  # another thread may be at it
+            with suppress(IndexError):  # another thread may take them too
                 while True:
                     self._append(*self._unlogged.popleft())
         finally:
@@ -184,14 +181,14 @@ class WriteRecords:
         try:
             audit.add(at_ns, record)
             self.audit_trouble = ""
-        except (OSError, ValueError) as failure:  # it may be closed meanwhile
+        except (OSError, ValueError) as failure:  # ValueError: it was closed
             self.audit_trouble = getattr(failure, "strerror", None) or str(failure)
             log_aside(_log, logging.WARNING, "the audit log cannot be written: %s", self.audit_trouble)
 
     def _note(self, cells: list[LedgerCell]) -> None:
         try:
             self._ledger.at(cells[0].port).note(cells, clock.utc_ns() / 1e9)
-        except (OSError, ValueError) as failure:  # a port's name may be no text
+        except (OSError, ValueError) as failure:  # ValueError: a port's name may not be valid text
             log_aside(_log, logging.WARNING, "stops were not counted: %s", failure)
 
     def _cell(self, drive: Drive, register: Register[Any]) -> LedgerCell:
@@ -200,7 +197,7 @@ class WriteRecords:
         )
 
     def close(self) -> None:
-        """Close the log when what was queued is in it; a disk that hangs holds nobody up for long."""
+        """Write the queue and close the log; wait only briefly for a disk that hangs."""
         self.flush(CLOSING_NS / 1e9)
         given_up_ns = clock.now_ns() + CLOSING_NS
         while self._writers and clock.now_ns() < given_up_ns:

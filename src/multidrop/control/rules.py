@@ -1,6 +1,6 @@
-"""Rules of a register, which must hold before anything is written to it.
+"""Rules of a register that must hold before it is written.
 
-A write against them is `WriteForbidden`, with the register, the rule and the manual's place.
+A violation is `WriteForbidden` with the register, the rule and the place in the manual.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ T = TypeVar("T", bound=float)
 
 
 def refused(drive: Drive, register: Register[Any], rule: str, advice: Advice | None = None) -> WriteForbidden:
-    """Return the error that says that this rule keeps the register from being written."""
+    """Return the error for a write that breaks this rule."""
     return _refusal(register, rule, f"{register.name} of {drive.name} is not written: {rule}", advice)
 
 
@@ -31,7 +31,7 @@ def _refusal(
 
 
 def raw_count(drive: Drive, register: Register[T], value: T) -> float:
-    """Return the raw count to send. Raises WriteForbidden by its declaration, TypeError for no value."""
+    """Return the raw count to send. Raises WriteForbidden or TypeError if it cannot be written."""
     check_own(drive, register)
     if register.never:
         raise refused(drive, register, register.never)
@@ -44,9 +44,9 @@ def raw_count(drive: Drive, register: Register[T], value: T) -> float:
 
 
 def check_known(drive: Drive, register: Register[Any], raw: float) -> None:
-    """Raise WriteForbidden unless the drive is known to be of its class, where this may command the motor.
+    """Raise WriteForbidden if this may command the motor and the drive's class is not confirmed.
 
-    A stop needs no such knowledge. What a file calls harmless is believed where its stop was checked with it.
+    A stop needs no confirmation. Other counts that a family file declares harmless do.
     """
     is_unproven = bool(drive.declared_in) and "confirmed" in drive.options  # any address may be the wrong one
     if is_harmless(register, raw):
@@ -57,9 +57,9 @@ def check_known(drive: Drive, register: Register[Any], raw: float) -> None:
 
 
 def check_plain(drive: Drive, register: Register[Any], raw: float) -> None:
-    """Raise WriteForbidden unless a plain write may do this: only a verb moves a motor or resets a fault.
+    """Raise WriteForbidden unless a plain write may do this: only verbs move a motor or reset a fault.
 
-    A command that moves nothing by itself is sent to a drive that is known to be of its class.
+    A command that does not move the motor by itself needs a drive whose class is confirmed.
     """
     if is_harmless(register, raw) or not register.commands:
         check_known(drive, register, raw)
@@ -86,23 +86,23 @@ def _has(drive: Drive, name: str) -> bool:
 
 
 def check_broadcast(drive: Drive, register: Register[Any], raw: float) -> None:
-    """Raise WriteForbidden for a broadcast of a user's family that nobody has confirmed, unless it stops."""
+    """Raise WriteForbidden for a broadcast to an unconfirmed user family, unless it is a stop."""
     if not is_stop(drive, register, raw):
         drive.check_confirmed(register.name)
 
 
 def is_stop(drive: Drive, register: Register[Any], raw: float) -> bool:
-    """Return True for a harmless count of a family that has a stop; a file calls only its words so."""
+    """Return True for a harmless count of a family that has a stop."""
     return is_harmless(register, raw) and _has(drive, "stop")
 
 
 def is_harmless(register: Register[Any], raw: float) -> bool:
-    """Return True for what may be sent at any time, even to a drive that does not answer: a stop."""
+    """Return True if this may be sent at any time, even to a silent drive, as a stop may."""
     return register.harmless is not None and raw in register.harmless
 
 
 def conditions(drive: Drive, register: Register[T], value: T) -> Script[None]:
-    """Read what the rules depend on: other registers, and the state of the motor."""
+    """Read the registers and the motor state that the rules depend on; raise WriteForbidden."""
     for name, sign, word in ((register.at_least, 1, "below"), (register.at_most, -1, "above")):
         bound = (yield from _bound(drive, name)) if name else None
         if bound is not None and (value - bound) * sign < 0:
@@ -113,7 +113,7 @@ def conditions(drive: Drive, register: Register[T], value: T) -> Script[None]:
 
 
 def _bound(drive: Drive, name: str) -> Script[float | None]:
-    """Return the value of an option, None where it was not declared, or of a register."""
+    """Return the value of a register, or of an option; None if it was not declared."""
     if name in drive.options:
         return drive.option.get(name)
     register: Register[float] = drive.register(name)
@@ -132,14 +132,14 @@ def _must_stand(drive: Drive, register: Register[Any]) -> Script[None]:
 
 
 def _not_now(drive: Drive, register: Register[Any], rule: str) -> WriteForbidden:
-    """Return the refusal by a rule that a manual need not print: its place is said to be the register's."""
+    """Return the error for a rule that the manual may not print; it names the register's place."""
     where = f" (in the manual, {register.name} is {register.place})" if register.place else ""
     sentence = f"{register.name} of {drive.name} is not written: {rule}{where}"
     return WriteForbidden(sentence, register=register.name, rule=rule, place=register.place)
 
 
 def wears(drive: Drive, register: Register[Any]) -> Kept:
-    """Return how a write to this register is kept: RAM does not wear, what is not stated may."""
+    """Return how a write to this register is kept; if that is not stated, it may wear an EEPROM."""
     if register.ram_address is not None or register.name in drive.ram or register.kept is Kept.RAM:
         return Kept.RAM
     is_bit = register.table.carrier is Carrier.BIT

@@ -1,4 +1,4 @@
-"""Time limit of writes: until when what is called within a block may be sent."""
+"""Time limit of writes: a deadline for the calls within a block."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ _limit: ContextVar[Limit] = ContextVar("multidrop time limit", default=_none)
 
 
 def present_limit_ns() -> float:
-    """Return the time (CLOCK_BOOTTIME, ns) until which what is called now may be sent; inf without one."""
+    """Return the deadline of calls in this context (CLOCK_BOOTTIME, ns); inf if there is none."""
     return _limit.get()()
 
 
 def checked_expiry(expiry: float, what: str) -> float:
-    """Return it, if it is a time in s that a write's or a read's turn may take; else raise ValueError."""
+    """Return `expiry`; raise ValueError unless it is a positive number of seconds."""
     is_number = isinstance(expiry, (int, float)) and not isinstance(expiry, bool)
     if not is_number or not 0 < expiry <= MOST_EXPIRY_S:
         raise ValueError(
@@ -39,25 +39,25 @@ def checked_expiry(expiry: float, what: str) -> float:
 
 def _called(limit: Limit) -> float:
     if not callable(limit):
-        raise TypeError(f"limit = {limit!r} is no function that returns a time of CLOCK_MONOTONIC in ns")
+        raise TypeError(f"limit = {limit!r} must be a function that returns a time of CLOCK_MONOTONIC in ns")
     at_ns = limit()
-    return at_ns if at_ns == at_ns else 0  # NaN is later than nothing, and no call would be too late
+    return at_ns if at_ns == at_ns else 0  # NaN compares as never late
 
 
 @contextmanager
 def written_before(limit: Limit) -> Iterator[None]:
-    """Send nothing of a call within the block whose first write would leave after the time of `limit`.
+    """Within the block, raise Expired if a call's first write cannot be sent by the time of `limit`.
 
-    `limit` returns a time of CLOCK_MONOTONIC in ns, as `time.monotonic_ns()` does; 0 is always past. It is
-    called when a call begins; from then on a stop ends that call. So whoever notes a stop, and has `limit`
-    return 0 from then on, misses none. A call that is too late sends nothing and raises Expired; time for
-    which the machine sleeps within the block counts. The later writes of a verb have the bus's own `expiry`,
-    and are not cut off. Stops are sent at any time. The block is that of this thread and what it calls, or of
-    this task of asyncio and `asyncio.to_thread`. With what is no function each call raises TypeError, but
-    for stops.
+    `limit` is called at the start of each call. It returns a time in ns, as `time.monotonic_ns()` does; 0 is
+    always past. A stop that is called later ends the call by itself, so a program that makes `limit` return 0
+    when it sees a stop misses none. Sleep of the machine within the block counts. The later writes of a verb
+    have the bus's own `expiry`. Stops are always sent.
+
+    It applies to this thread, or to this task and `asyncio.to_thread`. If `limit` is not a function, each
+    call but a stop raises TypeError.
     """
     outer = _limit.get()
-    slept_ns = clock.boottime_ns() - clock.now_ns()  # so far; read in this order, it is never too long
+    slept_ns = clock.boottime_ns() - clock.now_ns()  # in this order it is never too long
     token = _limit.set(lambda: min(outer(), _called(limit) + slept_ns))
     try:
         yield

@@ -1,4 +1,4 @@
-"""Writer: sends a write by all rules, once, has it recorded, and finds out what is known of its effect."""
+"""Writer: check a write, send it once, record it, and find out its effect."""
 
 from __future__ import annotations
 
@@ -9,8 +9,7 @@ from typing import Any
 
 from multidrop.control.author import check_author
 from multidrop.control.call import Call
-from multidrop.control.echo_check import EchoCheck
-from multidrop.control.identity import IdentityCheck
+from multidrop.control.identity import EchoCheck, IdentityCheck
 from multidrop.control.outcome import Effect, Outcome
 from multidrop.control.records import WriteRecords
 from multidrop.control.rules import check_known, conditions, raw_count, wears
@@ -35,7 +34,7 @@ from multidrop.errors import (
 from multidrop.transport import clock
 from multidrop.transport.exchange import Exchanges, good_reply
 
-ACKNOWLEDGED = 5  # the exception code of what is accepted and takes longer
+ACKNOWLEDGED = 5  # exception code: accepted, but takes longer
 
 
 class Writer:
@@ -50,7 +49,7 @@ class Writer:
     # ---- writing ----
 
     def put(self, drive: Drive, step: Write, call: Call) -> Outcome:
-        """Write once, by all rules but those of plain writes. Raises CancelledByStop or Expired."""
+        """Write once, by all rules except those of plain writes. Raises CancelledByStop or Expired."""
         check_author()
         register, value = step.register, step.value
         raw = raw_count(drive, register, value)
@@ -68,7 +67,7 @@ class Writer:
                     if register.name == drive.setpoint_name:
                         drive.commanded = asked
                     return Outcome(drive.name, register, asked, Effect.DONE, held=asked)
-            call.check(_in_words(register, asked))  # a write that is not sent is not counted
+            call.check(_in_words(register, asked))  # before counting it
         self.records.note_called(drive, write_request(drive, register, raw), _in_words(register, asked))
         if kept is not Kept.RAM:
             self.records.count(drive, register, kept)
@@ -77,11 +76,11 @@ class Writer:
     def insist(
         self, drive: Drive, step: Write, timeout: float = 0.0, log: Callable[..., None] | None = None
     ) -> Outcome:
-        """Write what stops the motor, or does no harm at any time: only the port can hold it back.
+        """Write a stop, or a count that is harmless at any time, past all rules and the ledger's budget.
 
-        Neither a rule nor the ledger is asked; the records are kept afterwards, by `catch_up`. Only proof of
-        another family is WriteForbidden. Where answers are known to be late, it waits up to `timeout` seconds
-        for its own. `log` notes it instead of the records.
+        Raises WriteForbidden only on proof that the drive is of another family. On a line with late replies
+        it waits up to `timeout` seconds for its own reply. `log` records it; by default it is queued until
+        `catch_up`.
         """
         register = step.register
         raw = raw_count(drive, register, step.value)
@@ -94,7 +93,7 @@ class Writer:
                 self.records.count_later(drive, register)
 
     def verified(self, drive: Drive, outcome: Outcome) -> Outcome:
-        """Return the outcome once something else was read of the drive: the write's reply may be an echo."""
+        """Return the outcome after another read from the drive: the write's reply may be an echo."""
         if outcome.effect is not Effect.DONE or outcome.held is not None:
             return outcome
         why = self._echo.why_doubtful(drive)
@@ -106,7 +105,7 @@ class Writer:
         return replace(outcome, effect=Effect.UNCONFIRMED, failure=unknown)
 
     def raw(self, drive: Drive, request: Message, call: Call) -> bytes:
-        """Send any request once, past every rule but its call's; return the data of the reply."""
+        """Send any request once, past all rules except its call's; return the data of the reply."""
         check_author()
         frame = build_request(drive.framing, request)
         what = f"raw request {frame.hex(' ').upper()}"
@@ -132,7 +131,7 @@ class Writer:
         return reply.data
 
     def broadcast(self, drive: Drive, register: Register[Any], raw: float, call: Call | None = None) -> None:
-        """Write to all drives at once, by the table of one of them; without a call it is a stop."""
+        """Write to all drives at once, by the table of one drive; without a call it is a stop."""
         request = write_request(drive, register, raw, address=0)
         what = _in_words(register, register.decode(raw))
         if call:
@@ -144,9 +143,9 @@ class Writer:
             )
             if call and completion.result == Failure.EXPIRED:
                 raise call.unsent(what)
-        self.records.log_later(drive, request, what, Effect.UNCONFIRMED, "nobody answers a broadcast")
+        self.records.log_later(drive, request, what, Effect.UNCONFIRMED, "a broadcast has no reply")
 
-    # ---- sending, and what came of it ----
+    # ---- sending, and the outcome ----
 
     def _send(
         self,
@@ -157,7 +156,7 @@ class Writer:
         timeout: float,
         log: Callable[..., None],
     ) -> Outcome:
-        """Send it once for its call; without one it is a stop, which insists."""
+        """Send it once for its call; without a call it is a stop, which insists."""
         request, asked = write_request(drive, register, raw), register.decode(raw)
         what = _in_words(register, asked)
         is_setpoint = register.name == drive.setpoint_name
@@ -211,7 +210,7 @@ class Writer:
         completion: Completion,
         call: Call | None,
     ) -> Outcome:
-        """Return what the reply says, and what the drive holds after it."""
+        """Return the outcome by the reply and by the value read back."""
         lost: BusError | None = None
         held, unread = None, None
         try:
@@ -222,7 +221,7 @@ class Writer:
             lost = failure
         except (NoReply, BadReply) as failure:
             lost = failure
-        if lost is None or call is not None:  # a stop whose reply is lost is sent again at once
+        if lost is None or call is not None:  # a stop without a reply is repeated instead
             held, unread = self._held(drive, register, call)
         if held is not None and (held == asked or lost is None):
             effect = Effect.DONE if held == asked else Effect.TAKEN_AS
@@ -235,7 +234,7 @@ class Writer:
         return Outcome(drive.name, register, asked, Effect.UNCONFIRMED, held=held, failure=unknown)
 
     def _held(self, drive: Drive, register: Register[Any], call: Call | None) -> tuple[Any, Exception | None]:
-        """Return what the drive holds, None where that cannot be read, and why it was not read."""
+        """Return the value read back, or None and the failure of reading it."""
         if not register.readable:
             return None, None
         try:
@@ -254,7 +253,7 @@ class Writer:
 
     @contextmanager
     def _logged(self, drive: Drive, request: Message, what: str, log: Callable[..., None]) -> Iterator[None]:
-        """Log the write also when its outcome never comes: the port failed, or somebody pressed Ctrl-C."""
+        """Record the write even if its outcome never comes: the port failed, or Ctrl-C was pressed."""
         try:
             yield
         except BaseException as failure:
@@ -271,14 +270,14 @@ def _in_words(register: Register[Any], value: Any) -> str:
 
 
 def _is_unsent(failure: BaseException) -> bool:
-    """Return True where a write ended so before anything of it was sent."""
+    """Return True if this failure means that the write was not sent."""
     if isinstance(failure, (LineError, NotMaster)):
         return not failure.is_sent
     return isinstance(failure, (Expired, CancelledByStop, NotAttached, NoReply))
 
 
 def _is_under_way(failure: DriveException) -> bool:
-    """Return True for exception 05: it was accepted, and takes longer (application protocol V1.1b3, 7)."""
+    """Return True for exception 05: accepted, but takes longer (application protocol V1.1b3, 7)."""
     return failure.code == ACKNOWLEDGED and failure.meaning == Drive.exceptions[ACKNOWLEDGED]
 
 

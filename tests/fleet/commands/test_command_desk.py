@@ -275,7 +275,7 @@ def test_a_stop_that_goes_on_says_what_is_known_of_it(desk: Desks) -> None:
     """Its asker is told that it was sent long before the motor stands; this one stands when that was told."""
     desk.sim["output_frequency"] = 10.0
     data = json.dumps({"id": "one", "by": "anna", "drives": None}).encode()
-    sentence = "pump: the stop was confirmed, and the motor is not seen to stand yet"
+    sentence = "pump: the stop was confirmed, but the motor is not yet seen to stand"
 
     async def main() -> CommandAnswer:
         while True:

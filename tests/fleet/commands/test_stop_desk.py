@@ -13,8 +13,7 @@ import pytest
 from command_desks import LINE, Desks, desks
 from lines import PATIENCE
 
-from multidrop.control.commands import Results, begin_stops, stop_drive, stop_line
-from multidrop.control.repeated_stops import RepeatedStops
+from multidrop.control.commands import RepeatedStops, Results, begin_stops, stop_drive, stop_line
 from multidrop.fleet.commands import stop_desk
 from multidrop.fleet.commands.words import CommandAnswer, CommandOutcome
 

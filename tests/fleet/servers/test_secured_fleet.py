@@ -281,7 +281,7 @@ def assert_told_while_it_goes_on(fleet: SecuredFleet) -> None:
     while "the stop was sent" not in told:  # the machine may be too busy to send it in half a second
         assert told.startswith("under way: "), told
         told = asker.stderr.readline()
-    assert told.startswith("under way: drive-line-1: the stop was sent, and is not confirmed yet")
+    assert told.startswith("under way: drive-line-1: the stop was sent, but is not yet confirmed")
     assert asker.poll() is None
     fleet.hall.refusing.clear()
     out, err = asker.communicate(timeout=PATIENCE_S)

@@ -12,7 +12,7 @@ from conftest import SIZES, Opener
 from fake_gateway import FakeGateway
 from watching import AT_ITS_PLACE, LIVE, VIEWS, press_enter, until, until_met
 
-from multidrop.control.stop_attempt import LEAST_S
+from multidrop.control.stops import LEAST_S
 
 pytestmark = pytest.mark.long  # Chromium is started for each file
 

@@ -50,7 +50,7 @@ def telling_what_was_sent(drive: Drive, command: str) -> Iterator[list[str]]:
     The notes are those of the list, which begins with the one that nothing was sent, and the failure under
     which the port was being closed.
     """
-    known = [f"{drive.name}: nothing of the {command} was sent"]
+    known = [f"{drive.name}: the {command} was not sent"]
     try:
         yield known
     except KeyboardInterrupt as interruption:

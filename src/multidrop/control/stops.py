@@ -1,0 +1,510 @@
+"""Stopper: stop one drive or all of a bus, and repeat each stop until the motor is seen to stand.
+
+Several stops take turns step by step, so that none waits for another motor's ramp.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from decimal import Decimal
+from functools import partial
+from math import inf
+from numbers import Real
+from typing import Any
+
+from multidrop.control.latches import Latches
+from multidrop.control.outcome import Outcome, Seen, Stopped
+from multidrop.control.writer import Writer
+from multidrop.core import Message
+from multidrop.drive.family import Drive
+from multidrop.drive.script import Pulse, Read, Script, Step, Wait, Write
+from multidrop.errors import (
+    BadReply,
+    BusError,
+    CheckAgain,
+    DriveException,
+    LineError,
+    NoReply,
+    NotMaster,
+    NotVerified,
+    PortLost,
+    Unconfirmed,
+    Unsupported,
+    WriteForbidden,
+)
+from multidrop.transport import clock
+from multidrop.transport.aside_log import log_aside
+from multidrop.transport.exchange import WRITE_TIMEOUT, Exchanges
+
+LEAST_S = 30.0  # for which a stop is repeated by default
+PAUSE_S = 0.2  # before it is repeated
+AT_ONCE = 8  # steps without a good reply until the line is shared with polling
+SHARE = 1.5  # time left to polling after such a step, in units of the step's own time
+MOST_STEPS = 8  # of a stop that is sent once more after an interruption
+UNSENT = (WriteForbidden, LineError, NotMaster, ValueError)
+WORTH_REPEATING = (Unconfirmed, NotVerified, NoReply, BadReply, DriveException, PortLost, NotMaster)
+UNANSWERED = (Unconfirmed, NoReply, BadReply)
+NO_ROOM = (MemoryError, OSError)  # the system may have memory or descriptors again soon
+REGAIN_NS = 500_000_000  # between attempts of stops to reopen a lost port
+
+_log = logging.getLogger("multidrop.control")
+
+
+Do = Callable[["StopAttempt", Step], Any]
+
+
+class StopAttempt:
+    """One drive's stop, repeated until it is confirmed and the motor is seen to stop.
+
+    It is repeated for `seconds`. By default that is LEAST_S, and an attempt that started by then may take as
+    long as the ramp. After AT_ONCE steps without a good reply it leaves more than half of the line's time to
+    others. `ready` returns the time before which the drive must not be sent to.
+    """
+
+    def __init__(
+        self,
+        drive: Drive,
+        script: Callable[[], Script[Any]],
+        begun: float,
+        seconds: float | None,
+        ready: Callable[[], float] = lambda: 0.0,
+    ) -> None:
+        self.drive = drive
+        self.ready = ready
+        self.due = begun
+        self.failure: Exception | None = None
+        self.is_sent = False  # a stop was sent to it
+        self._begun = begun
+        self._seconds = seconds
+        self._make = script
+        self.times_sent = 0  # including those that the drive refused
+        self._unanswered = 0  # steps without a good reply
+        self.is_over = False
+        self.ended = begun  # time of its end
+        self.interruption: BaseException | None = None  # raised by the script to end the program
+        self.frame: Message | None = None  # the latest that was sent
+        self._times_in_doubt = 0  # frames that an interruption or the system may have prevented
+        self._is_confirmed = False
+        self._pulses: set[tuple[str, Any]] = set()
+        self._has_warned = False
+        self._begin()
+
+    def _begin(self) -> None:
+        returned: list[bool] = []
+        script = self._script = _noting_return(self._make, returned)
+        self._has_returned = returned
+        self._resume: Callable[[], Step] = lambda: next(script)
+
+    def note_frame(self, drive: Drive, request: Message, *outcome: object) -> None:
+        """Note its newest frame, for the audit record."""
+        self.frame = request
+
+    def note_broadcast(self) -> None:
+        """Note that the stop was broadcast: sent, but not confirmed."""
+        self.is_sent = True
+        self.times_sent += 1
+
+    def advance(self, do: Do, now: Callable[[], float]) -> bool:
+        """Carry out one step; return True if the stop is over."""
+        limit = self._seconds
+        if limit is not None and self.is_sent and now() >= self._begun + limit:
+            reason = f"it was not seen to stop within its {limit:g} s"
+            self.failure = self.failure or Unconfirmed(self.drive.name, "the stop", reason)
+            return True
+        try:
+            step = self._next_step()
+            if isinstance(step, Wait):
+                self._wait(step.seconds, now())
+            else:
+                begun = now()
+                is_answered = self._carry_out(step, do)
+                self.due = max(self.due, now())  # behind all others that are due
+                if not is_answered:
+                    self._share_line(begun, now())
+        except StopIteration:
+            self.failure = None
+            return True
+        except Exception as failure:  # a user's own script may raise anything
+            self.failure = failure
+            return not self._goes_on(failure, now())
+        return False
+
+    def _next_step(self) -> Step:
+        """Resume the script. SystemExit and the like are kept until all stops are over."""
+        try:
+            return self._resume()
+        except StopIteration:
+            if self._has_returned:
+                raise
+            reason = "its script was interrupted"
+        except Exception:
+            raise
+        except BaseException as interruption:
+            self.interruption = interruption
+            reason = f"its script raised {type(interruption).__name__}"
+        raise Unconfirmed(self.drive.name, "the stop", reason)
+
+    def _wait(self, seconds: float, now: float) -> None:
+        self.due = now + seconds
+        if self._seconds is not None:
+            self.due = min(self.due, max(now, self._begun + self._seconds))
+        script = self._script
+        self._resume = lambda: script.send(None)
+
+    def _share_line(self, begun: float, now: float) -> None:
+        """Delay the next step after one without a good reply, unless the stop's time would end."""
+        self._unanswered += 1
+        limit = LEAST_S if self._seconds is None else self._seconds
+        due = now + SHARE * (now - begun)
+        if self._unanswered > AT_ONCE and due < self._begun + limit:
+            self.due = due
+
+    def _carry_out(self, step: Step, do: Do) -> bool:
+        """Carry out a step, and resume the script with its result; return False without a good reply."""
+        script = self._script
+        if isinstance(step, Pulse) and (step.register.name, step.value) in self._pulses:
+            reason = "it is a pulse that was already sent once"
+            self._raise_in_script(Unconfirmed(self.drive.name, step.register.name, reason))
+            return True
+        try:
+            result = do(self, step)
+        except CheckAgain:
+            self._resume = lambda: step
+        except (BusError, ValueError) as failure:
+            self._note(step, failure)
+            self._raise_in_script(failure)
+            return not isinstance(failure, UNANSWERED)
+        except BaseException:
+            self._times_in_doubt += isinstance(step, Write)
+            raise
+        else:
+            self._note(step, None)
+            self._resume = lambda: script.send(result)
+        return True
+
+    def _note(self, step: Step, failure: Exception | None) -> None:
+        if not isinstance(step, Write):
+            return
+        if not isinstance(failure, UNSENT):
+            self.times_sent += 1
+            if isinstance(step, Pulse):
+                self._pulses.add((step.register.name, step.value))
+        self.is_sent |= not isinstance(failure, (*UNSENT, DriveException))
+        self._is_confirmed |= failure is None
+
+    def _goes_on(self, failure: Exception, now: float) -> bool:
+        limit = LEAST_S if self._seconds is None else self._seconds
+        if isinstance(failure, NotMaster) and not failure.heard:
+            self._log_unsent(failure)
+            return False
+        if not _is_worth_repeating(failure) or now >= self._begun + limit:
+            return False
+        if not self._has_warned:
+            self._has_warned = True
+            log_aside(_log, logging.WARNING, "the stop is repeated for %g s at least: %s", limit, failure)
+        self._begin()
+        self.due = now + PAUSE_S
+        return True
+
+    def _log_unsent(self, failure: NotMaster) -> None:
+        """Log it at once as critical, because no other process stops this motor."""
+        if not self.is_sent:
+            log_aside(_log, logging.CRITICAL, "%s", failure.of_a_stop())
+
+    def once_more(self, do: Do) -> None:
+        """Send the stop again without waits, because its caller was interrupted.
+
+        Reads before the write are carried out; reads after it fail as if unanswered.
+        """
+        self._begin()
+        is_written = False
+        with suppress(Exception):  # its end, too
+            for _ in range(MOST_STEPS):
+                step = self._next_step()
+                if isinstance(step, Wait):
+                    return
+                if isinstance(step, Read) and is_written:
+                    self._raise_in_script(NoReply(self.drive.name))
+                else:
+                    is_written |= isinstance(step, Write)
+                    self._carry_out(step, do)
+
+    def _raise_in_script(self, failure: Exception) -> None:
+        script = self._script
+        self._resume = lambda: script.throw(failure)
+
+    @property
+    def known(self) -> Exception | None:
+        """The failure of the whole stop; None if the motor was seen to stop."""
+        failure = self.failure
+        if failure is None or isinstance(failure, (Unsupported, WriteForbidden)):
+            return failure
+        if self._is_confirmed and not isinstance(failure, Unconfirmed):
+            reason = f"it was confirmed, but its effect could not be seen: {failure}"
+        elif self.is_sent and not self._is_confirmed:
+            reason = f"sent {self._times()} times, it was never confirmed: {failure}"
+        else:
+            return failure
+        unknown = Unconfirmed(self.drive.name, "the stop", reason)
+        unknown.__cause__ = failure
+        return unknown
+
+    def result(self) -> Stopped:
+        """Return its result at its end."""
+        known, seconds = self.known, self.ended - self._begun
+        if known is None:
+            return Stopped(self.drive.name, Seen.STOPPED, seconds)
+        if isinstance(known, Unsupported) or not (self.is_sent or self.times_sent):
+            seen = Seen.FAILED
+        else:
+            seen = Seen.SENT if self.is_sent else Seen.REFUSED
+        why = str(known) if isinstance(known, (BusError, ValueError)) else f"{type(known).__name__}: {known}"
+        return Stopped(self.drive.name, seen, seconds, why)
+
+    def so_far(self) -> str:
+        """Return its progress so far; the text stays the same until something changes."""
+        why = f": {self.failure}" if self.failure else ""
+        if self._is_confirmed:
+            return f"{self.drive.name}: the stop was confirmed, but the motor is not yet seen to stand{why}"
+        if self.is_sent or self.times_sent:
+            return f"{self.drive.name}: the stop was sent, but is not yet confirmed{why}"
+        return f"{self.drive.name}: no stop was sent yet{why}"
+
+    def _times(self) -> str:
+        least, most = self.times_sent, self.times_sent + self._times_in_doubt
+        return f"{least}" if least == most else f"{least} to {most}"
+
+    def is_in_doubt(self) -> bool:
+        """Return True if it is unknown whether some of its frames were sent."""
+        return self._times_in_doubt > 0
+
+    def break_off(self) -> str:
+        """Note that its caller no longer waits, and return its progress."""
+        self.is_sent |= self._times_in_doubt > 0
+        if self.failure is None:
+            self.failure = Unconfirmed(self.drive.name, "the stop", "its caller was interrupted")
+        is_sent = self.times_sent or self._times_in_doubt
+        sent = f"the stop was sent {self._times()} times" if is_sent else "no stop was sent"
+        return f"{self.drive.name}: {sent}; the motor is not seen to stand"
+
+
+def _noting_return(make: Callable[[], Script[Any]], returned: list[bool]) -> Script[None]:
+    """Carry out a script, and note that it returned: a signal or MemoryError may also end it."""
+    yield from make()
+    returned.append(True)
+
+
+def _is_worth_repeating(failure: Exception) -> bool:
+    is_of_the_system = isinstance(failure, NO_ROOM) and not isinstance(failure, BusError)
+    return is_of_the_system or isinstance(failure, WORTH_REPEATING)
+
+
+class StopRun:
+    """Stops that were called together, and their state until each is over.
+
+    The caller repeats `carry_out` after MemoryError or OSError, and calls `interrupted` after other failures.
+    """
+
+    def __init__(
+        self,
+        stopper: Stopper,
+        verb: str,
+        drives: Sequence[Drive],
+        make: Callable[[Drive], Script[Any]],
+        seconds: float | None,
+        broadcast: Callable[[], bool] = lambda: False,
+    ) -> None:
+        self._stopper = stopper
+        self._verb = verb
+        self._drives = drives
+        self._make = make
+        self._seconds = seconds
+        self._broadcast: Callable[[], bool] | None = broadcast  # None after its call
+        self._tries = 0
+        self.attempts: list[StopAttempt] = []
+
+    def carry_out(self) -> None:
+        """Carry out the unfinished stops, until each motor is seen to stop or its time is over."""
+        self._tries += 1
+        if self._tries > 1:
+            clock.sleep(PAUSE_S)
+        self._begin()
+        if (broadcast := self._broadcast) is not None:
+            self._broadcast = None
+            if broadcast():
+                for attempt in self.attempts:
+                    attempt.note_broadcast()
+        stop_together(self.attempts, self._stopper.do, self._end)
+        self._release()
+
+    def _begin(self) -> None:
+        """Once: cancel other calls, record this one, and create the attempts."""
+        stopper = self._stopper
+        stopper.latches.begin(self, self._drives)
+        if not self.attempts and self._drives:
+            begun, limit = _now(), _limit(self._seconds)
+            self.attempts = [
+                StopAttempt(drive, partial(self._make, drive), begun, limit, partial(stopper.ready, drive))
+                for drive in self._drives
+            ]
+            stopper.records.note_stops_called(self._verb, self._drives)
+        stopper.under_way[self] = self.attempts
+
+    def _end(self, attempt: StopAttempt) -> None:
+        attempt.ended = _now()
+        records, drive = self._stopper.records, attempt.drive
+        records.note_stop_ended(self._verb, drive, attempt.result(), attempt.times_sent, attempt.frame)
+
+    def _release(self) -> None:
+        self._stopper.under_way.pop(self, None)
+        self._stopper.latches.over(self)
+
+    def interrupted(self, interruption: BaseException) -> None:
+        """Send each unfinished stop once more, and add its progress to the interruption.
+
+        A second interruption ends this.
+        """
+        latest = interruption
+        try:
+            self._begin()
+            for attempt in sorted(self._left(), key=StopAttempt.is_in_doubt):  # the interrupted one last
+                attempt.once_more(self._stopper.do)
+        except BaseException as another:
+            latest = another
+            raise
+        finally:
+            for attempt in self._left():
+                latest.add_note(attempt.break_off())
+                self._end(attempt)
+            self._release()
+
+    def _left(self) -> list[StopAttempt]:
+        return [attempt for attempt in self.attempts if not attempt.is_over]
+
+    def found(self) -> dict[str, Stopped]:
+        """Return the results by drive. Raises SystemExit or the like if a script raised it."""
+        found = {attempt.drive.name: attempt.result() for attempt in self.attempts}
+        for interruption in (attempt.interruption for attempt in self.attempts):
+            if interruption is not None:
+                for stopped in found.values():
+                    interruption.add_note(str(stopped))
+                raise interruption
+        return found
+
+    def result(self) -> None:
+        """Raise the failure if the motor was not seen to stop."""
+        self.found()
+        for attempt in self.attempts:
+            if attempt.known is not None:
+                raise attempt.known
+
+
+class Stopper:
+    """Stops the drives of one bus.
+
+    With `is_tended` a poller reopens a lost port, and stops wait for that; else stops reopen it.
+    """
+
+    def __init__(self, exchanges: Exchanges, writer: Writer, latches: Latches) -> None:
+        self.is_tended = False
+        self.latches = latches
+        self.records = writer.records
+        self.under_way: dict[StopRun, list[StopAttempt]] = {}
+        self._regain_ns = 0  # time of the next attempt
+        self._exchanges = exchanges
+        self._writer = writer
+
+    def so_far(self) -> dict[str, str]:
+        """Return the progress of each drive's stop under way; of several, the one that was sent most."""
+        attempts = [
+            each for stops in self.under_way.copy().values() for each in stops.copy() if not each.is_over
+        ]
+        return {each.drive.name: each.so_far() for each in sorted(attempts, key=lambda each: each.times_sent)}
+
+    def stop(
+        self, drive: Drive, verb: str, make: Callable[[], Script[Any]], seconds: float | None
+    ) -> StopRun:
+        """Return a stop of this drive that is repeated for `seconds`."""
+        return StopRun(self, verb, [drive], lambda drive: make(), seconds)
+
+    def stop_all(
+        self, drives: Sequence[Drive], broadcast: Callable[[], bool], seconds: float | None
+    ) -> StopRun:
+        """Return parallel stops of all these drives.
+
+        `broadcast` is called first, and returns True if it has sent a stop to all of them.
+        """
+        return StopRun(self, "stop", drives, lambda drive: drive.stop.script(), seconds, broadcast)
+
+    def do(self, stop: StopAttempt, step: Step) -> Any:
+        """Carry out a step. A stop's first write must not delay those of others; a later one may."""
+        self._regain()
+        if isinstance(step, Read):  # once: without a reply the stop is sent again
+            return self._exchanges.value(stop.drive, step.register, 1)
+        assert isinstance(step, Write)
+        timeout = WRITE_TIMEOUT if stop.is_sent else 0.0
+        return self._writer.insist(stop.drive, step, timeout, stop.note_frame).value
+
+    def insist(self, drive: Drive, step: Write) -> Outcome:
+        """Write a count that stops the motor; reopen a lost port first."""
+        self._regain()
+        try:
+            return self._writer.insist(drive, step)
+        except CheckAgain:  # no other stop waits
+            return self._writer.insist(drive, step)
+
+    def ready(self, drive: Drive) -> float:
+        """Return the time before which the drive must not be sent to."""
+        peer = self._exchanges.peers.get(drive)
+        return peer.ready_ns / 1e9 if peer else 0.0
+
+    def _regain(self) -> None:
+        line, now = self._exchanges.line, clock.now_ns()
+        if not self.is_tended and line.is_lost and now >= self._regain_ns and line.may_send:
+            self._regain_ns = now + REGAIN_NS
+            line.regain()
+
+
+def _due(stop: StopAttempt) -> float:
+    """Return when its next step is due, including the rest that its drive needs."""
+    return max(stop.due, stop.ready())
+
+
+def _now() -> float:
+    return clock.now_ns() / 1e9
+
+
+def _limit(seconds: float | None) -> float | None:
+    """Return the time as a float: other number types may not add to a time.
+
+    An invalid time does not prevent the stop: it is logged, and the stop is repeated as without one.
+    """
+    if seconds is None:
+        return None
+    if isinstance(seconds, (Real, Decimal)) and not isinstance(seconds, bool):
+        with suppress(ValueError):  # of Decimal("sNaN")
+            try:
+                limit = float(seconds)
+            except OverflowError:
+                limit = inf if seconds > 0 else -inf
+            if limit >= 0:
+                return limit
+    sentence = "seconds = %.100r is not a time for a stop: it is repeated for %g s at least, as without one"
+    log_aside(_log, logging.WARNING, sentence, seconds, LEAST_S)
+    return None
+
+
+def stop_together(stops: Sequence[StopAttempt], do: Do, end: Callable[[StopAttempt], object]) -> None:
+    """Carry out the stops, a step of each in turn; call `end` at the end of each, at least once."""
+    waiting = [stop for stop in stops if not stop.is_over]
+    while waiting:
+        stop = min(waiting, key=_due)  # the one that has been due for longest
+        clock.sleep(max(0.0, stop.due - _now()))
+        waiting.remove(stop)
+        if stop.advance(do, _now):
+            end(stop)
+            stop.is_over = True
+        else:
+            waiting.append(stop)
