@@ -67,6 +67,7 @@ class SimulatedBus:
         self.seconds += seconds
 
     is_lost = is_tcp = False
+    why_closing = ""
     may_send = True  # it has no mastership
 
     def open(self) -> SimulatedBus:
