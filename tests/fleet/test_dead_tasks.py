@@ -33,8 +33,8 @@ from multidrop.fleet import gateway as fleet_gateway  # noqa: E402
 from multidrop.fleet import metrics_port  # noqa: E402
 from multidrop.fleet.commands.fleet_commands import FleetCommands  # noqa: E402
 from multidrop.fleet.commands.log import CommandLog  # noqa: E402
+from multidrop.fleet.commands.messages import CommandOutcome  # noqa: E402
 from multidrop.fleet.commands.subjects import CommandedLines, CommandSubjects  # noqa: E402
-from multidrop.fleet.commands.words import CommandOutcome  # noqa: E402
 from multidrop.fleet.gateway import FleetGateway  # noqa: E402
 from multidrop.fleet.lines import fleet_lines  # noqa: E402
 from multidrop.fleet.lines.fleet_lines import FleetLines  # noqa: E402
@@ -54,7 +54,7 @@ STARTERS = {
 }
 WAITED_FOR = {  # modules that start tasks and threads, and themselves wait for them
     *("direct_gets", "fleet_commands", "forwarder", "gateway", "hub", "leaders", "line_keeper", "member"),
-    *("observer", "owner_records", "page_part", "servers", "shares", "stop_asking"),
+    *("observer", "owner_records", "page_part", "servers", "shares"),
     *("command_log", "fleet_lines"),  # whose callers wait for their threads
     "spool",  # whose thread the gateway watches
 }
@@ -178,7 +178,7 @@ def test_subjects_that_cannot_be_heard_end_the_gateway(gateway: Any, monkeypatch
 
     async def kill(made: FleetGateway) -> None:
         monkeypatch.setattr(made.paths[1], "subscribe", fail)
-        made.commands._change(made.commands._hear("stop.hall", made.commands.desk.do))
+        made.commands._change(made.commands._subscribe("stop.hall", made.commands.desk.do))
 
     with pytest.raises(Ended, match="commands has ended: Ill: a mistake"):
         gateway(kill)

@@ -23,7 +23,7 @@ from multidrop.control import Seen, audit_log, read_audit
 require_module("nats")
 
 from multidrop.fleet.commands.desk import MOST_WRITES  # noqa: E402
-from multidrop.fleet.commands.words import (  # noqa: E402
+from multidrop.fleet.commands.messages import (  # noqa: E402
     CommandAnswer,
     CommandOutcome,
     Offered,
@@ -520,5 +520,5 @@ def test_a_stop_finds_its_drive_by_another_spelling_and_a_command_does_not(tmp_p
 
 @table("data", [b"", b"[]", b'{"outcome": "maybe", "text": ""}', b'{"outcome": "done"}'])
 def test_an_asker_believes_no_answer_that_is_none(data: bytes) -> None:
-    with pytest.raises(ValueError, match=r"is not|is no text"):
+    with pytest.raises(ValueError, match=r"is not|must be"):
         read_answer(data) if data.startswith((b"{", b"[")) else read_offer(data)

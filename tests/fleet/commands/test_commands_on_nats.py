@@ -19,8 +19,8 @@ require_module("nats")
 require_module("pyarrow")
 
 from multidrop.fleet.commands.fleet_commands import FleetCommands  # noqa: E402
+from multidrop.fleet.commands.messages import CommandOutcome, Offered  # noqa: E402
 from multidrop.fleet.commands.subjects import CommandSubjects  # noqa: E402
-from multidrop.fleet.commands.words import CommandOutcome, Offered  # noqa: E402
 from multidrop.fleet.errors import NobodyThere, Unsure  # noqa: E402
 from multidrop.fleet.servers import names  # noqa: E402
 from multidrop.fleet.servers.buckets import Bucket  # noqa: E402

@@ -17,9 +17,8 @@ require_module("nats")
 
 from multidrop.control import read_audit  # noqa: E402
 from multidrop.fleet.commands import fleet_commands as asker_module  # noqa: E402
-from multidrop.fleet.commands import stop_asking  # noqa: E402
 from multidrop.fleet.commands.fleet_commands import FleetCommands  # noqa: E402
-from multidrop.fleet.commands.words import CommandAnswer, CommandOutcome  # noqa: E402
+from multidrop.fleet.commands.messages import CommandAnswer, CommandOutcome  # noqa: E402
 from multidrop.fleet.errors import FleetError, MayNotSend, NobodyThere, NotDelivered, Unsure  # noqa: E402
 from multidrop.fleet.servers.buckets import Record  # noqa: E402
 
@@ -99,9 +98,8 @@ def asked(
             await asker.close()
 
     with ExitStack() as stack:
-        for module, name, seconds in ((asker_module, "LOST_S", 0.01), (stop_asking, "NOBODY_S", nobody_s)):
-            stack.enter_context(patch.object(module, name, seconds))
-            stack.enter_context(patch.object(module, "AGAIN_S", 0.0))
+        for name, seconds in (("LOST_S", 0.01), ("NO_MASTER_S", nobody_s), ("AGAIN_S", 0.0)):
+            stack.enter_context(patch.object(asker_module, name, seconds))
         return asyncio.run(main())
 
 
@@ -188,11 +186,11 @@ STOPS: dict[str, tuple[ScriptedPath, CommandOutcome, str]] = {
     "silence": (
         ScriptedPath(stop=[LOST]),
         UNKNOWN,
-        "it is not known what became of the stop of pump-1: its gateway gives no answer any more; "
+        "the result of the stop of pump-1 is unknown: its gateway no longer answers; "
         "use the hard-wired stop (no answer)",
     ),
-    "any failure": (ScriptedPath(stop=[ANY]), UNKNOWN, "it is not known what became of the stop"),
-    "silence, then nobody": (ScriptedPath(stop=[LOST, NOBODY]), UNKNOWN, "it is not known what became of"),
+    "any failure": (ScriptedPath(stop=[ANY]), UNKNOWN, "the result of the stop"),
+    "silence, then nobody": (ScriptedPath(stop=[LOST, NOBODY]), UNKNOWN, "the result of"),
 }
 
 
@@ -236,7 +234,7 @@ def test_who_hears_no_more_of_a_stop_is_told_what_was_heard_last(tmp_path: Path)
     )
     last = asked(tmp_path, path, stop)
     assert last.outcome is UNKNOWN
-    assert last.text.endswith("; the last that was heard: pump-1: the stop was sent")
+    assert last.text.endswith("; its last answer: pump-1: the stop was sent")
 
 
 def test_who_hears_nothing_of_a_stop_is_told_so_before_it_is_given_up(tmp_path: Path) -> None:

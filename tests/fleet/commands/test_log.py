@@ -17,7 +17,7 @@ from peers import require_module
 require_module("nats")
 
 from multidrop.fleet.commands.log import CommandLog  # noqa: E402
-from multidrop.fleet.commands.words import CommandOutcome  # noqa: E402
+from multidrop.fleet.commands.messages import CommandOutcome  # noqa: E402
 
 HANGING_LOG = """
 import asyncio, sys, threading

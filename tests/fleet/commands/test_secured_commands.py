@@ -20,8 +20,8 @@ from nats.errors import TimeoutError as NatsTimeout  # noqa: E402
 from secured_clusters import GATEWAYS, SecuredCluster, secured_cluster  # noqa: E402
 
 from multidrop.fleet.commands.fleet_commands import FleetCommands  # noqa: E402
+from multidrop.fleet.commands.messages import CommandOutcome  # noqa: E402
 from multidrop.fleet.commands.subjects import CommandSubjects  # noqa: E402
-from multidrop.fleet.commands.words import CommandOutcome  # noqa: E402
 from multidrop.fleet.servers import names  # noqa: E402
 from multidrop.fleet.servers.buckets import Bucket  # noqa: E402
 from multidrop.fleet.servers.connections import connect, paths_of  # noqa: E402

@@ -15,7 +15,7 @@ from lines import PATIENCE
 
 from multidrop.control.commands import RepeatedStops, Results, begin_stops, stop_drive, stop_line
 from multidrop.fleet.commands import stop_desk
-from multidrop.fleet.commands.words import CommandAnswer, CommandOutcome
+from multidrop.fleet.commands.messages import CommandAnswer, CommandOutcome
 
 
 @pytest.mark.slow

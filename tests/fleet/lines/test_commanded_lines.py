@@ -18,8 +18,8 @@ from peers import require_module
 require_module("nats")
 
 from multidrop.fleet.commands import desk as command_desk  # noqa: E402
+from multidrop.fleet.commands.messages import CommandAnswer, CommandOutcome  # noqa: E402
 from multidrop.fleet.commands.subjects import CommandedLines, CommandSubjects  # noqa: E402
-from multidrop.fleet.commands.words import CommandAnswer, CommandOutcome  # noqa: E402
 from multidrop.fleet.servers import names  # noqa: E402
 from multidrop.supervisor import supervisor  # noqa: E402
 
@@ -84,7 +84,7 @@ def test_a_line_that_is_let_go_answers_for_its_stops_until_it_is_closed(tmp_path
         await settled(subjects)
         assert path.heard.keys() == {names.stop_subject(LINE)}
         assert made.ask(register="frequency", value=20.0) is None
-        assert "was let go" in (await made.do(offered)).text
+        assert "was released" in (await made.do(offered)).text
         while (told := await path.ask(names.stop_subject(LINE), drives=None))["outcome"] == "under way":
             pass
         assert told["outcome"] == "done"

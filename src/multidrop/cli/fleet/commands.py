@@ -24,7 +24,7 @@ from multidrop.printable import plain_number, printable
 
 if TYPE_CHECKING:
     from multidrop.fleet.commands.fleet_commands import FleetCommands
-    from multidrop.fleet.commands.words import CommandAnswer
+    from multidrop.fleet.commands.messages import CommandAnswer
 
 _DIRECTIONS = ("forward", "reverse")
 _DIRECTED = ("start", "jog")
@@ -62,7 +62,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _asker(arguments: argparse.Namespace) -> FleetCommands:
     from multidrop.fleet.commands.fleet_commands import FleetCommands
-    from multidrop.fleet.commands.words import MOST_CHARACTERS
+    from multidrop.fleet.commands.messages import MOST_CHARACTERS
 
     by = arguments.by or f"{_user()}@{socket.gethostname()}"
     if arguments.command in STOPS:
@@ -76,7 +76,7 @@ def _asker(arguments: argparse.Namespace) -> FleetCommands:
 @asynccontextmanager
 async def _asking(arguments: argparse.Namespace) -> AsyncIterator[FleetCommands]:
     """Give who asks. Where there is none a stop's failure says that nothing was sent."""
-    from multidrop.fleet.commands.stop_asking import HARD_WIRED
+    from multidrop.fleet.commands.fleet_commands import HARD_WIRED
     from multidrop.fleet.errors import FleetError
 
     async with AsyncExitStack() as stack:
@@ -117,7 +117,7 @@ async def _command(arguments: argparse.Namespace) -> int:
 
     The offer that was shown lasts for a second only, and a person takes longer.
     """
-    from multidrop.fleet.commands.words import CommandAnswer
+    from multidrop.fleet.commands.messages import CommandAnswer
 
     what, agreed = _what(arguments), ""
     if arguments.command not in STOPS and not arguments.yes:

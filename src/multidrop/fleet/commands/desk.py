@@ -1,7 +1,7 @@
-"""Command desk: carries out what a line's present master is asked for, each command once.
+"""CommandDesk: carry out commands on the lines of which this gateway is master, each once.
 
-A command is offered first and done when its token comes back, within a second of this machine's
-CLOCK_BOOTTIME. What is known of it is on the disk before it is sent, and after.
+A command is offered first, and carried out when its token comes back within a second of this machine's
+CLOCK_BOOTTIME. It is recorded on the disk before it is sent, and again at its end.
 """
 
 from __future__ import annotations
@@ -15,10 +15,8 @@ from typing import Any
 
 from multidrop import Unsupported
 from multidrop.control import CommandResult, begin_command, written_by
-from multidrop.fleet.commands.drive_commands import Prepared, prepare
 from multidrop.fleet.commands.log import CommandLog
-from multidrop.fleet.commands.offers import Offer, Offers
-from multidrop.fleet.commands.words import (
+from multidrop.fleet.commands.messages import (
     CommandAnswer,
     CommandOutcome,
     CommandRequest,
@@ -26,13 +24,14 @@ from multidrop.fleet.commands.words import (
     read_command,
     read_json,
 )
+from multidrop.fleet.commands.offers import Offer, Offers, Prepared, prepare
 from multidrop.fleet.leases.lease import boottime_ns
 from multidrop.fleet.lines.held_lines import HeldLine, HeldLines
 from multidrop.supervisor import supervisor
 
-HOLD_S = 0.5  # for which an answer waits for the end; after that it says "under way"
-AWAITED_S = 3.0  # by a line that is let go: a write and its reading back take less on most lines
-LOOK_S = 0.01
+HOLD_S = 0.5  # that an answer waits for the end, before it says "under way"
+AWAITED_S = 3.0  # that releasing a line waits for commands; most writes and read-backs are faster
+POLL_S = 0.01  # between checks for their end
 MOST_WRITES = 8  # under way on a line, without stops
 WAY = "fleet"  # in the audit log
 
@@ -40,7 +39,7 @@ _log = logging.getLogger("multidrop.fleet")
 
 
 class CommandDesk:
-    """Commands on the lines that this gateway holds; `subject` is where its tokens come back."""
+    """Commands on the lines that this gateway holds; tokens come back on `subject`."""
 
     def __init__(
         self,
@@ -60,9 +59,9 @@ class CommandDesk:
     # ---- an offer ----
 
     def offer(self, line: str, data: bytes) -> Offered | CommandAnswer | None:
-        """Return an offer, a refusal, or None where we are not the line's master and must keep silent.
+        """Return an offer or a refusal; None unless this gateway is the line's master.
 
-        The first answer counts, and it must be the master's.
+        The asker takes the first answer, so only the master may give one.
         """
         held = self._lines.for_command(line)
         if held is None:
@@ -77,10 +76,10 @@ class CommandDesk:
     # ---- and doing it ----
 
     async def do(self, data: bytes) -> CommandAnswer:
-        """Carry out what was offered, once; a copy of the message gets the same answer.
+        """Carry out an offered command once; a copy of the message gets the same answer.
 
-        A message with `ask` in place of `do` asks what became of it. If nobody has told us to do it by then,
-        nobody can any more: the answer is certain.
+        A message with `ask` instead of `do` asks for the result. If no `do` came before it, the offer is
+        withdrawn, so that the answer "not sent" is certain.
         """
         try:
             message = read_json(data)
@@ -92,7 +91,7 @@ class CommandDesk:
             sentence = "no offer with this token is known here, and nothing is sent for it now"
             return CommandAnswer(CommandOutcome.UNKNOWN, sentence, self.gateway)
         if "do" not in message:
-            self.offers.take_back(offer, "its asker asked what became of it before telling to do it")
+            self.offers.withdraw(offer, "its asker asked for the result before confirming it")
         elif self.offers.take(offer):
             supervisor().start("command", self._carry_out(offer))
         with suppress(TimeoutError):
@@ -101,19 +100,19 @@ class CommandDesk:
         return found._replace(gateway=self.gateway)
 
     async def await_commands(self, line: str, may_wait: Callable[[], bool]) -> None:
-        """Wait until none is under way on a line that is about to be let go: none begins there any more.
+        """Wait for the commands under way on a line that is being released.
 
-        For AWAITED_S at most, and only while `may_wait`.
+        Waits AWAITED_S at most, and only while `may_wait` returns True.
         """
         loop = asyncio.get_running_loop()
         ends = loop.time() + AWAITED_S
         while self._under_way.get(line) and loop.time() < ends and may_wait():
-            await asyncio.sleep(LOOK_S)
+            await asyncio.sleep(POLL_S)
 
     async def _carry_out(self, offer: Offer) -> None:
         line = offer.held.name
         self._under_way[line] = self._under_way.get(line, 0) + 1
-        sentence = f"{offer.prepared.text}: it is not known whether it was sent, for the gateway failed"
+        sentence = f"{offer.prepared.text}: it is not known whether it was sent, because the gateway failed"
         answer = CommandAnswer(CommandOutcome.UNKNOWN, sentence)
         try:
             answer = await self._once(offer)
@@ -153,12 +152,12 @@ class CommandDesk:
         return CommandResult(CommandOutcome.NOT_SENT, offer.unsent(why).text) if why else None
 
     def _why_not(self, offer: Offer) -> str:
-        """Return why it must not be sent now, or an empty text."""
+        """Return why it must not be sent now, or an empty string."""
         line = offer.held.name
         if offer.why_void:
             return offer.why_void
         if self._lines.for_command(line) is not offer.held:
-            return f"since the offer line {line} was let go, or its plant has changed"
+            return f"since the offer line {line} was released, or its plant has changed"
         if self._under_way[line] > MOST_WRITES:
             return f"{MOST_WRITES} others are under way on line {line}"
         return self.offers.why_late(offer)
@@ -172,7 +171,7 @@ class CommandDesk:
 
 
 def _prepared(held: HeldLine, request: CommandRequest) -> Prepared:
-    """Return what the request means. Raises ValueError for what the plant does not allow."""
+    """Return the checked request. Raises ValueError if the plant does not allow it."""
     drive = held.drive(request.drive)
     if request.verb == "stop":
         raise ValueError("a stop needs no offer: it goes to the line's own subject of stops")

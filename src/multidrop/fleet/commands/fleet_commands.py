@@ -1,4 +1,4 @@
-"""FleetCommands: asks the present master of a line for a command, and finds out what became of it."""
+"""FleetCommands: ask the present master of a line for commands and stops, and follow them to their end."""
 
 from __future__ import annotations
 
@@ -7,14 +7,13 @@ import difflib
 import json
 import logging
 import uuid
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Self
 
 from multidrop.fleet.commands.log import open_log
-from multidrop.fleet.commands.stop_asking import HARD_WIRED, News, first_answer
-from multidrop.fleet.commands.words import (
-    NOBODY,
+from multidrop.fleet.commands.messages import (
+    UNNAMED,
     CommandAnswer,
     CommandOutcome,
     CommandRequest,
@@ -26,7 +25,7 @@ from multidrop.fleet.commands.words import (
     spelt,
     worst,
 )
-from multidrop.fleet.errors import FleetError, NobodyThere, NotDelivered, Unsure
+from multidrop.fleet.errors import FleetError, MayNotSend, NobodyThere, NotDelivered, Unsure
 from multidrop.fleet.servers import names
 from multidrop.fleet.servers.buckets import Bucket, Follower
 from multidrop.fleet.servers.connections import ServerPath, paths_of
@@ -37,20 +36,24 @@ from multidrop.supervisor import Ended, reason_of
 
 LOST_S = 6.0  # without any answer, after which what became of a command stays unknown
 AGAIN_S = 0.2
+NO_MASTER_S = 6.0  # of retries without a master; a line gets one within 1 s, or 4 s after a death
+HARD_WIRED = "use the hard-wired stop"
+
+News = Callable[[CommandAnswer], object]
 
 _log = logging.getLogger("multidrop.fleet")
 
 
-def _tell_nobody(answer: CommandAnswer) -> None:
-    """Do nothing: the answer at the end is enough."""
+def _ignore(answer: CommandAnswer) -> None:
+    """Ignore news; the caller only needs the answer at the end."""
 
 
 class FleetCommands:
-    """Somebody who commands drives of a fleet.
+    """A client that commands the drives of a fleet.
 
-    `by` says who it is, for the logs of both sides; `log` is the file of this side. Each command is sent
-    once and never again; a stop is sent until a gateway answers. What cannot be noted in `log` is not sent,
-    but for stops. Raises FleetError where no server is reached.
+    `by` is its name in the logs of both sides; `log` is the file of this side. A command is sent once; a stop
+    is sent until a gateway answers. A command that cannot be recorded in `log` is not sent; a stop is. Raises
+    FleetError if no server can be reached.
     """
 
     def __init__(
@@ -91,13 +94,13 @@ class FleetCommands:
     # ---- commands ----
 
     async def preview(self, request: CommandRequest) -> Offered | CommandAnswer:
-        """Return what a command would do, or why it would not be sent; nothing is done."""
+        """Return the offer for a command, or its refusal, without carrying it out."""
         return await self._offer(await self._line_of(request.drive), request)
 
     async def write(self, drive: str, register: str, value: float | str) -> CommandAnswer:
         """Write a register once; a choice by its name or its raw count.
 
-        Raises ValueError for a drive that is not in the plant, FleetError where the plant cannot be read.
+        Raises ValueError if the drive is not in the plant, FleetError if the plant cannot be read.
         """
         return await self.carry_out(self.request(drive, register=register, value=value))
 
@@ -110,9 +113,10 @@ class FleetCommands:
         return CommandRequest(uuid.uuid4().hex, self.by, drive, **what)
 
     async def carry_out(self, request: CommandRequest, agreed: str = "") -> CommandAnswer:
-        """Have a command carried out, once, and return what is known of it; raises as `write`.
+        """Have a command carried out once, and return its answer. Raises as `write`.
 
-        `agreed` is the text of a preview that a person agreed to. Where it would differ now, nothing is sent.
+        `agreed` is the text of a preview that a person agreed to. If it has changed since, the command is not
+        sent.
         """
         line = await self._line_of(request.drive)
         record = {"id": request.id, "line": line, "what": request.words, "by": request.by}
@@ -133,7 +137,7 @@ class FleetCommands:
         return answer
 
     async def _offer(self, line: str, request: CommandRequest) -> Offered | CommandAnswer:
-        """Ask on one path after another; an offer alone does nothing, so this may be asked again."""
+        """Ask on one path after another. An offer alone has no effect, so it may be repeated."""
         why = ""
         for path in self._paths:
             try:
@@ -146,11 +150,11 @@ class FleetCommands:
             except FleetError as failure:
                 why = why or str(failure)
             except ValueError as mistake:
-                why = f"a gateway of line {line} answers no words of ours: {mistake}"
+                why = f"a gateway of line {line} gives an invalid answer: {mistake}"
         return CommandAnswer(CommandOutcome.NOT_SENT, f"{request.words} was not sent: {why}")
 
     async def _do(self, offered: Offered) -> CommandAnswer:
-        """Tell it to be done, once; ask from then on what became of it."""
+        """Confirm the offer once; from then on only ask for the result."""
         path = self._path()
         try:
             message = await path.request(offered.subject, json.dumps({"do": offered.token}).encode())
@@ -158,18 +162,16 @@ class FleetCommands:
         except NotDelivered:
             why = f"{offered.text} was not sent: {offered.gateway} is gone since its offer"
             return CommandAnswer(CommandOutcome.NOT_SENT, why)
-        except (FleetError, ValueError):  # it may have been told
+        except (FleetError, ValueError):  # it may have been delivered
             answer = CommandAnswer(CommandOutcome.UNDER_WAY, "")
         asked = json.dumps({"ask": offered.token}).encode()
-        lost = (
-            f"{offered.text}: it is not known whether it was sent: {offered.gateway} gives no answer any more"
-        )
+        lost = f"{offered.text}: it is not known whether it was sent: {offered.gateway} no longer answers"
         return await self._end_of(answer, offered.subject, asked, lost)
 
     async def _end_of(
-        self, answer: CommandAnswer, subject: str, asked: bytes, lost: str, on_news: News = _tell_nobody
+        self, answer: CommandAnswer, subject: str, asked: bytes, lost: str, on_news: News = _ignore
     ) -> CommandAnswer:
-        """Ask on all paths in turn until it is over; unknown where nobody has answered for LOST_S."""
+        """Ask on all paths in turn until it is over; UNKNOWN after LOST_S without any answer."""
         loop = asyncio.get_running_loop()
         ends, at = loop.time() + LOST_S, 0
         told = {""}
@@ -184,7 +186,7 @@ class FleetCommands:
                 ends = loop.time() + LOST_S
             except (FleetError, ValueError) as failure:
                 if loop.time() > ends:
-                    heard = f"; the last that was heard: {answer.text}" if answer.gateway else ""
+                    heard = f"; its last answer: {answer.text}" if answer.gateway else ""
                     return CommandAnswer(CommandOutcome.UNKNOWN, f"{lost} ({failure}){heard}")
                 await asyncio.sleep(AGAIN_S)
         return answer
@@ -196,20 +198,20 @@ class FleetCommands:
         drives: Sequence[str] | None = None,
         *,
         line: str = "",
-        on_news: News = _tell_nobody,
+        on_news: News = _ignore,
         by: str = "",
     ) -> CommandAnswer:
-        """Stop these drives, or all of the plant with None; the stops of many lines go side by side.
+        """Stop these drives, or all of the plant with None; the lines are stopped in parallel.
 
-        `by` names who asks, if that is somebody else than this object's `by`. With `line` the plant is not
-        looked at, and the drives are its. `on_news` is called in the loop with what is known of a stop that
-        is not over within half a second, and again when something else is. A drive that is not in the plant
-        is told as refused, and keeps no other's stop back. Raises ValueError where none of them is,
-        FleetError where the plant cannot be read; then no stop was sent.
+        `by` replaces this object's `by` in the logs. With `line` the plant is not read, and the drives are
+        those of the line. `on_news` is called in the loop with the progress of a stop that takes longer than
+        half a second, and again at each change. A drive that is not in the plant gets the answer "refused";
+        the others are stopped. Raises ValueError if none is in the plant, and FleetError if the plant cannot
+        be read; in both cases no stop was sent.
         """
         drives = [drives] if isinstance(drives, str) else drives
         wanted, unknown = await self._lines_of(drives, line)
-        asked = spelt(by or self.by) or NOBODY  # no name keeps a stop back
+        asked = spelt(by or self.by) or UNNAMED  # a stop is sent under any name
         answers = await asyncio.gather(*(self._stop(one, wanted[one], on_news, asked) for one in wanted))
         answers += unknown
         if len(answers) == 1:
@@ -244,13 +246,13 @@ class FleetCommands:
         return found, unknown
 
     async def _stop(self, line: str, drives: list[str] | None, on_news: News, by: str) -> CommandAnswer:
-        """Send a stop until a gateway answers, and go on until it is over."""
+        """Send a stop until a gateway answers, and follow it to its end."""
         request = StopRequest(uuid.uuid4().hex, by, None if drives is None else tuple(drives))
         what = f"the stop of {', '.join(drives) if drives else f'all drives of line {line}'}"
         record = {"id": request.id, "line": line, "what": what, "by": by}
         noting = asyncio.create_task(self._note_end(record, None))
-        answer = await first_answer(self._paths, line, request, what, on_news)
-        lost = f"it is not known what became of {what}: its gateway gives no answer any more; {HARD_WIRED}"
+        answer = await _first_answer(self._paths, line, request, what, on_news)
+        lost = f"the result of {what} is unknown: its gateway no longer answers; {HARD_WIRED}"
         answer = await self._end_of(answer, names.stop_subject(line), encode(request), lost, on_news)
         await noting
         await self._note_end(record, answer)
@@ -276,7 +278,7 @@ class FleetCommands:
         return self._find(drive)
 
     async def _read_plant(self, otherwise: str) -> None:
-        """Read what has changed of the plant. What was read before will do: the line's master checks."""
+        """Read changes of the plant; an older copy is good enough, because the line's master checks."""
         try:
             await self._plant.look()
         except FleetError as failure:
@@ -298,3 +300,53 @@ class FleetCommands:
             await self._log.note({**more, **record})
         except OSError as failure:
             _log.warning("not noted in %s: %s", self._log.path, failure.strerror or failure)
+
+
+# ---- stops that wait for a master ----
+
+
+async def _first_answer(
+    paths: Sequence[ServerPath], line: str, request: StopRequest, what: str, on_news: News
+) -> CommandAnswer:
+    """Send the request until a gateway answers or may have got it; else return that certainly none did.
+
+    Meanwhile `on_news` reports that no gateway is there yet.
+    """
+    loop = asyncio.get_running_loop()
+    ends, told = loop.time() + NO_MASTER_S, ""
+    while True:
+        try:
+            return await _ask_all(paths, line, request, what)
+        except NotDelivered as failure:
+            why = f"no gateway is master of line {line}" if isinstance(failure, NobodyThere) else str(failure)
+            if loop.time() > ends or isinstance(failure, MayNotSend):
+                sentence = f"{what} was NOT sent: {why}; {HARD_WIRED}"
+                return CommandAnswer(CommandOutcome.NOT_SENT, sentence)
+        if why != told:
+            told = why
+            sentence = f"{what} was NOT sent yet: {why}; {HARD_WIRED}"
+            on_news(CommandAnswer(CommandOutcome.UNDER_WAY, sentence))
+        await asyncio.sleep(AGAIN_S)
+
+
+async def _ask_all(paths: Sequence[ServerPath], line: str, request: StopRequest, what: str) -> CommandAnswer:
+    """Ask on all paths in parallel, and return the first answer.
+
+    Raises NotDelivered if all paths say that it was not delivered; NobodyThere if one of them says so.
+    """
+    subject, data = names.stop_subject(line), encode(request)
+    asking = [asyncio.create_task(path.request(subject, data)) for path in paths]
+    failures: list[NotDelivered] = []
+    try:
+        for asked in asyncio.as_completed(asking):
+            try:
+                return read_answer((await asked).data)
+            except NotDelivered as failure:
+                failures.append(failure)
+            except (FleetError, ValueError):
+                pass
+    finally:
+        await end_tasks(*asking)
+    if len(failures) == len(paths):
+        raise min(failures, key=lambda failure: not isinstance(failure, NobodyThere))
+    return CommandAnswer(CommandOutcome.UNDER_WAY, f"{what}: no gateway has answered yet; {HARD_WIRED}")

@@ -71,7 +71,7 @@ class UnopenedLog:
         raise self._failure
 
     def close(self) -> None:
-        """Do nothing: there is no file."""
+        """Do nothing, as no file is open."""
 
 
 def open_log(path: Path) -> CommandLog | UnopenedLog:

@@ -1,6 +1,6 @@
-"""Offers: what a line's master may be told to do, each once, within a second. In memory alone. Pure.
+"""Offers: commands that a line's master has offered, each to be carried out once within a second.
 
-A restarted gateway knows none of its predecessor's, so nothing that was offered before is ever carried out.
+They are in memory only: a restarted gateway forgets them, and never carries out an offer of its predecessor.
 """
 
 from __future__ import annotations
@@ -9,21 +9,78 @@ import asyncio
 import secrets
 from collections.abc import Callable, Collection
 from dataclasses import dataclass, field
+from functools import partial
+from typing import NamedTuple
 
-from multidrop.fleet.commands.drive_commands import Prepared
-from multidrop.fleet.commands.words import CommandAnswer, CommandOutcome, CommandRequest
+from multidrop import Drive, WriteForbidden
+from multidrop.control import CommandResult, carry_out_verb, stop_drive_by, typed_value, write_register
+from multidrop.drive import verb_arguments, verbs_of
+from multidrop.fleet.commands.messages import CommandAnswer, CommandOutcome, CommandRequest
 from multidrop.fleet.leases.rules import SECOND
 from multidrop.fleet.lines.held_lines import HeldLine
 
-LIMIT_NS = 1 * SECOND  # from the offer until what it says may be sent
-REMEMBERED = 10_000  # offers, of which the oldest are forgotten
+LIMIT_NS = 1 * SECOND  # from the offer until its first frame
+REMEMBERED = 10_000  # newest offers
+_MOVING = ("start", "jog", "reset_fault", "set_frequency")
+
+
+# ---- checking a request ----
+
+
+class Prepared(NamedTuple):
+    """A checked command: `text` describes it, `work` carries it out."""
+
+    text: str
+    work: Callable[[], CommandResult]
+
+
+def commands_of(drive: Drive) -> list[str]:
+    """Return the verbs that a command may ask for; a stop needs no offer."""
+    return [verb for verb in verbs_of(drive) if verb != "stop"]
+
+
+def prepare(drive: Drive, request: CommandRequest) -> Prepared:
+    """Return the checked request; sends no frame.
+
+    Raises ValueError (WriteForbidden is one), TypeError or Unsupported if it must not be sent.
+    """
+    return _prepare_write(drive, request) if request.register else _prepare_verb(drive, request)
+
+
+def _prepare_verb(drive: Drive, request: CommandRequest) -> Prepared:
+    verb = request.verb
+    if verb not in commands_of(drive):
+        known = ", ".join(commands_of(drive)) or "none"
+        raise ValueError(f"{drive.name} has no verb {verb!r}; it has {known}")
+    arguments = verb_arguments(verb, request.options)
+    if verb in _MOVING:
+        drive.check_confirmed(verb)
+    next(getattr(drive, verb).script(**arguments), None)  # raises if the family forbids it
+    options = "".join(f", {name} = {getattr(value, 'value', value)}" for name, value in arguments.items())
+    text = f"{drive.name}: {verb}{options}"
+    if verb not in _MOVING:
+        return Prepared(text, lambda: stop_drive_by(verb, drive, None)[drive.name])
+    return Prepared(text, partial(carry_out_verb, drive, verb, arguments))
+
+
+def _prepare_write(drive: Drive, request: CommandRequest) -> Prepared:
+    register = drive.register(request.register)
+    if not register.writable:
+        why = register.never or "it can only be read"
+        raise WriteForbidden(f"{request.entry} is never written: {why}", register=register.name)
+    value = register.decode(register.encode(typed_value(register, request.value)))
+    text = f"{drive.name}: {register.name} = {register.format(value)}"
+    return Prepared(text, partial(write_register, drive, register.name, request.value))
+
+
+# ---- offering it ----
 
 
 @dataclass(eq=False)
 class Offer:
-    """One command that was offered for a line that was held then.
+    """One command that was offered for a held line.
 
-    `is_taken` once it was told to be done; `answer` once it is over, and then `over` is set.
+    `is_taken` is set when its token comes back; `answer` and `over` are set at its end.
     """
 
     token: str
@@ -37,7 +94,7 @@ class Offer:
     over: asyncio.Event = field(default_factory=asyncio.Event)
 
     def unsent(self, why: str) -> CommandAnswer:
-        """Return the answer that it was not sent, for certain."""
+        """Return the answer that it was certainly not sent."""
         return CommandAnswer(CommandOutcome.NOT_SENT, f"{self.prepared.text} was not sent: {why}")
 
 
@@ -53,7 +110,7 @@ class Offers:
         return len(self._by_token)
 
     def make(self, request: CommandRequest, prepared: Prepared, held: HeldLine) -> Offer:
-        """Return a new offer, or for a copy of a request the one that was made for it."""
+        """Return a new offer; for a copy of a request, the earlier one."""
         known = self._by_request.get((held.name, request.id))
         if known is not None and known.request == request:
             return known
@@ -68,17 +125,17 @@ class Offers:
         return self._by_token.get(token)
 
     def take(self, offer: Offer) -> bool:
-        """Return True for the first who takes it, and who alone carries it out."""
+        """Return True for the first call; only that one carries it out."""
         is_first = not offer.is_taken
         offer.is_taken = True
         return is_first
 
     def left_ns(self, offer: Offer) -> int:
-        """Return for how long it may still be sent; 0 or less: not any more."""
+        """Return for how many ns it may still be sent; 0 or less if it is too late."""
         return offer.made_ns + LIMIT_NS - self._clock()
 
     def why_late(self, offer: Offer) -> str:
-        """Return why it is too late for an offer, or an empty text."""
+        """Return why it is too late for an offer, or an empty string."""
         left = self.left_ns(offer)
         if left > 0:
             return ""
@@ -86,20 +143,20 @@ class Offers:
         return f"{age_s:.1f} s have passed since the offer, and {LIMIT_NS / SECOND:g} s is allowed"
 
     def void(self, line: str, drives: Collection[str] | None, why: str) -> None:
-        """End what was offered for these drives of a line, or all with None, and was not sent yet."""
+        """Withdraw the unsent offers for these drives of a line, or all with None."""
         for offer in self._by_token.values():
             is_one = offer.held.name == line and (drives is None or offer.request.drive in drives)
             if is_one and offer.answer is None:
                 offer.why_void = offer.why_void or why
 
-    def take_back(self, offer: Offer, why: str) -> None:
-        """End an offer that nobody has taken: it will not be carried out."""
+    def withdraw(self, offer: Offer, why: str) -> None:
+        """Withdraw an offer unless it was already taken."""
         if self.take(offer):
             self.end(
                 offer, CommandAnswer(CommandOutcome.NOT_SENT, f"{offer.request.words} was not sent: {why}")
             )
 
     def end(self, offer: Offer, answer: CommandAnswer) -> None:
-        """Note what became of it; copies of the message get the same answer from now on."""
+        """Set its answer, which later copies of the message get too."""
         offer.answer = answer
         offer.over.set()

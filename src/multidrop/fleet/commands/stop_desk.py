@@ -1,7 +1,7 @@
-"""Stop desk: stops drives at once, for anybody who asks the line's present master.
+"""StopDesk: stop drives at once on the lines of which this gateway is master.
 
-A stop needs neither an offer nor a list: to stop twice does no harm, and to wait may. It goes to the present
-master all the same, for nobody else may send on the line. It is sent first, and noted afterwards.
+A stop needs neither an offer nor a list, because a second stop does no harm and a late one may. It is sent
+first and recorded afterwards.
 """
 
 from __future__ import annotations
@@ -16,8 +16,7 @@ from typing import Any
 from multidrop.control import LineStop, RepeatedStops, stop_line, written_by
 from multidrop.fleet.commands.desk import HOLD_S, WAY
 from multidrop.fleet.commands.log import CommandLog
-from multidrop.fleet.commands.offers import Offers
-from multidrop.fleet.commands.words import (
+from multidrop.fleet.commands.messages import (
     CommandAnswer,
     CommandOutcome,
     StopRequest,
@@ -25,18 +24,19 @@ from multidrop.fleet.commands.words import (
     spelt,
     worst,
 )
+from multidrop.fleet.commands.offers import Offers
 from multidrop.fleet.lines.held_lines import HeldLine, HeldLines
 from multidrop.plant import drive_meant
 from multidrop.supervisor import supervisor
 
-REMEMBERED = 1000  # stops, of which the oldest are forgotten
+REMEMBERED = 1000  # newest stops
 CALLED = "a stop was called"
 
 _log = logging.getLogger("multidrop.fleet")
 
 
 class StopDesk:
-    """Stops on the lines that this gateway holds; each ends what was offered before it."""
+    """Stops on the lines that this gateway holds; each withdraws the offers before it."""
 
     def __init__(self, gateway: str, lines: HeldLines, offers: Offers, log: CommandLog) -> None:
         self.gateway = gateway
@@ -47,13 +47,12 @@ class StopDesk:
         self._repeated = RepeatedStops()
 
     async def stop(self, line: str, data: bytes) -> CommandAnswer | None:
-        """Stop drives of a line now; None where we are not its master and must keep silent.
+        """Stop drives of a line now; return None unless this gateway is its master.
 
-        Nothing in the message is a reason to send none. A copy of the message gets the answer of the same
-        stop; another message is another stop, and so is each without an id. The answer to one that is not
-        over soon is "under way", with what is known of it so far; the asker asks again.
-        Where we lost the line meanwhile, or let it go, we keep silent too, unless the motors stand: its next
-        master may have had a copy, and stops, or is asked next.
+        A damaged message stops all drives. A copy of a message gets the answer of the same stop; a message
+        without an id is always a new stop. A stop that takes longer than HOLD_S is answered with "under way"
+        and its progress, and the asker asks again. If the line was lost or released meanwhile, return None
+        unless the motors have stopped: the next master answers.
         """
         held = self._lines.for_stop(line)
         if held is None:
@@ -65,7 +64,7 @@ class StopDesk:
             request = request._replace(drives=tuple(drive_meant(one, held.drives) for one in request.drives))
         key = (held.number, sha256(data).digest() if request.id else object())
         if key not in self._stops:
-            self._stops[key] = supervisor().start("stop", self._stop_or_tell(held, request))
+            self._stops[key] = supervisor().start("stop", self._stop_or_report(held, request))
             while len(self._stops) > REMEMBERED:
                 del self._stops[next(iter(self._stops))]
         task = self._stops[key]
@@ -86,8 +85,8 @@ class StopDesk:
         text = text or f"line {held.name}: a stop is under way"
         return CommandAnswer(CommandOutcome.UNDER_WAY, text, self.gateway, drives=drives)
 
-    async def _stop_or_tell(self, held: HeldLine, request: StopRequest) -> CommandAnswer:
-        """Stop them; a failure of ours is logged, and is the answer."""
+    async def _stop_or_report(self, held: HeldLine, request: StopRequest) -> CommandAnswer:
+        """Stop them; log an error of this gateway, and return it as the answer."""
         try:
             return await self._stop(held, request)
         except Exception as failure:
@@ -96,7 +95,7 @@ class StopDesk:
             return CommandAnswer(CommandOutcome.UNKNOWN, text, self.gateway)
 
     async def _stop(self, held: HeldLine, request: StopRequest) -> CommandAnswer:
-        """Begin the stops of all drives side by side; of a drive whose stop is repeated, one more is sent."""
+        """Stop all drives in parallel; of a drive whose stop is already repeated, send one more."""
         self._offers.void(held.name, request.drives, CALLED)
         drives = held.drives
         names = list(drives) if request.drives is None else list(dict.fromkeys(request.drives))
@@ -119,7 +118,7 @@ class StopDesk:
         return answer
 
     def _note(self, record: Mapping[str, Any]) -> None:
-        """Note it, in the order of the calls, whoever waits for the stop."""
+        """Record it in the order of the calls, without waiting."""
         supervisor().start("note of a stop", self._write(record))
 
     async def _write(self, record: Mapping[str, Any]) -> None:

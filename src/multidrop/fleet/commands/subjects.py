@@ -1,7 +1,8 @@
-"""Command subjects: what a gateway hears of commands on NATS, on all of its paths, and answers.
+"""CommandSubjects: receive commands and stops on NATS, on all paths of a gateway, and answer them.
 
-A line's subjects are heard while the line is polled, so that a server itself says where nobody is its master.
-Each message comes once on each path: the desks know copies by the asker's id. Nothing goes through a stream.
+A gateway subscribes to a line's subjects only while it polls the line, so a server itself reports a line
+without a master. Each message comes once on each path; the desks recognise copies by the asker's id. No
+stream is used.
 """
 
 from __future__ import annotations
@@ -19,8 +20,8 @@ from nats.aio.msg import Msg
 
 from multidrop.fleet.commands.desk import CommandDesk
 from multidrop.fleet.commands.log import CommandLog
+from multidrop.fleet.commands.messages import CommandAnswer, Offered, encode
 from multidrop.fleet.commands.stop_desk import StopDesk
-from multidrop.fleet.commands.words import CommandAnswer, Offered, encode
 from multidrop.fleet.lines.fleet_lines import FleetLines
 from multidrop.fleet.lines.held_lines import HeldLines
 from multidrop.fleet.servers import names
@@ -41,39 +42,39 @@ class CommandSubjects:
         self._stops = StopDesk(gateway, lines, self.desk.offers, log)
 
     async def begin(self) -> None:
-        """Hear the tokens of this run's offers."""
-        await self._hear(self.desk.subject, self.desk.do)
+        """Subscribe to the tokens of this run's offers."""
+        await self._subscribe(self.desk.subject, self.desk.do)
 
     def open(self, line: str, description: Any) -> None:
-        """Take commands for a line from now on."""
+        """Accept commands and stops for a line from now on."""
         self._lines.open(line, description)
-        self._change(self._hear(names.command_subject(line), partial(self._offer, line)))
-        self._change(self._hear(names.stop_subject(line), partial(self._stops.stop, line)))
+        self._change(self._subscribe(names.command_subject(line), partial(self._offer, line)))
+        self._change(self._subscribe(names.stop_subject(line), partial(self._stops.stop, line)))
 
     def leave(self, line: str) -> None:
-        """Take stops alone from now on, and carry out nothing that was offered."""
+        """From now on accept stops only."""
         self._lines.leave(line)
-        self._change(self._deafen(names.command_subject(line)))
+        self._change(self._unsubscribe(names.command_subject(line)))
 
     def shut(self, line: str) -> None:
-        """Take nothing any more."""
+        """Accept neither commands nor stops from now on."""
         self._lines.shut(line)
-        self._change(self._deafen(names.command_subject(line), names.stop_subject(line)))
+        self._change(self._unsubscribe(names.command_subject(line), names.stop_subject(line)))
 
     async def _offer(self, line: str, data: bytes) -> Offered | CommandAnswer | None:
         return self.desk.offer(line, data)
 
-    async def _hear(self, subject: str, heard: Heard) -> None:
+    async def _subscribe(self, subject: str, heard: Heard) -> None:
         async def take(message: Msg) -> None:
             supervisor().start("answer", _answer(message, heard))  # none waits for another
 
         await asyncio.gather(*(path.subscribe(subject, take) for path in self._paths))
 
-    async def _deafen(self, *subjects: str) -> None:
+    async def _unsubscribe(self, *subjects: str) -> None:
         await asyncio.gather(*(path.unsubscribe(one) for path in self._paths for one in subjects))
 
     def _change(self, work: Coroutine[Any, Any, None]) -> None:
-        """Begin to change which subjects are heard. If that fails, a stop might not be heard: it is fatal."""
+        """Change subscriptions in a task. A failure is fatal, because stops could get lost."""
 
         async def change() -> None:
             try:
@@ -93,14 +94,14 @@ async def _answer(message: Msg, heard: Heard) -> None:
     if answer is None or not names.is_inbox(message.reply):
         return
     data = json.dumps(answer.as_json()).encode() if isinstance(answer, CommandAnswer) else encode(answer)
-    with suppress(Exception):  # whoever asked may have gone
+    with suppress(Exception):  # the asker may be gone
         await message.respond(data)
 
 
 class CommandedLines:
-    """Lines that are open to commands as long as they are polled.
+    """Lines that accept commands as long as they are polled.
 
-    `may_wait` says whether the lease leaves time before a line must be closed.
+    `may_wait` returns True while the lease leaves time before a line must be closed.
     """
 
     def __init__(
@@ -111,7 +112,7 @@ class CommandedLines:
         self._may_wait = may_wait
 
     async def take(self, line: str, description: Any) -> None:
-        """Open the line, poll it and take commands; if that raises, it is not polled, and its port closed."""
+        """Poll a line and accept commands; if that raises, the line is released again."""
         await self._lines.take(line, description)
         try:
             self._subjects.open(line, description)
@@ -120,10 +121,10 @@ class CommandedLines:
             raise
 
     async def let_go(self, line: str) -> None:
-        """Take no commands any more, poll the line no more, and close it.
+        """Accept no more commands, stop polling the line, and close it.
 
-        Its stops under way are waited for, and who asked for them is answered until then. So are commands,
-        for a moment: what one that was sent has done would never be known.
+        Waits for its stops under way, whose askers are answered until then; and briefly for commands that
+        were sent, whose result would otherwise stay unknown.
         """
         self._subjects.leave(line)
         try:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from multidrop import InvtCHE
-from multidrop.fleet.commands.drive_commands import prepare
-from multidrop.fleet.commands.words import CommandOutcome, CommandRequest
+from multidrop.fleet.commands.messages import CommandOutcome, CommandRequest
+from multidrop.fleet.commands.offers import prepare
 
 
 def test_a_command_to_a_drive_that_has_left_its_line_was_not_sent() -> None:

@@ -1,4 +1,4 @@
-"""Words of commands: what a gateway is asked for and what it answers, as JSON. Pure: bytes come in."""
+"""Messages of commands: requests, offers and answers as JSON. Pure."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from multidrop.control import CommandResult, with_name
 
 MOST_BYTES = 64 * 1024  # of a request
 MOST_CHARACTERS = 200  # of a name, an id or a value's text
-NOBODY = "somebody"  # who gives no name
+UNNAMED = "somebody"  # an asker without a name
 
 
 class CommandAnswer(NamedTuple):
@@ -37,7 +37,7 @@ class CommandAnswer(NamedTuple):
         return cls(result.outcome, with_name(drive, result.text), held=result.held)
 
     def as_json(self) -> dict[str, Any]:
-        """Return it for a message or a log, without what is empty."""
+        """Return it for a message or a log, without empty fields."""
         found: dict[str, Any] = {"outcome": self.outcome.value, "text": self.text}
         found |= {key: text for key, text in (("gateway", self.gateway), ("held", self.held)) if text}
         if self.drives:
@@ -48,7 +48,7 @@ class CommandAnswer(NamedTuple):
 class CommandRequest(NamedTuple):
     """One command to one drive: a verb with its options, or a register and the value to write.
 
-    `id` is the asker's own and new for each command, so that copies of a message are told as such.
+    `id` is chosen by the asker, anew for each command, so that copies of a message are recognised.
     """
 
     id: str
@@ -66,7 +66,7 @@ class CommandRequest(NamedTuple):
 
     @property
     def words(self) -> str:
-        """Say what is asked for."""
+        """Return the request as text."""
         if self.register:
             return f"{self.entry} = {self.value}"
         options = ", ".join(f"{name} = {value}" for name, value in self.options.items())
@@ -74,7 +74,7 @@ class CommandRequest(NamedTuple):
 
 
 class StopRequest(NamedTuple):
-    """A stop of these drives of a line, or of all with None. An asker's `id` is new for each stop."""
+    """A stop of these drives of a line, or of all with None; each stop has an `id` of its own."""
 
     id: str
     by: str
@@ -82,11 +82,11 @@ class StopRequest(NamedTuple):
 
 
 class Offered(NamedTuple):
-    """A gateway's promise to do something once, if it is told to soon."""
+    """A gateway's offer to carry out a command once, if its token comes back soon."""
 
     token: str
-    subject: str  # to which the token is to be sent
-    text: str  # what will be done
+    subject: str  # for the token
+    text: str  # description of the command
     gateway: str
 
 
@@ -109,7 +109,7 @@ def read_json(data: bytes) -> dict[str, Any]:
 
 
 def read_command(data: bytes) -> CommandRequest:
-    """Return the command of a message from anybody. Raises ValueError, in one sentence."""
+    """Return the command in a message. Raises ValueError with one sentence."""
     found = read_json(data)
     id, by, drive = (_text(found, key) for key in ("id", "by", "drive"))
     verb, register = (_text(found, key, is_needed=False) for key in ("verb", "register"))
@@ -117,23 +117,23 @@ def read_command(data: bytes) -> CommandRequest:
         raise ValueError("a command has either a verb or a register")
     options = found.get("options", {})
     if not isinstance(options, dict):
-        raise ValueError("options is no JSON object")
+        raise ValueError("options must be a JSON object")
     if verb:
         return CommandRequest(id, by, drive, verb=verb, options=options)
     return CommandRequest(id, by, drive, register=register, value=_value(found))
 
 
 def read_stop(data: bytes) -> tuple[StopRequest, str]:
-    """Return the stop of a message from anybody, and why it is one of all drives where it names none.
+    """Return the stop in a message, and why it stops all drives if the message is damaged.
 
-    A stop is never refused. To stop too many drives can be mended, and to stop none cannot. Whoever asks is
-    named in printable words, "" being no id.
+    A stop is never refused: stopping too many drives does less harm than stopping none. Names are made
+    printable; a missing id is "".
     """
     try:
         found = read_json(data)
     except ValueError as mistake:
-        return StopRequest("", NOBODY, None), str(mistake)
-    request = StopRequest(spelt(found.get("id")), spelt(found.get("by")) or NOBODY, None)
+        return StopRequest("", UNNAMED, None), str(mistake)
+    request = StopRequest(spelt(found.get("id")), spelt(found.get("by")) or UNNAMED, None)
     drives = found.get("drives")
     if isinstance(drives, str):
         drives = [drives]
@@ -143,7 +143,7 @@ def read_stop(data: bytes) -> tuple[StopRequest, str]:
 
 
 def spelt(given: object) -> str:
-    r"""Return a name, whatever was given as one; what cannot be printed is spelt out: an escape is `\x1b`."""
+    r"""Return any object, given as a name, as printable text; an escape character becomes `\x1b`."""
     text = str(given) if isinstance(given, (str, int, float)) else ""
     return (text if text.isprintable() else repr(text)[1:-1]).strip()[:MOST_CHARACTERS]
 
@@ -151,7 +151,7 @@ def spelt(given: object) -> str:
 def _text(found: Mapping[str, Any], key: str, *, is_needed: bool = True) -> str:
     text = found.get(key, "")
     if not isinstance(text, str) or len(text) > MOST_CHARACTERS or not text.isprintable():
-        raise ValueError(f"{key} is no text of at most {MOST_CHARACTERS} printable characters")
+        raise ValueError(f"{key} must be text of at most {MOST_CHARACTERS} printable characters")
     if is_needed and not text.strip():
         raise ValueError(f"{key} is missing")
     return text
@@ -174,7 +174,7 @@ def _is_finite(value: float) -> bool:
 
 
 def read_offer(data: bytes) -> Offered | CommandAnswer:
-    """Return a gateway's offer, or its answer where it makes none. Raises ValueError."""
+    """Return a gateway's offer, or its answer if it makes none. Raises ValueError."""
     found = read_json(data)
     if "token" not in found:
         return read_answer(data)
@@ -188,10 +188,10 @@ def read_answer(data: bytes) -> CommandAnswer:
 
 def _answer(found: Any) -> CommandAnswer:
     if not isinstance(found, dict):
-        raise ValueError("an answer is no JSON object")
+        raise ValueError("an answer must be a JSON object")
     drives = found.get("drives", {})
     if not isinstance(drives, dict):
-        raise ValueError("drives of an answer is no JSON object")
+        raise ValueError("drives of an answer must be a JSON object")
     return CommandAnswer(
         CommandOutcome(_long_text(found, "outcome")),
         _long_text(found, "text"),
@@ -204,12 +204,12 @@ def _answer(found: Any) -> CommandAnswer:
 def _long_text(found: Mapping[str, Any], key: str) -> str:
     text = found.get(key)
     if not isinstance(text, str):
-        raise ValueError(f"{key} of an answer is no text")
+        raise ValueError(f"{key} of an answer must be text")
     return text
 
 
 def worst(answers: Sequence[CommandAnswer]) -> CommandOutcome:
-    """Return the outcome of several drives' commands together: the one that a person must know first."""
+    """Return the most important outcome of several drives' commands."""
     order = (
         CommandOutcome.UNKNOWN,
         CommandOutcome.NOT_SENT,
