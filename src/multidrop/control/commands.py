@@ -1,8 +1,8 @@
-"""Commands: carry out a verb, a write or a stop on a drive, for a server with many clients.
+"""Commands: the command service of servers with many clients; carries out verbs, writes and stops on drives.
 
 Each command has a thread of its own, so that a stop waits for no other command. The thread inherits its
-caller's context: who writes (`written_by`) and until when (`written_before`). A command never raises: its
-CommandResult says what is known.
+caller's context: the author (`written_by`) and the deadline (`written_before`). A command never raises; it
+returns a CommandResult.
 """
 
 from __future__ import annotations
@@ -113,7 +113,7 @@ def stop_line(bus: Callable[[], Any], names: Sequence[str], seconds: float | Non
 
 
 def in_thread(work: Callable[[], R]) -> asyncio.Future[R]:
-    """Do work in a thread of its own, to its end even if nobody waits for it.
+    """Do work in a thread of its own, to its end even if its caller is cancelled.
 
     Raises RuntimeError or MemoryError if the system has no thread left.
     """
@@ -127,8 +127,8 @@ def begin_command(
 ) -> asyncio.Future[CommandResult]:
     """Carry out a command in a thread, if its first frame leaves before `limit_ns` (CLOCK_MONOTONIC).
 
-    `why_not` is called in that thread: if it returns a result, nothing is sent. Without a thread the result
-    says that nothing was sent.
+    `why_not` is called in that thread; if it returns a result, that is the end. If the system has no thread
+    left, the result is NOT_SENT.
     """
 
     def checked() -> CommandResult:

@@ -1,4 +1,4 @@
-"""The audit log's newest records, for the page."""
+"""Newest records of the audit log, as the page shows them."""
 
 from __future__ import annotations
 
@@ -15,21 +15,21 @@ MOST_RECORDS = 200  # of an answer
 
 _UTC = re.compile(
     r"\d{4}-\d\d-\d\d(T\d\d:\d\d(:\d\d(\.\d+)?)?Z?)?", re.ASCII
-)  # also of its beginning, such as a day
+)  # or a prefix, such as a day
 
 
 def time_asked(query: Mapping[str, str]) -> str:
-    """Return the time before which records are asked for; "": all. Raises Denied for what is no UTC time."""
+    """Return the `before` of a query, "" without one. Raises Denied if it is not a UTC time."""
     if "before" in query and not _UTC.fullmatch(query["before"]):
         wrong = query["before"][:40]
-        raise Denied(400, f"before = {wrong!r} is no time in UTC, such as 2026-11-22 or 2026-11-22T09:30")
+        raise Denied(400, f"before = {wrong!r} is not a time in UTC, such as 2026-11-22 or 2026-11-22T09:30")
     return query.get("before", "")
 
 
 def newest_records(path: Path | None, before: str = "", count: int = MOST_RECORDS) -> dict[str, Any]:
-    """Return so many `entries` before this time (ISO 8601, UTC; "": all), the newest first.
+    """Return `count` entries before this time (ISO 8601, UTC; "" for all), the newest first.
 
-    `more` tells whether there are older ones. Raises OSError.
+    `more` says if there are older ones. Raises OSError.
     """
     count = max(1, min(count, MOST_RECORDS))
     found: deque[dict[str, Any]] = deque(maxlen=count + 1)

@@ -1,7 +1,7 @@
-"""BrokerCommands: commands that come by a broker, which may hold them up, keep them, and deliver them twice.
+"""BrokerCommands: check commands from a broker, which may delay, keep and duplicate them.
 
-A write or a verb is carried out only when it was sent within the last seconds, after the latest stop of its
-drive and the latest reload of the plant, and did not come before; a stop by any verb is carried out always.
+A write or a verb is carried out only if it was sent within the last seconds, after the latest stop of its
+drive and the latest reload of the plant, and did not come before. A verb that stops is always carried out.
 """
 
 from __future__ import annotations
@@ -17,26 +17,23 @@ from multidrop.gateway.commands import MOST_AGE_S, Commands
 from multidrop.gateway.http.rights import Caller
 from multidrop.supervisor import supervisor
 
-MOST_AGE_MS = round(MOST_AGE_S * 1e3)  # a broker that stood still delivers those of the whole time
-MOST_AHEAD_MS = 2_000  # by which the sender's clock may be fast
+MOST_AGE_MS = round(MOST_AGE_S * 1e3)  # a suspended broker delivers all of them at its end
+MOST_AHEAD_MS = 2_000  # tolerance for a fast clock of the sender
 MOST_UNDER_WAY = 16  # without stops
 REMEMBERED = 1_000
 
 _log = logging.getLogger("multidrop.gateway.mqtt.part")
-Tell = Callable[[str, str, CommandResult], None]  # the drive, what was asked, what became of it
+Report = Callable[[str, str, CommandResult], None]  # the drive, the command's text, and its result
 
 
 class BrokerCommands:
-    """Checks commands and carries them out; `tell` says what became of each.
+    """Checks commands and carries them out; `report` is called with each result, `utc_ms` returns the time."""
 
-    `utc_ms` is the time of day.
-    """
-
-    def __init__(self, commands: Commands, caller: Caller, utc_ms: Callable[[], int], tell: Tell) -> None:
+    def __init__(self, commands: Commands, caller: Caller, utc_ms: Callable[[], int], report: Report) -> None:
         self._commands = commands
         self._caller = caller
         self._utc_ms = utc_ms
-        self._tell = tell
+        self._report = report
         self._came: deque[object] = deque(maxlen=REMEMBERED)
         self._under_way = 0
 
@@ -45,11 +42,11 @@ class BrokerCommands:
         self._begin(self._stop(drives))
 
     def stop_by(self, drive: str, verb: str, options: Mapping[str, object]) -> None:
-        """Carry out a verb that stops the motor, whenever it was sent."""
+        """Carry out a verb that stops the motor, whatever its age."""
         self._begin(self._do(drive, verb, self._commands.act(drive, verb, options, self._caller)))
 
     def write(self, drive: str, register: str, value: float, time_ms: int) -> None:
-        """Write a register, if the command is fresh."""
+        """Write a register if the command is fresh."""
         what = f"{register} = {value!r}"
         stopped_ns = self._commands.stopped_ns(drive)
         if self._is_taken(drive, what, (drive, register, value, time_ms), time_ms, stopped_ns):
@@ -57,25 +54,25 @@ class BrokerCommands:
             self._begin(self._counted(self._do(drive, what, work)))
 
     def act(self, drive: str, verb: str, options: Mapping[str, object], time_ms: int) -> None:
-        """Carry out a verb, if the command is fresh."""
+        """Carry out a verb if the command is fresh."""
         stopped_ns = self._commands.stopped_ns(drive)
         if self._is_taken(drive, verb, (drive, verb, repr(options), time_ms), time_ms, stopped_ns):
             work = self._commands.act(drive, verb, options, self._caller)
             self._begin(self._counted(self._do(drive, verb, work)))
 
     def refuse(self, drive: str, what: str, why: str) -> None:
-        """Tell that a command was not carried out."""
+        """Report that a command was not carried out."""
         _log.warning("%s of %s was not carried out: %s", what, drive, why)
-        self._tell(drive, what, CommandResult(CommandOutcome.FAILED, f"not sent: {why}"))
+        self._report(drive, what, CommandResult(CommandOutcome.FAILED, f"not sent: {why}"))
 
     @staticmethod
     def _may_be_before(at_ns: int | None, age_ms: int) -> bool:
-        """Return True where a command may be older than that time; the sender's clock may be fast."""
+        """Return True if a command may be older than that time, as the sender's clock may be fast."""
         if at_ns is None:
             return False
         return (boottime_ns() - at_ns) // 1_000_000 <= age_ms + MOST_AHEAD_MS
 
-    def _is_taken(self, drive: str, what: str, order: object, time_ms: int, stopped_ns: int | None) -> bool:
+    def _is_taken(self, drive: str, what: str, command: object, time_ms: int, stopped_ns: int | None) -> bool:
         age_ms = self._utc_ms() - time_ms
         if not -MOST_AHEAD_MS <= age_ms <= MOST_AGE_MS:
             clocks = "by the clocks of sender and gateway"
@@ -83,23 +80,23 @@ class BrokerCommands:
         elif self._may_be_before(stopped_ns, age_ms):
             self.refuse(drive, what, "it may have been sent before the latest stop: send it again")
         elif self._may_be_before(self._commands.plant_ns, age_ms):
-            self.refuse(drive, what, "it may have been sent before the plant was read anew: send it again")
-        elif order in self._came:
+            self.refuse(drive, what, "it may have been sent before the plant was reloaded: send it again")
+        elif command in self._came:
             self.refuse(drive, what, "it came a second time")
         elif self._under_way >= MOST_UNDER_WAY:
             self.refuse(drive, what, f"{MOST_UNDER_WAY} others are under way")
         else:
-            self._came.append(order)
-            self._under_way += 1  # before it begins: a broker may deliver many at once
+            self._came.append(command)
+            self._under_way += 1  # before its task runs, as a broker may deliver many at once
             return True
         return False
 
     async def _stop(self, drives: Sequence[str] | None) -> None:
         for drive, told in (await self._commands.stop(drives, self._caller)).items():
-            self._tell(drive, "stop", told)
+            self._report(drive, "stop", told)
 
     async def _do(self, drive: str, what: str, work: Coroutine[Any, Any, CommandResult]) -> None:
-        self._tell(drive, what, await work)
+        self._report(drive, what, await work)
 
     async def _counted(self, work: Coroutine[Any, Any, None]) -> None:
         try:
@@ -108,4 +105,4 @@ class BrokerCommands:
             self._under_way -= 1
 
     def _begin(self, work: Coroutine[Any, Any, None]) -> None:
-        supervisor().start("order", work)
+        supervisor().start("broker command", work)
