@@ -27,7 +27,7 @@ Report = Callable[[str, str, CommandResult], None]  # the drive, the command's t
 
 
 class BrokerCommands:
-    """Checks commands and carries them out; `report` is called with each result, `utc_ms` returns the time."""
+    """Checks commands and carries them out; calls `report` with each result. `utc_ms` returns the time."""
 
     def __init__(self, commands: Commands, caller: Caller, utc_ms: Callable[[], int], report: Report) -> None:
         self._commands = commands
