@@ -487,11 +487,11 @@ def test_a_poll_is_captured(tmp_path: Path, run: Run, mixed_plant: Path) -> None
     )
     assert run("poll", mixed_plant, "--flight-recorder", capture)[::2] == (
         2,
-        f"multidrop: {capture} is a file: name a directory for the flight recorder\n",
+        f"multidrop: --flight-recorder {capture} is a file: name a directory\n",
     )
     assert run("poll", mixed_plant, "--capture", "a.csv")[::2] == (
         2,
-        "multidrop: a.csv: a capture's name ends in .pcapng\n",
+        "multidrop: a.csv: a capture's name must end in .pcapng\n",
     )
 
 

@@ -44,25 +44,25 @@ def test_check_tells_what_it_understood_and_what_it_does_not_know(run: Run, fan:
     shown = words(out)
     assert (status, err) == (0, "")
     assert "000FH speed reading 1 rpm" in shown  # as it is sent: the manual counts from 1
-    assert "declared by its file, not tested by us" in shown
+    assert "declared by its file, untested" in shown
     unknown, refused = shown.partition(" not known ")[2].split(" will be refused ")
     for told in (
-        "frequency whether it is kept in EEPROM: each write is counted as wear",
-        "frequency its span: all that fits is written; span = [0, 50]",
+        "frequency whether it is stored in EEPROM: each write counts as wear",
+        "frequency its span: every value that fits is written; span = [0, 50]",
         "frequency its place in the manual",
-        "scale the value of one count: its counts are shown as they are",
+        "scale its scale: raw counts are shown",
         "place the manual's place of speed",
-        "identify how to tell this device from another",
-        "watchdog whether the motor stops when nobody asks any more",
+        "identify how to recognise this device",
+        "watchdog whether the motor stops when polling stops",
     ):
         assert told in unknown
     for told in (
-        "ramp every write: nothing says whether the motor stands",
-        "ramp more than one write in 60 s, and than 1000 a year: it is in EEPROM",
+        "ramp every write: it is unknown whether the motor has stopped",
+        "ramp more than one write in 60 s, or 1000 a year: it is stored in EEPROM",
         "locked every write: it changes the motor",
-        "run every write but by verbs, and of 0000H",
+        "run every write except by verbs, and of 0000H",
         "confirmed every write, until the drive has confirmed = 1",
-        "It can move a motor, and nobody has tested it",
+        "It can move a motor and is untested",
     ):
         assert told in refused
 
@@ -95,7 +95,7 @@ def test_a_sheet_is_read_beside_the_manual(run: Run, tmp_path: Path) -> None:
     """Bits by their numbers, words in hex, names apart from sentences; a watchdog only of what moves."""
     _, out, _ = run("check", "abb-acs355")
     assert "bit 0 READY_TO_SWITCH_ON, bit 1 READY_TO_OPERATE" in words(out)
-    assert "verbs alone write it, but for 047EH, 047CH, 0476H" in words(out)
+    assert "only verbs write it, except 047EH, 047CH, 0476H" in words(out)
     assert "watchdog" in run("models", "abb-acs355")[1]
     path = write_meter(tmp_path)
     assert "watchdog" not in run("models", path)[1]
@@ -113,7 +113,7 @@ def test_check_prints_json(run: Run, fan: Path) -> None:
         "fan.toml",
         [],
     )
-    assert ["identify", "how to tell this device from another; look at its name plate"] in found["not_known"]
+    assert ["identify", "how to recognise this device; read its name plate"] in found["not_known"]
 
 
 def test_all_mistakes_are_told_with_status_1(run: Run, tmp_path: Path) -> None:
@@ -133,7 +133,7 @@ def test_models_says_that_a_file_is_not_tested(run: Run, tmp_path: Path) -> None
     path = write_meter(tmp_path)
     status, out, _ = run("models", path)
     assert status == 0
-    assert "declared by its file, not tested by us" in words(out)
+    assert "declared by its file, untested" in words(out)
     assert json.loads(run("models", path, "--json")[1])["declared_in"] == "meter.toml"
 
 
@@ -163,7 +163,8 @@ def test_a_line_with_more_drives_than_a_manual_allows_is_told(run: Run, tmp_path
     status, out, err = check(32)
     assert status == 0
     assert (
-        "line L: it has 32 drives, and the manual of ERMAN ER-G-220-01(02) allows 31 devices: split it" in err
+        "line L: it has 32 drives; the manual of ERMAN ER-G-220-01(02) allows 31 devices: split the line"
+        in err
     )
     assert out.startswith("No mistake found")
     remarks = json.loads(check(32, "--json")[1])["remarks"]
@@ -188,4 +189,4 @@ def test_two_files_of_one_name_are_not_scanned_for_at_once(run: Run, tmp_path: P
     found = [tmp_path / folder / "meter.toml" for folder in ("a", "b")]
     status, _, err = run("scan", "/dev/null", "--model", found[0], "--model", found[1])
     assert status == 2
-    assert "two files are called meter.toml: scan for one of them at a time" in err
+    assert "two files declare the model meter.toml: rename one" in err

@@ -55,10 +55,10 @@ def test_the_help_says_of_each_word_what_it_is(run: Run, name: str) -> None:
 @table(
     "name, told",
     [
-        ("read", "parity and stop bits; the family's default if not given"),
-        ("read", "where the family has several; its first if not given"),
-        ("doctor", "of the drive; the family's first if not given"),
-        ("write", "append every write and its outcome to this file; to none if not given"),
+        ("read", "parity and stop bits; default: the family's"),
+        ("read", "default: the family's first"),
+        ("doctor", "default: the family's first"),
+        ("write", "append every write and its outcome to this file"),
         ("hub", "seconds of samples in a commit; 10 if not given"),
         (
             "simulate",
@@ -170,7 +170,7 @@ def test_what_is_no_time_to_poll_for_is_a_sentence(run: Run, seconds: str) -> No
 def test_a_report_is_a_page_by_its_name(run: Run, tmp_path: Path) -> None:
     (tmp_path / "a.csv").touch()
     status, _, err = run("report", tmp_path / "a.csv", "--out", tmp_path / "a.txt")
-    assert (status, err) == (2, f"multidrop: {tmp_path / 'a.txt'}: a report's name ends in .html\n")
+    assert (status, err) == (2, f"multidrop: {tmp_path / 'a.txt'}: a report's name must end in .html\n")
 
 
 def test_a_line_that_no_link_can_be_named_after_is_not_simulated(run: Run, tmp_path: Path) -> None:
@@ -181,7 +181,7 @@ def test_a_line_that_no_link_can_be_named_after_is_not_simulated(run: Run, tmp_p
     status, _, err = run("simulate", plant, "--ports", tmp_path / "ports")
     assert (status, err) == (
         2,
-        "multidrop: line 'hall/1' has a / in its name, which the link to its port cannot have\n",
+        "multidrop: line 'hall/1' has a / in its name: rename it to link its port\n",
     )
 
 
@@ -193,7 +193,7 @@ def test_a_file_is_no_directory_of_ports(run: Run, tmp_path: Path) -> None:
     assert run("simulate", plant, "--ports", plant) == (
         2,
         "",
-        f"multidrop: {plant} is a file: name a directory with --ports, which is made if need be\n",
+        f"multidrop: --ports {plant} is a file: name a directory; it is created if missing\n",
     )
 
 
@@ -201,7 +201,7 @@ def test_a_ledger_that_is_named_must_be_there(
     run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("XDG_STATE_HOME", "/state")
-    sentence = f"there is no ledger {tmp_path}/none; without --ledger it is /state/multidrop/wear.sqlite"
+    sentence = f"there is no ledger {tmp_path}/none; the default is /state/multidrop/wear.sqlite"
     assert run("wear", "--ledger", tmp_path / "none") == (2, "", f"multidrop: {sentence}\n")
 
 
@@ -227,7 +227,7 @@ def test_a_sheet_says_what_its_class_says_of_moving_the_motor(run: Run, tmp_path
     _, _, registers = out.partition("holding registers")
     remarks = [line.strip() for line in registers.splitlines() if line.startswith(" " * 8)]
     assert remarks == [
-        "a write starts, stops and resets nothing",
+        "a write never starts, stops or resets",
         "kept: not stated; a write may move the motor",
     ]
     _, out, _ = run("models", family, "--json")
@@ -249,21 +249,21 @@ def test_a_sheet_says_what_its_class_says_of_moving_the_motor(run: Run, tmp_path
         (
             ["write", "/dev/ttyX", TOY, "1", "frequency", "5"],
             "Write frequency = 5.00 Hz to toy@1 on /dev/ttyX? There is no terminal to ask on: "
-            "add --yes if it is meant",
+            "add --yes to confirm",
         ),
         (
             ["start", "/dev/ttyX", TOY, "1"],
-            "Start the motor of toy@1 on /dev/ttyX? There is no terminal to ask on: add --yes if it is meant",
+            "Start the motor of toy@1 on /dev/ttyX? There is no terminal to ask on: add --yes to confirm",
         ),
         (
             ["start", "/dev/ttyX", TOY, "1", "--frequency", "20.5", "--direction", "reverse"],
             "Start the motor of toy@1 on /dev/ttyX at 20.5 Hz, reverse? There is no terminal to ask on: "
-            "add --yes if it is meant",
+            "add --yes to confirm",
         ),
         (
             ["set-frequency", "/dev/ttyX", TOY, "1", "20"],
             "Change the frequency setpoint of toy@1 on /dev/ttyX to 20 Hz? There is no terminal to ask on: "
-            "add --yes if it is meant",
+            "add --yes to confirm",
         ),
     ],
 )
@@ -363,7 +363,7 @@ def test_a_family_s_sheet_has_every_fact(run: Run) -> None:
         "verbs           start, stop, set-frequency, state",
         "  02H  illegal address",
         "  rated_frequency  rated frequency of the motor (10 to 400 Hz)",
-        "holding registers (read 03H, 10 at most; write 06H)",
+        "holding registers (read 03H, at most 10; write 06H)",
         "  0003H  mystery            reading  scale not stated",
         "        the manual gives no scale",
         "  000AH  acceleration_time  setting  0.1 s             0.1 to 600",
@@ -394,8 +394,8 @@ def test_a_family_s_json_has_every_register(run: Run) -> None:
                 "b.010 address (1 from the factory), set while the motor stands",
                 "remote b.001 must be 2 and b.002 5 (RS-485)",
                 "broadcast the manual calls address 0 one, and does not say that nobody answers: none",
-                "coils (read 01H, 12 at most; write 05H)",
-                "verbs alone write it, but for ON",
+                "coils (read 01H, at most 12; write 05H)",
+                "only verbs write it, except ON",
                 "(0 to 4294967295)",
             ],
         ),
@@ -405,7 +405,7 @@ def test_a_family_s_json_has_every_register(run: Run) -> None:
                 "PC.00 address (1 from the factory), PC.01 baud rate",
                 "PC.02 format (0 to 5: 8N1, 8E1, 8O1, 8N2, 8E2, 8O2",
                 "remote P0.01 must be 2",
-                "verbs alone write it, but for STOP, COAST, STOP_JOG",
+                "only verbs write it, except STOP, COAST, STOP_JOG",
             ],
         ),
         (
@@ -423,7 +423,7 @@ def test_a_family_s_json_has_every_register(run: Run) -> None:
             [
                 "delixi formats 8N1",
                 "delixi silence none",
-                "until measured, less than 80 ms by its document; none after 150 ms",
+                "until measured, less than 80 ms by its manual; timeout 150 ms",
                 "P00.00 must be 2",
                 "0 N81, 1 E81",
             ],
@@ -431,10 +431,10 @@ def test_a_family_s_json_has_every_register(run: Run) -> None:
         (
             "yd1000",
             [
-                "24 characters (27.5 ms at 9600 bit/s) until measured; none after 500 ms",
+                "24 characters (27.5 ms at 9600 bit/s) until measured; timeout 500 ms",
                 "F802 address",
                 "at least minimum_frequency; at most maximum_frequency",
-                "but for COMMAND_VALID|FREQUENCY_VALID, COMMAND_VALID,",
+                "except COMMAND_VALID|FREQUENCY_VALID, COMMAND_VALID,",
                 "never together: RESET and RUN, RESET and JOG",
                 "what it is from the factory is not stated",
             ],

@@ -136,8 +136,8 @@ def test_polling_all_readings_in_single_requests_is_warned_of(run: Run, tmp_path
     status, out, _ = run("plan", path)
     assert status == 0
     told = " ".join(out.split())
-    assert "? a bus cycle takes longer than 1 s, and all readings are polled of p (" in told
-    assert "name those that are needed, such as poll" in told
+    assert "? a bus cycle takes longer than 1 s; all readings are polled of p (" in told
+    assert "name the registers you need, such as poll" in told
     path.write_text(path.read_text().replace("address = 1\n", 'address = 1\npoll = ["output_current"]\n'))
     path.write_text(path.read_text().replace("address = 2\n", 'address = 2\npoll = ["output_current"]\n'))
     assert "?" not in run("plan", path)[1]
@@ -152,11 +152,13 @@ def test_a_plan_reckons_with_the_time_of_switching(run: Run, tmp_path: Path) -> 
     free = json.loads(run("plan", path, "--json")[1])["lines"]["hall-1"]
     assert (free["switches"], free["switching_ms"]) == (2, 0)
     told = " ".join(run("plan", path)[1].split())
-    assert "2 times in a bus cycle the line changes its settings; `multidrop poll` tells how long" in told
+    assert "the line changes its settings 2 times in a bus cycle; `multidrop poll` measures how long" in told
     path.write_text(path.read_text().replace("port =", 'switching = "3 ms"\nport ='))
     dear = json.loads(run("plan", path, "--json")[1])["lines"]["hall-1"]
     assert dear["cycle_ms"] - free["cycle_ms"] == pytest.approx(6)
-    assert "the line changes its settings, 3 ms each" in " ".join(run("plan", path)[1].split())
+    assert "the line changes its settings 2 times in a bus cycle, 3 ms each" in " ".join(
+        run("plan", path)[1].split()
+    )
 
 
 def test_long_names_stay_within_80_columns(run: Run, tmp_path: Path) -> None:
@@ -210,7 +212,7 @@ def test_poll_puts_prediction_and_measurement_side_by_side(run: Run, plant: Path
 def test_poll_shows_them_to_a_person(run: Run, plant: Path) -> None:
     lines = run("poll", plant, "--seconds", 1)[1].splitlines()
     heading = next(
-        at for at, line in enumerate(lines) if line.split() == ["PREDICTED", "BY", "DELAYS", "MEASURED"]
+        at for at, line in enumerate(lines) if line.split() == ["PREDICTED", "WITH", "DELAYS", "MEASURED"]
     )
     told = lines[heading + 1 : heading + 5]
     assert [line.split()[0] for line in told] == ["bus", "utilisation", "pump-1,", "pump-9,"]
@@ -222,7 +224,7 @@ def test_poll_shows_them_to_a_person(run: Run, plant: Path) -> None:
 def test_what_switching_took_is_told_where_drives_differ(run: Run, plant: Path) -> None:
     plant.write_text(plant.read_text().replace("address = 9\n", "address = 9\nbaudrate = 19200\n"))
     told = run("poll", plant, "--seconds", 1)[1]
-    assert re.search(r"\n  and with the \d+\.\d\d ms that the port needed to change its settings\n", told)
+    assert re.search(r"\n  and the measured \d+\.\d\d ms to change the port's settings\n", told)
 
 
 @pytest.mark.slow

@@ -101,20 +101,20 @@ def test_what_a_plant_says_of_a_drive_holds_for_a_command(run: Run, plant: Path,
         (["zz"], "PLANT has no drive 'zz'; there are pump-1, fan-1, che-1, pump-2"),
         (
             [],
-            "name a drive of PLANT: pump-1, fan-1, che-1, pump-2; see `multidrop read --help`",
+            "choose a drive of PLANT: pump-1, fan-1, che-1, pump-2; see `multidrop read --help`",
         ),
         (["pump-1", "output_curent"], "TOY T1 has no register 'output_curent'; did you mean output_current"),
         (["pump-1", "control"], "control can only be written; see `multidrop models PLANT pump-1`"),
-        (["pump-1", "--baudrate", "9600"], "--baudrate is a matter of the plant file: write it into PLANT"),
-        (["pump-1", "--option", "rated_frequency=50"], "--option is a matter of the plant file"),
-        (["pump-1", "--ram", "sealed"], "--ram is a matter of the plant file"),
+        (["pump-1", "--baudrate", "9600"], "--baudrate is not for plant files: set it in PLANT"),
+        (["pump-1", "--option", "rated_frequency=50"], "--option is not for plant files"),
+        (["pump-1", "--ram", "sealed"], "--ram is not for plant files"),
         (["pump-1", "--port", "hal-1=x"], "PLANT has no line 'hal-1'; did you mean hall-1?"),
         (["pump-1", "--port", "hall-1"], "argument --port: 'hall-1' is not LINE=PORT, such as"),
         (["pump-1", "--port", "hall-1="], "argument --port: 'hall-1=' is not LINE=PORT, such as"),
         (["pump-1", "--port", "roof=/dev/none-1"], "lines hall-1 and roof would both be at /dev/none-1"),
         (
             ["pump-1", "--port", "roof=a", "--port", "roof=b"],
-            "--port names line 'roof' twice; a line has one port",
+            "--port is given twice for line 'roof': give it once",
         ),
     ],
 )
@@ -126,7 +126,7 @@ def test_a_mistake_is_a_sentence(run: Run, plant: Path, words: list[str], senten
 
 
 def test_what_belongs_to_a_plant_file_is_refused_without_one(run: Run) -> None:
-    sentence = "multidrop: --port is for the lines of a plant file; write the port in place of PORT\n"
+    sentence = "multidrop: --port is for the lines of a plant file: write the port in place of PORT\n"
     for words in (("read", "/dev/none", TOY, 1), ("scan", "/dev/none"), ("doctor", "/dev/none")):
         assert run(*words, "--port=a=b") == (2, "", sentence)
 
@@ -149,7 +149,7 @@ def test_write_takes_a_plant_file(run: Run, plant: Path, at: str, toy: Simulated
     assert "unrecognized arguments: 26" in run(*words, 25, 26)[2]
     status, out, err = run(*words, "26")
     assert (status, out) == (1, "")
-    assert "There is no terminal to ask on: add --yes if it is meant" in err
+    assert "There is no terminal to ask on: add --yes to confirm" in err
     assert toy["frequency"] == 25
 
 
@@ -273,7 +273,7 @@ def test_scan_takes_a_line_of_a_plant(run: Run, plant: Path, port: str, at: str)
     assert status == 0
     record = json.loads(out)
     assert (record["port"], [drive["address"] for drive in record["drives"]]) == (port, [1])
-    sentence = f"multidrop: {plant} has several lines: name one of hall-1, roof\n"
+    sentence = f"multidrop: {plant} has several lines: choose one of hall-1, roof\n"
     assert run("scan", plant, *few) == (2, "", sentence)
     assert "has no line 'hall-2'; did you mean hall-1?" in run("scan", plant, "hall-2", *few)[2]
     assert "unrecognized arguments: hall-1" in run("scan", "/dev/none", "hall-1")[2]
@@ -290,17 +290,17 @@ def test_doctor_measures_with_a_drive_of_a_plant(run: Run, plant: Path, port: st
     assert "round trip" in findings("hall-1")
     assert "not measured" not in findings("pump-1")["round trip"]
     assert "has no drive 'pump-7'; did you mean" in run("doctor", plant, "pump-7")[2]
-    assert "--rs485 is a matter of the plant file" in run("doctor", plant, "pump-1", "--rs485", "kernel")[2]
-    assert "--rs485 is a matter of the plant file" in run("scan", plant, "hall-1", "--rs485", "kernel")[2]
-    assert "--settle is a matter of the plant file" in run("scan", plant, "hall-1", "--settle", "1 s")[2]
-    assert "--model is a matter of the plant file" in run("doctor", plant, "pump-1", "--model", TOY)[2]
+    assert "--rs485 is not for plant files" in run("doctor", plant, "pump-1", "--rs485", "kernel")[2]
+    assert "--rs485 is not for plant files" in run("scan", plant, "hall-1", "--rs485", "kernel")[2]
+    assert "--settle is not for plant files" in run("scan", plant, "hall-1", "--settle", "1 s")[2]
+    assert "--model is not for plant files" in run("doctor", plant, "pump-1", "--model", TOY)[2]
 
 
 def test_sniff_listens_to_a_line_of_a_plant(run: Run, plant: Path, at: str) -> None:
     status, out, err = run("sniff", plant, "hall-1", at, "--seconds", "0.2")
     assert (status, out) == (0, "0 exchanges, 0 unknown bytes\n")
     assert err.startswith("listening on /dev/pts/")
-    assert "has several lines: name one of hall-1, roof" in run("sniff", plant, "--seconds", "0.2")[2]
+    assert "has several lines: choose one of hall-1, roof" in run("sniff", plant, "--seconds", "0.2")[2]
     assert "is a plant file already" in run("sniff", plant, "roof", "--plant", plant, "--seconds", "0.2")[2]
 
 

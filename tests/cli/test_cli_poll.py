@@ -56,7 +56,7 @@ def test_simulate_does_not_replace_a_file_in_its_way(run: Run, tmp_path: Path) -
     assert run("simulate", plant_file(tmp_path), "--ports", link.parent) == (
         2,
         "",
-        f"multidrop: {link} is there already: remove it, or choose another directory with --ports\n",
+        f"multidrop: {link} exists already: remove it, or choose another directory with --ports\n",
     )
     assert link.read_text() == "mine"
 
@@ -96,7 +96,7 @@ def test_a_segment_is_to_be_named_where_there_is_no_whole_recording(run: Run, tm
         with open_writer(tmp_path / f"run.0000000{number}.arrows", METADATA) as writer:
             writer.write(counting(100, 0))
     whole, newest = tmp_path / "run.arrows", tmp_path / "run.00000002.arrows"
-    sentence = f"multidrop: {whole} was recorded in segments: name one of them, such as {newest}\n"
+    sentence = f"multidrop: {whole} was recorded in segments: name one, such as {newest}\n"
     assert run("convert", whole, tmp_path / "a.csv") == (2, "", sentence)
     assert run("report", whole) == (2, "", sentence)
 
@@ -104,9 +104,9 @@ def test_a_segment_is_to_be_named_where_there_is_no_whole_recording(run: Run, tm
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
-        (["--keep", "1 h"], '--keep and --most remove whole files: say --rotate too, such as --rotate "1 h"'),
-        (["--rotate", "1 h"], "--rotate needs a recording whose name ends in .arrows: say --out run.arrows"),
-        (["--rotate", "1 h", "--out", "a.csv"], "--rotate needs a recording whose name ends in .arrows"),
+        (["--keep", "1 h"], '--keep and --most remove whole files: add --rotate, such as --rotate "1 h"'),
+        (["--rotate", "1 h"], "--rotate needs a name that ends in .arrows, such as --out run.arrows"),
+        (["--rotate", "1 h", "--out", "a.csv"], "--rotate needs a name that ends in .arrows"),
         (["--rotate", "soon"], "'soon' is not a time from 1 s to 100 years"),
         (["--most", "big"], "'big' is not a size from 1 kB on"),
     ],
@@ -290,8 +290,7 @@ def test_that_the_end_of_a_recording_is_missing_is_told(run: Run, tmp_path: Path
     missing = open_recording(path).truncated
     assert 0 < missing < path.stat().st_size
     sentence = (
-        f"multidrop: the end of {path} is missing: {whole} rows read, and its last {missing} bytes left "
-        "out, which are no whole rows\n"
+        f"multidrop: {path} ends within a row: {whole} rows read, and the last {missing} bytes skipped\n"
     )
     out = tmp_path / "b.parquet"
     assert run("convert", path, out) == (0, f"{whole} rows in {out}\n", sentence)

@@ -109,7 +109,7 @@ def test_nobody_there_is_a_failure(run: Run, port: str, tmp_path: Path) -> None:
     status, text, _ = run("scan", port, *words)
     assert status == 1
     assert text.startswith("no drives found in ")
-    assert "what `multidrop doctor` says of the port" in text
+    assert "run `multidrop doctor` on the port" in text
     assert not out.exists()
 
 
@@ -144,12 +144,15 @@ def test_unit_ids_beyond_a_serial_line_s_addresses_are_scanned_on_tcp(run: Run, 
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
-        (("--addresses", "0-5"), "--addresses: 0 is a unit id of Modbus TCP; on /dev/nowhere write 1 to 247"),
-        (("--addresses", "1-256"), "'1-256' is not addresses from 1 to 247 (0 to 255 on a tcp:// port)"),
-        (("--addresses", "1-" + "9" * 400), "is not addresses from 1 to 247"),
-        (("--addresses", "1-99999999999"), "'1-99999999999' is not addresses from 1 to 247"),
-        (("--addresses", "one"), "'one' is not addresses from 1 to 247"),
-        (("--baudrates", "fast"), "'fast' is not baud rates such as 9600,19200"),
+        (
+            ("--addresses", "0-5"),
+            "--addresses: 0 is only valid on tcp:// ports; on /dev/nowhere use 1 to 247",
+        ),
+        (("--addresses", "1-256"), "invalid addresses '1-256': write 1 to 247 (0 to 255 on a tcp:// port)"),
+        (("--addresses", "1-" + "9" * 400), "write 1 to 247"),
+        (("--addresses", "1-99999999999"), "invalid addresses '1-99999999999': write 1 to 247"),
+        (("--addresses", "one"), "invalid addresses 'one': write 1 to 247"),
+        (("--baudrates", "fast"), "invalid baud rates 'fast': write such as 9600,19200"),
         (("--baudrates", "300"), "baud rate 300 is none that these families have"),
         (("--formats", "9N1"), "format 9N1 is none that these families have"),
         (("--model", "inovert-ibd"), "did you mean innovert-ibd"),
@@ -188,11 +191,12 @@ def test_a_port_that_is_not_there_is_one_sentence(run: Run) -> None:
 def test_every_finding_is_a_sentence() -> None:
     found = Found(5, USUAL, Framing.RTU, ("yd1000", "delixi-modbus"), 0.0051, "1 of 9 replies were damaged")
     assert sentence(found) == (
-        "address 5: yd1000 or delixi-modbus at 9600 8N1 rtu, 5.1 ms to answer (1 of 9 replies were damaged)"
+        "address 5: yd1000 or delixi-modbus at 9600 8N1 rtu, response delay 5.1 ms "
+        "(1 of 9 replies were damaged)"
     )
-    assert "several drives seem to have this address" in sentence(Crowd(5, USUAL, Framing.RTU))
+    assert "several drives may have this address" in sentence(Crowd(5, USUAL, Framing.RTU))
     whole = Crowd(5, USUAL, Framing.RTU, "reply from another address (received 63 03 02 00 00)")
-    assert sentence(whole).endswith("no reply to what was asked: " + whole.reply)
+    assert sentence(whole).endswith("do not match the request: " + whole.reply)
     assert "at 30 of 31 addresses" in sentence(Noise(USUAL, Framing.RTU, 30, 31))
     assert sentence(Untried(USUAL, Framing.RTU, "no parity")) == "not asked at 9600 8N1 rtu: no parity"
 

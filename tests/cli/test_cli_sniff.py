@@ -208,7 +208,7 @@ def test_a_url_s_port_has_no_write() -> None:
     far = ResponderLine(b"")
     with closing(Listener(far.url, Settings(9600, "8N1"))) as listener:
         port = listener._source
-        with pytest.raises(OSError, match="only listened to: 01 is not sent"):
+        with pytest.raises(OSError, match="only listens: 01 was not sent"):
             port.write(b"\x01")
     assert far.close() == b""
 
@@ -428,8 +428,8 @@ def test_mistaken_calls_are_told_in_a_sentence(
     cut = tmp_path / "cut.pcapng"
     cut.write_bytes(capture.read_bytes()[:-5])
     for words, status, sentence in (
-        (["sniff"], 2, "name a PORT to listen to, or a capture with --replay FILE, and not both"),
-        (["sniff", "--replay", capture, "--out", "a.csv"], 2, "a.csv: a capture's name ends in .pcapng"),
+        (["sniff"], 2, "name either a PORT to listen to, or a capture with --replay FILE"),
+        (["sniff", "--replay", capture, "--out", "a.csv"], 2, "a.csv: a capture's name must end in .pcapng"),
         (["decode", none], 2, f"{none}: No such file or directory"),
         (["decode", text], 2, f"{text} is not a capture: it does not begin like pcap or pcapng"),
         (["decode", pipe], 2, f"{pipe} is not a capture: it is no file"),
@@ -439,7 +439,7 @@ def test_mistaken_calls_are_told_in_a_sentence(
             2,
             f"{capture} is there already: name another file, or remove it first",
         ),
-        (["decode", cut], 0, f"{cut} is cut: its last 103 bytes are no whole packet, and were left out"),
+        (["decode", cut], 0, f"{cut} ends within a packet: its last 103 bytes were skipped"),
     ):
         found, _, err = run(*words)
         assert (found, err) == (status, f"multidrop: {sentence}\n")

@@ -50,7 +50,7 @@ def test_what_is_lost_while_nobody_reads_is_counted(monkeypatch: pytest.MonkeyPa
         told = [reader.readline().strip()]
         told += [reader.readline().strip() for _ in range(4)]
         handler.close()
-    lost = "5 later lines of the log are lost: nobody read it in time"
+    lost = "5 later lines of the log are lost: its reader was too slow"
     assert told == ["first", lost, "line 0", "line 1", "line 2"]
 
 

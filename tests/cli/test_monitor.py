@@ -158,15 +158,15 @@ def test_flags_of_which_none_is_set_are_no_state(tmp_path: Path) -> None:
 
 
 def test_rates_are_those_of_the_last_seconds(watched: LivePlant) -> None:
-    lately = watched.lately["hall-1"]
-    assert lately.exchanges_per_second == pytest.approx(50)
-    assert lately.utilisation == pytest.approx(0.9)
-    assert lately.misses == {}
+    recent = watched.recent["hall-1"]
+    assert recent.exchanges_per_second == pytest.approx(50)
+    assert recent.utilisation == pytest.approx(0.9)
+    assert recent.misses == {}
     assert watched.so_far["hall-1"].misses == {"no reply": 3, "bad checksum": 9}
     for second in range(2, 12):
         watched.tick(100.0 + second, told(10 + second, 1050, 0.0))
-    assert watched.lately["hall-1"].exchanges == 0
-    assert watched.drives[0].lately.exchanges == 0
+    assert watched.recent["hall-1"].exchanges == 0
+    assert watched.drives[0].recent.exchanges == 0
 
 
 def test_history_has_a_gap_where_a_value_was_missed(watched: LivePlant) -> None:
@@ -197,7 +197,7 @@ def test_the_overview_says_it_in_words(watched: LivePlant) -> None:
     assert lines[3].split() == [">drive-1", "forward", "42.50", "Hz", "2.5", "A", "0.5", "s", "12", "██"]
     assert lines[4].startswith("!drive-2 ?fault")
     assert lines[4].split()[2:5] == ["?0.00", "Hz", "?oc1_overcu~"]
-    assert lines[-2] == " ? is old"
+    assert lines[-2] == " ? old value"
     assert lines[5].split()[:5] == ["drive-3", "silent", "no", "reply", "never"]
     assert lines[-1].startswith(" up/down choose")
     assert "start" not in " ".join(lines).lower()
@@ -512,7 +512,7 @@ def test_a_failure_stays_until_it_is_acknowledged(tmp_path: Path, monkeypatch: p
     failure = "drive-2: failed after 0.2 s: no reply"
     assert failure in seen(monitor)
     assert "1 of 2 drives stopped" in seen(monitor)
-    assert "a acknowledges what FAILED" in seen(monitor)
+    assert "a acknowledge FAILURES" in seen(monitor)
     stopped = {"drive-2": Stopped("drive-2", Seen.STOPPED, 0.1)}
     poller.stop_all = lambda: stopped  # type: ignore[method-assign]
     for key in ("x", DOWN, "S", "y", ENTER, "s", "n", ENTER):  # also on a drive's page, and after a success
@@ -542,7 +542,7 @@ def test_what_had_no_room_is_shown_once_the_first_are_acknowledged(watched: Live
     for more in (24, 17, 10, 3, 0):
         lines = texts(overview(watched, at, (80, 24), NOW, BLOCKS))
         told = [line.strip(" !") for line in lines if line.startswith(" ! drive-")]
-        assert any(f"... and {more} more, after these" in line for line in lines) == bool(more)
+        assert any(f"... and {more} more; acknowledge these" in line for line in lines) == bool(more)
         shown += told
         del at.failures[: at.failures_shown]
     assert shown == [f"drive-{number}: no reply" for number in range(31)]
@@ -598,7 +598,7 @@ def test_leaving_under_a_stop_needs_a_yes_and_waits_for_it(
     monitor._session = monitor._session._replace(hand_out=stands.set)  # what is polled meanwhile is recorded
     assert monitor.await_stops() == []
     assert not any(thread.is_alive() for thread in monitor._stops)
-    assert "a stop is under way, and is waited for" in capsys.readouterr().err
+    assert "waiting for a stop in progress" in capsys.readouterr().err
     assert monitor.await_stops() == []
     assert capsys.readouterr().err == ""
 
@@ -754,7 +754,7 @@ def test_where_the_cursor_cannot_go_back_it_scrolls(plant: Path) -> None:
 @pytest.mark.long
 def test_a_terminal_that_is_too_small_is_one_sentence(plant: Path) -> None:
     with on_terminal("monitor", plant, size=(40, 10)) as terminal:
-        terminal.wait_for("too small: it has 40 x 10")
+        terminal.wait_for("the terminal has 40 x 10")
         assert terminal.process.wait(timeout=60) == 2
 
 

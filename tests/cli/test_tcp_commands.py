@@ -54,7 +54,7 @@ def test_a_pseudo_terminal_needs_a_place(tmp_path: Path, run: Run) -> None:
     plant.write_text(PLANT.format(port="/dev/ttyUSB0"))
     assert run("simulate", plant)[::2] == (
         2,
-        "multidrop: line net gets a pseudo-terminal: name a directory for it with --ports DIR\n",
+        "multidrop: line net needs a pseudo-terminal: add --ports DIR\n",
     )
 
 

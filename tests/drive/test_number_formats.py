@@ -160,9 +160,7 @@ def test_a_half_float_is_shown_as_short_as_it_reads_back(capsys: pytest.CaptureF
     assert Meter.f16.format(nearest_value(Meter.f16, 12.1)) == "12.1 V"
     assert capsys.readouterr().err == ""
     assert nearest_value(Meter.f16, 2049.0) == 2048
-    assert capsys.readouterr().err == (
-        "multidrop: f16 holds half-precision numbers: 2049.0 is taken as 2048 V\n"
-    )
+    assert capsys.readouterr().err == ("multidrop: f16 holds half-precision numbers: 2049.0 becomes 2048 V\n")
     with pytest.raises(ValueError, match=r"f16 = 65520 does not fit: -65504 to 65504 V"):
         Meter.f16.encode(65520)
 
@@ -196,7 +194,7 @@ def test_what_the_command_line_takes_and_tells(capsys: pytest.CaptureFixture[str
     assert capsys.readouterr().err == ""  # shown as it was typed
     assert nearest_value(Meter.f32, 16_777_217.0) == 16_777_216
     assert capsys.readouterr().err == (
-        "multidrop: f32 holds single-precision numbers: 16777217.0 is taken as 16777216 V\n"
+        "multidrop: f32 holds single-precision numbers: 16777217.0 becomes 16777216 V\n"
     )
     assert as_json(Meter.f32, 12.5) == {"value": 12.5, "unit": "V"}
     assert as_json(Meter.unscaled, 12.5) == {"value": None, "raw": 12.5}

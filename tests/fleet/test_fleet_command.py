@@ -191,7 +191,7 @@ def test_no_name_keeps_a_stop_back(run: Run, nobody: str) -> None:
 def test_no_unknown_option_keeps_a_stop_back(run: Run, nobody: str, action: str) -> None:
     status, _, said = run("fleet", action, "pump-1", "--lnie=hall", "--nats", nobody)
     assert status != 0
-    assert said.startswith(f"multidrop: left out, for {action} knows no such option: --lnie=hall\n")
+    assert said.startswith(f"multidrop: {action}: ignored unknown options: --lnie=hall\n")
     assert "no NATS server answers" in said
 
 

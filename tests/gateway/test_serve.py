@@ -222,11 +222,11 @@ def test_a_new_token_is_shown_once(run: Run) -> None:
     ("words", "sentence"),
     [
         ((), "name a plant file, or try `multidrop serve --demo`"),
-        (("--demo", "plant.toml"), "--demo has a plant of its own: leave the plant file out"),
-        (("--demo", "--port", "hall=x"), "--demo has a plant of its own: leave --port out"),
+        (("--demo", "plant.toml"), "--demo has its own plant: remove the plant file"),
+        (("--demo", "--port", "hall=x"), "--demo has its own plant: remove --port"),
         (
             ("--new-token", "stop"),
-            "a new token needs a role and a name: multidrop serve --new-token stop --for anna",
+            "a new token needs a role and an owner: multidrop serve --new-token stop --for anna",
         ),
         (
             ("--new-token", "stop", "--for", "a b"),
@@ -243,9 +243,9 @@ def test_a_demo_for_browsers_leaves_nothing_out_without_a_word(
 ) -> None:
     monkeypatch.setattr(serve_command, "serve_demo", lambda **_: 0)
     assert run("demo", "--web") == (0, "", "")
-    why = "multidrop: --web serves until Ctrl-C and records nothing: leave"
-    assert run("demo", "--web", "--out", "run.csv") == (2, "", f"{why} --out out\n")
-    assert run("demo", "--web", "--seconds", 3, "--json") == (2, "", f"{why} --seconds and --json out\n")
+    why = "multidrop: --web serves until Ctrl-C and records nothing: remove"
+    assert run("demo", "--web", "--out", "run.csv") == (2, "", f"{why} --out\n")
+    assert run("demo", "--web", "--seconds", 3, "--json") == (2, "", f"{why} --seconds and --json\n")
 
 
 @pytest.mark.long

@@ -809,7 +809,7 @@ def test_plot_and_report_need_nothing_but_the_file(run: Run, ramp: Path, tmp_pat
         (("--drive", "punp"), "the recording has no drive 'punp'; it has pump, fan"),
         (("--register", "speed"), "the recording has no register 'speed'; it has output_frequency, "),
         (("--drive", "fan", "--register", "fault"), "has no register 'fault'; it has output_current"),
-        (("--out", "picture.jpg"), "picture.jpg: a plot's name ends in .png or .html"),
+        (("--out", "picture.jpg"), "picture.jpg: a plot's name must end in .png or .html"),
     ],
 )
 def test_mistakes_are_one_sentence(
@@ -825,8 +825,8 @@ def test_mistakes_are_one_sentence(
 @pytest.mark.parametrize("command", ["plot", "report", "convert"])
 def test_a_folder_of_a_history_is_told_as_one(run: Run, tmp_path: Path, command: str) -> None:
     out = () if command != "convert" else (tmp_path / "all.csv",)
-    folder = f"multidrop: {tmp_path} is the folder of a history: name one of its segments, such as"
-    by_program = "or read all of them from Python by `multidrop.History`\n"
+    folder = f"multidrop: {tmp_path} is the folder of a history: name one of its files, such as"
+    by_program = "or read it from Python with `multidrop.History`\n"
     (tmp_path / "rows").mkdir()
     for name in ("rows.00000003.arrows", "rows/00000001.parquet", "rows/00000002.parquet"):
         (tmp_path / name).touch()

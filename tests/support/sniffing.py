@@ -40,8 +40,8 @@ class Sniffer:
 PATIENT = """
 import sys
 from multidrop.cli import main
-from multidrop.cli.sniff import command
-command._SILENT_S = command._GIVEN_UP_S = float("inf")
+from multidrop.cli import sniff
+sniff._SILENT_S = sniff._GIVEN_UP_S = float("inf")
 sys.exit(main())
 """
 

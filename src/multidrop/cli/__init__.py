@@ -19,41 +19,45 @@ from typing import Any, NoReturn
 from multidrop.errors import BusError, Unsupported, WriteForbidden
 
 DONE, FAILED, MISTAKE, INTERRUPTED = 0, 1, 2, 130
-STOPS = ("stop", "coast", "emergency-stop")  # neither a mistake beside their drive nor SIGHUP keeps one back
-HARD_WIRED = "use the hard-wired stop"  # advice when a stop could not be sent
+STOPS = (
+    "stop",
+    "coast",
+    "emergency-stop",
+)  # sent despite SIGHUP, and despite mistakes beside the drive's name
+HARD_WIRED = "use the hard-wired stop"  # advice if a stop could not be sent
 _MISNAMED = (FileNotFoundError, IsADirectoryError, NotADirectoryError)
 
 COMMANDS = {  # name: module in this package, and help
     "demo": ("demo", "poll simulated drives of every family on one line"),
     "models": ("models", "list the families, or one family's registers"),
-    "check": ("check", "check a family's file, or a plant file; opens no port"),
-    "import": ("import_family", "make a family's file of another program's register table"),
+    "check": ("check", "check a family file or a plant file; opens no port"),
+    "import": ("import_family", "convert another program's register table into a family file"),
     "read": ("read", "read values from a drive"),
     "write": ("write", "write one register of a drive"),
-    "state": ("verbs", "say whether a drive runs, which way, and its fault"),
+    "state": ("verbs", "show whether a drive runs, its direction and its fault"),
     "start": ("verbs", "start a drive's motor"),
     "stop": ("verbs", "stop a drive's motor along its deceleration ramp"),
-    "coast": ("verbs", "take the voltage off a motor and let it run out"),
+    "coast": ("verbs", "switch a motor's voltage off and let it run out"),
     "emergency-stop": ("verbs", "stop a motor by the drive's own emergency stop"),
-    "jog": ("verbs", "turn a drive's motor slowly until it is stopped"),
+    "jog": ("verbs", "run a drive's motor slowly until it is stopped"),
     "reset-fault": ("verbs", "reset a drive's fault; never starts the motor"),
     "set-frequency": ("verbs", "write a drive's frequency setpoint"),
-    "release-control": ("verbs", "give a motor at rest back to its panel and terminals"),
+    "release-control": ("verbs", "return control of a stopped motor to its panel and terminals"),
     "scan": ("scan", "find the drives on a line, by reading only"),
-    "plan": ("plan", "predict what a plant file's lines will reach; opens no port"),
-    "wear": ("wear", "list what was written to EEPROMs, and what is left"),
+    "plan": ("plan", "predict the load of a plant file's lines; opens no port"),
+    "wear": ("wear", "list the writes to EEPROMs, and how many are left"),
     "poll": ("poll", "poll the drives of a plant file, and record them"),
-    "doctor": ("doctor", "say what is amiss with a port and its adapter"),
+    "doctor": ("doctor", "examine a port and its adapter, and advise"),
     "serve": ("serve", "poll a plant for browsers and other programs"),
-    "fleet": ("fleet", "share the lines of a plant out to several gateways, by NATS"),
-    "hub": ("hub", "keep a fleet's samples in Parquet files or in PostgreSQL"),
+    "fleet": ("fleet", "share a plant's lines among several gateways, by NATS"),
+    "hub": ("hub", "store a fleet's samples in Parquet files or in PostgreSQL"),
     "monitor": ("monitor", "show the drives of a plant file live on a terminal"),
-    "simulate": ("simulate", "play the drives of a plant file on pseudo-terminals"),
-    "sniff": ("sniff", "listen to a line that someone else masters"),
-    "decode": ("decode", "turn a capture into a recording or into text"),
-    "plot": ("plot", "draw a recording's values into a picture"),
-    "report": ("report", "write one page of all that a recording tells"),
-    "convert": ("convert", "turn one recording into another format"),
+    "simulate": ("simulate", "simulate the drives of a plant file on pseudo-terminals"),
+    "sniff": ("sniff", "listen to a line that another master polls"),
+    "decode": ("decode", "convert a capture into a recording or text"),
+    "plot": ("plot", "plot a recording's values"),
+    "report": ("report", "summarise a recording on one HTML page"),
+    "convert": ("convert", "convert a recording to another format"),
 }
 
 
@@ -67,10 +71,10 @@ Poll every drive on an RS-485 line as fast as the wire allows.
 
 {_listed(COMMANDS)}
 
-`multidrop COMMAND --help` says what a command takes, `multidrop --version`
-which version this is. With --json most commands print for programs.
-Exit status: 0 done; 1 the line or a drive failed, or a rule forbade it;
-2 mistaken call; 130 interrupted.
+`multidrop COMMAND --help` lists a command's arguments, `multidrop --version`
+prints the version. With --json most commands print JSON for programs.
+Exit status: 0 done; 1 the line or a drive failed, or a rule forbids it;
+2 invalid arguments; 130 interrupted.
 """
 
 
@@ -81,7 +85,7 @@ def _help_of(prog: str, text: str, actions: Mapping[str, tuple[str, str]]) -> st
 
 {_listed(actions)}
 
-`{prog} ACTION --help` says what it takes.
+`{prog} ACTION --help` lists its arguments.
 """
 
 
@@ -108,7 +112,7 @@ def _run_interruptible(words: list[str]) -> int:
 def _replace_closed_streams() -> None:
     """Open the null device for each standard stream that the caller has closed.
 
-    Else a serial port might be opened in its place, and what is printed would go to the line.
+    Otherwise a serial port could get its descriptor, and printed text would go to the line.
     """
     for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
         if getattr(sys, name) is None:
@@ -116,7 +120,7 @@ def _replace_closed_streams() -> None:
 
 
 def _describe_itself(words: list[str]) -> int:
-    """Print the version or the help, which is also the answer to no words at all."""
+    """Print the version, or the help if there are no words."""
     if words[:1] == ["--version"]:
         from importlib.metadata import version
 
@@ -127,11 +131,11 @@ def _describe_itself(words: list[str]) -> int:
 
 
 def _guarded(run: Callable[[], int]) -> int:
-    """Run a command; print every foreseeable failure as a sentence on stderr."""
+    """Run a command; print each expected failure as a sentence on stderr."""
     try:
         status = run()
         sys.stdout.flush()
-    except KeyboardInterrupt as interruption:  # its notes say what was sent
+    except KeyboardInterrupt as interruption:  # its notes list the requests that were sent
         with suppress(KeyboardInterrupt):  # a second one at once
             return _fail("\n".join(["interrupted", *getattr(interruption, "__notes__", ())]), INTERRUPTED)
         return INTERRUPTED
@@ -141,7 +145,7 @@ def _guarded(run: Callable[[], int]) -> int:
     except (ValueError, TypeError, Unsupported) as mistake:
         return _fail(str(mistake), MISTAKE)
     except OSError as failure:
-        if failure.strerror is None:  # one of multidrop's own
+        if failure.strerror is None:  # raised by multidrop
             return _fail(str(failure), FAILED)
         _abandon_output()
         where = f"{failure.filename}: " if failure.filename else ""
@@ -149,7 +153,7 @@ def _guarded(run: Callable[[], int]) -> int:
     except BusError as failure:
         return _fail(str(failure), FAILED)
     except ImportError as missing:
-        if missing.name != "nanoarrow":  # which some machines go without
+        if missing.name != "nanoarrow":  # optional on some machines
             raise
         return _fail(str(missing), MISTAKE)
     return status
@@ -187,7 +191,7 @@ def _run(command: str, words: list[str]) -> int:
             raise ValueError(f"the {command} was NOT sent: {mistake}") from None
         raise
     if left_out:
-        _fail(f"left out, for {command} knows no such option: {' '.join(left_out)}", MISTAKE)
+        _fail(f"{command}: ignored unknown options: {' '.join(left_out)}", MISTAKE)
     try:
         return int(module.run(arguments)) or (MISTAKE if left_out else DONE)
     except WriteForbidden as refusal:
@@ -198,7 +202,7 @@ def _run(command: str, words: list[str]) -> int:
 
 
 class _Parser(argparse.ArgumentParser):
-    """Raise ValueError for mistaken arguments, as for every other mistake of the caller."""
+    """Raises ValueError for invalid arguments, as for every other mistake of the caller."""
 
     def error(self, message: str) -> NoReturn:
         raise ValueError(f"{message}; see `{self.prog} --help`")
@@ -207,11 +211,11 @@ class _Parser(argparse.ArgumentParser):
 def _parsed(
     parser: argparse.ArgumentParser, words: list[str], command: str
 ) -> tuple[argparse.Namespace, list[str]]:
-    """Return what the words say, and what a stop leaves out. Raises ValueError for a mistake.
+    """Return the parsed arguments, and the words that a stop ignores. Raises ValueError for a mistake.
 
-    An unknown option takes the word behind it along, which may be its value and must name no drive.
+    A stop ignores the word behind an unknown option too: it may be the option's value, so it names no drive.
     """
-    arguments, unknown = parser.parse_known_intermixed_args(words)  # an option between positionals too
+    arguments, unknown = parser.parse_known_intermixed_args(words)  # options may come between positionals
     if not unknown:
         return arguments, []
     if command not in STOPS:
@@ -234,6 +238,6 @@ def _fail(sentences: str, status: int) -> int:
 
 
 def _abandon_output() -> None:
-    """Point stdout at /dev/null: else the interpreter fails to flush it at exit."""
+    """Redirect stdout to /dev/null: otherwise the interpreter fails to flush it at exit."""
     with suppress(OSError, ValueError):
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

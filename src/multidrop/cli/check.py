@@ -1,6 +1,6 @@
-"""The `check` command: prints what a family's file says, what it leaves open, and what will be refused.
+"""`multidrop check`: prints a family file's contents, its gaps, and the requests that will be refused.
 
-It checks a plant file too, but for its table `[serve]`: `multidrop serve --check` does that.
+It checks a plant file too, except its table `[serve]`: `multidrop serve --check` does that.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "file",
         metavar="FILE.toml",
         type=Path,
-        help="a family's file, a shipped family's name, or a plant file",
+        help="a family file, the name of a shipped family, or a plant file",
     )
     add_json_argument(parser)
 
@@ -69,7 +69,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _is_plant(file: Path) -> bool:
-    """Return True for a file with lines. One that cannot be read is none: loading it as a family says why."""
+    """Return True for a file with lines. If it cannot be read, loading it as a family reports why."""
     try:
         return "line" in read_document(file, "file")
     except ValueError:
@@ -102,7 +102,7 @@ def _family(file: Path) -> type[Drive]:
     """Return the family of a file, or a shipped one by its name. Raises ValueError for any other."""
     name = str(file)
     if name in MODELS:
-        raise ValueError(f"{name} is built in, and no file declares it; see `multidrop models {name}`")
+        raise ValueError(f"{name} is built in and has no file; see `multidrop models {name}`")
     is_name = not file.suffix and not file.exists()
     return find_model(name) if is_name else load_family(file)
 
@@ -119,21 +119,24 @@ def _verdict(family: type[Drive], file: Path) -> str:
     if "confirmed" not in family.options:
         return f"No mistake found in {file}. Compare the addresses, as they are sent, with the manual."
     return (
-        f"No mistake found in {file}. It can move a motor, and nobody has tested it: compare every line with "
-        "the manual, and only then give its drives confirmed = 1 in the plant file, or --option confirmed=1."
+        f"No mistake found in {file}. It can move a motor and is untested: compare every line with the "
+        "manual, and only then give its drives confirmed = 1 in the plant file, or --option confirmed=1."
     )
+
+
+# ---- remarks ----
 
 
 Remark = tuple[str, str]  # a register or a key, and the sentence about it
 
 _OF_A_MOTOR = {
-    "remote": "what to set on the keypad so that the line commands it",
-    "watchdog": "whether the motor stops when nobody asks any more; it is taken to run on",
+    "remote": "the keypad settings that let the line command the motor",
+    "watchdog": "whether the motor stops when polling stops; assumed to run on",
 }
 
 
 def unknown(family: type[Drive]) -> Iterator[Remark]:
-    """Yield what the file leaves open, with the key that would say it."""
+    """Yield the facts that the file does not state, with the key for each."""
     drive = family(family.addresses[0])
     registers = family.registers.values()
     for register in registers:
@@ -142,9 +145,9 @@ def unknown(family: type[Drive]) -> Iterator[Remark]:
     if placeless:
         yield "place", f"the manual's place of {_some(placeless)}"
     if family.identify is Drive.identify:
-        yield "identify", "how to tell this device from another; look at its name plate"
+        yield "identify", "how to recognise this device; read its name plate"
     if not family.most_registers:
-        yield "together", "how many neighbours one request may read; together = { holding = 20 }"
+        yield "together", "how many neighbouring registers one request may read; together = { holding = 20 }"
     if "confirmed" in family.options:
         for key in ("remote", "watchdog"):
             if getattr(family, key) == getattr(Drive, key):
@@ -153,25 +156,24 @@ def unknown(family: type[Drive]) -> Iterator[Remark]:
 
 def _unknown_of(drive: Drive, register: Register[Any]) -> Iterator[str]:
     if wears(drive, register) is Kept.UNKNOWN and register.writable:
-        where = 'each write is counted as wear; kept = "ram" or "eeprom"'
-        yield f"whether it is kept in EEPROM: {where}"
+        yield 'whether it is stored in EEPROM: each write counts as wear; kept = "ram" or "eeprom"'
     if register.step is None:
-        yield "the value of one count: its counts are shown as they are"
+        yield "its scale: raw counts are shown"
     if register.access is Access.SETTING and register.values is None and register.span is None:
-        yield "its span: all that fits is written; span = [0, 50]"
+        yield "its span: every value that fits is written; span = [0, 50]"
     if register.access is not Access.READING and not register.place:
-        yield 'its place in the manual, to be compared; place = "table 3"'
+        yield 'its place in the manual, for comparison; place = "table 3"'
 
 
 def crowded(plant: Plant) -> Iterator[Remark]:
-    """Yield each line with more drives than one of their documents allows there."""
+    """Yield each line with more drives than one of their manuals allows."""
     for line in plant.lines:
         stated = [polled.drive for polled in line.drives if polled.drive.most_devices]
         strictest = min(stated, key=lambda drive: drive.most_devices, default=None)
         if strictest is not None and len(line.drives) > strictest.most_devices:
             kind, most = strictest.title or type(strictest).__name__, strictest.most_devices
             has = f"it has {len(line.drives)} drives"
-            yield f"line {line.name}", f"{has}, and the manual of {kind} allows {most} devices: split it"
+            yield f"line {line.name}", f"{has}; the manual of {kind} allows {most} devices: split the line"
 
 
 def _some(names: list[str]) -> str:
@@ -181,19 +183,19 @@ def _some(names: list[str]) -> str:
 
 
 def refused(family: type[Drive]) -> Iterator[Remark]:
-    """Yield what is not sent to a drive of this family, and why."""
+    """Yield the requests that are not sent to a drive of this family, and why."""
     drive = family(family.addresses[0])
     for register in family.registers.values():
         if register.access is not Access.READING:
             yield from ((register.name, sentence) for sentence in _refused_of(drive, register))
     moving = [name for name in MOVING if getattr(family, name) is not getattr(Drive, name)]
     if "confirmed" in family.options:
-        writes = "every write that is not called harmless" if moving else "every write"
+        writes = "every write that is not declared harmless" if moving else "every write"
         yield "confirmed", f"{', '.join([*moving, writes])}, until the drive has confirmed = 1"
     if not moving:
-        yield "verbs", "start, stop and the like: it has none"
+        yield "verbs", "start, stop and the others: the family has none"
     if not family.broadcasts:
-        yield "broadcast", "all: no register has counts that are documented for it"
+        yield "broadcast", "all: no register has counts documented for broadcasts"
 
 
 def _refused_of(drive: Drive, register: Register[Any]) -> Iterator[str]:
@@ -204,15 +206,14 @@ def _refused_of(drive: Drive, register: Register[Any]) -> Iterator[str]:
         yield f"every write: a {register.table.name} cannot be written"
     elif register.commands:
         harmless = ", ".join(f"{raw:04X}H" for raw in register.harmless or ())
-        yield f"every write but by verbs, and of {harmless}" if harmless else "every write but by verbs"
+        yield f"every write except by verbs, and of {harmless}" if harmless else "every write except by verbs"
     if register.while_running is False:
-        stands = "while the motor does not stand"
-        unsure = type(drive).state is Drive.state
-        yield (
-            "every write: nothing says whether the motor stands ([state])" if unsure else f"a write {stands}"
-        )
+        if type(drive).state is Drive.state:
+            yield "every write: it is unknown whether the motor has stopped ([state])"
+        else:
+            yield "a write unless the motor has stopped"
     kept = wears(drive, register)
     if register.writable and kept is Kept.EEPROM:
-        yield f"more than one write in {LEAST_INTERVAL:.0f} s, and than {BUDGET} a year: it is in EEPROM"
+        yield f"more than one write in {LEAST_INTERVAL:.0f} s, or {BUDGET} a year: it is stored in EEPROM"
     elif register.writable and kept is Kept.UNKNOWN:
-        yield f"more than {BUDGET} writes a year: it may be in EEPROM"
+        yield f"more than {BUDGET} writes a year: it may be stored in EEPROM"

@@ -12,7 +12,7 @@ from multidrop.recording import FORMATS, convert, open_recording
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("source", metavar="RECORDING", type=Path, help="its end may be missing")
+    parser.add_argument("source", metavar="RECORDING", type=Path, help="a recording; its end may be missing")
     parser.add_argument("target", metavar="FILE", type=Path, help=f"a new file: {', '.join(FORMATS)}")
 
 

@@ -1,4 +1,4 @@
-"""`multidrop decode`: turns a capture into a recording, or into text."""
+"""`multidrop decode`: converts a capture into a recording or text."""
 
 from __future__ import annotations
 
@@ -42,8 +42,8 @@ def run(arguments: argparse.Namespace) -> int:
             counts = dict(replay(capture, plant, as_json=arguments.json))
         if capture.truncated:
             warn(
-                f"{capture.path} is cut: its last {capture.truncated} bytes are no whole packet, "
-                "and were left out"
+                f"{capture.path} ends within a packet: "
+                f"its last {counted(capture.truncated, 'byte')} were skipped"
             )
     into = f"{counted(counts['rows'], 'row')} in {arguments.out}: " if arguments.out else ""
     print_text(json.dumps({"summary": counts}) if arguments.json else into + summary(counts))

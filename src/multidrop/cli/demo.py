@@ -44,7 +44,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _check_web(arguments: argparse.Namespace) -> None:
-    """Raise ValueError for what --web, which serves until Ctrl-C and records nothing, would leave out."""
+    """Raise ValueError for options that --web ignores: it serves until Ctrl-C and records nothing."""
     given = {
         "--seconds": arguments.seconds != SECONDS,
         "--out": str(arguments.out) != OUT,
@@ -53,19 +53,19 @@ def _check_web(arguments: argparse.Namespace) -> None:
         "--json": arguments.json,
     }
     if names := [name for name, is_given in given.items() if is_given]:
-        raise ValueError(f"--web serves until Ctrl-C and records nothing: leave {' and '.join(names)} out")
+        raise ValueError(f"--web serves until Ctrl-C and records nothing: remove {' and '.join(names)}")
 
 
 def _make_room(out: Path) -> None:
-    """Remove an earlier demo's recording, and nothing else. Raises ValueError for any other file."""
-    with suppress(ValueError, TypeError, OSError):  # no file, or no recording
+    """Remove an earlier demo's recording. Raises ValueError for any other file."""
+    with suppress(ValueError, TypeError, OSError):  # no file, or not a recording
         if set(open_recording(out).metadata.get("drives", ())) == {name for name, *_ in DRIVES}:
             out.unlink()
     refuse_overwriting(out)
 
 
 def _can_be_watched(arguments: argparse.Namespace) -> bool:
-    """Tell whether the monitor can show the demo: it writes no captures, and needs a terminal and rich."""
+    """Return whether the monitor can show the demo: it writes no captures, and needs a terminal and rich."""
     if arguments.capture or arguments.flight_recorder:
         return False
     return not arguments.json and is_possible() and find_spec("rich") is not None

@@ -1,4 +1,4 @@
-"""The `doctor` command: examines a port, and says what to change."""
+"""`multidrop doctor`: examines a port and its adapter, and advises what to change."""
 
 from __future__ import annotations
 
@@ -66,27 +66,23 @@ from multidrop.transport.peers import LEAST_TIMEOUT
 from multidrop.transport.port_identity import lasting_name
 from multidrop.transport.prepared import make_exchange
 
-NOBODY = 247  # the address of the request that looks for an echo
-SETTING_UP_COM = "while it has the port, multidrop makes it raw, and sets each drive's baud rate and format"
+NOBODY = 247  # an unused address: only an echo may answer it
+SETTING_UP_COM = "while the port is open, multidrop makes it raw and sets each drive's baud rate and format"
 SETTING_UP = (
-    "while it has the port, multidrop locks it against programs that heed such locks, makes it raw, sets "
+    "while the port is open, multidrop locks it against programs that respect such locks, makes it raw, sets "
     "each drive's baud rate and format, reads them back, and asks the driver for low latency"
 )
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_line_arguments(parser, name="NAME", kind="line or drive")
-    parser.add_argument("--model", help="of a drive that answers there: the round trip is measured with it")
+    parser.add_argument("--model", help="family of a drive to measure the round trip with")
     parser.add_argument("--address", type=whole, metavar="N", help="its address")
+    parser.add_argument("--baudrate", type=whole, metavar="N", help="default: the family's, or 9600")
     parser.add_argument(
-        "--baudrate", type=whole, metavar="N", help="of the line; the family's default if not given, or 9600"
+        "--format", metavar="8N1", help="data bits, parity and stop bits; default: the family's, or 8N1"
     )
-    parser.add_argument(
-        "--format",
-        metavar="8N1",
-        help="data bits, parity and stop bits; the family's default if not given, or 8N1",
-    )
-    parser.add_argument("--framing", metavar="rtu", help="of the drive; the family's first if not given")
+    parser.add_argument("--framing", metavar="rtu", help="default: the family's first")
     add_rs485_argument(parser)
     add_settle_argument(parser)
     add_json_argument(parser)
@@ -94,7 +90,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 @dataclass(frozen=True)
 class _Target:
-    """A port to examine, the drives to measure with, and the settings to look for an echo with."""
+    """A port to examine, the drives to measure with, and the settings of the echo test."""
 
     port: str
     drives: Sequence[Drive]
@@ -123,13 +119,13 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _of_plant(plant: Plant, arguments: argparse.Namespace) -> Iterator[_Target]:
-    """Yield the line that is named with all of its drives, or the drive that is named; without a name all.
+    """Yield the named line with all its drives, or the named drive, or every line without a name.
 
     Raises ValueError for options that belong to a port without a plant file.
     """
     for name in ("model", "address", "baudrate", "format", "framing"):
         if getattr(arguments, name) is not None:
-            raise ValueError(f"--{name} is a matter of the plant file: write it into {plant.path}")
+            raise ValueError(f"--{name} is not for plant files: set it in {plant.path}")
     for line in plant.lines:
         rs485, settle = rs485_at(arguments, line), settle_at(arguments, line)
         if arguments.name in (None, line.name):
@@ -149,7 +145,7 @@ def _by_hand(arguments: argparse.Namespace) -> _Target:
 
 
 def _examined(target: _Target, *, is_alone: bool) -> Iterator[Finding]:
-    """Yield the findings of a port. One of several that cannot be opened is a finding, and no error."""
+    """Yield the findings of a port. If there are several, one that cannot be opened is a finding too."""
     try:
         yield from _findings(target)
     except LineError as failure:
@@ -160,10 +156,10 @@ def _examined(target: _Target, *, is_alone: bool) -> Iterator[Finding]:
 
 def _drive(arguments: argparse.Namespace) -> Drive | None:
     if (arguments.model is None) != (arguments.address is None):
-        raise ValueError("--model and --address belong together: both name the drive to measure with")
+        raise ValueError("--model and --address belong together: give both for the drive to measure with")
     if arguments.model is None:
         if arguments.framing is not None:
-            raise ValueError("--framing is how a drive is asked: name the drive with --model and --address")
+            raise ValueError("--framing needs a drive: add --model and --address")
         return None
     return find_model(arguments.model)(
         arguments.address, framing=arguments.framing, baudrate=arguments.baudrate, format=arguments.format
@@ -171,7 +167,7 @@ def _drive(arguments: argparse.Namespace) -> Drive | None:
 
 
 def _line_settings(arguments: argparse.Namespace) -> Settings:
-    """Return the settings to look for an echo with, where no drive is named."""
+    """Return the settings of the echo test if no drive is named."""
     return Settings(
         9600 if arguments.baudrate is None else arguments.baudrate,
         "8N1" if arguments.format is None else arguments.format,
@@ -197,7 +193,7 @@ def _findings(target: _Target) -> Iterator[Finding]:
     block = first_block(target.drives[0]) if target.drives else None
     if block:
         yield other_way_finding(port, block.request, settings)
-    elif not speaks_tcp(port):  # a line without drives says nothing in the other way
+    elif not speaks_tcp(port):  # without drives, silence in the other framing proves nothing
         yield other_way_finding(port, nobody, settings)
 
 
@@ -212,10 +208,10 @@ def _remote(port: str) -> Iterator[Finding]:
     elif kind == "socket":
         yield Finding("port", f"{port} is a TCP connection; small packets are sent at once (TCP_NODELAY)")
     else:
-        yield Finding("port", f"{port} is a pyserial {kind} port, whose bytes two threads copy")
+        yield Finding("port", f"{port} is a pyserial {kind} port; two threads copy its bytes")
     yield Finding(
         "adapter",
-        "it is at the far end: its driver, latency timer and RS-485 mode cannot be seen from here",
+        "at the far end: its driver, latency timer and RS-485 mode are not visible from here",
         "set baud rate, format and the shortest packing delay in the serial server or gateway itself",
     )
 
@@ -229,13 +225,13 @@ def _local(port: str, rs485: RS485) -> Iterator[Finding]:
 
 
 def _opened_com(port: str) -> Iterator[Finding]:
-    """Report what Windows tells of a COM port that multidrop has open."""
+    """Report the facts that Windows has about an open COM port."""
     yield Finding("port", f"{port} is a serial port")
     yield Finding("set here", SETTING_UP_COM)
-    yield Finding("adapter", com_description(port) or "the system lists none for it")
+    yield Finding("adapter", com_description(port) or "the system lists none")
     yield Finding(
         "latency timer",
-        "it cannot be read here: an FTDI adapter may hold every reply back for 16 ms",
+        "not readable on Windows; an FTDI adapter may delay every reply by 16 ms",
         "set it to 1 ms in the device manager: Ports, the port's properties, Port Settings, Advanced",
     )
 
@@ -248,7 +244,7 @@ def _opened(port: str, rs485: RS485) -> Iterator[Finding]:
         yield Finding("port", f"{port} is a pseudo-terminal{link}: a program is at its other end")
         yield Finding("set here", SETTING_UP)
         yield Finding(
-            "adapter", "there is none, and so no driver, latency timer, RS-485 mode or low-latency flag"
+            "adapter", "none, and therefore no driver, latency timer, RS-485 mode or low-latency flag"
         )
         return
     yield Finding("port", f"{port} is a serial port{link}")
@@ -284,7 +280,7 @@ def _echo(port: str, rs485: RS485, settings: Settings) -> Finding:
     try:
         found = line.carry_out(probe)
     except LineError as failure:
-        return Finding("echo", f"not tried: {failure.reason}")
+        return Finding("echo", f"not tested: {failure.reason}")
     finally:
         line.close()
     return echo_finding(found, build_request(Framing.RTU, request), settings)
@@ -294,29 +290,31 @@ def _text(findings: list[Finding]) -> Iterator[str]:
     width = max(len(finding.topic) for finding in findings) + 2
     for finding in findings:
         yield from wrapped(finding.what, f"{finding.topic:<{width}}", " " * width)
-        if finding.advice:  # may hold a command to be copied
+        if finding.advice:  # may contain a command to copy
             indent = " " * width
             yield from wrapped(finding.advice, f"{indent}-> ", f"{indent}   ", breaks_words=False)
 
 
-UNANSWERED = 5  # requests to a drive that has answered none
-MOST_S = 5.0  # that all rounds take, where the drive is slow or silent
-LOOK_S = 0.05  # between attempts to send a request that was held back
+# ---- the round trip ----
+
+
+UNANSWERED = 5  # requests to a silent drive
+MOST_S = 5.0  # limit of all rounds, for slow and silent drives
+RETRY_S = 0.05  # pause before a delayed request is tried again
 OF_GATEWAYS = (0x0A, 0x0B)  # no path, and no response from the device (application protocol V1.1b3, 7)
 
 
 def measure(port: str, rs485: RS485, settle: float, drive: Drive | None) -> tuple[Finding, bool]:
-    """Return the finding, and True where the far end has answered anything in the port's framing."""
+    """Measure a drive's response delay; return the finding, and whether anything answered in this framing."""
     if drive is None:
         return Finding(
             "round trip",
-            "not measured: a drive must answer",
-            "name one with --model and --address, or one of a plant file; `multidrop scan` finds those "
-            "that are there",
+            "not measured: it needs a drive",
+            "name one with --model and --address, or a plant file; `multidrop scan` finds drives",
         ), False
     block = first_block(drive)
     if block is None:
-        return Finding("round trip", f"not measured: nothing of it can be read ({drive.name})"), False
+        return Finding("round trip", f"not measured: {drive.name} has no readable register"), False
     with Bus(port, rs485=rs485, settle=settle) as bus:
         bus.attach(drive)
         poll = make_exchange(drive, block.request, bus.peer(drive))
@@ -325,17 +323,17 @@ def measure(port: str, rs485: RS485, settle: float, drive: Drive | None) -> tupl
     sent = characters_on_wire(drive.framing, len(build_request(drive.framing, poll.request)))
     wire = (sent + 1) * drive.settings.character
     shows_bits = "://" not in port and not is_pseudo_terminal(str(Path(port).resolve()))
-    its_own = [done for done in completions if done.result > 0 and not _is_gateway_s(drive, done)]
+    its_own = [done for done in completions if done.result > 0 and not _is_from_gateway(drive, done)]
     seen = [(done.first_ns - done.sent_ns) / 1e9 for done in its_own]
     delays = sorted(max(0.0, delay - wire) if shows_bits else delay for delay in seen)
     refusals = [code for done in completions if (code := _exception(drive.framing, poll.request, done))]
     wire = 0.0 if shows_bits else wire
-    finding = round_trip_finding(drive, delays, len(completions), wire, refusals, _what_came(completions))
+    finding = round_trip_finding(drive, delays, len(completions), wire, refusals, _bad_bytes(completions))
     return finding, bool(delays or refusals)
 
 
-def _what_came(completions: Sequence[Completion]) -> str:
-    """Return the most frequent reason why bytes were no good reply, with an example; "" without one."""
+def _bad_bytes(completions: Sequence[Completion]) -> str:
+    """Return the most frequent reason for invalid replies, with an example; "" if there were none."""
     bad = [done for done in completions if done.result < 0 and done.raw and done.result != Failure.NO_REPLY]
     if not bad:
         return ""
@@ -345,25 +343,25 @@ def _what_came(completions: Sequence[Completion]) -> str:
 
 
 def _exception(framing: Framing, request: Message, done: Completion) -> int:
-    """Return the code of a reply that is an exception, also of a gateway's; else 0."""
+    """Return the exception code of a reply, the drive's or a gateway's; 0 if there is none."""
     if done.result > 0:
         return done.reply.exception
     if framing is not Framing.TCP:
         return 0
-    _, taken_for_silence = parse_reply(framing, done.raw, request)  # the core does so with a gateway's
-    return taken_for_silence.exception if taken_for_silence else 0
+    _, reply = parse_reply(framing, done.raw, request)  # the core counts a gateway's exception as silence
+    return reply.exception if reply else 0
 
 
-def _is_gateway_s(drive: Drive, done: Completion) -> bool:
-    """Return True for the exception that a gateway sends where it does not reach its device."""
+def _is_from_gateway(drive: Drive, done: Completion) -> bool:
+    """Return True for the exception that a gateway sends if it does not reach its device."""
     return done.reply.exception in OF_GATEWAYS and done.reply.exception not in drive.exceptions
 
 
 def _repeat(line: Line, poll: Exchange) -> Iterator[Completion]:
-    """Send ROUNDS requests, or those that fit into MOST_S, and return what became of each.
+    """Send up to ROUNDS requests within MOST_S; yield their outcomes.
 
-    A request that is held back, because an earlier answer may still come, does not count. A drive that is
-    silent from the start gets UNANSWERED requests.
+    A request that is delayed, because an earlier reply may still come, does not count. A drive that is silent
+    from the start gets UNANSWERED requests.
     """
     end = time.monotonic() + MOST_S
     count, is_silent = 0, True
@@ -374,14 +372,17 @@ def _repeat(line: Line, poll: Exchange) -> Iterator[Completion]:
             is_silent &= not found.raw
             yield found
         else:
-            time.sleep(LOOK_S)
+            time.sleep(RETRY_S)
 
 
-TIMEOUT = 2.0  # s: a gateway waits for its drives first
+# ---- the other framing ----
+
+
+TIMEOUT = 2.0  # s; a gateway waits for its drives first
 
 
 def ask_once(port: str, request: Message, settings: Settings) -> Completion:
-    """Send one read in the framing of this network port, and return its outcome. Raises LineError."""
+    """Send one read in this network port's framing; return its outcome. Raises LineError."""
     exchange = Exchange(
         Framing.TCP if speaks_tcp(port) else Framing.RTU,
         request,
@@ -405,32 +406,32 @@ def other_way_finding(port: str, request: Message, settings: Settings) -> Findin
     try:
         found = ask_once(other, request, settings)
     except LineError as failure:
-        return Finding("other way", f"{way} was not tried: {failure.reason}")
-    if found.result > 0 or mixed_up(port, found.raw):  # any other bytes prove nothing
+        return Finding("other framing", f"{way} was not tested: {failure.reason}")
+    if found.result > 0 or mixed_up(port, found.raw):  # other bytes are no proof
         return Finding(
-            "other way",
-            f"the far end speaks {way}, and not {spoken_on(port)}",
-            f"name the port {other} in place of {port}, or set the far end to {spoken_on(port)}",
+            "other framing",
+            f"the far end speaks {way}, not {spoken_on(port)}",
+            f"use the port {other} instead of {port}, or set the far end to {spoken_on(port)}",
             is_failure=True,
         )
-    return Finding("other way", f"{way} was tried too, and not answered either")
+    return Finding("other framing", f"{way} got no answer either")
 
 
 def unit_finding(port: str, request: Message, settings: Settings) -> Finding:
-    """Report what a port of Modbus TCP says of a unit that nobody should have."""
+    """Report how a Modbus TCP port answers for an unused unit id."""
     try:
         found = ask_once(port, request, settings)
     except LineError as failure:
-        return Finding("Modbus TCP", f"it is not spoken: {failure.reason}", is_failure=True)
-    asked = f"asked for unit {request.address}, which should be nobody's,"
+        return Finding("Modbus TCP", f"not spoken here: {failure.reason}", is_failure=True)
+    unit = f"unit {request.address}, which should be unused"
     if found.result > 0:
         reply = found.reply
-        how = f"with exception {reply.exception:02X}" if reply.exception else "with a value"
+        how = f"exception {reply.exception:02X}" if reply.exception else "a value"
         return Finding(
             "Modbus TCP",
-            f"{asked} it answers {how}",
-            "it may be a device that answers for every unit: then a wrong address goes unnoticed",
+            f"{unit}, answers with {how}",
+            "the device may answer for every unit: a wrong address then goes unnoticed",
         )
     if found.raw:
-        return Finding("Modbus TCP", f"{asked} the gateway says that it does not answer: as it should")
-    return Finding("Modbus TCP", f"{asked} it is silent: a gateway may be, and a far end of another kind is")
+        return Finding("Modbus TCP", f"the gateway reports no answer from {unit}: correct")
+    return Finding("Modbus TCP", f"{unit}, is silent: from a gateway or from a device without Modbus TCP")

@@ -1,4 +1,4 @@
-"""Findings about a port, its adapter and its line: a sentence each, with advice where it helps."""
+"""Findings about a port, its adapter and its line: a sentence each, with advice if there is any."""
 
 from __future__ import annotations
 
@@ -34,23 +34,23 @@ class Finding:
 
 
 def adapter_finding(adapter: Adapter, port: str, lasting: str) -> Finding:
-    """Say what it is; `lasting` is its name by the serial number, or the port's as it is."""
+    """Describe the adapter; `lasting` is its name by serial number, or the port's if there is none."""
     product = f"{adapter.product or 'a USB device'} ({adapter.usb_id})" if adapter.usb_id else "not on USB"
-    driver = f"its driver is {adapter.driver}" if adapter.driver else "the system names no driver for it"
-    advice = f"call it {lasting} in plant files: {port} is whichever adapter came first"
+    driver = f"driver {adapter.driver}" if adapter.driver else "driver unknown"
+    advice = f"name it {lasting} in plant files: {port} is assigned in the order of plugging in"
     return Finding("adapter", f"{product}; {driver}", advice if lasting != port else "")
 
 
 def latency_finding(adapter: Adapter) -> Finding:
     milliseconds = adapter.latency_timer
     if milliseconds is None:
-        return Finding("latency timer", "the driver has none that can be seen")
+        return Finding("latency timer", "the driver shows none")
     if milliseconds <= LATENCY_MS:
-        return Finding("latency timer", f"{milliseconds} ms: the shortest there is")
+        return Finding("latency timer", f"{milliseconds} ms: the shortest possible")
     return Finding(
         "latency timer",
-        f"{milliseconds} ms: every reply may wait for so long in the adapter",
-        f"echo {LATENCY_MS} | sudo tee {adapter.latency_path} (for good, a udev rule: "
+        f"{milliseconds} ms: every reply may wait that long in the adapter",
+        f"echo {LATENCY_MS} | sudo tee {adapter.latency_path} (permanently, by a udev rule: "
         f'ACTION=="add", SUBSYSTEM=="usb-serial", ATTR{{latency_timer}}="{LATENCY_MS}")',
     )
 
@@ -59,11 +59,11 @@ def low_latency_finding(low: bool | None) -> Finding:
     if low is None:
         return Finding("low latency", "the driver has no such flag")
     if low:
-        return Finding("low latency", "the flag is set: multidrop sets it whenever it opens the port")
+        return Finding("low latency", "the flag is set; multidrop sets it whenever it opens the port")
     return Finding(
         "low latency",
-        "the flag is not set: the driver did not take it from multidrop",
-        "perhaps root alone may set it: setserial PORT low_latency",
+        "the flag is not set: the driver did not accept it from multidrop",
+        "only root may be allowed to set it: setserial PORT low_latency",
     )
 
 
@@ -73,7 +73,7 @@ def rs485_finding(mode: RS485Mode | None, switch: RS485 = RS485.OFF) -> Finding:
         return Finding(
             "RS-485 mode",
             f"{switch}: multidrop turns RTS {_LEVELS[switch]} while a request leaves{doubled}",
-            'two switch one direction: say rs485 = "kernel", or leave it out' if doubled else "",
+            'both would switch the direction: set rs485 = "kernel", or remove it' if doubled else "",
         )
     if mode is None:
         return Finding(
@@ -82,40 +82,42 @@ def rs485_finding(mode: RS485Mode | None, switch: RS485 = RS485.OFF) -> Finding:
     if not mode.enabled:
         return Finding(
             "RS-485 mode",
-            "the driver has it, and it is off",
-            'if the transceiver hangs on RTS, say rs485 = "kernel" in the plant file; '
-            "an adapter that switches by itself needs nothing",
+            "off; the driver supports it",
+            'if RTS controls the transceiver, set rs485 = "kernel" in the plant file; '
+            "an adapter that switches by itself needs no setting",
         )
-    hears = ", and hears what it sends: multidrop takes the echo out" if mode.hears_itself else ""
+    hears = (
+        ", and the port receives its own requests: multidrop removes the echo" if mode.hears_itself else ""
+    )
     return Finding("RS-485 mode", f"on: the driver switches the direction{hears}")
 
 
 def echo_finding(found: Completion, sent: bytes, settings: Settings) -> Finding:
-    """Judge what became of a request, `sent`, that nobody should answer."""
+    """Judge the outcome of the request `sent` to an unused address."""
     if found.result > 0:
         return _answered_finding(found, sent, settings)
     received = found.raw
     if not received:
-        return Finding("echo", f"none at {settings}: nothing came back of what was sent")
+        return Finding("echo", f"none at {settings}")
     if received == sent:
-        return Finding("echo", f"the adapter hears what it sends at {settings}; multidrop takes it out")
+        return Finding("echo", f"the adapter receives its own requests at {settings}; multidrop removes them")
     return Finding(
         "echo",
-        f"{counted(len(received), 'byte')} came unasked at {settings}: {received[:16].hex(' ').upper()}",
-        "see whether another program or master talks on this line, and whether its ends are terminated",
+        f"{counted(len(received), 'unexpected byte')} at {settings}: {received[:16].hex(' ').upper()}",
+        "check whether another program or master uses this line, and whether its ends are terminated",
     )
 
 
 def _answered_finding(found: Completion, sent: bytes, settings: Settings) -> Finding:
-    """Report a good reply, which is no foreign traffic."""
+    """Report a valid reply from the unused address."""
     reply = found.reply
     how = f"with exception {reply.exception:02X}" if reply.exception else "with a value"
-    echo = "the adapter hears what it sends" if found.skipped == len(sent) else "none"
+    echo = "the adapter receives its own requests" if found.skipped == len(sent) else "none"
     return Finding(
         "echo",
-        f"{echo} at {settings}; address {reply.address}, which should be nobody's, answers {how}",
-        "either a drive has this address, or a server or gateway answers for drives that are not there: "
-        "then a drive that is missing seems to refuse",
+        f"{echo} at {settings}; address {reply.address}, which should be unused, answers {how}",
+        "either a drive has this address, or a server or gateway answers for missing drives: "
+        "a missing drive then looks like one that refuses",
     )
 
 
@@ -129,47 +131,47 @@ def round_trip_finding(
 ) -> Finding:
     """Judge the delays of the replies to `asked` requests.
 
-    `delays` are sorted, in s, from the request's last bit to the reply's first. Where the port does not
-    show bits, as a network, they begin when the request was handed over; `wire` is then the time, in s, of
-    the request and the first character on a wire. `refusals` are the codes of replies that are exceptions:
-    a gateway's are none of the drive's, and have no delay. `came` says what came in place of good replies.
+    `delays` are sorted, in s, from the request's last bit to the reply's first. If the port does not show
+    bits, such as on a network, they start when the request was handed over; `wire` is then the time, in s, of
+    the request and the first character on a wire. `refusals` are the codes of exception replies; a gateway's
+    have no delay. `came` describes the bytes received instead of valid replies.
     """
     codes = ", ".join(f"{code:02X}" for code in sorted(set(refusals)))
     if not delays:
-        unreached = f": exception {codes} came, as from a gateway that does not reach it" if refusals else ""
-        nothing = f"did not answer once in {counted(asked, 'request')}{unreached}"
-        only = f"gave no good reply to {counted(asked, 'request')}; what came: {came}"
+        unreached = f": exception {codes}, as from a gateway that does not reach it" if refusals else ""
+        silent = f"did not answer {counted(asked, 'request')}{unreached}"
+        invalid = f"gave no valid reply to {counted(asked, 'request')}; received: {came}"
         return Finding(
             "round trip",
-            f"{drive.name} {only if came and not refusals else nothing}",
-            "check its address, baud rate, format, wiring and power; `multidrop scan` looks for it",
+            f"{drive.name} {invalid if came and not refusals else silent}",
+            "check its address, baud rate, format, wiring and power; `multidrop scan` searches for it",
             is_failure=True,
         )
     least, median, most = delays[0], delays[len(delays) // 2], delays[-1]
-    figures = f"{least * 1e3:.1f} ms at least, {median * 1e3:.1f} in the middle, {most * 1e3:.1f} at most"
-    alone = f"a wire at {drive.settings} alone takes {wire * 1e3:.1f} ms"
-    since = f", from when its request was handed over ({alone})" if wire else ""
-    lost = f"; {asked - len(delays)} of {asked} requests got no good reply"
-    what = f"{drive.name} begins to answer after {figures}{since}{lost if len(delays) < asked else ''}"
+    figures = f"{median * 1e3:.1f} ms (median; {least * 1e3:.1f} to {most * 1e3:.1f} ms)"
+    alone = f"a wire at {drive.settings} takes {wire * 1e3:.1f} ms of it"
+    since = f" after its request was handed over ({alone})" if wire else ""
+    lost = f"; {asked - len(delays)} of {asked} requests got no valid reply"
+    what = f"{drive.name} answers in {figures}{since}{lost if len(delays) < asked else ''}"
     if refusals:
-        what += f"; {len(refusals)} replies were exceptions: {codes}"
+        what += f"; {counted(len(refusals), 'exception')}: {codes}"
     if came:
-        what += f"; what came in their place: {came}"
+        what += f"; received instead: {came}"
     if len(delays) < asked:
         return Finding(
             "round trip",
             what,
-            "look at termination, bias, cable and signal ground, and for another master; "
+            "check termination, bias, cable and signal ground, and whether there is another master; "
             "`multidrop poll` and `multidrop report` show when requests are lost",
             is_failure=True,
         )
     if median - wire - drive.response_delay > SLOW_S:
-        rest = "the adapter's or the network's" if wire else "the adapter's"
+        rest = "the adapter or the network" if wire else "the adapter"
         return Finding(
             "round trip",
             what,
-            f"its family usually takes {drive.response_delay * 1e3:.1f} ms: the rest is {rest}, "
-            "or the drive's own parameter for the response delay",
+            f"its family usually takes {drive.response_delay * 1e3:.1f} ms: the rest comes from {rest}, "
+            "or from the drive's response delay parameter",
         )
     return Finding("round trip", what)
 
@@ -189,7 +191,7 @@ _LACKING = {errno.ENOTTY, errno.EINVAL, errno.EOPNOTSUPP, errno.ENOSYS, errno.EI
 
 @dataclass(frozen=True)
 class Adapter:
-    """Facts from sysfs; those that are not known are empty or None."""
+    """Facts from sysfs; unknown ones are empty or None."""
 
     name: str  # of the tty, such as ttyUSB0
     driver: str = ""
@@ -223,8 +225,8 @@ def find_adapter(device: str, sysfs: Path = SYSFS) -> Adapter:
 
 
 def com_description(port: str) -> str:
-    """Return what Windows calls the adapter of a COM port, "" where it lists none."""
-    with suppress(ImportError, AttributeError, OSError):  # Wine has not all that is asked here
+    """Return Windows' description of a COM port's adapter, "" if it lists none."""
+    with suppress(ImportError, AttributeError, OSError):  # Wine lacks some of these calls
         from serial.tools.list_ports import comports
 
         return next((found.description for found in comports() if of_name(found.device) == of_name(port)), "")
@@ -247,7 +249,7 @@ def _text(path: Path) -> str:
 
 
 def rs485_mode(fd: int) -> RS485Mode | None:
-    """Ask the driver for its RS-485 mode; None where it has none."""
+    """Return the driver's RS-485 mode; None if it has none."""
     answer = _ask(fd, TIOCGRS485, RS485_STRUCT.size)
     return None if answer is None else decoded_rs485(answer)
 
@@ -259,16 +261,16 @@ def decoded_rs485(answer: bytes) -> RS485Mode:
 
 
 def low_latency(fd: int) -> bool | None:
-    """Ask the driver for its low-latency flag; None where it has none."""
+    """Return the driver's low-latency flag; None if it has none."""
     answer = _ask(fd, TIOCGSERIAL, SERIAL_STRUCT)
     return None if answer is None else bool(array.array("i", answer)[FLAGS_AT] & LOW_LATENCY)
 
 
 def _ask(fd: int, request: int, size: int) -> bytes | None:
-    """Return the driver's answer to an ioctl; None where it does not know the request."""
+    """Return the driver's answer to an ioctl; None if it does not know the request."""
     if sys.platform != "linux":
         return None
-    import fcntl  # which Windows lacks
+    import fcntl  # missing on Windows
 
     answer = bytearray(size)
     try:

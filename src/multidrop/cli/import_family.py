@@ -1,4 +1,4 @@
-"""`multidrop import`: makes a family file of another program's register table."""
+"""`multidrop import`: converts another program's register table into a family file."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=Path,
         help="CSV, TSV, YAML (Home Assistant, ESPHome), TOML (Telegraf) or JSON",
     )
-    parser.add_argument("--address", metavar="N", type=whole, help="the device, where the file has several")
-    parser.add_argument("--title", metavar="NAME", help="and its hub, where several have that address")
-    parser.add_argument("--out", metavar="FAMILY.toml", type=Path, help="a new file; printed without it")
+    parser.add_argument("--address", metavar="N", type=whole, help="the device, if the file has several")
+    parser.add_argument("--title", metavar="NAME", help="the device's hub, if several have that address")
+    parser.add_argument("--out", metavar="FAMILY.toml", type=Path, help="a new file; else it is printed")
     parser.add_argument("--plant", metavar="PLANT.toml", type=Path, help="a new plant file with this device")
 
 
@@ -29,7 +29,7 @@ def run(arguments: argparse.Namespace) -> int:
     for target in filter(None, (arguments.out, arguments.plant)):
         refuse_overwriting(target)
     if arguments.plant and not arguments.out:
-        raise ValueError("a plant file names its family's file: add --out FAMILY.toml")
+        raise ValueError("--plant needs --out FAMILY.toml: the plant file names the family file")
     try:
         devices = read_devices(arguments.file)
     except ImportError as failure:
@@ -39,14 +39,14 @@ def run(arguments: argparse.Namespace) -> int:
     plant = plant_text(device, arguments.out.name) if arguments.plant else ""
     if arguments.out:
         arguments.out.write_text(text, "utf-8")
-        print_text(f"{arguments.out} is ready: mend its gaps, then multidrop check {arguments.out}")
+        print_text(f"wrote {arguments.out}: fill its gaps, then run multidrop check {arguments.out}")
     else:
         print_text(text)
     if plant:
         arguments.plant.write_text(plant, "utf-8")
-        print_text(f"{arguments.plant} is ready: say its port")
+        print_text(f"wrote {arguments.plant}: enter its port")
     for sentence in device.lost:
-        warn(f"not carried over: {sentence}")
+        warn(f"not imported: {sentence}")
     return 0
 
 
@@ -64,7 +64,7 @@ def _chosen(devices: list[ImportedDevice], address: int | None, title: str | Non
     else:
         known = ", ".join(printable(_spelt(device)[:100]) for device in devices)
         example = f"{example} --title {printable(first.title[:60])!r}".strip()
-    raise ValueError(f"the file has devices at {known}: say which, such as {example}")
+    raise ValueError(f"the file has devices at {known}: choose one, such as {example}")
 
 
 def _spelt(device: ImportedDevice) -> str:

@@ -31,9 +31,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "model", metavar="MODEL", nargs="?", help="one family; or path/to/file.toml, or path/to/file.py:Class"
     )
-    parser.add_argument(
-        "drive", metavar="DRIVE", nargs="?", help="of which drive, where MODEL is a plant file"
-    )
+    parser.add_argument("drive", metavar="DRIVE", nargs="?", help="a drive's name, if MODEL is a plant file")
     add_json_argument(parser)
 
 
@@ -65,7 +63,7 @@ def _list(families: list[type[Drive]]) -> str:
         for row, title in zip(columns, titles, strict=True)
         for line in wrapped(title, row, " " * len(row), breaks_words=False)
     ]
-    return "\n".join([*lines, "", "`multidrop models MODEL` says all of one family."])
+    return "\n".join([*lines, "", "`multidrop models MODEL` shows one family in full."])
 
 
 # ---- as JSON ----
@@ -175,7 +173,7 @@ def sheet(family: type[Drive]) -> str:
     notes = inspect.cleandoc(family.__doc__ or "")
     for block in notes.split("\n\n") if notes else ():
         lines.append("")
-        for paragraph in re.split(r"\n(?=[-*] |    )", block):  # an indented line is one that stays a line
+        for paragraph in re.split(r"\n(?=[-*] |    )", block):  # an indented line stays a line
             item = "  " if paragraph[:2] in ("- ", "* ") else ""
             first = " " * (len(paragraph) - len(paragraph.lstrip()))
             lines += wrapped(" ".join(paragraph.split()), first, first + item)
@@ -185,7 +183,7 @@ def sheet(family: type[Drive]) -> str:
 def _lines_of(family: type[Drive]) -> Iterator[tuple[str, str]]:
     yield "model", family.model or "(a file of your own)"
     if family.declared_in:
-        yield "origin", f"declared by its file, not tested by us; see `multidrop check {family.declared_in}`"
+        yield "origin", f"declared by its file, untested; see `multidrop check {family.declared_in}`"
     yield "addresses", range_text(family.addresses)
     default = " (the first is the default)" if len(family.baudrates) > 1 else ""
     yield "baud rates", ", ".join(map(str, family.baudrates)) + default
@@ -194,7 +192,7 @@ def _lines_of(family: type[Drive]) -> Iterator[tuple[str, str]]:
     for framing in family.framings:
         yield f"{framing} silence", _silence(family, framing)
     yield "response", _response(family)
-    pause = f"yes; then {_ms(family.turnaround_delay)} of pause"
+    pause = f"yes, followed by a pause of {_ms(family.turnaround_delay)}"
     yield "broadcast", pause if family.broadcasts else family.no_broadcasts
     if family.least_interval:
         yield "interval", f"{_ms(family.least_interval)} from the end of an exchange to the next request"
@@ -216,7 +214,7 @@ def _lines_of(family: type[Drive]) -> Iterator[tuple[str, str]]:
 
 
 def gain_of(family: type[Drive]) -> ReadingGain | None:
-    """Return what stated gaps would save a class of a user's own, at its default settings."""
+    """Return the time that a user's own class would save by stating gaps, at its default settings."""
     drive = family(family.addresses[0])
     if not is_users_own(family):
         return None
@@ -245,8 +243,8 @@ def needed_silence(family: type[Drive], framing: Framing) -> float:
 
 
 def _response(family: type[Drive]) -> str:
-    stated = f", less than {_ms(family.answering_time)} by its document" if family.answering_time else ""
-    return f"{_response_delay(family)} until measured{stated}; none after {_ms(family.response_timeout)}"
+    stated = f", less than {_ms(family.answering_time)} by its manual" if family.answering_time else ""
+    return f"{_response_delay(family)} until measured{stated}; timeout {_ms(family.response_timeout)}"
 
 
 def _response_delay(family: type[Drive]) -> str:
@@ -270,8 +268,8 @@ def _table_heading(table: Table, family: type[Drive]) -> str:
     codes = []
     if table.read is not None:
         is_stated = stated_limit(family, table) or table.carrier not in (Carrier.BIT, Carrier.WORD)
-        stated = "" if is_stated else ", as the standard has it: the family states no limit"
-        codes.append(f"read {table.read:02X}H, {read_limit(family, table)} at most{stated}")
+        stated = "" if is_stated else ", the standard's limit: the family states none"
+        codes.append(f"read {table.read:02X}H, at most {read_limit(family, table)}{stated}")
     if table.write is not None:
         codes.append(f"write {table.write:02X}H")
     return f"{table.name}s ({'; '.join(codes)})"
@@ -313,16 +311,16 @@ def _remarks(register: Register[Any]) -> Iterator[str]:
     if register.at_most:
         yield f"at most {register.at_most}"
     if register.default is not None:
-        yield f"from the factory {register.default:g}"
+        yield f"factory setting {register.default:g}"
     if register.while_running is not None:
         yield "may change while running" if register.while_running else "only while stopped"
     if register.broadcast:
         yield "may be broadcast: " + ", ".join(f"{raw:04X}H" for raw in register.broadcast)
     if register.moves is not None:
-        yield "a write may move the motor" if register.moves else "a write starts, stops and resets nothing"
+        yield "a write may move the motor" if register.moves else "a write never starts, stops or resets"
     if register.harmless is not None:
         harmless = ", ".join(_word(register, raw) for raw in register.harmless)
-        yield f"verbs alone write it, but for {harmless}" if harmless else "verbs alone write it"
+        yield f"only verbs write it, except {harmless}" if harmless else "only verbs write it"
     if register.never_together:
         yield "never together: " + ", ".join(_bits(register, mask) for mask in register.never_together)
     if register.never:
@@ -333,7 +331,7 @@ def _remarks(register: Register[Any]) -> Iterator[str]:
 
 
 def _word(register: Register[Any], raw: int) -> str:
-    """Return the name of a raw count, or the word where the names of its bits would fill lines."""
+    """Return the name of a raw count, or the word if the names of its bits are too long."""
     name = register.format(register.decode(raw))
     return name if len(name) <= 2 * LONGEST_NAME else f"{raw:04X}H"
 

@@ -1,4 +1,4 @@
-"""The `monitor` command: polls, draws and obeys keys. Its keys stop motors, and none starts one."""
+"""`multidrop monitor`: shows a polled plant live. Its keys stop motors; no key starts one."""
 
 from __future__ import annotations
 
@@ -31,15 +31,13 @@ DRAW_S = 0.25
 SCROLL_S = 2.0  # between two pictures that scroll
 PAGE = 10  # lines
 _STOP_KEYS = ("s", "S")
-STILL_STOPPING = (
-    "a stop is under way, and is waited for; Ctrl-C again and again leaves it: look at the motors"
-)
+STILL_STOPPING = "waiting for a stop in progress; press Ctrl-C repeatedly to leave, and watch the motors"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_plant_argument(parser)
     add_port_option(parser)
-    parser.add_argument("--out", metavar="FILE", type=Path, help="record what is polled as well")
+    parser.add_argument("--out", metavar="FILE", type=Path, help="record too, into this new file")
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -53,14 +51,14 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def is_possible() -> bool:
-    """Tell whether there is a terminal to draw on and to read keys from."""
+    """Return whether stdin and stdout are a terminal."""
     return sys.stdin.isatty() and sys.stdout.isatty()
 
 
 def watch(plant: Plant, *, out: Path | None = None, seconds: float | None = None) -> dict[str, Any]:
-    """Poll the plant and show it until the user leaves or `seconds` are over; return the poller's summary.
+    """Poll the plant and show it until the user quits or `seconds` have passed; return the poller's summary.
 
-    A terminal that is closed ends it too. Stops that are under way are waited for in any case.
+    Closing the terminal ends it too. It always waits for stops in progress.
     """
     console = open_console()
     live = LivePlant(plant, plant.metadata()["planned"])
@@ -70,14 +68,14 @@ def watch(plant: Plant, *, out: Path | None = None, seconds: float | None = None
             try:
                 monitor.show(seconds)
             finally:
-                failures = monitor.await_stops()  # before the ports are closed: one may not be sent yet
+                failures = monitor.await_stops()  # before the ports close: a stop may not be sent yet
         for sentence in failures:
             warn(sentence)
     return session.poller.summary()
 
 
 class Monitor:
-    """The screen of a polled plant: draws what has come, and carries out what keys ask for."""
+    """The screen of a polled plant: draws the newest values and obeys keys."""
 
     def __init__(self, plant: LivePlant, session: PollingSession, console: Any) -> None:
         from multidrop.cli.monitor_screen import BLOCKS, PLAIN_BLOCKS, Position
@@ -86,17 +84,17 @@ class Monitor:
         self._session = session
         self._plant = plant
         self._at = Position()
-        self._on_yes: Callable[[], None] | None = None  # done when the question is answered with y
-        self._stops: list[threading.Thread] = []  # under way, or done
-        self._stop_results: dict[str, tuple[int, int]] = {}  # of all drives: stopped, asked, by line
+        self._on_yes: Callable[[], None] | None = None  # called if the question is answered with y
+        self._stops: list[threading.Thread] = []  # in progress or done
+        self._stop_results: dict[str, tuple[int, int]] = {}  # drives stopped and asked, by line
         self._has_left = False
         self._side_reader = SideReader(session.poller)
         self._blocks = BLOCKS if "utf" in console.encoding else PLAIN_BLOCKS
 
     def show(self, seconds: float | None) -> None:
-        """Draw and obey keys until the user leaves, a signal comes, or `seconds` are over."""
+        """Draw and obey keys until the user quits, a signal comes, or `seconds` have passed."""
         begun = next_draw = next_tick = time.monotonic()
-        # Warnings on standard error would spoil the screen.
+        # Warnings on stderr would overwrite the screen.
         with (
             self._drawing() as (draw, every),
             terminal_keys() as wait_for_key,
@@ -123,7 +121,7 @@ class Monitor:
         self._at.message = text
 
     def await_stops(self) -> list[str]:
-        """Record until no stop is under way; return the failures that nobody acknowledged."""
+        """Record until no stop is in progress; return the failures that were not acknowledged."""
         if self._is_stopping:
             warn(STILL_STOPPING)
         while self._is_stopping:
@@ -139,7 +137,7 @@ class Monitor:
     def _drawing(self) -> Iterator[tuple[Callable[[Any], None], float]]:
         """Give a function that draws a picture, and the seconds between two pictures.
 
-        On a terminal without cursor control each picture is printed below the last one.
+        Without cursor control, each picture is printed below the last one.
         """
         if self._console.is_dumb_terminal:
             yield self._console.print, SCROLL_S
@@ -149,7 +147,7 @@ class Monitor:
         with self._console.screen(hide_cursor=True) as screen:
 
             def draw(picture: Any) -> None:
-                self._console.control(Control.home())  # else rich draws below the last picture
+                self._console.control(Control.home())  # otherwise rich draws below the last picture
                 screen.update(picture)
 
             yield draw, DRAW_S
@@ -174,7 +172,7 @@ class Monitor:
     # ---- keys ----
 
     def _obey(self, key: str) -> None:
-        if self._on_yes and key not in _STOP_KEYS:  # these ask anew
+        if self._on_yes and key not in _STOP_KEYS:  # stop keys replace the question
             on_yes, self._on_yes, self._at.question = self._on_yes, None, ""
             if key in ("y", "Y"):  # with caps lock on
                 on_yes()
@@ -218,14 +216,14 @@ class Monitor:
             self._turn_page()
 
     def _acknowledge(self) -> None:
-        """Drop the failures that were shown; those that had no room are shown next."""
+        """Drop the failures that were shown; the others are shown next."""
         del self._at.failures[: self._at.failures_shown]
 
     def _leave(self) -> None:
         if not self._is_stopping:
             self._has_left = True
             return
-        self._at.question = "A stop is under way. Leave once it is over? y leaves, any other key does not"
+        self._at.question = "A stop is in progress. Quit when it is done? y quits, any other key does not"
         self._on_yes = self._leave_now
 
     def _leave_now(self) -> None:
@@ -244,7 +242,7 @@ class Monitor:
     def _stop_lines(self) -> None:
         """Stop all lines at the same time: none waits for another's ramps.
 
-        Where the system gives no more threads, each of the others is sent its stops before any is waited for.
+        If threads cannot be started, every remaining line is sent its stops before any is waited for.
         """
         self._stop_results = {}
         stops = {
@@ -253,18 +251,18 @@ class Monitor:
         }
         left = [line for line, stop in stops.items() if not self._begin(*stop)]
         for line in left if len(left) > 1 else ():
-            with suppress(Exception):  # it is told below, where the stop is sent again
+            with suppress(Exception):  # reported below, when the stop is sent again
                 self._session.poller.bus(line).stop_all(seconds=0.0)
         for line in left:
             self._carry_out(*stops[line])
 
     def _in_background(self, what: str, work: Callable[[], tuple[str, list[str]]]) -> None:
-        """Carry out a stop in a thread, or here and now where the system gives none: it is always sent."""
+        """Carry out a stop in a thread, or here if no thread can be started: it is always sent."""
         if not self._begin(what, work):
             self._carry_out(what, work)
 
     def _begin(self, what: str, work: Callable[[], tuple[str, list[str]]]) -> bool:
-        """Begin a stop in a thread, which waits until the motor stands; False where there is none."""
+        """Start a stop in a thread, which waits until the motor has stopped; False if no thread can start."""
         self._at.message = what
         thread = threading.Thread(target=self._carry_out, args=(what, work), daemon=True)
         try:
@@ -275,10 +273,10 @@ class Monitor:
         return True
 
     def _carry_out(self, what: str, work: Callable[[], tuple[str, list[str]]]) -> None:
-        """Carry out a stop; its failures stay on the screen until they are acknowledged."""
+        """Carry out a stop; its failures stay on the screen until acknowledged."""
         try:
             self._at.message, failures = work()
-        except Exception as failure:  # any failure of a stop must be seen
+        except Exception as failure:  # the user must see every failure of a stop
             self._at.message = f"{what} failed"
             failures = [f"{what} failed: {str(failure) or type(failure).__name__}"]
         clock = datetime.now(UTC)
@@ -299,7 +297,7 @@ class Monitor:
 
 
 UP, DOWN, PAGE_UP, PAGE_DOWN, ENTER, ESCAPE = "up", "down", "page up", "page down", "enter", "escape"
-KEYS = {  # as terminals send them
+KEYS = {  # escape sequences and letters that terminals send
     b"\x1b[A": UP,
     b"\x1bOA": UP,
     b"k": UP,
@@ -313,31 +311,30 @@ KEYS = {  # as terminals send them
     b"\n": ENTER,
 }
 UNKNOWN = "unknown"
-# A key that is no letter, as F4, which ends in S: it asks for nothing. And the beginning of one.
+# A key that is not a letter, such as F4, whose sequence ends in S: it must not stop motors. And its start.
 _SEQUENCE = re.compile(rb"\x1b(?:\[\[?[0-?]*[ -/]*[@-Z\\-~]|O[ -~])")
 _BEGUN = re.compile(rb"\x1b(?:\[\[?[0-?]*[ -/]*|O)?")
-SPLIT_S = 0.05  # after which the rest of one has not been sent
+SPLIT_S = 0.05  # how long to wait for the rest of a sequence
 MOST_BYTES = 4  # of a character in UTF-8
-# Letters of the Russian and the Ukrainian layout, and those of the same keys on a Latin one.
+# Letters of the Russian and Ukrainian layouts, and the Latin letters on the same keys.
 LATIN = str.maketrans("йыіфнолЙЫІФНОЛ", "qssayjkQSSAYJK")
 
 
 @contextmanager
 def terminal_keys() -> Iterator[Callable[[float], str]]:
-    """Give a function that waits so many seconds for a key, and returns its name or letter, or "".
+    """Give a function that waits up to n seconds for a key and returns its name or letter, or "".
 
-    It raises OSError once the terminal is gone. Raises ValueError on Windows, whose consoles have no such
-    mode.
+    The function raises OSError if the terminal is closed. Raises ValueError on Windows.
     """
     if sys.platform == "win32":
-        raise ValueError("the live screen needs a terminal of Linux or macOS; `multidrop poll` works here")
+        raise ValueError("the live screen needs Linux or macOS; use `multidrop poll` on Windows")
     import termios
     import tty
 
     fd = sys.stdin.fileno()
     before = termios.tcgetattr(fd)
     tty.setcbreak(fd)
-    pressed = b""  # and not returned yet
+    pressed = b""  # not returned yet
 
     def read() -> bytes:
         found = os.read(fd, 64)
@@ -357,12 +354,12 @@ def terminal_keys() -> Iterator[Callable[[float], str]]:
     try:
         yield wait_for_key
     finally:
-        with suppress(termios.error):  # of a terminal that is gone
+        with suppress(termios.error):  # the terminal is closed
             termios.tcsetattr(fd, termios.TCSADRAIN, before)
 
 
 def next_key(pressed: bytes) -> tuple[str, bytes]:
-    """Split off the first key of what a terminal sent: its name or letter, and the rest."""
+    """Split the first key off a terminal's bytes; return its name or letter, and the rest."""
     if sequence := _SEQUENCE.match(pressed):
         return KEYS.get(sequence[0], UNKNOWN), pressed[sequence.end() :]
     if pressed[:1] == b"\x1b":
@@ -372,7 +369,7 @@ def next_key(pressed: bytes) -> tuple[str, bytes]:
 
 
 def is_begun(pressed: bytes) -> bool:
-    """Return True for the beginning of a key or of a letter whose rest may be sent yet."""
+    """Return True for the start of a key or letter whose rest may still come."""
     with suppress(UnicodeDecodeError):
         return bool(_BEGUN.fullmatch(pressed)) or (
             pressed != b"" and codecs.getincrementaldecoder("utf-8")().decode(pressed) == ""
@@ -396,10 +393,10 @@ def open_console() -> Any:
     console = Console()
     if console.is_dumb_terminal:
         width, height = get_terminal_size()
-        console = Console(width=width, height=height - 1)  # it scrolls, and its last line stays empty
+        console = Console(width=width, height=height - 1)  # the last line stays empty when it scrolls
     if console.width < LEAST_WIDTH or console.height < LEAST_HEIGHT:
         raise ValueError(
-            f"the terminal is too small: it has {console.width} x {console.height} characters, "
-            f"and the monitor needs {LEAST_WIDTH} x {LEAST_HEIGHT}"
+            f"the terminal has {console.width} x {console.height} characters; "
+            f"the monitor needs at least {LEAST_WIDTH} x {LEAST_HEIGHT}"
         )
     return console

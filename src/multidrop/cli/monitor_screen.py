@@ -1,6 +1,6 @@
 """The pictures of the monitor, as lines of text for a width and a height.
 
-Everything that matters is in words and marks as well as in colours.
+Important states are shown in words and marks as well as in colours.
 """
 
 from __future__ import annotations
@@ -23,17 +23,17 @@ WIDE = 100  # has room for more columns
 OLD_NOTE, NOT_POLLED = "old", "not polled"  # of registers
 NEVER = "never"
 LEAST_VALUE, AROUND = 12, 13  # columns of a register's value; of its age, and of blanks
-OLD = "?"  # before a value that is not the present one any more
+OLD = "?"  # before an old value
 BLOCKS, PLAIN_BLOCKS = "▁▂▃▄▅▆▇█", "_.-=+*#@"
 STOPS = "s stop   S stop all   q quit"
-ACKNOWLEDGE = (f"a acknowledges what FAILED   {STOPS}",)
+ACKNOWLEDGE = (f"a acknowledge FAILURES   {STOPS}",)
 HELP = (f"up/down choose   Enter registers   {STOPS}", f"up/down   Enter registers   {STOPS}")
 PAGE_HELP = (f"up/down choose   PgUp/PgDn scroll   Enter back   {STOPS}", f"PgUp/PgDn   Enter back   {STOPS}")
 
 
 @dataclass
 class Position:
-    """The user's place in the monitor, and what waits for an answer."""
+    """The user's place in the monitor, and pending questions and failures."""
 
     chosen: int = 0  # of the drives
     page: bool = False  # one drive's registers are shown, not all drives
@@ -45,7 +45,7 @@ class Position:
 
 
 def overview(plant: LivePlant, at: Position, size: tuple[int, int], now_ns: int, blocks: str) -> list[Text]:
-    """Draw all drives, a line each; where not all fit, those around the chosen one."""
+    """Draw all drives, a line each; if they do not all fit, those around the chosen one."""
     width, height = size
     top = [_title(plant, width, now_ns), *_line_states(plant, width)]
     columns = _columns(plant, width)
@@ -58,7 +58,7 @@ def overview(plant: LivePlant, at: Position, size: tuple[int, int], now_ns: int,
         for number, drive in enumerate(plant.drives[first : first + room], first)
     ]
     hidden = len(plant.drives) - len(rows)
-    notes = [f"{OLD} is old"] if any(OLD in row.plain for row in rows) else []
+    notes = [f"{OLD} old value"] if any(OLD in row.plain for row in rows) else []
     note = "   ".join([*notes, *([f"{hidden} more drives: scroll"] if hidden else [])])
     return [*top, *rows, *[Text()] * (room - len(rows)), *alarms, *_foot(at, width, HELP, note)]
 
@@ -66,7 +66,7 @@ def overview(plant: LivePlant, at: Position, size: tuple[int, int], now_ns: int,
 def page(
     shown: LiveDrive, others: Mapping[str, SideRead], at: Position, size: tuple[int, int], now_ns: int
 ) -> list[Text]:
-    """Draw every register of one drive; `others` has the side reads of those that are not polled."""
+    """Draw every register of one drive; `others` has the side reads of unpolled registers."""
     width, height = size
     drive = shown.polled.drive
     head = f" {shown.name}  {drive.title or drive.model}  address {drive.address}  "
@@ -109,9 +109,9 @@ def _title(plant: LivePlant, width: int, now_ns: int) -> Text:
 def _line_states(plant: LivePlant, width: int) -> list[Text]:
     lines = []
     for line in plant.plant.lines:
-        lately = plant.lately[line.name]
-        text = f" {line.name}  {lately.utilisation:4.0%} of the wire used  "
-        text += f"{lately.exchanges_per_second:.1f} exchanges/s  {_misses(plant.so_far[line.name].misses)}"
+        recent = plant.recent[line.name]
+        text = f" {line.name}  {recent.utilisation:4.0%} of the wire used  "
+        text += f"{recent.exchanges_per_second:.1f} exchanges/s  {_misses(plant.so_far[line.name].misses)}"
         lines.append(Text(cut(text, width)))
     return lines
 
@@ -125,9 +125,9 @@ def _misses(reasons: Mapping[str, int]) -> str:
 
 
 def _pace(drive: LiveDrive) -> str:
-    """Describe the exchanges of late, and the delays and losses so far."""
+    """Describe the recent rate of exchanges, and the delays and losses so far."""
     so_far, delays = drive.so_far, drive.so_far.delays
-    parts = [f"{drive.lately.exchanges_per_second:.1f} exchanges/s"]
+    parts = [f"{drive.recent.exchanges_per_second:.1f} exchanges/s"]
     if delays.replies:
         parts.append(f"delay {_ms(delays.p50)} ms, p99 {_ms(delays.p99)}, max {_ms(delays.longest)}")
     if so_far.late_replies:
@@ -142,7 +142,7 @@ def _ms(seconds: float) -> str:
 
 
 def _columns(plant: LivePlant, width: int) -> dict[str, int]:
-    """Return widths by heading; the rest of the line goes to the fault and the history."""
+    """Return column widths by heading; fault and history share the rest of the line."""
     columns = {"DRIVE": 5, "STATE": 10, "FREQUENCY": 10, "CURRENT": 10, "FAULT": 8, "AGE": 7}
     longest = max(cell_len(drive.name) for drive in plant.drives)
     most = 11 + max(0, width - WIDE) // 3
@@ -181,7 +181,7 @@ def _drive(
 
     cells = {
         "DRIVE": drive.name,
-        "STATE": marked(drive.state, drive.told_by),
+        "STATE": marked(drive.state, drive.state_register),
         "FREQUENCY": marked(drive.shown(FREQUENCY), FREQUENCY),
         "CURRENT": marked(drive.shown(CURRENT), CURRENT),
         "FAULT": marked(drive.fault, FAULT) or drive.why_silent,
@@ -216,12 +216,12 @@ def _register_row(name: str, value: str, age: str, note: str, value_width: int, 
 
 
 def _alarms(at: Position, size: tuple[int, int]) -> list[Text]:
-    """Draw the failures to be acknowledged, the oldest first: as many as fit whole."""
+    """Draw the unacknowledged failures, the oldest first, as many as fit."""
     width, height = size
     most = max(2, (height - 8) // 2)
     lines: list[str] = []
     at.failures_shown = 0
-    failures = list(at.failures)  # a stop that ends meanwhile may add one
+    failures = list(at.failures)  # a stop thread may add one
     for failure in failures:
         wrapped = textwrap.wrap(printable(failure), width - 4, break_long_words=True)
         if lines and len(lines) + len(wrapped) > most - 1:
@@ -229,7 +229,7 @@ def _alarms(at: Position, size: tuple[int, int]) -> list[Text]:
         lines += wrapped[: most - 1]
         at.failures_shown += 1
     more = len(failures) - at.failures_shown
-    lines += [f"... and {more} more, after these are acknowledged"] if more else []
+    lines += [f"... and {more} more; acknowledge these first"] if more else []
     return [Text(f" ! {line}".ljust(width), style="bold white on red") for line in lines]
 
 
@@ -261,6 +261,6 @@ def sparkline(values: Sequence[float | None], width: int, blocks: str = BLOCKS) 
     values = values[-width:] if width > 0 else []
     there = [value for value in values if value is not None]
     low, high = min(there, default=0.0), max(there, default=0.0)
-    low = min(low, 0.0)  # else a steady value looks like rest, and noise like a swing
+    low = min(low, 0.0)  # otherwise a steady value would look like zero, and noise like a swing
     scale = (len(blocks) - 1) / (high - low) if high > low else 0.0
     return "".join(" " if value is None else blocks[round((value - low) * scale)] for value in values)

@@ -1,4 +1,4 @@
-"""`multidrop plan`: predicts what a plant file's lines reach, and suggests what would make misfits fit.
+"""`multidrop plan`: predicts the rates of a plant file's lines, and suggests changes if they do not fit.
 
 No port is opened.
 """
@@ -20,7 +20,7 @@ from multidrop.planning.suggestions import Suggestions, duration_text, reading_g
 from multidrop.plant.loader import load_plant
 from multidrop.plant.model import PlantLine, planned_on
 
-LONG_CYCLE = 1.0  # s; polling all readings for longer than this may not have been meant
+LONG_CYCLE = 1.0  # s; polling all readings for longer is probably not intended
 _NAMES = 3  # registers named in a sentence
 
 
@@ -54,7 +54,7 @@ def _plan(line: PlantLine) -> _PredictedLine:
 
 
 def _misfits(plan: _PredictedLine) -> list[str]:
-    """Return a sentence for each rate that is not kept."""
+    """Return a sentence for each rate that is not reached."""
     return [_misfit(rate, rate.every) for rate in plan.prediction.rates if rate.every and not rate.fits]
 
 
@@ -71,7 +71,7 @@ def _warnings(plan: _PredictedLine) -> list[str]:
 
 
 def _gains(plan: _PredictedLine) -> list[str]:
-    """Say what classes of a user's own would save if they stated the gaps that their document allows."""
+    """Return the time that users' own classes would save by stating the gaps that their manual allows."""
     gains = {
         polled.drive.name: reading_gain(polled.drive, polled.wanted)
         for polled in plan.line.drives
@@ -81,7 +81,7 @@ def _gains(plan: _PredictedLine) -> list[str]:
 
 
 def _long_cycle(plan: _PredictedLine) -> list[str]:
-    """Warn where all readings are polled, which is the default, and a cycle takes long."""
+    """Warn if all readings are polled, which is the default, and a cycle takes long."""
     whole = [
         polled.drive
         for polled in plan.line.drives
@@ -94,8 +94,8 @@ def _long_cycle(plan: _PredictedLine) -> list[str]:
         for drive in whole
     )
     return [
-        f"a bus cycle takes longer than {duration_text(LONG_CYCLE)}, and all readings are polled of {costs}; "
-        'name those that are needed, such as poll = ["output_current"]'
+        f"a bus cycle takes longer than {duration_text(LONG_CYCLE)}; all readings are polled of {costs}: "
+        'name the registers you need, such as poll = ["output_current"]'
     ]
 
 
@@ -122,11 +122,10 @@ def _text(plan: _PredictedLine) -> Iterator[str]:
 
 
 def _switching(plan: _PredictedLine) -> str:
-    times = f"{plan.prediction.switches} times in a bus cycle the line changes its settings"
+    times = f"the line changes its settings {plan.prediction.switches} times in a bus cycle"
     if plan.line.switching:
         return f"{times}, {duration_text(plan.line.switching)} each"
-    how_long = "`multidrop poll` tells how long that takes"
-    return f'{times}; {how_long}: add it to the line, such as switching = "2 ms"'
+    return f'{times}; `multidrop poll` measures how long that takes: add it, such as switching = "2 ms"'
 
 
 def _row(rate: Rate) -> Row:

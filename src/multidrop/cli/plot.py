@@ -1,4 +1,4 @@
-"""`multidrop plot`: draws a recording's values as a picture, or as a page with the picture in it."""
+"""`multidrop plot`: plots a recording's values as a picture or an HTML page."""
 
 from __future__ import annotations
 
@@ -12,20 +12,18 @@ SUFFIXES = (".png", ".html")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "recording", metavar="RECORDING", type=Path, help="as `multidrop poll --out` writes it"
-    )
+    parser.add_argument("recording", metavar="RECORDING", type=Path, help="a file of `multidrop poll --out`")
     parser.add_argument("--drive", action="append", default=[], help="only this one; may be repeated")
     parser.add_argument("--register", action="append", default=[], help="only this one; may be repeated")
     parser.add_argument(
-        "--out", metavar="FILE", type=Path, help="picture.png or page.html; without it RECORDING with .png"
+        "--out", metavar="FILE", type=Path, help="picture.png or page.html; default: RECORDING with .png"
     )
 
 
 def run(arguments: argparse.Namespace) -> int:
     out = arguments.out or beside(arguments.recording, ".png")
     if out.suffix.lower() not in SUFFIXES:
-        raise ValueError(f"{out}: a plot's name ends in {' or '.join(SUFFIXES)}")
+        raise ValueError(f"{out}: a plot's name must end in {' or '.join(SUFFIXES)}")
     recording = load_recording(arguments.recording, out, "plot")
     from multidrop.report import plot, plot_page, png
 

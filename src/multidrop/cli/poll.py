@@ -1,4 +1,4 @@
-"""The `poll` command: polls, shows the newest values, records, and prints a summary."""
+"""`multidrop poll`: polls, shows the newest values, records, and prints a summary."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ from multidrop.printable import printable
 from multidrop.recording import FORMATS
 from multidrop.recording.segments import parse_age, parse_size
 
-_TAKE_S = 0.1  # between looks for new rows
+_TAKE_S = 0.1  # between takes of new rows
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -52,23 +52,23 @@ def add_polling_arguments(parser: argparse.ArgumentParser, *, out: str | None, s
         metavar="S",
         type=duration,
         default=seconds,
-        help=f"how long it polls; {f'{seconds:g} s' if seconds else 'until Ctrl-C'} if not given",
+        help=f"how long to poll; default: {f'{seconds:g} s' if seconds else 'until Ctrl-C'}",
     )
     parser.add_argument(
         "--out",
         metavar="FILE",
         type=Path,
         default=out,
-        help=f"record into this new file: {', '.join(FORMATS)}; {out or 'nothing is recorded'} if not given",
+        help=f"record into this new file: {', '.join(FORMATS)}; default: {out or 'no recording'}",
     )
     parser.add_argument(
-        "--capture", metavar="FILE.pcapng", type=Path, help="all that goes over the lines, for Wireshark"
+        "--capture", metavar="FILE.pcapng", type=Path, help="capture the lines' traffic, for Wireshark"
     )
     parser.add_argument(
         "--flight-recorder",
         metavar="DIR",
         type=Path,
-        help="when something goes wrong, a capture of the last minutes is written there",
+        help="after an anomaly, write a capture of the last minutes there",
     )
     add_json_argument(parser)
 
@@ -85,7 +85,7 @@ def follow(plant: Plant, arguments: argparse.Namespace, rotation: Rotation | Non
     if arguments.capture:
         check_capture(arguments.capture)
     if arguments.flight_recorder and arguments.flight_recorder.is_file():
-        raise ValueError(f"{arguments.flight_recorder} is a file: name a directory for the flight recorder")
+        raise ValueError(f"--flight-recorder {arguments.flight_recorder} is a file: name a directory")
     show = not arguments.json and sys.stdout.isatty()
     table = LiveTable(plant, sys.stdout) if show else None
     consumers = [table.add] if table else []
@@ -106,7 +106,7 @@ def follow(plant: Plant, arguments: argparse.Namespace, rotation: Rotation | Non
 
 
 class _Taps:
-    """Taps on the lines, for --capture and --flight-recorder; `stack` closes their files."""
+    """The taps of --capture and --flight-recorder; `stack` closes their files."""
 
     def __init__(self, poller: Poller, arguments: argparse.Namespace, stack: ExitStack) -> None:
         lines = list(poller.buses)
@@ -135,7 +135,7 @@ class _Taps:
 
 
 def conclude(plant: Plant, polled: Mapping[str, Any], arguments: argparse.Namespace) -> int:
-    """Print the poller's summary beside the prediction; return the exit status."""
+    """Print the poller's summary and the prediction; return the exit status."""
     summary = {**polled, "recording": str(arguments.out) if arguments.out else None}
     for line in plant.lines:
         summary["lines"][line.name]["comparison"] = compare(line, summary["lines"][line.name])
@@ -183,12 +183,18 @@ def tap_text(summary: Mapping[str, Any]) -> Iterator[str]:
         yield f"{counted(summary['untapped_bytes'], 'byte')} not captured: this machine was too slow"
 
 
-EVERY = 0.5  # s, between two drawings
+# ---- the live table ----
+#
+# The monitor needs rich, takes over the terminal and its keys, and can stop motors. This table needs no
+# library, reads no keys, and stays on the terminal above the summary.
+
+
+EVERY = 0.5  # s between two drawings
 _UP_AND_CLEAR = "\x1b[{}F\x1b[J"
 
 
 class LiveTable:
-    """One line per drive: its samples and misses so far, and its newest values."""
+    """One line per drive: samples and misses so far, and newest values; redrawn in place."""
 
     def __init__(self, plant: Plant, terminal: TextIO) -> None:
         self._plant = LivePlant(plant)
@@ -212,15 +218,15 @@ class LiveTable:
 
     def draw(self) -> None:
         columns, height = shutil.get_terminal_size()
-        encoding = self._terminal.encoding or "utf-8"  # an escape for what it lacks would be longer
+        encoding = self._terminal.encoding or "utf-8"  # an escape for a missing character would be longer
         shown = (printable(line).encode(encoding, "replace").decode(encoding) for line in self._lines())
         lines = [cut_to(line, columns - 1) for line in shown]
         if len(lines) > height - 1:
             lines = [*lines[: height - 2], f"... and {counted(len(lines) - height + 2, 'more drive')}"]
-        # A terminal that has become narrower has wrapped what was drawn.
+        # A terminal that was narrowed has wrapped the last drawing.
         rows = sum(max(1, ceil(columns_of(line) / columns)) for line in self._drawn)
         back = _UP_AND_CLEAR.format(min(rows, height - 1)) if self._drawn else ""
-        with suppress(OSError):  # of a terminal that is closed: the recording goes on to its end
+        with suppress(OSError):  # a closed terminal does not end the recording
             print(back + "\n".join(lines), file=self._terminal, flush=True)
         self._drawn = lines
 
@@ -241,11 +247,14 @@ def _values(drive: LiveDrive) -> Iterator[str]:
             yield f"{name} {drive.shown(name)}"
 
 
+# ---- the comparison with the prediction ----
+
+
 Figures = dict[str, Any]
 
 
 def compare(line: PlantLine, summary: dict[str, Any]) -> dict[str, Figures]:
-    """Predict a line with the documents' delays and with the measured ones, beside its summary."""
+    """Return a line's predictions, with the manuals' and with measured delays, and its measured rates."""
     drives = summary["drives"]
     delays = {
         polled.drive: drives[polled.drive.name]["response_delay_ms"] / 1e3
@@ -253,7 +262,7 @@ def compare(line: PlantLine, summary: dict[str, Any]) -> dict[str, Figures]:
         if drives[polled.drive.name]["exchanges_per_second"]  # a silent drive has no delay
     }
     polls = [poll for polled in line.drives for poll in polled.polls]
-    is_timed = any(poll.every is not None for poll in polls)  # cycles then do not follow each other
+    is_timed = any(poll.every is not None for poll in polls)  # then a cycle has no measured time
     cycles = (summary["samples"] + sum(summary["misses"].values())) / len(polls)
     by_delays = predict(planned_on(line, delays), delays, summary["switching_ms"] / 1e3)
     return {
@@ -285,7 +294,7 @@ def comparison_text(found: dict[str, Figures]) -> Iterator[str]:
     columns = list(found.values())
     cycles = ("-" if column["cycle_ms"] is None else f"{column['cycle_ms']:.1f} ms" for column in columns)
     rows = [
-        ("", "PREDICTED", "BY DELAYS", "MEASURED"),
+        ("", "PREDICTED", "WITH DELAYS", "MEASURED"),
         ("bus cycle", *cycles),
         ("utilisation", *(f"{column['utilisation']:.1%}" for column in columns)),
     ]
@@ -293,10 +302,10 @@ def comparison_text(found: dict[str, Figures]) -> Iterator[str]:
         rates = (f"{column['exchanges_per_second'][name]:.1f}" for column in columns)
         rows.append((f"{shortened(name)}, exchanges/s", *rates))
     yield from (f"  {row}" for row in aligned(rows, "<>>>"))
-    yield "  by delays: predicted with the response delays that were measured"
+    yield "  WITH DELAYS: predicted with the measured response delays"
     if found["predicted"]["switches"]:
         took = found["measured"]["switching_ms"]
-        yield f"  and with the {took:.2f} ms that the port needed to change its settings"
+        yield f"  and the measured {took:.2f} ms to change the port's settings"
 
 
 def add_rotation_arguments(parser: argparse.ArgumentParser) -> None:
@@ -304,30 +313,30 @@ def add_rotation_arguments(parser: argparse.ArgumentParser) -> None:
         "--rotate",
         metavar="TIME",
         type=_age,
-        help='begin a new file so often, such as "1 h": run.arrows becomes run.00000001.arrows and so on',
+        help='start a new file at this interval, such as "1 h": run.00000001.arrows and so on',
     )
     parser.add_argument(
         "--keep",
         metavar="TIME",
         type=_age,
-        help='with --rotate: remove files older than so long, such as "30 days"',
+        help='with --rotate: remove files older than this, such as "30 days"',
     )
     parser.add_argument(
         "--most",
         metavar="SIZE",
         type=_size,
-        help='with --rotate: remove the oldest beyond a size, such as "20 GB"',
+        help='with --rotate: remove the oldest files beyond this total size, such as "20 GB"',
     )
 
 
 def rotation_of(arguments: argparse.Namespace) -> Rotation | None:
-    """Return how the recording is cut into files. Raises ValueError where options do not fit together."""
+    """Return how the recording is split into files. Raises ValueError for options that contradict."""
     if arguments.rotate is None:
         if arguments.keep is not None or arguments.most is not None:
-            raise ValueError('--keep and --most remove whole files: say --rotate too, such as --rotate "1 h"')
+            raise ValueError('--keep and --most remove whole files: add --rotate, such as --rotate "1 h"')
         return None
     if not arguments.out or arguments.out.suffix != ".arrows":
-        raise ValueError("--rotate needs a recording whose name ends in .arrows: say --out run.arrows")
+        raise ValueError("--rotate needs a name that ends in .arrows, such as --out run.arrows")
     return Rotation(arguments.rotate, arguments.keep, arguments.most)
 
 

@@ -18,7 +18,7 @@ from multidrop.errors import DriveException, NoValue
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_target_arguments(parser, "[REGISTER ...]")
-    parser.description = f"{parser.description} Without a REGISTER: all that can be read."
+    parser.description = f"{parser.description} Without REGISTER, all readable registers are read."
     add_json_argument(parser)
 
 
@@ -50,12 +50,12 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _read(drive: Drive, wanted: list[Register[Any]]) -> dict[Register[Any], Any]:
-    """Return each register's value, the drive's refusal, or None where it has no valid value."""
+    """Return each register's value, the drive's exception, or None if it has no valid value."""
     try:
         found = drive.read_many(wanted)
     except NoValue as lack:
         found = dict(lack.values)
-    except DriveException:  # which register, only single reads show
+    except DriveException:  # read singly to find the register
         return {register: _read_one(drive, register) for register in wanted}
     return {register: found.get(register.name) for register in wanted}
 

@@ -1,4 +1,4 @@
-"""`multidrop scan`: finds the drives on a line, their addresses and settings; writes a plant file."""
+"""`multidrop scan`: finds the drives on a line with their addresses and settings; writes a plant file."""
 
 from __future__ import annotations
 
@@ -53,22 +53,22 @@ _CLEAR_LINE = "\r\x1b[K"
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_line_arguments(parser)
-    parser.add_argument("--model", action="append", default=[], help="only these; all families without it")
+    parser.add_argument("--model", action="append", default=[], help="only these; default: all families")
     parser.add_argument(
         "--addresses",
         metavar="1-31",
         type=_addresses,
         default=list(ADDRESSES),
-        help=f"such as 1-247 or 1,5,9, on tcp:// 0-255; {ADDRESSES[0]}-{ADDRESSES[-1]} without it",
+        help=f"such as 1-247 or 1,5,9, on tcp:// 0-255; default: {ADDRESSES[0]}-{ADDRESSES[-1]}",
     )
     for name, metavar, parse in (("--baudrates", "N,N", _baudrates), ("--formats", "8N1,8E1", _formats)):
-        parser.add_argument(name, metavar=metavar, type=parse, default=[], help="only these; all without it")
-    parser.add_argument(
-        "--quick", action="store_true", help="do not ask again for drives that answer later than usual"
-    )
+        parser.add_argument(name, metavar=metavar, type=parse, default=[], help="only these; default: all")
+    parser.add_argument("--quick", action="store_true", help="skip the second pass for slow drives")
     add_rs485_argument(parser)
     add_settle_argument(parser)
-    parser.add_argument("--out", metavar="PLANT.toml", type=Path, help="write a plant file of what is found")
+    parser.add_argument(
+        "--out", metavar="PLANT.toml", type=Path, help="write a plant file of the drives found"
+    )
     add_json_argument(parser)
 
 
@@ -97,7 +97,7 @@ def run(arguments: argparse.Namespace) -> int:
     else:
         print_text(_summary(len(drives), seconds, arguments.addresses))
         if written:
-            print_text(f"{written} is ready: multidrop poll {written}")
+            print_text(f"wrote {written}; next: multidrop poll {written}")
     if not finished:
         raise KeyboardInterrupt
     return 0 if drives else 1
@@ -110,7 +110,7 @@ def _scan(
     planned: Sequence[Sweep],
     families: Sequence[type[Drive]],
 ) -> tuple[list[Finding], bool]:
-    """Return what was found, and False where Ctrl-C cut it short: what came until then is kept."""
+    """Return the findings, and whether the scan finished; after Ctrl-C the findings so far are kept."""
     found: list[Finding] = []
     line = Line(arguments.port, rs485=rs485, settle=settle).open()
     try:
@@ -133,7 +133,7 @@ def _families(models: Sequence[str]) -> dict[str, type[Drive]]:
         named[whole] = find_model(text)
     models = [family.model for family in named.values() if family.model]
     if twice := sorted({model for model in models if models.count(model) > 1}):
-        raise ValueError(f"two files are called {twice[0]}: scan for one of them at a time, or rename it")
+        raise ValueError(f"two files declare the model {twice[0]}: rename one, or scan for one at a time")
     return named
 
 
@@ -141,13 +141,12 @@ def _planned(arguments: argparse.Namespace, families: Sequence[type[Drive]]) -> 
     unknown = [one for one in arguments.addresses if one not in SERIAL_ADDRESSES]
     if unknown and not speaks_tcp(arguments.port):
         raise ValueError(
-            f"--addresses: {unknown[0]} is a unit id of Modbus TCP; on {arguments.port} write 1 to 247"
+            f"--addresses: {unknown[0]} is only valid on tcp:// ports; on {arguments.port} use 1 to 247"
         )
     fixed = arguments.port.startswith("socket://")
     if fixed and len(arguments.baudrates) != 1:
         raise ValueError(
-            f"{arguments.port} has a baud rate of its own, which its server knows alone: "
-            "name it, such as --baudrates 9600"
+            f"the serial server at {arguments.port} sets the baud rate: name it, such as --baudrates 9600"
         )
     planned = sweeps(
         families, addresses=arguments.addresses, baudrates=arguments.baudrates, formats=arguments.formats
@@ -163,9 +162,9 @@ def _planned(arguments: argparse.Namespace, families: Sequence[type[Drive]]) -> 
 
 
 def _shown(findings: Iterator[Finding], silent: bool) -> Iterator[Finding]:
-    """Print findings as they come, unless silent, and progress on stderr; pass the findings on.
+    """Print findings as they come, unless silent, and progress on stderr; yield the findings.
 
-    On a terminal progress is one line, redrawn; into a file it is a line for every setting.
+    On a terminal progress is one line, redrawn; in a file it is a line for every setting.
     """
     redraws = sys.stderr.isatty()
     shown = ""  # the setting of the progress line
@@ -184,7 +183,7 @@ def _shown(findings: Iterator[Finding], silent: bool) -> Iterator[Finding]:
             if not silent:
                 print_text(sentence(finding), flush=True)
             yield finding
-    finally:  # by Ctrl-C too
+    finally:  # also after Ctrl-C
         if shown and redraws:
             _redraw("")
 
@@ -199,29 +198,28 @@ def _duration(seconds: float) -> str:
 
 
 def sentence(finding: Finding) -> str:
-    """Return the finding in words."""
+    """Return the finding as a sentence."""
     at = f"{finding.settings} {finding.framing}"
     match finding:
         case Found():
             what = " or ".join(finding.models) or "an unknown Modbus device"
-            text = (
-                f"address {finding.address}: {what} at {at}, {finding.response_delay * 1e3:.1f} ms to answer"
-            )
+            delay = f"response delay {finding.response_delay * 1e3:.1f} ms"
+            text = f"address {finding.address}: {what} at {at}, {delay}"
             return f"{text} ({finding.doubt})" if finding.doubt else text
         case Crowd() if finding.reply:
             return (
-                f"address {finding.address}: whole frames at {at} that are no reply to what was asked: "
+                f"address {finding.address}: valid frames at {at} that do not match the request: "
                 f"{finding.reply}"
             )
         case Crowd():
             return (
-                f"address {finding.address}: garbage instead of replies at {at}: several drives seem to have "
-                "this address; leave one of them on and give it another"
+                f"address {finding.address}: garbage instead of replies at {at}: several drives may have "
+                "this address; switch on one of them only, and change its address"
             )
         case Noise():
             return (
-                f"noise at {at}: garbage instead of silence at {finding.garbled} of {finding.asked} "
-                "addresses; look at wiring, termination and shield"
+                f"noise at {at}: garbage at {finding.garbled} of {finding.asked} addresses; "
+                "check wiring, termination and shield"
             )
         case Untried():
             return f"not asked at {at}: {finding.reason}"
@@ -235,9 +233,9 @@ def sentence(finding: Finding) -> str:
 def _summary(drives: int, seconds: float, addresses: Sequence[int]) -> str:
     text = f"{counted(drives, 'drive') if drives else 'no drives'} found in {_duration(seconds)}"
     if not drives:
-        text += "; look at their power and address, at A and B, and what `multidrop doctor` says of the port"
+        text += "; check their power, their addresses and A/B, and run `multidrop doctor` on the port"
     if addresses == list(ADDRESSES):
-        text += f"; addresses above {ADDRESSES[-1]} were not asked (--addresses 1-247 does)"
+        text += f"; addresses above {ADDRESSES[-1]} were not tried (use --addresses 1-247)"
     return text
 
 
@@ -288,7 +286,7 @@ def _addresses(text: str) -> list[int]:
         spans = []
     if not spans or not all(0 <= first <= last <= UNIT_IDS[-1] for first, last in spans):
         raise argparse.ArgumentTypeError(
-            f"{text!r} is not addresses from 1 to 247 (0 to 255 on a tcp:// port), such as 1-31 or 1,5,9"
+            f"invalid addresses {text!r}: write 1 to 247 (0 to 255 on a tcp:// port), such as 1-31 or 1,5,9"
         )
     return list(dict.fromkeys(address for first, last in spans for address in range(first, last + 1)))
 
@@ -297,7 +295,7 @@ def _baudrates(text: str) -> list[int]:
     try:
         return [plain_whole(part) for part in text.split(",")]
     except ValueError:
-        raise argparse.ArgumentTypeError(f"{text!r} is not baud rates such as 9600,19200") from None
+        raise argparse.ArgumentTypeError(f"invalid baud rates {text!r}: write such as 9600,19200") from None
 
 
 def _formats(text: str) -> list[str]:

@@ -1,4 +1,4 @@
-"""The `serve` command: polls a plant, and serves it to others. No other module imports the gateway."""
+"""`multidrop serve`: polls a plant and serves it to browsers and programs."""
 
 from __future__ import annotations
 
@@ -32,8 +32,8 @@ if TYPE_CHECKING:
     from multidrop.gateway.reload import Read
     from multidrop.gateway.settings import ServeSettings
 
-DEMO_PORTS = (8750, 0)  # the usual one, or any
-END_S = 4.7  # from the signal until the process is gone, whatever hangs
+DEMO_PORTS = (8750, 0)  # the usual one, or any free port
+END_S = 4.7  # from the signal until the process is ended by force
 ROLES = ("look", "stop", "write")
 
 
@@ -41,16 +41,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("plant", metavar="PLANT.toml", nargs="?", help="lines, drives, and the table [serve]")
     add_port_option(parser)
     parser.add_argument("--demo", action="store_true", help="serve a simulated plant, and open its page")
-    parser.add_argument("--no-browser", action="store_true", help="open no page, with --demo")
-    parser.add_argument("--check", action="store_true", help="check the file and its [serve], and do nothing")
+    parser.add_argument("--no-browser", action="store_true", help="with --demo: do not open the page")
+    parser.add_argument("--check", action="store_true", help="check the file and its [serve], then exit")
     add_log_argument(parser)
     parser.add_argument(
         "--new-token",
         metavar="ROLE",
         choices=ROLES,
-        help=f"print a new token for this role: {', '.join(ROLES)}; with --for",
+        help=f"print a new token for this role: {', '.join(ROLES)}; needs --for",
     )
-    parser.add_argument("--for", metavar="NAME", dest="owner", help="who will have the new token")
+    parser.add_argument("--for", metavar="NAME", dest="owner", help="the owner of the new token")
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -58,9 +58,9 @@ def run(arguments: argparse.Namespace) -> int:
         return _new_token(arguments.new_token, arguments.owner)
     if arguments.demo:
         if arguments.plant:
-            raise ValueError("--demo has a plant of its own: leave the plant file out")
+            raise ValueError("--demo has its own plant: remove the plant file")
         if arguments.ports:
-            raise ValueError("--demo has a plant of its own: leave --port out")
+            raise ValueError("--demo has its own plant: remove --port")
         return serve_demo(is_shown=not arguments.no_browser, log=arguments.log)
     if not arguments.plant:
         raise ValueError("name a plant file, or try `multidrop serve --demo`")
@@ -83,7 +83,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def serve_demo(*, is_shown: bool = True, log: str = "text") -> int:
-    """Serve a simulated plant in which everybody on this machine may do everything."""
+    """Serve a simulated plant; every user of this machine has all rights."""
     _require_server()
     with TemporaryDirectory(prefix="multidrop-") as directory:
         folder = Path(directory)
@@ -103,15 +103,15 @@ def serve_demo(*, is_shown: bool = True, log: str = "text") -> int:
 
 
 def blind_spots(plant: Plant) -> list[str]:
-    """Return a sentence for each drive of which no polled register can show a fault."""
+    """Return a sentence for each drive whose polled registers cannot show a fault."""
     found = []
     for line in plant.lines:
         for drive, polled in ((one.drive, [poll.register.name for poll in one.polls]) for one in line.drives):
             if can_show_fault(drive, polled):
                 continue
             others = [one.name for one in drive.readings() if can_show_fault(drive, [*polled, one.name])]
-            advice = f"poll {' or '.join(others[:3])} too" if others else "its family names no such register"
-            found.append(f"{drive.name}: no register that is polled can show a fault: {advice}")
+            advice = f"poll {' or '.join(others[:3])} too" if others else "its family has no such register"
+            found.append(f"{drive.name}: no polled register can show a fault: {advice}")
     return found
 
 
@@ -181,7 +181,7 @@ def _serve(
 
 
 def _end_by_force() -> None:
-    """End the process when its time is over: a thread may hang in a read from a disk."""
+    """End the process after END_S: a thread may hang while reading from a disk."""
     time.sleep(END_S)
     os._exit(1)
 
@@ -192,11 +192,11 @@ def _url(settings: ServeSettings, port: int) -> str:
 
 
 def _new_token(role: str | None, owner: str | None) -> int:
-    """Print a line for the file of tokens, and on stderr the token itself, which is kept nowhere."""
+    """Print a line for the file of tokens, and on stderr the token itself, which is not stored."""
     from multidrop.gateway.http.rights import Right, new_token
 
     if not role or not owner:
-        raise ValueError("a new token needs a role and a name: multidrop serve --new-token stop --for anna")
+        raise ValueError("a new token needs a role and an owner: multidrop serve --new-token stop --for anna")
     secret, token = new_token(owner, Right[role.upper()])
     print_text(token.line)
     warn(f"the token of {owner}, shown this once: {secret}")

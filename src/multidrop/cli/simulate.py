@@ -17,8 +17,8 @@ from multidrop.sim.faulty_wire import HELP, Faults
 ANY_TCP = "tcp://127.0.0.1:0"  # for a line on another machine: any free port of this one
 LOOPBACK = ("127.0.0.1", "localhost")
 NO_TERMINALS = (
-    "this system has no pseudo-terminals for --ports DIR: give each line a port such as "
-    "socket://127.0.0.1:5020, and leave --ports out"
+    "this system has no pseudo-terminals for --ports DIR: remove --ports, and give each line a port such as "
+    "socket://127.0.0.1:5020"
 )
 
 
@@ -26,17 +26,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "plant",
         metavar="PLANT.toml",
-        help="the drives; each line's port is ignored, but for tcp:// of this machine, and its socket:// "
-        "without --ports",
+        help="the drives; lines' ports are ignored, except tcp:// on this machine and, without --ports, "
+        "socket:// on this machine",
     )
     parser.add_argument(
         "--ports",
         metavar="DIR",
         type=Path,
-        help="where a link to each line's port is put; needed where a line has neither of these ports",
+        help="directory for a link to each line's port; needed if a line has neither of these ports",
     )
     parser.add_argument("--unpaced", action="store_true", help="answer at once, not at the pace of a wire")
-    parser.add_argument("--faults", metavar="FILE", help="what befalls the bytes, as said below")
+    parser.add_argument("--faults", metavar="FILE", help="faults of the line, as described below")
     parser.epilog = HELP
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
 
@@ -48,9 +48,9 @@ def run(arguments: argparse.Namespace) -> int:
     if directory is not None and not hasattr(os, "openpty"):
         raise ValueError(NO_TERMINALS)
     if directory is None and (serial := [line.name for line in plant.lines if not _has_place(line.port)]):
-        raise ValueError(f"line {serial[0]} gets a pseudo-terminal: name a directory for it with --ports DIR")
+        raise ValueError(f"line {serial[0]} needs a pseudo-terminal: add --ports DIR")
     if directory is not None and directory.exists() and not directory.is_dir():
-        raise ValueError(f"{directory} is a file: name a directory with --ports, which is made if need be")
+        raise ValueError(f"--ports {directory} is a file: name a directory; it is created if missing")
     ports = [_port(line, directory) for line in plant.lines]
     if directory is not None:
         directory.mkdir(parents=True, exist_ok=True)
@@ -63,7 +63,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _has_place(port: str) -> bool:
-    """Return True for a port that needs no --ports: the line is simulated on TCP, on this machine."""
+    """Return True for a port without --ports: the line is simulated on TCP, on this machine."""
     return speaks_tcp(port) or _is_here(port)
 
 
@@ -77,7 +77,7 @@ def _drives(line: PlantLine) -> list[SimulatedDrive]:
 
 
 def _port(line: PlantLine, directory: Path | None) -> str:
-    """Return the port at which a line is simulated. Raises ValueError where a link cannot be made."""
+    """Return the port at which a line is simulated. Raises ValueError if its link cannot be made."""
     if speaks_tcp(line.port):
         url = urlsplit(line.port)
         return line.port if url.hostname in LOOPBACK and url.port else ANY_TCP
@@ -85,9 +85,9 @@ def _port(line: PlantLine, directory: Path | None) -> str:
         return line.port
     link = directory / line.name
     if link.parent != directory:
-        raise ValueError(f"line {line.name!r} has a / in its name, which the link to its port cannot have")
+        raise ValueError(f"line {line.name!r} has a / in its name: rename it to link its port")
     if link.is_symlink() or link.exists():
-        raise ValueError(f"{link} is there already: remove it, or choose another directory with --ports")
+        raise ValueError(f"{link} exists already: remove it, or choose another directory with --ports")
     return str(link)
 
 

@@ -1,4 +1,4 @@
-"""The `sniff` command: prints and captures a line's traffic, and sends nothing."""
+"""`multidrop sniff`: prints and captures the traffic of a line. It only listens."""
 
 from __future__ import annotations
 
@@ -44,20 +44,18 @@ _GIVEN_UP_S = 1.5  # longer than any master waits for a reply
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_line_arguments(parser)
-    parser.add_argument("--replay", metavar="FILE", type=Path, help="a capture, instead of a port")
+    parser.add_argument("--replay", metavar="FILE", type=Path, help="read a capture instead of a port")
     parser.add_argument("--plant", metavar="PLANT.toml", help="for names and engineering units")
     parser.add_argument("--out", metavar="FILE.pcapng", type=Path, help="write a capture, for Wireshark too")
-    parser.add_argument(
-        "--baudrate", type=whole, metavar="N", help="as the plant file says, or 9600, if not given"
-    )
-    parser.add_argument("--format", metavar="8N1", help="as the plant file says, or 8N1, if not given")
-    parser.add_argument("--seconds", type=duration, metavar="S", help="how long; until Ctrl-C if not given")
+    parser.add_argument("--baudrate", type=whole, metavar="N", help="default: the plant file's, or 9600")
+    parser.add_argument("--format", metavar="8N1", help="default: the plant file's, or 8N1")
+    parser.add_argument("--seconds", type=duration, metavar="S", help="how long; default: until Ctrl-C")
     add_json_argument(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
     if (arguments.port is None) == (arguments.replay is None):
-        raise ValueError("name a PORT to listen to, or a capture with --replay FILE, and not both")
+        raise ValueError("name either a PORT to listen to, or a capture with --replay FILE")
     if arguments.out:
         check_capture(arguments.out)
     plant = load_plant(arguments.plant) if arguments.plant else None
@@ -79,10 +77,10 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _line(arguments: argparse.Namespace, plant: Plant | None) -> PlantLine | None:
-    """Return the plant file's line to listen to, or None where none is known.
+    """Return the plant file's line to listen to, or None if it is unknown.
 
-    With PLANT.toml in place of PORT, sets `arguments.port` to the line's port. With --plant it is the line
-    that has this port, or else the plant's only line.
+    With PLANT.toml instead of PORT, set `arguments.port` to the line's port. With --plant, it is the line
+    with this port, or else the plant's only line.
     """
     named = plant_at(arguments)
     if named is None:
@@ -90,7 +88,7 @@ def _line(arguments: argparse.Namespace, plant: Plant | None) -> PlantLine | Non
         lines = plant.lines if plant else ()
         return next((line for line in lines if line.port == port), captured_line(plant, port))
     if plant:
-        raise ValueError(f"--plant is for a PORT: {arguments.port} is a plant file already")
+        raise ValueError(f"remove --plant: {arguments.port} is a plant file already")
     line = line_of(named, arguments.name)
     arguments.port = line.port
     return line
@@ -101,7 +99,7 @@ def _name(port: str) -> str:
 
 
 def _settings(arguments: argparse.Namespace, line: PlantLine | None) -> Settings:
-    """Return the settings that the arguments state, and for the rest those of most of the line's drives."""
+    """Return the arguments' settings, completed by those of most of the line's drives."""
     usual = usual_settings(line)
     baudrate = usual.baudrate if arguments.baudrate is None else arguments.baudrate
     return Settings(baudrate, arguments.format or usual.format)
@@ -116,7 +114,7 @@ def _listen(listener: Listener, printer: TrafficPrinter, seconds: float | None) 
             if seconds is not None and now - begun >= seconds:
                 break
             if listener.receive():
-                received_at = time.monotonic()  # not `now`: a busy machine may have let us wait for long
+                received_at = time.monotonic()  # not `now`: receiving may have taken long
             listener.stream.end(now - received_at > _SILENT_S)
             printer.show(listener.stream)
             if now - received_at > _GIVEN_UP_S:
@@ -126,14 +124,20 @@ def _listen(listener: Listener, printer: TrafficPrinter, seconds: float | None) 
     printer.finish()
 
 
-LOOK_S = 0.05  # the longest wait for bytes
+# ---- a port that is only listened to ----
+#
+# A device's descriptor is opened read-only. A port behind a URL is pyserial's, with its `write` replaced:
+# a socket gets no bytes, and an rfc2217 server gets the settings alone.
+
+
+LISTEN_S = 0.05  # the longest wait for bytes
 _MOST = 4096  # bytes of one read
 
 
 def _open_device(port: str, settings: Settings) -> FileIO:
     """Open a device of this machine read-only, and lock and set it up."""
     if sys.platform == "win32":
-        raise LineError(port, "on Windows only a socket:// can be listened to, and no serial device")
+        raise LineError(port, "serial devices cannot be sniffed on Windows: use socket://")
     import fcntl
 
     fd = os.open(port, os.O_RDONLY | os.O_NOCTTY | os.O_NONBLOCK)
@@ -141,7 +145,7 @@ def _open_device(port: str, settings: Settings) -> FileIO:
         fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
         refused = set_settings(fd, settings.baudrate, settings.format) & must_take(os.ttyname(fd))
         if refused:
-            raise LineError(port, f"the port does not take the {refused_names(refused)} of {settings}")
+            raise LineError(port, f"the port does not support the {refused_names(refused)} of {settings}")
     except OSError:
         os.close(fd)
         raise
@@ -149,20 +153,20 @@ def _open_device(port: str, settings: Settings) -> FileIO:
 
 
 def _open_url(url: str, settings: Settings) -> Any:
-    """Open a URL, with a `write` that refuses."""
+    """Open a URL, with a `write` that raises."""
     port = unopened(url)
     vars(port)["write"] = _refuse
     port.baudrate = settings.baudrate
     port.bytesize = settings.databits
     port.parity = settings.parity
     port.stopbits = settings.stopbits
-    port.timeout = LOOK_S
+    port.timeout = LISTEN_S
     port.open()
     return port
 
 
 def _refuse(data: bytes) -> NoReturn:
-    raise OSError(f"this port is only listened to: {data.hex(' ')} is not sent")
+    raise OSError(f"this port only listens: {data.hex(' ')} was not sent")
 
 
 class Listener:
@@ -182,7 +186,7 @@ class Listener:
             raise LineError(port, reason_of(failure)) from failure
 
     def receive(self) -> int:
-        """Wait for bytes, LOOK_S at most, and put them into the stream; return how many came."""
+        """Wait for bytes, at most LISTEN_S, and put them into the stream; return their number."""
         try:
             received = self._read()
         except PORT_FAILURES as failure:
@@ -197,12 +201,12 @@ class Listener:
         return len(received)
 
     def _read(self) -> bytes:
-        """Return what came within LOOK_S. Raises EOFError when the other end has hung up."""
+        """Return the bytes received within LISTEN_S. Raises EOFError if the other end has hung up."""
         try:
             fd = self.fileno()
         except OSError:  # no descriptor, as of loop://
             return bytes(self._source.read(1) + self._source.read_all())
-        if not select.select([fd], [], [], LOOK_S)[0]:
+        if not select.select([fd], [], [], LISTEN_S)[0]:
             return b""
         try:
             received = os.read(fd, _MOST)
@@ -219,6 +223,9 @@ class Listener:
         self._source.close()
 
 
+# ---- traffic ----
+
+
 _SIDES = {
     Kind.JUNK: Side.EITHER,
     Kind.REQUEST: Side.ASKING,
@@ -229,7 +236,7 @@ _SIDES = {
 
 
 class TrafficPrinter:
-    """Prints the exchanges of one line."""
+    """Prints the exchanges of one line, and writes its frames into a capture."""
 
     def __init__(
         self, name: str, line: PlantLine | None, *, as_json: bool, out: CaptureWriter | None
@@ -242,14 +249,14 @@ class TrafficPrinter:
         self._out = out
 
     def show(self, stream: Stream) -> None:
-        """Print what is complete in the stream so far."""
+        """Print the complete exchanges of the stream so far."""
         spans = list(self._splitter.spans(stream))
         if self._out:
             self._write(spans, self._out)
         self._print(self.pairing.pair(spans))
 
     def finish(self) -> None:
-        """Print the requests that still wait for a reply: none will come."""
+        """Print the pending requests: no reply will come."""
         self._print(self.pairing.flush())
 
     def _write(self, spans: list[FrameSpan], out: CaptureWriter) -> None:
@@ -268,7 +275,7 @@ class TrafficPrinter:
 def replay(
     capture: Capture, plant: Plant | None, *, as_json: bool, out: CaptureWriter | None = None
 ) -> Counter[str]:
-    """Print all that a capture holds; return its counts, as `summary` takes them."""
+    """Print the traffic of a capture; return its counts, for `summary`."""
     printers: list[TrafficPrinter] = []
     for _ in capture:
         printers += [
@@ -289,7 +296,7 @@ _COUNTED = {  # one, many
     "strays": ("reply without a request", "replies without a request"),
     "unknown_bytes": ("unknown byte", "unknown bytes"),
 }
-_ALWAYS = ("exchanges", "unknown_bytes")
+_ALWAYS = ("exchanges", "unknown_bytes")  # shown even if 0
 
 
 def summary(counts: Mapping[str, int]) -> str:

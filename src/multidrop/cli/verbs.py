@@ -1,4 +1,7 @@
-"""`multidrop start`, `stop` and the other verbs: each calls the drive's method of the same name."""
+"""`multidrop start`, `stop` and the other verbs: each calls the drive's method of the same name.
+
+`multidrop stop PLANT.toml` stops all drives of a plant, or of one of its lines.
+"""
 
 from __future__ import annotations
 
@@ -28,7 +31,7 @@ from multidrop.cli.support.arguments import (
 )
 from multidrop.cli.support.output import command_line, print_text, warn
 from multidrop.cli.support.values import as_json, nearest_value
-from multidrop.cli.support.writing import confirm, telling_what_was_sent
+from multidrop.cli.support.writing import confirm, reporting_interruption
 from multidrop.control.audit_log import AuditLog
 from multidrop.control.outcome import Seen, Stopped
 from multidrop.control.stops import LEAST_S
@@ -39,14 +42,14 @@ from multidrop.errors import LineError, Unsupported
 from multidrop.plant.model import Plant, PlantLine
 
 _DIRECTED = ("start", "jog")
-_FURTHER = {"set-frequency": ("HZ",)}  # arguments of commands behind the drive
-_SHOWING_WATCHDOG = ("state", *_DIRECTED)  # they print what the motor does when the client dies
-_QUESTIONS = {  # asked before anything is sent; a stop needs no confirmation
+_FURTHER = {"set-frequency": ("HZ",)}  # arguments behind the drive
+_SHOWING_WATCHDOG = ("state", *_DIRECTED)  # commands that print how the motor reacts if the client dies
+_QUESTIONS = {  # asked before the first request; a stop needs no confirmation
     "start": "Start the motor of",
     "jog": "Turn the motor of",
     "reset-fault": "Reset the fault of",
     "set-frequency": "Change the frequency setpoint of",
-    "release-control": "Give the command over the motor back to panel and terminals of",
+    "release-control": "Return control of the motor to panel and terminals of",
 }
 
 
@@ -59,7 +62,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         parser.add_argument(
             "--direction",
             choices=[direction.value for direction in Direction],
-            help="the one in force if not given",
+            help="default: the current direction",
         )
     if command == "start":
         parser.add_argument("--frequency", metavar="HZ", type=number, help="write this setpoint first")
@@ -68,7 +71,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
             "--seconds",
             metavar="S",
             type=_stop_time,
-            help="repeat it for so long until the motor stands; for 30 s at least if not given",
+            help="repeat it up to this long until the motor has stopped; default: at least 30 s",
         )
     if command != "state":
         add_writing_arguments(parser, asks=command in _QUESTIONS)
@@ -76,11 +79,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _stop_time(text: str) -> float | None:
-    """Parse a number of seconds above 0; what is none is told, and keeps no stop back."""
+    """Parse a number of seconds above 0; warn of an invalid one, and send the stop nevertheless."""
     try:
         return duration(text)
     except argparse.ArgumentTypeError as mistake:
-        warn(f"--seconds: {mistake}: the stop is repeated for {LEAST_S:g} s at least, as without it")
+        warn(f"--seconds: {mistake}: ignored; the stop is repeated for at least {LEAST_S:g} s")
         return None
 
 
@@ -123,7 +126,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _target(arguments: argparse.Namespace) -> tuple[Target, list[str]]:
-    """Return the drive that is named, and the words behind it, of which a stop uses none and says so."""
+    """Return the named drive and the words behind it; a stop ignores these with a warning."""
     command = arguments.command
     if command not in STOPS:
         target, words = target_of(arguments)
@@ -134,12 +137,12 @@ def _target(arguments: argparse.Namespace) -> tuple[Target, list[str]]:
     except (ValueError, TypeError) as mistake:
         raise ValueError(f"the {command} was NOT sent: {mistake}") from mistake
     if words:
-        warn(f"left out, for {command} takes one drive, and that is {target.drive.name}: {' '.join(words)}")
+        warn(f"{command} takes one drive, which is {target.drive.name}: ignored {' '.join(words)}")
     return target, words
 
 
 def _opened(target: Target, arguments: argparse.Namespace) -> Bus:
-    """Open the drive's line; of a stop whose port cannot be had, say that it was not sent."""
+    """Open the drive's line. Raises OSError for a stop whose port cannot be opened: it was not sent."""
     audit = _audit_file(arguments)
     try:
         return target.open_bus(audit)
@@ -150,27 +153,22 @@ def _opened(target: Target, arguments: argparse.Namespace) -> Bus:
 
 
 def _audit_file(arguments: argparse.Namespace) -> str | None:
-    """Return the audit log's path; None, with a warning, where it cannot be opened for a stop.
-
-    A log that cannot be written holds no stop back.
-    """
+    """Return the audit log's path; None, with a warning, if a stop cannot open it: it is sent anyway."""
     audit: str | None = getattr(arguments, "audit", None)
     if audit and arguments.command in STOPS:
         try:
             AuditLog(audit).close()
         except OSError as failure:
-            warn(
-                f"{audit}: {failure.strerror or failure}: the {arguments.command} is sent and not noted there"
-            )
+            warn(f"{audit}: {failure.strerror or failure}: the {arguments.command} is sent, not logged")
             return None
     return audit
 
 
 @contextmanager
 def _annotating(command: str, target: Target) -> Iterator[list[str]]:
-    """Add notes to an interruption: what is known of the verb, and the command that stops the motor."""
+    """Add notes to an interruption: the state of the verb, and the command that stops the motor."""
     try:
-        with telling_what_was_sent(target.drive, command) as known:
+        with reporting_interruption(target.drive, command) as known:
             yield known
     except KeyboardInterrupt as interruption:
         if command != "state":
@@ -179,7 +177,7 @@ def _annotating(command: str, target: Target) -> Iterator[list[str]]:
 
 
 def _setpoint(drive: Drive, hz: float) -> Write | None:
-    """Return what set_frequency writes; None where its script begins with a read."""
+    """Return the first write of set_frequency; None if its script starts with a read."""
     step = next(drive.set_frequency.script(hz))
     if not isinstance(step, Write):
         return None
@@ -187,14 +185,14 @@ def _setpoint(drive: Drive, hz: float) -> Write | None:
 
 
 def _rehearse(script: Script[Any]) -> None:
-    """Make the script's first step: raise for what the family lacks or forbids, before a port is opened."""
+    """Run the script's first step without a port: raise if the family lacks or forbids the verb."""
     step = next(script)
     if isinstance(step, Write):
         step.register.encode(step.value)
 
 
 def _details(arguments: argparse.Namespace) -> str:
-    """Return what a question says of the setpoint and the direction that were asked for."""
+    """Return a question's words for the wanted setpoint and direction."""
     hz, direction = (getattr(arguments, name, None) for name in ("frequency", "direction"))
     at = "to" if arguments.command == "set-frequency" else "at"
     return ("" if hz is None else f" {at} {hz:g} Hz") + (f", {direction}" if direction else "")
@@ -206,7 +204,7 @@ def _parameters(arguments: argparse.Namespace) -> list[Any]:
     return [arguments.frequency] if arguments.command == "set-frequency" else []
 
 
-# ---- what became of it ----
+# ---- results ----
 
 
 def _sentence(command: str, drive: Drive, state: State | None, setpoint: Write | None, watchdog: str) -> str:
@@ -237,25 +235,25 @@ def _as_json(state: State | None) -> dict[str, Any] | None:
 
 
 def add_plant_stop_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add --all and --line, and show in the usage that a plant file alone is enough."""
+    """Add --all and --line, and the usage with only a plant file."""
     parser.usage = f"{parser.usage}\n       {parser.prog} PLANT.toml [--line LINE] [options]"
     parser.add_argument(
-        "--all", action="store_true", help="all drives of the plant; so without it, if no drive is named"
+        "--all", action="store_true", help="all drives of the plant; the default if no drive is named"
     )
     parser.add_argument("--line", metavar="LINE", help="all drives of this line of the plant")
 
 
 def names_plant(arguments: argparse.Namespace) -> bool:
-    """Return True if the words name a whole plant or a line of it, and no single drive."""
+    """Return True if the words name a whole plant or one of its lines, not a single drive."""
     if arguments.command != "stop" or not arguments.words or not is_plant(arguments.words[0]):
         return False
     return len(arguments.words) == 1 or arguments.all or arguments.line is not None
 
 
 def stop_plant(arguments: argparse.Namespace, audit: str | None) -> int:
-    """Stop the lines side by side; print what became of each drive as its line is done.
+    """Stop the lines in parallel; print each drive's result when its line is done.
 
-    Raises ValueError for mistakes in the plant file or in the name of the line; nothing is sent then.
+    Raises ValueError for mistakes in the plant file or the line's name; then no stop is sent.
     """
     try:
         lines = _lines(plant_of(arguments.words[0], arguments), arguments)
@@ -280,7 +278,7 @@ def stop_plant(arguments: argparse.Namespace, audit: str | None) -> int:
 
 
 def _lines(plant: Plant, arguments: argparse.Namespace) -> Sequence[PlantLine]:
-    """Return the lines to stop. A drive named beside --all or --line is a contradiction: ValueError."""
+    """Return the lines to stop. Raises ValueError for a drive beside --all or --line."""
     if arguments.words[1:]:
         option = "--all" if arguments.all else "--line"
         raise ValueError(
@@ -292,9 +290,9 @@ def _lines(plant: Plant, arguments: argparse.Namespace) -> Sequence[PlantLine]:
 
 
 def _start_stops(stops: Sequence[_LineStop], finished: SimpleQueue[_LineStop]) -> None:
-    """Stop each line in a thread of its own: no line waits for the ports and ramps of another.
+    """Stop each line in its own thread: no line waits for the ports and ramps of another.
 
-    If the system has no more threads, the remaining lines are stopped here, one after another.
+    If no more threads can be started, stop the remaining lines here, one after another.
     """
     without_thread = []
     for stop in stops:
@@ -337,7 +335,7 @@ class _LineStop:
             self.results += self.bus.stop_all(self.seconds).values()
 
     def so_far(self) -> list[str]:
-        """Return a sentence for each drive: its result, or what is known of its stop."""
+        """Return a sentence for each drive: its result, or the state of its stop."""
         known = {result.drive: _stop_sentence(result) for result in self.results}
         if not known and self.bus:
             known = self.bus.stops_under_way()

@@ -1,4 +1,4 @@
-"""`multidrop wear`: lists the writes to registers that a drive may keep in EEPROM, and how many are left."""
+"""`multidrop wear`: lists writes to registers that may be stored in EEPROM, and how many are left."""
 
 from __future__ import annotations
 
@@ -18,24 +18,22 @@ HEAD = ("PORT", "ADDRESS", "MODEL", "REGISTER", "WRITES", "THIS YEAR", "LEFT", "
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--ledger", metavar="FILE", help="another one than the user's own")
+    parser.add_argument("--ledger", metavar="FILE", help="another ledger than the user's")
     add_json_argument(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
     if arguments.ledger and not Path(arguments.ledger).is_file():
-        raise ValueError(f"there is no ledger {arguments.ledger}; without --ledger it is {default_path()}")
+        raise ValueError(f"there is no ledger {arguments.ledger}; the default is {default_path()}")
     ledger = Ledger(arguments.ledger)
     found = ledger.wear((now_ns() + utc_minus_monotonic_ns()) / 1e9)
     if arguments.json:
         print_text(json.dumps([_as_json(wear) for wear in found], indent=2))
     elif not found:
-        print_text(f"{ledger.path}: no register that may be in EEPROM was written yet")
+        print_text(f"{ledger.path}: no writes to EEPROM yet")
     else:
         print_text("\n".join(aligned([HEAD, *map(_row, found)], "<><<>>><")))
-        print_text(
-            f"\n{ledger.path}: {BUDGET} writes of a register in a year, of {CYCLES} that an EEPROM bears."
-        )
+        print_text(f"\n{ledger.path}: {BUDGET} writes of a register a year; an EEPROM lasts {CYCLES} writes.")
     return 0
 
 

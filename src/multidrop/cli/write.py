@@ -1,4 +1,4 @@
-"""`multidrop write`: writes one register of one drive and says what became of it."""
+"""`multidrop write`: writes one register of one drive and prints the outcome."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from multidrop.cli.support.arguments import (
 )
 from multidrop.cli.support.output import print_text
 from multidrop.cli.support.values import as_json, nearest_value
-from multidrop.cli.support.writing import confirm, telling_what_was_sent
+from multidrop.cli.support.writing import confirm, reporting_interruption
 from multidrop.control.rules import check_plain, raw_count, refused
 
 _FURTHER = ("REGISTER", "VALUE")
@@ -38,7 +38,7 @@ def run(arguments: argparse.Namespace) -> int:
     value = nearest_value(register, register.parse(words[1]))
     check_plain(drive, register, raw_count(drive, register, value))  # before a port is opened
     confirm(f"Write {register.name} = {register.format(value)} to {drive.name} on {target.port}?", arguments)
-    with telling_what_was_sent(drive, "write") as known, target.open_bus(arguments.audit):
+    with reporting_interruption(drive, "write") as known, target.open_bus(arguments.audit):
         known.clear()
         outcome = drive.try_write(register, value)
         known.append(str(outcome))

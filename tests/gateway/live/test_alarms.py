@@ -128,7 +128,7 @@ def test_check_warns_of_registers_that_cannot_show_a_fault(run: Run, tmp_path: P
     assert (status, errors) == (0, "")
     plant.path.write_text(plant.path.read_text().replace(POLL, '["output_frequency"]', 1))
     status, _, errors = run("serve", "--check", plant.path)
-    advice = "no register that is polled can show a fault: poll status or fault too"
+    advice = "no polled register can show a fault: poll status or fault too"
     assert (status, errors.count("\n")) == (0, 1)
     assert f"pump-1: {advice}" in errors
 

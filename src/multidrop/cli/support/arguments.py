@@ -22,13 +22,13 @@ from multidrop.toml_check import parse_duration
 
 
 def add_writing_arguments(parser: argparse.ArgumentParser, *, asks: bool = True) -> None:
-    """Add --yes and --audit, for commands that may write; `asks`: this one asks before it does."""
-    yes = "do not ask; needed where no terminal is" if asks else "changes nothing: this command never asks"
+    """Add --yes and --audit, for commands that may write; `asks`: the command asks before it writes."""
+    yes = "do not ask; needed without a terminal" if asks else "no effect: this command never asks"
     parser.add_argument("--yes", action="store_true", help=yes)
     parser.add_argument(
         "--audit",
         metavar="FILE",
-        help="append every write and its outcome to this file; to none if not given",
+        help="append every write and its outcome to this file",
     )
 
 
@@ -45,7 +45,7 @@ def whole(text: str) -> int:
 
 
 def number(text: str) -> float:
-    """Parse a number with a point."""
+    """Parse a number, with or without a decimal point."""
     try:
         return plain_number(text)
     except ValueError:
@@ -76,30 +76,30 @@ def add_port_option(parser: argparse.ArgumentParser) -> None:
         type=_named_port,
         action="append",
         default=[],
-        help="another port for a line of the plant file, such as a simulated one; as often as needed",
+        help="use another port for a line of the plant file, such as a simulated one; may be repeated",
     )
 
 
 def plant_of(path: str, arguments: argparse.Namespace) -> Plant:
-    """Load a plant with the ports of --port. Raises ValueError for whatever is wrong with either."""
+    """Load a plant with the ports of --port. Raises ValueError for a mistake in either."""
     plant = load_plant(path)
     ports: dict[str, str] = {}
     for name, port in arguments.ports:
         if name in ports:
-            raise ValueError(f"--port names line {name!r} twice; a line has one port")
+            raise ValueError(f"--port is given twice for line {name!r}: give it once")
         ports[name] = port
     return plant.with_ports(ports) if ports else plant
 
 
 def is_plant(word: str) -> bool:
-    """Return True where a word in place of PORT is a plant file, by its suffix."""
+    """Return True if a word in place of PORT is a plant file, by its suffix."""
     return "://" not in word and word.lower().endswith(".toml")
 
 
 def add_line_arguments(parser: argparse.ArgumentParser, *, name: str = "LINE", kind: str = "line") -> None:
-    """Add PORT, or PLANT.toml and the name of a line, which may be left out where the plant has one line.
+    """Add PORT, or PLANT.toml and the name of a line, which is optional if the plant has one line.
 
-    `name` is how the help calls that second argument, and `kind` says what it may be the name of.
+    `name` is the second argument's name in the help, and `kind` the kinds of things it may name.
     """
     ways = [f"{parser.prog} PORT [options]", f"{parser.prog} PLANT.toml [{name}] [options]"]
     parser.usage = "\n       ".join(ways)
@@ -110,54 +110,54 @@ def add_line_arguments(parser: argparse.ArgumentParser, *, name: str = "LINE", k
         help="a device such as /dev/ttyUSB0, or a URL such as socket://host:port; or a plant file",
     )
     parser.add_argument(
-        "name", metavar=name, nargs="?", help=f"a {kind} of the plant file; its only line if not given"
+        "name", metavar=name, nargs="?", help=f"a {kind} of the plant file; default: its only line"
     )
     add_port_option(parser)
 
 
 def add_rs485_argument(parser: argparse.ArgumentParser) -> None:
-    """Add --rs485, for a port by hand; `rs485_at` has its value."""
+    """Add --rs485 for a port without a plant file; `rs485_at` returns its value."""
     parser.add_argument(
         "--rs485",
         metavar="MODE",
-        help="who switches between sending and receiving, where the adapter does not by itself: "
+        help="how to switch between sending and receiving, if the adapter does not by itself: "
         "kernel, rts-up or rts-down",
     )
 
 
 def rs485_at(arguments: argparse.Namespace, line: PlantLine | None) -> RS485:
-    """Return who switches the transceiver of this line, or of a port by hand. Raises ValueError."""
+    """Return the RS-485 mode of this line, or of a port without a plant file. Raises ValueError."""
     if line is None:
         found = RS485(arguments.rs485 or "off")
         found.check_port(arguments.port)
         return found
     if arguments.rs485 is not None:
-        raise ValueError("--rs485 is a matter of the plant file: write it into the line there")
+        raise ValueError("--rs485 is not for plant files: set rs485 in the line's table there")
     return line.rs485
 
 
 def add_settle_argument(parser: argparse.ArgumentParser) -> None:
-    """Add --settle, for a port by hand; `settle_at` has its value."""
+    """Add --settle for a port without a plant file; `settle_at` returns its value."""
     parser.add_argument(
         "--settle",
         metavar="TIME",
-        help='such as "1.5 s": send nothing for so long after the port is opened, for devices that it resets',
+        help='pause after opening the port, such as "1.5 s", for devices that this resets',
     )
 
 
 def settle_at(arguments: argparse.Namespace, line: PlantLine | None) -> float:
-    """Return how long this line, or a port by hand, needs after its opening, in s. Raises ValueError."""
+    """Return the pause in s after opening this line, or a port without a plant file. Raises ValueError."""
     if line is not None:
         if arguments.settle is not None:
-            raise ValueError("--settle is a matter of the plant file: write it into the line there")
+            raise ValueError("--settle is not for plant files: set settle in the line's table there")
         return line.settle
     return parse_duration(arguments.settle) if arguments.settle is not None else 0.0
 
 
 def plant_at(arguments: argparse.Namespace) -> Plant | None:
-    """Return the plant where a plant file stands in place of PORT; None where a port does.
+    """Return the plant if a plant file is given in place of PORT; None for a port.
 
-    Raises ValueError for mistakes in the plant file, and beside a port for arguments that belong to a plant.
+    Raises ValueError for mistakes in the plant file, and for a plant's arguments beside a port.
     """
     if arguments.port is None:
         raise ValueError(
@@ -167,7 +167,7 @@ def plant_at(arguments: argparse.Namespace) -> Plant | None:
         return plant_of(arguments.port, arguments)
     check_port(arguments.port)
     if arguments.ports:
-        raise ValueError("--port is for the lines of a plant file; write the port in place of PORT")
+        raise ValueError("--port is for the lines of a plant file: write the port in place of PORT")
     if arguments.name is not None:
         raise ValueError(
             f"unrecognized arguments: {arguments.name}; see `multidrop {arguments.command} --help`"
@@ -181,12 +181,12 @@ def line_of(plant: Plant, name: str | None) -> PlantLine:
         return plant.find_line(name)
     if len(plant.lines) > 1:
         names = ", ".join(line.name for line in plant.lines)
-        raise ValueError(f"{plant.path} has several lines: name one of {names}")
+        raise ValueError(f"{plant.path} has several lines: choose one of {names}")
     return plant.lines[0]
 
 
 def usual_settings(line: PlantLine | None) -> Settings:
-    """Return the settings of most of a line's drives; 9600 8N1 where none is known."""
+    """Return the settings of most of a line's drives; 9600 8N1 without a line."""
     found = [polled.drive.settings for polled in line.drives] if line else []
     return max(found, key=found.count) if found else Settings(9600, "8N1")
 
@@ -199,7 +199,7 @@ def _named_port(text: str) -> tuple[str, str]:
 
 
 _HEX = re.compile("0[xX][0-9A-Fa-f]+")
-_BY_HAND = ("PORT", "MODEL", "ADDRESS")
+_BY_PORT = ("PORT", "MODEL", "ADDRESS")
 _BY_PLANT = ("PLANT.toml", "DRIVE")
 _STOPS_AND_LOOKS = ("read", "state", "stop", "coast", "emergency-stop")
 _SETTINGS = ("baudrate", "format", "framing")  # of a drive without a plant file
@@ -207,7 +207,7 @@ _SETTINGS = ("baudrate", "format", "framing")  # of a drive without a plant file
 
 @dataclass(frozen=True)
 class Target:
-    """A drive, its port, the words that name both on a command line, and those that name its family."""
+    """A drive, its port, the words that name both on a command line, and its family's name there."""
 
     drive: Drive
     port: str
@@ -226,7 +226,7 @@ class Target:
 
 def add_target_arguments(parser: argparse.ArgumentParser, *further: str) -> None:
     """Add the two ways to name a drive, and `further` arguments behind them, such as "[REGISTER ...]"."""
-    ways = [" ".join((parser.prog, *way, *further, "[options]")) for way in (_BY_HAND, _BY_PLANT)]
+    ways = [" ".join((parser.prog, *way, *further, "[options]")) for way in (_BY_PORT, _BY_PLANT)]
     parser.usage = "\n       ".join(ways)
     parser.add_argument(
         "words",
@@ -236,13 +236,11 @@ def add_target_arguments(parser: argparse.ArgumentParser, *further: str) -> None
         "`multidrop models`, or file.toml, or file.py:Class. ADDRESS: the drive's. In their place "
         "PLANT.toml DRIVE: a plant file and the name of a drive in it",
     )
-    parser.add_argument("--baudrate", type=whole, metavar="N", help="where it is not the family's default")
+    parser.add_argument("--baudrate", type=whole, metavar="N", help="default: the family's")
     parser.add_argument(
-        "--format", metavar="8N1", help="data bits, parity and stop bits; the family's default if not given"
+        "--format", metavar="8N1", help="data bits, parity and stop bits; default: the family's"
     )
-    parser.add_argument(
-        "--framing", metavar="rtu", help="where the family has several; its first if not given"
-    )
+    parser.add_argument("--framing", metavar="rtu", help="default: the family's first")
     parser.add_argument(
         "--option",
         metavar="NAME=VALUE",
@@ -256,23 +254,23 @@ def add_target_arguments(parser: argparse.ArgumentParser, *further: str) -> None
         metavar="REGISTER",
         action="append",
         default=[],
-        help="a register that this drive is known not to store in EEPROM",
+        help="a register that this drive does not store in EEPROM",
     )
     add_port_option(parser)
 
 
 def target_of(arguments: argparse.Namespace) -> tuple[Target, list[str]]:
-    """Return the drive that is named, and the words behind it.
+    """Return the named drive, and the words behind it.
 
-    Raises ValueError for missing words, and for whatever the plant file or the family does not allow.
+    Raises ValueError for missing words, and for mistakes in the plant file or the drive's options.
     """
     words = arguments.words
     if words and is_plant(words[0]):
         return _by_plant(arguments), words[len(_BY_PLANT) :]
-    check_words(arguments, words[: len(_BY_HAND)], _BY_HAND)
+    check_words(arguments, words[: len(_BY_PORT)], _BY_PORT)
     if arguments.ports:
-        raise ValueError("--port is for the lines of a plant file; write the port in place of PORT")
-    return _by_hand(arguments), words[len(_BY_HAND) :]
+        raise ValueError("--port is for the lines of a plant file: write the port in place of PORT")
+    return _by_port(arguments), words[len(_BY_PORT) :]
 
 
 def check_words(arguments: argparse.Namespace, words: Sequence[str], names: Sequence[str]) -> None:
@@ -298,10 +296,10 @@ def _by_plant(arguments: argparse.Namespace) -> Target:
         f"--{name}" for name in (*_SETTINGS, "option", "ram") if getattr(arguments, name) not in (None, [])
     ]
     if given:
-        raise ValueError(f"{given[0]} is a matter of the plant file: write it into {path}")
+        raise ValueError(f"{given[0]} is not for plant files: set it in {path}")
     drives = [polled.drive.name for line in plant.lines for polled in line.drives]
     if not names:
-        raise _mistaken(arguments, f"name a drive of {path}: {', '.join(drives)}")
+        raise _mistaken(arguments, f"choose a drive of {path}: {', '.join(drives)}")
     name = drive_meant(names[0], drives) if arguments.command in _STOPS_AND_LOOKS else names[0]
     line, drive = plant.find_drive(name)
     ports = [f"--port={name}={port}" for name, port in arguments.ports]
@@ -311,8 +309,8 @@ def _by_plant(arguments: argparse.Namespace) -> Target:
     )
 
 
-def _by_hand(arguments: argparse.Namespace) -> Target:
-    port, model, text = arguments.words[: len(_BY_HAND)]
+def _by_port(arguments: argparse.Namespace) -> Target:
+    port, model, text = arguments.words[: len(_BY_PORT)]
     check_port(port)
     family = find_model(model)
     try:

@@ -1,4 +1,4 @@
-"""A simulated plant to show: a line with every family on it, and its motors running."""
+"""A simulated plant for demos: a line with every family on it, and its motors running."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ OPTIONS = {"maximum_frequency": 50}
 
 
 def demo_port(folder: Path) -> str:
-    """Return the simulated line's port: a link to a pseudo-terminal, or TCP where a system has none."""
+    """Return the simulated line's port: a link to a pseudo-terminal, or TCP if the system has none."""
     if hasattr(os, "openpty"):
         return str(folder / "mixed")
     with socket.create_server(("127.0.0.1", 0)) as free:
@@ -43,7 +43,7 @@ def demo_port(folder: Path) -> str:
 
 
 def plant_file(port: str, registers: Sequence[str]) -> str:
-    """Return the text of a plant file; of each drive these registers are polled, as far as it has them."""
+    """Return the text of a plant file that polls these registers of each drive that has them."""
     tables = [f'[[line]]\nname = "mixed"\nport = "{port}"\n']
     for address, (name, model, framing) in enumerate(DRIVES, 1):
         family = MODELS[model]
@@ -57,13 +57,13 @@ def plant_file(port: str, registers: Sequence[str]) -> str:
 
 
 def start_motors(line: PlantLine, ledger: Path) -> None:
-    """Start every simulated motor, each at another frequency; on a terminal, say what takes some seconds."""
+    """Start every simulated motor, each at another frequency; announce it on a terminal: it takes seconds."""
     if sys.stdout.isatty():
         print_text(f"starting the motors of {counted(len(line.drives), 'simulated drive')} ...", flush=True)
     with Bus(line.port, ledger=ledger) as bus:
         for number, polled in enumerate(line.drives):
             drive = bus.attach(polled.drive)
-            # On a busy machine a simulated drive may answer too late: the demo goes on without its motor.
+            # On a busy machine a simulated drive may answer too late: its motor stays off.
             with suppress(BadReply, Expired, NoReply, NotVerified, Unconfirmed):
                 drive.set_frequency(20.0 + 3 * number)
                 drive.start()
@@ -71,12 +71,12 @@ def start_motors(line: PlantLine, ledger: Path) -> None:
 
 @contextmanager
 def simulator(plant: Path, ports: Path) -> Iterator[None]:
-    """Simulate in another process, which ends with this one: the two sides do not share an interpreter."""
+    """Simulate in a child process, so that both sides do not share an interpreter."""
     words = [sys.executable, "-X", "utf8", "-m", __name__, str(plant)]
     if hasattr(os, "openpty"):
         words += ["--ports", str(ports)]
     pipe = subprocess.PIPE
-    # A session of its own keeps Ctrl-C from it, and on Windows a group: it must outlive the polling.
+    # Its own session, or group on Windows, shields it from Ctrl-C: it must outlive the polling.
     apart: dict[str, Any] = {"start_new_session": True}
     if sys.platform == "win32":
         apart = {"creationflags": subprocess.CREATE_NEW_PROCESS_GROUP}
@@ -85,14 +85,14 @@ def simulator(plant: Path, ports: Path) -> Iterator[None]:
         assert process.stdout is not None
         try:
             if not process.stdout.readline().startswith("ready"):
-                raise OSError("the simulator did not start; see above")
+                raise OSError("the simulator did not start; its reason is above")
             yield
         finally:
             process.stdin.close()
 
 
 def simulate(words: Sequence[str]) -> int:
-    """Simulate until standard input ends: it ends when the process that started this one is gone."""
+    """Simulate until standard input ends, which it does with the parent process."""
 
     def end_with_parent() -> None:
         os.read(0, 1)

@@ -1,4 +1,4 @@
-"""Files that a command reads or creates. No command replaces a file: it may hold months of data."""
+"""Files that commands read or create, and optional libraries. No command replaces a file."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ if TYPE_CHECKING:
 
 
 def refuse_overwriting(path: Path) -> None:
-    """Raise ValueError when there is a file at this path."""
+    """Raise ValueError if there is a file at this path."""
     if path.is_file():
         raise already_there(path)
 
 
 def check_writable(path: Path) -> None:
-    """Raise ValueError or OSError when no new file can be written there, by creating and removing one."""
+    """Raise ValueError or OSError if no new file can be written there, by creating and removing one."""
     refuse_overwriting(path)
     if path.exists() and not path.is_dir():  # a device or a pipe
         return
@@ -31,33 +31,33 @@ def check_writable(path: Path) -> None:
 
 
 def check_capture(path: Path) -> None:
-    """Raise ValueError when no capture can be written there."""
+    """Raise ValueError if no capture can be written there."""
     if path.suffix != ".pcapng":
-        raise ValueError(f"{path}: a capture's name ends in .pcapng")
+        raise ValueError(f"{path}: a capture's name must end in .pcapng")
     refuse_overwriting(path)
 
 
 def warn_truncated(path: Path, rows: int, left_out: int) -> None:
-    """Warn of a recording whose last `left_out` bytes are no whole rows."""
+    """Warn of a recording that ends with `left_out` bytes of an incomplete row."""
     if left_out:
         warn(
-            f"the end of {path} is missing: {counted(rows, 'row')} read, and its last "
-            f"{counted(left_out, 'byte')} left out, which are no whole rows"
+            f"{path} ends within a row: {counted(rows, 'row')} read, "
+            f"and the last {counted(left_out, 'byte')} skipped"
         )
 
 
 def check_no_segments(path: Path) -> None:
-    """Raise ValueError where there is no recording at this path, but segments of one, or a folder."""
+    """Raise ValueError if the path is a folder, or names the segments of a recording."""
     if path.is_dir():
         kept = [*sorted(path.glob("rows/*.parquet")), *sorted(path.glob("rows.*.arrows"))]
         if not kept:
             raise _is_folder(path)
         raise ValueError(
-            f"{path} is the folder of a history: name one of its segments, such as {kept[-1]}, or read all "
-            "of them from Python by `multidrop.History`"
+            f"{path} is the folder of a history: name one of its files, such as {kept[-1]}, or read it from "
+            "Python with `multidrop.History`"
         )
     if not path.exists() and path.parent.is_dir() and (segments := segments_of(path)):
-        raise ValueError(f"{path} was recorded in segments: name one of them, such as {segments[-1][1]}")
+        raise ValueError(f"{path} was recorded in segments: name one, such as {segments[-1][1]}")
 
 
 def _is_folder(path: Path) -> ValueError:
@@ -84,7 +84,7 @@ def load_recording(path: Path, out: Path, command: str) -> Recording:
 
 
 def require_extra(library: str, extra: str, command: str) -> None:
-    """Raise ValueError, with what to install, when the library is missing."""
+    """Raise ValueError if the library is missing; the error names the package to install."""
     if importlib.util.find_spec(library) is None:
         raise ValueError(
             f"`multidrop {command}` needs {library}, which is not installed: pip install 'multidrop[{extra}]'"

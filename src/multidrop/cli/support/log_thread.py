@@ -1,4 +1,4 @@
-"""The log's own thread, so that no stop waits for a halted terminal or a full pipe, and the log's forms."""
+"""A log that writes on its own thread, so that no stop waits for a halted terminal or a full pipe."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from typing import TextIO
 from multidrop.printable import masked, printable
 
 MOST_WAITING = 10_000  # lines
-ENDING_S = 1.0  # for which the last of them are waited for
+ENDING_S = 1.0  # how long `close` waits for the last lines
 
 
 class LogThread(logging.Handler):
-    """Writes records to a stream's file on a thread of its own; those that find no room are counted."""
+    """Writes records to a stream's file on its own thread; counts those that do not fit into the queue."""
 
     def __init__(self, stream: TextIO, formatter: logging.Formatter) -> None:
         super().__init__()
         self.setFormatter(formatter)
         self._stream = self._file = stream
         with suppress(OSError):  # a stream in memory has no file
-            # Its own: Python flushes that of `stream` when it ends, and would wait for one that is held up.
+            # A duplicate: Python flushes `stream` at exit, and would wait for a halted one.
             own = os.dup(stream.fileno())
             self._file = os.fdopen(own, "w", 1, encoding=stream.encoding, errors="backslashreplace")
         self._waiting: queue.Queue[str | None] = queue.Queue(MOST_WAITING)
@@ -35,18 +35,18 @@ class LogThread(logging.Handler):
         self._thread.start()
 
     def is_alive(self) -> bool:
-        """True until the thread has ended: then nothing is logged any more."""
+        """True while the thread that writes is running."""
         return self._thread.is_alive()
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Take a record, without waiting."""
+        """Queue a record without waiting."""
         try:
             self._waiting.put_nowait(self.format(record))
         except queue.Full:
             self._lost += 1
 
     def close(self) -> None:
-        """Wait a second for the last lines; where nobody reads them they are left."""
+        """Wait up to ENDING_S for the last lines."""
         with suppress(queue.Full):
             self._waiting.put_nowait(None)
         self._thread.join(ENDING_S)
@@ -56,7 +56,7 @@ class LogThread(logging.Handler):
         while (line := self._waiting.get()) is not None:
             if self._lost:
                 lost, self._lost = self._lost, 0
-                said = f"{lost} later lines of the log are lost: nobody read it in time"
+                said = f"{lost} later lines of the log are lost: its reader was too slow"
                 self._put(
                     self.format(logging.LogRecord("multidrop", logging.WARNING, "", 0, said, None, None))
                 )
@@ -66,7 +66,7 @@ class LogThread(logging.Handler):
                 self._file.close()
 
     def _put(self, line: str) -> None:
-        with suppress(OSError, ValueError):  # a full disk, or a reader that is gone
+        with suppress(OSError, ValueError):  # a full disk, or a closed reader
             self._file.write(f"{line}\n")
 
 
@@ -89,7 +89,7 @@ class JsonFormatter(logging.Formatter):
 
 
 class TextFormatter(logging.Formatter):
-    """Time, level and message on a line, whoever's names are in it; a traceback below it."""
+    """Time, level and message on one line, escaped; a traceback below it."""
 
     def format(self, record: logging.LogRecord) -> str:
         text = f"{_time(record)} {record.levelname.lower()} {printable(masked(record.getMessage()))}"

@@ -1,4 +1,4 @@
-"""Output on stdout and stderr: control characters are spelt out, and passwords of URLs left out."""
+"""Output on stdout and stderr: control characters are escaped, and passwords of URLs masked."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from multidrop.printable import masked, printable
 
 
 def spell_out_unencodable() -> None:
-    """Let stdout spell out what its encoding lacks, as stderr does: a pipe on Windows has few letters."""
+    """Let stdout escape characters that its encoding lacks, as stderr does: pipes on Windows lack many."""
     if isinstance(sys.stdout, TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")
 
 
 def print_text(text: object, *, file: TextIO | None = None, flush: bool = False) -> None:
-    """Print the text; of its control characters only \\n has its effect, and the others are spelt out."""
+    """Print the text; control characters except \\n are escaped."""
     print("\n".join(map(printable, masked(str(text)).split("\n"))), file=file, flush=flush)
 
 
 def command_line(words: Sequence[str]) -> str:
-    """Return the words as one types them, quoted as this system's shell wants it."""
+    """Return the words as a command line, quoted for this system's shell."""
     if sys.platform == "win32":
         from subprocess import list2cmdline
 
@@ -36,7 +36,7 @@ def command_line(words: Sequence[str]) -> str:
 def warn(sentences: str) -> None:
     """Print each line on stderr, after the program's name.
 
-    Where nobody can be told, as on a terminal that was closed, that keeps nothing back: it may be a stop.
+    A closed stderr is ignored: it must not prevent a stop.
     """
     with suppress(OSError):
         for sentence in masked(sentences).splitlines():
@@ -54,14 +54,14 @@ class _Handler(logging.Handler):
 
 @contextmanager
 def logging_to(show: Callable[[str], object], logger_name: str, level: int) -> Iterator[None]:
-    """Hand the messages of this logger, from this level on, to `show`."""
+    """Pass the messages of this logger, from this level up, to `show`."""
     with logging_by(_Handler(show, level), {logger_name: level}):
         yield
 
 
 @contextmanager
 def logging_by(handler: logging.Handler, levels: Mapping[str, int]) -> Iterator[None]:
-    """Hand the messages of these loggers, from these levels on, to a handler, which is closed at the end."""
+    """Pass the messages of these loggers, from these levels up, to a handler; close it at the end."""
     loggers = {logging.getLogger(name): level for name, level in levels.items()}
     before = {logger: logger.level for logger in loggers}
     for logger, level in loggers.items():

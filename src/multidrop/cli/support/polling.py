@@ -1,4 +1,4 @@
-"""A plant that is polled until a signal comes, with its rows handed to a recording and a screen."""
+"""A polled plant for commands: the session, the state that screens show, and side reads."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ from multidrop.transport.statistics import LineStatistics, Statistics, line_stat
 class PollingSession(NamedTuple):
     poller: Poller  # not started yet
     interruption: Interruption
-    hand_out: Callable[[], None]  # hands the rows that have come to the recording and the consumers
+    hand_out: Callable[[], None]  # passes new rows to the recording and the consumers
 
 
 class Rotation(NamedTuple):
-    """A recording in segments: how long each is, in s, and how much of them is kept."""
+    """A recording in segments: the length of each in s, and the limits of age and size."""
 
     every: float
     keep: float | None = None  # s
@@ -53,11 +53,11 @@ def polling_session(
     *consumers: Callable[[Rows], None],
     rotation: Rotation | None = None,
 ) -> Iterator[PollingSession]:
-    """Open the plant's ports, and then its recording; close both when the block is left, with all rows."""
+    """Open the plant's ports, then its recording; on leaving, record all rows and close both."""
     takers = list(consumers)
     with ExitStack() as stack:
         interruption = stack.enter_context(noting_signals())
-        poller = stack.enter_context(closing(Poller(plant)))  # first: without ports there is no recording
+        poller = stack.enter_context(closing(Poller(plant)))  # first: no recording without ports
         if out:
             takers.append(stack.enter_context(_open(out, plant.metadata(), rotation)).write)
 
@@ -69,11 +69,11 @@ def polling_session(
         try:
             yield PollingSession(poller, interruption, hand_out)
         finally:
-            hand_out()  # what came while the poller closed, also after a failure
+            hand_out()  # the rows of the poller's closing, also after a failure
 
 
 HISTORY = 240  # points, one a second
-LATELY = 5.0  # s over which rates are taken
+RECENT = 5.0  # s over which rates are measured
 OLD = 5.0  # s, or so many periods of a register, or bus cycles of its line, if they are longer:
 PERIODS = 3  # a value is old then,
 MISSED = 1.0  # s: and where it was missed since, after so long
@@ -89,12 +89,12 @@ class LiveDrive:
     line: PlantLine
     polled: PolledDrive
     cycle: float = 0.0  # s, of its line, as planned
-    line_utilisation: float = 1.0  # as planned; 1 or more: the polls leave no spare time
+    line_utilisation: float = 1.0  # as planned; from 1 on, the polls leave no spare time
     newest: dict[str, Row] = field(default_factory=dict)  # samples, by register
     missed: dict[str, Row] = field(default_factory=dict)  # misses newer than the register's sample
     last_miss: str = ""  # status of the last miss of a request that was sent
     so_far: Statistics = _NOTHING
-    lately: Statistics = _NOTHING
+    recent: Statistics = _NOTHING
     history: deque[float | None] = field(default_factory=lambda: deque(maxlen=HISTORY))
 
     @property
@@ -111,7 +111,7 @@ class LiveDrive:
             self.missed.pop(row.register, None)
 
     def shown(self, name: str) -> str:
-        """Return a register's newest value with its unit; "" where there is none."""
+        """Return a register's newest value with its unit; "" if there is none."""
         row = self.newest.get(name)
         if row is None or row.value is None:
             return ""
@@ -135,7 +135,7 @@ class LiveDrive:
 
     @property
     def why_silent(self) -> str:
-        """Return the reason for the misses, where every polled register is missed."""
+        """Return the reason for the misses if every polled register is missed, else ""."""
         if not self.missed or len(self.missed) < len(self.polled.polls):
             return ""
         return self.last_miss or max(self.missed.values(), key=lambda row: row.time_ns).status
@@ -146,8 +146,8 @@ class LiveDrive:
         return self.shown(FAULT).lower() if row and row.value else ""
 
     @property
-    def told_by(self) -> str:
-        """Return the register that tells the state; "" where the drive is silent."""
+    def state_register(self) -> str:
+        """Return the register that shows the state; "" if the drive is silent."""
         if self.why_silent:
             return ""
         if self.fault:
@@ -158,21 +158,21 @@ class LiveDrive:
     @property
     def state(self) -> str:
         """Return the state as far as the polled registers show it."""
-        told_by = self.told_by
-        if told_by == STATE:
+        register = self.state_register
+        if register == STATE:
             return self.shown(STATE).lower()
-        if told_by != FREQUENCY:
-            return "fault" if told_by else "silent"
+        if register != FREQUENCY:
+            return "fault" if register else "silent"
         row = self.newest.get(FREQUENCY)
         return "turns" if row and row.value else ""  # 0 Hz may be a stop, or a run at a setpoint of 0
 
     def _is_bare(self, row: Row) -> bool:
-        """Return True for flags of which none is set: they are no name of a state."""
+        """Return True for flags with no bit set: they name no state."""
         values = self.polled.drive.register(row.register).values
         return not row.value and values is not None and issubclass(values, Flag)
 
     def remember(self) -> None:
-        """Add a point of history: the frequency where it is polled, else the register polled first."""
+        """Add a point of history: the frequency if it is polled, else the first polled register."""
         polled = [poll.register.name for poll in self.polled.polls]
         name = FREQUENCY if FREQUENCY in polled else next(iter(polled), "")
         fresh = name in self.newest and name not in self.missed
@@ -180,9 +180,10 @@ class LiveDrive:
 
 
 class LivePlant:
-    """All drives of a plant, and the statistics of its lines: so far, and of the last LATELY seconds.
+    """All drives of a plant, and the statistics of its lines: so far, and of the last RECENT seconds.
 
-    `planned` is `plant.metadata()["planned"]`, for a screen that tells old values from new ones.
+    Rows, statistics and times are arguments: it reads no clock. `planned` is `plant.metadata()["planned"]`,
+    for a screen that marks old values.
     """
 
     def __init__(self, plant: Plant, planned: Mapping[str, Any] | None = None) -> None:
@@ -193,7 +194,7 @@ class LivePlant:
             cycle, utilisation = facts.get("cycle_ms", 0.0) / 1e3, facts.get("utilisation", 1.0)
             self.drives += [LiveDrive(line, polled, cycle, utilisation) for polled in line.drives]
         self.so_far = {line.name: line_statistics(1.0, {}, None) for line in plant.lines}
-        self.lately = self.so_far
+        self.recent = self.so_far
         self._by_name = {drive.name: drive for drive in self.drives}
         self._earlier: deque[tuple[float, Mapping[str, LineStatistics]]] = deque()
 
@@ -204,15 +205,15 @@ class LivePlant:
     def tick(self, now: float, statistics: dict[str, LineStatistics]) -> None:
         """Take the poller's statistics; call this once a second."""
         self._earlier.append((now, statistics))
-        while now - self._earlier[0][0] > LATELY:
+        while now - self._earlier[0][0] > RECENT:
             self._earlier.popleft()
         before = self._earlier[0][1]
-        self.so_far = self.lately = statistics
+        self.so_far = self.recent = statistics
         if before is not statistics:
-            self.lately = {name: line.since(before[name]) for name, line in statistics.items()}
+            self.recent = {name: line.since(before[name]) for name, line in statistics.items()}
         for drive in self.drives:
             drive.so_far = statistics[drive.line.name].drives[drive.name]
-            drive.lately = self.lately[drive.line.name].drives[drive.name]
+            drive.recent = self.recent[drive.line.name].drives[drive.name]
             drive.remember()
 
 
@@ -230,9 +231,9 @@ class SideRead(NamedTuple):
 
 
 class SideReader:
-    """Reads one drive's other registers, one after another, in a thread of its own.
+    """Reads one drive's unpolled registers, one after another, in its own thread.
 
-    The reads use the time that the polls leave, at most MOST_SHARE of it; on a full line LEAST_SHARE.
+    The reads take at most MOST_SHARE of the line's time, on a full line LEAST_SHARE.
     """
 
     def __init__(self, poller: Poller) -> None:
@@ -242,7 +243,7 @@ class SideReader:
         self._thread: threading.Thread | None = None
 
     def read(self, drive: LiveDrive) -> dict[str, SideRead]:
-        """Return what was found so far, by register; go on reading."""
+        """Return the values so far, by register, and continue reading."""
         if self._drive is not drive:
             self._drive, self._found = drive, {}
         if self._thread is None or not self._thread.is_alive():
@@ -251,7 +252,7 @@ class SideReader:
         return self._found
 
     def rest(self) -> None:
-        """Read no further."""
+        """Stop reading."""
         self._drive = None
 
     def _read_all(self, chosen: LiveDrive, found: dict[str, SideRead]) -> None:
@@ -272,7 +273,7 @@ class SideReader:
 
 
 def pause_s(read_s: float, utilisation: float) -> float:
-    """Return how long to wait, in s, after a read that took `read_s` on a line with this utilisation."""
+    """Return the pause in s after a read that took `read_s` on a line with this utilisation."""
     share = min(MOST_SHARE, max(LEAST_SHARE, 1.0 - utilisation))
     return max(LEAST_PAUSE_S, read_s * (1.0 / share - 1.0))
 

@@ -1,4 +1,4 @@
-"""Text on a terminal's whole screen: cut to columns, and spelt in what the terminal can show."""
+"""Text on a full-screen terminal: cut to columns, and limited to the terminal's characters."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from multidrop.printable import printable
 
 
 def cut(text: str, width: int) -> str:
-    """Cut to so many columns, of which some characters take two and some none; a ~ ends what was cut."""
+    """Cut a text to a width in columns; a ~ marks the cut. Some characters take two columns, some none."""
     text = printable(text)
     return text if cell_len(text) <= width else set_cell_size(text, max(0, width - 1)) + "~"
 
 
 def joined(lines: Iterable[Text], encoding: str) -> Any:
-    """Return the lines as one picture; a ? stands for each column of what the encoding lacks.
+    """Return the lines as one picture, with a ? for each column of a character that the encoding lacks.
 
-    Else such a character would be written as an escape, which is longer, and every column behind it move.
+    An escape instead would be longer, and would move every column behind it.
     """
     shown = [Text(_encodable(line.plain, encoding), style=line.style) for line in lines]
     return Text("\n", no_wrap=True, end="").join(shown)

@@ -1,9 +1,9 @@
 """SIGINT (Ctrl-C), SIGTERM and SIGHUP while a command runs.
 
-The first two interrupt a command at once, but for polling and sniffing: there the first one is noted, so that
-what is under way is finished and recorded, and the second one interrupts. SIGHUP, of a terminal that is
-closed, ends a command as the first of them does, but for a stop, which goes on. Several of it mean no more.
-A service manager sends it too, to a gateway that is to read its plant file again.
+SIGINT and SIGTERM interrupt a command at once. Polling and sniffing note the first one, finish and record the
+exchange in progress, and are interrupted by the second. SIGHUP, from a closing terminal, ends a command as
+the first SIGINT does, except a stop, which continues; further SIGHUPs are ignored. Service managers send it
+to a gateway that should reload its plant file.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ T = TypeVar("T")
 
 @contextmanager
 def handling(handler: Callable[[int, FrameType | None], object], *numbers: signal.Signals) -> Iterator[None]:
-    """Call `handler` for these signals. Only the main thread can: in another one nothing changes."""
+    """Call `handler` for these signals. In another thread than the main one this has no effect."""
     try:
         before = {number: signal.signal(number, handler) for number in numbers}
     except ValueError:
@@ -35,7 +35,7 @@ def handling(handler: Callable[[int, FrameType | None], object], *numbers: signa
 
 
 def _hangup() -> tuple[signal.Signals, ...]:
-    """Return SIGHUP, of a terminal that is closed; nothing where there is none, or nohup ignores it."""
+    """Return SIGHUP, or () if the system has none or nohup ignores it."""
     if sys.platform == "win32" or signal.getsignal(signal.SIGHUP) == signal.SIG_IGN:
         return ()
     return (signal.SIGHUP,)
@@ -74,14 +74,14 @@ class Interruption:
 
 @contextmanager
 def outliving_the_terminal() -> Iterator[None]:
-    """Go on though the terminal is closed: a stop is repeated until its end."""
+    """Continue after the terminal is closed: a stop is repeated until it is done."""
     with handling(lambda number, frame: None, *_hangup()):
         yield
 
 
 @contextmanager
 def noting_signals() -> Iterator[Interruption]:
-    """Note the first SIGINT or SIGTERM, and each SIGHUP, instead of being interrupted by it."""
+    """Note the first SIGINT or SIGTERM, and each SIGHUP, instead of raising KeyboardInterrupt."""
     interruption = Interruption()
     with (
         handling(interruption.note, signal.SIGINT, signal.SIGTERM),
@@ -93,7 +93,7 @@ def noting_signals() -> Iterator[Interruption]:
 def on_end_signals(end: Callable[[], object]) -> None:
     """Call `end` in the running asyncio loop, once, at the first SIGINT, SIGTERM or SIGHUP.
 
-    A second SIGINT or SIGTERM cancels this task, and a third one interrupts wherever it comes.
+    A second SIGINT or SIGTERM cancels this task, and a third raises KeyboardInterrupt.
     """
     import asyncio
 
@@ -118,7 +118,7 @@ def on_end_signals(end: Callable[[], object]) -> None:
         came.add(number)
 
     for number in (signal.SIGINT, signal.SIGTERM):
-        if sys.platform == "win32":  # whose loops handle none
+        if sys.platform == "win32":  # its loops handle no signals
             signal.signal(number, lambda given, frame: loop.call_soon_threadsafe(come, signal.Signals(given)))
         else:
             loop.add_signal_handler(number, come, number)
@@ -138,9 +138,9 @@ def run_loop(work: Coroutine[Any, Any, T]) -> T:
 
 @contextmanager
 def end_signals_cancel() -> Iterator[None]:
-    """Cancel the running asyncio task where it waits, at the first such signal; KeyboardInterrupt then.
+    """Cancel the running asyncio task at the first end signal, then raise KeyboardInterrupt.
 
-    An exception in the midst of a task, maybe a library's, would leave what others wait for.
+    An exception raised inside a task, such as a library's, could leave other tasks waiting for ever.
     """
     import asyncio
 
@@ -153,9 +153,9 @@ def end_signals_cancel() -> Iterator[None]:
 
 
 def on_reload_signal(reload: Callable[[], object], end: Callable[[], object]) -> None:
-    """Call `reload` in the running asyncio loop at each SIGHUP; `end`, once the terminal before it is closed.
+    """Call `reload` in the running asyncio loop at each SIGHUP, or `end` if the terminal was closed.
 
-    In the background, and by nohup, a command has no use for its terminal. Windows has no such signal.
+    In the background, and under nohup, a closed terminal does not matter. Windows has no SIGHUP.
     """
     if sys.platform == "win32":
         return
@@ -173,7 +173,7 @@ def on_reload_signal(reload: Callable[[], object], end: Callable[[], object]) ->
 
 
 def _foreground() -> int | None:
-    """Return the group of processes that has this process's terminal; None without a terminal."""
+    """Return the foreground process group of this process's terminal; None without a terminal."""
     try:
         with Path("/dev/tty").open("rb", buffering=0) as terminal:
             return os.tcgetpgrp(terminal.fileno())

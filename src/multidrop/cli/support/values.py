@@ -28,7 +28,7 @@ def aligned(rows: Iterable[Row], alignment: str) -> list[str]:
 
 
 def columns_of(text: str) -> int:
-    """Return how many columns of a terminal a text takes: some characters take two, and some none."""
+    """Return a text's width in terminal columns: some characters take two, and some none."""
     return sum((not combining(mark)) + (east_asian_width(mark) in "WF") for mark in text)
 
 
@@ -38,7 +38,7 @@ def _padded(text: str, side: str, width: int) -> str:
 
 
 def wrapped(text: str, first: str = "", rest: str = "", *, breaks_words: bool = True) -> list[str]:
-    """Wrap to WIDTH; `first` begins the first line, `rest` the others."""
+    """Wrap to WIDTH; `first` is put before the first line, `rest` before the others."""
     return textwrap.wrap(
         text,
         WIDTH,
@@ -55,24 +55,24 @@ def counted(count: int, one: str, many: str = "") -> str:
 
 
 def shortened(name: str) -> str:
-    """Return a name without its middle where it is long: two may differ at their ends."""
+    """Return a long name without its middle: names may differ at their ends."""
     if columns_of(name) <= LONGEST_NAME:
         return name
     return f"{_first(name, 12)}...{_first(name[::-1], LONGEST_NAME - 15)[::-1]}"
 
 
 def cut_to(text: str, columns: int) -> str:
-    """Return a text as far as it fits; a ~ ends what was cut."""
+    """Cut a text to a width in columns; a ~ marks the cut."""
     return text if columns_of(text) <= columns else f"{_first(text, columns - 1)}~"
 
 
 def _first(text: str, columns: int) -> str:
-    """Return as much of a text's beginning as fits."""
+    """Return the longest start of a text that fits."""
     return next(text[:n] for n in range(len(text), -1, -1) if columns_of(text[:n]) <= columns)
 
 
 def nearest_value(register: Register[T], value: T) -> T:
-    """Return the nearest value that the register can hold; warn when it is another one.
+    """Return the nearest value that the register can hold; warn if it differs.
 
     Raises ValueError for a value outside the register's span.
     """
@@ -82,7 +82,7 @@ def nearest_value(register: Register[T], value: T) -> T:
         if register.is_float:
             why = f"holds {_PRECISIONS[register.number_format]}-precision numbers"
         shown = register.format(nearest)
-        warn(f"{register.name} {why}: {value!r} is taken as {shown}")
+        warn(f"{register.name} {why}: {value!r} becomes {shown}")
     return nearest
 
 
@@ -106,7 +106,7 @@ def as_row(register: Register[Any], value: Any) -> Row:
         return register.name, register.format(value), ""
     number, _, unit = register.format(value).partition(" ")
     if register.values is not None:
-        unit = "(the document has no name for it)"
+        unit = "(no name in the manual)"
     return register.name, number, unit
 
 

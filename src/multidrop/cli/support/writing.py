@@ -17,8 +17,8 @@ def confirm(question: str, arguments: argparse.Namespace) -> None:
     if arguments.yes:
         return
     if not sys.stdin.isatty():
-        raise WriteForbidden(f"{question} There is no terminal to ask on: add --yes if it is meant")
-    _drop_what_was_typed_before()
+        raise WriteForbidden(f"{question} There is no terminal to ask on: add --yes to confirm")
+    _drop_typed_input()
     print(f"{printable(question)} [y/N] ", end="", file=sys.stderr, flush=True)
     answer = ""
     try:
@@ -27,28 +27,28 @@ def confirm(question: str, arguments: argparse.Namespace) -> None:
         interruption.add_note("nothing was sent")
         raise
     finally:
-        if not answer.endswith("\n"):  # the question's line has no end yet
+        if not answer.endswith("\n"):  # end the question's line
             print(file=sys.stderr)
     if answer.strip().lower() not in ("y", "yes"):
         raise WriteForbidden("nothing was sent")
 
 
-def _drop_what_was_typed_before() -> None:
-    """Drop what the terminal holds: a "y" from before the question does not answer it."""
+def _drop_typed_input() -> None:
+    """Drop pending input: a "y" typed before the question does not answer it."""
     if sys.platform == "win32":
         return
     import termios
 
-    with suppress(OSError, termios.error):  # a stream that is no device
+    with suppress(OSError, termios.error):  # not a terminal
         termios.tcflush(sys.stdin.fileno(), termios.TCIFLUSH)
 
 
 @contextmanager
-def telling_what_was_sent(drive: Drive, command: str) -> Iterator[list[str]]:
-    """Add notes to an interruption, also to one that comes while the port is opened or closed.
+def reporting_interruption(drive: Drive, command: str) -> Iterator[list[str]]:
+    """On Ctrl-C, add the requests sent so far as notes, also while the port is opened or closed.
 
-    The notes are those of the list, which begins with the one that nothing was sent, and the failure under
-    which the port was being closed.
+    The caller replaces the notes in the list: at first it says that no request was sent. A failure that was
+    being handled is added.
     """
     known = [f"{drive.name}: the {command} was not sent"]
     try:
