@@ -483,7 +483,7 @@ def test_a_poll_is_captured(tmp_path: Path, run: Run, mixed_plant: Path) -> None
     assert run(*words) == (
         2,
         "",
-        f"multidrop: {capture} is there already: name another file, or remove it first\n",
+        f"multidrop: {capture} exists already: name another file, or remove it first\n",
     )
     assert run("poll", mixed_plant, "--flight-recorder", capture)[::2] == (
         2,

@@ -107,8 +107,8 @@ def test_a_segment_is_to_be_named_where_there_is_no_whole_recording(run: Run, tm
         (["--keep", "1 h"], '--keep and --most remove whole files: add --rotate, such as --rotate "1 h"'),
         (["--rotate", "1 h"], "--rotate needs a name that ends in .arrows, such as --out run.arrows"),
         (["--rotate", "1 h", "--out", "a.csv"], "--rotate needs a name that ends in .arrows"),
-        (["--rotate", "soon"], "'soon' is not a time from 1 s to 100 years"),
-        (["--most", "big"], "'big' is not a size from 1 kB on"),
+        (["--rotate", "soon"], "invalid time 'soon': write 1 s to 100 years"),
+        (["--most", "big"], "invalid size 'big': write 1 kB or more"),
     ],
 )
 def test_options_of_segments_that_do_not_fit(run: Run, plant: Path, words: list[str], sentence: str) -> None:
@@ -224,7 +224,7 @@ def test_a_plant_file_s_mistakes_are_all_told(run: Run, tmp_path: Path) -> None:
 def test_a_recording_is_not_overwritten(run: Run, tmp_path: Path) -> None:
     out = tmp_path / "out.csv"
     out.write_text("mine")
-    sentence = f"multidrop: {out} is there already: name another file, or remove it first\n"
+    sentence = f"multidrop: {out} exists already: name another file, or remove it first\n"
     assert run("poll", plant_file(tmp_path), "--out", out) == (2, "", sentence)
     assert run("convert", out, out) == (2, "", sentence)
     assert out.read_text() == "mine"
@@ -233,7 +233,7 @@ def test_a_recording_is_not_overwritten(run: Run, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("out", "status", "sentence"),
     [
-        ("out.txt", 2, "a recording's name ends in .arrows, .csv, .parquet"),
+        ("out.txt", 2, "a recording's name must end in .arrows, .csv, .parquet"),
         ("none/out.arrows", 1, "cannot be written: No such file or directory"),
     ],
 )
@@ -347,7 +347,7 @@ def test_a_demo_takes_the_place_of_a_demo_only(run: Run, tmp_path: Path) -> None
     with open_writer(out, {"drives": {"pump-1": {}}}):
         pass
     mine = out.read_bytes()
-    sentence = f"multidrop: {out} is there already: name another file, or remove it first\n"
+    sentence = f"multidrop: {out} exists already: name another file, or remove it first\n"
     assert run("demo", "--seconds", 1, "--out", out) == (2, "", sentence)
     assert out.read_bytes() == mine
 

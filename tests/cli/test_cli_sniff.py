@@ -437,7 +437,7 @@ def test_mistaken_calls_are_told_in_a_sentence(
         (
             ["decode", capture, "--out", capture],
             2,
-            f"{capture} is there already: name another file, or remove it first",
+            f"{capture} exists already: name another file, or remove it first",
         ),
         (["decode", cut], 0, f"{cut} ends within a packet: its last 103 bytes were skipped"),
     ):

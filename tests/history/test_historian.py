@@ -30,8 +30,8 @@ def test_all_mistakes_of_its_table_at_once() -> None:
         HistorySettings(keep="for ever", most="20", rotate="0 s")
     lines = str(failure.value).splitlines()
     assert [line.split(" = ")[0] for line in lines] == ["keep", "most", "rotate"]
-    assert "'for ever' is not a time from 1 s to 100 years" in lines[0]
-    assert "'20' is not a size from 1 kB on" in lines[1]
+    assert "invalid time 'for ever': write 1 s to 100 years" in lines[0]
+    assert "invalid size '20': write 1 kB or more" in lines[1]
     HistorySettings()
 
 
@@ -139,7 +139,7 @@ def test_it_records_and_answers(tmp_path: Path) -> None:
             path = tmp_path / f"got.{kind}"
             path.write_bytes(b"".join(part.export(["pump-1.speed"], begin, end, kind)))
             assert [row for rows in open_recording(path) for row in rows] == list(taken)
-        with pytest.raises(ValueError, match="is no series"):
+        with pytest.raises(ValueError, match="invalid series"):
             part.export(["pump"], begin, end, "csv")
         with pytest.raises(ValueError, match="neither csv nor parquet"):
             part.export([], begin, end, "xlsx")

@@ -168,13 +168,13 @@ def test_mistakes(tmp_path: Path) -> None:
     with History(tmp_path) as history:
         assert rows_in(history) == []
         for name in ("pump-1", "", ".speed", "pump-1."):
-            with pytest.raises(ValueError, match="is no series: write a drive and a register, such as"):
+            with pytest.raises(ValueError, match=r"invalid series .*: write a drive and a register, such as"):
                 history.buckets(name, NOON, NOON + DAY)
-        with pytest.raises(ValueError, match="buckets takes one series or more"):
+        with pytest.raises(ValueError, match="name at least one series"):
             history.buckets([], NOON, NOON + DAY)
-        with pytest.raises(ValueError, match="begins not before it"):
+        with pytest.raises(ValueError, match="empty range: it starts at"):
             history.buckets("a.b", NOON, NOON)
-        with pytest.raises(ValueError, match="points = 0 is not a number from 1 to 100000"):
+        with pytest.raises(ValueError, match="invalid points = 0: write 1 to 100000"):
             history.buckets("a.b", NOON, NOON + DAY, 0)
 
 
@@ -297,7 +297,7 @@ def test_an_end_that_is_no_batch_is_told_where_the_segment_is_closed(tmp_path: P
         path.write_bytes(path.read_bytes() + b"\0" * 7)
         with History(tmp_path) as history:
             assert rows_in(history) == flat(rows)
-            told = [] if number == 2 else [f"the last 7 bytes of {path} are no whole batch"]
+            told = [] if number == 2 else [f"{path} ends within a batch: its last 7 bytes were skipped"]
             assert history.damage == told
 
 

@@ -111,7 +111,7 @@ def test_a_damaged_recording_is_told_as_its_reader_does(tmp_path: Path) -> None:
 
 def test_what_is_no_recording_is_told(tmp_path: Path) -> None:
     (tmp_path / "run.txt").write_text("")
-    with pytest.raises(ValueError, match=r"a recording's name ends in \.arrows, \.csv, \.parquet"):
+    with pytest.raises(ValueError, match=r"a recording's name must end in \.arrows, \.csv, \.parquet"):
         multidrop.open_recording(tmp_path / "run.txt")
     with pytest.raises(FileNotFoundError):
         multidrop.open_recording(tmp_path / "none.arrows")
@@ -125,7 +125,7 @@ def test_steps_of_a_script_are_in_a_module_of_their_own() -> None:
 
 
 def test_a_writer_replaces_a_recording_only_when_asked(path: Path) -> None:
-    with pytest.raises(FileExistsError, match=r"is there already: name another file, or remove it first"):
+    with pytest.raises(FileExistsError, match=r"exists already: name another file, or remove it first"):
         open_writer(path, METADATA)
     with open_writer(path, {"second": True}, overwrite=True):
         pass

@@ -94,7 +94,7 @@ class _LineDecoding:
         if len(self._registers) > _MOST_NAMES:
             return False
         target = self._lookup.find(framing, request)
-        is_broadcast = request.address == 0 and framing is not Framing.TCP  # nobody answers one
+        is_broadcast = request.address == 0 and framing is not Framing.TCP  # has no reply
         block = None if is_broadcast else self._layout(target)
         return self.decoder.know(block)
 
@@ -208,7 +208,7 @@ _MOST_BYTES = 32
 
 
 class ExchangeFormatter:
-    """Format the exchanges of one line, in engineering units where the plant is known."""
+    """Format the exchanges of one line, in engineering units if the plant is known."""
 
     def __init__(self, lookup: RegisterLookup) -> None:
         self._lookup = lookup

@@ -1,4 +1,4 @@
-"""Pair sniffed frames: requests with their replies, and what is neither."""
+"""Pair sniffed requests with their replies; report other bytes."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ def _is_broadcast(framing: Framing, request: Message) -> bool:
 
 @dataclass(frozen=True)
 class SniffedExchange:
-    """A request and its reply; one of the two is None where it was not sniffed or never came.
+    """A request and its reply; one of the two is None if it was not sniffed or never sent.
 
-    `is_sure` is False where the request may be the copy that confirms an earlier one.
+    `is_sure` is False if the request may be the copy that confirms an earlier one.
     """
 
     framing: Framing
@@ -56,7 +56,7 @@ class Pairing:
         self._junk: list[FrameSpan] = []
 
     def pair(self, spans: Iterable[FrameSpan]) -> Iterator[Sniffed]:
-        """Yield the exchanges of these spans; a request waits for its reply or for the next request."""
+        """Yield the spans' exchanges; a request waits for its reply or the next request."""
         for span in spans:
             if span.kind is Kind.JUNK:
                 yield from self._add_junk(span)
@@ -78,7 +78,7 @@ class Pairing:
                 self._asked = span
 
     def flush(self) -> Iterator[Sniffed]:
-        """Yield what waits, because nothing more is to come."""
+        """Yield the pending request: no reply will come."""
         if self._asked:
             asked, self._asked = self._asked, None
             self._counts["unanswered"] += 1

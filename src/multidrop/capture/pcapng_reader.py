@@ -1,7 +1,7 @@
 """Read captures: pcap and pcapng files, ours and others', as streams of bytes on lines.
 
-A capture is read piece by piece: it may be larger than memory, and a file that is cut short meanwhile
-is an error; if it were mapped, that would end the process.
+A capture is read in pieces: it may be larger than memory, and if the file is truncated while it is read,
+that is an error. A mapped file would then crash the process.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ class Capture:
     """A capture file; leaving the `with` block closes it. Raises CaptureError, and OSError.
 
     `lines` has the name of every interface met so far, and `streams` its bytes; `truncated` is the
-    number of bytes at the file's end that are no whole packet: the writer was killed, or the disk was full.
+    number of bytes of an incomplete packet at the file's end: the writer was killed, or the disk was full.
     """
 
     def __init__(self, path: Path | str) -> None:
@@ -78,7 +78,7 @@ class Capture:
     def _begin(self) -> None:
         if not self._file.seekable():  # a serial port, or a pipe
             raise CaptureError(f"{self.path} is not a capture: it is no file")
-        self._size = self._file.seek(0, SEEK_END)  # what is appended later is not read
+        self._size = self._file.seek(0, SEEK_END)  # later additions are not read
         if not self._size:
             raise CaptureError(f"{self.path} is not a capture: it is empty")
         magic = self._piece(0, 4)
@@ -99,10 +99,10 @@ class Capture:
             raise CaptureError(f"{self.path} is not a capture: it does not begin like pcap or pcapng")
 
     def __iter__(self) -> Iterator[None]:
-        """Fill `streams`; at each step and at the end the caller takes what it can from every stream."""
+        """Fill `streams`; at each step, and at the end, the caller takes frames from every stream."""
         unpacker = self._unpacker
         assert unpacker is not None
-        seen = unpacker.at  # end of what was read of the file
+        seen = unpacker.at  # end of the bytes read
         while True:
             state = unpacker.unpack()
             if state is Unpacked.NONSENSE:
@@ -135,7 +135,7 @@ class Capture:
         return piece
 
     def _read_block(self, unpacker: Unpacker) -> bool:
-        """Read a block that is no enhanced packet; return False where the file is truncated."""
+        """Read a block other than an enhanced packet; return False if the file is truncated."""
         at = unpacker.at
         kind = self._read("I", at)
         if kind == SECTION and self._size - at >= _PCAPNG_HEADER and self._order_at(at) != self._order:
@@ -200,7 +200,7 @@ class Capture:
             at += 4 + size + -size % 4
 
     def _order_at(self, at: int) -> str:
-        """Return the byte order of the section that begins there."""
+        """Return the byte order of the section at this place."""
         magic = self._piece(at + 8, 4)
         if magic not in (b"\x1a\x2b\x3c\x4d", b"\x4d\x3c\x2b\x1a"):
             raise self._damaged(at)

@@ -11,7 +11,7 @@ from multidrop.core import Side, Wrappings
 from multidrop.recording.format import AppendFile, RecordingError, writing
 
 EXPORTED_PDU = 252
-APPLICATION = b"multidrop"  # begins the application's name in captures of ours
+APPLICATION = b"multidrop"  # start of the application's name in our captures
 
 SECTION, INTERFACE = 0x0A0D0D0A, 1
 _END, _COMMENT = 0, 1
@@ -32,7 +32,7 @@ class CaptureWriter:
     """
 
     def __init__(self, path: Path | str, lines: Sequence[str] = (), comment: str = "") -> None:
-        from importlib.metadata import version  # an eighth of what a command imports, and few write captures
+        from importlib.metadata import version  # slow to import, and few commands write captures
 
         self.path = Path(path)
         self._lines: dict[str, int] = {}
@@ -62,7 +62,7 @@ class CaptureWriter:
             self._file.append(packets)
 
     def report(self, anomalies: list[str]) -> None:
-        """Do nothing: a capture has all packets anyway."""
+        """Ignore anomalies: a capture has all packets."""
 
     def _declare(self, line: str) -> None:
         self._lines[line] = len(self._lines)
@@ -113,7 +113,7 @@ _MASTER, _DRIVE = (bytes([10, 0, 0, 1]), 50000), (bytes([10, 0, 0, 2]), 502)
 _FAILED, _NOISE = (bytes([10, 0, 0, 2]), 1), (bytes([10, 0, 0, 3]), 2)
 _OUTBOUND = (_EPB_FLAGS, struct.pack("<I", 2))
 _INBOUND = (_EPB_FLAGS, struct.pack("<I", 1))
-_PACKETS = {  # side: dissector of a frame that is no text, sender, target, options
+_PACKETS = {  # side: dissector of binary frames, sender, target, options
     Side.EITHER: (_BYTES, None, _MASTER, [(_COMMENT, b"no frame")]),
     Side.ASKING: (_RTU, _MASTER, _DRIVE, [_OUTBOUND]),
     Side.ANSWERING: (_RTU, _DRIVE, _MASTER, [_INBOUND]),
@@ -123,7 +123,7 @@ _PACKETS = {  # side: dissector of a frame that is no text, sender, target, opti
 
 
 def _wrappings(frames: bytes, texts: bytes) -> Wrappings:
-    """Return a line's wrappings: `frames` is the dissector of frames, `texts` of what begins with ':'."""
+    """Return a line's wrappings: `frames` is the dissector of frames, `texts` of those starting with ':'."""
     return Wrappings(
         {
             (side, is_text): (
@@ -137,4 +137,4 @@ def _wrappings(frames: bytes, texts: bytes) -> Wrappings:
 
 
 WRAPPINGS = _wrappings(_RTU, _BYTES)
-TCP_WRAPPINGS = _wrappings(_TCP_FRAME, _TCP_FRAME)  # of tcp:// ports, whose ids may begin like a text
+TCP_WRAPPINGS = _wrappings(_TCP_FRAME, _TCP_FRAME)  # of tcp:// ports: a transaction id may start with ':'

@@ -64,7 +64,7 @@ class Tapped:
         return sum(tap.lost for tap in self._taps)
 
     def close(self) -> None:
-        """Hand on the rest; a port that is closed by now is no anomaly."""
+        """Hand on the rest; a closed port is not an anomaly here."""
         self._hand_on()
 
     def __enter__(self) -> Self:
@@ -81,11 +81,11 @@ _MOST_NAMED = 20  # anomalies in a file's comment
 
 
 class FlightRecorder:
-    """Keep the last `seconds` of the lines' traffic in memory, and no more than `most_bytes`.
+    """Keep the last `seconds` of the lines' traffic in memory, at most `most_bytes`.
 
     `AFTER_S` after an anomaly, and not before `PAUSE_S` have passed since the last file, a capture
     `flight-<UTC>.pcapng` is written into `directory`, with the anomaly in its comment. The newest
-    `most_files` of them are kept. `written` lists those of this recorder. Raises RecordingError.
+    The newest `most_files` are kept. `written` lists this recorder's files. Raises RecordingError.
     """
 
     def __init__(

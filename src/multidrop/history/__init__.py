@@ -11,7 +11,7 @@ Numbers grow, also over restarts. Three rules say where a row is read, so that i
 
 1. Rows of a segment are read from `rows/` if they are there, else from `rows.NUMBER.arrows`.
 2. Tens are read from the file with the widest range of numbers, else they are reckoned from the rows.
-3. A file that is being made has a name that begins with a point. It is renamed when it is whole and on the
+3. A file in the making has a name that starts with a point. It is renamed when it is complete and on the
    disk, `tens` before `rows`; only then is what it replaces removed. A reader lists the folder, then `rows/`,
    then `tens/`, so it meets the old or the new, and by the rules above never both.
 

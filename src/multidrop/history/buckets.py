@@ -12,19 +12,21 @@ from multidrop.history.folder import SECOND_NS, TEN_NS
 STEPS_S = (10, 20, 30, 60, 120, 300, 600, 900, 1800, 3600, 7200, 10800, 21600, 43200, 86400)
 MOST_POINTS = 100_000
 _BEFORE_ALL, _AFTER_ALL = -(1 << 64), 1 << 64  # ns
-_NOTHING = 0, 0, 0.0, math.inf, -math.inf  # values, misses, their sum, least, most
-FINE_NS = 2 * SECOND_NS  # shorter times are made of rows; others of tens, which cost a hundredth
+_EMPTY = 0, 0, 0.0, math.inf, -math.inf  # values, misses, sum of values, least, most
+FINE_NS = (
+    2 * SECOND_NS
+)  # shorter buckets are made from rows, longer ones from tens, at a hundredth of the cost
 
 
 @dataclass(frozen=True)
 class Buckets:
-    """A register in equal times, one entry each in every list.
+    """A register in buckets of equal length; each list has one entry per bucket.
 
-    A bucket begins at `begin + number * step`, in ns. Where it has no value, `least`, `mean` and `most` are
-    None: `missed` says whether it was asked in vain (above 0), or not at all (0).
+    A bucket starts at `begin + number * step`, in ns. Without values, `least`, `mean` and `most` are None;
+    `missed` is above 0 if the register was polled, else 0.
 
-    All values are of one quantity, the newest of the range: `unit` says which, where that was recorded.
-    `left_out` lists the units of rows that are not in it, because the name was another register's then.
+    All values are of one quantity, the newest of the range; `unit` is its unit, if recorded. `left_out` lists
+    the units of excluded rows, from when the name belonged to another register.
     """
 
     begin: int  # UTC in ns
@@ -42,13 +44,13 @@ class Buckets:
 
     @property
     def times(self) -> list[int]:
-        """The beginning of each bucket, UTC in ns."""
+        """The start of each bucket, UTC in ns."""
         return [self.begin + number * self.step for number in range(len(self))]
 
 
 @dataclass(frozen=True)
 class Grid:
-    """Times of equal length that cover a range."""
+    """Buckets of equal length that cover a range."""
 
     begin: int  # in ns
     step: int
@@ -60,11 +62,11 @@ class Grid:
 
     @property
     def is_of_tens(self) -> bool:
-        """True where every edge is one of ten seconds."""
+        """True if every edge is a multiple of ten seconds."""
         return self.step % TEN_NS == 0 and self.begin % TEN_NS == 0
 
     def bucket_of(self, time: int) -> tuple[int, int, int]:
-        """Return the number, begin and end of the bucket of a time; -1 for all before or behind them."""
+        """Return a time's bucket as number, start and end; the number is -1 outside the grid."""
         if time < self.begin:
             return -1, _BEFORE_ALL, self.begin
         if time >= self.end:
@@ -74,15 +76,15 @@ class Grid:
 
 
 def grid_of(begin: int, end: int, points: int) -> Grid:
-    """Return at most `points` times that cover the range; from 2 s on, of whole tens, hours or days.
+    """Return at most `points` buckets that cover the range; from 2 s on, of whole tens of seconds or more.
 
-    A range that begins within a bucket is covered from that bucket's beginning. Raises ValueError for a
-    range without length, or another number of points than 1 to 100000.
+    The first bucket may start before `begin`. Raises ValueError for an empty range, or for points outside 1
+    to 100000.
     """
     if not 1 <= points <= MOST_POINTS:
-        raise ValueError(f"points = {points} is not a number from 1 to {MOST_POINTS}")
+        raise ValueError(f"invalid points = {points}: write 1 to {MOST_POINTS}")
     if begin >= end:
-        raise ValueError(f"the range ends at {end} ns, and begins not before it, at {begin} ns")
+        raise ValueError(f"empty range: it starts at {begin} ns and ends at {end} ns")
     least = -(-(end - begin) // points)
     if least < FINE_NS:
         return Grid(begin, least, -(-(end - begin) // least))
@@ -95,7 +97,7 @@ def grid_of(begin: int, end: int, points: int) -> Grid:
 
 
 def _handy_steps(least: int) -> Iterator[int]:
-    """Yield steps of tens of seconds, hours or days that are no less."""
+    """Yield round steps, of tens of seconds up to days, from `least` on."""
     yield from (seconds * SECOND_NS for seconds in STEPS_S if seconds * SECOND_NS >= least)
     yield from (days * 86400 * SECOND_NS for days in count(max(2, least // (86400 * SECOND_NS))))
 
@@ -110,7 +112,7 @@ class Accumulator:
         self._least, self._most = [math.inf] * grid.points, [-math.inf] * grid.points
 
     def add(self, bucket: int, n: int, missed: int, total: float, least: float, most: float) -> None:
-        """Add what is known of so many values and misses of a bucket; the numbers matter where n > 0."""
+        """Add `n` values, with their sum, least and most, and `missed` misses to a bucket."""
         self._missed[bucket] += missed
         if n:
             self._n[bucket] += n
@@ -119,17 +121,17 @@ class Accumulator:
             self._most[bucket] = max(self._most[bucket], most)
 
     def add_rows(self, times: Iterable[int], values: Iterable[float], valid: Iterable[int]) -> None:
-        """Add rows, in ns; a row that is not valid is a miss. Those outside of the grid are left out.
+        """Add rows, in ns; an invalid row is a miss. Rows outside the grid are skipped.
 
-        Rows of a bucket mostly follow each other: they are summed up here before they are added.
+        Successive rows are mostly of one bucket: they are summed up before they are added.
         """
         grid, bucket, begin, end = self._grid, -1, 0, 0
-        n, missed, total, least, most = _NOTHING
+        n, missed, total, least, most = _EMPTY
         for time, value, is_valid in zip(times, values, valid, strict=True):
             if not begin <= time < end:
                 if bucket >= 0:
                     self.add(bucket, n, missed, total, least, most)
-                n, missed, total, least, most = _NOTHING
+                n, missed, total, least, most = _EMPTY
                 bucket, begin, end = grid.bucket_of(time)
             if is_valid:
                 n += 1
@@ -144,7 +146,7 @@ class Accumulator:
             self.add(bucket, n, missed, total, least, most)
 
     def add_all(self, other: Accumulator) -> None:
-        """Add what another one of the same grid has gathered."""
+        """Add the values of another accumulator of the same grid."""
         gathered = zip(other._n, other._missed, other._sum, other._least, other._most, strict=True)
         for bucket, known in enumerate(gathered):
             self.add(bucket, *known)
@@ -169,7 +171,7 @@ def _where(has: Sequence[int], values: Sequence[float]) -> list[float | None]:
 
 
 class UnitBuckets:
-    """The buckets of one register: for each unit that rows told, and for those that told none."""
+    """The buckets of one register, by unit if the rows carry their own unit, as those of a hub do."""
 
     def __init__(self, grid: Grid) -> None:
         self._grid = grid
@@ -178,14 +180,14 @@ class UnitBuckets:
         self.untold = Accumulator(grid)
 
     def told(self, unit: str | None, newest_ns: int) -> Accumulator:
-        """Return the buckets of rows of this unit, the newest of which has this time."""
+        """Return the buckets for rows of this unit; `newest_ns` is the time of its newest row."""
         if unit is None:
             return self.untold
         self._newest_ns[unit] = max(newest_ns, self._newest_ns.get(unit, newest_ns))
         return self._told.setdefault(unit, Accumulator(self._grid))
 
     def buckets(self, unit: str | None, left_out: Sequence[str]) -> Buckets:
-        """Return all as of a unit that is known by other means; None is the newest that was told."""
+        """Return the buckets of a known unit, or with None those of the newest unit in the rows."""
         if unit is None and self._told:
             unit, *others = sorted(self._told, key=self._newest_ns.__getitem__, reverse=True)
             parts, left_out = [self._told[unit]], others

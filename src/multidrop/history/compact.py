@@ -1,7 +1,7 @@
 """Compact closed segments: `python -m multidrop.history.compact FOLDER --below NUMBER`, a process of its own.
 
-It may be killed at any moment and started again: what it makes gets its name when it is whole and on the
-disk, and only then is what it replaces removed.
+It may be killed at any moment and started again: a new file gets its name when it is complete and on the
+disk, and only then are the files that it replaces removed.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from multidrop.recording.arrows import ArrowsReader
 from multidrop.recording.segments import FileLock, segments_of
 
 MEMORY = "100MB"  # of DuckDB; the process takes about 80 MB more
-TOLD = """
+WITH_UNITS = """
 create temp view told as select recorded.*, unit from recorded left join units using (drive, register)
 """
 ROWS = "select * from told order by drive, time"
@@ -40,7 +40,7 @@ MOST_MERGED = 200_000_000  # bytes of files of rows that become one
 
 
 def main(words: list[str] | None = None) -> int:
-    """Compact what can be compacted. Return 0, also where another process does so already."""
+    """Compact a folder; return 0. Do nothing if another process does so already."""
     parser = argparse.ArgumentParser(prog="multidrop.history.compact", description=__doc__)
     parser.add_argument("folder", type=Path)
     parser.add_argument("--below", type=int, required=True, help="segments with a lower number are closed")
@@ -83,7 +83,7 @@ def compact(folder: Path, below: int, *, merge_rows: bool = False) -> None:
 
 
 def clean(folder: Path) -> None:
-    """Remove what a killed process left: files without their name, and those that others replace."""
+    """Remove the remains of a killed process: unnamed files, and files that others replace."""
     for directory in (folder / "rows", folder / "tens"):
         for path in directory.glob(".*.part"):
             path.unlink()
@@ -106,8 +106,8 @@ def _is_whole(path: Path) -> bool:
 
 
 def _put_away(folder: Path, path: Path, is_damaged: bool) -> None:
-    """Remove a segment, but keep one of which only a part could be read: somebody may mend it."""
-    with suppress(FileNotFoundError):  # too old, and removed meanwhile
+    """Remove a compacted segment; keep a damaged one for repair."""
+    with suppress(FileNotFoundError):  # removed because of its age
         if is_damaged and path.stat().st_size:
             path.replace(folder / "damaged" / path.name)
         else:
@@ -122,15 +122,15 @@ def _compact_segment(database: Database, folder: Path, number: int, path: Path) 
             reader = ArrowsReader(path)
             metadata = dict(reader.metadata)
             if reader.truncated:
-                damage.append(f"the last {reader.truncated} bytes of {path} are no whole batch")
-        except FileNotFoundError:  # too old, and removed meanwhile
+                damage.append(f"{path} ends within a batch: its last {reader.truncated} bytes were skipped")
+        except FileNotFoundError:  # removed because of its age
             return
         except ValueError as error:
             damage.append(str(error))
         else:
             insert(cursor, _readable(reader, damage))
             insert_units(cursor, units_of(metadata))
-            cursor.execute(TOLD)
+            cursor.execute(WITH_UNITS)
             bounds = "select min(epoch_ns(time)), max(epoch_ns(time)), count(*) from recorded"
             least, most, rows = cursor.execute(bounds).fetchone()
             if rows:
@@ -143,7 +143,7 @@ def _compact_segment(database: Database, folder: Path, number: int, path: Path) 
 
 
 def _readable(reader: ArrowsReader, damage: list[str]) -> Iterator[Rows]:
-    """Yield the rows up to the first that is damaged, and note that."""
+    """Yield the rows up to the first damaged one, and note the damage."""
     try:
         yield from reader
     except ValueError as error:
@@ -151,7 +151,7 @@ def _readable(reader: ArrowsReader, damage: list[str]) -> Iterator[Rows]:
 
 
 def _write(database: Any, query: str, path: Path, metadata: dict[str, Any] | None = None) -> None:
-    """Write a Parquet file, which has its name once it is on the disk."""
+    """Write a Parquet file; it gets its name when it is on the disk."""
     part = path.with_name(f".{path.name}.part")
     copy_out(database, query, part, metadata)
     _on_disk(part)
@@ -161,7 +161,7 @@ def _write(database: Any, query: str, path: Path, metadata: dict[str, Any] | Non
 
 def _on_disk(path: Path) -> None:
     is_windows = sys.platform == "win32"
-    if is_windows and path.is_dir():  # it keeps a folder's entries by itself, and opens none
+    if is_windows and path.is_dir():  # Windows cannot open folders, and writes their entries itself
         return
     file = os.open(path, os.O_RDWR if is_windows else os.O_RDONLY)
     try:
@@ -178,9 +178,9 @@ def _without_tens(folder: Path, tens: list[HistoryFile]) -> set[int]:
 
 
 def finished(tens: list[HistoryFile], seconds: int, missing: set[int]) -> list[list[HistoryFile]]:
-    """Return the files to merge: those of each hour or day, once a later one has begun.
+    """Return the runs of files to merge: each hour or day that is over.
 
-    Where a segment between them has no tens yet, nothing is merged: the file would hide its number.
+    A run is not merged while a segment within it has no tens: the merged file would hide its number.
     """
     runs = [list(run) for _, run in groupby(tens, key=lambda file: file.begin // seconds)]
     return [
@@ -216,7 +216,7 @@ def _parts(run: list[HistoryFile]) -> Iterator[list[HistoryFile]]:
 
 
 def _merge_rows(database: Database, folder: Path, part: list[HistoryFile]) -> None:
-    """Make one file of these, with the metadata of the last one."""
+    """Merge these files into one, with the metadata of the last."""
     begin, end = min(file.begin for file in part), max(file.end for file in part)
     name = file_name(part[0].first, part[-1].last, begin * 10**9, end * 10**9)
     with database.cursor() as cursor:
@@ -237,9 +237,9 @@ def _make_tens(database: Database, folder: Path, rows: list[HistoryFile]) -> Non
 
 
 def be_low() -> None:
-    """Give way to everything else, where that is allowed.
+    """Lower this process's priority, if the system allows it.
 
-    A child inherits the scheduling of a recorder that runs by SCHED_RR, and would hold its polling up.
+    Otherwise it would inherit SCHED_RR from a recorder that uses it, and delay its polling.
     """
     with suppress(OSError, AttributeError):  # Windows and macOS have no such call
         os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))

@@ -24,7 +24,7 @@ FORM = "format parquet, compression zstd"
 
 
 class MissingDuckDB(ImportError):
-    """DuckDB is not installed, and what was asked for needs it."""
+    """DuckDB is not installed, but compacted files need it."""
 
 
 def connect(memory: str, spill: Path | None = None) -> Any:
@@ -42,9 +42,9 @@ def connect(memory: str, spill: Path | None = None) -> Any:
 
 
 class Database:
-    """A database in memory that is opened when it is first needed: that takes 20 ms of processor time.
+    """A database in memory, opened on first use: that takes 20 ms of processor time.
 
-    What has no room there goes to `spill`, or to a folder of its own for temporary files.
+    Data that does not fit goes to `spill`, or else to its own temporary folder.
     """
 
     def __init__(self, memory: str, spill: Path | None = None) -> None:
@@ -62,7 +62,7 @@ class Database:
         return self._opened.cursor()
 
     def _make_spill(self) -> None:
-        folder = mkdtemp(prefix="multidrop-history-")  # nobody else can open it, or have put it there
+        folder = mkdtemp(prefix="multidrop-history-")  # private to this user
         self._forget = weakref.finalize(self, rmtree, folder, ignore_errors=True)
         self._opened.execute("set temp_directory = ?", [folder])
 
@@ -121,7 +121,7 @@ def copy_out(
     metadata: Metadata | None = None,
     values: Mapping[str, Any] | None = None,
 ) -> int:
-    """Write what the query gives into a Parquet file; return the number of rows."""
+    """Write a query's rows into a Parquet file; return their number."""
     form = FORM
     if metadata is not None:
         form += f", kv_metadata {{{METADATA_KEY}: {quoted(json.dumps(metadata, ensure_ascii=False))}}}"
@@ -164,12 +164,12 @@ def quoted(text: str) -> str:
 
 
 def files_of(paths: Iterable[Path]) -> str:
-    """Return a table of these Parquet files."""
+    """Return the SQL of a table of Parquet files."""
     return f"read_parquet({_list(paths)})"
 
 
 def with_units(paths: Iterable[Path]) -> str:
-    """Return a table of these Parquet files and their names; `unit` is null where a file has none."""
+    """Return the SQL of a table of Parquet files with their names; `unit` is null if a file lacks it."""
     files = f"read_parquet({_list(paths)}, union_by_name = true, filename = true)"
     return f"(select * from {files} union all by name select null::varchar as unit where false)"
 

@@ -1,4 +1,4 @@
-"""The files of a history: their names, and which of them hold a row."""
+"""The files of a history: their names, and the rows they hold."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ class HistoryFile(NamedTuple):
     end: int
 
     def may_have(self, begin: int, end: int) -> bool:
-        """Return True where rows from `begin` to `end`, in ns, may be in the file."""
+        """Return True if the file may have rows from `begin` to `end`, in ns."""
         return self.begin * SECOND_NS < end and begin <= self.end * SECOND_NS
 
 
 def file_name(first: int, last: int, least_ns: int, most_ns: int) -> str:
-    """Return the name of the Parquet file of these segments, and of times from `least_ns` to `most_ns`."""
+    """Return the name of a Parquet file of segments `first` to `last` and times `least_ns` to `most_ns`."""
     numbers = f"{first:08d}" if first == last else f"{first:08d}-{last:08d}"
     begin, end = least_ns // SECOND_NS, -(-most_ns // SECOND_NS)
     return f"{numbers}.{_text(begin)}-{_text(end)}.parquet"
@@ -49,7 +49,7 @@ def _second(text: str) -> int:
 
 
 def parquet_files(directory: Path) -> list[HistoryFile]:
-    """Return the Parquet files there, the oldest first; none where there is no such directory."""
+    """Return a directory's Parquet files, the oldest first; [] if there is no directory."""
     found = []
     with suppress(FileNotFoundError, NotADirectoryError):
         for path in directory.iterdir():
@@ -72,7 +72,7 @@ def widest(files: list[HistoryFile]) -> list[HistoryFile]:
 
 @dataclass(frozen=True)
 class Listing:
-    """The files that hold the history now, each row in one of them."""
+    """The current files of a history; each row is in one file."""
 
     segments: dict[int, Path] = field(default_factory=dict)  # that are not in `rows`
     rows: dict[int, HistoryFile] = field(default_factory=dict)
@@ -80,15 +80,15 @@ class Listing:
 
     @property
     def newest(self) -> int:
-        """The highest number that was given; 0 for an empty history."""
+        """The highest segment number; 0 for an empty history."""
         return max([0, *self.segments, *self.rows, *(file.last for file in self.tens)])
 
 
 def listing(folder: Path) -> Listing:
-    """List a history, or a recording in segments such as run.arrows. Raises OSError where there is none."""
+    """List a history, or a recording in segments such as run.arrows. Raises OSError if there is none."""
     if folder.suffix == ".arrows":
         return Listing(dict(segments_of(folder)))
-    segments = dict(segments_of(folder / STEM))  # first: what is removed next is in what is listed next
+    segments = dict(segments_of(folder / STEM))  # first: a segment removed later is in a file listed later
     rows = {file.first: file for file in widest(parquet_files(folder / "rows"))}
     tens = widest(parquet_files(folder / "tens"))
     left = {number: path for number, path in segments.items() if number not in rows}

@@ -1,4 +1,4 @@
-"""A segment that is not compacted yet: rows and tens of the series that are asked for."""
+"""A segment that is not compacted yet: the rows and tens of requested series."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from multidrop.polling.batch import Row
 from multidrop.recording.arrow_decoder import RecordedColumns
 from multidrop.recording.arrows import ArrowsTail, BatchPlace
 
-MOST_TENS = 4096  # series whose tens are kept: names of none may be asked for, too
+MOST_TENS = 4096  # series whose tens are kept; queries may name series without rows
 
 Ten = list[float]  # values, misses, their sum, least, most
 
@@ -54,7 +54,7 @@ class IndexedBatch(NamedTuple):
 
 
 class GrowingSegment:
-    """A segment, read as far as it is written; `damage` says why no more of it can be read.
+    """A segment, read as far as it is written; `damage` is the reason if reading has ended.
 
     Raises as ArrowsTail does.
     """
@@ -75,7 +75,7 @@ class GrowingSegment:
             self._holders += 1
 
     def let_go(self) -> None:
-        """Close the segment when nobody holds it any more."""
+        """Close the segment when its last holder lets go."""
         with self._changing:
             self._holders -= 1
             if not self._holders:
@@ -83,17 +83,17 @@ class GrowingSegment:
 
     @property
     def bounds(self) -> tuple[int, int]:
-        """The least and the greatest time in it, in ns; (0, 0) where there are no rows."""
+        """The least and the greatest time in it, in ns; (0, 0) without rows."""
         least = min((batch.least for batch in self._batches), default=0)
         return least, max((batch.most for batch in self._batches), default=0)
 
     @property
     def left_out(self) -> int:
-        """Bytes at the end that are no whole batch."""
+        """Bytes of an incomplete batch at the end."""
         return self._tail.left_out
 
-    def look(self) -> None:
-        """Read what was written since the last look."""
+    def read_new(self) -> None:
+        """Read the batches written since the last call."""
         with self._changing:
             try:
                 for columns, place in self._tail.new() if self.damage is None else ():
@@ -103,13 +103,13 @@ class GrowingSegment:
                 self.damage = str(damage)
 
     def batches(self, begin: int, end: int) -> list[IndexedBatch]:
-        """Return the batches that may have rows from `begin` to before `end`, in ns."""
+        """Return the batches that may have rows with begin <= time < end, in ns."""
         return [batch for batch in self._batches if batch.least < end and begin <= batch.most]
 
     def rows_of(
         self, batch: IndexedBatch, series: frozenset[Series] | None, begin: int, end: int
     ) -> list[Row]:
-        """Return a batch's rows of these series, or of all, from `begin` to before `end`."""
+        """Return a batch's rows of the series, or of all, with begin <= time < end."""
         columns = self._tail.again(batch.place)
         wanted = None if series is None else _codes(columns.drives, columns.registers, series)
         return list(_rows(columns, wanted, begin, end))
@@ -134,7 +134,7 @@ class GrowingSegment:
         return range(found[0], found[-1] + 1) if found else range(0)
 
     def _read(self, number: int, series: frozenset[Series]) -> Iterator[SeriesRow]:
-        """Yield a batch's rows of these series."""
+        """Yield a batch's rows of the series."""
         columns = self._tail.again(self._batches[number].place)
         for at in _places(columns, _codes(columns.drives, columns.registers, series)):
             name = columns.drives[columns.drive[at]], columns.registers[columns.register[at]]
@@ -144,14 +144,14 @@ class GrowingSegment:
         if len(self._tens) > MOST_TENS:
             self._tens.clear()
         self._tens = {one: SeriesTens() for one in found} | self._tens
-        self._tend_tens()
+        self._update_tens()
         for series, into in found.items():
             for number, (n, missed, *sums) in self._tens[series].by_number.items():
                 if grid.begin <= number * TEN_NS < grid.end:
                     into.add((number * TEN_NS - grid.begin) // grid.step, int(n), int(missed), *sums)
 
-    def _tend_tens(self) -> None:
-        """Read each batch once more for those series that lack it."""
+    def _update_tens(self) -> None:
+        """Read each batch for the series whose tens lack it."""
         end = len(self._batches)
         for number in range(min((tens.past for tens in self._tens.values()), default=end), end):
             behind = frozenset(series for series, tens in self._tens.items() if tens.past <= number)
@@ -210,7 +210,7 @@ MOST_SERIES = 4096  # without rows too: names of none may be asked for
 
 
 class SeriesRow(NamedTuple):
-    """A row of a series that is known; None is a miss."""
+    """A row of a known series; the value None is a miss."""
 
     series: Series
     time: int  # UTC in ns
@@ -233,18 +233,21 @@ class SeriesRows:
 
 
 class KeptSeries:
-    """The rows of the series that were asked for last; `read` gives a batch's rows of some series."""
+    """Caches the rows of recently requested series, so that a live plot reads each batch once.
+
+    `read` returns a batch's rows of some series.
+    """
 
     def __init__(self, read: Callable[[int, frozenset[Series]], Iterable[SeriesRow]]) -> None:
         self._read = read
-        self._kept: dict[Series, SeriesRows] = {}  # the one that was asked for last is the last
+        self._kept: dict[Series, SeriesRows] = {}  # in the order of their last request
 
     def rows_of(self, series: Iterable[Series], batches: range) -> dict[Series, SeriesRows]:
-        """Return the rows of each series in these batches, and maybe in others beside them."""
+        """Return the rows of each series in these batches, and perhaps in neighbouring ones."""
         if not batches:
             return {}
         found = {one: self._found(one, batches) for one in series}
-        begin = min((rows.past for rows in found.values()), default=batches.stop)  # of what is to be read
+        begin = min((rows.past for rows in found.values()), default=batches.stop)  # first batch to read
         for number in range(begin, batches.stop):
             for row in self._read(number, frozenset(one for one in found if found[one].past <= number)):
                 found[row.series].add(row)
@@ -259,6 +262,6 @@ class KeptSeries:
         return sum(len(rows.times) for rows in self._kept.values())
 
     def _found(self, series: Series, batches: range) -> SeriesRows:
-        """Return the rows that are kept, if these batches follow on them; else none, to be read anew."""
+        """Return the cached rows if these batches continue them, else an empty entry."""
         rows = self._kept.pop(series, None)
         return rows if rows and rows.first <= batches.start <= rows.past else SeriesRows(batches.start)

@@ -22,7 +22,7 @@ from multidrop.history.sources import (
     gather_files,
     metadata_of,
     rows_of_file,
-    told_by,
+    units_in_rows,
     write_parquet,
 )
 from multidrop.polling.batch import Row, Rows
@@ -35,18 +35,18 @@ from multidrop.recording.rows import from_rows
 class History:
     """The rows that `multidrop serve` or `HistoryWriter` keeps in a folder; or segments: `run.arrows`.
 
-    It may be written meanwhile, by any process: every row is there once, about 0.3 s after it was polled. A
+    Another process may write it at the same time: every row appears once, about 0.3 s after it was polled. A
     series is a drive and a register, such as "pump-1.output_frequency". A moment is UTC in ns, or a datetime
     with a time zone.
 
-    Segments are read by the library itself; Parquet files need duckdb (`pip install 'multidrop[history]'`):
-    where there are some and it is missing, methods raise ImportError. They raise ValueError for a series or
-    range that is none, and OSError. Any thread may call them.
+    Compacted files need duckdb (`pip install 'multidrop[history]'`). Methods raise ImportError if there are
+    such files and duckdb is missing, ValueError for an invalid series or range, and OSError. Any thread may
+    call them.
     """
 
     def __init__(self, folder: str | os.PathLike[str]) -> None:
         self.folder = Path(folder)
-        listing(self.folder)  # a wrong name is told at once
+        listing(self.folder)  # raises at once for a wrong name
         self._sources = Sources(self.folder)
 
     def __repr__(self) -> str:
@@ -64,11 +64,11 @@ class History:
 
     @property
     def damage(self) -> list[str]:
-        """Sentences about segments of which a part could not be read, so far."""
+        """Sentences about damaged segments so far."""
         return list(self._sources.damage.values())
 
     def metadata(self) -> Metadata:
-        """Return the metadata of the newest segment; empty where there is none."""
+        """Return the metadata of the newest segment; {} without segments."""
         return self._sources.again(self._newest_metadata)
 
     def _newest_metadata(self, found: Listing) -> Metadata:
@@ -99,7 +99,7 @@ class History:
         return HistoryRows(self, parsed_series(series), first, ALWAYS[1] if end is None else ns_of(end))
 
     def parting_of(self, series: Sequence[Series] | None, begin: int, end: int) -> Parting:
-        """Return the quantities of these series, or of all, in the segments of this range."""
+        """Return the quantities of the series, or of all, in the segments of this range."""
         parting = Parting({}, series)
         self._sources.again(lambda found: self._learnt(found, series, begin, end, parting))
         return parting
@@ -109,7 +109,7 @@ class History:
     ) -> Iterator[Rows]:
         """Yield the rows of `read` for parsed series and times in ns."""
         found = self._sources.again(lambda found: self._learnt(found, series, begin, end, parting))
-        given = 0  # all numbers up to this one
+        given = 0  # all segments up to this number were yielded
         for number in sorted({*found.segments, *found.rows}):
             if number <= given:
                 continue
@@ -117,7 +117,7 @@ class History:
                 try:
                     yield from self._rows_of_segment(number, found, series, begin, end, parting)
                     break
-                except Replaced:  # before the first of its rows: now they are elsewhere
+                except Replaced:  # before its first row: another file has its rows now
                     found = self._sources.listing()
                     self._check_merged(number, found)
             else:
@@ -125,18 +125,18 @@ class History:
             given = found.rows[number].last if number in found.rows else number
 
     def _check_merged(self, number: int, found: Listing) -> None:
-        """Raise OSError where the rows of this number are in a file with others that were given already."""
+        """Raise OSError if this segment was merged with segments that were yielded already."""
         if any(file.first < number <= file.last for file in found.rows.values()):
             raise OSError(f"{self.folder}: files were merged while they were read: read them again")
 
     def _learnt(
         self, found: Listing, series: Sequence[Series] | None, begin: int, end: int, parting: Parting
     ) -> Listing:
-        """Let the parting learn of all segments there are; return them."""
+        """Add all current segments to the parting; return them."""
         known = self._sources.known(found, begin, end)
         new = parting.unknown_of(known)
         if files := [found.rows[number] for number in new if number in found.rows and not known[number]]:
-            known |= told_by(self._sources, files, series, begin, end)
+            known |= units_in_rows(self._sources, files, series, begin, end)
         parting.learn(known)
         return found
 
@@ -175,7 +175,7 @@ class History:
         """
         names = parsed_series(series)
         if not names:
-            raise ValueError("buckets takes one series or more, such as 'pump-1.output_frequency'")
+            raise ValueError("name at least one series, such as 'pump-1.output_frequency'")
         grid = grid_of(ns_of(begin), time.time_ns() if end is None else ns_of(end), points)
 
         def gathered(found: Listing) -> dict[str, Buckets]:
@@ -193,7 +193,7 @@ class History:
         self, found: Listing, into: Mapping[Series, UnitBuckets], grid: Grid, parting: Parting
     ) -> None:
         everything = tuple(into)
-        # A file of tens may be of many segments; where these differ, each is read by itself.
+        # A file of tens may cover many segments; if their quantities differ, each segment is read itself.
         tens = [file for file in found.tens if grid.is_of_tens and parting.is_whole(file.first, file.last)]
         reckoned = {number for file in tens for number in range(file.first, file.last + 1)}
         parted: dict[tuple[str, tuple[Series, ...]], list[HistoryFile]] = {(OF_TENS, everything): tens}
@@ -219,7 +219,7 @@ class History:
         begin: Moment | None = None,
         end: Moment | None = None,
     ) -> Iterator[bytes]:
-        """Yield the rows of `read` as the text of a .csv recording with a column of units, piece by piece."""
+        """Yield the rows of `read` as the text of a .csv recording with a column `unit`, in pieces."""
         rows = self.read(series, begin, end)
         units = units_of(rows.metadata)
         lines = (lines_with_units(batch, units) for batch in rows)
@@ -234,8 +234,8 @@ class History:
     ) -> int:
         """Write the rows of `read` into a new .csv, .parquet or .arrows file; return their number.
 
-        Parquet is written by duckdb, or else by pyarrow, and by duckdb not in order. Raises as `open_writer`
-        does. What goes wrong leaves no file.
+        Parquet is written by duckdb, not in order, or else by pyarrow. Raises as `open_writer` does, and
+        leaves no file then.
         """
         rows, target = self.read(series, begin, end), Path(path)
         if target.suffix.lower() == ".parquet":
@@ -248,7 +248,7 @@ class History:
             with writer:
                 for batch in rows:
                     writer.write(batch)
-        except BaseException:  # Ctrl-C as well: half of it would pass for the whole
+        except BaseException:  # also Ctrl-C: an incomplete file would look complete
             writer.discard()
             raise
         return writer.rows
@@ -278,7 +278,7 @@ class History:
 
 
 class HistoryRows(RecordingReader):
-    """Rows of a history, read anew each time; may be iterated over more than once."""
+    """Rows of a history; every iteration reads the files again."""
 
     truncated = 0
 
@@ -294,7 +294,7 @@ class HistoryRows(RecordingReader):
 
 
 def _renamed(rows: list[Row], others: Iterable[OtherColumn]) -> list[Row]:
-    """Return a segment's rows with the columns of their quantities for the names of registers."""
+    """Return a segment's rows with registers renamed to the columns of their quantities."""
     columns = {other.series: other.column for other in others}
     if not columns:
         return rows

@@ -1,7 +1,7 @@
-"""Quantities: what the values of a series are, by the metadata of the segments that hold them. Pure.
+"""Quantities: the units of a series' values, by the metadata of their segments. Pure.
 
-A name may be another drive's, or of another family, from one segment on. Values of two quantities are never
-put together.
+From one segment to the next a name may pass to another drive or family. Values of two quantities are never
+combined.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ RAW, NAMED = "raw count", "names"
 
 
 class Quantity(NamedTuple):
-    """The unit of values, which may be "", or the names that their numbers stand for."""
+    """The unit of values, which may be "", or the names of their numbers."""
 
     unit: str
     names: tuple[tuple[str, object], ...] = ()
@@ -35,12 +35,12 @@ def quantities_of(metadata: object) -> dict[Series, Quantity]:
 
 
 def known_by(metadata: object) -> Known:
-    """Return what is known by the metadata of one segment."""
+    """Return the quantities that one segment's metadata describes."""
     return {series: (quantity,) for series, quantity in quantities_of(metadata).items()}
 
 
 def units_of(metadata: object) -> dict[Series, str]:
-    """Return what the column `unit` of Parquet files says of each series, as in a fleet's messages."""
+    """Return each series' text for the column `unit` of Parquet files, as in a fleet's messages."""
     found = {}
     drives = _table(_table(metadata).get("drives"))
     for (drive, register), quantity in quantities_of(metadata).items():
@@ -62,7 +62,7 @@ def _quantity(about: Mapping[str, Any]) -> Quantity:
 
 
 def description_of(quantity: Quantity) -> dict[str, Any]:
-    """Return what metadata say of a register with this quantity."""
+    """Return the metadata of a register with this quantity."""
     if quantity.unit == RAW:
         return {"unit": "", "step": None}
     if quantity.unit == NAMED:
@@ -101,7 +101,7 @@ class Parting:
         self.learn(known)
 
     def learn(self, known: Mapping[int, Known]) -> None:
-        """Learn of more segments; what a column holds stays the same."""
+        """Add segments; existing columns keep their quantity."""
         before: Known | None = None
         for number in sorted(known.keys() - self._known.keys(), reverse=True):
             self._known[number] = found = known[number]
@@ -123,11 +123,11 @@ class Parting:
             self._columns[series, quantity] = f"{series[1]} [{words}]"
 
     def unknown_of(self, numbers: Iterable[int]) -> list[int]:
-        """Return the numbers of which it has not learnt."""
+        """Return the numbers of segments that were not added yet."""
         return [number for number in numbers if number not in self._known]
 
     def renamed(self, number: int) -> list[OtherColumn]:
-        """Return the columns for what is of another quantity in this segment."""
+        """Return the columns for this segment's values of other quantities."""
         known = self._known.get(number, {})
         return [
             OtherColumn(series, None if len(known[series]) == 1 else quantity.unit, column)
@@ -150,7 +150,7 @@ class Parting:
         return {**metadata, "drives": drives} if drives else dict(metadata)
 
     def unit_of(self, series: Series) -> str | None:
-        """Return the unit of its values; None where no segment says it."""
+        """Return the unit of a series' values; None if no segment has it."""
         return self.newest[series].unit if series in self.newest else None
 
     def series_of(self, number: int) -> tuple[Series, ...]:
@@ -158,7 +158,7 @@ class Parting:
         return tuple(one for one in self._series or () if self._is_newest(one, number))
 
     def is_whole(self, first: int, last: int) -> bool:
-        """Return True where the values of all series are of their newest quantity in these segments."""
+        """Return True if all series have their newest quantity in these segments."""
         return not self.left_out or all(
             self._is_newest(one, number) for one in self.left_out for number in range(first, last + 1)
         )

@@ -1,4 +1,4 @@
-"""Series by name, and moments, that a history is asked for."""
+"""Parse the names of series and the moments of a query."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 
 
 def parsed_series(series: str | Iterable[str] | None) -> list[Series] | None:
-    """Return the drives and registers of series; raise ValueError for a name that is none."""
+    """Return series as pairs of drive and register. Raises ValueError for an invalid name."""
     if series is None:
         return None
     found = []
@@ -19,7 +19,7 @@ def parsed_series(series: str | Iterable[str] | None) -> list[Series] | None:
         drive, point, register = name.rpartition(".")
         if not (drive and point and register):
             raise ValueError(
-                f"{name!r} is no series: write a drive and a register, such as 'pump-1.motor_speed'"
+                f"invalid series {name!r}: write a drive and a register, such as 'pump-1.motor_speed'"
             )
         found.append((drive, register))
     return list(dict.fromkeys(found))

@@ -31,9 +31,9 @@ from multidrop.recording.format import Metadata
 T = TypeVar("T")
 ALWAYS = -(2**63), 2**63 - 1  # ns
 MEMORY = "200MB"  # of DuckDB
-MOST_TRIES = 50  # for files that are replaced: a busy machine takes longer than some of them last
-MOST_GROWING = 4  # segments of which what was learnt is kept
-FILES_AT_ONCE = 200  # of which metadata is read: a text may take 100 kB
+MOST_TRIES = 50  # to read files that are being replaced; a busy machine may be slower than the compaction
+MOST_GROWING = 4  # segments whose index is kept
+FILES_AT_ONCE = 200  # per query of metadata; a text may take 100 kB
 
 
 class Replaced(Exception):
@@ -41,7 +41,7 @@ class Replaced(Exception):
 
 
 class Sources:
-    """All that is open of a folder; any thread may use it."""
+    """The open files of a history's folder; any thread may use it."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -70,18 +70,19 @@ class Sources:
     def segment(self, number: int, found: Listing, begin: int, end: int) -> Iterator[GrowingSegment | None]:
         """Give a segment, as far as it is written, open until the block is left.
 
-        None where nothing of it is in this range, or can be read. Raises Replaced.
+        Give None if it has no rows in this range, or cannot be read. Raises Replaced.
         """
         segment: GrowingSegment | None = None
         with self._changing:
             least, most = self._bounds.get(number, ALWAYS)
             if least < end and begin <= most:
                 segment = self._held(number, found.segments[number])
-            if segment and number < max(found.segments):  # it is closed: nothing will come to it
+            if segment and number < max(found.segments):  # closed: it grows no further
                 self._bounds[number] = segment.bounds
                 if segment.left_out:
                     left_out = (
-                        f"the last {segment.left_out} bytes of {found.segments[number]} are no whole batch"
+                        f"{found.segments[number]} ends within a batch: "
+                        f"its last {segment.left_out} bytes were skipped"
                     )
                     self.damage.setdefault(number, left_out)
         try:
@@ -98,13 +99,13 @@ class Sources:
                 segment = GrowingSegment(path)
             except FileNotFoundError:
                 raise Replaced from None
-            except ValueError as error:  # it has no head: the machine lost power, or it begins just now
+            except ValueError as error:  # no head yet, or lost in a power cut
                 if path.exists() and path.stat().st_size:
                     self.damage[number] = str(error)
                 return None
             self._growing[number] = segment
         self.damage.pop(number, None)
-        segment.look()
+        segment.read_new()
         segment.hold()
         if segment.damage:
             self.damage[number] = segment.damage
@@ -142,7 +143,7 @@ class Sources:
             return self._database.cursor()
 
     def again(self, act: Callable[[Listing], T]) -> T:
-        """Return act(listing), called again as long as files are replaced meanwhile."""
+        """Return act(listing); call it again if files were replaced in between."""
         for _ in range(MOST_TRIES):
             try:
                 return act(self.listing())
@@ -162,7 +163,7 @@ def _parsed(text: str) -> object:
 
 @contextmanager
 def while_there(files: Sequence[HistoryFile]) -> Iterator[None]:
-    """Raise Replaced where the block fails because one of the files is gone."""
+    """Raise Replaced if the block fails because one of the files is gone."""
     try:
         yield
     except Exception as failure:
@@ -195,10 +196,10 @@ def rows_of_file(
     end: int,
     renamed: Iterable[OtherColumn],
 ) -> Iterator[Rows]:
-    """Yield the rows of these series, or of all, in the order of their requests. Raises Replaced, at once."""
+    """Yield the rows of the series, or of all, in the order of their requests. Raises Replaced at first."""
     condition, values = _condition(series)
     with sources.cursor() as cursor, while_there([file]):
-        # It is sorted, so all of it was read before the first rows come: none are given out twice.
+        # Sorting reads the whole file before the first rows: after Replaced, no row is yielded twice.
         query = _ROWS.format(_columns(renamed), with_units([file.path]), condition) + " order by monotonic_ns"
         yield from rows_of(cursor, query, {"begin": begin, "end": end, **values})
 
@@ -211,9 +212,9 @@ def gather_files(
     grid: Grid,
     described: Container[Series],
 ) -> None:
-    """Add the rows, or the tens, of these files to the buckets. Raises Replaced.
+    """Add the rows, or the tens, of the files to the buckets. Raises Replaced.
 
-    Units that rows tell are looked at only where not all series are described: that takes twice as long.
+    Rows' own units are read only if the metadata does not describe all series: that takes twice as long.
     """
     condition, values = _condition(list(into))
     values |= {"begin": grid.begin, "end": grid.end, "step": grid.step}
@@ -227,10 +228,10 @@ def gather_files(
         into[drive, register].told(unit, newest_ns).add(bucket, n, missed, *numbers)
 
 
-def told_by(
+def units_in_rows(
     sources: Sources, files: Sequence[HistoryFile], series: Sequence[Series] | None, begin: int, end: int
 ) -> dict[int, Known]:
-    """Return what the rows of each file say that they are. Raises Replaced."""
+    """Return each file's quantities by its rows' own units. Raises Replaced."""
     condition, values = _condition(series)
     query = _UNITS.format(files=with_units(file.path for file in files), condition=condition)
     known: dict[str, dict[Series, list[Quantity]]] = {str(file.path): {} for file in files}
@@ -257,7 +258,7 @@ def write_parquet(
     metadata: Metadata,
     renamed: Mapping[int, Iterable[OtherColumn]],
 ) -> int:
-    """Write these batches and the files' rows of these series and times; return how many. Raises Replaced.
+    """Write batches, and the files' rows of the series and range; return their number. Raises Replaced.
 
     `renamed` has the columns by the first segment of a file, as `rows_of_file` takes them.
     """
@@ -276,7 +277,7 @@ def write_parquet(
 
 
 def _columns(renamed: Iterable[OtherColumn]) -> str:
-    """Return what follows `select *` so that rows have these columns for their registers."""
+    """Return the SQL behind `select *` that renames registers to these columns."""
     whens = " ".join(
         f"when drive = {quoted(drive)} and register = {quoted(register)}"
         f"{'' if unit is None else f' and unit = {quoted(unit)}'} then {quoted(name)}"
@@ -286,7 +287,7 @@ def _columns(renamed: Iterable[OtherColumn]) -> str:
 
 
 def _condition(series: Sequence[Series] | None) -> tuple[str, dict[str, Any]]:
-    """Return what follows a where clause so that it gives these series, and the values for it."""
+    """Return the SQL behind a where clause that selects the series, and its values."""
     if series is None:
         return "", {}
     drives, registers = ({pair[at]: None for pair in series} for at in (0, 1))

@@ -1,4 +1,4 @@
-"""HistoryWriter: rows into a folder, on a thread of its own, whatever the disk does."""
+"""HistoryWriter: records rows into a folder on its own thread, so that a slow disk delays no polling."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ from multidrop.recording.format import Metadata
 from multidrop.recording.segments import SegmentWriter, outlived, segments_of
 from multidrop.transport import clock
 
-MOST_WAITING = 250_000  # rows, for a disk that is slow: 12 MB
-WRITING_S = 0.4  # between writes: each is a batch, and a question reads all batches of its time
-TENDING_S = 60.0  # between looks at what is too old
-HANGING_S = 5.0  # for which the disk may keep the thread waiting
-ENDING_S = 10.0  # for which `close` waits for the disk
+MOST_WAITING = 250_000  # rows that wait for a slow disk: 12 MB
+WRITING_S = 0.4  # between writes; each is a batch, and a query reads all batches of its range
+TENDING_S = 60.0  # between removals of old files
+HANGING_S = 5.0  # after which a write that hangs is reported
+ENDING_S = 10.0  # how long `close` waits for the disk
 
 _log = logging.getLogger("multidrop.history")
 
 
 class HistoryState(NamedTuple):
-    """The state of a recording: rows written and lost so far, and what is wrong now, or None."""
+    """The state of a recording: rows written and lost so far, and the current problem or None."""
 
     rows: int
     dropped: int
@@ -39,12 +39,12 @@ class HistoryState(NamedTuple):
 class HistoryWriter:
     """Records batches into the history in a folder, which is made: `poller.on_batch(writer.take)`.
 
-    A new segment begins every `rotate` s. Where duckdb is installed, a process of low priority compacts
-    closed ones. What is older than `keep` s is removed, and the oldest while all takes above `most` bytes.
+    A new segment starts every `rotate` s. If duckdb is installed, a process of low priority compacts closed
+    segments. Files older than `keep` s are removed, and the oldest while all take more than `most` bytes.
 
-    A disk that is full or fails holds nobody up: rows are dropped and counted in `state()`, which says why,
-    and each second it is tried again. Raises ValueError while another process records there, OSError where
-    that is impossible, and TypeError for metadata that JSON cannot hold.
+    A full or failing disk delays no polling: rows are dropped and counted in `state()`, with the reason, and
+    writing is tried again each second. Raises ValueError while another process records there, OSError if the
+    folder cannot be written, and TypeError for metadata that JSON cannot hold.
     """
 
     def __init__(
@@ -64,13 +64,15 @@ class HistoryWriter:
         self._compactor = Compactor(self.folder)
         self._waiting: list[GatheredRows] = []
         self._waiting_rows = 0
-        self._ended: list[tuple[list[GatheredRows], Metadata]] = []  # rows, and what the plant was after them
+        self._ended: list[
+            tuple[list[GatheredRows], Metadata]
+        ] = []  # rows, and the metadata of those after them
         self._changing = threading.Lock()
         self._dropped = 0
         self._trouble: str | None = None
         self._again_ns = 0
         self._tended_ns: int | None = None
-        self._busy_since_ns: int | None = None  # when the thread last went to the disk; None: it waits
+        self._busy_since_ns: int | None = None  # start of the current disk access; None: idle
         self._over = threading.Event()
         self._thread = threading.Thread(target=self._run, name="multidrop history", daemon=True)
         self._thread.start()
@@ -81,7 +83,7 @@ class HistoryWriter:
         return []
 
     def take(self, batch: Batch) -> None:
-        """Copy the rows for the thread to write. It takes microseconds, and raises nothing for the disk."""
+        """Copy the rows for the thread to write. Takes microseconds, and never raises for the disk."""
         with self._changing:
             if self._over.is_set() or self._waiting_rows + len(batch) > MOST_WAITING:
                 self._dropped += len(batch)
@@ -90,17 +92,17 @@ class HistoryWriter:
             self._waiting_rows += len(batch)
 
     def begin(self, metadata: Metadata) -> None:
-        """Begin a segment with this metadata: the plant changed. What was taken is in the one before."""
+        """Start a segment with the metadata of a changed plant. Earlier rows are in the segment before."""
         with self._changing:
             self._ended.append((self._waiting, metadata))
             self._waiting = []
 
     def state(self) -> HistoryState:
-        """Return rows written and lost so far, and what is wrong now."""
+        """Return the rows written and lost so far, and the current problem."""
         return HistoryState(self._segments.rows, self._dropped, self._hang() or self._trouble)
 
     def _hang(self) -> str:
-        """Return that the disk does not answer; "" if it does."""
+        """Return a sentence if the disk does not answer, else ""."""
         since_ns = self._busy_since_ns
         seconds = 0.0 if since_ns is None else (clock.now_ns() - since_ns) / 1e9
         return f"the disk has not answered for {seconds:.0f} s" if seconds > HANGING_S else ""
@@ -111,7 +113,7 @@ class HistoryWriter:
         return self._thread.is_alive()
 
     def close(self) -> None:
-        """Write what waits, and end; a disk that does not answer is waited for 10 s at most."""
+        """Write the waiting rows and end; wait at most 10 s for the disk."""
         self._over.set()
         self._thread.join(ENDING_S)
 
@@ -123,8 +125,8 @@ class HistoryWriter:
             try:
                 self._write_waiting()
                 self._tend()
-            except Exception:  # a mistake of ours must not end the recording
-                _log.exception("the history's thread goes on after a failure")
+            except Exception:  # a bug must not end the recording
+                _log.exception("the history's thread continues after an exception")
             self._busy_since_ns = None
         self._write_waiting()
         self._compactor.end()
@@ -150,14 +152,14 @@ class HistoryWriter:
             return
         try:
             self._segments.write(batch)
-        except Exception as failure:  # whatever it is, polling must go on
+        except Exception as failure:  # polling must continue
             self._drop(batch)
             self._again_ns = clock.now_ns() + 10**9
             if not self._trouble:
                 _log.error("nothing is recorded: %s", failure)
             self._trouble = str(failure)
             self._rotate()
-            self._tended_ns = None  # room may be made
+            self._tended_ns = None  # removing old files may free space
             return
         if self._trouble:
             _log.warning("rows are recorded again; %d were lost so far", self._dropped)
@@ -171,10 +173,10 @@ class HistoryWriter:
         try:
             self._segments.rotate(metadata)
         except OSError as failure:
-            _log.error("a segment was not ended well: %s", failure)
+            _log.error("a segment could not be closed: %s", failure)
 
     def _tend(self) -> None:
-        """Remove what is too old, and have closed segments compacted."""
+        """Remove old files, and have closed segments compacted."""
         self._compactor.tend(self._segments.open_number)
         now = clock.now_ns()
         if self._tended_ns is not None and now - self._tended_ns < TENDING_S * 1e9:
@@ -185,11 +187,11 @@ class HistoryWriter:
                 if file.number < self._segments.open_number:
                     file.path.unlink(missing_ok=True)
         except OSError as failure:
-            _log.error("what is too old cannot be removed: %s", failure)
+            _log.error("old files cannot be removed: %s", failure)
 
 
 class Compactor:
-    """A child process that compacts closed segments, begun again when there are new ones."""
+    """A child process that compacts closed segments; started again when there are new ones."""
 
     PAUSE_S = 60.0  # after a failure
 
@@ -201,7 +203,7 @@ class Compactor:
         self.is_possible = importlib.util.find_spec("duckdb") is not None
 
     def tend(self, below: int) -> None:
-        """Note how the last child ended; begin one where segments below this number are not compacted yet."""
+        """Collect a finished child; start one if segments below this number are not compacted yet."""
         if self._child and self._child.poll() is not None:
             self._note(self._child)
             self._child = None
@@ -218,23 +220,23 @@ class Compactor:
             )
             self._below = below
         except OSError as failure:
-            self._pause(f"cannot be begun: {failure}")
+            self._pause(f"cannot be started: {failure}")
 
     def _note(self, child: subprocess.Popen[str]) -> None:
         said = child.communicate()[1].strip()
         if child.returncode:
-            self._pause(f"ended with {child.returncode}: {said.splitlines()[-1] if said else 'no word'}")
+            self._pause(f"ended with {child.returncode}: {said.splitlines()[-1] if said else 'no output'}")
             return
         if said:
             _log.warning("%s", said)
         self._done = self._below
 
     def _pause(self, sentence: str) -> None:
-        _log.error("compaction %s; it is tried again in a minute", sentence)
+        _log.error("compaction %s; next try in a minute", sentence)
         self._not_before_ns = clock.now_ns() + round(self.PAUSE_S * 1e9)
 
     def end(self) -> None:
-        """Kill the child: it may be killed at any moment."""
+        """Kill the child, which is safe at any moment."""
         if self._child:
             self._child.kill()
             self._child.communicate()

@@ -4,10 +4,10 @@
 |------------|-----------------------------------|----------------------------|
 | `.arrows`  | Arrow IPC stream                  | every whole batch is there |
 | `.csv`     | text; metadata in `NAME.csv.json` | every whole line is there  |
-| `.parquet` | Parquet, needs pyarrow            | nothing can be read        |
+| `.parquet` | Parquet, needs pyarrow            | the file cannot be read    |
 
-A crash is one of the process: once `write` has returned, the system has the whole batch, and only a
-power cut in the next seconds loses it. A file without its head, which is written first, is no recording.
+The table is about crashes of the process: once `write` has returned, the system has the whole batch, and only
+a power cut in the next seconds loses it. A file without its head, which is written first, cannot be read.
 
 All three have the same columns, and one row for every sample or miss:
 
@@ -19,16 +19,16 @@ All three have the same columns, and one row for every sample or miss:
 | `drive`          | utf8               | the drive's name                                           |
 | `register`       | utf8               | the register's name                                        |
 | `value`          | float64, or null   | in the register's unit                                     |
-| `status`         | utf8               | `ok`, or why there is no value: both others are then null  |
+| `status`         | utf8               | `ok`, or the reason for a miss: the two others are null    |
 
-In .csv a text that a spreadsheet would evaluate as a formula, because it begins with `=`, `+`, `-`, `@`,
-a tab or the end of a line, has an apostrophe in front; so has one that begins with apostrophes and then
-one of these. The reader removes one apostrophe.
+In .csv a text that a spreadsheet would evaluate as a formula, because it starts with `=`, `+`, `-`, `@`, a
+tab or a line end, gets an apostrophe in front; so does a text that starts with apostrophes followed by one of
+these characters. The reader removes one apostrophe.
 
 In the file, .arrows has `drive`, `register` and `status` as dictionaries of utf8 with unsigned codes of 16,
 16 and 8 bits, and `uncertainty_ns` as a float32 that is rounded up: exact up to 2^24 ns, above that at most
-1.2e-7 more. A row takes 33 bytes. The reader here gives all of them in the types above, also from files of
-before, which held them so.
+1.2e-7 more. A row takes 33 bytes. The reader here returns all columns in the types above. Files of earlier
+versions have these types.
 
 The metadata is one JSON object: under the key `multidrop` of the schema's metadata (.arrows, .parquet) or
 in the file NAME.csv.json. `multidrop poll` writes `plant`, the plant file; `planned`, the prediction for
@@ -36,7 +36,7 @@ each line by name (multidrop.planning.prediction); and `drives`: by name each dr
 settings and framing, and `registers`, by name each register's unit and step.
 
 pyarrow.ipc.open_stream and polars.read_ipc_stream open .arrows; they refuse a recording with a truncated
-end until `repair` has cut it off. The reader here needs neither library, and leaves such an end out.
+end until `repair` has cut it off. The reader here needs neither library, and skips such an end.
 """
 
 from __future__ import annotations
@@ -108,7 +108,7 @@ def convert(source: str | os.PathLike[str], target: str | os.PathLike[str]) -> i
 
 
 def repair(path: str | os.PathLike[str]) -> int:
-    """Cut the truncated end off a recording that nobody is writing; return the number of bytes."""
+    """Cut the truncated end off a finished recording; return the number of bytes cut."""
     truncated = open_recording(path).truncated
     if truncated:
         os.truncate(path, Path(path).stat().st_size - truncated)
@@ -119,5 +119,5 @@ def _format(path: Path) -> Any:
     """Return the module of the format, which has a `writer` and a `reader`."""
     module = FORMATS.get(path.suffix.lower())
     if not module:
-        raise ValueError(f"{path}: a recording's name ends in {', '.join(FORMATS)}")
+        raise ValueError(f"{path}: a recording's name must end in {', '.join(FORMATS)}")
     return importlib.import_module(f"multidrop.recording.{module}")

@@ -58,7 +58,7 @@ class BatchDecoder:
     def decode(self, message: IpcMessage, header: FlatTable, body: memoryview) -> RecordedRows | None:
         """Return the rows of a batch, None for a dictionary.
 
-        Raises ValueError, RuntimeError or struct.error where it is damaged.
+        Raises ValueError, RuntimeError or struct.error if it is damaged.
         """
         if message.kind == DICTIONARY_BATCH:
             self._learn(header, body)
@@ -75,14 +75,14 @@ class BatchDecoder:
 
     @property
     def known(self) -> dict[int, Names]:
-        """The dictionaries that have come so far; it stays as it is when others come."""
+        """The dictionaries so far; a mapping that is replaced, never changed."""
         return self._names
 
     def columns(self, header: FlatTable, body: memoryview, names_of: dict[int, Names]) -> RecordedColumns:
-        """Return the columns of a batch without spelling their names out; codes are checked.
+        """Return a batch's columns with codes in place of names; the codes are checked.
 
-        `names_of` is what was `known` when it came. Raises as `decode`, and for a file of before, whose names
-        have no codes.
+        `names_of` are the dictionaries `known` before the batch. Raises as `decode` does, and for files of
+        earlier versions, whose names have no codes.
         """
         rows, buffers = _parts(header, body, sum(column.buffers for column, _ in self._columns))
         left = iter(buffers)
@@ -132,7 +132,7 @@ class BatchDecoder:
         return valid, *data
 
     def _learn(self, header: FlatTable, body: memoryview) -> None:
-        """Take a dictionary: in the place of the one before, or behind it."""
+        """Replace a dictionary, or extend it."""
         number, table = header.number(0, "<q"), header.table(1)
         if table is None or number not in self._ids:
             raise ValueError("there are names of no column")
@@ -152,10 +152,10 @@ class BatchDecoder:
 
 
 def _parts(batch: FlatTable, body: memoryview, count: int) -> tuple[int, list[bytes]]:
-    """Return the number of rows and the buffers of a batch that has so many of these.
+    """Return a batch's number of rows and its buffers, which must be `count`.
 
-    The core takes them, so they are no views: a view that it holds, in the traceback of a damaged batch,
-    ends the interpreter when that is collected.
+    The buffers are copies because the core takes them: a view that it holds in the traceback of a damaged
+    batch would crash the interpreter when it is collected.
     """
     if batch.table(3):
         raise ValueError("its batches are compressed, which only pyarrow and polars read")
@@ -168,14 +168,14 @@ def _parts(batch: FlatTable, body: memoryview, count: int) -> tuple[int, list[by
 
 
 def _check_filled(column: FileColumn, bits: bytes, rows: int) -> None:
-    """Raise ValueError unless a column that every row has, has a value in each."""
+    """Raise ValueError unless a column without nulls has a value in each row."""
     filled = (1 << rows) - 1
     if int.from_bytes(bits, "little") & filled != filled:
         raise ValueError(f"there is a row without a {column.name.decode()}")
 
 
 def _check_text(offsets: bytes, text: bytes) -> None:
-    """Raise ValueError unless each row's text is UTF-8: libraries that take the batch rely on it."""
+    """Raise ValueError unless each row's text is UTF-8: Arrow libraries rely on it."""
     if str(text, "utf-8").isascii():
         return
     for at in memoryview(offsets)[: len(offsets) // 4 * 4].cast("i"):

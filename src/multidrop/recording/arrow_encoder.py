@@ -36,7 +36,7 @@ MOST_NAMES = {DRIVE: 1 << 16, REGISTER: 1 << 16, STATUS: MOST_NARROW}  # codes o
 
 Names = tuple[str, ...]
 Column = Any  # memoryview, array or bytes: anything with a buffer
-Codes = dict[int, tuple[Column, Names]]  # codes and the names they stand for, by dictionary
+Codes = dict[int, tuple[Column, Names]]  # codes and their names, by dictionary
 
 
 def schema_message(metadata: dict[bytes, bytes]) -> bytes:
@@ -53,7 +53,7 @@ class Encoder:
         self._dictionaries: dict[int, Names] = {}  # those in the file
 
     def encode(self, batch: Rows) -> bytes:
-        """Return the messages of these rows, behind the dictionaries that the file lacks.
+        """Return a record batch of the rows, preceded by the dictionaries that the file lacks.
 
         Call `forget_dictionaries` if they could not be appended.
         """
@@ -107,7 +107,7 @@ def _pieces(source: _BatchCodes | _RowCodes, begin: int, end: int) -> Iterator[_
 
 
 def _bitmap(bits: memoryview | None, begin: int, end: int) -> bytes:
-    """Return the bits of these rows, or nothing if all are set."""
+    """Return the rows' bits, or b"" if all are set."""
     if bits is None:
         return b""
     rows = end - begin
@@ -126,7 +126,7 @@ class _BatchCodes:
         self.certain = self.valid = columns.valid
 
     def codes(self, begin: int, end: int) -> Codes | None:
-        """Return the codes of these rows; None if there are too many names."""
+        """Return the rows' codes; None if there are too many names."""
         columns, rows = self._columns, slice(begin, end)
         statuses = self._statuses.narrow(columns.status[rows])
         if statuses is None:
@@ -154,7 +154,7 @@ class _RowCodes:
         self.certain, self.valid = (_bits(children[number]) for number in (2, 5))
 
     def codes(self, begin: int, end: int) -> Codes | None:
-        """Return the codes of these rows; None if there are too many names."""
+        """Return the rows' codes; None if there are too many names."""
         found: Codes = {}
         for number, texts in self._texts.items():
             known, part = self._known[number], texts[begin:end]

@@ -19,7 +19,7 @@ SCHEMA, DICTIONARY_BATCH, RECORD_BATCH = 1, 2, 3  # IpcMessage.header_type
 
 
 class FlatTable:
-    """A flatbuffer's table; fields are found by their number, and an absent one is 0 or empty."""
+    """A flatbuffer's table; fields are read by number, and an absent one is 0 or empty."""
 
     def __init__(self, data: bytes, at: int) -> None:
         self._data = data
@@ -71,7 +71,7 @@ class FlatTable:
 
 @dataclass(frozen=True)
 class IpcMessage:
-    """One whole message: its header, and the places in the file where its body begins and ends."""
+    """One whole message: its header, and the start and end of its body in the file."""
 
     kind: int
     header: FlatTable | None
@@ -79,9 +79,9 @@ class IpcMessage:
     end: int
 
 
-def messages(file: BinaryIO, size: int, begin: int = 0) -> Iterator[IpcMessage]:
-    """Yield the messages from `begin` to `size`, up to the first that is truncated or invalid."""
-    end = begin
+def messages(file: BinaryIO, size: int, start: int = 0) -> Iterator[IpcMessage]:
+    """Yield the messages from `start` to `size`, up to the first that is truncated or invalid."""
+    end = start
     while message := _message(file, end, size):
         yield message
         end = message.end
@@ -110,7 +110,7 @@ def _message(file: BinaryIO, at: int, size: int) -> IpcMessage | None:
 
 
 Table = dict[int, Any]
-_OFFSET = ("<I", 0)  # of what is written later
+_OFFSET = ("<I", 0)  # placeholder, filled in later
 
 
 class Structs(bytes):
@@ -134,7 +134,7 @@ def build(root: Table) -> bytes:
 
 
 def _align(out: bytearray, size: int, ahead: int = 0) -> None:
-    """Fill up so that what comes `ahead` bytes later is aligned."""
+    """Pad so that the position `ahead` bytes later is aligned."""
     out += bytes(-(len(out) + ahead) % size)
 
 
@@ -217,7 +217,7 @@ CODED = {number: column for number, column in enumerate(COLUMNS) if column.code_
 
 
 def schema_table(metadata: dict[bytes, bytes]) -> Table:
-    """Return the Schema of these columns."""
+    """Return the Schema table of COLUMNS."""
     return {
         0: ("<h", int(sys.byteorder == "big")),
         1: [_field(number, column) for number, column in enumerate(COLUMNS)],

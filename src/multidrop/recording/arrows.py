@@ -55,7 +55,7 @@ class ArrowsWriter(AppendingWriter):
 
 
 class ArrowsReader(RecordingReader):
-    """Read every whole message; a truncated one at the end is left out."""
+    """Reads every whole message; a truncated one at the end is skipped."""
 
     def __init__(self, path: Path) -> None:
         super().__init__(path)
@@ -65,11 +65,11 @@ class ArrowsReader(RecordingReader):
             for message in messages(file, size):
                 if not self._whole:
                     self.metadata = self._read_schema(message)
-                elif message.kind == DICTIONARY_BATCH:  # other libraries miss the batch that it is for
+                elif message.kind == DICTIONARY_BATCH:  # other libraries fail if its batch is missing
                     continue
                 self._whole = message.end
         if not self._whole:
-            raise self._not_a_recording("it does not begin like an Arrow stream")
+            raise self._not_a_recording("it does not start like an Arrow stream")
         self.truncated = size - self._whole
 
     def __iter__(self) -> Iterator[Rows]:
@@ -104,12 +104,12 @@ class ArrowsReader(RecordingReader):
             self._columns = list(zip(known, map(_dictionary, fields), strict=True))
             entries = {entry.text(0): entry.text(1) for entry in head.tables(2)}
         except struct.error as error:
-            raise self._not_a_recording("it does not begin like an Arrow stream") from error
+            raise self._not_a_recording("it does not start like an Arrow stream") from error
         return self._parse_metadata(entries.get(METADATA_KEY.encode(), b"{}"))
 
 
 def _column(field: FlatTable) -> FileColumn:
-    """Return a column as the file describes it: with -1 bits where its codes are none of ours."""
+    """Return a column as the file describes it, with -1 code bits if its codes are not ours."""
     detail, coded = field.table(3), field.table(4)
     index = coded.table(1) if coded else None
     is_unsigned = index is not None and not index.number(1, "<?")
@@ -124,7 +124,7 @@ def _dictionary(field: FlatTable) -> int | None:
 
 
 def _described(*found: FileColumn) -> tuple[FileColumn, ...] | None:
-    """Return the columns of a recording, of now or before, that are described so."""
+    """Return the columns, of this or an earlier version, that match this description."""
     for known in (COLUMNS, COLUMNS_BEFORE):
         if found == tuple(column._replace(nullable=False) for column in known):
             return known
@@ -135,28 +135,28 @@ writer, reader = ArrowsWriter, ArrowsReader
 
 
 class BatchPlace(NamedTuple):
-    """A batch's place in the file, and the names that its codes stand for."""
+    """A batch's place in the file, and the names of its codes."""
 
     message: IpcMessage
     names: dict[int, Names]
 
 
 class RecordedBatch(NamedTuple):
-    """A batch, and where it is."""
+    """A batch and its place."""
 
     columns: RecordedColumns
     place: BatchPlace
 
 
 class ArrowsTail:
-    """Yields each whole batch of a file once, also when the file is removed meanwhile.
+    """Reads each whole batch of a growing file once, even if the file is removed while it is open.
 
-    Raises ValueError for a file that is no recording, and OSError.
+    Raises ValueError for a file that is not a recording, and OSError.
     """
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self._file = path.open("rb", buffering=0)  # a buffer would keep what was cut off
+        self._file = path.open("rb", buffering=0)  # a buffer would keep bytes that were cut off
         try:
             reader = ArrowsReader(path)
             self.metadata = reader.metadata
@@ -171,11 +171,11 @@ class ArrowsTail:
 
     @property
     def left_out(self) -> int:
-        """Bytes at the end that are no whole batch yet, or never will be."""
+        """Bytes of an incomplete batch at the end."""
         return self._size() - self._end
 
     def new(self) -> Iterator[RecordedBatch]:
-        """Yield the batches that came since the last call. Raises ValueError where the file is damaged."""
+        """Yield the batches appended since the last call. Raises ValueError if the file is damaged."""
         for message in messages(self._file, self._size(), self._end):
             if not message.header:
                 return
@@ -192,7 +192,7 @@ class ArrowsTail:
             yield batch
 
     def again(self, place: BatchPlace) -> RecordedColumns:
-        """Return a batch that `new` gave before. Raises ValueError."""
+        """Return a batch that `new` yielded before. Raises ValueError."""
         assert place.message.header
         return self._decoder.columns(place.message.header, self._body(place.message), place.names)
 

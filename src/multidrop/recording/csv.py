@@ -53,7 +53,7 @@ class CsvWriter(AppendingWriter):
 
 
 def _write_whole(path: Path, text: str) -> None:
-    """Make the file at once: at no time is there half of it."""
+    """Create the file atomically: it is never incomplete."""
     part = path.with_name(path.name + ".part")
     try:
         part.write_text(text, encoding="utf-8")

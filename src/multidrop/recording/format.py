@@ -22,7 +22,7 @@ METADATA_KEY = "multidrop"  # of an Arrow schema's metadata
 class RecordingError(OSError):
     """A recording cannot be written: the disk is full or read-only, or a library is missing.
 
-    `rows` is how many rows were written before that and can be read.
+    `rows` is the number of rows that were written before and can be read.
     """
 
     def __init__(self, path: Path, reason: str, rows: int = 0) -> None:
@@ -35,7 +35,7 @@ class RecordingError(OSError):
 
 @contextmanager
 def writing(path: Path, rows: int = 0) -> Iterator[None]:
-    """Raise an OSError of the block as the RecordingError of a file that holds so many rows."""
+    """Raise an OSError of the block as a RecordingError of a file with this number of rows."""
     try:
         yield
     except RecordingExists:
@@ -106,11 +106,11 @@ _REASONS = {  # a library's own sentence is about its internals
 class RecordingReader(ArrowTable):
     """A recording as it was when it was opened; may be iterated over more than once.
 
-    As a table, in pandas, in polars or in the wide form, all of it is in memory. An Arrow library takes it as
-    it is, such as `pyarrow.table(reader)`.
+    Tables of pandas or polars and the wide form hold all rows in memory. An Arrow library accepts the reader
+    itself, such as `pyarrow.table(reader)`.
 
-    `truncated` is the number of bytes at its end that are left out: the writer was killed, or the disk
-    was full, before their batch was whole.
+    `truncated` is the number of bytes at its end that are skipped: the writer was killed, or the disk was
+    full, before their batch was complete.
     """
 
     metadata: Metadata
@@ -121,7 +121,7 @@ class RecordingReader(ArrowTable):
 
     @abstractmethod
     def __iter__(self) -> Iterator[Rows]:
-        """Yield the rows, some thousands at a time. Raises ValueError where the file is damaged."""
+        """Yield the rows, some thousands at a time. Raises ValueError if the file is damaged."""
 
     def __repr__(self) -> str:
         try:
@@ -134,7 +134,7 @@ class RecordingReader(ArrowTable):
         return f"<recording {self.path}: {shown_span(rows)}>"
 
     def __arrow_c_stream__(self, requested_schema: object = None) -> Any:
-        layout = schema()  # says so where nanoarrow is missing
+        layout = schema()  # raises if nanoarrow is missing
         from nanoarrow.c_array_stream import CArrayStream
 
         return CArrayStream.from_c_arrays([rows.arrow() for rows in self], layout).__arrow_c_stream__()
@@ -142,13 +142,13 @@ class RecordingReader(ArrowTable):
     def wide(self, *columns: str) -> WideRows:
         """Return a column for each `drive.register`, or for these alone, and a row for each time.
 
-        Registers that were asked in one request share a row; nothing else is joined, and a miss is null, as
-        `WideRows` says. Raises ValueError for a column that is not in the recording, and where it is damaged.
+        Only registers of one request share a row, and a miss is null: see `WideRows`. Raises ValueError for a
+        column that is not in the recording, or if the recording is damaged.
         """
         return WideRows((row for rows in self for row in rows), columns, self._registers())
 
     def _registers(self) -> list[str]:
-        """Return the columns of the wide form of all that was polled."""
+        """Return the wide form's columns for every polled register."""
         drives = self.metadata.get("drives")
         described = drives.items() if isinstance(drives, dict) else ()
         return [
@@ -159,7 +159,7 @@ class RecordingReader(ArrowTable):
         ]
 
     def _damaged(self, rows: int, error: Exception | str) -> ValueError:
-        """Return the error that says how many rows can be read, and why no more."""
+        """Return an error with the number of readable rows and the damage."""
         reason = next((text for kind, text in _REASONS.items() if isinstance(error, kind)), error)
         return ValueError(f"{self.path} is damaged after row {rows}: {reason}")
 
@@ -189,7 +189,7 @@ class RecordingExists(FileExistsError, ValueError):
 
 
 def already_there(path: Path) -> RecordingExists:
-    return RecordingExists(f"{path} is there already: name another file, or remove it first")
+    return RecordingExists(f"{path} exists already: name another file, or remove it first")
 
 
 def new_file(path: Path) -> FileIO:
@@ -210,13 +210,13 @@ class AppendFile:
     def __init__(self, path: Path) -> None:
         self._file = new_file(path)
         self._length = 0
-        self._is_truncated = False  # a piece was begun and not finished
+        self._is_truncated = False  # the last piece is incomplete
 
     def append(self, piece: bytes | memoryview) -> None:
-        """Give the piece to the system at once; when it does not fit, the file stays as it was.
+        """Append the whole piece, or leave the file as it was if the piece does not fit.
 
-        The same holds when a signal handler raises. If the file cannot be cut back at once, that is
-        done before the next piece.
+        The same holds if a signal handler raises. If the file cannot be cut back at once, that happens
+        before the next piece.
         """
         if self._is_truncated:
             self._cut()

@@ -30,7 +30,7 @@ GROUP_ROWS = 1 << 17  # that wait in memory
 TEXTS = ("drive", "register", "status")
 MOST_TEXT = 1 << 26  # bytes of a text column in GROUP_ROWS rows
 MOST_OF_GROUP = 1 << 29  # unpacked bytes of a group of rows
-UNREADABLE = "nothing of it can be read, because a Parquet file is readable only once it is closed"
+UNREADABLE = "it cannot be read, because a Parquet file is readable only once it is closed"
 ENCODING = {
     "compression": "zstd",
     "use_dictionary": ["drive", "register", "status", "value"],
@@ -108,9 +108,9 @@ class ParquetReader(RecordingReader):
         if found.types[: len(wanted)] != wanted.types or not (has_units or found.names == wanted.names):
             raise self._not_a_recording("it is a Parquet file with other columns")
         self.metadata = self._parse_metadata((found.metadata or {}).get(METADATA_KEY.encode(), b"{}"))
-        if has_units and not self.metadata.get("drives"):  # a register may have two of them
+        if has_units and not self.metadata.get("drives"):  # a register may have two units
             raise self._not_a_recording(
-                "it is a file of `multidrop hub`: read its folder by multidrop.History"
+                "it is a file of `multidrop hub`: read its folder with multidrop.History"
             )
 
     def __iter__(self) -> Iterator[Rows]:
@@ -136,7 +136,7 @@ class ParquetReader(RecordingReader):
     def _check_sizes(self, described: Any) -> None:
         """Raise ValueError for a group of rows that would take too much memory once it is unpacked.
 
-        pyarrow aborts the process if the columns of a damaged group are asked for their own sizes.
+        The sizes of single columns are not read: pyarrow aborts the process for a damaged group.
         """
         for number in range(described.num_row_groups):
             size = described.row_group(number).total_byte_size
@@ -153,7 +153,7 @@ class ParquetReader(RecordingReader):
                 return None
             batch.validate(full=True)
         except (OSError, ValueError, self._arrow.ArrowException) as failure:
-            raise self._damaged(rows, "what follows cannot be unpacked") from failure
+            raise self._damaged(rows, "the next rows cannot be unpacked") from failure
         batch = self._with_texts(batch, rows)
         for field in self._arrow.schema(schema()):
             if not field.nullable and batch[field.name].null_count:

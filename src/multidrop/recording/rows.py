@@ -31,7 +31,7 @@ class RecordedRows(Rows):
 
 
 def _values(column: Any) -> Iterable[Any]:
-    """Return each row's value of a column, None where it has none."""
+    """Return a column's values, None for nulls."""
     if column.n_buffers == 3:
         return texts_of(column)
     numbers = memoryview(column.buffer(1))[: column.length]
@@ -72,7 +72,7 @@ def _filled(values: Sequence[Any]) -> list[Any]:
 
 
 def _bitmap(values: Sequence[object]) -> bytes:
-    """Return a bit for each value, least significant first: 1 where there is one."""
+    """Return a bit for each value, least significant first: 0 for None."""
     bits = "".join("0" if value is None else "1" for value in reversed(values))
     return int(bits, 2).to_bytes((len(values) + 7) // 8, "little")
 

@@ -20,7 +20,7 @@ from multidrop.recording.arrows import ArrowsReader, ArrowsWriter
 from multidrop.recording.format import Metadata, RecordingWriter, writing
 from multidrop.transport import clock
 
-MOST_CUT = 1 << 24  # bytes: a longer end is no truncated batch, but damage, and kept for somebody to mend
+MOST_CUT = 1 << 24  # bytes; a longer end is damage, not a truncated batch, and is kept
 
 
 def segments_of(path: Path) -> list[tuple[int, Path]]:
@@ -31,13 +31,12 @@ def segments_of(path: Path) -> list[tuple[int, Path]]:
 
 
 class SegmentWriter(RecordingWriter):
-    """A recording that begins a new segment `every` s, counted on the monotonic clock.
+    """A recording that starts a new segment `every` s, on the monotonic clock.
 
-    A segment is made when its first rows come. Segments that ended more than `keep` s ago are removed, and
-    then the oldest while all take more than `most` bytes; never the one that is written. Both are checked
-    whenever a segment begins. `after` is a number that all new segments are above. One process records at a
-    time. Raises ValueError while another does, or where the name does not end in .arrows, TypeError for
-    metadata that JSON cannot hold, and RecordingError.
+    A segment is created with its first rows. Whenever one starts, segments that ended more than `keep` s ago
+    are removed, and then the oldest while all take more than `most` bytes; never the current one. All new
+    segments have numbers above `after`. Raises ValueError while another process records there, or if the name
+    does not end in .arrows, TypeError for metadata that JSON cannot hold, and RecordingError.
     """
 
     def __init__(
@@ -52,7 +51,7 @@ class SegmentWriter(RecordingWriter):
     ) -> None:
         super().__init__(Path(path))
         if self.path.suffix != ".arrows":
-            raise ValueError(f"{path}: a recording in segments has a name that ends in .arrows")
+            raise ValueError(f"{path}: the name of a recording in segments must end in .arrows")
         self._metadata, self._every_ns, self._keep, self._most = metadata, round(every * 1e9), keep, most
         self._segment: ArrowsWriter | None = None
         self._begun_ns = 0
@@ -70,12 +69,12 @@ class SegmentWriter(RecordingWriter):
 
     @property
     def files(self) -> tuple[Path, ...]:
-        """All segments that were written here, and are still kept."""
+        """The segments that this writer wrote and that still exist."""
         return tuple(filter(Path.exists, self._written))
 
     @property
     def open_number(self) -> int:
-        """The number of the segment that is written, or will be: those below it are closed."""
+        """The number of the current or next segment: those below it are closed."""
         return self.number if self._segment else self.number + 1
 
     def write(self, batch: Rows) -> None:
@@ -88,7 +87,7 @@ class SegmentWriter(RecordingWriter):
             self.rows += len(batch)
 
     def rotate(self, metadata: Metadata | None = None) -> None:
-        """End this segment: the next rows begin a new one, with other metadata where it is given.
+        """End this segment; the next rows start a new one, with this metadata if given.
 
         A segment without rows is removed.
         """
@@ -129,8 +128,8 @@ class SegmentWriter(RecordingWriter):
 
 
 def _cut_truncated(path: Path) -> None:
-    """Cut off what a killed writer left of its last batch: other libraries refuse such a file."""
-    with suppress(OSError, ValueError):  # no recording at all: it stays as it is
+    """Cut off the incomplete batch of a killed writer: other libraries refuse such a file."""
+    with suppress(OSError, ValueError):  # not a recording: keep it
         truncated = ArrowsReader(path).truncated
         if 0 < truncated <= MOST_CUT:
             os.truncate(path, path.stat().st_size - truncated)
@@ -145,7 +144,7 @@ class StoredFile(NamedTuple):
 
     path: Path
     number: int  # of its last segment
-    end: float  # the newest of it, in s since 1970
+    end: float  # time of its newest row, in s since 1970
     size: int  # in bytes
 
 
@@ -154,11 +153,11 @@ def outlived(
 ) -> list[StoredFile]:
     """Return the files to remove: those that are older than `keep` s, and the oldest beyond `most`.
 
-    `now` is in s since 1970, `most` is the number of bytes that may stay. The oldest is the one with the
-    lowest number, whatever the clock said. None is no limit.
+    `now` is in s since 1970, `most` is the number of bytes that may stay; None means unlimited. The oldest
+    file is the one with the lowest number, whatever the clock said.
 
-    An age is the sum of the times from each file's end to the next one's, and to `now`. Of those a time that
-    is longer than `keep` is left out: the clock jumped, or nothing was recorded. Neither empties a history.
+    An age is the sum of the times from each file's end to the next one's, and to `now`. A step longer than
+    `keep` is skipped, because the clock jumped or the recording paused: neither empties a history.
     """
     in_order = sorted(files, key=lambda file: file.number)
     ages = {} if keep is None else _ages(in_order, now, keep)
@@ -177,7 +176,7 @@ def _ages(files: Iterable[StoredFile], now: float, longest: float) -> dict[int, 
     """Return the age in s of each number, without steps that are longer than this, or back in time."""
     ends: dict[int, float] = {}
     for file in files:
-        ends[file.number] = min(file.end, ends.get(file.number, file.end))  # a copy may say later
+        ends[file.number] = min(file.end, ends.get(file.number, file.end))  # a copy may have a later time
     ages, age, later = {}, 0.0, now
     for number in sorted(ends, reverse=True):
         step = later - ends[number]
@@ -193,7 +192,7 @@ def parse_age(text: str) -> float:
     seconds = float(match[1]) * AGES[match[2] or match[3]] if match else 0.0
     if not 1.0 <= seconds <= 36525 * AGES["day"]:
         raise ValueError(
-            f'{text!r} is not a time from 1 s to 100 years, such as "10 min", "1 h" or "30 days"'
+            f'invalid time {text!r}: write 1 s to 100 years, such as "10 min", "1 h" or "30 days"'
         )
     return seconds
 
@@ -203,7 +202,7 @@ def parse_size(text: str) -> int:
     match = re.fullmatch(r"(\d+(?:\.\d+)?)\s*(kB|MB|GB|TB)", str(text).strip(), re.ASCII)
     size = round(float(match[1]) * SIZES[match[2]]) if match else 0
     if not SIZES["kB"] <= size <= 10**18:
-        raise ValueError(f'{text!r} is not a size from 1 kB on, such as "500 MB" or "20 GB"')
+        raise ValueError(f'invalid size {text!r}: write 1 kB or more, such as "500 MB" or "20 GB"')
     return size
 
 
@@ -211,9 +210,9 @@ _CLOSED_IN_CHILDREN = getattr(os, "O_CLOEXEC", 0) or getattr(os, "O_NOINHERIT", 
 
 
 class FileLock:
-    """A lock, had from the beginning until `close`; the file stays, because removing it would be a race.
+    """A lock, held until `close` or the process ends; the file stays, because removing it would be a race.
 
-    Raises BlockingIOError while another process has it, and OSError when the file cannot be made.
+    Raises BlockingIOError while another process holds it, and OSError if the file cannot be created.
     """
 
     def __init__(self, path: Path) -> None:
@@ -231,7 +230,7 @@ class FileLock:
 
 
 def _lock(file: int) -> None:
-    """Lock an open file for this process alone. Raises BlockingIOError while another one has it."""
+    """Lock an open file. Raises BlockingIOError while another process holds the lock."""
     if sys.platform != "win32":
         import fcntl
 

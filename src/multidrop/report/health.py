@@ -152,10 +152,10 @@ def reasons_of(recording: Recording, drive: str) -> Counter[str]:
 
 
 def miss_shares(recording: Recording, drive: str) -> tuple[Array, Array] | None:
-    """Return output frequencies in Hz, and the share of the drive's values missed near each of them.
+    """Return output frequencies in Hz, and the drive's share of missed values near each.
 
     The frequency at a miss is the last one that was read. Values that were not asked for do not count.
-    None where nothing was missed, and where the drive has no frequency or always the same.
+    None without misses, or if the drive has no frequency or a constant one.
     """
     (frequency, *_) = (*recording.of(drive, FREQUENCY), None)
     reasons = [reason for reason in reasons_of(recording, drive) if not reason.startswith(UNASKED)]
@@ -220,7 +220,7 @@ class LineUse:
 
     @property
     def cycle(self) -> float | None:
-        """Seconds to read everything once; None where a register has a rate of its own."""
+        """Seconds to read everything once; None if a register has its own rate."""
         blocks = [block for drive in self.planned["drives"].values() for block in drive["blocks"]]
         if any(block["every_ms"] is not None for block in blocks) or not self.values:
             return None
@@ -276,7 +276,7 @@ def _line_use(recording: Recording, line: str, planned: Mapping[str, Any]) -> Li
     time, needed, silence = time[order], needed[order], silence[order]
     if len(time):  # the longer of two neighbours' silences is kept
         needed = needed + np.maximum(silence, np.concatenate([silence[1:], silence[-1:]]))
-        # A port that is faster than its settings, such as a network's, needs no more than it took.
+        # A port may be faster than its settings, such as a network's: limit its need to the measured time.
         needed[:-1] = np.minimum(needed[:-1], np.diff(time) / 1e9)
     end = float(needed[-1]) if len(time) else 0.0
     return LineUse(line, planned, time, needed, asked, values, max(recording.seconds + end, 1e-9))
@@ -285,7 +285,7 @@ def _line_use(recording: Recording, line: str, planned: Mapping[str, Any]) -> Li
 def _exchanges(recording: Recording, name: str, drive: Mapping[str, Any]) -> tuple[Array, Array, int]:
     """Return the time and the seconds to its reply's end of each answered exchange, and how many values.
 
-    Values of one time were read together: blocks may have been chosen anew since the plan.
+    Values of one time were read together; the blocks may differ from the plan's.
     """
     registers = [register for block in drive["blocks"] for register in block["registers"]]
     read = [(series, ~series.missed) for register in registers for series in recording.of(name, register)]
@@ -305,7 +305,7 @@ def _exchanges(recording: Recording, name: str, drive: Mapping[str, Any]) -> tup
     framing = Framing[recording.about(name)["framing"].upper()]
     requests = [Message(1, asked, at, count, bytes(4)) for asked, at, count in blocks.T.tolist()]
     characters = np.array([_characters(framing, request) for request in requests])[which]
-    # The stamps are those of the request's begin and of the reply's first character.
+    # Rows have the times of the request's start and of the reply's first character.
     rest = (characters - 1) * drive["character_ms"] / 1e3
     return time, uncertainty / 1e9 + rest, len(times)
 

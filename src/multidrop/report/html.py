@@ -1,4 +1,4 @@
-"""Write a recording as one HTML page that needs nothing else: tables and pictures."""
+"""Write a recording as one self-contained HTML page with tables and pictures."""
 
 from __future__ import annotations
 
@@ -229,7 +229,7 @@ def _escape(text: str) -> str:
 
 
 def _table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """Return a table; a column whose head begins with # has numbers, aligned to the right."""
+    """Return a table; a column whose head starts with # has numbers, aligned right."""
     kinds = [f' class="{_kind(column)}"' for column in zip(heads, *rows, strict=True)]
     head = "".join(
         f"<th{kind}>{_escape(text.removeprefix('#'))}</th>" for kind, text in zip(kinds, heads, strict=True)

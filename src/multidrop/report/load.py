@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 from multidrop.polling.batch import ROW_COLUMNS
 from multidrop.recording import open_recording
 
-RAW = "raw count"  # the unit where no document states the scale
+RAW = "raw count"  # unit of values without a known scale
 LARGEST = 1e150  # drawable value: axes compute with differences and products
 LATEST_NS = 230 * 365 * 86400 * 10**9  # UTC: dates beyond it cannot be computed
-PAUSE_NS, PAUSE_STEPS = 2 * 10**9, 5  # longer than both: nothing was polled, as by a process that stood still
+PAUSE_NS, PAUSE_STEPS = 2 * 10**9, 5  # a longer step is a pause in polling, such as of a suspended process
 MOST_ROWS = 100_000_000  # they take 5 GB
 MOST_NAMES = 4096  # of drives, registers or statuses
 LONGEST_NAME = 4096  # bytes
@@ -63,7 +63,7 @@ class Series:
 
     @cached_property
     def pauses(self) -> Array:
-        """True for each row, but the last, after which nothing was polled: neither a value nor a miss."""
+        """True for each row, except the last, that is followed by a pause without values or misses."""
         steps = np.diff(self.time)
         beside = np.maximum(np.append(steps[1:], 0), np.append(0, steps[:-1]))
         return np.asarray((steps > PAUSE_NS) & (steps / PAUSE_STEPS > beside) & (beside > 0))
@@ -75,12 +75,12 @@ class Series:
 
     @property
     def is_bits(self) -> bool:
-        """True where a count is a sum of bits, each with a name of its own."""
+        """True if a count is a sum of named bits."""
         return bool(self.names) and self.metadata.get("bits") is True
 
     @property
     def unit(self) -> str:
-        """The unit beside an axis; "raw count" where no document states the scale."""
+        """The unit beside an axis; "raw count" if the scale is unknown."""
         if self.names:
             return ""
         if "step" in self.metadata and self.metadata["step"] is None:

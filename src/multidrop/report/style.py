@@ -46,7 +46,7 @@ class TimeBins:
         return np.asarray(np.histogram(time, self._edges, weights=weights)[0] / self._seconds)
 
     def label(self, axes: Axes) -> None:
-        """Label the x axis, and let it begin and end with the bins."""
+        """Label the x axis, and limit it to the bins."""
         label_time(axes)
         axes.set_xlim(*days(self._edges[[0, -1]].astype(np.int64)))
 
@@ -106,7 +106,7 @@ def day(time: int) -> float:
 
 
 def label_time(axes: Axes) -> None:
-    """Label the x axis with the time of day in UTC, and the date where that is not clear."""
+    """Label the x axis with the time of day in UTC, and the date if needed."""
     locator = _DATES.AutoDateLocator(tz=UTC)
     axes.xaxis.set_major_locator(locator)
     formatter = _DATES.ConciseDateFormatter(

@@ -81,7 +81,7 @@ def plot(
 ) -> tuple[Figure, list[str]]:
     """Return the picture, and the registers and drives that had no room in it.
 
-    Raises ValueError for unknown names, and where there is no value to draw.
+    Raises ValueError for unknown names, and if there is no value to draw.
     """
     chosen = _of_drives(recording, drives, registers)
     wanted = [series for series in chosen if not registers or series.register in registers]
@@ -107,11 +107,11 @@ def plot(
     return figure, [*left_out, *([f"{hidden} more drives"] if hidden else [])]
 
 
-# ---- what is shown ----
+# ---- choice of series ----
 
 
 def _of_drives(recording: Recording, drives: Sequence[str], registers: Sequence[str]) -> list[Series]:
-    """Return the series of these drives, or of the first MOST_DRIVES. Raises ValueError for unknown names."""
+    """Return the drives' series, or those of the first MOST_DRIVES. Raises ValueError for unknown names."""
     _check("drive", drives, recording.drives)
     shown = set(drives or recording.drives[:MOST_DRIVES])
     chosen = [series for series in recording.series if series.drive in shown]
@@ -120,7 +120,7 @@ def _of_drives(recording: Recording, drives: Sequence[str], registers: Sequence[
 
 
 def _faults(chosen: Sequence[Series], *, is_alone: bool) -> list[Series]:
-    """Return the drives' faults: those that had some, or all where nothing else is shown."""
+    """Return the fault series of drives that had faults, or all if there are no other series."""
     polled = [series for series in chosen if series.register == FAULTS]
     return [series for series in polled if series.faults()] or (polled if is_alone else [])
 
@@ -248,7 +248,7 @@ def _shade(axes: Axes, content: Content, faults: Sequence[Series]) -> None:
 
 
 def with_pauses(time: Array, value: Array, begins: Array) -> tuple[Array, Array]:
-    """Return the points with a miss at the begin of each pause, across which no line leads."""
+    """Return the points with a miss at the start of each pause, which interrupts the line."""
     at = np.searchsorted(time, begins, side="right")
     return np.insert(time, at, begins + 1), np.insert(value, at, np.nan)
 
@@ -280,7 +280,7 @@ MOST_TEXTS = 50  # with one name, in one lane
 
 @dataclass(frozen=True, eq=False)
 class Lane:
-    """The states of one drive's register, or of one bit of it, and their times."""
+    """The states of a drive's register, or of one of its bits, and their times."""
 
     drive: str
     title: str
@@ -288,7 +288,7 @@ class Lane:
     time: Array  # of its rows, ns UTC
     missed: Array
     state: tuple[str, ...]  # of each run of rows that are alike
-    begin: Array  # of each of them, ns UTC
+    begin: Array  # of each state, ns UTC
     end: Array
 
 
@@ -303,7 +303,7 @@ def lanes_of(series: Sequence[Series]) -> tuple[list[Lane], int]:
 def _lanes(series: Series) -> Iterable[Lane]:
     if not series.is_bits:
         return [_lane(series, series.drive, series.value, series.name_of)]
-    with np.errstate(invalid="ignore"):  # an infinite value is no count
+    with np.errstate(invalid="ignore"):  # infinite values are not counts
         is_whole = series.value % 1 == 0
     is_count = is_whole & (series.value >= 0) & (series.value < 2**32)
     counts = np.where(is_count, series.value, 0.0).astype(np.int64)
@@ -322,7 +322,7 @@ def _lanes(series: Series) -> Iterable[Lane]:
 
 
 def _lane(series: Series, title: str, value: Array, name_of: Callable[[float], str]) -> Lane:
-    """Cut the rows into runs of one value; a state lasts until the next row, or until a pause begins."""
+    """Cut the rows into runs of one value; a state lasts until the next row, or until a pause."""
     time = series.time
     differs = (value[1:] != value[:-1]) & ~(np.isnan(value[1:]) & np.isnan(value[:-1]))
     cuts = np.flatnonzero(differs | series.pauses)
@@ -344,7 +344,7 @@ def _lane(series: Series, title: str, value: Array, name_of: Callable[[float], s
 
 
 def lanes_inches(lanes: Sequence[Lane]) -> float:
-    """Return the height of a panel of these lanes."""
+    """Return a panel's height in inches for these lanes."""
     return 0.45 + LANE_INCHES * len(lanes)
 
 
@@ -379,7 +379,7 @@ def draw_lanes(axes: Axes, lanes: Sequence[Lane], recording: Recording) -> None:
 
 
 def name_bar(axes: Axes, text: str, at: float, row: int) -> None:
-    """Write a name at the begin of a bar, readable also where the bar is shorter."""
+    """Write a name at the start of a bar, readable even if the bar is shorter."""
     box = {"facecolor": "white", "alpha": 0.75, "pad": 0.8, "linewidth": 0}
     place: dict[str, Any] = {"xytext": (3, 0), "textcoords": "offset points", "va": "center"}
     axes.annotate(text, (at, row), fontsize=7.5, clip_on=True, bbox=box, **place)
@@ -399,7 +399,7 @@ def _longest_first(lane: Lane) -> list[str]:
 
 
 def _merged(lane: Lane, name: str, span: int) -> tuple[Array, Array]:
-    """Return begins and ends of this state, without gaps that are too narrow to be seen."""
+    """Return the starts and ends of this state, without gaps too narrow to see."""
     of = np.array([state == name for state in lane.state])
     begin, end = lane.begin[of], lane.end[of]
     apart = np.concatenate([[True], begin[1:] - end[:-1] > span * NARROWEST / 2])

@@ -33,7 +33,7 @@ def identify(
 ) -> tuple[list[Drive], str]:
     """Return drives of the families that fit best, and the doubt that is left.
 
-    There are several where they fit equally well, and none where none fits.
+    There are several if they fit equally well, and none if none fits.
     """
     found = [candidate(family, sweep.settings, sweep.framing, address) for family in families]
     drives = [drive for drive in found if drive is not None]
@@ -49,7 +49,7 @@ def identify(
 
 
 def candidate(family: type[Drive], settings: Settings, framing: Framing, address: int) -> Drive | None:
-    """Return a drive of the family with these settings; None where its document does not allow them.
+    """Return a drive of the family with these settings; None if its manual does not allow them.
 
     A drive with two stop bits, or on a pseudo-terminal with another parity, answers in the sweep's
     format too: it is given the family's usual one.
@@ -65,7 +65,7 @@ def candidate(family: type[Drive], settings: Settings, framing: Framing, address
 
 
 def _score(drive: Drive, ask: Ask) -> int:
-    """Return the number of checks that speak for the family. Raises where one speaks against it."""
+    """Return the number of checks that the drive passes. Raises if one excludes the family."""
     score = 0
     if type(drive).identify is not Drive.identify:
         _run(drive, drive.identify.script(), ask)
@@ -114,7 +114,7 @@ def _read(drive: Drive, register: Register[Any] | Text, ask: Ask) -> Any:
     return value
 
 
-MOST_TIMEOUT = 1.0  # s: for a drive of which only the address is known
+MOST_TIMEOUT = 1.0  # s, for a drive with a known address only
 TRIES = 3
 LATE_NS = 500_000_000  # for which late replies are waited for
 SHORTEST_REPLY = 5  # bytes, of an exception; less is noise
@@ -148,7 +148,7 @@ class Probe:
         self._address = address
         self._peer = scan.peer(LEAST_TIMEOUT, MOST_TIMEOUT)
         self.answers = self.damaged = self.followed = 0
-        self.whole_frame = ""  # why a frame with a good checksum was no reply to the request, and the frame
+        self.whole_frame = ""  # a frame with a valid checksum that did not match the request, and why
         self.excess = 0.0
         self._answered = False  # the last request
         self._has_missed = False  # some request
@@ -171,7 +171,7 @@ class Probe:
 
     def found(self, families: Sequence[type[Drive]]) -> Found:
         """Identify the drive, as far as reading can."""
-        # Its response delay is known by now: a short time-out shows what it does not answer.
+        # Its response delay is known: after a short timeout a request counts as unanswered.
         known = max(LEAST_TIMEOUT, 4 * self.response_delay)
         drives, guess = self._identify(families, LEAST_TIMEOUT, known)
         if self._has_missed and not self._is_in_step():  # it became slower, or this computer did

@@ -1,4 +1,4 @@
-"""Write a plant file of the drives that a scan has found; doubts stand in its comments."""
+"""Write a plant file of the drives that a scan has found, with doubts as comments."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def plant_text(
 ) -> str:
     """Return the file's text; `families` by their model in a plant file.
 
-    Raises ValueError where no drive of a known family was found.
+    Raises ValueError if no drive of a known family was found.
     """
     names = {family.model or family.__name__: name for name, family in families.items()}
     taken: dict[int, str] = {}

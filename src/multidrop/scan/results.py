@@ -12,10 +12,10 @@ GUESS = "it only reads like one: look at its name plate"
 
 @dataclass(frozen=True)
 class Found:
-    """A drive that answers: `models` fit equally well, and there is none where no family fits.
+    """A drive that answers: `models` fit equally well; it is empty if no family fits.
 
-    The settings are the first of these families' at which it answered: a drive with another number of
-    stop bits answers too.
+    The settings are the first of these families' that it answered: a drive with another number of stop
+    bits answers too.
     """
 
     address: int
@@ -28,7 +28,7 @@ class Found:
 
 @dataclass(frozen=True)
 class Crowd:
-    """An address that answers every time with bytes that are no reply to the request.
+    """An address whose answers never match the request.
 
     Several drives seem to have it, unless `reply` says why a whole frame with a good checksum is none.
     """
@@ -41,7 +41,7 @@ class Crowd:
 
 @dataclass(frozen=True)
 class Noise:
-    """A setting at which so many addresses bring garbage that none of it can be a drive's."""
+    """A setting with garbage at so many addresses that it cannot come from drives."""
 
     settings: Settings
     framing: Framing
@@ -51,7 +51,7 @@ class Noise:
 
 @dataclass(frozen=True)
 class Untried:
-    """A setting that the port did not take: nothing was sent."""
+    """A setting that the port does not support: no request was sent."""
 
     settings: Settings
     framing: Framing
@@ -60,7 +60,7 @@ class Untried:
 
 @dataclass(frozen=True)
 class Progress:
-    """One more address is done; `left` is the time in s until the end if nothing else answers."""
+    """One more address is done; `left` is the time in s until the end if no more drives answer."""
 
     settings: Settings
     framing: Framing

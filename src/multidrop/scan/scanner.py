@@ -28,7 +28,7 @@ from multidrop.scan.sweep import Sweep
 
 NOISY = 1 / 3  # of a sweep's addresses: more garbage than this is noise, not drives
 LEAST_NOISY = 4  # such addresses
-BEGUN = 2  # characters: enough to see that a reply has begun
+BEGUN = 2  # characters that show the start of a reply
 LATE = 8  # addresses back: a reply may be so many time-outs late and still be matched
 
 
@@ -70,7 +70,7 @@ class _Scan:
 
     def _sweep(self, sweep: Sweep, left_after: float) -> Iterator[Finding]:
         addresses = [address for address in sweep.addresses if _key(sweep, address) not in self._found]
-        garbled: dict[int, str] = {}  # address: what came, if that was a whole frame
+        garbled: dict[int, str] = {}  # address: the frame received, if it was whole
         peers: dict[int, Peer] = {}
         for number, address in enumerate(addresses, 1):
             peers[address] = self._sweep_peer(sweep)
@@ -110,7 +110,7 @@ class _Scan:
                 yield Crowd(address, sweep.settings, sweep.framing, whole_frame)
 
     def ask(self, sweep: Sweep, request: Message, peer: Peer, not_before_ns: int = 0) -> Completion:
-        """Carry out an exchange; an echo of the request is no reply."""
+        """Carry out an exchange; an echo of the request does not count."""
         completion = self._once(sweep, sweep.framing, request, peer, not_before_ns)
         if sweep.framing is not Framing.TCP and completion.raw == build_request(sweep.framing, request):
             # A reply may be a copy of its request here: an exchange in another framing shows an echo.
@@ -140,7 +140,7 @@ class _Scan:
         return completion
 
     def _sweep_peer(self, sweep: Sweep) -> Peer:
-        """Return a peer whose time-out lasts until a reply has begun: a probe then waits for all of it."""
+        """Return a peer whose timeout lasts until the start of a reply; a probe then waits for the rest."""
         settings = sweep.settings
         length = reply_length(sweep.framing, sweep.request.to(sweep.addresses[0]))
         window = sweep.patience + (BEGUN - length) * settings.character

@@ -23,7 +23,7 @@ Setting = tuple[Settings, Framing]
 GATEWAY_PATIENCE = 1.0  # s: a gateway says after a while that a drive does not answer
 ADDRESSES = range(1, 32)  # asked unless the caller says otherwise
 _ILLEGAL_ADDRESS = 2  # the exception code
-# A reply with the value 0 looks like an echo of its request there; an address is never 0.
+# There, a reply with the value 0 equals its request's echo; an address is never 0.
 _ECHOED = (Carrier.LONG, Carrier.NUMBER)
 
 
@@ -42,7 +42,7 @@ class ScanRequest:
 
 @dataclass(frozen=True)
 class Sweep:
-    """One request to many addresses, each with `patience` s for the beginning of its reply."""
+    """One request to many addresses, each with `patience` s until its reply starts."""
 
     settings: Settings
     framing: Framing
@@ -60,7 +60,7 @@ class Sweep:
 
     @property
     def needed(self) -> float:
-        """Seconds if nothing answers."""
+        """Seconds if no drive answers."""
         return len(self.addresses) * self.each
 
 
@@ -75,7 +75,7 @@ def sweeps(
 
     Every setting is swept with the patience that usual response delays need, and then again with the
     longest that the documents allow. Without baud rates and formats, all of the documents are used.
-    Raises ValueError for one that no document has, and where no sweep is left.
+    Raises ValueError for one that no manual has, and if no sweep is left.
     """
     settings = _settings(families)
     _check("baud rate", baudrates, {setting.baudrate for setting, _ in settings})
@@ -157,7 +157,7 @@ def _sweeps(
 
 
 def _best(families: Collection[type[Drive]]) -> Register[Any] | None:
-    """Return the register to which most families answer, and of several such one that most of them have."""
+    """Return the register that most families answer; among several, the one that most of them have."""
     registers = (one for family in families for one in family.registers.values() if one.readable)
     return max(
         registers,

@@ -24,8 +24,9 @@ class SimulatedCHE(MotorDrive):
 
     Output power is 0.01 kW, as a CHF100A has it; no manual of a CHE says so.
 
-    For `storing` s after a write to the EEPROM the drive is busy. No manual says what a stop, a start or
-    the jog's own stop do to a jog and to a run: here both stops end both, and a start ends a jog.
+    For `storing` s after a write to the EEPROM the drive is busy. The manual does not say
+    whether a stop, a start or the jog's own stop ends a jog or a run: here both stops end both, and a start
+    ends a jog.
     """
 
     functions = (0x03, 0x06)

@@ -20,7 +20,7 @@ RECORDS = (0x020D, 0x020E, 0x020F, 0x0210)  # P05.25 to P05.28
 
 
 class SimulatedDelixi(MotorDrive):
-    """Delixi by standard Modbus. The document has no exceptions: what cannot be done is not answered.
+    """Delixi by standard Modbus. The manual has no exceptions: a request that fails gets no answer.
 
     Not in the document: a run command is confirmed and has no effect in a fault and where P00.00 is not 2,
     and the setpoint is 0 where P00.01 is not 1; a start ends a jog. Gaps are those of part 3.

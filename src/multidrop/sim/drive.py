@@ -1,7 +1,7 @@
 """SimulatedDrive: answers requests from its memory, as the drive's class declares it.
 
-It knows neither ports nor clocks: a request and its time come in, the reply or nothing comes out. What
-one family does differently is in that family's file.
+It uses no ports and no clocks: a request and its time come in, a reply or None comes out. Families' own
+behaviour is in their files.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ def _most_cells(drive: Drive) -> dict[int, int]:
 
 
 class SimulatedDrive:
-    """A drive of any class: its registers hold what is written to them.
+    """A drive of any class; registers hold the values written to them.
 
     `drive[name]` gets and sets a register's value in its own unit, None for "no value", or a text.
     """
@@ -120,7 +120,7 @@ class SimulatedDrive:
         return raw
 
     def _accept_long(self, raws: Mapping[MemoryCell, int]) -> None:
-        """Refuse a value of several words that is outside its span, if all of them are written."""
+        """Refuse a value of several words outside its span, if all its words are written."""
         for register in {cell.register for cell in raws if cell.register and cell.register.words > 1}:
             cells = self.memory.of(register)
             if all(cell in raws for cell in cells):
@@ -140,7 +140,7 @@ class SimulatedDrive:
 
     @property
     def delay(self) -> float:
-        """Seconds from the request's end to the reply's begin, at least the silence after an RTU frame."""
+        """Seconds from the request's end to the reply's start, at least the silence after an RTU frame."""
         return max(self.response_delay, self.silence)
 
     @property
@@ -150,7 +150,7 @@ class SimulatedDrive:
 
     @property
     def most_gap(self) -> float:
-        """Seconds of silence within a frame after which the drive discards its beginning."""
+        """Seconds of silence within a frame after which the drive discards its start."""
         return GAPS.get(self.drive.framing, self.drive.settings.t3_5)
 
     def receive(self, frame: Frame) -> Message | None:
@@ -182,7 +182,7 @@ class SimulatedDrive:
         return (self.protocol.codes if self.codes is None else self.codes).get(reason)
 
     def answer(self, request: Message, now: float) -> Message | None:
-        """Carry out a request; return its reply, or None where the drive keeps silent."""
+        """Carry out a request; return its reply, or None if the drive stays silent."""
         if now < self.deaf_until:
             return None
         self.now = now
@@ -250,7 +250,7 @@ class SimulatedDrive:
             self.changed(cell)
 
     def wears(self, cell: MemoryCell, function: int, address: int) -> bool:
-        """Tell whether a write there wears the EEPROM; one to a setting of unknown memory does."""
+        """Return whether a write there wears the EEPROM; assume so for settings of unknown memory."""
         register = cell.register
         if register is None or (function, address) in self.memory.aliases:
             return False

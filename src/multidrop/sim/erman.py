@@ -20,8 +20,8 @@ class SimulatedERMAN(MotorDrive):
 
     The manual does not say whether a coil is a level or a pulse. Here clearing START stops as well, and
     neither clearing a stop nor a reset starts anything. Nor does it say when the motor counts as
-    overloaded (here above 1.2 times its rated current), or what the line's commands do where b.001 is
-    not 2: here they are always obeyed.
+    overloaded (here above 1.2 times its rated current), or whether it obeys the line's commands if b.001
+    is not 2: here it does.
     """
 
     functions = (0x01, 0x03, 0x04, 0x05, 0x06, 0x08, 0x0F, 0x10)
@@ -37,7 +37,7 @@ class SimulatedERMAN(MotorDrive):
         self.memory.make_writable(COIL, COILS)
 
     def takes_broadcast(self, request: Message) -> bool:
-        return True  # section 6 calls address 0 the broadcast, and says no more
+        return True  # section 6 only says that address 0 is the broadcast
 
     def _start(self, on: int) -> None:
         if not on:

@@ -188,7 +188,7 @@ class Faults:
     """Rates of faults; of `drop`, `flip` and `repeat` at most one happens to a frame.
 
     So any of the three checksums shows the damage. A reply later than its family's response time-out
-    cannot be told from the next one of the same kind.
+    cannot be distinguished from the next one of the same kind.
     """
 
     seed: int = field(default=0, metadata={"means": "the same one brings the same faults", "example": "7"})

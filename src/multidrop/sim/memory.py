@@ -50,7 +50,7 @@ class Memory:
         self._read: dict[tuple[int, int], MemoryCell | None] = {}  # None: unreadable, also in a gap
         self._gaps = [(table.read, table, addresses) for table, addresses in drive.readable_gaps.items()]
         self._written: dict[tuple[int, int], MemoryCell] = {}
-        self.aliases: set[tuple[int, int]] = set()  # where a write does not reach the EEPROM
+        self.aliases: set[tuple[int, int]] = set()  # addresses whose writes do not reach the EEPROM
         for register in drive.registers.values():
             self._declare(register)
         for text in drive.texts.values():
@@ -112,7 +112,7 @@ class Memory:
         return self._written.get((function, address))
 
     def get(self, register: Register[Any]) -> Any:
-        """Return the register's value in its own unit; None where its count means no value."""
+        """Return the register's value in its own unit; None if its count means "no value"."""
         reach = register.reach
         cells = [self._cell(register.table, address) for address in reach]
         data = b"".join(pack(register.table, cell.raw) for cell in cells)
@@ -121,7 +121,7 @@ class Memory:
     def set(self, register: Register[Any], value: float | None) -> None:
         """Hold this value, rounded to the register's step; bits that do not fit are lost.
 
-        None is what the device gives for no value. Raises ValueError where the register has no such count.
+        None is the device's "no value". Raises ValueError if the register has no such count.
         """
         coding = register.coding
         if value is None:
@@ -196,7 +196,7 @@ def _placed(register: Register[Any], raw: int) -> int:
 
 
 def _no_value(register: Register[Any]) -> tuple[int, int]:
-    """Return bits that mean no value, and the mask of those that matter."""
+    """Return the bits that mean "no value", and their mask."""
     for mask, pattern in register.coding.invalid_patterns:
         return pattern, mask
     if register.is_float:
@@ -210,5 +210,5 @@ def pack(table: Table, raw: int) -> bytes:
 
 
 def decode(register: Register[Any], raw: int) -> Any:
-    """Return the value of a raw count that one cell holds; None where it means none."""
+    """Return the value of a raw count that one cell holds; None if it means "no value"."""
     return register.value_in(pack(register.table, raw), 0)

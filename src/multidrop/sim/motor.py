@@ -71,7 +71,7 @@ class Motor:
         self._brakes = False  # by direct current
 
     def run(self, direction: int | None = None) -> None:
-        """Run at `target`, which may change meanwhile; without a direction, in the present one."""
+        """Run at `target`, which may change; without a direction, in the current one."""
         self._start(direction, None)
 
     def jog(self, direction: int | None = None) -> None:
@@ -150,7 +150,7 @@ class Motor:
         return 0.0
 
     def fault_record(self, number: int) -> int:
-        """Return the code of a fault, the latest being number 1; 0 where there is none."""
+        """Return the code of a fault, the latest being number 1; 0 if there is none."""
         return self.faults[number - 1] if number <= len(self.faults) else 0
 
     @property
@@ -219,7 +219,7 @@ MONITORS: Mapping[str, Callable[[Motor], float]] = {
     "last_fault": lambda motor: motor.fault_record(1),
 } | {f"fault_record_{nth}": lambda motor, nth=nth: motor.fault_record(nth) for nth in range(1, 5)}
 
-# Values that are 100 % where the register's unit is per cent.
+# Values that mean 100 % if the register's unit is %.
 RATED: Mapping[str, Callable[[Rating], float]] = {
     "output_frequency": lambda rating: rating.frequency,
     "reference_frequency": lambda rating: rating.frequency,

@@ -1,7 +1,7 @@
 """MotorDrive: a simulated drive with a motor behind its registers.
 
-Settings of common names set the motor up, monitors of common names show its state. What a family has of
-its own is in two tables: `obeys`, the commands of writes, and `shows`, the counts of reads; their keys
+Settings of common names set the motor up, monitors of common names show its state. A family's own
+registers are in two tables: `obeys`, the commands of writes, and `shows`, the counts of reads; their keys
 are (function code that reads the table, address).
 """
 
@@ -91,7 +91,7 @@ class MotorDrive(SimulatedDrive):
             self.motor.direction = direction
 
     def word(self, address: int) -> int:
-        """Return the holding register at this address; 0 where the class has none."""
+        """Return the holding register at this address; 0 if the class has none."""
         cell = self.memory.writable(0x06, address)
         return cell.raw if cell else 0
 
@@ -122,7 +122,7 @@ class MotorDrive(SimulatedDrive):
 
 
 class ProfileDrive(MotorDrive):
-    """A drive whose commands and monitors are roles: `heeds` and `tells` have them by name.
+    """A drive of a profile, whose registers have roles: `heeds` has commands by role, `tells` monitors.
 
     `is_local` takes the command away from the line, as the keypad does. `power_cycle` loses all that is not
     a setting in EEPROM.
@@ -165,7 +165,7 @@ class ProfileDrive(MotorDrive):
             super().refresh(cell)
 
     def rises(self, word: int, bits: int) -> bool:
-        """Return True where the bits are set in this word, and were not in the one before."""
+        """Return True if the bits are set in this word, and were not in the one before."""
         return bool(word & bits) and not self.word_before & bits
 
     def power_cycle(self) -> None:

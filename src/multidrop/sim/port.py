@@ -53,7 +53,7 @@ class PtyPort:
             return b""
 
     def write(self, data: bytes) -> None:
-        with contextlib.suppress(BlockingIOError):  # nobody reads: lost, as on a wire
+        with contextlib.suppress(BlockingIOError):  # no reader: lost, as on a wire
             os.write(self._master, data)
 
     def baudrate(self) -> int | None:

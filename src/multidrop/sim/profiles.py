@@ -33,8 +33,8 @@ _RUN = (
 class SimulatedProfidrive(ProfileDrive):
     """PROFIdrive: inhibited after power-up, a trip, OFF2 and OFF3, until a word with OFF1 and without these.
 
-    `off2` and `off3` are active from elsewhere, such as a terminal. In local control, and where the remote
-    bit is 0, the word is ignored, but for its OFF bits. A word that takes back bit 3 lets the motor coast.
+    `off2` and `off3` are active from elsewhere, such as a terminal. In local control, and if the remote
+    bit is 0, the word is ignored, except its OFF bits. A word that clears bit 3 lets the motor coast.
     Whether the ramp bits stop a motor that runs is not simulated: all three at 1 let it run.
     """
 

@@ -1,4 +1,4 @@
-"""Function codes and what they make a drive do.
+"""Function codes and their effects on a simulated drive.
 
 Modbus (application protocol V1.1b3), and Delixi's own (RS-485 communication protocol, part 3).
 """
@@ -19,7 +19,7 @@ COIL_ON, COIL_OFF = b"\xff\x00", b"\x00\x00"
 
 # Delixi's function codes K.
 COMMAND, STATE, SETPOINT, SET, STORE, QUERY = 0x02, 0x03, 0x04, 0x05, 0x06, 0x07
-NO_DATA = bytes(4)  # D3..D0 where they are unused
+NO_DATA = bytes(4)  # D3..D0 if unused
 
 
 class Reason(Enum):

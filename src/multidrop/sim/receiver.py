@@ -1,7 +1,7 @@
 """Cut received bytes into requests, as a drive does: bytes and times in, frames out.
 
-Garbage costs the frames that it damages and no others, and buffers are bounded. An RTU frame ends by silence:
-a request that other bytes follow at once, which begin no request, is damaged too.
+Garbage costs only the frames that it damages, and buffers are bounded. An RTU frame ends with silence: a
+request that is followed at once by other bytes, unless these start a request, is damaged too.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ MOST_RTU = 256
 TCP_HEAD, MOST_TCP = 6, 260  # bytes before the unit id, and of a frame
 MOST_TEXT = 513
 LEAST_RTU = 4  # address, function, CRC
-# Function codes of requests: where none follows a byte, no request begins with it.
+# Function codes of requests: a byte without one behind it cannot start a request.
 _REQUESTS = frozenset(code for code in range(256) if parse_request(Framing.RTU, bytes([1, code]))[0] == 0)
 
 
@@ -45,7 +45,7 @@ class Frame:
 class Receiver:
     """The receiver of one framing and baud rate; `most_gap` s of silence end a frame.
 
-    One character takes `character` s; 0 where the line is not paced.
+    One character takes `character` s; 0 if the line is not paced.
     """
 
     def __init__(self, framing: Framing, character: float, most_gap: float) -> None:
@@ -93,7 +93,7 @@ class Receiver:
         return Frame(body, message, intact, end - length * self.character, end)
 
     def _cut_rtu(self) -> Frame | None:
-        """Return the next request, unless bytes follow it of which it is not known yet what they are."""
+        """Return the next request, unless it is followed by bytes that may still become a request."""
         data = bytes(self._buffer[-MOST_RTU:])
         while (found := _first_request(data)) is not None:
             at, used, message = found
@@ -109,7 +109,7 @@ class Receiver:
         return None
 
     def _cut_tcp(self) -> Frame | None:
-        """Return the next frame; what is no header leaves nothing to go on with."""
+        """Return the next frame; after an invalid header, drop all bytes."""
         data = bytes(self._buffer)
         if len(data) < TCP_HEAD:
             return None

@@ -41,7 +41,7 @@ class Simulator:
     def __enter__(self) -> Self:
         try:
             self._start()
-        except BaseException:  # then nobody leaves the block
+        except BaseException:  # __exit__ is not called then
             self._end()
             raise
         return self
@@ -49,7 +49,7 @@ class Simulator:
     @undisturbed
     def _start(self) -> None:
         with self._changing:
-            if not self._is_over:  # whoever starts it may have been interrupted, and have ended it
+            if not self._is_over:  # an interruption may have ended it already
                 self.open()
                 self._is_open = True
                 self._thread.start()
@@ -93,7 +93,7 @@ class Simulator:
             raise
 
     def forked(self) -> None:
-        """Interrupt nothing of the parent's in the child, whose end of the pair is the same."""
+        """Give a forked child its own pair: it must not interrupt its parent's simulator."""
         self._interrupted, self._interrupter = socket.socketpair()
 
     def close(self) -> None:
@@ -144,7 +144,7 @@ class Simulator:
             select.select([self._selector], [], [], limit)
 
     def _note(self, number: int, failure: Exception) -> None:
-        """Note a failure of one wire: the others go on, and so does this one."""
+        """Note a failure of one wire: all wires continue."""
         self.failure = self.failure or failure
         if number not in self._failed:
             self._failed.add(number)

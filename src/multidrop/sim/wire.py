@@ -91,7 +91,7 @@ class Wire:
         self.port: SimulatedEnd | None = None  # None while it is closed
         self._pace = 0.0 if unpaced else 1.0  # every duration is multiplied by it
         self._groups = self._group()
-        self._outgoing: list[Transmission] = []  # by their begin
+        self._outgoing: list[Transmission] = []  # by their start
         self._quiet_since = -math.inf  # the end of the last reply
         self._baudrate: int | None = None
 
@@ -115,7 +115,7 @@ class Wire:
         return f"<Wire {self.name} of {len(self.drives)} drives>"
 
     def receive(self, chunk: bytes, now: float, baudrate: int | None = None) -> None:
-        """Take bytes of the client, at its baud rate where that can be seen."""
+        """Take bytes of the client, at its baud rate if it is visible."""
         if baudrate != self._baudrate:
             for group in self._groups:
                 group.receiver.forget()
@@ -125,7 +125,7 @@ class Wire:
                 self._deliver(group, group.receiver.feed(chunk, now))
 
     def advance(self, now: float) -> bytes:
-        """Let time pass until `now`; return the bytes that reach the client meanwhile."""
+        """Let time pass until `now`; return the bytes that reach the client until then."""
         for group in self._groups:
             if frames := group.receiver.silence(now):
                 self._deliver(group, frames)
@@ -168,8 +168,8 @@ class Wire:
     def _keeps_silence(self, sim: SimulatedDrive, frame: Frame) -> bool:
         """Tell whether a drive takes a frame; count one that came before the drive's silence was over.
 
-        A frame that begins within a reply is lost. Silence is counted from the end of a reply only: that
-        is known here to the bit, so that a client is never blamed because this process woke late.
+        A frame that starts within a reply is lost. Silence is counted only from the end of a reply, which is
+        known to the bit here: a client is never blamed for a late wake-up of this process.
         """
         replying = self._outgoing and self._outgoing[0].begin <= frame.begin
         silent_for = frame.begin - (self._outgoing[0].end if replying else self._quiet_since)

@@ -44,7 +44,7 @@ class SimulatedYD1000(MotorDrive):
     def prepare(self) -> None:
         self._panel_runs = False
         self._in_force = 0  # the control word in force
-        self._message_at = math.inf  # the time-out begins with the first message
+        self._message_at = math.inf  # the timeout starts with the first message
         self.memory.make_readable(HOLDING, [CONTROL])
 
     @property
@@ -134,7 +134,7 @@ class SimulatedYD1000(MotorDrive):
         self.motor.coast()
         self.motor.reset()
         self.deaf_until = self.now + RESTART_TIME
-        self._message_at = math.inf  # the time-out begins anew with the first message
+        self._message_at = math.inf  # the timeout starts again with the first message
         for address in (CONTROL, COMMUNICATION_FREQUENCY, PANEL_FREQUENCY):
             cell = self.memory.writable(0x06, address)
             if cell:
