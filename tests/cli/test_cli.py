@@ -306,7 +306,7 @@ def test_advice_for_a_program_becomes_a_command_s() -> None:
     reset = WriteForbidden(
         "x has a fault: remove its cause, then call reset_fault()", advice=Advice.call("reset_fault")
     )
-    assert reset.for_command_line() == "x has a fault: see to it, then run `multidrop reset-fault`"
+    assert reset.for_command_line() == "x has a fault: remove its cause, then run `multidrop reset-fault`"
     declare = WriteForbidden("and declare confirmed = 1 if it is", advice=Advice.declare("confirmed", 1))
     assert declare.for_command_line() == "and add --option confirmed=1 if it is"
     in_plant = declare.for_command_line(in_plant=True)
@@ -321,7 +321,7 @@ def test_a_family_s_advice_stands_in_its_sentence() -> None:
     answers = {"last_fault": 64, "status": 4, "setpoint": 0.0, "frequency_setpoint": 0.0}
     for script, command in (
         (erman.start.script(), "then run `multidrop reset-fault` and add --option acknowledged_fault=64"),
-        (che.start.script(), "see to it, then run `multidrop reset-fault`"),
+        (che.start.script(), "remove its cause, then run `multidrop reset-fault`"),
         (ibd.identify.script(), "and add --option confirmed=1 if it is an IBD"),
     ):
         with pytest.raises(WriteForbidden) as refused:
