@@ -26,7 +26,7 @@ MS = 1_000_000
 
 
 def test_all_mistakes_of_its_table_at_once() -> None:
-    with pytest.raises(ValueError, match="is not a") as failure:
+    with pytest.raises(ValueError, match="invalid time") as failure:
         HistorySettings(keep="for ever", most="20", rotate="0 s")
     lines = str(failure.value).splitlines()
     assert [line.split(" = ")[0] for line in lines] == ["keep", "most", "rotate"]

@@ -113,7 +113,7 @@ def test_one_process_records_at_a_time(tmp_path: Path) -> None:
 
 
 def test_only_arrows(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match=r"a recording in segments has a name that ends in \.arrows"):
+    with pytest.raises(ValueError, match=r"the name of a recording in segments must end in \.arrows"):
         SegmentWriter(tmp_path / "run.csv", ABOUT, every=60)
     with pytest.raises(RecordingError, match="cannot be written: No such file or directory"):
         SegmentWriter(tmp_path / "none" / "run.arrows", ABOUT, every=60)
