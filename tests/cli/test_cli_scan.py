@@ -100,7 +100,7 @@ def test_the_plant_file_can_be_used_as_it_is(run: Run, port: str, tmp_path: Path
     assert all(each["samples"] for each in polled.values())
     status, _, err = run("scan", port, *words)
     assert status == 2
-    assert "is there already" in err
+    assert "exists already" in err
 
 
 def test_nobody_there_is_a_failure(run: Run, port: str, tmp_path: Path) -> None:

@@ -125,7 +125,7 @@ def test_an_export_is_what_is_read(folder: Path, rows: list[list[Row]]) -> None:
             reader = open_recording(folder / name)
             assert sorted(row for batch in reader for row in batch) == sorted(wanted)
             assert reader.metadata == METADATA
-            with pytest.raises(ValueError, match="is there already"):
+            with pytest.raises(ValueError, match="exists already"):
                 history.export(folder / name, names, begin, end)
         text = b"".join(history.csv(names, begin, end))
     without = [line.rpartition(b",") for line in text.splitlines()]

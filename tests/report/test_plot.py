@@ -798,7 +798,7 @@ def test_plot_and_report_need_nothing_but_the_file(run: Run, ramp: Path, tmp_pat
     assert "Report on ramp.arrows" in (tmp_path / "ramp.html").read_text()
     status, _, err = run("plot", here)
     assert status == 2
-    assert "is there already" in err
+    assert "exists already" in err
     assert run("plot", here, "--drive", "fan", "--out", tmp_path / "fan.html")[0] == 0
     assert "data:image/png" in (tmp_path / "fan.html").read_text()
 
