@@ -1,4 +1,4 @@
-/* What clients do with a port, on any thread of theirs. */
+/* The functions of ports for clients, on any thread. */
 #define _GNU_SOURCE
 #include "engine.h"
 
@@ -41,7 +41,7 @@ struct md_port *md_port_open(struct md_engine *engine, int fd, int must_take, in
     port->must_take = must_take;
     port->turn.line.transactions = (uint8_t)transactions;
     port->is_watched = 1;
-    /* Raw before it is first read: a terminal at VMIN 0 looks like one that hung up. */
+    /* Make it raw before the first read: at VMIN 0 a terminal seems to have hung up. */
     struct md_settings settings;
     if (must_take >= 0 && md_port_get(fd, &settings) == 0)
         md_port_set(fd, &settings);
@@ -104,7 +104,7 @@ void md_port_fence(struct md_port *port, struct md_mastership *mastership)
     md_engine_enter(port->engine);
     __atomic_store_n(&mastership->engine, port->engine, __ATOMIC_SEQ_CST);
     port->mastership = mastership;
-    port->heard_term = 0; /* perhaps of another one */
+    port->heard_term = 0; /* it may be another mastership's */
     md_engine_leave(port->engine);
 }
 
@@ -172,8 +172,8 @@ const struct md_progress *md_port_progress(struct md_port *port)
     return &port->turn.progress;
 }
 
-/* The thread looks at the port by itself before anything can be sent there: it need not be woken, but for a
- * stop, which is not held up by listening. */
+/* Return 1 if the thread serves the port by itself before the next request can leave, so that the client
+ * need not wake it. While listening it must, because a stop does not wait for that. */
 static int is_attended(const struct md_port *port)
 {
     if (port->turn.line.listened_ns)
@@ -185,12 +185,12 @@ static int is_attended(const struct md_port *port)
 int md_port_carry_out(struct md_port *port, const struct md_exchange *exchange, int64_t not_before_ns,
                       int64_t expires_ns, struct md_completion *completion, double *values)
 {
-    struct md_engine *engine = port->engine; /* the port may be gone at the end */
+    struct md_engine *engine = port->engine; /* the port may not exist at the end */
     struct md_urgent urgent = {.exchange = exchange, .not_before_ns = not_before_ns, .expires_ns = expires_ns,
                                .completion = completion};
     md_engine_enter(engine);
     int64_t late_until_ns = exchange->drive->late_until_ns;
-    if (port->is_closing) { /* nobody carries it out any more */
+    if (port->is_closing) { /* the engine has stopped serving it */
         *completion = (struct md_completion){.result = MD_LINE_LOST};
     } else {
         md_turn_add_urgent(&port->turn, &urgent);
@@ -205,8 +205,8 @@ int md_port_carry_out(struct md_port *port, const struct md_exchange *exchange, 
     return exchange->values ? md_values(exchange->values, &completion->reply, values) : 0;
 }
 
-/* The engine's thread has its mutex from the look to the end of write(2): who had it after the deadline was
- * taken back knows that nothing is on its way there. */
+/* The engine's thread holds its mutex from the check to the end of write(2). Once this thread has held the
+ * mutex after resetting the deadline, no write is in flight. */
 void md_mastership_end(struct md_mastership *mastership)
 {
     __atomic_store_n(&mastership->until_ns, 0, __ATOMIC_SEQ_CST);

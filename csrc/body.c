@@ -1,7 +1,8 @@
-/* Bodies of frames: what a request or a reply says, whatever wraps it; does the reply confirm the request?
+/* Bodies of frames: the content of requests and replies in any framing, and whether a reply confirms its
+ * request.
  *
- * The Modbus framings wrap the same bytes, address + PDU (application protocol V1.1b3). Delixi's body is
- * A K P1 P0 D3 D2 D1 D0. */
+ * The Modbus framings wrap the same bytes, address + PDU (application protocol V1.1b3). Delixi's body is A
+ * K P1 P0 D3 D2 D1 D0. */
 #include "internal.h"
 
 #include <string.h>
@@ -29,7 +30,7 @@ static const struct fields {
 
 enum { BIT = 1, WORD = 16 };
 
-/* Nobody answers a broadcast, so that it cannot ask for anything. */
+/* Broadcasts have no reply, so only writes may be broadcast. */
 enum { NO_BROADCAST, BROADCAST };
 
 static const struct function {
@@ -106,7 +107,7 @@ static size_t put_body(int layout, const struct md_message *message, uint8_t *bo
     return (size_t)(at - body) + message->data_len;
 }
 
-/* Write no more data than there is: clearing the rest costs more than to parse. */
+/* Write only the bytes that exist: clearing the rest costs more than parsing. */
 static void get_body(int layout, const uint8_t *body, struct md_message *message)
 {
     const struct fields *fields = &fields_of[layout];
@@ -130,9 +131,9 @@ static void begin_message(struct md_message *message, uint8_t address, uint8_t f
     message->function = function;
 }
 
-/* Return the length of a request's body by its first bytes; MD_INCOMPLETE where they do not tell yet. A
- * count that cannot be answered is still a request, where the length does not depend on it: the
- * drive's side answers it with an exception. */
+/* Return the length of a request's body by its first bytes; MD_INCOMPLETE while they do not determine it.
+ * A request with an invalid count is still a request if its length does not depend on the count: the drive
+ * answers it with an exception. */
 static int request_length(int framing, const uint8_t *body, size_t have)
 {
     if (have < 2)
@@ -151,13 +152,13 @@ static int request_length(int framing, const uint8_t *body, size_t have)
     return head + body[6];
 }
 
-/* Only a serial line has broadcasts: a unit id of Modbus TCP is any. */
+/* Only serial lines have broadcasts: a Modbus TCP unit id of 0 is a device. */
 static int is_answered(int framing, uint8_t address)
 {
     return address != 0 || framing == MD_TCP;
 }
 
-/* Do the same for the reply to `request`, which is refused as soon as its first bytes differ. */
+/* Return the length of the body of the reply to `request`, or an error as soon as its first bytes differ. */
 static int reply_length(int framing, const uint8_t *body, size_t have, const struct md_message *request)
 {
     const struct function *function = find_function(framing, request->function);
@@ -198,7 +199,7 @@ int md_body_reply_length(int framing, const struct md_message *request)
     return is_answered(framing, request->address) ? head_length(function->reply) + data : 0;
 }
 
-/* ---- what may be said ---- */
+/* ---- bounds ---- */
 
 static int is_range(const struct function *function, const struct md_message *message)
 {
@@ -206,7 +207,7 @@ static int is_range(const struct function *function, const struct md_message *me
     return count >= 1 && count <= function->most && message->start + count <= 0x10000;
 }
 
-/* Check that a body of this layout can say it. */
+/* Check that the message fits a body of this layout. */
 static int fits(int layout, const struct function *function, const struct md_message *message)
 {
     switch (layout) {
@@ -254,9 +255,9 @@ static int is_reply(int framing, const struct md_message *message)
     return fits(function->reply, function, message);
 }
 
-/* Check that the reply says what the request asked for. A write is confirmed by its own address and value,
- * or address and count. Of Delixi's (part 3, note 1) a query is answered in P1P0 or in D3..D0, and
- * everything else with a copy. */
+/* Check that the reply confirms its request. A write's reply repeats address and value, or address and
+ * count. With Delixi (part 3, note 1) a query is answered in P1P0 or in D3..D0, all other requests with a
+ * copy. */
 static int confirms(int framing, const uint8_t *body, const struct md_message *request)
 {
     uint16_t start = md_get16(body + 2);
@@ -265,7 +266,7 @@ static int confirms(int framing, const uint8_t *body, const struct md_message *r
         return start == request->start && md_get16(body + 4) == request->count;
     case ECHO:
         return start == request->start && memcmp(body + 4, request->data, 2) == 0;
-    case LONG: /* there is no state 0: that is the query itself */
+    case LONG: /* state 0 does not exist: it would be the query itself */
         return (request->function == MD_DELIXI_STATE_QUERY ? start != 0 : start == request->start) &&
                (request->function == MD_DELIXI_PARAMETER_QUERY || memcmp(body + 4, request->data, 4) == 0);
     default:

@@ -1,18 +1,17 @@
-/* Cut the bytes that were sniffed on a line into frames of both directions and every framing.
+/* Captures: packets of capture files, frames of both directions and all framings, and rows.
  *
- * Nothing is known beforehand but the table of functions: a frame is what has a good checksum where
- * a frame may be. Bytes behind a request are first tried as its reply, then as a request, then as a
- * reply without its request. At most three frames are tried at a byte, so that garbage costs no more
- * than its length. */
+ * The splitter knows the table of functions only. A frame is a byte sequence with a good checksum at a
+ * place that allows one. Bytes after a request are tried as its reply, then as a request, then as a reply
+ * without its request. At most three frames are tried at a byte, so the cost is linear in the length of
+ * garbage. */
 #include "internal.h"
 
 #include <string.h>
 
 /* ---- packets of capture files ---- */
 
-/* Take packets out of capture files: pcap and pcapng, as others and we write them.
- *
- * The blocks that describe a pcapng file's interfaces are rare, and the caller's to read. */
+/* Read the packets of pcap and pcapng files. The caller reads the rare blocks that describe a pcapng file's
+ * interfaces. */
 
 enum {
     RECORD_HEAD = 16, /* of pcap */
@@ -25,7 +24,7 @@ enum {
 
 static const char tcp_dissector[] = "mbtcp"; /* Wireshark's name for Modbus TCP */
 
-/* The senders' ports in captures of ours. */
+/* The senders' port numbers in files from multidrop. */
 static const struct { uint32_t port; uint8_t side; } senders[] = {
     {50000, MD_ASKING}, {502, MD_ANSWERING}, {1, MD_FAILED}, {2, MD_NOISE},
 };
@@ -39,8 +38,8 @@ static uint32_t number(const struct md_capture *capture, const uint8_t *at)
     return value;
 }
 
-/* Return the length of what a link type puts before a frame; tags in it tell who sent the frame, and whether
- * it is Modbus TCP. */
+/* Return the length of the link type's header before a frame. Its tags give the sender, and mark Modbus
+ * TCP. */
 static size_t skip_header(struct md_channel *channel, const uint8_t *packet, size_t len, uint8_t *side)
 {
     uint32_t link = channel->link;
@@ -67,7 +66,7 @@ static size_t skip_header(struct md_channel *channel, const uint8_t *packet, siz
     return len;
 }
 
-/* Append a packet to its channel; 0 when there is no room for it. */
+/* Append a packet to its channel; 0 without room. */
 static int put(struct md_channel *channel, const uint8_t *packet, size_t len, uint64_t ticks)
 {
     struct md_piece piece = {.is_after_pause = 1};
@@ -78,7 +77,7 @@ static int put(struct md_channel *channel, const uint8_t *packet, size_t len, ui
         piece.side = MD_EITHER_SIDE;
     uint64_t seconds = ticks / channel->ticks_per_s, rest = ticks % channel->ticks_per_s;
     uint64_t time_ns = seconds * 1000000000u + rest * 1000000000u / channel->ticks_per_s;
-    piece.time_ns = (int64_t)(time_ns + (uint64_t)channel->offset_ns); /* a nonsensical one may wrap around */
+    piece.time_ns = (int64_t)(time_ns + (uint64_t)channel->offset_ns); /* invalid times may wrap around */
     return md_stream_put(&channel->stream, packet + header, len - header, piece);
 }
 
@@ -136,9 +135,9 @@ int md_unpack(struct md_capture *capture)
 
 /* ---- frames of sniffed bytes ---- */
 
-enum { MOST_NOISE = 3 }; /* bytes between a request and its reply; in more of them a request may be lost */
+enum { MOST_NOISE = 3 }; /* bytes between a request and its reply; more may hide a lost request */
 
-/* Find the end of the bytes that came without a pause from this piece on. */
+/* Return the index of the first pause after this piece. */
 static size_t end_of_run(const struct md_stream *stream, size_t piece)
 {
     while (++piece < stream->count)
@@ -154,14 +153,14 @@ static int is_start(int framing, uint8_t first)
     return framing == MD_RTU ? first <= MD_MOST_ADDRESS : first == ':';
 }
 
-/* A good reply to such a request is its copy, or looks like one. */
+/* Return 1 if a good reply to such a request is its copy, or looks like one. */
 static int is_echoed(int framing, uint8_t function)
 {
     int is_write = function == MD_WRITE_COIL || function == MD_WRITE_ONE;
     return framing == MD_DELIXI || is_write || function == MD_LOOPBACK;
 }
 
-/* Delixi's requests look like replies, but the value that a query asks for is 0 in it. */
+/* Delixi requests look like replies, but the value in a query is 0. */
 static int is_delixi_request(const struct md_message *message)
 {
     static const uint8_t zeros[4];
@@ -184,7 +183,7 @@ static int find_request(int framing, const uint8_t *bytes, size_t len, struct md
 
 enum { HEAD = 6 };
 
-/* Read the first bytes of the body; 0 where there are none. */
+/* Read the first bytes of the body; missing ones are 0. */
 static void read_head(int framing, const uint8_t *bytes, size_t len, uint8_t head[HEAD])
 {
     memset(head, 0, HEAD);
@@ -203,7 +202,7 @@ static void read_head(int framing, const uint8_t *bytes, size_t len, uint8_t hea
     }
 }
 
-/* Find a reply without its request: guess the request that it would be a good reply to. */
+/* Parse a reply without its request: guess the matching request. */
 static int find_reply(int framing, const uint8_t *bytes, size_t len, struct md_message *message)
 {
     uint8_t head[HEAD];
@@ -225,8 +224,8 @@ static int find_reply(int framing, const uint8_t *bytes, size_t len, struct md_m
     return used;
 }
 
-/* Find the frame that begins here: return its length, and set its kind, framing and message in `span`.
- * `least` is MD_INCOMPLETE as long as more bytes may come, and 1 when these are all. */
+/* Parse the frame at `bytes`: return its length, and set kind, framing and message in `span`. `least` is
+ * MD_INCOMPLETE while more bytes may come, otherwise 1. */
 static int find_frame(const struct md_splitter *splitter, int is_tcp, int side, const uint8_t *bytes,
                       size_t len, int least, struct md_span *span)
 {
@@ -273,18 +272,18 @@ static void pass(struct md_splitter *splitter, const struct md_span *span)
     splitter->awaited = span->message.address != 0 || span->framing == MD_TCP;
 }
 
-/* Whoever captured these bytes says that they are no frames. */
+/* Return 1 if the capture marks these bytes as not being frames. */
 static int is_ruled_out(const struct md_piece *piece)
 {
     return piece->side == MD_FAILED || piece->side == MD_NOISE;
 }
 
-/* Find the frame at `at`, which is in the splitter's piece; `end` is that of its run. */
+/* Parse the frame at `at` in the splitter's piece; `end` is the end of its run. */
 static int look_at(const struct md_splitter *splitter, const struct md_stream *stream, size_t at, size_t end,
                    struct md_span *span)
 {
     const struct md_piece *piece = &stream->pieces[splitter->piece];
-    /* A pause ends what begins amid junk: it must not swallow the good frame behind the pause. */
+    /* A frame that starts inside junk ends at the pause at the latest: a good frame may follow it. */
     int is_due = (at == splitter->at && splitter->junk == 0) || (piece->at == at && piece->is_after_pause);
     size_t limit = is_due ? stream->len : end;
     int least = limit < stream->len || stream->is_all ? 1 : MD_INCOMPLETE;
@@ -315,14 +314,14 @@ int md_split(struct md_splitter *splitter, const struct md_stream *stream, struc
     span->at = splitter->at;
     span->len = at - splitter->at;
     if (!span->len && is_junk) {
-        span->kind = MD_JUNK; /* it says nothing of the frames around it */
+        span->kind = MD_JUNK; /* does not affect the frames around it */
         size_t next = splitter->piece + 1;
         splitter->at = next < stream->count ? pieces[next].at : stream->len;
         span->len = splitter->at - span->at;
         return 1;
     }
     if (span->len)
-        span->kind = MD_JUNK; /* the frame behind it is found again */
+        span->kind = MD_JUNK; /* the next call finds the frame after it */
     else if (used <= 0)
         return 0;
     else
@@ -357,7 +356,7 @@ void md_stream_forget(struct md_stream *stream, struct md_splitter *splitter)
     memmove(stream->pieces, stream->pieces + first, stream->count * sizeof *stream->pieces);
     for (size_t i = 0; i < stream->count; i++) {
         struct md_piece *piece = &stream->pieces[i];
-        if (piece->at < gone) /* its pause was before what is gone */
+        if (piece->at < gone) /* its pause was before the discarded bytes */
             piece->is_after_pause = 0;
         piece->at = piece->at < gone ? 0 : piece->at - gone;
     }
@@ -366,14 +365,12 @@ void md_stream_forget(struct md_stream *stream, struct md_splitter *splitter)
 
 /* ---- rows of sniffed bytes ---- */
 
-/* Make rows of sniffed bytes, as fast as a disk delivers them. */
-
 static int is_run_command(int framing, const struct md_message *request)
 {
     return framing == MD_DELIXI && request->function == MD_DELIXI_RUN;
 }
 
-/* Requests with one key have replies with the same fields. A Delixi run command stands where other
+/* Requests with the same key have replies with the same fields. A Delixi run command is where other
  * requests have their address. */
 static uint64_t key_of(int framing, const struct md_message *request)
 {
@@ -382,7 +379,7 @@ static uint64_t key_of(int framing, const struct md_message *request)
            start << 24 | (uint64_t)request->count << 40;
 }
 
-/* Find the place of the key, or the empty one for it. */
+/* Find the slot of the key, or the empty one for it. */
 static struct md_known *place_of(const struct md_decoder *decoder, uint64_t key)
 {
     size_t place = (size_t)(key * 0x9E3779B97F4A7C15u >> 32);
@@ -402,7 +399,7 @@ int md_know(struct md_decoder *decoder, int framing, const struct md_message *re
     return 1;
 }
 
-/* Take the written data from the request, where the reply does not repeat it. */
+/* Copy the written data from the request if the reply does not repeat it. */
 static void put_written(struct md_message *reply, int framing, const struct md_message *request)
 {
     if (reply->exception)
@@ -413,7 +410,7 @@ static void put_written(struct md_message *reply, int framing, const struct md_m
         md_copy_message(reply, request);
 }
 
-/* Add the rows of the last request: its reply, or why there is none. Return 0 when there is no room. */
+/* Add the rows of the last request: its reply, or why it has none. Return 0 without room. */
 static int add_rows(struct md_decoder *decoder, int result, struct md_columns *columns)
 {
     struct md_completion *completion = &decoder->completion;
@@ -448,7 +445,7 @@ static int take_request(struct md_decoder *decoder, struct md_columns *columns)
     return MD_ALL_DECODED;
 }
 
-/* Learn why there is no reply from what came in its place. */
+/* Find the failure that the bytes instead of a reply show. */
 static void explain(struct md_decoder *decoder, const struct md_stream *stream)
 {
     const struct md_span *span = &decoder->span;
@@ -469,7 +466,7 @@ static int take(struct md_decoder *decoder, const struct md_stream *stream, stru
     case MD_REQUEST:
     case MD_EITHER:
         if (!decoder->is_sure)
-            decoder->block = NULL; /* it may have been a confirmation: nobody failed to answer it */
+            decoder->block = NULL; /* maybe a confirmation, which needs no reply */
         int undone = take_request(decoder, columns);
         if (undone)
             return undone;

@@ -7,42 +7,42 @@
 /* cdef: start */
 /* ---- tap.c: return a length in bytes ---- */
 
-/* The sender, where it is known. The last two are no frames by the master's own account. */
+/* The sender of bytes. The capturing master marked the last two as not being frames. */
 enum md_side {
-    MD_EITHER_SIDE,
+    MD_EITHER_SIDE, /* unknown */
     MD_ASKING,
     MD_ANSWERING,
-    MD_FAILED, /* came in place of a reply */
+    MD_FAILED, /* bytes instead of a reply */
     MD_NOISE,  /* stray bytes, echo, late replies */
     MD_SIDES
 };
 
-/* A ring with one writer and one reader. Zeroed but for `ring` and `room` it is empty. */
+/* A ring with one writer and one reader. All zero except `ring` and `room`: empty. */
 struct md_tap {
     uint8_t *ring;
     uint32_t room;       /* bytes, a power of two */
     uint32_t put, taken; /* each has one writer, only grows, and wraps around */
     uint64_t lost;       /* bytes without room */
-    int64_t ahead_ns;    /* UTC - CLOCK_MONOTONIC of what is put next; 0: as when it is taken */
+    int64_t ahead_ns;    /* UTC - CLOCK_MONOTONIC of the next bytes; 0: use the reader's */
 };
 
-/* Header and trailer of a packet. Each side has two: for any bytes, and for those that begin with ':'. */
+/* Header and trailer of a packet. Each side has two: for bytes that start with ':', and for all others. */
 struct md_wrapping {
     const uint8_t *head, *tail;
-    uint32_t head_len, tail_len; /* the tail's is a multiple of 4 */
+    uint32_t head_len, tail_len; /* tail_len is a multiple of 4 */
 };
 
 /* Write whole pcapng packets to `out` while there is room. */
 size_t md_tap_take(struct md_tap *tap, const struct md_wrapping *wrappings, uint32_t interface,
                    int64_t utc_minus_monotonic_ns, uint8_t *out, size_t room);
-/* Return the length of the packet with `len` bytes that begin with `first`. */
+/* Return the length of a packet of `len` bytes, the first of which is `first`. */
 size_t md_packet_length(const struct md_wrapping *wrappings, int side, uint8_t first, size_t len);
 void md_put_packet(const struct md_wrapping *wrappings, uint32_t interface, int side, int64_t time_ns,
                    const uint8_t *bytes, size_t len, uint8_t *out);
 
-/* ---- capture.c: return 1; 0 when room (md_stream_put) or more bytes (md_split) are needed ---- */
+/* ---- capture.c: return 1; 0 without room (md_stream_put), or without enough bytes (md_split) ---- */
 
-/* Bytes that came together, from `at` up to the next piece. */
+/* Bytes that came together, from `at` to the next piece. */
 struct md_piece {
     size_t at;
     int64_t time_ns;
@@ -50,58 +50,58 @@ struct md_piece {
     uint8_t is_after_pause; /* the line was silent before them: a hint */
 };
 
-/* Sniffed bytes that are not yet forgotten. */
+/* A buffer of sniffed bytes. */
 struct md_stream {
     uint8_t *bytes;
     struct md_piece *pieces;
-    size_t len, room, count, most; /* of the bytes, of the pieces */
-    int is_all;                    /* nothing more will come */
-    int is_tcp;                    /* all frames are MD_TCP's; else none is */
+    size_t len, room, count, most; /* bytes, and room for bytes; pieces, and room for pieces */
+    int is_all;                    /* the stream is complete */
+    int is_tcp;                    /* all frames are Modbus TCP; otherwise none is */
 };
 
 enum md_kind {
-    MD_JUNK,    /* no frame */
+    MD_JUNK,    /* not a frame */
     MD_REQUEST,
-    MD_EITHER,  /* a request, or its copy that confirms it: what came before was not understood */
-    MD_REPLY,   /* to the request before it */
+    MD_EITHER,  /* a request, or its confirming copy: the bytes before it were not understood */
+    MD_REPLY,   /* to the previous request */
     MD_STRAY    /* a reply without its request */
 };
 
-/* Sniffed bytes that belong together. */
+/* A frame, or junk between frames. */
 struct md_span {
     size_t at, len;
-    int64_t time_ns; /* time and side of the piece in which it begins */
+    int64_t time_ns; /* time and side of its first piece */
     int side;
     int kind, framing;
     struct md_message message;
 };
 
-/* Zeroed, it is at the beginning. */
+/* The position in a stream; all zero: its start. */
 struct md_splitter {
-    size_t at, piece;          /* what comes next */
+    size_t at, piece;          /* the next byte, and its piece */
     size_t junk;               /* bytes since the last frame */
-    int is_in_step;            /* a frame came last: requests and their copies alternate */
-    int awaited, framing;      /* of the reply to `request` */
+    int is_in_step;            /* the last bytes were a frame: requests and their copies alternate */
+    int awaited, framing;      /* the reply to `request` is due, in this framing */
     struct md_message request; /* the last one */
 };
 
 /* Append a piece. */
 int md_stream_put(struct md_stream *stream, const uint8_t *bytes, size_t len, struct md_piece piece);
-/* Forget what was split. */
+/* Discard the bytes before the splitter's position. */
 void md_stream_forget(struct md_stream *stream, struct md_splitter *splitter);
-/* Find the next span. Every byte is part of one. Only pauses and sides matter of how the bytes came in; junk
- * comes in any number of spans. */
+/* Find the next span; every byte is part of one. Pauses and sides influence the result, the other borders of
+ * pieces do not. Junk may be split into several spans. */
 int md_split(struct md_splitter *splitter, const struct md_stream *stream, struct md_span *span);
 
 /* ---- capture.c: return an enum md_decoded ---- */
 
-/* The fields of a request's reply; key 0: an empty place. */
+/* The fields of a request's reply; key 0: an empty slot. */
 struct md_known {
     uint64_t key;
     const struct md_block *block;
 };
 
-/* Zeroed but for `known` and `places`, a power of two, it is at the beginning. */
+/* The state of decoding. All zero except `known` and `places`, a power of two: the start. */
 struct md_decoder {
     struct md_splitter splitter;
     struct md_span span;
@@ -109,32 +109,32 @@ struct md_decoder {
     size_t places, taken;
     const struct md_block *block; /* of the last request */
     int64_t asked_ns;
-    int is_sure, failure;         /* it was a request; why it has no reply, if none comes */
-    int is_due;                   /* `span` is still to be dealt with */
+    int is_sure, failure;         /* it was certainly a request; its result if no reply comes */
+    int is_due;                   /* `span` is not processed yet */
     uint64_t frames, exchanges, junk, strays;
     struct md_completion completion;
 };
 
 enum md_decoded {
-    MD_ALL_DECODED, /* but for what needs more bytes */
-    MD_NO_ROOM,     /* in the columns */
-    MD_UNKNOWN      /* the request in `span`: call md_know(), and again */
+    MD_ALL_DECODED, /* except an incomplete frame at the end */
+    MD_NO_ROOM,     /* the columns are full */
+    MD_UNKNOWN      /* unknown request in `span`: call md_know() and repeat */
 };
 
-/* Say what replies to this request hold; NULL: nothing that makes rows. Return 0 when the table is full. */
+/* Set the fields of replies to this request; NULL: no rows. Return 0 if the table is full. */
 int md_know(struct md_decoder *decoder, int framing, const struct md_message *request,
             const struct md_block *block);
-/* Add the rows of every sniffed exchange, also of requests without a reply. */
+/* Add the rows of all sniffed exchanges, including requests without a reply. */
 int md_decode(struct md_decoder *decoder, const struct md_stream *stream, struct md_columns *columns);
 
 /* ---- capture.c: return an enum md_unpacked ---- */
 
-enum { MD_LINK_RTAC = 250, MD_LINK_EXPORTED = 252 }; /* link types with a header; all others: bare bytes */
+enum { MD_LINK_RTAC = 250, MD_LINK_EXPORTED = 252 }; /* link types with a header; others: bare frames */
 
-/* One interface of a capture: a line. */
+/* An interface of a capture: one line. */
 struct md_channel {
     uint32_t link;
-    int has_sides;        /* the packets' directions are right */
+    int has_sides;        /* the packets' directions can be trusted */
     uint64_t ticks_per_s; /* of the packets' time stamps */
     int64_t offset_ns;
     struct md_stream stream;
@@ -149,11 +149,11 @@ struct md_capture {
 };
 
 enum md_unpacked {
-    MD_UNPACKED,      /* all of it */
-    MD_CHANNEL_FULL,  /* split what the channels hold, and again */
-    MD_OTHER_BLOCK,   /* of a pcapng file, at `at`: for the caller to read */
+    MD_UNPACKED,      /* the whole file */
+    MD_CHANNEL_FULL,  /* split the channels' bytes and repeat */
+    MD_OTHER_BLOCK,   /* another pcapng block at `at`, which the caller must read */
     MD_CUT,           /* the file ends within a packet */
-    MD_NONSENSE       /* no packet begins at `at` */
+    MD_NONSENSE       /* invalid packet at `at` */
 };
 
 /* Append packets to their channels' streams. */

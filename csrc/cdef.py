@@ -1,6 +1,6 @@
 """Write the cffi module's C source: `python cdef.py OUTPUT`.
 
-The cdef is the marked part of each header; there is no second copy of the contract.
+The cdef is the marked part of each header.
 """
 
 import sys

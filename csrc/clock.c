@@ -1,8 +1,8 @@
-/* Reads the monotonic clock, and by how much the time of day is ahead of it. */
+/* The monotonic clock, and its offset from UTC. */
 #include "internal.h"
 
 enum {
-    WRONG_NS = 100000, /* a kept difference that is off by more is replaced */
+    WRONG_NS = 100000, /* replace the stored offset if it is off by more */
     MOST_TRIES = 4     /* to read two clocks at once */
 };
 
@@ -33,7 +33,7 @@ int64_t md_utc_ahead_ns(int64_t now_ns)
     }
     if (known && is_interrupted)
         return known;
-    /* Where two threads replace it at once, both return what the first one kept. */
+    /* If two threads replace it at once, both return the first one's value. */
     return atomic_compare_exchange_strong(&kept, &known, found) ? found : known;
 }
 

@@ -1,4 +1,4 @@
-/* Make columns of completions: numbers in engineering units. */
+/* Columns from completions: numbers in engineering units, and columns in the format of recordings. */
 #include "internal.h"
 
 #include <math.h>
@@ -6,7 +6,7 @@
 #include <string.h>
 
 enum {
-    FORMAT = MD_LOW_WORD_FIRST - 1, /* without its order */
+    FORMAT = MD_LOW_WORD_FIRST - 1, /* mask: the format without its byte order */
     DECIMALS = 22                   /* 10^22 is the last power that a double holds exactly */
 };
 
@@ -108,7 +108,7 @@ static uint32_t get32(const uint8_t *at, int low_word_first)
     return low_word_first ? second << 16 | first : first << 16 | second;
 }
 
-/* Read a number. The formats that most registers have need no loop, and half the time. */
+/* Read a number. The usual formats have a fast path without a loop, in half the time. */
 static inline double number_at(const uint8_t *data, size_t at, int format)
 {
     const uint8_t *first = data + 2 * at;
@@ -139,7 +139,7 @@ static int is_any(uint64_t bits, const struct md_invalid *invalid, int count)
     return 0;
 }
 
-/* The bits of a part; those of a signed format have their own sign. */
+/* Return the bits of a part; in a signed format the part has its own sign. */
 static double part_of(uint64_t bits, int format, const struct md_extra *extra)
 {
     uint64_t mask = extra->bits < 64 ? (UINT64_C(1) << extra->bits) - 1 : UINT64_MAX;
@@ -155,7 +155,7 @@ static double scaled(double raw, const struct md_field *field, double addend, in
     return (raw * multiplier + addend) / divisor;
 }
 
-/* Return the value; NaN where the device gives none. */
+/* Return the value; NaN if the device reports none. */
 static double value_with(const struct md_message *reply, const struct md_field *field,
                          const struct md_extra *extra)
 {
@@ -176,7 +176,7 @@ static double value_with(const struct md_message *reply, const struct md_field *
     return scaled(raw, field, extra->addend, power);
 }
 
-/* Return the row's status, and put its value there where it is MD_OK. */
+/* Return the row's status; if it is MD_OK, set its value. */
 static uint16_t find_value(const struct md_message *reply, const struct md_block *block,
                            const struct md_field *field, double *value)
 {
@@ -246,7 +246,7 @@ static void set_bit(uint8_t *bits, size_t at, int on)
     bits[at / 8] = (uint8_t)(on ? bits[at / 8] | mask : bits[at / 8] & ~mask);
 }
 
-/* Return why none of the fields has a value; MD_OK: each has its own status. */
+/* Return the status of all fields; MD_OK: each field has its own. */
 static uint16_t status_of(const struct md_completion *completion)
 {
     if (completion->result < 0)
@@ -299,11 +299,9 @@ int64_t md_spell(const uint16_t *codes, size_t n, const uint8_t *bytes, const in
 
 /* ---- columns as recordings hold them ---- */
 
-/* Columns as recordings hold them: times of float, codes of a byte. */
+static const float BEYOND = 0x1p63F; /* the least float above all int64 */
 
-static const float BEYOND = 0x1p63F; /* the first that no int64 can be */
-
-/* Return the next float towards plus infinity; not of zero, which is exact. */
+/* Return the next float towards plus infinity. The number is not zero. */
 static float next_up(float number)
 {
     uint32_t bits;

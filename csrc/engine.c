@@ -1,5 +1,5 @@
-/* The thread that runs every line of the process. It never takes the interpreter lock. A line that is
- * polled as fast as it allows needs nobody but this thread. */
+/* The thread that runs every line of the process. It never takes the interpreter lock: polling needs no other
+ * thread. */
 #define _GNU_SOURCE
 #include "engine.h"
 
@@ -10,11 +10,11 @@
 
 /* ---- prefetching ---- */
 
-/* Memory that ports need for their next exchange, brought into the caches while others are dealt with.
+/* Prefetch the memory that ports need for their next exchange while other ports are served.
  *
- * With many lines it has left the caches since the line's last exchange, and each exchange would wait a dozen
- * times for memory: more than a third of the core's own time with 1024 lines, a tenth with 256. The first
- * byte of each thing is read, because the processor drops the prefetch of a page for which it has no
+ * With many lines that memory has left the caches since the line's last exchange. Each exchange would wait
+ * for it a dozen times: more than a third of the core's own time with 1024 lines, a tenth with 256. The
+ * first byte of each object is read, because the processor drops a prefetch from a page without a cached
  * translation. */
 
 enum { CACHE_LINE = 64 };
@@ -43,13 +43,13 @@ static void bring_exchange(const struct md_exchange *exchange)
     bring(exchange, offsetof(struct md_exchange, request.data));
 }
 
-/* Return the exchange under way; NULL: there is none. */
+/* Return the exchange in flight; NULL: none. */
 static const struct md_exchange *present(const struct md_port *port)
 {
     return port->turn.whose != MD_NOBODYS ? port->turn.line.exchange : NULL;
 }
 
-/* Return where the exchange to be repeated next is named; NULL: there is none. */
+/* Return the address of the pointer to the next repeated exchange; NULL: none. */
 static const struct md_exchange *const *next_name(const struct md_port *port)
 {
     const struct md_turn *turn = &port->turn;
@@ -83,11 +83,12 @@ static void bring_rest(const struct md_port *port)
         bring((*next_name(port))->drive, offsetof(struct md_drive, counters));
 }
 
-/* Each needs what the one behind it brought: the last one is for the port that is farthest ahead. */
+/* Each step uses memory that the one after it has fetched: the last one is for the port farthest ahead. */
 static void (*const steps[STEPS_AHEAD])(const struct md_port *port) = {
     bring_rest, bring_drives, bring_exchanges, bring_port,
 };
 
+/* Prefetch one stage for ports next .. next + 3; `next` may be negative. */
 static void prefetch(struct md_port *const *ports, int n, int next)
 {
     for (int step = 0; step < STEPS_AHEAD; step++, next++)
@@ -101,7 +102,7 @@ static void prefetch(struct md_port *const *ports, int n, int next)
 #include <sys/prctl.h>
 #endif
 
-enum { READY = 256 }; /* ports that are dealt with at a time */
+enum { READY = 256 }; /* ports handled at a time */
 
 static int64_t earliest(const struct md_engine *engine)
 {
@@ -120,7 +121,7 @@ static int wait_until(struct md_engine *engine, void **ready, int64_t until_ns)
     if (n > 0)
         return n;
     int64_t late = md_now_ns() - until_ns;
-    if (left > 0 && late >= 0) { /* else it could not sleep for so short a time */
+    if (left > 0 && late >= 0) { /* otherwise it did not sleep */
         late = sooner(late, MD_MOST_LATENESS);
         engine->lateness_ns += (late - engine->lateness_ns) / (late > engine->lateness_ns ? 4 : 16);
     }
@@ -129,7 +130,7 @@ static int wait_until(struct md_engine *engine, void **ready, int64_t until_ns)
 
 /* ---- ports come and go ---- */
 
-/* Make room for one more port; 0 when there is no memory. */
+/* Make room for one more port; 0 without memory. */
 static int grow(struct md_engine *engine)
 {
     if (engine->count < engine->room)
@@ -147,7 +148,7 @@ static int grow(struct md_engine *engine)
     return 1;
 }
 
-/* Open those ports whose clients wait for it: nobody else may touch the waiter while it waits. */
+/* Open the ports whose clients wait for it. Only this thread may touch the waiter. */
 static void open_ports(struct md_engine *engine)
 {
     for (struct md_port *port = engine->arriving; port; port = port->next) {
@@ -164,12 +165,12 @@ static void open_ports(struct md_engine *engine)
     engine->arriving = NULL;
 }
 
-/* Close those ports whose clients wait for it. */
+/* Close the ports whose clients wait for it. */
 static void close_ports(struct md_engine *engine)
 {
     for (unsigned i = engine->count; i-- > 0;) {
         struct md_port *port = engine->ports[i];
-        if (!port->is_closing || port->rs485.is_sending) /* a stop that leaves must not be cut off */
+        if (!port->is_closing || port->rs485.is_sending) /* do not cut off a stop that is leaving */
             continue;
         if (!port->turn.progress.lost)
             md_waiter_remove(engine->waiter, port->fd);
@@ -184,7 +185,7 @@ static void close_ports(struct md_engine *engine)
 
 /* ---- the thread ---- */
 
-/* Carry on with the ports that can be read; return what time it is then, 0 if there were none. */
+/* Serve the readable ports; return the time afterwards, 0 if there were none. */
 static int64_t advance_ready(struct md_port *const *ready, int n, int *is_woken)
 {
     int64_t now_ns = 0;
@@ -201,14 +202,14 @@ static int64_t advance_ready(struct md_port *const *ready, int n, int *is_woken)
     return now_ns;
 }
 
-/* Whoever woke the thread may have put something before this port that need not wait: it is idle, or only
- * listens, which is no reason for a stop to wait. */
+/* Return 1 if a client that woke the thread may have given this port an exchange that can start: the port is
+ * idle, or only listens, which a stop ignores. */
 static int may_have_news(const struct md_port *port)
 {
     return port->turn.whose == MD_NOBODYS || port->turn.line.listened_ns;
 }
 
-/* A far end that is gone is a lost port, and not the end of a process that has SIGPIPE's default. */
+/* Block SIGPIPE: a closed far end is a lost port, and must not end the process. */
 static void bear_broken_pipes(void)
 {
 #ifndef _WIN32
@@ -234,7 +235,7 @@ static void *run(void *argument)
         int has_news = engine->has_news;
         engine->has_news = 0;
         pthread_mutex_unlock(&engine->mutex);
-        if (has_news) /* not before: they would wake for nothing but to wait for the mutex */
+        if (has_news) /* after unlocking, so that they get the mutex at once */
             pthread_cond_broadcast(&engine->changed);
         while (atomic_load(&engine->callers)) /* yield: otherwise this thread would always win the mutex */
             sched_yield();
@@ -277,7 +278,7 @@ struct md_engine *md_engine_start(void)
     return NULL;
 }
 
-/* ---- for its clients ---- */
+/* ---- for clients ---- */
 
 void md_engine_enter(struct md_engine *engine)
 {

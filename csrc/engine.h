@@ -10,70 +10,70 @@
 #include <stdint.h>
 #include <sys/types.h>
 
-/* The transceiver's direction. */
+/* The state of the transceiver's direction. */
 struct md_rs485 {
     int mode;        /* enum md_rs485_mode */
-    int tells_end;   /* the driver says when the last bit has left */
-    int is_sending;  /* RTS stands so that the transceiver sends */
-    int64_t sent_ns; /* the last bit has left by then, if the UART began at once */
-    int64_t look_ns; /* when to look whether it has */
-    int64_t empty_ns; /* nothing was queued any more; 0: not yet seen */
+    int tells_end;   /* the driver reports when the last bit has left */
+    int is_sending;  /* RTS makes the transceiver send */
+    int64_t sent_ns; /* the last bit leaves then, if the UART started at once */
+    int64_t look_ns; /* next check whether it has left */
+    int64_t empty_ns; /* the driver's queue was empty; 0: not yet */
     int64_t character_ns;
 };
 
 struct md_port {
-    /* what the thread needs at every exchange */
+    /* fields for every exchange */
     int fd, must_take;
     unsigned index;    /* among the engine's ports */
-    int is_blind;      /* nothing is worth reading before the port's waking time */
-    int is_watched;    /* the waiter tells when it can be read */
-    int is_empty;      /* it was read empty a moment ago: nothing is there yet */
+    int is_blind;      /* no useful bytes come before the port's wake time */
+    int is_watched;    /* the waiter reports when it is readable */
+    int is_empty;      /* it has just been read empty */
     int is_closing;
     struct md_settings settings; /* in force; baudrate 0: not yet set */
     struct md_engine *engine;
-    const struct md_mastership *mastership; /* NULL: nobody else may be master here */
+    const struct md_mastership *mastership; /* NULL: this process is always the master */
     struct md_rs485 rs485;
     struct md_turn turn;
 
-    uint32_t heard_term;  /* of its mastership, for which it was listened to last; 0: none */
-    struct md_port *next; /* of those that wait to be opened */
+    uint32_t heard_term;  /* term of the mastership that last listened to the line; 0: none */
+    struct md_port *next; /* in the engine's list of arriving ports */
     int is_opened, open_error, is_closed;
 };
 
 struct md_engine {
     pthread_t thread;
-    pthread_mutex_t mutex;  /* held by the thread but while it waits; guards all below, and the ports */
+    pthread_mutex_t mutex;  /* the thread releases it only while it waits; guards all below, and the ports */
     atomic_int callers;     /* clients that want the mutex */
     pthread_cond_t changed; /* an urgent request is done, a port opened or closed */
-    int has_news;           /* of these: clients are to be woken */
+    int has_news;           /* `changed` must be signalled */
     struct md_waiter *waiter;
     struct md_wakeup wakeup;
-    struct md_port *arriving; /* clients wait for these to be opened */
+    struct md_port *arriving; /* clients wait until these are open */
     struct md_port **ports;
-    int64_t *wakes; /* when the thread is to wake for each port, whatever happens */
+    int64_t *wakes; /* latest wake time for each port */
     unsigned count, room;
-    int64_t lateness_ns; /* of the thread's waking, as is usual */
+    int64_t lateness_ns; /* the thread's usual lateness after a sleep */
 };
 
-/* Until when this process may send, as the ports see it. */
+/* The right to send, which ends at a deadline. */
 struct md_mastership {
     int64_t until_ns;         /* of CLOCK_BOOTTIME; read and written atomically; 0: it does not hold */
-    int64_t guard_ns;         /* from the end of one master to the beginning of the next */
-    uint32_t term;            /* how often it began to hold: another may have been master before each */
-    struct md_engine *engine; /* that looks at it; NULL: none does yet */
+    int64_t guard_ns;         /* least time between two masters */
+    uint32_t term;            /* terms so far; another process may have been master between two */
+    struct md_engine *engine; /* the engine that checks it; NULL: none yet */
 #ifdef __linux__
     timer_t timer;
 #endif
 };
 
-/* Nanoseconds of a wake-up that are reckoned with. */
+/* The longest expected lateness of a wake-up, in ns. */
 #ifdef _WIN32
 enum { MD_MOST_LATENESS = 1500000 }; /* its best timers keep time to half a millisecond, or one */
 #else
 enum { MD_MOST_LATENESS = 80000 };
 #endif
 
-/* ---- engine.c: for its clients ---- */
+/* ---- engine.c: for clients ---- */
 
 void md_engine_enter(struct md_engine *engine); /* take the mutex */
 void md_engine_leave(struct md_engine *engine);
@@ -82,16 +82,16 @@ void md_engine_await(struct md_engine *engine, const int *is_done); /* with the 
 
 /* ---- port.c: on the engine's thread ---- */
 
-int64_t md_port_receive(struct md_port *port); /* what has come; return when it was read */
-/* Carry on until there is nothing to do but wait; return what time it is then. */
+int64_t md_port_receive(struct md_port *port); /* read the port; return the time of the read */
+/* Do all that is due on a port; return the time afterwards. */
 int64_t md_port_advance(struct md_port *port, int64_t now_ns);
 
 /* ---- rs485.c ---- */
 
 int md_rs485_begin(struct md_port *port, int mode); /* 0, -errno */
-/* Write, with the transceiver sending from now on. */
+/* Write, and let the transceiver send from now on. */
 ssize_t md_rs485_write(struct md_port *port, const uint8_t *bytes, size_t len);
-/* Let the transceiver receive again when the last bit has left; 0, or -errno: then the port is to be lost. */
+/* Let the transceiver receive once the last bit has left; 0, or -errno: give up the port. */
 int md_rs485_look(struct md_port *port, int64_t now_ns);
 
 
@@ -115,7 +115,7 @@ int md_descriptor_is_queued(int fd);
 
 #include <sys/ioctl.h>
 #include <unistd.h>
-#ifdef __linux__ /* others have no RS-485 mode */
+#ifdef __linux__ /* other systems have no RS-485 mode */
 #include <linux/serial.h>
 #endif
 
@@ -129,14 +129,14 @@ static inline ssize_t md_descriptor_write(int fd, const void *bytes, size_t len)
     return write(fd, bytes, len);
 }
 
-/* Put the driver into its RS-485 mode; 0, -errno. */
+/* Switch the driver to its RS-485 mode; 0, -errno. */
 static inline int md_descriptor_take_rs485(int fd)
 {
 #ifdef __linux__
     struct serial_rs485 mode;
     if (ioctl(fd, TIOCGRS485, &mode))
         return -errno;
-    if (!(mode.flags & (SER_RS485_RTS_ON_SEND | SER_RS485_RTS_AFTER_SEND))) /* else as it was set up */
+    if (!(mode.flags & (SER_RS485_RTS_ON_SEND | SER_RS485_RTS_AFTER_SEND))) /* keep a configured polarity */
         mode.flags |= SER_RS485_RTS_ON_SEND;
     mode.flags |= SER_RS485_ENABLED;
     if (ioctl(fd, TIOCSRS485, &mode) || ioctl(fd, TIOCGRS485, &mode))
@@ -154,7 +154,7 @@ static inline int md_descriptor_set_rts(int fd, int is_up)
     return ioctl(fd, is_up ? TIOCMBIS : TIOCMBIC, &rts) ? -errno : 0;
 }
 
-/* Return 1 where the UART says that its last bit has left, 0 where not, -errno where it does not tell. */
+/* Return 1 if the UART reports that its last bit has left, 0 if not, -errno if it does not report it. */
 static inline int md_descriptor_is_shifted_out(int fd)
 {
 #ifdef TIOCSERGETLSR
@@ -166,7 +166,7 @@ static inline int md_descriptor_is_shifted_out(int fd)
 #endif
 }
 
-/* Return 1 where the driver says that it still holds bytes to be sent. */
+/* Return 1 if the driver reports unsent bytes. */
 static inline int md_descriptor_is_queued(int fd)
 {
     int queued = 0;

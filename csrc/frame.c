@@ -1,15 +1,13 @@
-/* Requests and replies in four framings: Modbus RTU, Modbus ASCII, Modbus TCP, Delixi's own ASCII
- * (serial-line guide V1.02, messaging guide for TCP/IP V1.0b). What they wrap is the body; see body.c. */
+/* Requests and replies in four framings: Modbus RTU, Modbus ASCII, Modbus TCP, Delixi's ASCII (serial-line
+ * guide V1.02, messaging guide for TCP/IP V1.0b). See body.c for their content. */
 #include "internal.h"
 
 #include <string.h>
 
 /* ---- checksums ---- */
 
-/* The three checksums of the five families. */
-
-/* CRC-16/MODBUS, polynomial A001H (8005H reversed), of every byte value that 0 to 3 zero bytes
- * follow: the CRC of a byte is the sum, without carry, of the CRCs of its bits, which stand below. */
+/* CRC-16/MODBUS, polynomial A001H (8005H reversed), of every byte value followed by 0 to 3 zero bytes: the
+ * CRC of a byte is the sum, without carry, of the CRCs of its bits, which are the arguments of ALL. */
 #define BYTE(n, a, b, c, d, e, f, g, h) \
     ((n) & 1 ? a : 0) ^ ((n) & 2 ? b : 0) ^ ((n) & 4 ? c : 0) ^ ((n) & 8 ? d : 0) ^ \
     ((n) & 16 ? e : 0) ^ ((n) & 32 ? f : 0) ^ ((n) & 64 ? g : 0) ^ ((n) & 128 ? h : 0)
@@ -55,7 +53,7 @@ uint8_t md_lrc(const uint8_t *bytes, size_t len)
 
 /* ---- frames ---- */
 
-/* ---- out of the wrapping ---- */
+/* ---- parsing ---- */
 
 static int hex_digit(uint8_t character)
 {
@@ -77,7 +75,7 @@ static uint8_t text_checksum(int framing, const uint8_t *body, size_t len)
     return framing == MD_ASCII ? md_lrc(body, len) : md_sum(body, len);
 }
 
-/* Open what is written in hex digits: unhex its body, and return the frame's length. */
+/* Decode the hex digits of a text frame's body, and return the frame's length. */
 static int open_text(int framing, const uint8_t *text, size_t len, const struct md_message *request,
                      uint8_t body[MD_MOST_BODY + 1])
 {
@@ -90,7 +88,7 @@ static int open_text(int framing, const uint8_t *text, size_t len, const struct 
     int length = md_body_length(framing, body, have, request);
     if (length < 0)
         return length;
-    if (length == 0 || have <= (size_t)length) /* the checksum's byte follows the body */
+    if (length == 0 || have <= (size_t)length) /* the checksum follows the body */
         return byte < 0 ? MD_BAD_CHARACTER : MD_INCOMPLETE;
     size_t end = 2 * (size_t)length + 3;
     if ((len > end && text[end] != '\r') || (len > end + 1 && text[end + 1] != '\n'))
@@ -152,7 +150,7 @@ static int open_tcp(const uint8_t *bytes, size_t len, const struct md_message *r
     return whole;
 }
 
-/* Find the body of the frame at the beginning of `bytes`: in place, or unhexed into `text`. */
+/* Find the body of the frame that `bytes` start with: in place, or decoded into `text`. */
 static int open_frame(int framing, const uint8_t *bytes, size_t len, const struct md_message *request,
                       uint8_t text[MD_MOST_BODY + 1], const uint8_t **body)
 {
@@ -164,7 +162,7 @@ static int open_frame(int framing, const uint8_t *bytes, size_t len, const struc
     return open_text(framing, bytes, len, request, text);
 }
 
-/* ---- into the wrapping ---- */
+/* ---- building ---- */
 
 static int close_frame(int framing, uint16_t transaction, uint8_t *body, size_t len, uint8_t *out,
                        size_t room)
@@ -200,7 +198,7 @@ static int close_frame(int framing, uint16_t transaction, uint8_t *body, size_t 
     return (int)(at - out);
 }
 
-/* ---- the contract ---- */
+/* ---- requests and replies ---- */
 
 int md_build_request(int framing, const struct md_message *message, uint8_t *out, size_t room)
 {
@@ -256,10 +254,8 @@ int md_reply_length(int framing, const struct md_message *request)
 
 /* ---- why a request has no reply ---- */
 
-/* Find out why a request has no reply from what came in its place. */
-
-/* Weigh a reason by how much it tells. The one that tells most is reported, and of several that tell as
- * much the first: a frame from another address may hold our own further on. */
+/* Rank reasons by how specific they are. The most specific one is reported, the first of equals: a frame
+ * from another address may contain the awaited one. */
 static int weight(int reason)
 {
     static const uint8_t weights[] = {
@@ -275,7 +271,7 @@ static int weight(int reason)
     return reason < 0 && (size_t)-reason < sizeof weights ? weights[-reason] : 0;
 }
 
-/* Where a header is damaged nothing behind it is known. */
+/* Return the offset of the next frame. After a damaged header it is unknown. */
 static size_t next_at(int framing, const uint8_t *bytes, size_t len)
 {
     int whole = framing == MD_TCP ? md_tcp_length(bytes, len) : 1;

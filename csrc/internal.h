@@ -1,5 +1,5 @@
-/* The functions that only C calls, but for those of a line (line.h) and its turns (turn.h). Tests see the
- * marked part, too. */
+/* The functions that only C calls, except those of a line and its turns (line.h). Tests see the marked part,
+ * too. */
 #ifndef MULTIDROP_INTERNAL_H
 #define MULTIDROP_INTERNAL_H
 
@@ -12,48 +12,48 @@
 /* cdef: start */
 /* ---- stats.c: counters ---- */
 
-/* Count an exchange that is over. */
+/* Count an exchange that ended. */
 void md_counters_end(const struct md_exchange *exchange, const struct md_completion *completion);
-/* Count its reply, which came after this delay and needed so long of the line. */
+/* Count a reply: its delay, and the line time that its exchange needed. */
 void md_counters_answer(struct md_drive *drive, int64_t delay_ns, int64_t ideal_ns);
 uint64_t md_replies(const struct md_drive *drive);
-const uint64_t *md_usual_delays(const struct md_drive *drive); /* replies of the usual delay */
+const uint64_t *md_usual_delays(const struct md_drive *drive); /* the counter of the usual delay */
 
 /* ---- clock.c ---- */
 
-/* Return UTC - CLOCK_MONOTONIC as md_utc_minus_monotonic_ns() does, where the latter is `now_ns` by now. */
+/* Return the same as md_utc_minus_monotonic_ns(), for a caller that has just read CLOCK_MONOTONIC. */
 int64_t md_utc_ahead_ns(int64_t now_ns);
 
 /* ---- columns.c, row_queue.c ---- */
 
-/* Append one row for each of the block's fields; return how many, 0 when there is no room. */
+/* Append one row for each of the block's fields; return how many, 0 without room. */
 int md_columns_add(struct md_columns *columns, const struct md_block *block,
                    const struct md_completion *completion, int64_t utc_minus_monotonic_ns);
-/* Return how many of the block's fields have no value in a good reply. */
+/* Count the block's fields without a value in a good reply. */
 uint64_t md_count_lacking(const struct md_block *block, const struct md_message *reply);
-/* Keep it until it is released, though its client frees it. */
+/* Keep the queue until it is released, even if its client frees it. */
 void md_row_queue_hold(struct md_row_queue *row_queue);
 void md_row_queue_release(struct md_row_queue *row_queue);
-/* Append to the newest chunk; a block that is NULL has no rows. */
+/* Append to the newest chunk; block NULL: no rows. */
 void md_row_queue_add(struct md_row_queue *row_queue, const struct md_block *block,
                       const struct md_completion *completion);
 /* cdef: end */
 
-/* ---- body.c: what is wrapped in a frame, from its address on ---- */
+/* ---- body.c: the content of frames, from the address on ---- */
 
 enum { MD_MOST_BODY = 253 }; /* 125 registers read; the standard has room for 254 */
 
-/* Return the length of the body that begins there: a request's, or that of the reply to `request`;
- * MD_INCOMPLETE where its first bytes do not tell yet. */
+/* Return the length of the body at `body`: a request's, or that of the reply to `request`; MD_INCOMPLETE
+ * while its first bytes do not determine it. */
 int md_body_length(int framing, const uint8_t *body, size_t have, const struct md_message *request);
-/* Return the length of the good reply's body; 0 where none comes. */
+/* Return the length of the good reply's body; 0 after a broadcast. */
 int md_body_reply_length(int framing, const struct md_message *request);
-/* Write what follows on address and function, and return the whole length; MD_BAD_REQUEST where no body can
- * say it. */
+/* Write the fields after address and function; return the body's length, MD_BAD_REQUEST if a field is out of
+ * bounds. */
 int md_body_put_request(int framing, const struct md_message *message, uint8_t *body);
 int md_body_put_reply(int framing, const struct md_message *message, uint8_t *body);
 void md_body_get_request(int framing, const uint8_t *body, struct md_message *message);
-/* Read a whole reply; 0 where it confirms what was not asked for. */
+/* Read a whole reply; 0 if it does not confirm its request. */
 int md_body_get_reply(int framing, const uint8_t *body, const struct md_message *request,
                       struct md_message *reply);
 
@@ -67,7 +67,7 @@ enum {
 
 enum { MD_WRITE_COIL = 0x05, MD_WRITE_ONE = 0x06, MD_LOOPBACK = 0x08, MD_EXCEPTION_BIT = 0x80 };
 
-/* Delixi's K (part 3): a master sends these, and those between them. */
+/* Delixi's K (part 3): a master sends K = 2 to 7. */
 enum { MD_DELIXI_RUN = 2, MD_DELIXI_STATE_QUERY = 3, MD_DELIXI_PARAMETER_QUERY = 7 };
 
 /* Numbers in frames are big-endian. */
@@ -83,38 +83,37 @@ static inline uint8_t *md_put16(uint8_t *at, unsigned value)
     return at + 2;
 }
 
-/* Copy only the data that the message has: most are much shorter than the longest. */
+/* Copy only the used part of the data: most messages are short. */
 void md_copy_message(struct md_message *to, const struct md_message *from);
-int md_hex_byte(const uint8_t digits[2]); /* value of two upper-case hex digits; -1 where they are none */
-/* Return the length that a header of Modbus TCP announces, an enum md_frame_fault where it is none. */
+int md_hex_byte(const uint8_t digits[2]); /* value of two upper-case hex digits; -1: not digits */
+/* Return the length in a Modbus TCP header, or an enum md_frame_fault. */
 int md_tcp_length(const uint8_t *bytes, size_t len);
-/* An exception to this request begins there. Its length is fixed, and some devices announce another one. */
+/* Return 1 if the bytes start an exception to this request. Its length is fixed; some devices announce
+ * another one. */
 int md_tcp_is_exception(const uint8_t *bytes, size_t len, const struct md_message *request);
-/* A gateway has no path to the drive, or no reply from it: the drive itself said nothing. */
+/* Return 1 if a gateway reports that it has no path to the drive, or no reply: the drive itself is silent. */
 int md_is_gateways(int framing, const struct md_message *reply);
-/* Return why these bytes, which came in place of the reply, are none: an enum md_frame_fault, MD_CUT_SHORT or
- * MD_NO_REPLY. */
+/* Return why these bytes are not the reply: an enum md_frame_fault, MD_CUT_SHORT or MD_NO_REPLY. */
 int md_reason(int framing, const struct md_message *request, const uint8_t *bytes, size_t len);
 
-/* ---- stats.c: what is learnt of a drive from the delays of its replies ---- */
+/* ---- stats.c: delays and timeouts ---- */
 
-/* Return the time after a request, beside its reply's own, before which it is not worth looking for that. */
+/* Return the time after a request, without the reply's own time, at which to read the port. */
 int64_t md_look_ns(const struct md_exchange *exchange);
 int64_t md_timeout_ns(const struct md_exchange *exchange);
-/* Return the time after a request by which its reply begins, with a margin; 0 if the drive is not steady, or
- * not known well enough. */
+/* Return the time after a request by which its reply starts, with a margin; 0 if the drive is not steady,
+ * or not known well enough. */
 int64_t md_reply_due_ns(const struct md_exchange *exchange);
-/* Learn from a reply's delay (the longest possible, where the reply was whole when first looked at);
- * return what to take for its delay. */
+/* Learn from a reply's delay (an upper bound if the first read found the reply whole); return the best
+ * estimate of the delay. */
 int64_t md_learn_delay(const struct md_exchange *exchange, int64_t delay_ns, int is_whole);
-/* Learn from a late reply, so long after its request or after the last of several: wait longer from now
- * on. */
+/* Wait longer from now on: a late reply came `delay_ns` after its request, or after the last of several. */
 void md_learn_lateness(struct md_drive *drive, int64_t delay_ns, int is_exact);
-/* Learn from a time-out, which takes back half of that. */
+/* Halve that longer wait after a timeout. */
 void md_learn_silence(struct md_drive *drive);
-int64_t md_window_ns(const struct md_exchange *exchange); /* in which a late reply may come in any order */
+int64_t md_window_ns(const struct md_exchange *exchange); /* in which late replies come in any order */
 
-/* The clients read it meanwhile. */
+/* Set the drive's count of failures, which clients read at any time. */
 static inline void md_count_failures(struct md_drive *drive, uint32_t failures)
 {
     if (drive->failures != failures)
@@ -127,23 +126,24 @@ static inline void md_count_failures(struct md_drive *drive, uint32_t failures)
 enum {
     MD_PACKET_BLOCK = 6,
     MD_PACKET_HEAD = 28, /* bytes before a packet */
-    MD_PACKET_END = 4    /* and behind it */
+    MD_PACKET_END = 4    /* bytes after it */
 };
 
 void md_tap_put(struct md_tap *tap, int side, int64_t time_ns, const uint8_t *bytes, size_t len);
 
-/* ---- waiter_epoll.c, or waiter_poll.c where the system is not Linux: wait for many descriptors ---- */
+/* ---- waiter_epoll.c, or waiter_poll.c on other systems: wait for many descriptors ---- */
 
 struct md_waiter;
 
 struct md_waiter *md_waiter_new(void); /* NULL: see errno */
 void md_waiter_free(struct md_waiter *waiter);
-/* Report `whose` from now on when the descriptor can be read; -1: see errno. */
+/* Report `whose` whenever the descriptor is readable; -1: see errno. */
 int md_waiter_add(struct md_waiter *waiter, int fd, void *whose);
 /* Stop watching a descriptor for a while, or watch it again. */
 void md_waiter_change(struct md_waiter *waiter, int fd, void *whose, int watched);
 void md_waiter_remove(struct md_waiter *waiter, int fd);
-/* Wait so long, for ever where it is negative; write who can read, and return how many. */
+/* Wait at most `timeout_ns`, forever if it is negative; write the owners of readable descriptors, and return
+ * how many. */
 int md_waiter_wait(struct md_waiter *waiter, void **ready, int room, int64_t timeout_ns);
 
 /* ---- termios.c ---- */
@@ -153,7 +153,7 @@ int md_port_keep_rts(int fd); /* leave RTS as it is when the port is closed; 0, 
 /* ---- wakeup.c ---- */
 
 struct md_wakeup {
-    int fd, ringer; /* `fd` can be read while it rings */
+    int fd, ringer; /* `fd` is readable while it rings */
     atomic_int is_rung;
 };
 

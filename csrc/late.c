@@ -1,24 +1,22 @@
-/* Replies that come after their time-out, and how none of them is taken for another request's.
+/* Replies after their timeout: no late reply is ever mistaken for another request's.
  *
- * A drive that is a little late may answer in any order: for some time after a time-out, the window, no
- * request leaves that such a reply could be taken for. A path that holds everything up (a modem, a gateway, a
- * stalled network) keeps the order: a reply that no outstanding request could have proves that all earlier
- * ones have come, or never will. So outstanding requests are remembered beyond the window, and a proof is
- * sent first: a request whose reply differs from all outstanding ones in function, length or value.
+ * A drive that is a little late may answer in any order. For some time after a timeout, the window, no
+ * request leaves that such a reply could be mistaken for. A path that delays all bytes (a modem, a gateway, a
+ * stalled network) keeps the order: a reply that fits no outstanding request proves that all earlier replies
+ * have come, or never will. Therefore outstanding requests are kept beyond the window, and a proof is sent
+ * first: a request whose reply differs from all outstanding ones in function, length or value.
  *
- * A reply that fits an outstanding request as well is counted as that one's. Whichever it answers, the
- * earliest request that it fits is accounted for, and so is all that was sent before it. */
+ * A reply that fits an outstanding request counts as that one's. It accounts for the earliest request that
+ * it fits, and for all requests before that one. */
 #include "line.h"
 
 #include <string.h>
 
 /* ---- one request whose reply may still come ---- */
 
-/* One request whose reply may still come: when it was sent, and what could be taken for its reply. */
+/* An outstanding request: its send times, and the replies that fit it. */
 
 enum { DATA_KEPT = sizeof((struct md_owed){0}.data), LAST_READ = 0x04 };
-
-/* ---- what it asked for ---- */
 
 static uint8_t data_kept(const struct md_message *request)
 {
@@ -46,8 +44,6 @@ static int is_same(const struct md_owed *owed, const struct md_exchange *exchang
            memcmp(owed->data, request->data, data_kept(request)) == 0;
 }
 
-/* ---- what could be taken for its reply ---- */
-
 static int may_hold_the_same(const struct md_owed *owed, const struct md_exchange *exchange)
 {
     return !owed->end || !exchange->end || (owed->least < exchange->end && exchange->least < owed->end);
@@ -60,8 +56,8 @@ int md_is_read(int framing, uint8_t function)
     return function <= LAST_READ;
 }
 
-/* A reply to the one could pass for the reply to the other. An exception does not say which write it
- * refuses, and a start that is wrongly reported as refused is a motor that is wrongly reported to stand. */
+/* Return 1 if a reply to the one could be mistaken for a reply to the other. An exception does not name the
+ * write that it refuses; a start wrongly reported as refused is a running motor reported as stopped. */
 static int is_mistakable(const struct md_owed *owed, const struct md_exchange *exchange)
 {
     const struct md_message *request = &exchange->request;
@@ -83,6 +79,7 @@ int md_is_in_range(const struct md_message *reply, uint16_t least, uint32_t end)
     return end == 0 || reply->exception || reply->data_len < 2 || (value >= least && value < end);
 }
 
+/* Return the length of the reply at `bytes`, MD_INCOMPLETE, or why it does not fit. */
 static int parse_owed(const struct md_owed *owed, const uint8_t *bytes, size_t len)
 {
     struct md_message request = {.address = owed->address, .function = owed->function, .start = owed->start,
@@ -94,8 +91,6 @@ static int parse_owed(const struct md_owed *owed, const uint8_t *bytes, size_t l
     int used = md_parse_reply(owed->framing, bytes, len, &request, &reply);
     return used > 0 && !md_is_in_range(&reply, owed->least, owed->end) ? MD_BAD_ECHO : used;
 }
-
-/* ---- when it was sent ---- */
 
 static uint32_t last_place(const struct md_owed *owed)
 {
@@ -123,15 +118,15 @@ static void drop_time(struct md_owed *owed)
 
 /* ---- proofs ---- */
 
-/* A drive's proofs, and which of them serve: a device may be silent to registers that it lacks, and a
- * document wrong about what a register holds. */
+/* A drive's proofs. Some may not work: a device may be silent to registers that it lacks, and a document
+ * may be wrong about a register's range. */
 
-/* A proof that was never answered is dropped after so many times in vain; a silence counts if other replies
- * came before it. */
+/* A proof that was never answered is dropped after MOST_VAIN failures. A silence counts as one only if other
+ * replies came before it. */
 enum { MOST_VAIN = 2, ANSWERED = 0xFF };
 
-/* Return which of the drive's proofs it is; their number: none, as most are. Then the list is not looked at,
- * which is elsewhere in memory. */
+/* Return the index of this proof in the drive's list, or proof_count. Most exchanges are not proofs: for
+ * those the list, elsewhere in memory, is not read. */
 static uint32_t proof_at(const struct md_exchange *exchange)
 {
     const struct md_drive *drive = exchange->drive;
@@ -146,7 +141,7 @@ int md_proof_is(const struct md_exchange *exchange)
     return proof_at(exchange) < exchange->drive->proof_count;
 }
 
-/* One alone proves nothing of its own late replies. */
+/* Remove a proof. A single one is useless against its own late replies. */
 static void drop_proof(struct md_drive *drive, uint32_t at)
 {
     drive->proof_count--;
@@ -168,7 +163,7 @@ void md_proof_end(const struct md_exchange *exchange, int result)
     int is_silent_to_it = result == MD_NO_REPLY && replies != drive->vain_at;
     if (result > 0)
         drive->vain[at] = ANSWERED;
-    if (!is_silent_to_it && result != MD_BAD_ECHO) /* which is another value than its document says */
+    if (!is_silent_to_it && result != MD_BAD_ECHO) /* a value out of its documented range */
         return;
     drive->vain_at = replies;
     if (++drive->vain[at] == MOST_VAIN)
@@ -184,7 +179,7 @@ static void note_late_proof(struct md_drive *drive, const struct md_owed *owed)
 
 /* ---- late replies ---- */
 
-static const int64_t FORGET_NS = INT64_C(120000000000); /* no path holds anything up for so long */
+static const int64_t FORGET_NS = INT64_C(120000000000); /* no path delays bytes for so long */
 
 /* ---- outstanding requests of a drive ---- */
 
@@ -202,7 +197,7 @@ int md_late_is_repeated(const struct md_exchange *exchange)
     return find_same(exchange->drive, exchange) != NULL;
 }
 
-/* No reply to a later request has come: that would settle this one. */
+/* Return 1 unless a reply to a later request has settled this one. */
 static int is_open(const struct md_drive *drive, const struct md_owed *owed)
 {
     return last_ns(owed) > drive->answered_ns;
@@ -223,13 +218,14 @@ static void forget_settled(struct md_drive *drive, int64_t now_ns)
     }
 }
 
-/* ---- what may be sent ---- */
+/* ---- requests that may be sent ---- */
 
-/* An outstanding reply could be taken for the exchange's; `own`: count one to the same request too. */
+/* Return 1 if an outstanding reply could be mistaken for the exchange's; `own`: also one to the same
+ * request. */
 static int has_mistakable(const struct md_exchange *exchange, int own)
 {
     const struct md_drive *drive = exchange->drive;
-    int is_crowded = drive->owed_count > MD_MOST_OWED - MD_MOST_PROOFS; /* room is kept for the proofs */
+    int is_crowded = drive->owed_count > MD_MOST_OWED - MD_MOST_PROOFS; /* leave room for the proofs */
     for (uint32_t i = 0; i < drive->owed_count; i++) {
         const struct md_owed *owed = &drive->history->owed[i];
         int counts = is_open(drive, owed) && (own || !is_same(owed, exchange));
@@ -239,7 +235,8 @@ static int has_mistakable(const struct md_exchange *exchange, int own)
     return 0;
 }
 
-/* An exception names the function at most, and in Delixi's own protocol not even that. */
+/* Return 1 if an exception in the window could be mistaken: it names the function at most, with Delixi not
+ * even that. */
 static int is_in_window(const struct md_exchange *exchange, int64_t now_ns)
 {
     const struct md_drive *drive = exchange->drive;
@@ -257,7 +254,7 @@ static int is_doubted(const struct md_exchange *exchange)
     return drive->is_doubted && drive->proof_count && !exchange->insists;
 }
 
-/* A refusal tells no value, and proves nothing. */
+/* An exception carries no value, and proves nothing. */
 int md_late_is_in_doubt(const struct md_exchange *exchange, const struct md_message *reply)
 {
     return is_doubted(exchange) && !reply->exception &&
@@ -283,14 +280,14 @@ int md_late_bars(const struct md_exchange *exchange, int64_t now_ns)
     return !md_proof_is(exchange) && has_mistakable(exchange, 0);
 }
 
-/* The last proof is kept for a drive that answers again: it is not outstanding from the time of silence,
- * so that its second reply at the latest settles everything. */
+/* The last proof is reserved for a drive that answers again. It is not outstanding from the silence
+ * before, so its second reply at the latest settles all requests. */
 static const struct md_exchange *last_proof(const struct md_drive *drive)
 {
     return drive->proof_count ? drive->proofs[drive->proof_count - 1] : NULL;
 }
 
-/* A silent drive gains nothing from a proof: any reply shows that it is back. */
+/* Return 1 if a silent drive's request needs no proof: any reply shows that it is back. */
 static int is_sent_alone(const struct md_exchange *exchange)
 {
     const struct md_exchange *last = last_proof(exchange->drive);
@@ -309,7 +306,7 @@ static int is_free(const struct md_drive *drive, const struct md_exchange *proof
     return 1;
 }
 
-/* Return when it was sent last; 0 where it is not outstanding. */
+/* Return the time of its last sending; 0: it is not outstanding. */
 static int64_t sent_last_ns(struct md_drive *drive, const struct md_exchange *proof)
 {
     const struct md_owed *owed = find_same(drive, proof);
@@ -332,13 +329,13 @@ const struct md_exchange *md_late_proof(const struct md_exchange *exchange, int6
         const struct md_exchange *proof = drive->proofs[n];
         if (is_free(drive, proof))
             return proof;
-        if (!latest || sent_last_ns(drive, proof) > sent_last_ns(drive, latest)) /* its reply settles most */
+        if (!latest || sent_last_ns(drive, proof) > sent_last_ns(drive, latest)) /* settles most */
             latest = proof;
     }
     return is_answering ? last_proof(drive) : latest;
 }
 
-/* ---- what is outstanding ---- */
+/* ---- changes of the list ---- */
 
 void md_late_link(struct md_line *line, struct md_drive *drive)
 {
@@ -398,8 +395,8 @@ void md_late_inherit(struct md_drive *drive, const struct md_drive *before)
 
 /* ---- late replies ---- */
 
-/* Account for the earliest request of the drive that the reply there fits: its length, MD_INCOMPLETE or
- * MD_NO_START. One that fits a single request, and not the present one, tells how late the drive is. */
+/* Account for the drive's earliest request that fits the reply at `at`: return its length, MD_INCOMPLETE or
+ * MD_NO_START. A reply that fits a single old request shows how late the drive is. */
 static int take_of(struct md_drive *drive, struct md_line *line, size_t at, int64_t now_ns, int64_t *since_ns)
 {
     struct md_owed *earliest = NULL;

@@ -1,8 +1,8 @@
-/* One line as a state machine: silence, request, reply or time-out. Bytes and time come in as arguments; it
- * knows neither descriptor nor clock.
+/* One line as a state machine: silence, request, reply or timeout. Bytes and times are arguments; it uses
+ * neither a descriptor nor a clock.
  *
- * Junk, an echo, or another station's frame may come before the reply on real lines. Neither they nor a
- * damaged frame end the exchange: the time-out keeps running (serial-line guide V1.02, 2.4.1). */
+ * On real lines junk, an echo, or another station's frame may come before the reply. Neither those nor a
+ * damaged frame end the exchange: the timeout keeps running (serial-line guide V1.02, 2.4.1). */
 #include "line.h"
 
 #include <errno.h>
@@ -10,7 +10,7 @@
 
 /* ---- states ---- */
 
-/* The states of a line, and what leads from one to the next. */
+/* The next state for each state and event. */
 
 enum { IDLE = MD_IDLE, SILENCE, CHECK, READY, WRITING, AWAITING, LAST_LOOK, NONE = -1 };
 
@@ -27,17 +27,17 @@ const int8_t md_line_follows[MD_LINE_STATES][MD_LINE_EVENTS] = {
 
 /* ---- listening for another master ---- */
 
-/* Listening before the first request: a line has one master, and a new one finds out whether it is alone.
- * Bytes that come while nothing was asked are replies to another master, or its requests. Each of them begins
- * the wait anew, so that nothing is asked before the line has been silent for long enough.
- * The wait lasts for the guard at least: meanwhile a master before us that stands still is ended by its own
- * timer. On a connection of Modbus TCP no other master can be heard, and only the guard is waited for.
+/* Listening before the first request: a line has one master, and a new one checks that it is alone. Unasked
+ * bytes are another master's requests or the replies to them. Each restarts the wait, so the first request
+ * leaves after a silence that is long enough.
+ * The wait lasts for the guard at least: in that time the kernel's timer ends a suspended former master. A
+ * Modbus TCP connection shows no other master; there only the guard counts.
  *
- * A stop is not held up: whoever else is there, the motor must stop. */
+ * A stop does not wait: the motor must stop, even beside another master. */
 
 enum { LONGEST_RTU = 256 }; /* serial-line guide V1.02, 2.5.1 */
 
-/* One burst is borne: it may be the reply to what another master, which is gone, asked last. */
+/* Accept one burst: it may be the last reply to a master that has just gone. */
 int md_listen_begin(struct md_line *line, int64_t now_ns, int64_t guard_ns)
 {
     const struct md_exchange *exchange = line->exchange;
@@ -60,7 +60,7 @@ void md_listen_put_back(struct md_line *line)
 
 void md_listen_hear(struct md_line *line, size_t len, int64_t now_ns)
 {
-    if (line->transactions) /* a late reply to ourselves */
+    if (line->transactions) /* a late reply to this process */
         return;
     line->listened_ns = later(line->listened_ns, now_ns + line->listen_ns);
     line->foreign += (uint32_t)len;
@@ -68,7 +68,7 @@ void md_listen_hear(struct md_line *line, size_t len, int64_t now_ns)
 
 static int end_listening(struct md_line *line, int64_t now_ns)
 {
-    if (!md_listen_is_held(line)) /* a stop; what follows it goes on listening */
+    if (!md_listen_is_held(line)) /* a stop; later exchanges keep listening */
         return 1;
     if (now_ns < line->listened_ns)
         return 0;
@@ -80,7 +80,9 @@ static int end_listening(struct md_line *line, int64_t now_ns)
 
 /* The end of an exchange: its bytes for the tap, its completion, and the counts of its drive and block. */
 
-/* The drive does not answer, or cannot be reached. Damage says that it does. */
+/* Return 1 if the result means that the drive is silent or unreachable. A damaged reply shows that it
+ * answers. */
+
 static int is_failure(int result)
 {
     switch (result) {
@@ -104,7 +106,7 @@ static void count_reply(struct md_block *block, uint8_t exception)
     if (exception) {
         block->refusals++;
         block->refusal = exception;
-    } else if (block->refusals || !block->is_answered) { /* mostly nothing is written */
+    } else if (block->refusals || !block->is_answered) { /* usually no write */
         block->refusals = 0;
         block->is_answered = 1;
     }
@@ -118,7 +120,7 @@ static void count(const struct md_exchange *exchange, const struct md_completion
     struct md_block *block = exchange->block;
     md_counters_end(exchange, completion);
     md_proof_end(exchange, completion->result);
-    int is_alive = completion->result == MD_BAD_ECHO && md_proof_is(exchange); /* its value is not as known */
+    int is_alive = completion->result == MD_BAD_ECHO && md_proof_is(exchange); /* out of range */
     if (is_failure(completion->result)) {
         md_count_failures(drive, is_alive ? 0 : drive->failures + 1);
         if (block)
@@ -133,11 +135,11 @@ static void count(const struct md_exchange *exchange, const struct md_completion
 
 static void tap_bytes(const struct md_line *line, int side, int64_t time_ns, const uint8_t *bytes, size_t len)
 {
-    if (line->tap && md_line_is_under_way(line)) /* what came before was put there when it came */
+    if (line->tap && md_line_is_under_way(line)) /* earlier bytes were put there as they came */
         md_tap_put(line->tap, side, time_ns ? time_ns : line->completion->sent_ns, bytes, len);
 }
 
-/* What came since the request began to leave: the reply, or what came in its place, amid the rest. */
+/* Give the tap the bytes since the request left: the reply, or the bytes instead of one, and the rest. */
 static void tap_received(const struct md_line *line, struct md_ending ending)
 {
     const struct md_completion *completion = line->completion;
@@ -167,12 +169,12 @@ static void complete(struct md_line *line, struct md_ending ending)
 
 /* ---- the state machine ---- */
 
-static const int64_t WORTH_WAITING = 250000; /* ns; before a shorter time a sleep costs more than a look */
+static const int64_t WORTH_WAITING = 250000; /* ns; a shorter sleep costs more than reading the port */
 
 /* ---- the end of an exchange ---- */
 
-/* Return the silence around an exchange. A network needs none, but where replies have no ids it shows whether
- * more is to come, such as a second copy, which could otherwise be taken for the next reply. */
+/* Return the silence around an exchange. A network needs none, but without ids in replies a silence separates
+ * them: a second copy of one could be mistaken for the next reply. */
 static int64_t silence_of(const struct md_line *line, const struct md_exchange *exchange)
 {
     enum { CHARACTERS = 4 };
@@ -186,14 +188,14 @@ static void finish(struct md_line *line, struct md_ending ending)
     complete(line, ending);
     line->rx_len = line->rx_from = 0;
     line->quiet_ns = later(line->quiet_ns, completion->last_ns);
-    if (line->transactions && completion->last_ns) /* a network takes the next request at once */
+    if (line->transactions && completion->last_ns) /* a network needs no silence */
         line->quiet_ns = completion->last_ns;
-    if (completion->sent_ns) /* else the silence after what went before still holds */
+    if (completion->sent_ns) /* otherwise the previous exchange's silence still holds */
         line->silence_ns = silence_of(line, line->exchange);
     md_line_go(line, MD_ENDED);
 }
 
-/* End it with all that came. */
+/* End the exchange with all bytes received. */
 static void fail(struct md_line *line, int result)
 {
     finish(line, (struct md_ending){result, 0, line->rx_len});
@@ -204,7 +206,7 @@ void md_line_abandon(struct md_line *line, int result, int error)
     if (line->state == MD_IDLE)
         return;
     if (line->state >= MD_AWAITING && line->transactions != MD_MATCHED)
-        md_late_expect(line, md_window_ns(line->exchange)); /* the port may be back before it comes */
+        md_late_expect(line, md_window_ns(line->exchange)); /* it may come after a reopening */
     line->completion->error = error;
     fail(line, result);
 }
@@ -216,12 +218,12 @@ void md_line_init(struct md_line *line, int64_t now_ns)
     *line = (struct md_line){.state = MD_IDLE, .quiet_ns = now_ns, .transaction = (uint16_t)(now_ns >> 16)};
 }
 
-/* Find the request's bytes: an exchange keeps short ones. Return 0, or why there are none. */
+/* Set tx to the request's bytes: the exchange stores short ones. Return 0, or an enum md_frame_fault. */
 static int load(struct md_line *line, const struct md_exchange *exchange)
 {
     int is_tcp = exchange->framing == MD_TCP;
     if (is_tcp != (line->transactions != MD_NO_TRANSACTIONS))
-        return MD_BAD_REQUEST; /* it would be a frame of another meaning */
+        return MD_BAD_REQUEST; /* the port would read it as another frame */
     line->tx = exchange->frame;
     line->tx_len = exchange->frame_len;
     if (line->tx_len && !is_tcp)
@@ -239,7 +241,7 @@ static int load(struct md_line *line, const struct md_exchange *exchange)
 void md_line_begin(struct md_line *line, const struct md_exchange *exchange, struct md_completion *completion,
                    int64_t now_ns)
 {
-    memset(completion, 0, offsetof(struct md_completion, reply.data)); /* what follows counts by its length */
+    memset(completion, 0, offsetof(struct md_completion, reply.data)); /* the rest has lengths */
     completion->begun_ns = now_ns;
     completion->stale = line->rx_len;
     line->exchange = exchange;
@@ -250,7 +252,7 @@ void md_line_begin(struct md_line *line, const struct md_exchange *exchange, str
     md_line_go(line, MD_BEGUN);
     if (md_listen_is_held(line))
         line->give_up_ns = later(line->give_up_ns, line->listened_ns + exchange->drive->most_timeout_ns);
-    if (exchange->drive->owed_count) /* of another line, or from before the port was lost */
+    if (exchange->drive->owed_count) /* from another line, or from before a reopening */
         md_late_link(line, exchange->drive);
     int refused = md_late_bars(exchange, now_ns) ? MD_LATE_ANSWER_DUE : load(line, exchange);
     if (refused)
@@ -262,7 +264,7 @@ int64_t md_line_silent_ns(const struct md_line *line)
     return line->quiet_ns + line->silence_ns;
 }
 
-/* Return when the line is free for the exchange. */
+/* Return the time at which the exchange may leave. */
 static int64_t free_ns(const struct md_line *line)
 {
     int64_t silent_ns = md_line_silent_ns(line);
@@ -272,7 +274,7 @@ static int64_t free_ns(const struct md_line *line)
 int md_line_want(struct md_line *line, int64_t now_ns)
 {
     switch (line->state) {
-    case MD_SILENCE: /* a line that babbles is not waited for without end */
+    case MD_SILENCE: /* wait for a babbling line until give_up_ns only */
         line->wake_ns = sooner(free_ns(line), line->give_up_ns);
         if (now_ns < line->wake_ns)
             return md_listen_is_held(line) ? MD_READ : MD_WAIT;
@@ -289,7 +291,7 @@ int md_line_want(struct md_line *line, int64_t now_ns)
             now_ns + line->exchange->drive->most_timeout_ns + md_wire_ns(line->exchange, line->tx_len);
         return MD_WRITE;
     case MD_READY:
-    case MD_WRITING: /* a port that takes nothing is a broken port */
+    case MD_WRITING: /* a port that takes no bytes for so long is broken */
         if (now_ns < line->wake_ns)
             return MD_WRITE;
         md_line_abandon(line, MD_LINE_LOST, ETIMEDOUT);
@@ -304,7 +306,7 @@ int md_line_want(struct md_line *line, int64_t now_ns)
         if (line->looks++ && line->rx_len < line->tx_len)
             line->missing_ns = line->looked_ns;
         line->looked_ns = now_ns;
-        if (now_ns >= line->wake_ns) /* it may be late to look at all */
+        if (now_ns >= line->wake_ns) /* this call may itself be late: read once more */
             md_line_go(line, MD_TIME_OUT);
         else if (now_ns < line->copy_by_ns)
             line->wake_ns = sooner(line->wake_ns, line->copy_by_ns);
@@ -346,14 +348,14 @@ void md_line_sent(struct md_line *line, size_t len, int64_t begun_ns, int64_t no
     line->silence_ns = later(exchange->silence_ns, exchange->turnaround_ns);
 }
 
-/* ---- what comes ---- */
+/* ---- received bytes ---- */
 
-/* Make room: the older half goes. No reply can have begun there and not be whole by now. */
+/* Make room by discarding the older half. A reply that started there would be whole by now. */
 static void forget(struct md_line *line)
 {
     enum { GONE = sizeof line->rx / 2 };
     _Static_assert(sizeof line->rx / 2 >= MD_MOST_FRAME, "half of the room holds the longest frame");
-    if (md_line_is_under_way(line)) /* else there is no completion, or its owner has it back */
+    if (md_line_is_under_way(line)) /* otherwise there is no completion */
         tap_bytes(line, MD_NOISE, line->completion->first_ns, line->rx, GONE);
     line->sight = 0;
     line->rx_len = (uint16_t)(line->rx_len - GONE);
@@ -361,7 +363,7 @@ static void forget(struct md_line *line)
     memmove(line->rx, line->rx + GONE, line->rx_len);
 }
 
-/* Take in as much as there is room for, and return how much that is. */
+/* Store as many bytes as fit, and return how many. */
 static size_t keep(struct md_line *line, const uint8_t *bytes, size_t len)
 {
     if (line->rx_len == sizeof line->rx)
@@ -372,10 +374,10 @@ static size_t keep(struct md_line *line, const uint8_t *bytes, size_t len)
     return taken;
 }
 
-/* Stray bytes put off the next request, which must find the line silent. */
+/* Stray bytes delay the next request: it needs a silent line. */
 static void take_stray(struct md_line *line, const uint8_t *bytes, size_t len, int64_t now_ns)
 {
-    line->quiet_ns = later(line->quiet_ns, now_ns); /* the request before may still be leaving */
+    line->quiet_ns = later(line->quiet_ns, now_ns); /* the last request may still be leaving */
     if (line->listened_ns)
         md_listen_hear(line, len, now_ns);
     if (line->state != MD_IDLE)
@@ -389,7 +391,7 @@ static void take_stray(struct md_line *line, const uint8_t *bytes, size_t len, i
     md_reply_find_late(line, line->rx_from, now_ns);
 }
 
-/* Frames of Modbus TCP. What is not awaited puts nothing off where it is told by its id. */
+/* Take frames of Modbus TCP. With ids in replies, unexpected frames delay no request. */
 static void take_frames(struct md_line *line, const uint8_t *bytes, size_t len, int64_t now_ns)
 {
     struct md_ending ending;
@@ -410,9 +412,9 @@ static void take_frames(struct md_line *line, const uint8_t *bytes, size_t len, 
         if (md_tcp_find(line, now_ns, &ending))
             finish(line, ending);
     }
-    if (line->state < MD_AWAITING) /* behind what is out of step */
+    if (line->state < MD_AWAITING) /* after bytes that are not Modbus TCP */
         md_tap_put(line->tap, MD_NOISE, now_ns, bytes, len);
-    for (size_t at = 0; at < len && line->state >= MD_AWAITING;) /* it may tell what is spoken there */
+    for (size_t at = 0; at < len && line->state >= MD_AWAITING;) /* for the error message */
         at += keep(line, bytes + at, len - at);
     if (line->state != MD_IDLE && now_ns < line->give_up_ns)
         md_line_go(line, MD_BYTES_IN_TIME);
@@ -442,7 +444,7 @@ void md_line_received(struct md_line *line, const uint8_t *bytes, size_t len, in
         if (md_reply_find(line, now_ns, &ending))
             finish(line, ending);
     }
-    if (at < len) /* behind the reply, and there was no room for it beside what came before that */
+    if (at < len) /* bytes after the reply that did not fit */
         md_tap_put(line->tap, MD_NOISE, now_ns, bytes + at, len - at);
     if (line->state != MD_IDLE && now_ns < line->give_up_ns)
         md_line_go(line, MD_BYTES_IN_TIME);

@@ -1,8 +1,8 @@
-/* The time until which this process may send on its lines, and the kernel's timer that ends the process where
- * it stood still beyond that. Both are of CLOCK_BOOTTIME, which runs on while the machine sleeps.
+/* The deadline until which this process may send on its lines, and the kernel's timer that kills the process
+ * if it is still suspended after that. Both use CLOCK_BOOTTIME, which counts the machine's sleep.
  *
- * A look at the clock cannot be enough: the process may be stopped between the look and write(2). The timer
- * needs nothing of the process, and a stopped process can be killed. */
+ * Checking the clock is not enough: the process may be suspended between the check and write(2). The timer
+ * works without the process, and the kernel can kill a suspended process. */
 #include "engine.h"
 
 #include <errno.h>
@@ -13,7 +13,7 @@
 
 static int set_timer(struct md_mastership *mastership, int64_t at_ns)
 {
-    struct itimerspec once = {.it_value = timespec_of(at_ns)}; /* 0: called off */
+    struct itimerspec once = {.it_value = timespec_of(at_ns)}; /* 0: disarm it */
     return timer_settime(mastership->timer, TIMER_ABSTIME, &once, NULL);
 }
 
@@ -53,7 +53,7 @@ static int set_timer(struct md_mastership *mastership, int64_t at_ns)
 
 int64_t md_boottime_ns(void)
 {
-    return md_now_ns(); /* on macOS and Windows it runs on, too */
+    return md_now_ns(); /* on macOS and Windows it counts sleep, too */
 }
 
 struct md_mastership *md_mastership_new(int64_t guard_ns)
@@ -75,16 +75,16 @@ int64_t md_mastership_until_ns(const struct md_mastership *mastership)
     return __atomic_load_n(&mastership->until_ns, __ATOMIC_SEQ_CST);
 }
 
-/* The deadline is read before the clock: a process that stands still between the two finds a later time, and
- * never an earlier one. */
+/* Read the deadline before the clock: if the process is suspended between the two, the check only gets
+ * stricter. */
 int md_mastership_holds(const struct md_mastership *mastership)
 {
     int64_t until_ns = md_mastership_until_ns(mastership);
     return until_ns && md_boottime_ns() < until_ns;
 }
 
-/* The timer comes first: no request leaves by a deadline that nobody watches. Then the term, before the
- * deadline: none leaves by a new one before the line was listened to. */
+/* Set the timer first, so that it guards every deadline. Set the term before the deadline, so that no
+ * request leaves in a new term before the port has listened to the line. */
 int md_mastership_extend(struct md_mastership *mastership, int64_t until_ns, int64_t kill_ns)
 {
     if (set_timer(mastership, kill_ns))

@@ -1,12 +1,12 @@
-/* One port on the engine's thread: reading, writing and switching, until there is nothing to do but wait. */
+/* One port on the engine's thread: it reads, writes and switches settings until it must wait. */
 #define _GNU_SOURCE
 #include "engine.h"
 
 enum {
-    WORTH_BLINDNESS = 200000, /* ns; a shorter wait is not worth the system calls to look away */
-    HELD_UP_NS = 200000,      /* no write takes so long by itself */
-    MOST_SPINNING = 4,        /* ports; with more of them the processor has better to do */
-    NO_SLEEP_NS = 1000        /* to come back for so little costs more, however many ports there are */
+    WORTH_BLINDNESS = 200000, /* ns; a shorter wait is not worth the system calls to stop watching */
+    HELD_UP_NS = 200000,      /* a longer write means that the thread was suspended */
+    MOST_SPINNING = 4,        /* ports; with more of them the processor has other work */
+    NO_SLEEP_NS = 1000        /* a shorter sleep costs more than spinning */
 };
 static const int64_t RETRY_WRITE_NS = 1000000;
 
@@ -20,7 +20,7 @@ static void watch(struct md_port *port, int is_watched)
 
 static void lose(struct md_port *port, int error)
 {
-    md_waiter_remove(port->engine->waiter, port->fd); /* a port that hung up is ready for ever */
+    md_waiter_remove(port->engine->waiter, port->fd); /* a port that hung up is always ready */
     md_turn_lose(&port->turn, error);
 }
 
@@ -46,8 +46,8 @@ int64_t md_port_receive(struct md_port *port)
     return now_ns;
 }
 
-/* Look whether this process may still send; 0: the request goes no further now. This stands right before
- * write(2): nothing comes between but the switching of a transceiver that hangs on RTS. */
+/* Check that this process may still send; 0: the request must wait or has ended. Call it right before
+ * write(2); only the switching of a transceiver by RTS comes between. */
 static int may_send(struct md_port *port)
 {
     struct md_line *line = &port->turn.line;
@@ -63,7 +63,7 @@ static int may_send(struct md_port *port)
     return !md_listen_begin(line, md_now_ns(), port->mastership->guard_ns);
 }
 
-/* Look whether its time is over, by a clock that runs on while the machine sleeps. */
+/* Return 1 if the request's time is over, by a clock that counts the machine's sleep. */
 static int is_expired(const struct md_turn *turn)
 {
     if (turn->whose != MD_URGENT || turn->line.tx_at > 0)
@@ -71,9 +71,9 @@ static int is_expired(const struct md_turn *turn)
     return turn->urgent->expires_ns && md_boottime_ns() > turn->urgent->expires_ns;
 }
 
-/* Write; 1: the port took something, or there is something else to do. The request is taken to leave when the
- * write begins. Where the thread was held up meanwhile, it is taken to leave when the write ends: a time too
- * early would make the waits for its reply, and for a late one, too short. */
+/* Write; 1: the port took bytes, or there is other work. The send time is the start of the write. If the
+ * thread was suspended during it, the send time is its end: too early a time would make the waits for the
+ * reply, and for a late one, too short. */
 static int write_request(struct md_port *port, int64_t begun_ns)
 {
     struct md_line *line = &port->turn.line;
@@ -102,19 +102,19 @@ static int is_in_force(const struct md_port *port, const struct md_settings *wan
             settings->parity == wanted->parity && settings->stopbits == wanted->stopbits);
 }
 
-/* Switch baud rate and format; return what time it is then. */
+/* Switch baud rate and format; return the time afterwards. */
 static int64_t apply(struct md_port *port, const struct md_settings *settings)
 {
     struct md_progress *progress = &port->turn.progress;
     int64_t begun_ns = md_now_ns();
     int refused = md_port_set(port->fd, settings);
     int64_t now_ns = md_now_ns();
-    port->turn.line.wake_ns += now_ns - begun_ns; /* so long the port could take nothing */
+    port->turn.line.wake_ns += now_ns - begun_ns; /* the port took no bytes meanwhile */
     progress->switching_ns += now_ns - begun_ns;
     md_store(&progress->switches, progress->switches + 1);
     port->settings = *settings;
     if (refused < 0 || (refused & port->must_take))
-        port->settings = (struct md_settings){0}; /* some of them may be in force now */
+        port->settings = (struct md_settings){0}; /* some may be in force */
     if (refused < 0)
         lose(port, -refused);
     else if (refused & port->must_take)
@@ -122,16 +122,16 @@ static int64_t apply(struct md_port *port, const struct md_settings *settings)
     return now_ns;
 }
 
-/* The request is out, and its reply is awaited. */
+/* Return 1 if the request has left and the reply is due. */
 static int is_sent(const struct md_port *port)
 {
     return port->turn.whose != MD_NOBODYS && port->turn.line.completion->sent_ns;
 }
 
-/* A sleeping processor wakes late, and by much the same time again and again. So the sleep before a
- * request is shortened by what is usual, and the rest is spun away: with few lines some 20 us of each
- * exchange. That is not worth it for a client that waits, whose own share of an exchange is longer and may
- * be late by more. A look at a reply may be early, and is not spun for. */
+/* A sleeping processor wakes late, by much the same time each time. Therefore the sleep before a request
+ * ends early by that time, and the thread spins for the rest: with few lines some 20 us of each exchange.
+ * That is not worth it for a client that waits: its own delays are longer and vary more. Reads of a reply
+ * may be early, so the thread does not spin for them. */
 static int is_worth_spinning(const struct md_port *port)
 {
     return port->engine->count <= MOST_SPINNING && port->turn.whose != MD_URGENT;
@@ -142,19 +142,19 @@ static int spin_until(struct md_port *port, int64_t until_ns, int64_t *now_ns)
     int64_t most_ns = is_worth_spinning(port) ? MD_MOST_LATENESS : NO_SLEEP_NS;
     if (until_ns - *now_ns > most_ns || port->turn.progress.lost)
         return 0;
-    if (!port->is_empty) /* what came meanwhile is looked for now, not when the request must leave */
+    if (!port->is_empty) /* read now, not when the request must leave */
         *now_ns = md_port_receive(port);
     while (*now_ns < until_ns)
         *now_ns = md_now_ns();
     return 1;
 }
 
-/* Do what is wanted; 1: there may be more to do. */
+/* Carry out the wanted action; 1: ask for the next one. */
 static int act(struct md_port *port, int want, int64_t *wake_ns, int64_t *now_ns)
 {
     const struct md_exchange *exchange = port->turn.line.exchange;
     switch (want) {
-    case MD_WRITE: /* asked for again after a switch: a stop may have come meanwhile */
+    case MD_WRITE: /* after a switch ask again, because a stop may have come */
         if (!is_in_force(port, &exchange->settings)) {
             *now_ns = apply(port, &exchange->settings);
             return 1;
@@ -177,15 +177,15 @@ static int act(struct md_port *port, int want, int64_t *wake_ns, int64_t *now_ns
     }
 }
 
-/* A client that reads again and again comes back while the line is still silent. The thread wakes when that
- * is over, and the client need not wake it. */
+/* Return 1 if a client that reads repeatedly will be back before the line's silence is over. The thread wakes
+ * at its end, so the client need not wake it. */
 static int is_client_expected(const struct md_turn *turn, int64_t now_ns)
 {
     return turn->whose == MD_NOBODYS && turn->last == MD_URGENT &&
            md_line_silent_ns(&turn->line) - now_ns > MD_MOST_LATENESS;
 }
 
-/* Return when the transceiver's direction is to be looked at. */
+/* Return the next time to check the transceiver's direction. */
 static int64_t direction_ns(const struct md_port *port)
 {
     return port->rs485.is_sending ? port->rs485.look_ns : MD_NEVER;
@@ -199,7 +199,7 @@ int64_t md_port_advance(struct md_port *port, int64_t now_ns)
     int want, failure = md_rs485_look(port, now_ns);
     if (failure && !turn->progress.lost)
         lose(port, -failure);
-    if (port->is_closing) { /* it is there but to let its last request leave */
+    if (port->is_closing) { /* it only lets its last request leave */
         engine->wakes[port->index] = direction_ns(port);
         return now_ns;
     }

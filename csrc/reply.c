@@ -1,21 +1,22 @@
-/* The reply among the bytes that came since the request left: when to look, where it begins, what it tells.
+/* The reply among the bytes since the request: when to read the port, where the reply starts, what it shows.
  *
- * It may begin at any byte. Late replies stand in front of it, or in its place. frame.c and body.c check it
- * against its request. */
+ * It may start at any byte. Late replies may precede it or replace it. frame.c and body.c check it against
+ * its request. */
 #include "line.h"
 
 #include <string.h>
 
 /* ---- adapters that echo ---- */
 
-/* Adapters that repeat what they send. A reply that is no copy of its request tells whether the adapter
- * does, and so does a copy that is all that comes before a time-out. Until that is known, no copy is taken
- * for the reply. That a drive's reply echoes the written address and value is checked in body.c. */
+/* Some adapters repeat the bytes that they send. A reply that differs from its request shows whether the
+ * adapter does, and so does a copy without other bytes before a timeout. While that is unknown, no copy
+ * counts as the reply. body.c checks that a reply repeats the written address and value. */
 
-enum { MOST_LONE_COPIES = 2 }; /* taken for replies before an echo probe is sent again */
+enum { MOST_LONE_COPIES = 2 }; /* copies accepted as replies before the next echo probe */
 
-/* An adapter may begin to echo at any time. A write whose confirmation is a copy is read back; a read that
- * may be answered by a copy waits for the reply behind it, unless the copy came too late for an echo. */
+/* An adapter may start to echo at any time. The library reads back a write that a copy confirmed. If the
+ * reply to a read may equal its request, wait for the reply after the copy, unless the copy is too late
+ * for an echo. */
 int md_echo_is_due(const struct md_line *line, int reply_len)
 {
     const struct md_exchange *exchange = line->exchange;
@@ -29,6 +30,7 @@ int md_echo_is_copy(const struct md_line *line, size_t at)
     return at + line->tx_len <= line->rx_len && memcmp(line->rx + at, line->tx, line->tx_len) == 0;
 }
 
+/* Return 1 if all bytes from `at` on are the start of a copy. */
 static int may_become_copy(const struct md_line *line, size_t at)
 {
     size_t len = line->rx_len - at;
@@ -41,30 +43,30 @@ static void learn(struct md_line *line, int echo)
         line->echo = (uint8_t)echo;
 }
 
-/* Return when an echo of the request under way would be whole, on a line not known to echo; 0 if the drive's
- * delay is not known well enough. */
+/* Return the time by which an echo of the request in flight would be whole, on a line not known to echo; 0
+ * if the drive's delay is not known well enough. */
 static int64_t echo_whole_ns(const struct md_line *line)
 {
     int64_t due_ns = line->echo == MD_NO_ECHO ? md_reply_due_ns(line->exchange) : 0;
     return due_ns ? line->quiet_ns + due_ns : 0;
 }
 
-/* The copy was not whole when an echo would have been: it is the reply. */
+/* Return 1 if the copy is the reply, because it was incomplete when an echo would have been whole. */
 static int is_timely_copy(const struct md_line *line)
 {
     return line->copy_by_ns && line->missing_ns >= line->copy_by_ns;
 }
 
-/* A copy that goes before replies shows on this line, and so do two copies, unless there was no echo so far:
- * then the reply may have come twice. A few stray bytes are no echo, but what is left of one where there is
- * known to be one. */
+/* Learn from a reply. A copy before it shows an echo. Two copies do too, unless the adapter did not echo
+ * so far: then the reply may have come twice. A few stray bytes are not an echo, but may be the rest of a
+ * known one. */
 static void learn_echo(struct md_line *line, size_t reply_at)
 {
     int is_copy = md_echo_is_copy(line, reply_at);
     int shown = is_copy && line->echo == MD_NO_ECHO ? MD_ECHO_UNKNOWN : MD_ECHO;
     uint32_t most_stray = line->echo == MD_ECHO_UNKNOWN ? (line->tx_len - 1U) / 2 : 0;
     if (line->completion->skipped - line->cut <= most_stray && !is_copy)
-        learn(line, line->echo == MD_ECHO ? MD_ECHO_UNKNOWN : MD_NO_ECHO); /* one may have been lost */
+        learn(line, line->echo == MD_ECHO ? MD_ECHO_UNKNOWN : MD_NO_ECHO); /* an echo may have been lost */
     for (size_t at = 0; at + line->tx_len <= reply_at && !md_late_is_repeated(line->exchange); at++)
         if (md_echo_is_copy(line, at))
             learn(line, shown);
@@ -72,8 +74,10 @@ static void learn_echo(struct md_line *line, size_t reply_at)
         line->lone_copies = 0;
 }
 
-/* Only an adapter repeats the request and sends no more, or the drive itself where a copy is its reply. */
 enum copy { IS_ECHO, MAY_BE_REPLY, IS_REPLY };
+
+/* Classify a copy without other bytes: from the adapter, or from the drive if its reply may equal the
+ * request. */
 
 static enum copy learn_lone_copy(struct md_line *line, int may_be_reply)
 {
@@ -88,7 +92,7 @@ static enum copy learn_lone_copy(struct md_line *line, int may_be_reply)
     return IS_REPLY;
 }
 
-/* Where it was known not to echo, it may echo now, and the drive that seems to answer be dead. */
+/* An adapter that did not echo may have started to, and the drive that seems to answer may be dead. */
 int md_echo_is_in_doubt(const struct md_line *line)
 {
     return line->echo == MD_ECHO_UNKNOWN || line->lone_copies == MOST_LONE_COPIES;
@@ -112,7 +116,7 @@ void md_echo_keep(struct md_line *line)
 /* ---- replies ---- */
 
 enum { MOST_BURST = 16 }; /* characters that a UART gathers before it hands them over */
-static const int64_t OLDEST_IN_DOUBT = INT64_C(2000000000); /* of a row's value */
+static const int64_t OLDEST_IN_DOUBT = INT64_C(2000000000); /* ns; oldest such value in a row */
 
 int md_reply_parse(const struct md_line *line, size_t at, struct md_message *reply)
 {
@@ -121,7 +125,7 @@ int md_reply_parse(const struct md_line *line, size_t at, struct md_message *rep
     return used > 0 && !md_is_in_range(reply, exchange->least, exchange->end) ? MD_BAD_ECHO : used;
 }
 
-/* ---- when to look ---- */
+/* ---- when to read ---- */
 
 void md_reply_await(struct md_line *line, int reply_len)
 {
@@ -131,12 +135,12 @@ void md_reply_await(struct md_line *line, int reply_len)
     line->give_up_ns = line->quiet_ns + timeout_ns + reply_ns;
     line->ready_ns = 0;
     line->begun_by_ns = line->give_up_ns;
-    if (line->burst > 0 && drive->delay_ns) /* what comes at once is there when the port is ready */
+    if (line->burst > 0 && drive->delay_ns) /* else the adapter hands over whole replies */
         line->ready_ns = line->quiet_ns + md_look_ns(exchange) + reply_ns;
     if (line->burst > 0 && drive->failures == 0) {
         int64_t begun_ns = timeout_ns + (line->burst + 2) * exchange->character_ns;
         line->begun_by_ns = sooner(line->quiet_ns + begun_ns, line->begun_by_ns);
-        if (line->begun_by_ns + begun_ns < line->ready_ns) /* a look is cheaper than so long a wait in vain */
+        if (line->begun_by_ns + begun_ns < line->ready_ns) /* an early read costs less */
             line->ready_ns = line->begun_by_ns;
     }
     line->missing_ns = 0;
@@ -152,7 +156,7 @@ int md_reply_has_begun(const struct md_line *line)
     return line->rx_len > 0 && !(line->rx_len == line->tx_len && md_echo_is_copy(line, 0));
 }
 
-/* A reply that has begun comes character by character: it is not worth looking at each. */
+/* A reply comes character by character: do not read each. */
 void md_reply_foresee(struct md_line *line, int64_t now_ns)
 {
     const struct md_exchange *exchange = line->exchange;
@@ -180,7 +184,7 @@ void md_reply_extend(struct md_line *line)
 
 /* ---- a reply ---- */
 
-/* Tell the drive's response delay, and what the exchange needed of the line. */
+/* Record the drive's response delay and the line time of the exchange. */
 static void measure(struct md_line *line, int reply_len)
 {
     const struct md_exchange *exchange = line->exchange;
@@ -188,8 +192,8 @@ static void measure(struct md_line *line, int reply_len)
     struct md_drive *drive = exchange->drive;
     int64_t request_ns = md_wire_ns(exchange, line->tx_len), reply_ns = md_wire_ns(exchange, reply_len);
     int64_t left_ns = line->quiet_ns, begun_ns = completion->last_ns - reply_ns;
-    /* Characters that follow each other tell better when the first came than a late look at them, but not on
-     * a port that is quicker than its settings, such as a pseudo-terminal: there all may come at once. */
+    /* The time of the last character dates the first one better than a late read does. That fails on ports
+     * that are faster than their settings, such as pseudo-terminals, where all bytes may come at once. */
     line->is_quicker |= begun_ns < left_ns;
     if (!line->is_quicker)
         completion->first_ns =
@@ -197,13 +201,13 @@ static void measure(struct md_line *line, int reply_len)
     int is_whole = line->waited && line->looks == 1;
     int64_t delay_ns = md_learn_delay(exchange, later(begun_ns - left_ns, 0), is_whole);
     int64_t ideal_ns = line->silence_ns + request_ns + delay_ns + reply_ns;
-    /* A port that is faster than its settings, such as a network's, needs no more than it took. */
+    /* On a port that is faster than its settings, such as a network's, the time taken is the bound. */
     int64_t ended_ns = line->transactions ? completion->last_ns : later(completion->last_ns, left_ns);
     int64_t took_ns = line->silence_ns + ended_ns - completion->sent_ns;
     md_counters_answer(drive, delay_ns, sooner(ideal_ns, took_ns));
 }
 
-/* A reply of which little was seen first tells that the adapter does not keep it until it is whole. */
+/* If the first read found only part of the reply, the adapter hands over bursts, not whole replies. */
 static void learn_burst(struct md_line *line, size_t at, int reply_len)
 {
     if (line->sight_at == at && line->sight < reply_len && line->sight <= MOST_BURST &&
@@ -249,14 +253,13 @@ void md_reply_find_late(struct md_line *line, size_t from, int64_t now_ns)
         int used = md_late_take(line, at, now_ns, NULL);
         if (used > 0) {
             at += (size_t)used - 1;
-            line->rx_from = (uint16_t)(at + 1); /* else it would be counted again with what comes behind it */
+            line->rx_from = (uint16_t)(at + 1); /* count it once only */
         }
     }
 }
 
-/* It answers this request or an earlier one, and the other's reply may still come. A row may have it, with
- * a time that leaves that open. A value that was asked for by hand must be the present one: it is read
- * again. */
+/* The reply answers this request or an earlier one, and the other reply may still come. A row can hold it,
+ * with an uncertainty that covers both. A client that waits needs the present value: read it again. */
 static struct md_ending end_in_doubt(struct md_line *line, size_t at, int used,
                                      const struct md_message *reply, int64_t now_ns, int64_t since_ns)
 {
@@ -276,7 +279,7 @@ static struct md_ending end_in_doubt(struct md_line *line, size_t at, int used,
     return (struct md_ending){used, at, (size_t)used};
 }
 
-/* Whatever the first reply answers, it tells of the adapter. It is asked for again. */
+/* The first reply may answer another process: ask again. It still shows whether the adapter echoes. */
 static struct md_ending doubt_first(struct md_line *line, size_t at, int used, int64_t now_ns)
 {
     line->completion->skipped -= (uint32_t)used;
@@ -305,7 +308,7 @@ int md_reply_judge(struct md_line *line, size_t at, int used, const struct md_me
         *ending = (struct md_ending){used, at, (size_t)used};
         return 1;
     }
-    /* Whichever request it answers, it took that long. */
+/* The reply took this long, whichever request it answers. */
     md_learn_lateness(exchange->drive, now_ns - line->quiet_ns, 0);
     md_reply_extend(line);
     if (md_is_read(exchange->framing, exchange->request.function)) {
@@ -316,15 +319,15 @@ int md_reply_judge(struct md_line *line, size_t at, int used, const struct md_me
     return 0;
 }
 
-/* Find a read of another master in front of a reply to a read: then that reply is its, as far as anybody can
- * tell. Return where it begins; SIZE_MAX: there is none. */
+/* Find another master's read in front of a reply to a read: the reply probably answers that one. Return its
+ * index; SIZE_MAX: none. */
 static size_t find_foreign_read(const struct md_line *line, size_t reply_at)
 {
     const struct md_exchange *exchange = line->exchange;
     const struct md_message *own = &exchange->request;
     struct md_message request;
     if (exchange->framing == MD_DELIXI || !md_is_read(exchange->framing, own->function))
-        return SIZE_MAX; /* a reply of Delixi's looks like a request */
+        return SIZE_MAX; /* Delixi replies look like requests */
     for (size_t at = 0; at < reply_at; at++) {
         int used = md_parse_request(exchange->framing, line->rx + at, reply_at - at, &request);
         if (used > 0 && request.address == own->address && request.function == own->function &&
@@ -334,8 +337,8 @@ static size_t find_foreign_read(const struct md_line *line, size_t reply_at)
     return SIZE_MAX;
 }
 
-/* Look at every place where the reply may still begin. A late reply is looked for only where what precedes it
- * cannot be the reply's beginning: it may be the inside of the reply. */
+/* Try each byte as the start of the reply. Search for late replies only while no earlier byte may start the
+ * reply: later bytes may be inside it. */
 int md_reply_find(struct md_line *line, int64_t now_ns, struct md_ending *ending)
 {
     struct md_message reply;
@@ -345,7 +348,7 @@ int md_reply_find(struct md_line *line, int64_t now_ns, struct md_ending *ending
         if (used > 0 && line->echo_due && may_become_copy(line, at))
             used = MD_INCOMPLETE;
         if (used > 0 && line->echo_due && md_echo_is_copy(line, at) && !is_timely_copy(line)) {
-            line->echo_due = 0; /* the adapter's, or it cannot be told from that */
+            line->echo_due = 0; /* the adapter's echo, or indistinguishable from it */
             at += line->tx_len;
             first_open = SIZE_MAX;
             continue;
@@ -378,13 +381,13 @@ int md_reply_find(struct md_line *line, int64_t now_ns, struct md_ending *ending
 
 /* ---- no reply ---- */
 
-/* A damaged frame of the drive's own, at the beginning of what came, says that it has answered. Others'
- * frames, the echo and noise do not, and what looks like one further on may be the inside of another. */
+/* Return 1 if the bytes start with a damaged frame of the drive: then it has answered. Foreign frames,
+ * echo and noise do not count, and later bytes may be the inside of another frame. */
 static int is_damaged_answer(const struct md_line *line, size_t begin, int found)
 {
     if (begin == 0 && line->echo == MD_ECHO)
         return 0;
-    if (found == MD_BAD_CHARACTER) /* of which the framing looks at no address */
+    if (found == MD_BAD_CHARACTER) /* here the parser has not checked the address */
         return line->rx_len >= begin + 5 &&
                md_hex_byte(line->rx + begin + 1) == line->exchange->request.address &&
                md_hex_byte(line->rx + begin + 3) >= 0;
@@ -396,7 +399,7 @@ struct md_ending md_reply_missed(struct md_line *line, int64_t now_ns)
     const struct md_exchange *exchange = line->exchange;
     struct md_message reply;
     struct md_ending ending;
-    size_t begin = md_echo_is_copy(line, 0) ? line->tx_len : 0; /* the adapter's echo says nothing */
+    size_t begin = md_echo_is_copy(line, 0) ? line->tx_len : 0; /* skip the echo */
     int is_doubtful = 0;
     if (line->rx_len == 0)
         forget_lone_copies(line);
@@ -408,13 +411,13 @@ struct md_ending md_reply_missed(struct md_line *line, int64_t now_ns)
         is_doubtful = copy == MAY_BE_REPLY;
     }
     int first = begin == line->rx_len ? MD_NO_REPLY : md_reply_parse(line, begin, &reply);
-    /* With others outstanding it may be the answer to one of them. */
+    /* With other requests outstanding it may answer one of those. */
     if (exchange->drive->owed_count || !is_damaged_answer(line, begin, first))
         md_late_expect(line, md_window_ns(exchange));
     if (!is_doubtful)
         md_learn_silence(exchange->drive);
     int reason = md_reason(exchange->framing, &exchange->request, line->rx + begin, line->rx_len - begin);
-    if (first == MD_BAD_ECHO) /* a good frame, whose value is not as known: md_reason() knows no range */
+    if (first == MD_BAD_ECHO) /* a good frame with a value out of range, which md_reason() does not check */
         reason = first;
     return (struct md_ending){is_doubtful ? MD_MAYBE_ECHO : reason, 0, line->rx_len};
 }

@@ -1,7 +1,7 @@
 /* A queue of rows and calls from the engine's thread to a client.
  *
- * The thread never waits for a client: rows gather in chunks of bounded number. It holds the lock while it
- * adds one exchange's rows, and a client while it unhooks a chunk. */
+ * The thread never waits for a client: rows collect in a bounded number of chunks. The thread holds the
+ * lock while it adds one exchange's rows, a client while it removes a chunk. */
 #define _GNU_SOURCE
 #include "internal.h"
 
@@ -19,20 +19,20 @@ struct md_row_queue {
     size_t first, count;        /* of the chunks that hold rows */
     struct md_columns *spare[MOST_SPARE]; /* chunks that were given back */
     size_t spares;
-    size_t lent;                /* chunks that were taken and not given back, and ports that report to it */
+    size_t lent;                /* chunks in a client's hands, and ports that report to it */
     int is_done;                /* its client has freed it */
     uint64_t dropped;
     uint64_t called[WORDS];     /* a bit for each number */
     uint32_t calls;             /* bits that are set */
 };
 
-#if defined __APPLE__ || defined _WIN32 /* no condition there takes times of CLOCK_MONOTONIC */
+#if defined __APPLE__ || defined _WIN32 /* their conditions do not support CLOCK_MONOTONIC */
 #define RELATIVE_TIMES 1
 #else
 #define RELATIVE_TIMES 0
 #endif
 
-/* Make a condition with time-outs by CLOCK_MONOTONIC. */
+/* Initialise a condition with timeouts by CLOCK_MONOTONIC. */
 static void init_condition(pthread_cond_t *condition)
 {
 #if RELATIVE_TIMES
@@ -121,7 +121,7 @@ static struct md_columns *newest(struct md_row_queue *queue)
     return queue->count ? queue->chunks[(queue->first + queue->count - 1) % queue->most_chunks] : NULL;
 }
 
-/* Return a chunk without rows: a new one, or else the newest, whose rows are dropped. */
+/* Return an empty chunk: a new one, otherwise the newest one without its rows. */
 static struct md_columns *begin_chunk(struct md_row_queue *queue)
 {
     struct md_columns *chunk = NULL;
@@ -136,7 +136,7 @@ static struct md_columns *begin_chunk(struct md_row_queue *queue)
     return chunk;
 }
 
-/* Bring the places of the rows after the next ones into the caches: unlocking waits until all is written. */
+/* Prefetch the memory of the exchange's next rows, because unlocking waits for all writes. */
 static void look_ahead(const struct md_columns *chunk, size_t count)
 {
     enum { CACHE_LINE = 64, NUMBERS = CACHE_LINE / sizeof(int64_t) };

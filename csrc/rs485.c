@@ -1,14 +1,14 @@
-/* The direction of an RS-485 transceiver, where the port must see to it: by the driver's own RS-485 mode, or
- * by RTS, switched here round each request.
+/* The direction of an RS-485 transceiver that the port must switch: by the driver's RS-485 mode, or by RTS
+ * around each request.
  *
- * RTS may fall no sooner than the last stop bit has left, and before a drive answers, 3.5 characters later.
- * Nothing here waits: the thread looks when the last bit must have left. Then a UART that tells so has the
- * last word (TIOCSERGETLSR); where none does, nothing may be queued, and a character more is waited for. */
+ * RTS must fall after the last stop bit, and before a drive answers, 3.5 characters later. No function
+ * waits: the thread checks when the last bit must have left. If the UART reports its end (TIOCSERGETLSR),
+ * that decides. Otherwise the driver's queue must be empty, plus the time of one character. */
 #define _GNU_SOURCE
 #include "engine.h"
 
 static const int64_t LOOK_AGAIN_NS = 200000;
-static const int64_t MOST_HELD_NS = 100000000; /* behind its time: the port is broken, no request leaves */
+static const int64_t MOST_HELD_NS = 100000000; /* ns; after a longer delay the port counts as broken */
 
 static int is_by_rts(const struct md_rs485 *rs485)
 {
@@ -21,7 +21,7 @@ static int steer(struct md_port *port, int is_sending)
     return md_descriptor_set_rts(port->fd, is_sending == (port->rs485.mode == MD_RS485_RTS_UP));
 }
 
-/* Return 1 when the last bit has left; else say when to look again. */
+/* Return 1 if the last bit has left; otherwise set look_ns. */
 static int is_out(struct md_port *port, int64_t now_ns)
 {
     struct md_rs485 *rs485 = &port->rs485;
@@ -34,7 +34,7 @@ static int is_out(struct md_port *port, int64_t now_ns)
     }
     if (!rs485->empty_ns)
         rs485->empty_ns = now_ns;
-    rs485->look_ns = rs485->empty_ns + rs485->character_ns; /* the one in its shift register */
+    rs485->look_ns = rs485->empty_ns + rs485->character_ns; /* for the character in its shift register */
     return now_ns >= rs485->look_ns;
 }
 
@@ -47,7 +47,7 @@ int md_rs485_begin(struct md_port *port, int mode)
     else if (is_by_rts(&port->rs485)) {
         port->rs485.tells_end = md_descriptor_is_shifted_out(port->fd) >= 0;
         failure = steer(port, 0);
-        if (!failure && mode == MD_RS485_RTS_DOWN) /* else it would fall with the port, and send for ever */
+        if (!failure && mode == MD_RS485_RTS_DOWN) /* else the closed port sends forever */
             failure = md_port_keep_rts(port->fd);
     }
     if (failure)
@@ -68,7 +68,7 @@ ssize_t md_rs485_write(struct md_port *port, const uint8_t *bytes, size_t len)
     ssize_t written = md_descriptor_write(port->fd, bytes, len);
     int error = errno;
     if (written > 0) {
-        rs485->character_ns = port->turn.line.exchange->character_ns; /* its exchange may end before */
+        rs485->character_ns = port->turn.line.exchange->character_ns; /* it may end first */
         rs485->sent_ns = later(rs485->sent_ns, md_now_ns()) + written * rs485->character_ns;
         rs485->look_ns = rs485->sent_ns;
         rs485->empty_ns = 0;
@@ -91,7 +91,7 @@ int md_rs485_look(struct md_port *port, int64_t now_ns)
             return 0;
     }
     int failure = steer(port, 0);
-    if (port->is_closing) /* that waited for this */
+    if (port->is_closing) /* the closing waits for this */
         md_wakeup_ring(&port->engine->wakeup);
     return is_stuck ? -ETIMEDOUT : failure;
 }

@@ -1,20 +1,20 @@
-/* What is learnt of a drive from the delays of its replies: when to look for one, and how long to wait. */
+/* A drive's response delays: when to read the port, how long to wait; and its counters. */
 #include "internal.h"
 
-/* ---- when to look ---- */
+/* ---- when to read the port ---- */
 
-/* Err on the early side: an early look costs one wake-up, a late one delays the next request. A look that
- * was learnt to come just when replies are whole saved one sleep of three, and lost the line a 300th:
- * sleeps end late. */
+/* Prefer to read early: that costs one wake-up, and a late read delays the next request. A read timed to
+ * the exact end of replies saved one sleep of three, but lost 1/300 of the line's time, because sleeps end
+ * late. */
 static int64_t early_look_ns(const struct md_exchange *exchange)
 {
     const struct md_drive *drive = exchange->drive;
     return later(0, drive->delay_ns - drive->deviation_ns - exchange->character_ns / 2);
 }
 
-/* A client that waits for values is back late by more than a steady drive's delays vary, and each wake-up
- * costs it dearly: caches are cold. So of its looks but one in SURE may come when the reply must be whole.
- * From that one is learnt whether replies come sooner. */
+/* A client that waits for values comes back later than a steady drive's delays vary, and each wake-up
+ * costs it much: caches are cold. Therefore all but one in SURE of its reads come when the reply must be
+ * whole. The one early read shows whether replies have become faster. */
 enum { SURE = 8 };
 
 static int is_sure(const struct md_exchange *exchange)
@@ -31,7 +31,7 @@ int64_t md_look_ns(const struct md_exchange *exchange)
 
 /* ---- how long to wait ---- */
 
-/* The engine's thread learns these times, and others read them meanwhile. */
+/* The engine's thread writes these times; other threads read them at any time. */
 static int64_t learnt(const int64_t *ns)
 {
     return __atomic_load_n(ns, __ATOMIC_RELAXED);
@@ -42,7 +42,7 @@ static void learn(int64_t *ns, int64_t value)
     __atomic_store_n(ns, value, __ATOMIC_RELAXED);
 }
 
-/* As TCP's retransmission time-out (RFC 6298). */
+/* As TCP's retransmission timeout (RFC 6298). */
 static int64_t usual_timeout_ns(const struct md_drive *drive)
 {
     int64_t usual_ns = 3 * drive->least_timeout_ns, delay_ns = learnt(&drive->delay_ns);
@@ -52,10 +52,10 @@ static int64_t usual_timeout_ns(const struct md_drive *drive)
     return sooner(usual_ns, drive->most_timeout_ns);
 }
 
-/* After a failure a request has all the time that the document allows: the drive may have become slower.
- * While it stays silent that is rare, because the other drives lose that time. A stop must be repeated
- * sooner: its time doubles after each failure but the first, which is the identity check's; and where
- * replies are known to be late, it has as long as its sender bears. */
+/* After a failure a request gets the whole time that the document allows: the drive may have become
+ * slower. While it stays silent that is rare, because the other drives lose that time. A stop must be
+ * repeated sooner. Its time doubles after each failure except the first, which is the identity check's. If
+ * replies are known to be late, it may wait as long as its sender allows. */
 enum { RARELY = 16, MOST_DOUBLINGS = 8 };
 static const int64_t MOST_PATIENCE = INT64_C(20000000000);
 
@@ -71,7 +71,7 @@ int64_t md_timeout_ns(const struct md_exchange *exchange)
     return later(md_vain_ns(drive), later(learnt(&drive->patience_ns), exchange->timeout_ns));
 }
 
-/* A write waits longer than the drive's time-out: the window goes on for as long after either. */
+/* A write may wait longer than the drive's timeout; the window starts after that wait. */
 int64_t md_window_ns(const struct md_exchange *exchange)
 {
     const struct md_drive *drive = exchange->drive;
@@ -117,7 +117,7 @@ int64_t md_reply_due_ns(const struct md_exchange *exchange)
 
 /* ---- late replies ---- */
 
-/* No more than the usual time is no patience. */
+/* Set the longer timeout; 0 if it does not exceed the usual one. */
 static void be_patient(struct md_drive *drive, int64_t patience_ns)
 {
     learn(&drive->patience_ns, patience_ns > usual_timeout_ns(drive) ? patience_ns : 0);
@@ -131,7 +131,7 @@ int64_t md_learn_delay(const struct md_exchange *exchange, int64_t delay_ns, int
         delay_ns = sooner(delay_ns, drive->delay_ns);
     } else {
         drive->sure_looks = is_whole ? 0 : SURE - 1;
-        if (is_whole) /* it may have been so for long */
+        if (is_whole) /* an upper bound only */
             delay_ns = sooner(delay_ns, early_look_ns(exchange));
         smooth(drive, delay_ns);
     }
@@ -140,7 +140,7 @@ int64_t md_learn_delay(const struct md_exchange *exchange, int64_t delay_ns, int
     return delay_ns;
 }
 
-/* Half as long again: delays vary. Of a request that was sent several times nobody knows which is
+/* Add half, because delays vary. If the request was sent several times, it is unknown which one is
  * answered. */
 void md_learn_lateness(struct md_drive *drive, int64_t delay_ns, int is_exact)
 {
@@ -156,12 +156,10 @@ void md_learn_silence(struct md_drive *drive)
 
 /* ---- counters ---- */
 
-/* What became of a drive's exchanges, counted in memory that does not grow.
- *
- * Numbers only rise, so that a span of time is the difference of two looks. Response delays fall into
- * buckets, PARTS of them to each doubling. */
+/* Counters only grow, so the figures of a time span are the difference of two readings. Response delays are
+ * counted in buckets, PARTS to each doubling. */
 
-enum { FIRST_DOUBLING = 16, PARTS = 8, PART_BITS = 3 }; /* the second bucket begins near 2^16 ns */
+enum { FIRST_DOUBLING = 16, PARTS = 8, PART_BITS = 3 }; /* the second bucket starts near 2^16 ns */
 enum { NAK = 7, BUSY = 6 };                                /* Modbus exception codes */
 
 _Static_assert(MD_STATUSES == 1 - MD_POLLING_FAILED, "every status has a place");
@@ -189,7 +187,7 @@ void md_counters_end(const struct md_exchange *exchange, const struct md_complet
     struct md_counters *counters = &drive->counters;
     uint64_t values = exchange->block ? (uint64_t)exchange->block->count : 1;
     if (completion->result == MD_LATE_ANSWER_DUE && completion->sent_ns)
-        values = 0; /* they are read again */
+        values = 0; /* the client reads them again */
     uint8_t exception = completion->reply.exception;
     counters->exchanges++;
     counters->sent += completion->sent_ns != 0;

@@ -1,18 +1,18 @@
-/* A ring of all that goes over a line, taken as packets of a pcapng file.
+/* A ring of all bytes on a line, read as packets of a pcapng file.
  *
- * The line's thread writes, one other reads, and neither waits for the other: bytes without room are
- * counted. */
+ * The line's thread writes, one other thread reads, and neither waits for the other: bytes that do not fit
+ * are counted. */
 #include "internal.h"
 
 #include <string.h>
 
-/* Stands in the ring before the bytes. */
+/* The header of bytes in the ring. */
 struct mark {
-    int64_t time_ns; /* of CLOCK_MONOTONIC, or UTC where `side` says so */
+    int64_t time_ns; /* of CLOCK_MONOTONIC, or UTC with IS_UTC in `side` */
     uint32_t len, side;
 };
 
-enum { IS_UTC = 1 << 16 }; /* beside the side */
+enum { IS_UTC = 1 << 16 }; /* flag in `side` */
 
 static uint32_t get(const uint32_t *counter)
 {
@@ -24,7 +24,7 @@ static void set(uint32_t *counter, uint32_t value)
     __atomic_store_n(counter, value, __ATOMIC_RELEASE);
 }
 
-/* Find a place in the ring, and how much of `len` bytes lies before the ring's end. */
+/* Return the address of a ring position; set `first` to the bytes of `len` before the ring's end. */
 static uint8_t *place(const struct md_tap *tap, uint32_t at, size_t len, size_t *first)
 {
     uint32_t offset = at & (tap->room - 1);
@@ -71,7 +71,7 @@ static uint8_t *put32(uint8_t *at, uint32_t value)
     return at;
 }
 
-/* Write all of a packet but its bytes; return where those belong. */
+/* Write a packet without its bytes; return the address for them. */
 static uint8_t *wrap(const struct md_wrapping *wrapping, uint32_t interface, int64_t time_ns, uint32_t len,
                      uint8_t *out)
 {

@@ -1,12 +1,12 @@
-/* Frames of Modbus TCP (messaging guide V1.0b): a stream, and whose replies they are.
+/* Modbus TCP (messaging guide V1.0b): frames from a stream, and the matching of replies.
  *
- * A reply has its request's transaction id: one with another id is late, or was never asked for here, and is
- * skipped. So no late reply can pass for another's, whatever it holds. Where a gateway replies with ids of
- * its own, the rules of late.c hold instead.
+ * A reply repeats its request's transaction id. One with another id is late or foreign, and is skipped, so no
+ * late reply can be mistaken for another's. If a gateway replies with its own ids, the rules of late.c apply
+ * instead.
  *
- * A frame's length is in its header alone. If a device sends more or less than its header says, the head of
- * the awaited reply is found by its id, unit and function. Bytes that are no header, before any good reply,
- * mean that the far end speaks another protocol: the connection is lost. */
+ * Only the header gives a frame's length. If a device sends more or fewer bytes, the header of the awaited
+ * reply is found by its id, unit and function. If the first bytes on a port are not a header, the far end
+ * speaks another protocol: the connection is given up. */
 #include "line.h"
 
 #include <string.h>
@@ -26,7 +26,7 @@ static int is_ours(const struct md_line *line)
            (line->frame_len >= 2 && md_get16(line->frame) == line->transaction);
 }
 
-/* The awaited reply may begin there, as far as these bytes go and whatever length they announce. */
+/* Return 1 if these bytes may start the awaited reply, whatever length they announce. */
 static int may_be_awaited(const struct md_line *line, const uint8_t *bytes, size_t len)
 {
     if (line->state < MD_AWAITING)
@@ -42,8 +42,8 @@ static int may_be_awaited(const struct md_line *line, const uint8_t *bytes, size
     return 1;
 }
 
-/* Return the length of the frame that has begun, as md_tcp_length(). Of the awaited reply an exception has
- * its own, and a length that cannot be leaves no more than the head. */
+/* Return the length of the current frame, as md_tcp_length(). In the awaited reply an exception has a fixed
+ * length, and an impossible length counts as that of the header. */
 static int frame_length(const struct md_line *line)
 {
     int whole = md_tcp_length(line->frame, line->frame_len);
@@ -55,7 +55,7 @@ static int frame_length(const struct md_line *line)
     return line->frame_len < KNOWN_HEAD || whole < 0 ? KNOWN_HEAD : whole;
 }
 
-/* Report bytes that are no part of a frame. */
+/* Report bytes outside of frames. */
 static void skip(struct md_line *line, const uint8_t *bytes, size_t len, int64_t now_ns)
 {
     md_tap_put(line->tap, MD_NOISE, now_ns, bytes, len);
@@ -71,7 +71,7 @@ static void cut_off(struct md_line *line, size_t len)
     memmove(line->frame, line->frame + len, line->frame_len);
 }
 
-/* Leave the beginning of the awaited reply at most. */
+/* Drop all bytes except a start of the awaited reply. */
 static void realign(struct md_line *line, int64_t now_ns)
 {
     cut_off(line, line->frame_told);
@@ -82,7 +82,7 @@ static void realign(struct md_line *line, int64_t now_ns)
     }
 }
 
-/* Take in bytes up to the head of the awaited reply. */
+/* Take bytes up to the header of the awaited reply. */
 static size_t seek(struct md_line *line, const uint8_t *bytes, size_t len, int64_t now_ns)
 {
     size_t taken = 0;
@@ -98,7 +98,7 @@ static size_t seek(struct md_line *line, const uint8_t *bytes, size_t len, int64
     return taken;
 }
 
-/* Be done with a frame that is part of no exchange. */
+/* Drop a frame that belongs to no exchange. */
 static void drop(struct md_line *line, int64_t now_ns)
 {
     md_tap_put(line->tap, MD_NOISE, now_ns, line->frame + line->frame_told,
@@ -119,7 +119,7 @@ size_t md_tcp_put(struct md_line *line, const uint8_t *bytes, size_t len, int64_
 {
     size_t enough = line->transactions == MD_IGNORED ? KNOWN_HEAD : MD_TCP_HEAD;
     if (line->is_adrift && line->frame_told && len >= enough && may_be_awaited(line, bytes, len))
-        drop(line, now_ns); /* its rest never comes */
+        drop(line, now_ns); /* its rest is missing */
     if (line->is_adrift && !line->frame_told)
         return seek(line, bytes, len, now_ns);
     int whole = frame_length(line);
@@ -136,10 +136,10 @@ size_t md_tcp_put(struct md_line *line, const uint8_t *bytes, size_t len, int64_
     return taken;
 }
 
-/* Put what there is of a frame behind those that came before it, and report no byte of it twice. */
+/* Append the current frame to rx and return its index. Do not report a byte twice. */
 static size_t keep(struct md_line *line)
 {
-    if (line->rx_len + line->frame_len > MD_RX_ROOM) { /* frames that answer nothing, without end */
+    if (line->rx_len + line->frame_len > MD_RX_ROOM) { /* endless unrelated frames */
         md_tap_put(line->tap, MD_NOISE, line->completion->last_ns, line->rx, line->rx_len);
         line->rx_len = 0;
     }
@@ -151,7 +151,8 @@ static size_t keep(struct md_line *line)
 
 /* ---- late replies ---- */
 
-/* When there are too many, every other one goes: of the earliest and of the latest some remain. */
+/* Add the request to the drive's outstanding ones. When the list is full, drop every second one, to keep
+ * both old and new ones. */
 static void remember(struct md_line *line)
 {
     struct md_drive *drive = line->exchange->drive;
@@ -167,7 +168,7 @@ static void remember(struct md_line *line)
     md_late_link(line, drive);
 }
 
-/* The exchange under way is over, and its reply may still come. */
+/* Record that the ended exchange's reply may still come. */
 static void expect(struct md_line *line)
 {
     if (line->transactions == MD_IGNORED)
@@ -176,7 +177,7 @@ static void expect(struct md_line *line)
         remember(line);
 }
 
-/* This one and those before it are answered, or never will be. */
+/* Drop this request and all earlier ones: they are answered, or never will be. */
 static void forget_up_to(struct md_drive *drive, uint32_t last)
 {
     struct md_unanswered *unanswered = drive->history->unanswered;
@@ -195,7 +196,7 @@ static int is_reply_to(const struct md_line *line, const struct md_unanswered *u
            !md_is_gateways(MD_TCP, &reply);
 }
 
-/* Learn how late a drive is, where the frame is a reply of its. */
+/* Learn how late a drive is, if the frame is its late reply. */
 static void learn_late(struct md_line *line, int64_t now_ns)
 {
     for (struct md_drive **link = &line->late; *link;) {
@@ -216,9 +217,9 @@ static void learn_late(struct md_line *line, int64_t now_ns)
     }
 }
 
-/* ---- whose reply it is ---- */
+/* ---- matching ---- */
 
-/* It came while nothing is awaited. */
+/* Process a frame that came while no reply is due. */
 static void pass(struct md_line *line, int64_t now_ns)
 {
     if (line->state != MD_IDLE)
@@ -242,7 +243,7 @@ static int judge(struct md_line *line, size_t at, int64_t now_ns, struct md_endi
                           : used == MD_BAD_LENGTH || used == MD_NO_START;
     line->is_adrift |= (uint8_t)is_odd;
     line->is_proven |= used > 0;
-    if (used > 0 && md_is_gateways(MD_TCP, &reply)) { /* the drive said nothing, and may still say it */
+    if (used > 0 && md_is_gateways(MD_TCP, &reply)) { /* the drive may still answer */
         expect(line);
         *ending = (struct md_ending){MD_NO_REPLY, at, line->frame_len};
         return 1;
@@ -278,7 +279,7 @@ int md_tcp_find(struct md_line *line, int64_t now_ns, struct md_ending *ending)
         learn_late(line, now_ns);
         md_reply_extend(line);
         drop(line, now_ns);
-        if (line->rx_len == 0) /* the reply's first byte is still to come */
+        if (line->rx_len == 0) /* the reply's first byte has not come */
             line->completion->first_ns = 0;
     } else {
         pass(line, now_ns);

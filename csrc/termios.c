@@ -1,8 +1,7 @@
-/* Sets a port's speed and character format, then reads back which of them the driver took.
+/* Sets a port's speed and character format, then reads back the values that the driver took.
  *
- * tcsetattr() fails with EINVAL where nothing that it was asked for took effect: a pty could not be
- * opened again at even parity. Linux's ioctl does not fail then, and takes any speed; elsewhere the speed
- * is one of those that termios lists. */
+ * tcsetattr() fails with EINVAL if no requested change took effect: a pty could not be reopened at even
+ * parity. Linux's ioctl does not fail then, and takes any speed; other systems take the speeds in termios. */
 #include "internal.h"
 
 #include <errno.h>
@@ -79,7 +78,7 @@ static struct md_settings describe(const attributes *now)
     };
 }
 
-/* An adapter reports the speed that its divisor gives. A receiver bears 2 %, as the kernel has it. */
+/* Adapters report the speed that their divisor gives. Receivers tolerate 2 %, the kernel's limit too. */
 static int is_near(uint32_t baudrate, uint32_t wanted)
 {
     uint32_t off = baudrate > wanted ? baudrate - wanted : wanted - baudrate;
@@ -119,7 +118,7 @@ int md_port_set(int fd, const struct md_settings *settings)
     port.c_cflag |= settings->databits == 7 ? CS7 : CS8;
     port.c_cflag |= settings->stopbits == 2 ? CSTOPB : 0;
     port.c_cflag |= settings->parity == 'N' ? 0 : settings->parity == 'O' ? PARENB | PARODD : PARENB;
-    /* A character with a parity error is dropped: the frame is damaged, and must not look whole. */
+    /* Drop characters with a parity error: their frame is damaged, and must not look whole. */
     port.c_iflag |= settings->parity == 'N' ? 0 : INPCK | IGNPAR;
     port.c_cc[VMIN] = 1;
     port.c_cc[VTIME] = 0;

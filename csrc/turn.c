@@ -1,19 +1,19 @@
-/* Whose turn it is on a line. An urgent request goes ahead of all, then what is queued and due, and else what
- * is repeated. The last two keep a share of the line beside urgent requests without end, but for those that
- * insist.
+/* The order of exchanges on a line: first urgent requests, then queued ones that are due, then repeated ones.
+ * The last two keep a share of the line beside endless urgent requests, except beside stops.
  *
- * Its caller brings the time, carries the bytes, and guards it: only md_turn_submit() takes no lock. */
+ * The caller passes the time, moves the bytes, and holds the engine's lock; only md_turn_submit() needs
+ * none. */
 #include "line.h"
 
 /* ---- requests before an exchange ---- */
 
-/* The requests that go before an exchange where it needs them: proofs, by which no late reply is taken for
- * its own, and an echo probe. */
-
 enum { MOST_PROOFS_SENT = 12 }; /* before one exchange */
 
+/* Return a request to send before the exchange: a proof, so that no late reply is mistaken for its own, or an
+ * echo probe. NULL: send the exchange itself. */
+
 static const struct md_exchange *find_before(struct md_before *before, const struct md_exchange *exchange,
-                                         int is_echo_in_doubt, int64_t now_ns)
+                                             int is_echo_in_doubt, int64_t now_ns)
 {
     const struct md_drive *drive = exchange->drive;
     if (before->then != exchange)
@@ -31,9 +31,10 @@ static const struct md_exchange *find_before(struct md_before *before, const str
     return exchange->echo_probe;
 }
 
-/* A write is never sent again: it may have started a motor. */
+/* Return 1 to send the exchange again, because its reply may have been an earlier one's. Never repeat a
+ * write: it may have started a motor. */
 static int is_again(struct md_before *before, const struct md_exchange *exchange,
-                       const struct md_completion *completion)
+                    const struct md_completion *completion)
 {
     int is_in_doubt = completion->result == MD_LATE_ANSWER_DUE && completion->sent_ns;
     if (is_in_doubt && md_is_read(exchange->framing, exchange->request.function) &&
@@ -44,8 +45,6 @@ static int is_again(struct md_before *before, const struct md_exchange *exchange
 }
 
 /* ---- the queue ---- */
-
-/* The requests that clients put before a line: queued, repeated and urgent ones. */
 
 void md_turn_init(struct md_turn *turn, struct md_slot *slots, uint32_t room, int64_t now_ns)
 {
@@ -79,10 +78,10 @@ uint32_t md_turn_repeat(struct md_turn *turn, const struct md_exchange *const *e
 void md_turn_add_urgent(struct md_turn *turn, struct md_urgent *urgent)
 {
     struct md_urgent **at = &turn->urgent;
-    if (*at && turn->whose == MD_URGENT) /* it is under way */
+    if (*at && turn->whose == MD_URGENT) /* the first one is in flight */
         at = &(*at)->next;
     for (struct md_urgent **waiting = at; *waiting; waiting = &(*waiting)->next)
-        if (!urgent->exchange->insists || (*waiting)->exchange->insists) /* the first one goes first */
+        if (!urgent->exchange->insists || (*waiting)->exchange->insists) /* first come, first served */
             at = &(*waiting)->next;
     urgent->next = *at;
     *at = urgent;
@@ -91,7 +90,7 @@ void md_turn_add_urgent(struct md_turn *turn, struct md_urgent *urgent)
 void md_turn_tell_echo(struct md_turn *turn, int echo)
 {
     turn->line.echo = (uint8_t)echo;
-    turn->line.echo_is_told = echo == MD_ECHO; /* an echo that shows is believed: it confirms no write */
+    turn->line.echo_is_told = echo == MD_ECHO; /* MD_NO_ECHO may change: an echo must not confirm a write */
     md_store(&turn->progress.echo, (uint32_t)echo);
 }
 
@@ -102,8 +101,8 @@ int md_turn_end(struct md_turn *turn)
     return !is_waiting && turn->whose != MD_URGENT;
 }
 
-/* What an exchange needs of the line begins with the silence before it, and never before the line's last
- * activity (measure() in reply.c). */
+/* The line time of an exchange starts with the silence before it, never before the line's last activity (see
+ * measure() in reply.c). */
 int64_t md_turn_counted_ns(const struct md_turn *turn, int64_t now_ns)
 {
     const struct md_line *line = &turn->line;
@@ -137,8 +136,8 @@ void md_count_stop(uint32_t *stops)
 /* ---- turns ---- */
 
 enum {
-    POLLED = 20,            /* one part in so many of a line that urgent requests keep busy */
-    MOST_OWED_NS = 50000000 /* of that, where there was nothing to poll */
+    POLLED = 20,            /* polling gets 1/20 of a line that urgent requests keep busy */
+    MOST_OWED_NS = 50000000 /* bound of that debt, if no poll was due for a while */
 };
 
 static uint32_t pending(const struct md_turn *turn)
@@ -152,7 +151,7 @@ static void call(struct md_turn *turn)
         md_row_queue_call(turn->row_queue, turn->number);
 }
 
-/* Return 1 when the time has come; else say when it comes. */
+/* Return 1 if the time has come; otherwise set wake_ns to it. */
 static int is_time(int64_t from_ns, int64_t *wake_ns, int64_t now_ns)
 {
     if (now_ns >= from_ns)
@@ -161,15 +160,15 @@ static int is_time(int64_t from_ns, int64_t *wake_ns, int64_t now_ns)
     return 0;
 }
 
-/* ---- the beginning of an exchange ---- */
+/* ---- the start of an exchange ---- */
 
-/* Return when its drive may be asked. A broadcast waits for none. */
+/* Return the time from which its drive may be asked. A broadcast waits for no drive. */
 static int64_t ready_ns(const struct md_exchange *exchange)
 {
     return exchange->request.address ? exchange->drive->ready_ns : 0;
 }
 
-/* Begin the exchange, or what must go before it: then return 0. */
+/* Start the exchange and return 1, or start a request that must precede it and return 0. */
 static int begin(struct md_turn *turn, int whose, const struct md_exchange *exchange,
                  struct md_completion *completion, int64_t now_ns)
 {
@@ -184,7 +183,7 @@ static int begin(struct md_turn *turn, int whose, const struct md_exchange *exch
 
 /* ---- urgent requests ---- */
 
-/* A stop was called after what is under way, of which nothing has left. */
+/* Return 1 if a stop came after the urgent request in flight, of which no byte has left. */
 static int is_overtaken(const struct md_turn *turn)
 {
     if (turn->whose != MD_URGENT || turn->line.tx_at > 0)
@@ -193,8 +192,8 @@ static int is_overtaken(const struct md_turn *turn)
     return exchange->stops && md_load(exchange->stops) != exchange->stops_seen;
 }
 
-/* Put the first one that may be sent now before the others, and return it; else say when one may be. While a
- * stop waits for its drive only other stops go on: else it would wait for their exchanges, too. */
+/* Move the first request that may be sent now to the front and return it; otherwise set wake_ns. While a stop
+ * waits for its drive, only other stops are sent: it must not wait for further exchanges. */
 static struct md_urgent *find_urgent(struct md_turn *turn, int *is_held, int64_t *wake_ns, int64_t now_ns)
 {
     for (struct md_urgent **at = &turn->urgent; *at; at = &(*at)->next) {
@@ -212,9 +211,9 @@ static struct md_urgent *find_urgent(struct md_turn *turn, int *is_held, int64_t
     return NULL;
 }
 
-/* ---- what is polled ---- */
+/* ---- polling ---- */
 
-/* The line is so late that the same exchange's next slot is due already: then this one is left out. */
+/* Return 1 if the same exchange's next slot is already due: then skip this one. */
 static int is_over(const struct md_turn *turn, const struct md_slot *slot, int64_t now_ns)
 {
     int64_t period_ns = slot->exchange->period_ns;
@@ -229,7 +228,7 @@ static int is_over(const struct md_turn *turn, const struct md_slot *slot, int64
     return 0;
 }
 
-/* Begin what is queued, or say when; 1: there is something to carry out now. */
+/* Start a queued exchange and return 1, or set wake_ns to its time. */
 static int take_queued(struct md_turn *turn, int64_t *wake_ns, int64_t now_ns)
 {
     const struct md_slot *slot = &turn->slots[turn->progress.done & (turn->room - 1)];
@@ -242,7 +241,7 @@ static int take_queued(struct md_turn *turn, int64_t *wake_ns, int64_t now_ns)
 
 static int take_polled(struct md_turn *turn, int64_t *wake_ns, int64_t now_ns)
 {
-    if (turn->is_ending || turn->progress.lost) /* the client sends the queue elsewhere */
+    if (turn->is_ending || turn->progress.lost) /* then the client moves its queue */
         return 0;
     if (pending(turn) && take_queued(turn, wake_ns, now_ns))
         return 1;
@@ -262,7 +261,7 @@ static void stop_repeating(struct md_turn *turn)
 
 /* ---- turns ---- */
 
-/* Count what an exchange took of the line. */
+/* Count the line time of an exchange. */
 static void settle(struct md_turn *turn, int64_t took_ns)
 {
     if (turn->whose == MD_URGENT)
@@ -272,7 +271,7 @@ static void settle(struct md_turn *turn, int64_t took_ns)
     turn->owed_ns = sooner(turn->owed_ns, MOST_OWED_NS);
 }
 
-/* Give its drive a rest after an exchange that was sent. */
+/* Start the drive's interval after an exchange that was sent. */
 static void rest(const struct md_exchange *exchange, const struct md_completion *completion, int64_t now_ns)
 {
     if (exchange->drive->interval_ns && completion->sent_ns)
@@ -287,13 +286,14 @@ static int is_stop_waiting(const struct md_turn *turn)
     return 0;
 }
 
-/* One exchange of what is polled may hold up urgent requests: never two in a row, and never a stop. */
+/* Return 1 if one polled exchange goes ahead of urgent requests: never two in a row, and never before a
+ * stop. */
 static int is_polls_turn(const struct md_turn *turn)
 {
     return !is_stop_waiting(turn) && turn->owed_ns > 0 && turn->last == MD_URGENT;
 }
 
-/* Begin what comes next, or say when; 1: there is something to carry out now. */
+/* Start the next exchange and return 1, or set wake_ns to its time. */
 static int take(struct md_turn *turn, int64_t *wake_ns, int64_t now_ns)
 {
     int is_held = 0;
@@ -308,13 +308,13 @@ static int take(struct md_turn *turn, int64_t *wake_ns, int64_t now_ns)
     }
     if (!turn->is_ending && !pending(turn)) {
         md_store(&turn->is_idle, 1);
-        if (pending(turn)) /* it came just now */
+        if (pending(turn)) /* queued since the check above */
             *wake_ns = now_ns;
     }
     return 0;
 }
 
-/* Hand over the result of an exchange that nobody waits for. */
+/* Hand over the result of a polled exchange. */
 static void report(struct md_turn *turn)
 {
     const struct md_exchange *exchange = turn->line.exchange;
@@ -326,14 +326,14 @@ static void report(struct md_turn *turn)
         call(turn);
 }
 
-/* Go back to the repeated exchange that was begun last: it is the next one again. */
+/* Make the last repeated exchange the next one again. */
 static void step_back(struct md_turn *turn)
 {
     if (turn->round_len)
         turn->round_at = (turn->round_at ? turn->round_at : turn->round_len) - 1;
 }
 
-/* The exchange under way is over. */
+/* Record the end of the exchange in flight. */
 static void finish(struct md_turn *turn)
 {
     int whose = turn->whose;
@@ -363,11 +363,11 @@ static void finish(struct md_turn *turn)
         if (left == turn->room / 4 || left == 0)
             call(turn);
     } else if (turn->completion.result < 0 && !turn->completion.sent_ns) {
-        stop_repeating(turn); /* it would be tried again at once */
+        stop_repeating(turn); /* otherwise it would fail again and again */
     }
 }
 
-/* A stop does not wait for an exchange that so far only listens: that one has its turn again later. */
+/* Put back an exchange that only listens so far, because a stop must not wait for it. */
 static void give_way(struct md_turn *turn)
 {
     int whose = turn->whose;
@@ -419,8 +419,8 @@ void md_turn_lose(struct md_turn *turn, int error)
     stop_repeating(turn);
 }
 
-/* A client that waits learns whether its request had begun to leave. An exchange that is over and counted has
- * its rows. */
+/* Waiting clients get a completion that shows whether their request left. An ended poll still gets its
+ * rows. */
 void md_turn_close(struct md_turn *turn)
 {
     int is_told = turn->whose == MD_URGENT || turn->is_ending || turn->line.state == MD_IDLE;

@@ -22,7 +22,7 @@ struct md_waiter {
 };
 
 /* Calls epoll_pwait2() by its number, because musl and glibc before 2.35 have no function for it. Its two
- * times are 64 bits wide, also where time_t is not. */
+ * times are 64 bits wide on all systems. */
 static int wait_at_once(int epoll, struct epoll_event *events, int most, int64_t timeout_ns)
 {
     const int64_t span[] = {timeout_ns / MD_SECOND_NS, timeout_ns % MD_SECOND_NS};

@@ -9,7 +9,7 @@
 #include <stdlib.h>
 
 struct md_waiter {
-    struct pollfd *fds; /* one that is not watched is kept as its complement, which poll() ignores */
+    struct pollfd *fds; /* unwatched ones are stored as their complement, which poll() ignores */
     void **whose;
     int count, room;
 };

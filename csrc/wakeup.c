@@ -1,4 +1,4 @@
-/* A pipe by which any thread wakes the one that waits. */
+/* A pipe by which any thread wakes the waiting one. */
 #include "internal.h"
 
 #include <fcntl.h>

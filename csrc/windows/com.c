@@ -72,8 +72,6 @@ const struct md_file_kind md_port_kind = {read_port, port_has_bytes, begin_port,
 
 /* ---- speed and character format ---- */
 
-/* Sets a COM port's speed and character format, and finds out which of them its driver refuses. */
-
 static int get(int fd, DCB *now)
 {
     *now = (DCB){.DCBlength = sizeof *now};
@@ -94,14 +92,14 @@ int md_port_get(int fd, struct md_settings *settings)
     return failure;
 }
 
-/* RTS and DTR fall when a port is closed, and nothing keeps them up. */
+/* RTS and DTR fall when a port is closed; Windows cannot keep them up. */
 int md_port_keep_rts(int fd)
 {
     (void)fd;
     return -EOPNOTSUPP;
 }
 
-/* ---- one setting after another, to find out which of them is refused ---- */
+/* ---- one setting after another, to find the refused ones ---- */
 
 static void set_baudrate(DCB *port, const struct md_settings *settings)
 {
@@ -193,7 +191,7 @@ int md_descriptor_set_rts(int fd, int is_up)
 int md_descriptor_is_shifted_out(int fd)
 {
     (void)fd;
-    return -ENOTTY; /* no call tells */
+    return -ENOTTY; /* Windows has no such call */
 }
 
 int md_descriptor_is_queued(int fd)

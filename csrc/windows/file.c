@@ -1,8 +1,8 @@
-/* Reads and writes COM ports and sockets, all of them on the engine's thread.
+/* Reads and writes COM ports and sockets on the engine's thread.
  *
- * While a file is watched, one byte of it is being read, overlapped: the read's completion routine runs while
- * the thread waits, and so the waiter learns that bytes have come. The rest is read at once, as much as there
- * is. Time-outs of a COM port would not do instead: they are whole milliseconds. */
+ * A watched file has an overlapped read of one byte in progress. Its completion routine runs while the
+ * thread waits, and so the waiter learns that bytes have come; the other bytes are then read at once.
+ * Timeouts of COM ports are no substitute: they are whole milliseconds. */
 #include "file.h"
 #include "../engine.h"
 
@@ -12,9 +12,7 @@
 
 /* ---- errors ---- */
 
-/* Windows' errors in the words of POSIX, which the rest of the core and Python speak. */
-
-static const struct {
+/* Windows errors as the errno of POSIX, which the core and Python use. */static const struct {
     DWORD error;
     int number;
 } known[] = {
@@ -27,7 +25,7 @@ static const struct {
     {WSAETIMEDOUT, ETIMEDOUT},
     {WSAENOTCONN, ENOTCONN},
     {WSAESHUTDOWN, EPIPE},
-    {ERROR_NETNAME_DELETED, ECONNRESET}, /* overlapped reads say it so */
+    {ERROR_NETNAME_DELETED, ECONNRESET}, /* from overlapped reads */
     {ERROR_CONNECTION_ABORTED, ECONNABORTED},
     {ERROR_SEM_TIMEOUT, ETIMEDOUT},
     {ERROR_INVALID_HANDLE, EBADF},
@@ -35,7 +33,7 @@ static const struct {
     {ERROR_INVALID_PARAMETER, EINVAL},
     {ERROR_INVALID_FUNCTION, ENOTTY},
     {ERROR_NOT_SUPPORTED, EOPNOTSUPP},
-    /* an adapter that was unplugged; which of them comes is the driver's choice */
+    /* an unplugged adapter, depending on the driver */
     {ERROR_ACCESS_DENIED, ENODEV},
     {ERROR_BAD_COMMAND, ENODEV},
     {ERROR_DEVICE_NOT_CONNECTED, ENODEV},
@@ -70,7 +68,7 @@ static struct md_file *find(int fd)
     return at < room_for ? files[at] : NULL;
 }
 
-/* ---- what completes while the thread waits ---- */
+/* ---- completions while the thread waits ---- */
 
 static void tell(struct md_file *file)
 {
@@ -100,7 +98,7 @@ void md_file_has_written(struct md_file *file, DWORD error)
     tell(file);
 }
 
-/* Begin to read the file's byte, unless it has come or is on its way. */
+/* Start to read the file's byte, unless it has come or a read is in progress. */
 static void begin(struct md_file *file)
 {
     if (file->is_reading || file->is_held || file->is_ended || file->error)
@@ -130,7 +128,7 @@ ssize_t md_descriptor_read(int fd, void *bytes, size_t room)
     if (!file)
         return md_fail(ERROR_INVALID_HANDLE);
     complete(file);
-    if (file->is_reading) /* nothing has come since */
+    if (file->is_reading) /* no byte has come since */
         return md_fail(WSAEWOULDBLOCK);
     size_t held = 0;
     if (file->is_held) {
@@ -145,7 +143,7 @@ ssize_t md_descriptor_read(int fd, void *bytes, size_t room)
     }
     ssize_t got = file->kind->read(file, (uint8_t *)bytes + held, room - held);
     int error = errno;
-    if (file->is_watched) /* an end or a failure that came just now is found again by this */
+    if (file->is_watched) /* this finds an end or a failure of just now again */
         begin(file);
     errno = error;
     return got > 0 ? got + (ssize_t)held : held ? 1 : got;

@@ -28,9 +28,9 @@ struct md_file {
 
 /* The calls in which COM ports and sockets differ; the first and the last return -1 and set errno. */
 struct md_file_kind {
-    ssize_t (*read)(struct md_file *file, void *bytes, size_t room); /* what is there */
+    ssize_t (*read)(struct md_file *file, void *bytes, size_t room); /* the available bytes */
     int (*has_bytes)(struct md_file *file);
-    DWORD (*begin)(struct md_file *file); /* begin to read `byte`; return an error, or 0 */
+    DWORD (*begin)(struct md_file *file); /* start to read `byte`; return an error, or 0 */
     ssize_t (*write)(struct md_file *file, const void *bytes, size_t len);
 };
 
@@ -38,7 +38,7 @@ struct md_file_kind {
 
 extern const struct md_file_kind md_port_kind, md_socket_kind;
 
-int md_port_prepare(HANDLE handle); /* so that its reads and writes have no time-outs; 0 where that fails */
+int md_port_prepare(HANDLE handle); /* remove the timeouts of its reads and writes; 0 on failure */
 
 /* ---- file.c ---- */
 
@@ -61,7 +61,7 @@ static inline ssize_t md_fail(DWORD error) /* -1, and errno */
     return -1;
 }
 
-/* Run the completion routines of what is complete. */
+/* Run the routines of completed reads and writes. */
 static inline void md_run_completed(void)
 {
     SleepEx(0, TRUE);

@@ -69,7 +69,7 @@ int md_waiter_wait(struct md_waiter *waiter, void **ready, int room, int64_t tim
     do {
         ended = WaitForMultipleObjectsEx(count, waiter->objects, FALSE, most, TRUE);
         n += md_files_ready(ready + n, room - 1 - n);
-    } while (ended == WAIT_IO_COMPLETION && !n && most); /* what completed was a write */
+    } while (ended == WAIT_IO_COMPLETION && !n && most); /* a write completed */
     if (ended == WAIT_OBJECT_0 + WAKEUP)
         ready[n++] = NULL;
     return n;
@@ -98,7 +98,7 @@ void md_wakeup_ring(struct md_wakeup *wakeup)
         SetEvent(handle_of(wakeup->fd));
 }
 
-/* A ring before this announces what the thread is about to look at; one after it ends the next wait. */
+/* The thread is about to handle an earlier ring; a later one ends its next wait. */
 void md_wakeup_silence(struct md_wakeup *wakeup)
 {
     atomic_store(&wakeup->is_rung, 0);
