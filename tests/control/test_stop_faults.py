@@ -62,7 +62,7 @@ FIRST_OPCODES = 6
 
 
 OURS = (
-    *(f"{HOME}/{file}" for file in ("bus.py", "core/latch.py", "drive/verbs.py")),
+    *(f"{HOME}/{file}" for file in ("bus.py", "core/permissions.py", "drive/verbs.py")),
     *(f"{HOME}/{room}/" for room in ("control", "drives")),
 )
 

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from multidrop.core.narrow import CodeTable, find_codes, greatest_code, narrow_up, wide_codes, widen
+from multidrop.core.columns import CodeTable, find_codes, greatest_code, narrow_up, wide_codes, widen
 
 EDGES = [0, 1, -1, 2**24, 2**24 + 1, 2**53 + 1, 2**63 - 1, -(2**63), -(2**63) + 1, 2**63 - 2**38]
 

@@ -201,7 +201,7 @@ def _imported(path: Path) -> set[str]:
 
 def test_drive_and_planning_are_pure() -> None:
     """They know no time but what they are given, and no port."""
-    ports = {"multidrop.core.port", "multidrop.core.row_queue", "multidrop.core.sniffer"}
+    ports = {"multidrop.core.port", "multidrop.core.capture"}
     outside = OUTSIDE | ports | {"datetime", "random", "threading", "pathlib", "asyncio"}
     pure = [path for path in FILES if room(path) in ("drive", "planning")]
     assert offenders({str(path.relative_to(PACKAGE)): _imported(path) & outside for path in pure}) == {}

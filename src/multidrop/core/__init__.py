@@ -2,6 +2,20 @@
 
 from __future__ import annotations
 
+from multidrop.core.capture import (
+    STREAM_ROOM,
+    Decoded,
+    Decoder,
+    FrameSpan,
+    Kind,
+    Side,
+    Splitter,
+    Stream,
+    Tap,
+    Unpacked,
+    Unpacker,
+    Wrappings,
+)
 from multidrop.core.columns import (
     COLUMNS,
     LOW_BYTE_FIRST,
@@ -16,9 +30,7 @@ from multidrop.core.columns import (
     raw_value,
     spell,
 )
-from multidrop.core.completion import Completion
-from multidrop.core.counters import DELAY_BUCKETS, Counters, delay_edge
-from multidrop.core.exchange import PAUSE_NS, Exchange, Peer
+from multidrop.core.exchange import DELAY_BUCKETS, PAUSE_NS, Completion, Counters, Exchange, Peer, delay_edge
 from multidrop.core.frame import (
     MODBUS,
     Framing,
@@ -34,12 +46,12 @@ from multidrop.core.frame import (
     reply_length,
     sum8,
 )
-from multidrop.core.latch import Latch, Permit
-from multidrop.core.mastership import Mastership, boottime_ns
+from multidrop.core.permissions import Latch, Mastership, Permit, boottime_ns
 from multidrop.core.port import (
     RS485,
     Echo,
     Port,
+    RowQueue,
     TransactionIds,
     Transactions,
     now_ns,
@@ -55,20 +67,6 @@ from multidrop.core.port_settings import (
     set_settings,
 )
 from multidrop.core.result import EXCEPTION_STATUS, STATUSES, UNASKED, Failure, FrameFault, Status
-from multidrop.core.row_queue import RowQueue
-from multidrop.core.sniffer import (
-    STREAM_ROOM,
-    Decoded,
-    Decoder,
-    FrameSpan,
-    Kind,
-    Side,
-    Splitter,
-    Stream,
-    Unpacked,
-    Unpacker,
-)
-from multidrop.core.tap import Tap, Wrappings
 
 __all__ = [
     "COLUMNS",

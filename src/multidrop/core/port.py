@@ -1,4 +1,4 @@
-"""Ports: lines that the core's own thread drives on descriptors."""
+"""Ports: lines that the core's thread drives, and the queue of their rows."""
 
 from __future__ import annotations
 
@@ -11,12 +11,67 @@ from typing import Any
 from weakref import finalize
 
 from multidrop._core import ffi, lib
-from multidrop.core.completion import Completion
-from multidrop.core.exchange import Exchange, Peer
-from multidrop.core.fork import register_at_fork
-from multidrop.core.mastership import Mastership
-from multidrop.core.row_queue import RowQueue
-from multidrop.core.tap import Tap
+from multidrop.core.capture import Tap
+from multidrop.core.columns import Columns, RowLayout
+from multidrop.core.exchange import Completion, Exchange, Peer
+from multidrop.core.fork import only_here, register_at_fork
+from multidrop.core.permissions import Mastership
+from multidrop.core.result import Status
+
+CHUNK_ROWS = 1 << 12
+MOST_CHUNKS = 256  # waiting to be taken; further rows are dropped, and counted
+
+
+class RowQueue:
+    """Rows that nobody has taken yet, and the numbers of ports that need attention (struct md_row_queue)."""
+
+    _MOST_AT_ONCE = 1024
+
+    def __init__(self, chunk_rows: int = CHUNK_ROWS, most_chunks: int = MOST_CHUNKS) -> None:
+        self._room = (chunk_rows, most_chunks)
+        self._called = ffi.new("uint32_t[]", self._MOST_AT_ONCE)
+        self._begin()
+        register_at_fork(self)
+
+    def _begin(self) -> None:
+        made = lib.md_row_queue_new(*self._room)
+        if made == ffi.NULL:
+            raise OSError(ffi.errno, "no room for what the core leaves")
+        self.c = ffi.gc(made, only_here(lib.md_row_queue_free))
+        self._give_back = only_here(partial(lib.md_row_queue_give_back, self.c))
+
+    def forked(self) -> None:
+        """Be empty, in the child: the rows that wait are the parent's to take."""
+        self._begin()
+
+    def take(self) -> Columns | None:
+        """Return the oldest rows that wait; None when there are none."""
+        made = lib.md_row_queue_take(self.c)
+        return None if made == ffi.NULL else Columns.lent(made, self._give_back)
+
+    def add_miss(self, block: RowLayout, status: Status, due_ns: int) -> None:
+        """Add rows for values that were due at `due_ns` and not asked for."""
+        lib.md_row_queue_miss(self.c, block.c, status, due_ns)
+
+    @property
+    def chunks(self) -> int:
+        """Columns that wait to be taken; the newest are still being filled."""
+        return int(lib.md_row_queue_chunks(self.c))
+
+    @property
+    def dropped(self) -> int:
+        """Rows for which there was no room."""
+        return int(lib.md_row_queue_dropped(self.c))
+
+    def call(self, number: int) -> None:
+        """Wake whoever waits, as if the port of this number needed attention."""
+        lib.md_row_queue_call(self.c, number)
+
+    def await_calls(self, seconds: float) -> list[int]:
+        """Wait for calls, at most so long; return the numbers of the ports that need attention."""
+        count = lib.md_row_queue_await(self.c, round(seconds * 1e9), self._called, self._MOST_AT_ONCE)
+        return ffi.unpack(self._called, count) if count else []
+
 
 now_ns = lib.md_now_ns
 utc_minus_monotonic_ns = lib.md_utc_minus_monotonic_ns

@@ -9,7 +9,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import NamedTuple
 
-from multidrop.core.narrow import find_codes
+from multidrop.core.columns import find_codes
 from multidrop.history.buckets import Accumulator, Grid
 from multidrop.history.folder import TEN_NS
 from multidrop.history.series import Series

@@ -10,7 +10,7 @@ from itertools import islice, pairwise
 from typing import Any, NamedTuple
 
 from multidrop.core import Names, spell
-from multidrop.core.narrow import greatest_code, wide_codes, widen
+from multidrop.core.columns import greatest_code, wide_codes, widen
 from multidrop.polling.batch import assemble
 from multidrop.recording.arrow_ipc import (
     DICTIONARY_BATCH,

@@ -13,7 +13,7 @@ from struct import pack
 from typing import Any, NamedTuple
 
 from multidrop.core import STATUSES
-from multidrop.core.narrow import MOST_NARROW, CodeTable, narrow_up
+from multidrop.core.columns import MOST_NARROW, CodeTable, narrow_up
 from multidrop.polling.batch import Batch, Rows
 from multidrop.recording.arrow_ipc import (
     CODED,
