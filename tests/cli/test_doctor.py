@@ -294,7 +294,7 @@ def test_who_switches_the_transceiver_is_said_of_a_device_only(run: Run, port: s
     assert (status, err) == (0, "")  # a pseudo-terminal has none, and goes without
     for words, sentence in (
         ((port, "--rs485", "on"), 'rs485 \'on\' is none of "off", "kernel", "rts-up" and "rts-down"'),
-        (("tcp://10.0.0.7", "--rs485", "kernel"), "rs485 is a fact of serial devices"),
+        (("tcp://10.0.0.7", "--rs485", "kernel"), "rs485 applies to serial devices only"),
     ):
         status, out, err = run("doctor", *words)
         assert (status, out) == (2, "")

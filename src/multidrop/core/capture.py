@@ -12,13 +12,13 @@ from multidrop.core.frame import Framing, Message, from_c
 
 
 class Side(IntEnum):
-    """The sender of sniffed bytes, where it is known (enum md_side)."""
+    """The sender of captured bytes (enum md_side)."""
 
-    EITHER = lib.MD_EITHER_SIDE
+    EITHER = lib.MD_EITHER_SIDE  # unknown
     ASKING = lib.MD_ASKING
     ANSWERING = lib.MD_ANSWERING
-    FAILED = lib.MD_FAILED  # came in place of a reply, as the master itself says
-    NOISE = lib.MD_NOISE  # not even that: stray bytes, echo, late replies
+    FAILED = lib.MD_FAILED  # bytes instead of a reply, marked by the capturing master
+    NOISE = lib.MD_NOISE  # stray bytes, echo, late replies, marked likewise
 
 
 class Kind(IntEnum):
@@ -26,13 +26,13 @@ class Kind(IntEnum):
 
     JUNK = lib.MD_JUNK
     REQUEST = lib.MD_REQUEST
-    EITHER = lib.MD_EITHER  # a request, or its copy that confirms it
+    EITHER = lib.MD_EITHER  # a request, or its confirming copy
     REPLY = lib.MD_REPLY
     STRAY = lib.MD_STRAY  # a reply without its request
 
 
 class FrameSpan(NamedTuple):
-    """Sniffed bytes that belong together; `message` and `framing` mean nothing of junk."""
+    """A frame, or junk between frames; junk has no valid `message` and `framing`."""
 
     kind: Kind
     framing: Framing
@@ -46,7 +46,7 @@ _MOST_PIECES = 1 << 15
 
 
 class Stream:
-    """Bytes of one line in the pieces in which they came (struct md_stream); of Modbus TCP, or of none."""
+    """Bytes of one line in pieces (struct md_stream); `is_tcp`: all frames are Modbus TCP, or none is."""
 
     def __init__(self, place: Any = None, *, is_tcp: bool = False) -> None:
         self.c = ffi.new("struct md_stream *") if place is None else place
@@ -59,13 +59,13 @@ class Stream:
     def put(
         self, received: bytes, time_ns: int, *, side: Side = Side.EITHER, after_pause: bool = False
     ) -> None:
-        """Append bytes that came at this time; a pause before them hints where frames begin."""
+        """Append bytes of this time; a pause before them hints at the start of a frame."""
         piece = {"time_ns": time_ns, "side": side, "is_after_pause": after_pause}
         if not lib.md_stream_put(self.c, received, len(received), ffi.new("struct md_piece *", piece)[0]):
-            raise BufferError("more was heard than fits: split it first")
+            raise BufferError("the stream is full: split it first")
 
     def end(self, is_end: bool) -> None:
-        """Say whether nothing more will come, as when the line has long been silent."""
+        """Set whether the stream is complete, as after a long silence of the line."""
         self.c.is_all = is_end
 
 
@@ -77,7 +77,7 @@ class Splitter:
         self._span = ffi.new("struct md_span *")
 
     def spans(self, stream: Stream) -> Iterator[FrameSpan]:
-        """Yield all spans that are complete, and forget them. Every byte is part of one."""
+        """Yield and discard all complete spans. Every byte is part of one."""
         span = self._span
         while lib.md_split(self._c, stream.c, span):
             raw = bytes(ffi.buffer(stream.c.bytes + span.at, span.len))
@@ -101,29 +101,29 @@ class Decoder:
         self._c.block = ffi.NULL
         ffi.buffer(self._known)[:] = bytes(ffi.sizeof(self._known))
         self._c.taken = 0
-        self._blocks.clear()  # at last: the core knows none of them any more
+        self._blocks.clear()  # last, after the core has forgotten them
 
     @property
     def asked(self) -> tuple[Framing, Message]:
-        """The request whose fields are to be told by know()."""
+        """The unknown request; pass its fields to know()."""
         return Framing(self._c.span.framing), from_c(self._c.span.message)
 
     def know(self, block: RowLayout | None) -> bool:
-        """Tell the fields of the reply to `asked`, None: no rows; return False where the table is full."""
+        """Set the fields of replies to `asked`, None: no rows; return False if the table is full."""
         if block:
             self._blocks.append(block)
         c = block.c if block else ffi.NULL
         return bool(lib.md_know(self._c, self._c.span.framing, ffi.addressof(self._c.span, "message"), c))
 
     def decode(self, stream: Stream, columns: Columns) -> Decoded:
-        """Make rows of the stream, and forget it."""
+        """Append the stream's rows to `columns`; discard the stream once all is decoded."""
         done = Decoded(lib.md_decode(self._c, stream.c, columns.c))
         if done is Decoded.ALL:
             lib.md_stream_forget(stream.c, ffi.addressof(self._c, "splitter"))
         return done
 
     def counts(self) -> dict[str, int]:
-        """Count frames, exchanges, replies without a request, and bytes that are part of no frame."""
+        """Return the counts of frames, exchanges, replies without a request, and bytes outside of frames."""
         c = self._c
         return {"frames": c.frames, "exchanges": c.exchanges, "strays": c.strays, "unknown_bytes": c.junk}
 
@@ -143,7 +143,7 @@ class Unpacked(IntEnum):
 
 
 class Unpacker:
-    """Takes packets out of a capture file's bytes (struct md_capture); `at` is its position in the file."""
+    """Reads packets from a capture file's bytes (struct md_capture); `at` is its position in the file."""
 
     MOST_CHANNELS = 64
 
@@ -157,8 +157,8 @@ class Unpacker:
         self.look_at(b"", at)
 
     def look_at(self, piece: bytes, at: int) -> None:
-        """Go on with these bytes of the file, which begin at its byte `at`."""
-        self._c.len = self._c.at = 0  # before the last piece is let go, and until the core has this one
+        """Continue with these bytes of the file, the first of which is byte `at`."""
+        self._c.len = self._c.at = 0  # before freeing the last piece, until the core has this one
         self._piece, self._begin = ffi.from_buffer("uint8_t[]", piece), at
         self._c.bytes, self._c.len = self._piece, len(piece)
 
@@ -171,7 +171,7 @@ class Unpacker:
         self._c.at = at - self._begin
 
     def add_channel(self, link: int, *, has_sides: bool, ticks_per_s: int, offset_ns: int) -> None:
-        """Add the next interface of the file; `has_sides`: its packets tell their senders."""
+        """Add the next interface of the file; `has_sides`: its packets name their senders."""
         channel = self._channels[self._c.count]
         channel.link, channel.has_sides = link, has_sides
         channel.ticks_per_s, channel.offset_ns = ticks_per_s, offset_ns
@@ -179,16 +179,16 @@ class Unpacker:
         self._c.count += 1
 
     def unpack(self) -> Unpacked:
-        """Append packets to their channels' streams, until there is something to do."""
+        """Append packets to their channels' streams, until the caller must act."""
         return Unpacked(lib.md_unpack(self._c))
 
 
-_RING = 1 << 18  # bytes: some seconds of a fast line
-_TAKEN = 1 << 16  # bytes of packets at a time
+_RING = 1 << 18  # bytes; some seconds of a fast line
+_TAKEN = 1 << 16  # bytes of packets read at a time
 
 
 class Wrappings:
-    """Headers and trailers of packets, by side, and apart for bytes that begin with ':'."""
+    """Headers and trailers of packets, by side and by whether the bytes start with ':'."""
 
     def __init__(self, wrappings: Mapping[tuple[Side, bool], tuple[bytes, bytes]]) -> None:
         self._kept: list[Any] = []
@@ -203,7 +203,7 @@ class Wrappings:
         return self._kept[-1]
 
     def packet(self, interface: int, side: Side, time_ns: int, raw: bytes) -> bytes:
-        """Return one packet with these bytes."""
+        """Return a packet with these bytes."""
         length = lib.md_packet_length(self.c, side, raw[0] if raw else 0, len(raw))
         out = ffi.new("uint8_t[]", length)
         lib.md_put_packet(self.c, interface, side, time_ns, raw, len(raw), out)
@@ -211,7 +211,7 @@ class Wrappings:
 
 
 class Tap:
-    """Bytes that went over one line and were not taken yet (struct md_tap)."""
+    """A ring of all bytes on one line (struct md_tap), to be read as packets of a pcapng file."""
 
     def __init__(self) -> None:
         self._ring = ffi.new("uint8_t[]", _RING)
@@ -220,7 +220,7 @@ class Tap:
 
     @property
     def lost(self) -> int:
-        """Bytes without room, because nobody took the others in time."""
+        """Bytes that were lost because the ring was full."""
         return int(self.c.lost)
 
     def take(self, wrappings: Wrappings, interface: int, utc_minus_monotonic_ns: int) -> Iterator[bytes]:

@@ -14,7 +14,7 @@ from multidrop.core.memory import new_beside
 
 
 class NumberFormat(IntEnum):
-    """The format of a number in a reply's data, the most significant byte first; `order` changes that."""
+    """The format of a number in a reply's data, most significant byte first unless an order flag is added."""
 
     U16 = lib.MD_U16
     I16 = lib.MD_I16
@@ -32,8 +32,8 @@ class NumberFormat(IntEnum):
     F16 = lib.MD_F16
 
 
-LOW_WORD_FIRST: int = lib.MD_LOW_WORD_FIRST  # added to a format
-LOW_BYTE_FIRST: int = lib.MD_LOW_BYTE_FIRST  # within each word
+LOW_WORD_FIRST: int = lib.MD_LOW_WORD_FIRST  # order flag
+LOW_BYTE_FIRST: int = lib.MD_LOW_BYTE_FIRST  # order flag, within each word
 MOST_INVALID: int = lib.MD_MOST_INVALID
 
 _MAY_LACK = frozenset(
@@ -45,27 +45,27 @@ _MAY_LACK = frozenset(
 
 
 def raw_value(data: bytes, at: int, number_format: int) -> float:
-    """Read the number at word (BIT: bit) `at` of a reply's data; NaN where the data ends before it.
+    """Return the number at word (BIT: bit) `at` of a reply's data; NaN if the data is too short.
 
-    The order of words and bytes is added to the format.
+    `number_format` includes the order flags.
     """
     return float(lib.md_value(data, len(data), at, number_format))
 
 
 class Extra(NamedTuple):
-    """Rest of a field (struct md_extra): value = (raw * multiplier + addend) / divisor."""
+    """Properties that few fields have (struct md_extra): value = (raw * multiplier + addend) / divisor."""
 
     addend: float = 0.0
-    low: int = 0  # raw is so many bits of the number, from this one on
-    bits: int = 0  # 0: all
-    scale_at: int | None = None  # place of the power of ten
-    scale_format: int = NumberFormat.I16  # of which the low 16 bits are a signed number
-    invalid: tuple[tuple[int, int], ...] = ()  # mask and pattern of bits that mean no value
+    low: int = 0  # lowest bit of raw
+    bits: int = 0  # number of bits; 0: all
+    scale_at: int | None = None  # word of the decimal exponent
+    scale_format: int = NumberFormat.I16  # its low 16 bits are signed
+    invalid: tuple[tuple[int, int], ...] = ()  # masks and patterns that mean "no value"
     scale_invalid: tuple[tuple[int, int], ...] = ()
 
     @property
     def may_lack(self) -> bool:
-        """True where a good reply may hold no value."""
+        """True if the field may have no value in a good reply."""
         return bool(self.invalid) or self.scale_at is not None
 
 
@@ -73,7 +73,7 @@ class Field(NamedTuple):
     """A register's place in a block's reply, its scale, and the code of its name."""
 
     at: int
-    number_format: int  # with its order
+    number_format: int  # including order flags
     register: int
     multiplier: float
     divisor: float
@@ -81,14 +81,14 @@ class Field(NamedTuple):
 
     @property
     def may_lack(self) -> bool:
-        """True where a good reply may hold no value."""
+        """True if the field may have no value in a good reply."""
         may = self.number_format & (LOW_WORD_FIRST - 1) in _MAY_LACK
         return may or (self.extra is not None and self.extra.may_lack)
 
 
 @lru_cache(maxsize=1024)
 def _shared(fields: tuple[Field, ...]) -> tuple[Any, Any]:
-    """Return arrays of fields and extras, which all drives of a kind share: so they stay in the cache."""
+    """Return arrays of fields and extras; drives of a model share them, so they stay in the cache."""
     extras = list(dict.fromkeys(field.extra for field in fields if field.extra is not None))
     places = {extra: place for place, extra in enumerate(extras, 1)}
     return (
@@ -149,11 +149,11 @@ class RowLayout:
 
     @property
     def is_answered(self) -> bool:
-        """True once a good reply came that was no exception."""
+        """True once a good reply without exception came."""
         return bool(self.c.is_answered)
 
     def forget(self) -> None:
-        """Begin as if nothing had been asked."""
+        """Reset the counts, as before the first exchange."""
         self.c.refusals = self.c.failures = self.c.is_answered = 0
 
 
@@ -176,7 +176,7 @@ class Columns:
 
     @classmethod
     def lent(cls, made: Any, give_back: Callable[[Any], object]) -> Columns:
-        """Return columns that the core made, and give them back when nobody looks at them any more."""
+        """Return columns over memory of the core; `give_back` is called when the last view is gone."""
         columns = cls.__new__(cls)
         columns._own(made, give_back)
         return columns
@@ -195,7 +195,7 @@ class Columns:
 
     @cached_property
     def _memory(self) -> memoryview[Any]:
-        """The struct and all columns: one piece, which lives as long as any view of it."""
+        """The struct and all columns in one buffer, which lives as long as any view."""
         return memoryview(ffi.buffer(self.c, self._at("valid") + (self.c.room + 7) // 8))
 
     def array(self, name: str) -> memoryview[Any]:
@@ -213,11 +213,11 @@ class Spelling(NamedTuple):
     names: int
     longest: int
     text: bytes
-    ends: Any  # int32_t[]: the beginning of each, and the end of the last
+    ends: Any  # int32_t[]: the start of each name, and the end of the last
 
 
 class Names:
-    """Names, and the numbers by which columns hold them. Names are only added: a number keeps its name."""
+    """Names and their numbers in columns. Names are never removed, so a number keeps its name."""
 
     def __init__(self, names: Iterable[str] = ()) -> None:
         self._names = list(names)
@@ -240,7 +240,7 @@ class Names:
 
     @property
     def listed(self) -> tuple[str, ...]:
-        """All names so far in the order of their numbers; the same tuple while none is added."""
+        """All names in the order of their numbers; the same tuple until one is added."""
         if len(self._listed) != len(self._names):
             self._listed = tuple(self._names)
         return self._listed
@@ -261,7 +261,7 @@ class Names:
 def spell(codes: memoryview[Any], names: Names) -> tuple[memoryview[Any], memoryview[Any]]:
     """Return offsets (int32) and text of an Arrow utf8 column with the name of each code.
 
-    ValueError for a code without a name.
+    Raises ValueError if a code has no name.
     """
     known = names.spelling
     rows = len(codes)
@@ -275,11 +275,11 @@ def spell(codes: memoryview[Any], names: Names) -> tuple[memoryview[Any], memory
     return memoryview(ffi.buffer(offsets)).cast("i"), memoryview(ffi.buffer(text, used))
 
 
-MOST_NARROW = 256  # names whose codes take a byte
+MOST_NARROW = 256  # names with codes of one byte
 
 
 class CodeTable:
-    """Codes of one byte for names whose own codes take two, given in the order of their first use."""
+    """Codes of one byte for names with codes of two bytes, assigned in the order of first use."""
 
     def __init__(self, names: Sequence[str]) -> None:
         self._names = names
@@ -287,14 +287,14 @@ class CodeTable:
         self.used: tuple[str, ...] = ()
 
     def forget(self) -> None:
-        """Give codes anew."""
+        """Forget all assigned codes."""
         self._numbers[0 : len(self._names)] = [-1] * len(self._names)
         self.used = ()
 
     def narrow(self, codes: memoryview[Any]) -> memoryview[Any] | None:
-        """Return each code as a byte; None where there are more names than a byte has values.
+        """Return each code as a byte; None if there are more names than a byte has values.
 
-        Raises ValueError for a code without a name.
+        Raises ValueError if a code has no name.
         """
         given, rows = _copy("uint16_t[]", codes, 2), len(codes)
         out = ffi.new("uint8_t[]", max(rows, 1))
@@ -309,14 +309,14 @@ class CodeTable:
 
 
 def _copy(kind: str, column: bytes | memoryview[Any], size: int) -> Any:
-    """Return a copy of a column as an array: its place in a file may not be aligned."""
+    """Return a copy of a column as an aligned array; its place in a file may not be aligned."""
     made = ffi.new(kind, max(memoryview(column).nbytes // size, 1))
     ffi.memmove(made, column, memoryview(column).nbytes)
     return made
 
 
 def narrow_up(numbers: memoryview[Any]) -> memoryview[Any]:
-    """Return int64 numbers as float32, each the next one that is no less."""
+    """Return int64 numbers as float32, rounded up."""
     rows = len(numbers)
     out = ffi.new("float[]", max(rows, 1))
     lib.md_narrow_up(ffi.from_buffer("int64_t[]", numbers), rows, out)
@@ -326,7 +326,10 @@ def narrow_up(numbers: memoryview[Any]) -> memoryview[Any]:
 def widen(
     numbers: bytes | memoryview[Any], valid: bytes | memoryview[Any] | None, rows: int
 ) -> memoryview[Any]:
-    """Return float32 numbers as int64, 0 where there is none; ValueError for one that is beyond them."""
+    """Return float32 numbers as int64, 0 for those that `valid` excludes.
+
+    Raises ValueError if a number is not finite or too large.
+    """
     if len(numbers) < 4 * rows or (valid is not None and len(valid) < (rows + 7) // 8):
         raise ValueError("its lengths do not fit together")
     out = ffi.new("int64_t[]", max(rows, 1))
@@ -337,7 +340,7 @@ def widen(
 
 
 def wide_codes(codes: bytes | memoryview[Any], rows: int, size: int) -> memoryview[Any]:
-    """Return codes of so many bytes as uint16."""
+    """Return codes of `size` bytes (1 or 2) as uint16."""
     if len(codes) < rows * size:
         raise ValueError("its lengths do not fit together")
     if size == 2:
@@ -349,14 +352,14 @@ def wide_codes(codes: bytes | memoryview[Any], rows: int, size: int) -> memoryvi
 
 
 def greatest_code(codes: memoryview[Any]) -> int:
-    """Return the greatest of uint16 codes; 0 where there are none."""
+    """Return the greatest of uint16 codes; 0 without codes."""
     return int(lib.md_greatest_code(ffi.from_buffer("uint16_t[]", codes), len(codes)))
 
 
 def find_codes(
     drives: memoryview[Any], registers: memoryview[Any], series: Iterable[tuple[int, int]]
 ) -> list[int]:
-    """Return the places of the rows that have one of these pairs of codes, in their order."""
+    """Return the sorted indexes of the rows with one of these pairs of codes (drive, register)."""
     rows = len(drives)
     given = ffi.from_buffer("uint16_t[]", drives), ffi.from_buffer("uint16_t[]", registers), rows
     out, found = ffi.new("uint32_t[]", max(rows, 1)), list[int]()

@@ -17,22 +17,22 @@ from multidrop.core.result import Status
 
 
 class Counters(NamedTuple):
-    """Counters of exchanges (struct md_counters); all but longest_ns and timeout_ns only grow."""
+    """Counters of a drive's exchanges (struct md_counters); all but longest_ns and timeout_ns only grow."""
 
     exchanges: int = 0
     answered: int = 0
     values: int = 0
-    sent: int = 0  # requests that began to leave
-    exceptions: int = 0  # exchanges that ended with one
+    sent: int = 0  # requests of which at least one byte left
+    exceptions: int = 0  # exchanges that ended with an exception
     naks: int = 0  # with code 07
     busies: int = 0  # with code 06
     late: int = 0
     stray_bytes: int = 0
     ideal_ns: int = 0
     longest_ns: int = 0  # response delay
-    timeout_ns: int = 0  # at present
+    timeout_ns: int = 0  # present timeout
     ended: Counter[Status] = Counter()  # exchanges without a reply; broadcasts are OK
-    missed: Counter[Status] = Counter()  # values
+    missed: Counter[Status] = Counter()  # values, by status
     refused: Counter[int] = Counter()  # values, by exception code
     delays: Counter[int] = Counter()  # replies, by the bucket of their response delay
 
@@ -42,12 +42,12 @@ _EDGES_NS = tuple(int(lib.md_delay_edge(bucket)) for bucket in range(DELAY_BUCKE
 
 
 def delay_edge(bucket: int) -> int:
-    """Return the least response delay of a bucket, in ns; it ends where the next one begins."""
+    """Return the least response delay of a bucket, in ns; the next bucket's is its end."""
     return _EDGES_NS[bucket]
 
 
 def read_counters(drive: Any, timeout_ns: int, unasked: Counter[Status]) -> Counters:
-    """Read what a struct md_drive counted; `unasked` are values that were due and not asked for."""
+    """Return the counters of a struct md_drive; `unasked` counts values that were due but not asked for."""
     c, history = drive.counters, drive.history
     return Counters(
         c.exchanges,
@@ -74,7 +74,7 @@ def _by_status(array: Any) -> Counter[Status]:
 
 
 def _by_place(array: Any, kind: Literal["I", "Q"]) -> Counter[int]:
-    """Return the numbers that are not 0, by their index."""
+    """Return the numbers other than 0, by their index."""
     numbers = memoryview(ffi.buffer(array)).cast(kind)
     return Counter({index: number for index, number in enumerate(numbers) if number})
 
@@ -85,13 +85,12 @@ _NO_NUMBERS = memoryview(b"").cast("d")
 
 
 class Completion:
-    """The result of an exchange (struct md_completion), read where it is asked for.
+    """The result of an exchange (struct md_completion). Properties read the struct on access.
 
-    Times are CLOCK_MONOTONIC, in ns. `count` is how many values of the exchange's the good reply has; -1
-    where there is no good reply, and of an exception. They are the `numbers`, NaN where there is no value:
-    `room` of them, at `values`. A read that went well asks for nothing else: with caches that a sleep has
-    cooled each field, and each call, takes microseconds. Where nobody looks at it any more, an exchange with
-    as many values may be carried out into it.
+    Times are CLOCK_MONOTONIC, in ns. `numbers` are the values of the exchange's fields, NaN for a missing
+    one; `count` is how many exist, -1 without a good reply and after an exception. A successful read needs
+    only these two: after a sleep, with cold caches, each further field and call costs microseconds. A
+    completion can be reused for an exchange with the same number of values (`room`).
     """
 
     __slots__ = ("c", "count", "numbers", "room", "values")
@@ -105,12 +104,12 @@ class Completion:
 
     @property
     def result(self) -> int:
-        """The reply's length; 0 after a broadcast, else a Failure or a FrameFault."""
+        """The reply's length; 0 after a broadcast, otherwise a Failure or a FrameFault."""
         return int(self.c.result)
 
     @property
     def error(self) -> int:
-        """An errno of a line that was lost, as C numbers it; or the REFUSALS of settings."""
+        """The errno of a lost line, or the mask of REFUSALS of settings."""
         return int(self.c.error)
 
     @property
@@ -120,32 +119,32 @@ class Completion:
 
     @property
     def sent_ns(self) -> int:
-        """The time at which the request began to leave; 0: it never did."""
+        """The time at which the request left; 0: never."""
         return int(self.c.sent_ns)
 
     @property
     def first_ns(self) -> int:
-        """The time at which the first byte was seen after the request; 0: none came."""
+        """The arrival of the first byte after the request; 0: none came."""
         return int(self.c.first_ns)
 
     @property
     def last_ns(self) -> int:
-        """The time at which the last byte was seen; 0: none came."""
+        """The arrival of the last byte; 0: none came."""
         return int(self.c.last_ns)
 
     @property
     def late_until_ns(self) -> int:
-        """The time until which a late reply could come, as was known when it was asked for."""
+        """The drive's `late_until_ns` at the time of the call."""
         return int(self.c.late_until_ns)
 
     @property
     def stale(self) -> int:
-        """Bytes that were thrown away before the request left."""
+        """Bytes that were discarded before the request left."""
         return int(self.c.stale)
 
     @property
     def skipped(self) -> int:
-        """Bytes after the request that were no part of the reply."""
+        """Bytes after the request outside of the reply."""
         return int(self.c.skipped)
 
     @property
@@ -155,23 +154,23 @@ class Completion:
 
     @property
     def data(self) -> bytes:
-        """Data of the good reply; none where there is no such reply."""
+        """Data of the good reply; empty without one."""
         reply = self.c.reply
         return bytes(ffi.buffer(reply.data, reply.data_len)) if self.count >= 0 else b""
 
     def values_of(self, layout: RowLayout) -> list[float | None]:
-        """Return the values of any fields in the good reply; None where it has none."""
+        """Return the values of other fields in the good reply; None for a missing one."""
         values = ffi.new(_VALUES, layout.count)
         lib.md_values(layout.c, ffi.addressof(self.c, "reply"), values)
         return [None if value != value else value for value in ffi.unpack(values, layout.count)]
 
     @property
     def raw(self) -> bytes:
-        """The reply's bytes; of a failure the end of what came."""
+        """The reply's bytes; after a failure the last bytes received."""
         return bytes(ffi.buffer(self.c.raw, self.c.raw_len))
 
     def unanswered(self) -> Completion:
-        """Return a copy to which nothing came: the reply was the request's echo."""
+        """Return a copy without a reply, because the reply was the request's echo."""
         found = ffi.new("struct md_completion *", self.c[0])
         found.result, found.raw_len = lib.MD_NO_REPLY, 0
         return Completion(found)
@@ -183,11 +182,11 @@ _NUMBERS = count(1)
 
 
 class Peer:
-    """The knowledge of one drive's replies (struct md_drive), shared by all its exchanges.
+    """A drive's state and statistics (struct md_drive), shared by all its exchanges.
 
-    `least_timeout` and `most_timeout`, in s, bound the time-out, which runs from the request's last
-    bit to the reply's first; between them it is learnt from the drive's own response delays. No request
-    leaves sooner than `interval`, in s, after the end of an exchange.
+    `least_timeout` and `most_timeout`, in s, bound the timeout, which runs from the request's last bit to the
+    reply's first. Between them the core learns it from the drive's response delays. At least `interval`, in
+    s, passes between the end of an exchange and the next request.
     """
 
     def __init__(self, *, least_timeout: float, most_timeout: float, interval: float = 0.0) -> None:
@@ -201,9 +200,9 @@ class Peer:
                 "history": self._history,
             },
         )
-        self.number = next(_NUMBERS)  # no other peer of this process has it
+        self.number = next(_NUMBERS)  # unique in this process
         self.proofs: tuple[Exchange, ...] = ()
-        self.unasked: Counter[Status] = Counter()  # values that were due and not asked for
+        self.unasked: Counter[Status] = Counter()  # values that were due but not asked for
 
     @property
     def exchanges(self) -> int:
@@ -212,7 +211,7 @@ class Peer:
 
     @property
     def has_answered(self) -> bool:
-        """True once a reply came, be it an exception, late or in doubt."""
+        """True once any reply came, including exceptions, late and doubtful ones."""
         return bool(self.c.counters.answered or self.c.history.late or self.c.doubtful)
 
     @property
@@ -222,7 +221,7 @@ class Peer:
 
     @property
     def late(self) -> int:
-        """Replies that came after their time-out and were recognised."""
+        """Recognised replies after their timeout."""
         return int(self.c.history.late)
 
     @property
@@ -232,7 +231,7 @@ class Peer:
 
     @property
     def owes(self) -> bool:
-        """True while replies to earlier requests may still come, on however slow a path."""
+        """True while a slow path may still deliver replies to earlier requests."""
         return bool(self.c.owed_count)
 
     @property
@@ -242,23 +241,23 @@ class Peer:
 
     @property
     def pauses(self) -> int:
-        """Replies that came PAUSE_NS or more after the one before."""
+        """Replies PAUSE_NS or more after the previous one."""
         return int(self.c.history.pauses)
 
     @property
     def ready_ns(self) -> int:
-        """The time before which no request leaves for it."""
+        """The earliest time of the next request."""
         return int(self.c.ready_ns)
 
     def inherit(self, before: Peer) -> None:
-        """Take the place of another at its address, whose replies may still come."""
+        """Take over the outstanding requests of the peer that this one replaces at its address."""
         lib.md_late_inherit(self.c, before.c)
 
     def prove_by(self, proofs: Sequence[Exchange]) -> None:
-        """Send one of these, at most MOST_PROOFS, first where a late reply could be taken for another.
+        """Send one of these reads first whenever a late reply could be mistaken for another's.
 
-        No reply to one of them may pass for the reply to another. Call it once, before the first exchange:
-        the core reads them from then on.
+        Uses the first MOST_PROOFS. The replies to two of them must be distinguishable. Call it once, before
+        the first exchange: the core reads the list from then on.
         """
         self.proofs = tuple(proofs[:MOST_PROOFS])
         self._c_proofs = ffi.new("struct md_exchange *[]", [proof.c for proof in self.proofs])
@@ -267,15 +266,15 @@ class Peer:
         self.c.proofs, self.c.proof_count = self._c_proofs, len(self.proofs)
 
     def doubt_first_reply(self) -> None:
-        """Have a proof sent after its first reply, which may answer what another process asked.
+        """Repeat the first read after a proof, because its first reply may answer another process.
 
-        Its first read is asked again then. Without proofs it goes as it comes.
+        Without proofs the first reply is accepted.
         """
         self.c.is_doubted = True
 
     @property
     def timeout(self) -> float:
-        """The present time-out, in s."""
+        """The present timeout, in s."""
         return float(lib.md_present_timeout_ns(self.c)) / 1e9
 
     @property
@@ -285,7 +284,7 @@ class Peer:
 
     @property
     def vain_ns(self) -> int:
-        """The time-out of its next read, if it stays silent."""
+        """The timeout of the next read if the drive stays silent."""
         return int(lib.md_vain_ns(self.c))
 
     @property
@@ -294,20 +293,20 @@ class Peer:
         return int(self.c.history.ended[Status.NO_REPLY])
 
     def counters(self) -> Counters:
-        """Count its exchanges so far, and values that were due and not asked for."""
+        """Return the counters of all exchanges so far."""
         return read_counters(self.c, int(lib.md_present_timeout_ns(self.c)), self.unasked)
 
 
 class Exchange:
-    """One request with all that is needed to carry it out; made once, run as often as wanted.
+    """A request with its drive, timing and settings; made once, carried out as often as needed.
 
-    Times are in seconds: `character` of one character, `silence` before the request and after
-    its reply, `turnaround` after a broadcast, `period` between its slots in a queue, if it has any.
-    One that `insists` is sent even where a late reply may pass for its own. `timeout` is the least
-    time-out; 0: as learnt. `answer` is the least and the greatest raw count of the reply's one register.
-    `block` has the fields for rows, `values` those whose values its caller gets. `echo_probe` is sent first
-    while it is unknown whether the adapter echoes: its reply is never a copy of its request. Once a stop was
-    called, `permit` keeps the request from being sent.
+    Times are in seconds: `character` is that of one character, `silence` precedes the request and follows its
+    reply, `turnaround` follows a broadcast, `period` is that of its slots in a queue, 0: none. With `insists`
+    it is sent even if a late reply could be mistaken for its own. `timeout` is the least timeout; 0: as
+    learnt. `answer` is the least and the greatest raw value of the reply's one register. `block` has the
+    fields for rows, `values` those for the caller of `Port.carry_out`. `echo_probe` is sent first while it is
+    unknown whether the adapter echoes; its reply is never a copy of its request. After a stop, `permit`
+    keeps the request from being sent.
     """
 
     __slots__ = (
@@ -344,15 +343,15 @@ class Exchange:
         echo_probe: Exchange | None = None,
         permit: Permit | None = None,
     ) -> None:
-        least, most = answer or (0, -1)  # the core takes the first count above them; 0: none is
+        least, most = answer or (0, -1)  # (0, -1): no range
         frame = build_request(framing, request)
-        kept = frame if len(frame) <= lib.MD_KEPT_FRAME else b""  # the core builds a longer one again
+        kept = frame if len(frame) <= lib.MD_KEPT_FRAME else b""  # the core rebuilds longer frames
         self.framing = framing
         self.request = request
         self.peer = peer
         self.block = block
         self.values = values
-        self.room = values.count if values else 0  # for them, in a completion
+        self.room = values.count if values else 0  # values in a completion
         self.echo_probe = echo_probe
         self.permit = permit
         self.settings = (baudrate, format)

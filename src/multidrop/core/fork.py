@@ -1,6 +1,6 @@
-"""Forks: a child made by fork() inherits all objects of its parent, but none of the threads behind them.
+"""Forks: a child process inherits all objects of its parent, but no threads.
 
-In the child a lock that another thread held is held for ever, and what a thread was to answer never comes.
+In the child, a lock that another thread held stays locked forever, and other threads' answers never come.
 """
 
 from __future__ import annotations
@@ -13,28 +13,28 @@ from weakref import WeakSet
 
 class Inherited(Protocol):
     def forked(self) -> None:
-        """In the child: leave to the parent what is the parent's, and wait for nobody."""
+        """Called in the child: give up the parent's resources without waiting."""
 
 
 _registered: WeakSet[Inherited] = WeakSet()
 
 
 def register_at_fork(inherited: Inherited) -> None:
-    """Call its `forked` in every child, as long as it lives."""
+    """Call the object's `forked` in every child process while the object exists."""
     _registered.add(inherited)
 
 
 def _call_all() -> None:
-    for inherited in list(_registered):  # the list keeps all of them until the last one was called
+    for inherited in list(_registered):  # a list, so that none is freed during the calls
         inherited.forked()
 
 
-if hasattr(os, "register_at_fork"):  # Windows knows no fork
+if hasattr(os, "register_at_fork"):  # Windows has no fork
     os.register_at_fork(after_in_child=_call_all)
 
 
 def only_here(act: Callable[..., object]) -> Callable[..., None]:
-    """Return a function that does the same in this process, and nothing in its children."""
+    """Return a function that acts in this process only, and not in its children."""
     here = os.getpid()
 
     def act_here(*details: object) -> None:

@@ -18,7 +18,7 @@ class Framing(IntEnum):
     RTU = lib.MD_RTU
     ASCII = lib.MD_ASCII
     DELIXI = lib.MD_DELIXI
-    TCP = lib.MD_TCP  # Modbus TCP (MBAP): of every exchange on a tcp:// port, and of no other
+    TCP = lib.MD_TCP  # Modbus TCP (MBAP), only on tcp:// ports
 
     def __str__(self) -> str:
         return self.name.lower()
@@ -26,7 +26,7 @@ class Framing(IntEnum):
 
 @dataclass(frozen=True)
 class Message:
-    """One frame's meaning, whatever its framing (struct md_message)."""
+    """The content of a frame in any framing (struct md_message)."""
 
     address: int
     function: int
@@ -34,15 +34,15 @@ class Message:
     count: int = 0
     data: bytes = b""
     exception: int = 0
-    transaction: int = 0  # of Modbus TCP alone
+    transaction: int = 0  # Modbus TCP only
 
 
-MODBUS = (Framing.RTU, Framing.ASCII, Framing.TCP)  # they wrap the same bytes
-_LONGER_THAN_RTU = 4  # bytes of a frame of Modbus TCP
+MODBUS = (Framing.RTU, Framing.ASCII, Framing.TCP)  # framings of the same PDU
+_LONGER_THAN_RTU = 4  # additional bytes of a Modbus TCP frame
 
 
 def characters_on_wire(framing: Framing, length: int) -> int:
-    """Return the characters of a frame on a drive's own wire: behind a gateway it is RTU's."""
+    """Return the characters of a frame on the drive's own wire: behind a gateway the frame is RTU."""
     return length - _LONGER_THAN_RTU if framing is Framing.TCP else length
 
 
@@ -64,7 +64,7 @@ def to_c(message: Message) -> Any:
             },
         )
     except OverflowError as mistake:
-        raise ValueError(f"no frame can say this: {mistake}") from mistake
+        raise ValueError(f"a field is out of bounds: {mistake}") from mistake
 
 
 def from_c(found: Any) -> Message:
@@ -84,24 +84,24 @@ def _build(build: Any, framing: Framing, message: Message) -> bytes:
     out = ffi.new("uint8_t[]", room)
     length = build(framing, to_c(message), out, room)
     if length < 0:
-        raise ValueError(f"no {framing} frame can say {message}")
+        raise ValueError(f"a field is out of bounds for a {framing} frame: {message}")
     return bytes(ffi.buffer(out, length))
 
 
 def build_request(framing: Framing, message: Message) -> bytes:
-    """Build a request; ValueError when a field is out of bounds."""
+    """Return a request's frame. Raises ValueError if a field is out of bounds."""
     return _build(lib.md_build_request, framing, message)
 
 
 def build_reply(framing: Framing, message: Message) -> bytes:
-    """Build a reply, as the drive; ValueError when a field is out of bounds."""
+    """Return a drive's reply as a frame. Raises ValueError if a field is out of bounds."""
     return _build(lib.md_build_reply, framing, message)
 
 
 def parse_request(framing: Framing, received: bytes) -> tuple[int, Message | None]:
-    """Parse the request at the beginning of `received`.
+    """Parse the request that `received` starts with.
 
-    Returns the bytes consumed and the message, or a FrameFault and None.
+    Return its length in bytes and the message, or a FrameFault and None.
     """
     found = ffi.new("struct md_message *")
     used = lib.md_parse_request(framing, received, len(received), found)
@@ -109,14 +109,14 @@ def parse_request(framing: Framing, received: bytes) -> tuple[int, Message | Non
 
 
 def parse_reply(framing: Framing, received: bytes, request: Message) -> tuple[int, Message | None]:
-    """Parse the reply to `request`, whatever its transaction, as parse_request does."""
+    """Parse the reply to `request`, as parse_request does; the transaction may differ."""
     found = ffi.new("struct md_message *")
     used = lib.md_parse_reply(framing, received, len(received), to_c(request), found)
     return used, from_c(found) if used > 0 else None
 
 
 def find_replies(framing: Framing, received: bytes, request: Message) -> Iterator[bytes]:
-    """Yield each reply to `request`, at whatever byte of `received` it begins."""
+    """Yield each reply to `request`, starting at any byte of `received`."""
     asked, reply, source = to_c(request), ffi.new("struct md_message *"), ffi.from_buffer(received)
     for at in range(len(received)):
         used = lib.md_parse_reply(framing, source + at, len(received) - at, asked, reply)

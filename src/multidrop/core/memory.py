@@ -1,7 +1,7 @@
-"""Memory of what the core touches at every exchange: side by side, and in whole cache lines.
+"""Memory for structs that the core uses at every exchange: adjacent, and in whole cache lines.
 
-With many lines it has left the caches since a line's last exchange, and so have the translations of its
-pages. What belongs to one drive is made together, so that it shares a page or two.
+With many lines this memory and its page translations have left the caches since a line's last exchange. The
+structs of a drive are allocated together, so that they share a page or two.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ CACHE_LINE = 64
 
 
 class Chunk:
-    """A piece of memory from which structs are taken, and how much of it is left."""
+    """A piece of memory from which structs are allocated."""
 
     def __init__(self, size: int) -> None:
         self.owner = ffi.new("uint8_t[]", size + CACHE_LINE)
@@ -34,7 +34,7 @@ class Chunk:
 
 
 class Chunks:
-    """The memory in which a process makes structs, a chunk at a time."""
+    """The structs of a process, allocated chunk by chunk."""
 
     def __init__(self) -> None:
         self._lock = Lock()
@@ -43,7 +43,7 @@ class Chunks:
     def take(self, kind: str) -> tuple[Any, Any]:
         """Return a pointer to a struct of zeros, and the owner of its memory."""
         size = -(-ffi.sizeof(kind) // CACHE_LINE) * CACHE_LINE
-        if not self._lock.acquire(blocking=False):  # another thread has it, or this is a signal's handler
+        if not self._lock.acquire(blocking=False):  # used by another thread, or in a signal handler
             chunk = Chunk(size)
             return chunk.take(kind, size), chunk.owner
         try:
@@ -58,7 +58,7 @@ _chunks = Chunks()
 
 
 def new_beside(kind: str, fields: dict[str, Any]) -> tuple[Any, Any]:
-    """Return a pointer to a new struct of this kind, beside the one made before, and what owns its memory.
+    """Return a pointer to a new struct, adjacent to the previous one, and the owner of its memory.
 
     Keep both: the struct lives as long as the owner.
     """
@@ -68,6 +68,6 @@ def new_beside(kind: str, fields: dict[str, Any]) -> tuple[Any, Any]:
 
 
 def new_apart(kind: str, fields: dict[str, Any]) -> tuple[Any, Any]:
-    """Return the same for a struct that is seldom touched: it has no place beside the others."""
+    """Return the same for a rarely used struct, in memory of its own."""
     made = ffi.new(f"{kind} *", fields)
     return made, made

@@ -13,54 +13,54 @@ from multidrop.core.fork import register_at_fork
 
 
 class Latch:
-    """The stops of one drive, counted; the core compares the count right before a request begins to leave.
+    """A drive's stop counter, which the core checks right before a request leaves.
 
-    `rise` takes no lock: a signal handler may call it.
+    `rise` takes no lock, so a signal handler may call it.
     """
 
     def __init__(self) -> None:
         self.c: Any = ffi.new("uint32_t *")
-        self.why = ""  # of the last rise, or of its shutting
+        self.why = ""  # reason of the last rise, or of the shutting
         self._is_shut = False
-        self._holds: set[object] = set()  # stops under way
+        self._holds: set[object] = set()  # stops in progress
 
     def rise(self, why: str) -> None:
-        """End every permit that there is."""
+        """Invalidate all existing permits."""
         if not self._is_shut:
             self.why = why
         lib.md_count_stop(self.c)
 
     def shut(self, why: str) -> None:
-        """Rise for good: no permit is good any more."""
+        """Invalidate all existing and future permits."""
         if not self._is_shut:
             self.why = why
         self._is_shut = True
         self.rise(why)
 
     def hold(self, stop: object, why: str) -> None:
-        """Rise, and stay so until it is let go: no permit that is asked for meanwhile is good."""
+        """Invalidate all permits, including new ones until `let_go` is called for this stop."""
         self._holds.add(stop)
         self.rise(why)
 
     def let_go(self, stop: object) -> None:
-        """End this stop's hold, if there is one."""
+        """End the stop's hold, if it has one."""
         self._holds.discard(stop)
 
     def permit(self, seen: int | None = None) -> Permit:
-        """Return a permit that is good until the latch rises; while a stop is under way it never is.
+        """Return a permit that is good until the latch rises; during a stop it is never good.
 
-        `seen`: what `c[0]` was when the call began that needs it.
+        `seen`: the value of `c[0]` at the start of the call that needs the permit.
         """
         if seen is None:
             seen = int(self.c[0])
-        if self._is_shut or self._holds:  # read after `seen`: a rise between the two ends this permit
+        if self._is_shut or self._holds:  # read after `seen`: a rise in between invalidates the permit
             seen = (seen - 1) & 0xFFFF_FFFF
         return Permit(self, seen)
 
 
 @dataclass(frozen=True)
 class Permit:
-    """The permission to write what may move a motor, until a stop is called."""
+    """The permission for a write that may move a motor, until a stop is called."""
 
     latch: Latch
     seen: int
@@ -78,16 +78,16 @@ boottime_ns = lib.md_boottime_ns
 
 
 class Mastership:
-    """The right to send on lines that other processes may be masters of, too, until a deadline.
+    """The right to send on lines that other processes may also use, until a deadline.
 
-    Times are ns of CLOCK_BOOTTIME, as `time.clock_gettime_ns(time.CLOCK_BOOTTIME)` has them. It does not hold
-    before the first `extend`. Ports that have it look at the clock right before each write: after the
-    deadline nothing is sent, not even a stop. Where this process stands still until half of `guard_s`, in s,
-    after its deadline, the kernel kills it with SIGKILL, so that nothing is sent when it goes on. Whoever
-    takes its lines over listens to each for at least `guard_s` before the first request, and only a stop
-    goes at once. Any thread may call these.
+    Times are ns of CLOCK_BOOTTIME, as from `time.clock_gettime_ns(time.CLOCK_BOOTTIME)`. A mastership does
+    not hold before the first `extend`. Its ports check the clock right before each write: after the deadline
+    they send no bytes, not even a stop. If the process is still suspended `guard_s / 2` seconds after the
+    deadline, a kernel timer kills it with SIGKILL, so that it cannot send when it resumes. The next master
+    listens to each line for at least `guard_s` before its first request; only stops leave at once.
+    Thread-safe.
 
-    Raises NotImplementedError where the system is not Linux, and ValueError for a guard that is no time.
+    Raises NotImplementedError on other systems than Linux, and ValueError if `guard_s` is out of range.
     """
 
     def __init__(self, guard_s: float = GUARD_S) -> None:
@@ -98,20 +98,18 @@ class Mastership:
         self.guard_s = float(guard_s)
         c = lib.md_mastership_new(round(self.guard_s * 1e9))
         if c == ffi.NULL and ffi.errno == errno.ENOSYS:
-            raise NotImplementedError(
-                "a mastership needs Linux, whose kernel can end a process that stands still"
-            )
+            raise NotImplementedError("a mastership needs Linux, whose kernel can kill a suspended process")
         if c == ffi.NULL:
             raise OSError(ffi.errno, "the kernel's timer cannot be made")
         self.c: Any = c
         self._free = finalize(self, lib.md_mastership_free, c)
-        self._free.atexit = False  # ports may still look at it
+        self._free.atexit = False  # ports may still use it
         self._is_inherited = False
-        self._lock = threading.Lock()  # of the deadline and its timer, which go together
+        self._lock = threading.Lock()  # keeps the deadline and its timer consistent
         register_at_fork(self)
 
     def forked(self) -> None:
-        """Hold no more in the child, whose parent is the master; the timer is the parent's."""
+        """Do not hold in a forked child: mastership and timer belong to the parent."""
         self._free.detach()
         self._is_inherited = True
         self._lock = threading.Lock()
@@ -131,20 +129,20 @@ class Mastership:
         return not self._is_inherited and bool(lib.md_mastership_holds(self.c))
 
     def extend(self, until_ns: int) -> None:
-        """Hold until this time, and put the kernel's timer off to half of the guard after it.
+        """Hold until this time, and set the kernel's timer to `guard_s / 2` seconds after it.
 
-        A time before the present deadline changes nothing. After `end` it holds anew. Raises ValueError for
-        a time that is past, and nothing has changed: a timer that is set to the past would kill at once.
+        A time before the present deadline has no effect. After `end` the mastership holds again.
+
+        Raises ValueError if the time is past, without any change: a timer in the past would kill at once.
         """
         if isinstance(until_ns, bool) or not isinstance(until_ns, int):
             raise TypeError(f"until_ns is a whole number of ns of CLOCK_BOOTTIME, not {until_ns!r}")
         if self._is_inherited:
-            raise ValueError("this mastership is of the process that was forked: make another one here")
+            raise ValueError("this mastership belongs to the parent of this forked process: make another one")
         late_ns = boottime_ns() - until_ns
         if late_ns >= 0:
             raise ValueError(
-                f"until_ns = {until_ns} is past, by {late_ns / 1e9:.3f} s of CLOCK_BOOTTIME: a mastership is "
-                "extended to a time to come"
+                f"until_ns = {until_ns} is past by {late_ns / 1e9:.3f} s of CLOCK_BOOTTIME: give a later time"
             )
         if until_ns > MOST_NS:
             raise ValueError(f"until_ns = {until_ns} is beyond {MOST_NS}: give ns of CLOCK_BOOTTIME")
@@ -154,10 +152,9 @@ class Mastership:
                 raise OSError(ffi.errno, "the kernel's timer cannot be set")
 
     def end(self) -> None:
-        """Hold no more: nothing is sent once this returns, and the kernel's timer is called off.
+        """End the mastership and disarm the kernel's timer; after this call no byte is written.
 
-        What the system has been given and has not sent yet is discarded when the lines' ports are closed:
-        remove the lines first.
+        Bytes in the system's output buffers are discarded when the ports close: remove the lines first.
         """
         if self._is_inherited:
             return

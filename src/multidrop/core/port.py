@@ -19,11 +19,11 @@ from multidrop.core.permissions import Mastership
 from multidrop.core.result import Status
 
 CHUNK_ROWS = 1 << 12
-MOST_CHUNKS = 256  # waiting to be taken; further rows are dropped, and counted
+MOST_CHUNKS = 256  # when all are full, the queue drops and counts new rows
 
 
 class RowQueue:
-    """Rows that nobody has taken yet, and the numbers of ports that need attention (struct md_row_queue)."""
+    """Rows from ports, and the numbers of ports that need attention (struct md_row_queue)."""
 
     _MOST_AT_ONCE = 1024
 
@@ -36,39 +36,39 @@ class RowQueue:
     def _begin(self) -> None:
         made = lib.md_row_queue_new(*self._room)
         if made == ffi.NULL:
-            raise OSError(ffi.errno, "no room for what the core leaves")
+            raise OSError(ffi.errno, "no memory for the rows of a poll")
         self.c = ffi.gc(made, only_here(lib.md_row_queue_free))
         self._give_back = only_here(partial(lib.md_row_queue_give_back, self.c))
 
     def forked(self) -> None:
-        """Be empty, in the child: the rows that wait are the parent's to take."""
+        """Start empty in a forked child: the rows belong to the parent."""
         self._begin()
 
     def take(self) -> Columns | None:
-        """Return the oldest rows that wait; None when there are none."""
+        """Return the oldest rows; None without rows."""
         made = lib.md_row_queue_take(self.c)
         return None if made == ffi.NULL else Columns.lent(made, self._give_back)
 
     def add_miss(self, block: RowLayout, status: Status, due_ns: int) -> None:
-        """Add rows for values that were due at `due_ns` and not asked for."""
+        """Add rows for values that were due at `due_ns` but not asked for."""
         lib.md_row_queue_miss(self.c, block.c, status, due_ns)
 
     @property
     def chunks(self) -> int:
-        """Columns that wait to be taken; the newest are still being filled."""
+        """The number of chunks with rows; the newest chunk is still growing."""
         return int(lib.md_row_queue_chunks(self.c))
 
     @property
     def dropped(self) -> int:
-        """Rows for which there was no room."""
+        """The number of dropped rows."""
         return int(lib.md_row_queue_dropped(self.c))
 
     def call(self, number: int) -> None:
-        """Wake whoever waits, as if the port of this number needed attention."""
+        """Wake the waiting client, as if the port of this number needed attention."""
         lib.md_row_queue_call(self.c, number)
 
     def await_calls(self, seconds: float) -> list[int]:
-        """Wait for calls, at most so long; return the numbers of the ports that need attention."""
+        """Wait for calls, at most `seconds`; return the numbers of the ports that need attention."""
         count = lib.md_row_queue_await(self.c, round(seconds * 1e9), self._called, self._MOST_AT_ONCE)
         return ffi.unpack(self._called, count) if count else []
 
@@ -78,7 +78,7 @@ utc_minus_monotonic_ns = lib.md_utc_minus_monotonic_ns
 
 
 class Echo(StrEnum):
-    """An adapter's echo: it repeats to the client what the client sends; `AUTO`: that is learnt."""
+    """An adapter's echo of the bytes that it sends; with `AUTO` the core learns it."""
 
     AUTO = "auto"
     ON = "on"
@@ -90,10 +90,10 @@ class Echo(StrEnum):
 
 
 class RS485(StrEnum):
-    """The one that switches between sending and receiving, where the adapter does not.
+    """The owner of the transceiver's direction; `OFF`: the adapter itself.
 
-    `KERNEL`: the driver's own RS-485 mode; `RTS_UP`: the core, RTS being on while a request leaves;
-    `RTS_DOWN`: RTS being off then.
+    `KERNEL`: the driver's RS-485 mode. `RTS_UP`: the core, with RTS on while a request leaves. `RTS_DOWN`:
+    the core, with RTS off while a request leaves.
     """
 
     OFF = "off"
@@ -106,13 +106,13 @@ class RS485(StrEnum):
         raise ValueError(f'rs485 {value!r} is none of "off", "kernel", "rts-up" and "rts-down"')
 
     def check_port(self, port: str) -> None:
-        """Raise ValueError for a port that cannot have it."""
+        """Raise ValueError if the port cannot switch a transceiver."""
         if self is not RS485.OFF and "://" in port:
-            raise ValueError(f"rs485 is a fact of serial devices, and {port} is none; leave it out")
+            raise ValueError(f"rs485 applies to serial devices only, and {port} is not one; remove it")
 
 
 class TransactionIds(StrEnum):
-    """A gateway's transaction ids: its replies `MATCH` their requests, or it has ids of its own: `IGNORE`."""
+    """A gateway's transaction ids: `MATCH` if replies repeat their request's, `IGNORE` if they do not."""
 
     MATCH = "match"
     IGNORE = "ignore"
@@ -125,9 +125,9 @@ class TransactionIds(StrEnum):
 class Transactions(IntEnum):
     """The use of transaction ids on a port (enum md_transactions)."""
 
-    NONE = lib.MD_NO_TRANSACTIONS  # it has none: any framing but Modbus TCP
-    MATCHED = lib.MD_MATCHED  # a reply has its request's id, and any other is late or foreign
-    IGNORED = lib.MD_IGNORED  # a gateway replies with ids of its own
+    NONE = lib.MD_NO_TRANSACTIONS  # every framing except Modbus TCP
+    MATCHED = lib.MD_MATCHED  # a reply repeats its request's id; all others are late or foreign
+    IGNORED = lib.MD_IGNORED  # a gateway replies with its own ids
 
 
 _ECHOES = {Echo.AUTO: lib.MD_ECHO_UNKNOWN, Echo.ON: lib.MD_ECHO, Echo.OFF: lib.MD_NO_ECHO}
@@ -142,20 +142,20 @@ _SWITCHES = {
 
 
 class _Engine:
-    """The core's thread, started when the first port is opened; there is one in a process."""
+    """The core's thread, one per process, started with the first port."""
 
     def __init__(self) -> None:
         self.forked()
         register_at_fork(self)
 
     def forked(self) -> None:
-        """Start another one, in the child, with the next port that is opened."""
-        self._starting = threading.Lock()  # ports are opened beside each other
+        """Forget the thread in a forked child: the next port starts another one."""
+        self._starting = threading.Lock()  # several threads may open ports
         self._c: Any = None
 
     @property
     def c(self) -> Any:
-        """The core's own (struct md_engine). Raises OSError where its thread cannot be started."""
+        """The core's struct md_engine. Raises OSError if its thread cannot be started."""
         with self._starting:
             if self._c is None:
                 started = lib.md_engine_start()
@@ -168,18 +168,18 @@ class _Engine:
 class _PortMemory:
     """All of Python's memory that the core's thread reads and writes for one port.
 
-    What the core is given is put here first.
+    Store an object here before passing it to the core.
     """
 
     def __init__(self, room: int, mastership: Mastership | None) -> None:
         self.mastership = mastership
-        self.lasting: set[object] = set()  # as long as the port is open
-        self.queued: list[Exchange | None] = [None] * room  # as in the core's own ring
+        self.lasting: set[object] = set()  # kept until the port closes
+        self.queued: list[Exchange | None] = [None] * room  # same indexes as the core's ring
         self._newest: dict[str, tuple[object, ...]] = {}
 
     @contextmanager
     def replacing(self, kind: str, new: object) -> Iterator[None]:
-        """Keep what replaces another of its kind, and the other too until the core has the new one."""
+        """Keep the new object of a kind, and the old one until the core has switched to the new one."""
         self._newest[kind] = (*self._newest.get(kind, ()), new)
         yield
         self._newest[kind] = (new,)
@@ -191,28 +191,29 @@ _engine = _Engine()
 def _owner_of(port: Any, memory: _PortMemory) -> Any:
     """Return the owner of a port and of its memory.
 
-    Once nothing refers to it the core's thread lets the port go, and then the memory is freed: cffi calls its
-    destructor before it drops the handle, and the garbage collector calls all destructors before it frees
-    anything, also at the interpreter's end. No Python code runs meanwhile that a signal could break off.
+    When the last reference is gone, the core's thread first releases the port, then the memory is freed: cffi
+    calls its destructor before it drops the handle, and the garbage collector calls all destructors before it
+    frees memory, also at interpreter exit. No Python code runs in between, so no signal can interrupt this.
     """
     return ffi.gc(ffi.new_handle(memory), partial(lib.md_port_let_go, port))
 
 
 def _stop(port: Any, memory: _PortMemory) -> None:
-    """Stop a port to which nothing refers any more, with all of its memory still there.
+    """Stop an unreferenced port while all of its memory still exists.
 
-    A collector calls this first. Then it finalizes all else in any order, also what owns the descriptor.
+    The garbage collector calls this first, before it finalizes other objects, such as the descriptor's owner.
     """
     lib.md_port_stop(port)
 
 
 class Port:
-    """A line driven on a descriptor by the core's thread (struct md_port).
+    """A line that the core's thread drives on a descriptor (struct md_port).
 
-    `must_take` is the mask of REFUSALS that are failures; -1 for a port without settings. `room` is
-    how many exchanges may be queued, a power of two. With `transactions` all of them are of Modbus TCP,
-    and without them none is. Requests leave while the `mastership` holds; None: always. OSError where the
-    descriptor cannot be waited for.
+    `must_take` is the mask of REFUSALS that are failures; -1: a port without settings. `room` is the length
+    of its queue, a power of two. With `transactions` all exchanges are Modbus TCP, without them none is.
+    Requests leave only while the `mastership` holds; None: always.
+
+    Raises OSError if the descriptor cannot be polled.
     """
 
     def __init__(
@@ -232,94 +233,94 @@ class Port:
             raise OSError(ffi.errno, "the port cannot be waited for")
         self._owner = _owner_of(self.c, self._memory)
         self._abandoned = finalize(self, _stop, self.c, self._memory)
-        self._abandoned.atexit = False  # others may still use the port at exit
+        self._abandoned.atexit = False  # other exit handlers may use the port
         if mastership is not None:
             lib.md_port_fence(self.c, mastership.c)
-        # Read in place: a call of the core would release the GIL, and wait to have it back.
+        # Read in place: a call into the core would release the GIL and wait for it afterwards.
         self._progress = lib.md_port_progress(self.c)
         register_at_fork(self)
 
     def forked(self) -> None:
-        """Leave it to the parent, in the child: the engine's thread is there alone."""
+        """Leave the port to the parent, because a forked child has no engine thread."""
         self._abandoned.detach()
         ffi.gc(self._owner, None)
         self._is_inherited = True
 
     def tap(self, tap: Tap) -> None:
-        """Put all that goes over the line into this tap, and into no other any more."""
+        """Copy all bytes of the line to this tap, instead of the previous one."""
         with self._memory.replacing("tap", tap):
             lib.md_port_tap(self.c, tap.c)
 
     def tell_echo(self, echo: Echo) -> None:
-        """Say whether its adapter echoes."""
+        """Set whether its adapter echoes."""
         lib.md_port_tell_echo(self.c, _ECHOES[echo])
 
     def switch(self, rs485: RS485) -> None:
-        """Say who switches its transceiver, before anything is sent. OSError where the driver refuses."""
+        """Set the owner of the transceiver's direction, before the first request.
+
+        Raises OSError if the driver refuses.
+        """
         failure = lib.md_port_rs485(self.c, _SWITCHES[rs485])
         if failure:
             raise OSError(-failure, "the transceiver cannot be switched")
 
     def is_asking(self, peer: Peer) -> bool:
-        """Return True while an exchange with this peer is queued, repeated, urgent or under way."""
+        """Return True while an exchange with this peer is queued, repeated, urgent or in flight."""
         return bool(lib.md_port_is_asking(self.c, peer.c))
 
     def counted_ns(self) -> int:
-        """Return until when the port's time is over and counted: where it stands still in an exchange."""
+        """Return the time up to which all line use has been counted."""
         return int(lib.md_port_counted_ns(self.c))
 
     def inherit(self, peer: Peer, before: Peer) -> None:
-        """Have a peer take the place of another, which may be on the line."""
+        """Let a peer take over the outstanding requests of the one that it replaces."""
         self._memory.lasting.update((peer, before))
         lib.md_port_inherit(self.c, peer.c, before.c)
 
     @property
     def cut_off(self) -> bool:
-        """True once the port was lost in the middle of a polled exchange, and not of the first one on it."""
+        """True once the port was lost during a polled exchange, after a good reply on it."""
         return bool(self._progress.cut_off)
 
     def end(self) -> bool:
-        """Begin nothing more of the queue; return True while one of it is under way.
-
-        Urgent exchanges are still carried out.
-        """
+        """Start urgent exchanges only from now on; return True while a polled one is in flight."""
         return bool(lib.md_port_end(self.c))
 
     def stop(self) -> None:
-        """Carry out nothing more, and give the descriptor back. What it did can still be asked."""
+        """Stop all exchanges and give the descriptor back. The port's counters stay readable."""
         if not self._is_inherited:
             lib.md_port_stop(self.c)
 
     close = stop
 
     def report_to(self, row_queue: RowQueue, number: int) -> None:
-        """Deliver rows to `row_queue`, and call it with `number` when the port needs attention.
+        """Deliver rows to `row_queue`, and call its client with `number` when the port needs attention.
 
-        That is when little is queued, when the port was lost or repeats nothing any more, and when a drive
-        refuses, fails to answer, or answers again.
+        It does if its queue runs low, if it is lost or has stopped repeating, and if a drive refuses, fails
+        to answer, or answers again.
         """
         with self._memory.replacing("rows", row_queue):
             lib.md_port_report(self.c, row_queue.c, number)
 
     def repeat(self, exchanges: Sequence[Exchange]) -> int:
-        """Carry these out in turn while nothing that is queued is due, until they are replaced.
+        """Carry these out in turn whenever no queued exchange is due, until they are replaced.
 
-        Returns which of those that are replaced would have been next; on a closed port 0.
+        Return the index of the next one in the replaced round; 0 on a closed port.
         """
         if self.c is None:
             return 0
-        self._memory.lasting.update(exchanges)  # one of them may be under way when they are replaced
+        self._memory.lasting.update(exchanges)  # one may be in flight when they are replaced
         rounds = ffi.new("struct md_exchange *[]", [exchange.c for exchange in exchanges])
         with self._memory.replacing("round", rounds):
             return int(lib.md_port_repeat(self.c, rounds, len(exchanges)))
 
     @property
     def repeating(self) -> bool:
-        """True while it repeats: until the port is lost, or an exchange could not be sent."""
+        """True while it repeats exchanges: until the port is lost, or one could not be sent."""
         return bool(self._progress.repeating)
 
     def submit(self, exchanges: Sequence[Exchange], not_before_ns: Sequence[int]) -> int:
-        """Queue exchanges, none to be sent before its time; return how many there was room for."""
+        """Queue exchanges with the earliest time of each; return how many fitted."""
         todo = ffi.new("struct md_exchange *[]", [exchange.c for exchange in exchanges])
         times = ffi.new("int64_t[]", not_before_ns)
         self._memory.lasting.update(exchange.peer for exchange in exchanges)  # a late reply may come
@@ -330,32 +331,32 @@ class Port:
 
     @property
     def done(self) -> int:
-        """Queued exchanges that were carried out; it wraps around at 2^32."""
+        """The number of queued exchanges that ended; it wraps around at 2^32."""
         return int(self._progress.done)
 
     @property
     def pending(self) -> int:
-        """Queued exchanges that were not carried out yet."""
+        """The number of queued exchanges that have not ended."""
         return (int(self._progress.submitted) - self.done) & 0xFFFF_FFFF
 
     @property
     def lost(self) -> bool:
-        """True once the descriptor failed: nothing more is carried out on it."""
+        """True once the descriptor failed: no further exchange is sent."""
         return bool(self._progress.lost)
 
     @property
     def has_echo(self) -> bool:
-        """True once its adapter is known to echo: then no echo is taken for a reply."""
+        """True once the adapter is known to echo; the core then never mistakes an echo for a reply."""
         return int(self._progress.echo) == int(lib.MD_ECHO)
 
     @property
     def foreign(self) -> int:
-        """Bytes that came while the line was listened to before a request: another master's doing."""
+        """Bytes received while listening before the first request: another master uses the line."""
         return int(self._progress.foreign)
 
     @property
     def switching(self) -> float:
-        """Seconds that a change of baud rate or format takes, on average; 0 before the first one."""
+        """The average seconds of a change of baud rate or format; 0 before the first one."""
         return float(self._progress.switching_ns) / 1e9 / max(int(self._progress.switches), 1)
 
     def carry_out(
@@ -365,9 +366,10 @@ class Port:
         expires_ns: int = 0,
         into: Completion | None = None,
     ) -> Completion:
-        """Carry one out ahead of the queue and wait for it; `into`: the completion to fill in, where it fits.
+        """Carry out an exchange ahead of the queue, wait for it, and return its completion.
 
-        After `expires_ns` (of CLOCK_BOOTTIME; 0: never), or after a stop, it is not sent.
+        Reuses the completion `into` if it has room for the values. After `expires_ns` (of CLOCK_BOOTTIME; 0:
+        never), or after a stop, the exchange is not sent.
         """
         self._memory.lasting.add(exchange.peer)  # a late reply may come
         found = into if into is not None and into.room == exchange.room else Completion(room=exchange.room)

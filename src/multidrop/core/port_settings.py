@@ -28,12 +28,12 @@ class CharacterFormat(NamedTuple):
 
 
 def is_pseudo_terminal(device: str) -> bool:
-    """Tell a pseudo-terminal by the path of its device."""
+    """Return True if the device's path is that of a pseudo-terminal."""
     return device.startswith(("/dev/pts/", "/dev/ttys"))
 
 
 def must_take(device: str) -> int:
-    """Return the mask of REFUSALS that are failures: a pseudo-terminal stays at 8N whatever it is told."""
+    """Return the mask of REFUSALS that are failures: a pseudo-terminal ignores all but the baud rate."""
     return int(lib.MD_REFUSED_BAUDRATE) if is_pseudo_terminal(device) else sum(REFUSALS)
 
 
@@ -43,7 +43,7 @@ def refused_names(mask: int) -> str:
 
 
 def get_settings(fd: int) -> tuple[int, str]:
-    """Return baud rate and format in force on a port; OSError where it has none."""
+    """Return a port's present baud rate and format. Raises OSError if it has none."""
     settings = ffi.new("struct md_settings *")
     failure = lib.md_port_get(fd, settings)
     if failure:
@@ -52,7 +52,10 @@ def get_settings(fd: int) -> tuple[int, str]:
 
 
 def set_settings(fd: int, baudrate: int, format: str) -> int:
-    """Make a port raw with these settings; return the mask of REFUSALS. OSError where it has none."""
+    """Make a port raw with these settings; return the mask of REFUSALS.
+
+    Raises OSError if the port has no settings.
+    """
     refused = lib.md_port_set(fd, ffi.new("struct md_settings *", settings_to_c(baudrate, format)))
     if refused < 0:
         raise OSError(-refused, "no serial settings")

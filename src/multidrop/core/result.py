@@ -1,4 +1,4 @@
-"""Reasons why there is no frame, no reply, no value: as numbers, and in words."""
+"""Faults of frames, failures of exchanges and statuses of rows: numbers and texts."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from multidrop._core import lib
 
 
 class FrameFault(IntEnum):
-    """Reasons why bytes are no frame (enum md_frame_fault)."""
+    """Reasons why bytes are not a frame (enum md_frame_fault)."""
 
     INCOMPLETE = lib.MD_INCOMPLETE
     NO_START = lib.MD_NO_START
@@ -22,7 +22,7 @@ class FrameFault(IntEnum):
 
 
 class Failure(IntEnum):
-    """Reasons why an exchange has no reply, beside those of FrameFault (enum md_failure)."""
+    """Reasons why an exchange has no reply, besides FrameFault (enum md_failure)."""
 
     CUT_SHORT = lib.MD_CUT_SHORT
     NO_REPLY = lib.MD_NO_REPLY
@@ -38,7 +38,7 @@ class Failure(IntEnum):
 
 
 class Status(IntEnum):
-    """A row's status, but for exceptions: why it has no value (enum md_status)."""
+    """A row's status: why it has no value; exceptions are not members (enum md_status)."""
 
     OK = lib.MD_OK
     NO_START = -FrameFault.NO_START
@@ -92,11 +92,11 @@ _WORDS: dict[int, str] = {
     Status.POLLING_FAILED: "not asked: polling failed",
 }
 
-UNASKED = "not "  # begins the statuses of values for which no request left
+UNASKED = "not "  # prefix of the statuses without a request
 EXCEPTION_STATUS: int = lib.MD_EXCEPTION  # + the exception's code
 
 STATUSES = (
     *(_WORDS.get(code, "") for code in range(EXCEPTION_STATUS)),
     *(f"exception {code:02X}" for code in range(256)),
 )
-"""The words of every status code."""
+"""The text of every status code."""

@@ -1,8 +1,7 @@
-"""Work that no signal breaks off: what a handler raises in the main thread ends its waiting, not the work.
+"""Work that no signal interrupts: a signal handler's exception ends the main thread's wait, not the work.
 
-Python raises KeyboardInterrupt, and what else a signal's handler raises, between any two steps of the main
-thread, also in `finally` and `__exit__`. So ports are opened and closed, and lines come and go, on threads
-of their own, which nothing interrupts.
+Python raises KeyboardInterrupt and other exceptions of signal handlers between any two bytecodes of the main
+thread, also in `finally` and `__exit__`. Therefore separate threads open and close ports and lines.
 """
 
 from __future__ import annotations
@@ -15,14 +14,14 @@ from functools import partial, wraps
 from queue import Empty, SimpleQueue
 from typing import Any, ParamSpec, TypeVar
 
-HANDLING_S = 0.05  # the longest that a signal waits to be handled, where another thread was given it
+HANDLING_S = 0.05  # longest delay of a signal that another thread received
 
 P = ParamSpec("P")
 R = TypeVar("R")
 
 
 class _Act:
-    """Work that is carried out once, by the thread that takes it first."""
+    """A call that the first thread to take it carries out, once."""
 
     def __init__(self, act: Callable[[], Any]) -> None:
         self._untaken = SimpleQueue[Callable[[], Any]]()
@@ -30,7 +29,7 @@ class _Act:
         self._outcome = SimpleQueue[tuple[Any, BaseException | None]]()
 
     def run(self) -> None:
-        """Carry it out, unless it was taken."""
+        """Carry out the call, unless another thread has taken it."""
         try:
             act = self._untaken.get_nowait()
         except Empty:
@@ -43,7 +42,7 @@ class _Act:
             self._outcome.put((found, None))
 
     def result(self) -> Any:
-        """Wait until it is over; return what it returned, or raise what it raised."""
+        """Wait for the call; return its result or raise its exception."""
         while True:
             with suppress(Empty):
                 found, failure = self._outcome.get(timeout=HANDLING_S)
@@ -53,14 +52,14 @@ class _Act:
                 raise failure
             return found
         finally:
-            del failure  # which has this frame in its traceback
+            del failure  # its traceback refers to this frame
 
 
 def undisturbed(function: Callable[P, R]) -> Callable[P, R]:
-    """Return a function that does the same, on a thread of its own where the main thread calls it.
+    """Return a function that runs in a separate thread when the main thread calls it.
 
-    What interrupts the main thread meanwhile leaves it at once, and the work goes on to its end. Where the
-    system gives no thread the main thread does the work itself.
+    An exception that interrupts the main thread leaves the call at once, while the work continues. If no
+    thread can be started, the main thread does the work itself.
     """
 
     @wraps(function)
