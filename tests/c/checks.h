@@ -15,7 +15,7 @@
                       : (failures++, printf("%s:%d: %s: %s\n", __FILE__, __LINE__, row, #truth), 0))
 
 static int checks, failures;
-static const char *row = ""; /* what is being checked, for the report */
+static const char *row = ""; /* the present check, for the report */
 
 static uint8_t *page_end(void)
 {

@@ -1,6 +1,6 @@
 /* What libmodbus makes of frames: a line of standard input is a case, a line of standard output its word.
  *
- * It is fed through a socket pair that ends after the frame, so that nothing waits for time.
+ * Its input is a socket pair that ends after the frame, so that no read waits.
  *   "request FRAME"
  *       a server at the frame's address hears it: "refused ERRNO", or "taken LENGTH REPLY CHANGES",
  *       its reply (- for none) and each cell that it changed as table:address:value (- for none)
@@ -59,7 +59,7 @@ static int say(const uint8_t *frame, size_t len)
     return ends[1];
 }
 
-/* What it said. */
+/* Its output. */
 static ssize_t hear(int end, uint8_t *out)
 {
     shutdown(modbus_get_socket(peer), SHUT_WR);

@@ -65,7 +65,7 @@ static void check_line(const struct frame *frame, const struct md_message *reque
     static struct md_line line;
     static struct md_completion completion;
     struct md_history history = {0};
-    /* Its proofs are none of this exchange's: the list of them is not looked at. */
+    /* For other exchanges than proofs the list of proofs is not read. */
     struct md_drive drive = {.least_timeout_ns = 1000000, .most_timeout_ns = 1000000, .history = &history,
                              .proofs = NULL, .proof_count = MD_MOST_PROOFS};
     struct md_exchange exchange = {.framing = frame->framing, .request = *request, .character_ns = 1000,
@@ -92,7 +92,7 @@ static void check_behind_junk(const struct frame *frame, const struct md_message
     for (size_t junk_len = 0; junk_len <= sizeof junk; junk_len++)
         for (size_t step = 1; step <= 64; step *= 4)
             check_line(frame, request, junk, junk_len, step);
-    check_line(frame, request, frame->bytes, 2, 1); /* the beginning of a reply, then the reply */
+    check_line(frame, request, frame->bytes, 2, 1); /* the start of a reply, then the reply */
 }
 
 /* "01 03 ..." or ":0103...\r\n" (spelt out) to bytes. */
@@ -129,7 +129,7 @@ static void check_documents(const char *path)
         frame.len = read_bytes(bytes, frame.bytes);
         frame.result = strcmp(verdict, "bad checksum") == 0 ? MD_BAD_CHECKSUM : (int)frame.len;
         if (strcmp(verdict, "bad content") == 0 && frame.is_reply && frame.bytes[1] == 0x04)
-            frame.result = MD_BAD_LENGTH; /* its byte count is for other registers than were asked for */
+            frame.result = MD_BAD_LENGTH; /* its byte count does not match the request */
         check_parse(&frame, &request);
         if (frame.is_reply && frame.result > 0)
             check_behind_junk(&frame, &request);
@@ -149,7 +149,7 @@ static void check_documents(const char *path)
     CHECK(rows == 49);
 }
 
-/* ---- what can be said at all ---- */
+/* ---- bounds of fields ---- */
 
 static const struct {
     const char *name;
@@ -245,10 +245,10 @@ static void check_builders(void)
     }
 }
 
-/* ---- how soon bytes tell ---- */
+/* ---- the first byte that decides ---- */
 
 static const struct {
-    const char *name, *bytes; /* all but the last are no verdict yet */
+    const char *name, *bytes; /* only the last one decides */
     int framing, result;
     struct md_message request; /* none: the bytes are a request's */
 } verdicts[] = {

@@ -15,7 +15,7 @@ static struct md_engine *engine;
 static struct md_row_queue *row_queue;
 static int is_over;
 
-/* One drive that nobody answers for, and its read. */
+/* A silent drive, and its read. */
 struct subject {
     struct md_history history;
     struct md_drive drive;
@@ -71,7 +71,7 @@ static void *come_and_go(void *argument)
     return NULL;
 }
 
-/* What a poller's thread does meanwhile. */
+/* The thread of a poller, at the same time. */
 static void *take_calls(void *argument)
 {
     (void)argument;

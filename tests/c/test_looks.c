@@ -1,5 +1,5 @@
-/* A port is read once for an exchange where the silence before the next request is over at once, however many
- * ports there are. */
+/* With any number of ports, a port is read once for an exchange if the silence before the next request is
+ * over at once. */
 #include <unistd.h>
 
 static ssize_t counted(int fd, void *bytes, size_t room);
@@ -26,7 +26,7 @@ static ssize_t counted(int fd, void *bytes, size_t room)
     return read(fd, bytes, room);
 }
 
-/* Answer so many requests at once, and no more. */
+/* Answer EXCHANGES requests at once. */
 static void *answer(void *argument)
 {
     int fd = *(int *)argument;
@@ -38,7 +38,7 @@ static void *answer(void *argument)
         ssize_t put = write(fd, frame, (size_t)length);
         assert(got == REQUEST && put == length);
     }
-    ssize_t got = recv(fd, request, sizeof request, MSG_WAITALL); /* all of them are taken in by now */
+    ssize_t got = recv(fd, request, sizeof request, MSG_WAITALL); /* the client has all replies by now */
     assert(got == REQUEST);
     return NULL;
 }

@@ -1,5 +1,5 @@
-/* Nothing leaves but by a look at CLOCK_BOOTTIME right before write(2), and what becomes of what does not.
- * The clock is the test's, and so is write(2); the engine, its thread and the kernel's timer are real. */
+/* The core checks CLOCK_BOOTTIME right before each write(2); results of requests that must not leave.
+ * Clock and write(2) are the test's; the engine, its thread and the kernel's timer are real. */
 #define _GNU_SOURCE
 #include <signal.h>
 #include <stdint.h>
@@ -44,7 +44,7 @@ static int told_clock(clockid_t clock, struct timespec *now)
     return 0;
 }
 
-/* A clock that stands while the machine sleeps would kill too late; while none sleeps nothing shows it. */
+/* A clock that stops while the machine sleeps would kill too late; only this assertion shows it. */
 static int made_timer(clockid_t clock, struct sigevent *event, timer_t *timer)
 {
     assert(clock == CLOCK_BOOTTIME);
@@ -52,7 +52,7 @@ static int made_timer(clockid_t clock, struct sigevent *event, timer_t *timer)
     return timer_create(clock, event, timer);
 }
 
-/* Take no more than most_written bytes; each request and each rest of one has a look of its own. */
+/* Take at most most_written bytes; the core must check the deadline before each call. */
 static ssize_t noted_write(int fd, const void *bytes, size_t len)
 {
     size_t most = (size_t)atomic_load(&most_written);
@@ -115,7 +115,7 @@ static void check_unsent(const struct md_exchange *exchange)
     uint32_t failures = drive.failures;
     struct md_completion found = carry_out(exchange);
     assert(found.result == MD_NOT_MASTER && found.sent_ns == 0 && atomic_load(&written) == 0);
-    assert(drive.failures == failures); /* it is no failure of the drive */
+    assert(drive.failures == failures); /* not a failure of the drive */
 }
 
 static int64_t left_of_timer(void)
@@ -166,7 +166,7 @@ static void check_listens_first(void)
     check_listens_no_more();
 }
 
-/* Nothing was asked while it did not hold: another may have been master all the same. */
+/* Without a request during the gap: another process may still have been the master. */
 static void check_listens_after_a_lapse(void)
 {
     extend(1000);
@@ -176,7 +176,7 @@ static void check_listens_after_a_lapse(void)
     md_mastership_end(mastership);
     extend(1000);
     check_listens_first();
-    extend(2000); /* before its end: nobody was master meanwhile */
+    extend(2000); /* before its end: no gap for another master */
     check_listens_no_more();
 }
 
@@ -225,7 +225,7 @@ static void check_all_foreign_bytes_are_counted(void)
     md_listen_hear(&line, 3, 10);
     md_listen_hear(&line, 4, 20);
     assert(line.foreign == 7 && line.listened_ns == 25);
-    line.transactions = 1; /* what comes is ours, late */
+    line.transactions = 1; /* a late reply to this process */
     md_listen_hear(&line, 3, 30);
     assert(line.foreign == 7 && line.listened_ns == 25);
 }
@@ -263,7 +263,7 @@ static void check_other_master(void)
     pthread_t other, reader;
     struct md_completion found, stopped;
     extend(MD_SECOND_NS);
-    reading.character_ns = 2 * MS; /* it listens for half a second: nothing holds the other one up so long */
+    reading.character_ns = 2 * MS; /* it listens for half a second; the other port must not wait for that */
     atomic_store(&is_babbling, 1);
     pthread_create(&other, NULL, babble, NULL);
     found = carry_out(&reading);

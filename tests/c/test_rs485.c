@@ -16,7 +16,7 @@ enum { CHARACTER_NS = 1145833, FD = 1000 }; /* 9600 8N1 */
 static struct {
     int64_t now_ns;
     int64_t start_ns;   /* from a write to its first bit */
-    int64_t percent;    /* time of a character, of what it should be */
+    int64_t percent;    /* actual time of a character, relative to the nominal one */
     int64_t end_ns;     /* the last bit has left */
     int64_t changed_ns; /* RTS was set last */
     int is_up, changes, writes_while_receiving;
@@ -98,7 +98,7 @@ int ioctl(int fd, int request, ...)
     case TIOCSRS485:
         return mode_of_driver((unsigned long)request, argument);
     default:
-        CHECK(request == TIOCOUTQ); /* nothing else is asked of a driver */
+        CHECK(request == TIOCOUTQ); /* the core makes no other calls */
         return refuse(ENOTTY);
     }
 }
@@ -166,7 +166,7 @@ static void check_direction(void)
     for (size_t i = 0; i < COUNT(rows); i++) {
         row = rows[i].row;
         struct md_port *port = new_port(rows[i].mode, rows[i].tells_end);
-        CHECK(uart.is_up != uart.sending_level); /* the bus is free from the beginning on */
+        CHECK(uart.is_up != uart.sending_level); /* the bus is free from the start */
         CHECK(uart.keeps == (rows[i].mode == MD_RS485_RTS_DOWN));
         uart.start_ns = rows[i].start_ns;
         uart.percent = rows[i].percent;

@@ -1,4 +1,4 @@
-/* The end of a silence is spun for before what is queued, and not before what a client waits for. */
+/* The thread spins for the end of a silence before queued requests, but not for a waiting client. */
 #include "internal.h"
 
 #include <assert.h>
@@ -10,7 +10,7 @@
 
 enum {
     BY_HAND = 50, MOST_TRIES = 500,
-    FEW = 60 /* looks at the clock in an exchange; spinning takes some thirty in a microsecond */
+    FEW = 60 /* clock readings in an exchange; spinning makes some thirty per microsecond */
 };
 static const int64_t SILENCE_NS = 3000000, TIMEOUT_NS = INT64_C(5000000000);
 
@@ -67,7 +67,7 @@ static void ask_queued(struct md_port *port, const struct md_exchange *exchange)
         poll(NULL, 0, 1);
 }
 
-/* Return how often the clock was looked at for one exchange. */
+/* Return the number of clock readings for one exchange. */
 static int looks_of(void (*ask)(struct md_port *, const struct md_exchange *), struct md_port *port,
                     const struct md_exchange *exchange)
 {

@@ -1,4 +1,4 @@
-/* How long the system is asked to wait, to the nanosecond: what it is asked comes here. */
+/* The core passes waits to the system exactly, in nanoseconds: this program intercepts the calls. */
 #define _GNU_SOURCE
 #include "internal.h"
 

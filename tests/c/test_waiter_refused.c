@@ -1,4 +1,4 @@
-/* Waiting as this system can, and where it refuses epoll_pwait2(), as old kernels and some containers do. */
+/* Waiting with epoll_pwait2(), and without it, as on old kernels and in some containers. */
 #define _GNU_SOURCE
 #include "internal.h"
 
@@ -17,7 +17,7 @@
 
 enum { SKIPPED = 77 };
 
-/* From now on the call fails with this error, in this process; 0 where that cannot be had. */
+/* Let the call fail with this error in this process from now on; 0: not possible here. */
 static int refuse(unsigned call, unsigned error)
 {
     struct sock_filter filter[] = {

@@ -1,4 +1,4 @@
-/* A client wakes the engine's thread only where that would not look at the port by itself in time. */
+/* A client wakes the engine's thread only if the thread would not serve the port by itself in time. */
 #include "internal.h"
 
 #include <assert.h>
@@ -66,7 +66,7 @@ static int asked(struct md_port *port, const struct md_exchange *exchange, struc
 
 int main(void)
 {
-    alarm(60); /* nobody would wake a thread that was not rung for */
+    alarm(60); /* no other call would wake the thread */
     struct md_history history = {0};
     struct md_drive drive = {.least_timeout_ns = TIMEOUT_NS, .most_timeout_ns = TIMEOUT_NS,
                              .history = &history};

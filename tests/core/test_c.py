@@ -13,7 +13,7 @@ from examples import usually
 
 @pytest.fixture
 def build(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Callable[..., None]:
-    """Build and run the program of that name; all workers keep what they compiled in one folder."""
+    """Build and run a test program; all workers share a folder of objects."""
     shared = tmp_path_factory.getbasetemp()
     shared = (shared.parent if "PYTEST_XDIST_WORKER" in os.environ else shared) / "objects"
     shared.mkdir(exist_ok=True)
@@ -39,7 +39,7 @@ def test_rows(build: Callable[..., None]) -> None:
 
 @pytest.mark.long
 @pytest.mark.slow
-def test_the_time_of_day_is_asked_for_again_and_again(build: Callable[..., None]) -> None:
+def test_utc_offset_is_read_for_each_batch_of_rows(build: Callable[..., None]) -> None:
     build("test_row_queue", "row_queue", "columns", "body", "frame")
 
 
@@ -49,7 +49,7 @@ def test_the_time_of_day_is_asked_for_again_and_again(build: Callable[..., None]
 @pytest.mark.parametrize(
     "sanitizers", usually([*SANITIZERS], ["-fsanitize=thread"]), ids=["memory", "threads"]
 )
-def test_ports_come_and_go_on_threads_of_their_own(build: Callable[..., None], sanitizers: list[str]) -> None:
+def test_threads_open_and_close_ports_concurrently(build: Callable[..., None], sanitizers: list[str]) -> None:
     core = [path.stem for path in (ROOT / "csrc").glob("*.c") if path.stem != "waiter_poll"]
     build("test_engine", *core, sanitizers=sanitizers)
 
@@ -57,7 +57,9 @@ def test_ports_come_and_go_on_threads_of_their_own(build: Callable[..., None], s
 @pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="others wait by poll")
-def test_a_client_that_is_back_soon_wakes_nobody(build: Callable[..., None]) -> None:
+def test_a_client_that_returns_within_the_silence_does_not_wake_the_thread(
+    build: Callable[..., None],
+) -> None:
     replaced = ("waiter_poll", "wakeup")
     core = [path.stem for path in (ROOT / "csrc").glob("*.c") if path.stem not in replaced]
     build("test_wakings", *core)
@@ -66,7 +68,7 @@ def test_a_client_that_is_back_soon_wakes_nobody(build: Callable[..., None]) -> 
 @pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="others wait by poll")
-def test_nothing_is_spun_for_a_client_that_waits(build: Callable[..., None]) -> None:
+def test_the_thread_does_not_spin_for_a_waiting_client(build: Callable[..., None]) -> None:
     replaced = ("waiter_poll", "clock")
     core = [path.stem for path in (ROOT / "csrc").glob("*.c") if path.stem not in replaced]
     build("test_spinning", *core)
@@ -90,13 +92,13 @@ def test_a_transceiver_sends_until_the_last_bit_has_left(build: Callable[..., No
 @pytest.mark.long
 @pytest.mark.skipif(sys.platform != "linux", reason="others wait by poll")
 @pytest.mark.parametrize("program", ["test_waiter", "test_waiter_refused"])
-def test_no_wait_is_rounded(build: Callable[..., None], program: str) -> None:
+def test_waits_are_exact_to_the_nanosecond(build: Callable[..., None], program: str) -> None:
     build(program, "waiter_epoll")
 
 
 @pytest.mark.long
 @pytest.mark.skipif(sys.platform != "linux", reason="masterships are Linux's")
-def test_nothing_is_sent_but_by_a_look_at_the_deadline(build: Callable[..., None]) -> None:
+def test_the_deadline_is_checked_before_each_write(build: Callable[..., None]) -> None:
     replaced = ("waiter_poll", "port", "rs485", "mastership")
     core = [path.stem for path in (ROOT / "csrc").glob("*.c") if path.stem not in replaced]
     build("test_mastership", *core)

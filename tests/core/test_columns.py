@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+import struct
 import sys
 from array import array
+from fractions import Fraction
 from itertools import pairwise
 from struct import iter_unpack
 from typing import Any
@@ -12,6 +14,8 @@ from typing import Any
 import pytest
 from completions import add_miss, add_rows
 from frames import words
+from hypothesis import given
+from hypothesis import strategies as st
 from line_driver import MS, LineDriver
 from tables import table
 
@@ -35,6 +39,7 @@ from multidrop.core import (
     raw_value,
     spell,
 )
+from multidrop.core.columns import CodeTable, find_codes, greatest_code, narrow_up, wide_codes, widen
 
 UTC = 1_700_000_000_000_000_000  # what monotonic time lies behind
 
@@ -75,7 +80,7 @@ def test_number(wire: int, data: str, value: float) -> None:
     assert raw_value(bytes.fromhex(data), 0, wire) == value
 
 
-def test_every_half_float_is_what_struct_reads() -> None:
+def test_every_half_float_equals_struct() -> None:
     data = b"".join(bits.to_bytes(2) for bits in range(1 << 16))
     for at, (number,) in enumerate(iter_unpack(">e", data)):
         found = raw_value(data, at, NumberFormat.F16)
@@ -83,7 +88,7 @@ def test_every_half_float_is_what_struct_reads() -> None:
         assert math.copysign(1, found) == math.copysign(1, number) or math.isnan(number)
 
 
-def test_every_wire_is_tested() -> None:
+def test_every_number_format_is_tested() -> None:
     assert {wire & (LOW_WORD_FIRST - 1) for wire, _, _ in NUMBERS} == set(NumberFormat)
 
 
@@ -94,14 +99,14 @@ def test_coils_count_from_the_least_significant_bit_of_the_first_byte() -> None:
 
 
 @table("wire", list(NumberFormat))
-def test_beyond_the_data_there_is_no_number(wire: NumberFormat) -> None:
+def test_a_number_beyond_the_data_is_nan(wire: NumberFormat) -> None:
     for at in (8, 9, 2**15, sys.maxsize, sys.maxsize + 1, 2 * sys.maxsize + 1):
         assert math.isnan(raw_value(b"\xff", at, wire))
     assert math.isnan(raw_value(b"", 0, wire))
 
 
 def completed(request: Message, received: bytes) -> Any:
-    """The row of an exchange that begins at 1000 ms and whose reply begins 30 ms later."""
+    """The row of an exchange that starts at 1000 ms; its reply starts 30 ms later."""
     line = LineDriver()
     line.begin(
         Exchange(
@@ -173,7 +178,7 @@ ONE = RowLayout(1, [Field(0, NumberFormat.U16, 2, 1, 1)])
         ),
     ],
 )
-def test_missing_value_has_a_row_that_says_why(received: bytes, status: int, text: str) -> None:
+def test_missing_value_has_a_row_with_its_status(received: bytes, status: int, text: str) -> None:
     columns = Columns(1)
     assert add_rows(columns, ONE, completed(Message(1, 0x03, 0, 1), received), UTC)
     assert list(columns.array("status")) == [status]
@@ -182,14 +187,14 @@ def test_missing_value_has_a_row_that_says_why(received: bytes, status: int, tex
     assert (columns.array("time")[0], columns.array("uncertainty")[0]) == (UTC + 1000 * MS, 0)
 
 
-def test_value_that_was_due_but_never_asked_for() -> None:
+def test_value_that_was_due_but_not_asked_for_has_a_row() -> None:
     columns = Columns(2)
     assert add_miss(columns, ONE, Status.NOT_ASKED, 77 * MS, UTC)
     assert (columns.array("status")[0], columns.array("sent")[0]) == (Status.NOT_ASKED, 77 * MS)
     assert columns.array("valid")[0] & 1 == 0
 
 
-def test_request_that_never_left_has_the_time_at_which_it_was_taken_up() -> None:
+def test_request_that_never_left_has_the_time_of_its_turn() -> None:
     line = LineDriver()
     line.now = 5000 * MS
     line.begin(
@@ -227,7 +232,7 @@ def test_bitmap_of_values_and_misses() -> None:
     assert [valid[at // 8] >> at % 8 & 1 for at in range(20)] == pattern
 
 
-def test_block_without_room_is_left_out_whole() -> None:
+def test_block_that_does_not_fit_adds_no_row() -> None:
     columns = Columns(3)
     two = RowLayout(1, [Field(0, NumberFormat.U16, 2, 1, 1), Field(1, NumberFormat.U16, 3, 1, 1)])
     answer = reply(1, 2)
@@ -239,7 +244,7 @@ def test_block_without_room_is_left_out_whole() -> None:
     assert list(columns.array("value")) == [1, 2, 1]
 
 
-def test_codes_are_spelt_out() -> None:
+def test_codes_become_names() -> None:
     names = Names(["pump-1", "вентилятор", ""])
     offsets, text = spell(memoryview(array("H", [1, 0, 2, 1])), names)
     ends = list(offsets)
@@ -247,7 +252,7 @@ def test_codes_are_spelt_out() -> None:
     assert found == ["вентилятор", "pump-1", "", "вентилятор"]
 
 
-def test_names_that_are_added_are_spelt_out_too() -> None:
+def test_names_added_later_are_included() -> None:
     names = Names()
     numbers = [names.number(name) for name in ("pump", "fan", "pump")]
     spell(memoryview(array("H", numbers)), names)
@@ -256,7 +261,7 @@ def test_names_that_are_added_are_spelt_out_too() -> None:
     assert (numbers, bytes(text).decode()) == ([0, 1, 0, 2], "".join(["pump", "fan", "pump", "насос"]))
 
 
-def test_nothing_is_spelt_out() -> None:
+def test_no_codes_give_an_empty_column() -> None:
     offsets, text = spell(memoryview(array("H")), Names("a"))
     assert (list(offsets), bytes(text)) == ([0], b"")
 
@@ -264,7 +269,7 @@ def test_nothing_is_spelt_out() -> None:
 BLOCK = RowLayout(0, [Field(0, NumberFormat.U16, register, 1.0, 1.0) for register in range(3)])
 
 
-def test_a_block_without_fields_leaves_nothing() -> None:
+def test_a_block_without_fields_adds_no_row() -> None:
     row_queue = RowQueue()
     row_queue.add_miss(RowLayout(0, []), Status.NOT_ASKED, 5)
     assert (row_queue.chunks, row_queue.dropped, row_queue.take()) == (0, 0, None)
@@ -288,6 +293,81 @@ def test_chunks_that_were_taken_can_all_be_given_back() -> None:
     assert (row_queue.take(), row_queue.dropped) == (None, 0)
 
 
-def test_a_code_without_a_name_is_not_spelt_out() -> None:
+def test_a_code_without_a_name_raises() -> None:
     with pytest.raises(ValueError, match=r"^a code without a name, or more than 2 GiB of names"):
         spell(memoryview(array("H", [0, 1])), Names(["pump"]))
+
+
+# ---- narrow columns of recordings ----
+
+
+EDGES = [0, 1, -1, 2**24, 2**24 + 1, 2**53 + 1, 2**63 - 1, -(2**63), -(2**63) + 1, 2**63 - 2**38]
+
+
+def as_float32(bits: int) -> Fraction:
+    return Fraction(*struct.unpack("<f", struct.pack("<I", bits))[0].as_integer_ratio())
+
+
+@given(st.lists(st.one_of(st.integers(-(2**63), 2**63 - 1), st.sampled_from(EDGES)), max_size=9))
+def test_a_bound_is_the_least_float_that_is_no_less(numbers: list[int]) -> None:
+    """Neighbours of a float are those of its bits (IEEE 754)."""
+    narrow = bytes(narrow_up(memoryview(array("q", numbers))))
+    for number, bits in zip(numbers, struct.unpack(f"<{len(numbers)}I", narrow), strict=True):
+        found = as_float32(bits)
+        assert found >= number
+        if number == 0:
+            assert bits == 0
+        else:
+            assert as_float32(bits - 1 if number > 0 else bits + 1) < number
+    wide = widen(memoryview(narrow), None, len(numbers)).cast("q")
+    for number, found in zip(numbers, wide, strict=True):
+        assert number <= found <= number + abs(number) // 2**23
+
+
+def test_only_valid_numbers_are_read() -> None:
+    floats = struct.pack("<4f", 7.0, float("nan"), float("inf"), 1e30)
+    assert list(widen(memoryview(floats), memoryview(b"\x01"), 4).cast("q")) == [7, 0, 0, 0]
+    for bit in (2, 4, 8):
+        with pytest.raises(ValueError, match="an uncertainty is no number"):
+            widen(memoryview(floats), memoryview(bytes([bit])), 4)
+    for cut in (floats[:15], b""):
+        with pytest.raises(ValueError, match="lengths do not fit"):
+            widen(memoryview(cut), None, 4)
+    with pytest.raises(ValueError, match="lengths do not fit"):
+        widen(memoryview(floats), memoryview(b""), 4)
+
+
+def test_codes_are_given_in_the_order_of_their_use() -> None:
+    table = CodeTable([f"name {number}" for number in range(400)])
+    assert bytes(table.narrow(memoryview(array("H", [9, 0, 9, 399]))) or b"") == bytes([0, 1, 0, 2])
+    assert table.used == ("name 9", "name 0", "name 399")
+    assert table.narrow(memoryview(array("H", range(256)))) is None  # 257 with the one before
+    table.forget()
+    assert bytes(table.narrow(memoryview(array("H", range(256)))) or b"") == bytes(range(256))
+    with pytest.raises(ValueError, match="a status 400 without a name"):
+        table.narrow(memoryview(array("H", [400])))
+
+
+def test_codes_are_widened() -> None:
+    assert list(wide_codes(memoryview(bytes([0, 255, 7])), 3, 1)) == [0, 255, 7]
+    assert list(wide_codes(memoryview(b"x" + struct.pack("=2H", 1, 65535))[1:], 2, 2)) == [1, 65535]
+    with pytest.raises(ValueError, match="lengths do not fit"):
+        wide_codes(memoryview(b"123"), 2, 2)
+
+
+codes = st.integers(0, 65535)
+
+
+@given(st.lists(codes))
+def test_the_greatest_code_is_found(given_codes: list[int]) -> None:
+    assert greatest_code(memoryview(array("H", given_codes))) == max(given_codes, default=0)
+
+
+@given(st.lists(st.tuples(codes, codes) | st.just((7, 65535))), st.frozensets(st.tuples(codes, codes)))
+def test_rows_are_found_by_their_codes(
+    rows: list[tuple[int, int]], others: frozenset[tuple[int, int]]
+) -> None:
+    wanted = frozenset({(7, 65535), *rows[::3], *others})
+    drives, registers = (memoryview(array("H", [row[side] for row in rows])) for side in (0, 1))
+    assert find_codes(drives, registers, wanted) == [at for at, row in enumerate(rows) if row in wanted]
+    assert find_codes(drives, registers, ()) == []

@@ -1,4 +1,4 @@
-"""The core as Python sees it: exchanges carried out on descriptors, and what is told when they fail."""
+"""Exchanges on real descriptors, and the results when they fail."""
 
 from __future__ import annotations
 
@@ -187,7 +187,7 @@ def test_a_queue_takes_no_more_than_it_has_room_for(drive: Drive) -> None:
         assert pending(port) == 4
 
 
-def test_nothing_is_sent_before_its_time(drive: Drive) -> None:
+def test_no_queued_request_leaves_before_its_time(drive: Drive) -> None:
     with closing(Port(drive(echo_start), NO_SETTINGS)) as port:
         due = [now_ns() + 20_000_000, now_ns() + 40_000_000]
         rows = Rows(port)
@@ -197,7 +197,7 @@ def test_nothing_is_sent_before_its_time(drive: Drive) -> None:
     assert all(at >= wanted for at, wanted in zip(sent, due, strict=True))
 
 
-def test_slots_that_the_line_was_too_late_for_are_not_made_up_for(drive: Drive) -> None:
+def test_missed_slots_are_not_made_up(drive: Drive) -> None:
     """The last one of each exchange that is due is sent, how late it may be."""
     second = 1_000_000_000
     fast, slow, in_turn = read(1, period=1.0), read(2, period=30.0), read(3)
@@ -233,7 +233,7 @@ def test_exchanges_are_repeated_until_they_are_replaced(drive: Drive) -> None:
         assert status_of(port.carry_out(read(9))) == 0
 
 
-def test_how_far_the_repetition_was_is_told(drive: Drive) -> None:
+def test_replacing_a_round_returns_its_next_index(drive: Drive) -> None:
     with closing(Port(drive(echo_start), NO_SETTINGS)) as port:
         rows = Rows(port)
         port.repeat([read(0), read(1), read(2)])
@@ -243,7 +243,7 @@ def test_how_far_the_repetition_was_is_told(drive: Drive) -> None:
         assert following == (rows.of("value", 20)[-1] + 1) % 3
 
 
-def test_what_is_queued_goes_between_what_is_repeated(drive: Drive) -> None:
+def test_queued_exchanges_interrupt_the_repeated_round(drive: Drive) -> None:
     with closing(Port(drive(echo_start), NO_SETTINGS)) as port:
         rows = Rows(port)
         port.repeat([read(0)])
@@ -258,7 +258,7 @@ def test_what_is_queued_goes_between_what_is_repeated(drive: Drive) -> None:
     assert sent[at] >= due_ns
 
 
-def test_what_cannot_be_sent_is_not_tried_again_and_again(drive: Drive) -> None:
+def test_repeating_stops_when_a_request_cannot_be_sent(drive: Drive) -> None:
     slow = Peer(least_timeout=0.01, most_timeout=0.02)
     with closing(Port(drive(lambda _: b""), NO_SETTINGS)) as port:
         rows = Rows(port)
@@ -303,7 +303,7 @@ def test_the_client_is_called_when_a_drive_refuses_and_when_the_port_is_lost() -
     near.close()
 
 
-def test_rows_for_which_there_is_no_room_are_counted(drive: Drive) -> None:
+def test_dropped_rows_are_counted(drive: Drive) -> None:
     with closing(Port(drive(echo_start), NO_SETTINGS)) as port:
         row_queue = RowQueue(chunk_rows=10, most_chunks=2)
         port.report_to(row_queue, 0)
@@ -330,7 +330,7 @@ def test_a_view_of_rows_outlives_them(drive: Drive) -> None:
         assert list(values) == list(range(100))
 
 
-def test_rows_outlive_what_they_were_taken_from(drive: Drive) -> None:
+def test_rows_outlive_their_queue(drive: Drive) -> None:
     with closing(Port(drive(echo_start), NO_SETTINGS)) as port:
         row_queue = RowQueue()
         port.report_to(row_queue, 0)
@@ -344,7 +344,7 @@ def test_rows_outlive_what_they_were_taken_from(drive: Drive) -> None:
     del columns
 
 
-def test_a_port_that_was_forgotten_is_let_go_of() -> None:
+def test_an_unreferenced_port_is_closed() -> None:
     near, far = socket.socketpair()
     near.setblocking(False)
     port = Port(near.fileno(), NO_SETTINGS)
@@ -358,7 +358,7 @@ def test_a_port_that_was_forgotten_is_let_go_of() -> None:
 
 
 @pytest.mark.parametrize("way", ["queued", "repeated", "urgent"])
-def test_a_echo_probe_goes_first_where_the_adapter_is_not_known(drive: Drive, way: str) -> None:
+def test_an_echo_probe_is_sent_first_on_an_unknown_adapter(drive: Drive, way: str) -> None:
     requested: list[int] = []
 
     def answer(request: Message) -> bytes:
@@ -375,7 +375,7 @@ def test_a_echo_probe_goes_first_where_the_adapter_is_not_known(drive: Drive, wa
         assert requested[:3] == [99, 7, 7]
 
 
-def test_a_echo_probe_that_learns_nothing_goes_first_again(drive: Drive) -> None:
+def test_an_inconclusive_echo_probe_is_repeated(drive: Drive) -> None:
     requested: list[int] = []
 
     def answer(request: Message) -> bytes:
@@ -392,7 +392,7 @@ def test_a_echo_probe_that_learns_nothing_goes_first_again(drive: Drive) -> None
 
 
 @pytest.mark.parametrize("echo", [Echo.ON, Echo.OFF])
-def test_no_echo_probe_goes_first_where_the_echo_was_told(drive: Drive, echo: Echo) -> None:
+def test_a_configured_echo_needs_no_probe(drive: Drive, echo: Echo) -> None:
     requested: list[int] = []
 
     def answer(request: Message) -> bytes:
@@ -481,7 +481,7 @@ def test_an_urgent_exchange_that_expires_before_it_can_leave_is_not_sent(drive: 
         assert (found.result, found.sent_ns) == (Failure.EXPIRED, 0)
 
 
-def test_a_stop_goes_ahead_of_all_that_waits_and_ends_what_came_before_it_for_its_drive(drive: Drive) -> None:
+def test_a_stop_precedes_waiting_requests_and_cancels_earlier_ones_of_its_drive(drive: Drive) -> None:
     """Sent after it, a start would undo it; sent before it, it would move the motor first."""
     latch, other = Latch(), Latch()
     requested: list[int] = []
@@ -518,7 +518,7 @@ def test_a_stop_goes_ahead_of_all_that_waits_and_ends_what_came_before_it_for_it
     assert (found[50].result, found[50].sent_ns) == (Failure.EXPIRED, 0)
 
 
-def test_a_permit_is_good_until_its_latch_rises_and_never_while_that_is_held() -> None:
+def test_a_permit_is_good_until_its_latch_rises_and_never_during_a_hold() -> None:
     latch = Latch()
     before = latch.permit()
     assert before.is_good
@@ -543,7 +543,7 @@ def test_no_permit_is_good_until_the_last_of_several_stops_is_over() -> None:
     assert latch.permit().is_good
 
 
-def test_a_permit_is_for_a_call_that_no_stop_came_after() -> None:
+def test_a_permit_of_a_call_before_a_stop_is_not_good() -> None:
     latch = Latch()
     seen = latch.c[0]
     assert latch.permit(seen).is_good
@@ -552,7 +552,7 @@ def test_a_permit_is_for_a_call_that_no_stop_came_after() -> None:
     assert latch.permit().is_good
 
 
-def test_a_port_that_is_closed_tells_whether_what_was_under_way_had_left(drive: Drive) -> None:
+def test_closing_a_port_reports_whether_the_request_in_flight_had_left(drive: Drive) -> None:
     """And what had not begun is never sent."""
     came = threading.Event()
 
@@ -581,7 +581,7 @@ def test_a_port_that_is_closed_tells_whether_what_was_under_way_had_left(drive: 
     assert sorted(each.sent_ns > 0 for each in found) == [False, True]
 
 
-def test_what_was_counted_before_a_port_closed_has_its_rows() -> None:
+def test_exchanges_counted_before_closing_have_rows() -> None:
     """Close it in the moment in which a reply comes."""
     values = 0
     for _ in range(60):
@@ -604,7 +604,7 @@ def test_what_was_counted_before_a_port_closed_has_its_rows() -> None:
 
 
 def wait_until_it_sleeps(thread: threading.Thread) -> None:
-    """Wait until the thread is in the core: asleep at every look, while nobody holds the interpreter."""
+    """Wait until the thread sleeps in the core."""
     stat = Path(f"/proc/self/task/{thread.native_id}/stat")
     asleep = 0
     while asleep < 20:
@@ -651,7 +651,7 @@ def test_a_port_is_woken_in_time_after_another_was_closed(drive: Drive) -> None:
         until(lambda: not pending(port))
 
 
-def test_what_is_queued_lives_until_it_was_carried_out(drive: Drive) -> None:
+def test_queued_exchanges_are_kept_alive_until_they_end(drive: Drive) -> None:
     with closing(Port(drive(echo_start), NO_SETTINGS)) as port:
         rows = Rows(port)
         port.submit([read(1), read(2)], [now_ns() + 20_000_000] * 2)
@@ -674,7 +674,7 @@ def test_silent_drive_does_not_end_the_run(drive: Drive) -> None:
         assert rows.of("status", 3) == [0, Status.NO_REPLY, 0]
 
 
-def test_nothing_that_a_late_answer_could_be_taken_for_is_sent(drive: Drive) -> None:
+def test_a_request_that_a_late_reply_could_answer_is_not_sent(drive: Drive) -> None:
     slow = Peer(least_timeout=0.01, most_timeout=0.02)
     fd = drive(lambda request: b"" if request.start == 1 else echo_start(request))
     with closing(Port(fd, NO_SETTINGS)) as port:
@@ -687,7 +687,7 @@ def test_nothing_that_a_late_answer_could_be_taken_for_is_sent(drive: Drive) -> 
         assert port.carry_out(queued[1]).result == 7
 
 
-def test_broadcast_is_sent_and_nobody_waited_for(drive: Drive) -> None:
+def test_a_broadcast_waits_for_no_reply(drive: Drive) -> None:
     requested: list[int] = []
 
     def answer(request: Message) -> bytes:
@@ -711,7 +711,7 @@ def test_broadcast_is_sent_and_nobody_waited_for(drive: Drive) -> None:
     assert read_back.sent_ns - sent.sent_ns >= 1_000_000  # the turnaround delay
 
 
-def test_what_is_queued_on_a_lost_port_stays_queued() -> None:
+def test_the_queue_of_a_lost_port_stays_queued() -> None:
     """Its client has it sent on the port that is opened next."""
     near, far = socket.socketpair()
     near.setblocking(False)
@@ -726,9 +726,7 @@ def test_what_is_queued_on_a_lost_port_stays_queued() -> None:
 
 @pytest.mark.parametrize("way", ["queued", "repeated"])
 @pytest.mark.parametrize("answered", [0, 1])
-def test_the_exchange_that_a_port_is_lost_with_is_known_unless_it_was_the_first(
-    answered: int, way: str
-) -> None:
+def test_cut_off_is_set_unless_the_first_exchange_was_lost(answered: int, way: str) -> None:
     near, far = socket.socketpair()
     near.setblocking(False)
     with closing(Port(near.fileno(), NO_SETTINGS)) as port:
@@ -763,7 +761,7 @@ def test_pty_whose_far_end_hangs_up() -> None:
 
 
 def test_refused_settings_that_must_be_taken() -> None:
-    """Nothing is sent with wrong parity. A pty takes none."""
+    """A request with wrong parity must not leave. A pty has no parity."""
     master, slave = os.openpty()
     os.set_blocking(slave, False)
     os.set_blocking(master, False)
@@ -778,7 +776,7 @@ def test_refused_settings_that_must_be_taken() -> None:
     os.close(master)
 
 
-def test_what_a_change_of_settings_takes_is_measured() -> None:
+def test_the_time_of_a_settings_change_is_measured() -> None:
     master, slave = os.openpty()
     os.set_blocking(slave, False)
     with closing(Port(slave, ANY_SETTINGS)) as port:

@@ -1,4 +1,4 @@
-"""Beyond the window of a late answer: what could be taken for another waits until a proof was answered."""
+"""After the window of late replies: requests with ambiguous replies wait for the answer to a proof."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def test_a_read_of_the_same_length_waits_for_a_proof(line: LineDriver, drive: Pe
 
 @pytest.mark.usefixtures("proof")
 def test_a_write_waits_for_the_answer_of_an_earlier_one(line: LineDriver, drive: Peer) -> None:
-    """A late refusal of the first would be told as the second's, whose motor has started."""
+    """A late refusal of the first would count as the second's, whose motor has started."""
     time_out(line, drive, WRITE)
     assert is_barred(line, drive, AGAIN)
 
@@ -65,7 +65,7 @@ def test_an_answered_proof_says_that_the_earlier_answer_never_comes(
     assert (line.want, line.completion.reply.data) == ("done", words(2222))
 
 
-def test_a_late_answer_before_the_proof_s_is_neither(line: LineDriver, drive: Peer, proof: Exchange) -> None:
+def test_a_late_reply_before_the_proof_s_is_skipped(line: LineDriver, drive: Peer, proof: Exchange) -> None:
     send(line, proof)
     line.receive(reply(1111))
     assert line.listens
@@ -234,7 +234,7 @@ def test_the_first_write_waits_for_a_reply_to_a_read(line: LineDriver, drive: Pe
 
 
 @pytest.mark.usefixtures("first")
-def test_a_stop_and_what_it_reads_are_taken_as_they_come(line: LineDriver, drive: Peer) -> None:
+def test_a_stop_accepts_its_first_replies(line: LineDriver, drive: Peer) -> None:
     for request, came in ((READ, reply(1)), (WRITE, build_reply(Framing.RTU, WRITE))):
         asked = exchange(request, drive)
         asked.c.insists = 1
@@ -243,7 +243,7 @@ def test_a_stop_and_what_it_reads_are_taken_as_they_come(line: LineDriver, drive
         assert line.completion.result > 0
 
 
-def test_the_first_reply_is_taken_where_nothing_proves(line: LineDriver, drive: Peer) -> None:
+def test_without_proofs_the_first_reply_is_accepted(line: LineDriver, drive: Peer) -> None:
     drive.doubt_first_reply()
     ask(line, drive, READ)
     line.receive(reply(1111))

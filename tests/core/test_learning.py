@@ -1,4 +1,4 @@
-"""A line learns of its drives: when to look for a reply, how long to wait, what may come late."""
+"""Learning from drives: when to read the port, how long to wait, which replies may be late."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def test_the_response_delay_is_learnt(line: LineDriver, drive: Peer) -> None:
     assert drive.response_delay == pytest.approx(15e-3, rel=0.01)
 
 
-def test_nothing_is_looked_at_before_a_reply_can_be_whole(line: LineDriver, drive: Peer) -> None:
+def test_the_port_is_not_read_before_a_reply_can_be_whole(line: LineDriver, drive: Peer) -> None:
     for _ in range(40):
         answer(line, drive, 15 * MS)
     left = ask(line, drive)
@@ -71,12 +71,12 @@ def attend(line: LineDriver, drive: Peer, delay: int) -> int:
     return line.now - times[-1]
 
 
-def test_a_reply_is_looked_for_before_it_is_whole(line: LineDriver, drive: Peer) -> None:
+def test_the_first_read_comes_shortly_before_the_reply_s_end(line: LineDriver, drive: Peer) -> None:
     for _ in range(20):
         assert attend(line, drive, 15 * MS) == attend(line, drive, 16 * MS) == 0
 
 
-def test_the_rest_of_a_reply_is_waited_for_by_its_length(line: LineDriver, drive: Peer) -> None:
+def test_the_wait_for_the_rest_of_a_reply_depends_on_its_length(line: LineDriver, drive: Peer) -> None:
     ask(line, drive)
     line.now += 60 * MS
     line.receive(reply()[:3])
@@ -145,7 +145,7 @@ def test_a_silent_drive_has_all_its_time_once_and_then_rarely(line: LineDriver, 
 
 
 def test_a_write_is_waited_for_as_long_as_it_may_take(line: LineDriver, drive: Peer) -> None:
-    """However quick the drive was at reads: a write that is wrongly told to be unconfirmed costs more."""
+    """Even if reads are quick: a write wrongly reported as unconfirmed costs more than the wait."""
     for _ in range(12):
         answer(line, drive, 2 * MS)
     assert given_up(line, drive) < 100 * MS
@@ -156,7 +156,7 @@ def test_a_write_is_waited_for_as_long_as_it_may_take(line: LineDriver, drive: P
     assert line.now - left == 1000 * MS + 8 * CHARACTER
 
 
-# ---- nothing has begun ----
+# ---- no byte within the timeout ----
 
 AWAITED = 3 * CHARACTER  # where characters come one by one: that one, and two
 LONG = Message(1, 3, 0, 100)  # with a reply of 205 characters
@@ -239,7 +239,7 @@ def test_an_answer_that_was_not_waited_for_is_late(line: LineDriver, drive: Peer
 # ---- answers that come late ----
 
 
-def test_what_a_late_answer_could_be_taken_for_is_not_sent(line: LineDriver, drive: Peer) -> None:
+def test_no_request_leaves_that_a_late_reply_could_answer(line: LineDriver, drive: Peer) -> None:
     time_out(line, drive)
     line.begin(exchange(OTHER, drive))
     assert line.want == "done"
@@ -262,7 +262,7 @@ def test_an_answer_may_still_come_when_the_port_that_was_lost_is_back(line: Line
 def test_a_value_that_may_answer_an_earlier_question_has_its_time(
     line: LineDriver, drive: Peer, is_row: bool
 ) -> None:
-    """Whoever asks by hand gets none: another question is to prove first that no answer is on its way."""
+    """A read outside of a poll gets no value: a proof must show first that no late reply is on its way."""
     drive.prove_by([exchange(LONGER, drive), exchange(Message(1, 3, 0, 3), drive)])
     rows = RowLayout(0, [Field(0, NumberFormat.U16, 0, 1.0, 1.0)]) if is_row else None
     asked = exchange(READ, drive, block=rows)
@@ -286,7 +286,7 @@ def test_a_value_that_may_answer_an_earlier_question_has_its_time(
 
 
 @pytest.mark.parametrize(("asked", "times"), [(READ, 2), (WRITE, 1)], ids=["a read", "a write"])
-def test_nothing_but_a_read_is_sent_again(drive: Peer, asked: Message, times: int) -> None:
+def test_only_reads_are_repeated(drive: Peer, asked: Message, times: int) -> None:
     """Its reply may have been an earlier one; but a write may have started a motor."""
     slots, turn = ffi.new("struct md_slot[]", 1), ffi.new("struct md_turn *")
     wake, found = ffi.new("int64_t *"), ffi.new("struct md_completion *")
@@ -310,7 +310,7 @@ def test_a_request_that_never_left_has_no_late_answer(line: LineDriver, drive: P
     assert drive.late_until_ns == 0
 
 
-def test_what_no_late_answer_could_be_taken_for_is_sent(line: LineDriver, drive: Peer) -> None:
+def test_a_request_that_no_late_reply_could_answer_is_sent(line: LineDriver, drive: Peer) -> None:
     """A stop is a write: it never waits."""
     time_out(line, drive)
     ask(line, drive, WRITE)
@@ -359,7 +359,7 @@ def delixi(function: int, start: int, value: int = 0) -> Message:
     ],
     ids=["another parameter", "the same one", "a state", "a state and a parameter", "a write", "a command"],
 )
-def test_what_a_late_answer_of_delixi_s_own_protocol_could_be_taken_for(
+def test_which_requests_a_late_delixi_reply_could_answer(
     line: LineDriver, drive: Peer, first: Message, second: Message
 ) -> None:
     line.begin(exchange(first, drive, Framing.DELIXI))
@@ -371,7 +371,7 @@ def test_what_a_late_answer_of_delixi_s_own_protocol_could_be_taken_for(
 
 
 def test_a_late_answer_of_a_write_is_expected_beyond_its_own_time_out(line: LineDriver, drive: Peer) -> None:
-    """Its late refusal would be told as the next write's, whose motor has started."""
+    """Its late refusal would count as the next write's, whose motor has started."""
     line.begin(exchange(WRITE, drive, timeout=5 * MOST / 1e9))
     line.wait_until_write()
     line.wait_until_done()
@@ -407,7 +407,7 @@ def test_a_stop_is_given_longer_step_by_step(line: LineDriver, drive: Peer) -> N
     assert found == [60, 60, 120, 240, 300]
 
 
-def test_what_looks_like_a_damaged_reply_inside_another_frame_is_none(line: LineDriver, drive: Peer) -> None:
+def test_a_damaged_reply_inside_another_frame_does_not_count(line: LineDriver, drive: Peer) -> None:
     ask(line, drive)
     inside = bytes([1, 3, 2, 0, 0, 0, 0])  # a reply with a wrong checksum
     line.receive(build_reply(Framing.RTU, Message(1, 4, data=bytes(1) + inside)))
@@ -470,7 +470,7 @@ def test_a_late_answer_within_another_drive_s_exchange_is_recognised(
     ask(line, drive, OTHER)  # it need not be waited for any more
 
 
-def test_all_who_owe_an_answer_are_recognised(line: LineDriver) -> None:
+def test_late_replies_of_several_drives_are_recognised(line: LineDriver) -> None:
     drives = {address: peer() for address in (1, 2, 3)}
     for address, each in drives.items():
         time_out(line, each, Message(address, 3, 0, address))
@@ -502,7 +502,7 @@ def test_a_late_answer_is_no_reply_from_another_address(line: LineDriver, drive:
     assert other.late_until_ns > line.now
 
 
-def test_what_the_reply_s_own_data_look_like_is_no_late_answer(line: LineDriver, drive: Peer) -> None:
+def test_data_that_look_like_a_late_reply_are_part_of_the_reply(line: LineDriver, drive: Peer) -> None:
     """It comes at once or byte by byte: the bar stays, and the reply is read."""
     time_out(line, drive)
     until = drive.late_until_ns
@@ -513,7 +513,7 @@ def test_what_the_reply_s_own_data_look_like_is_no_late_answer(line: LineDriver,
     assert (drive.counters().late, drive.late_until_ns) == (0, until)
 
 
-def test_a_frame_of_a_drive_that_owes_nothing_any_more_is_a_stray_one(line: LineDriver, drive: Peer) -> None:
+def test_a_frame_of_a_drive_without_outstanding_requests_is_stray(line: LineDriver, drive: Peer) -> None:
     time_out(line, drive)
     line.now = drive.late_until_ns
     ask(line, peer(), Message(2, 3, 0, 1))
@@ -542,3 +542,68 @@ def test_everything_is_counted(line: LineDriver, drive: Peer) -> None:
     assert (counters.exchanges, counters.answered, counters.values, counters.exceptions) == (4, 2, 1, 1)
     assert counters.missed == {Status.NO_REPLY: 1, Status.LATE_ANSWER_DUE: 1}
     assert (counters.stray_bytes, counters.late) == (1, 0)
+
+
+# ---- reads for a client that waits: one wake-up, when the reply is whole ----
+
+
+FIELDS = RowLayout(0, [Field(0, NumberFormat.U16, 0, 1.0, 1.0)])
+BY_HAND, FOR_A_ROW = {"values": FIELDS}, {"block": FIELDS}
+STEADY = 60 * [15 * MS]
+
+
+def looks(line: LineDriver, drive: Peer, delay: int, details: dict[str, RowLayout]) -> tuple[int, int]:
+    """Carry out an exchange as the engine does; return the reads, and the last one's lateness."""
+    line.begin(exchange(READ, drive, **details))
+    line.wait_until_write()
+    left = line.now + 8 * CHARACTER
+    times = [left + delay + (at + 1) * CHARACTER for at in range(len(reply()))]
+    seen = found = 0
+    while line.want != "done":
+        line.wait_for_look()
+        if found and line.now < times[seen]:  # it waits for the next character
+            line.now = times[seen]
+        come = sum(time <= line.now for time in times)
+        line.receive(reply()[seen:come])
+        seen = come
+        found += 1
+    return found, line.now - times[-1]
+
+
+def all_looks(
+    line: LineDriver, drive: Peer, delays: list[int], details: dict[str, RowLayout]
+) -> list[tuple[int, int]]:
+    return [looks(line, drive, delay, details) for delay in delays]
+
+
+def test_seven_of_eight_reads_for_a_client_come_when_the_reply_is_whole(
+    line: LineDriver, drive: Peer
+) -> None:
+    all_looks(line, drive, STEADY, BY_HAND)
+    found = all_looks(line, drive, 80 * [15 * MS], BY_HAND)
+    assert sum(times == 1 for times, _ in found) == 70
+    assert max(late for _, late in found) <= CHARACTER
+
+
+def test_polled_replies_are_always_read_early(line: LineDriver, drive: Peer) -> None:
+    all_looks(line, drive, STEADY, BY_HAND)
+    found = all_looks(line, drive, STEADY, FOR_A_ROW)
+    assert min(times for times, _ in found) > 1
+    assert {late for _, late in found} == {0}
+
+
+def test_an_unsteady_drive_is_read_early(line: LineDriver, drive: Peer) -> None:
+    all_looks(line, drive, 20 * [15 * MS, 19 * MS], BY_HAND)
+    assert {late for _, late in all_looks(line, drive, 20 * [15 * MS, 19 * MS], BY_HAND)} == {0}
+
+
+def test_a_steady_drive_that_becomes_quicker_is_followed(line: LineDriver, drive: Peer) -> None:
+    all_looks(line, drive, [*STEADY, *(120 * [5 * MS])], BY_HAND)
+    assert looks(line, drive, 5 * MS, BY_HAND)[1] <= CHARACTER
+    assert drive.response_delay < 6e-3
+
+
+def test_a_steady_drive_that_becomes_slower_is_followed(line: LineDriver, drive: Peer) -> None:
+    found = all_looks(line, drive, [*STEADY, *(120 * [18 * MS])], BY_HAND)
+    assert max(late for _, late in found) <= CHARACTER
+    assert drive.response_delay > 17.5e-3

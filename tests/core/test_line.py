@@ -65,7 +65,7 @@ def line() -> LineDriver:
 
 
 def ask(line: LineDriver, request: Message = READ) -> None:
-    """Send the request; the clock then stands at its first bit."""
+    """Send the request; the clock is then at its first bit."""
     line.begin(exchange(request))
     line.wait_until_write()
 
@@ -152,7 +152,7 @@ def test_silence_counts_from_the_end_of_what_was_heard_last(line: LineDriver) ->
     assert line.completion.stale == 2
 
 
-def test_bytes_found_in_the_last_look_renew_the_silence(line: LineDriver) -> None:
+def test_bytes_found_in_the_last_read_restart_the_silence(line: LineDriver) -> None:
     line.begin(exchange(READ))
     line.now += SILENCE
     assert line.listens
@@ -187,8 +187,8 @@ def test_flooded_line_is_given_up_even_when_time_stands_still(line: LineDriver) 
     raise AssertionError("it still looks at the flood")
 
 
-def test_a_flood_while_nothing_is_asked_is_no_part_of_any_exchange(line: LineDriver) -> None:
-    """Also before the first one: there is nobody yet to be told of it."""
+def test_a_flood_on_an_idle_line_belongs_to_no_exchange(line: LineDriver) -> None:
+    """Also before the first exchange."""
     for value in range(3):
         line.receive(b"\xff" * 4000)
         ask(line)
@@ -250,7 +250,7 @@ def test_noise_while_the_port_takes_nothing_renews_the_silence(line: LineDriver)
 
 
 @pytest.mark.parametrize("taken", [0, 3])
-def test_what_comes_before_the_request_is_out_is_not_its_reply(line: LineDriver, taken: int) -> None:
+def test_bytes_before_the_request_has_left_are_not_its_reply(line: LineDriver, taken: int) -> None:
     line.begin(exchange(READ))
     line.now += SILENCE + TIMEOUT  # a babbling line is written to all the same
     assert [line.want, line.want] == ["read", "write"]
@@ -318,7 +318,7 @@ def test_time_out_counts_from_the_requests_last_bit_and_leaves_time_for_the_repl
     assert (found.result, found.raw, found.first_ns, found.last_ns) == (Failure.NO_REPLY, b"", 0, 0)
 
 
-def test_reply_found_in_the_last_look_counts(line: LineDriver) -> None:
+def test_reply_found_in_the_last_read_counts(line: LineDriver) -> None:
     ask(line)
     assert line.listens
     line.now = line.wake + 50 * MS
@@ -328,7 +328,7 @@ def test_reply_found_in_the_last_look_counts(line: LineDriver) -> None:
     assert line.completion.reply.data == words(3)
 
 
-def test_last_look_is_the_last_whatever_it_finds(line: LineDriver) -> None:
+def test_the_exchange_ends_after_the_last_read(line: LineDriver) -> None:
     ask(line)
     assert line.listens
     line.now = line.wake
@@ -374,7 +374,9 @@ REASONS = [
 @pytest.mark.parametrize(
     ("received", "reason"), [each[1:] for each in REASONS], ids=[each[0] for each in REASONS]
 )
-def test_time_out_tells_what_went_wrong(line: LineDriver, received: bytes, reason: int, piece: int) -> None:
+def test_the_result_at_the_timeout_gives_the_reason(
+    line: LineDriver, received: bytes, reason: int, piece: int
+) -> None:
     ask(line, READ_TWO)
     sent = line.now
     answer(line, received, piece)
@@ -488,7 +490,7 @@ def teach_echo(line: LineDriver) -> None:
 
 @pytest.mark.parametrize("piece", [4096, 1], ids=["whole", "byte by byte"])
 def test_the_reply_behind_another_masters_read_is_not_ours(line: LineDriver, piece: int) -> None:
-    """Both ask the same drive: its first reply then answers the other master, as far as anybody can tell."""
+    """Both ask the same drive: its first reply then probably answers the other master."""
     ask(line)
     line.receive(rtu("01 03 00 40 00 01") + reply_of(0x1234), piece)
     assert line.listens
@@ -634,7 +636,7 @@ def test_where_no_adapter_echoes_the_first_confirmation_is_believed_until_an_ech
     assert line.completion.result == Failure.NO_REPLY
 
 
-def test_an_adapter_that_is_told_to_echo_stays_one_that_does(line: LineDriver) -> None:
+def test_a_configured_echo_is_never_unlearnt(line: LineDriver) -> None:
     line.tell_echo(lib.MD_ECHO)
     for _ in range(3):
         ask(line)
@@ -645,7 +647,7 @@ def test_an_adapter_that_is_told_to_echo_stays_one_that_does(line: LineDriver) -
     assert line.completion.result == Failure.NO_REPLY
 
 
-def test_the_first_echo_of_a_delixi_query_is_no_value_of_0_where_it_is_told(line: LineDriver) -> None:
+def test_with_a_configured_echo_the_echo_of_a_delixi_query_is_not_a_value(line: LineDriver) -> None:
     query, value = Message(1, 0x07, 0x01F4, data=bytes(4)), b"\0\0\x13\x88"
     line.tell_echo(lib.MD_ECHO)
     line.begin(exchange(query, framing=Framing.DELIXI))
@@ -655,7 +657,7 @@ def test_the_first_echo_of_a_delixi_query_is_no_value_of_0_where_it_is_told(line
     assert (line.completion.reply.data, line.completion.skipped) == (value, 21)
 
 
-def test_what_may_be_the_echo_of_an_unknown_adapter_is_not_believed(line: LineDriver) -> None:
+def test_a_possible_echo_of_an_unknown_adapter_is_rejected(line: LineDriver) -> None:
     ask(line, WRITE)
     answer(line, confirmation())
     assert (line.completion.result, line.completion.raw) == (Failure.MAYBE_ECHO, confirmation())
@@ -667,7 +669,7 @@ def test_what_may_be_the_echo_of_an_unknown_adapter_is_not_believed(line: LineDr
     assert line.completion.result == Failure.NO_REPLY
 
 
-def test_a_reply_without_an_echo_before_it_tells_that_there_is_none(line: LineDriver) -> None:
+def test_a_reply_without_an_echo_shows_that_the_adapter_does_not_echo(line: LineDriver) -> None:
     ask(line)
     answer(line, reply_of(1))
     ask(line, WRITE)
@@ -686,7 +688,7 @@ def test_a_few_stray_bytes_before_a_reply_are_no_echo(line: LineDriver, stray: i
     assert (line.completion.result == 8) is told
 
 
-def test_an_echo_alone_tells_of_itself(line: LineDriver) -> None:
+def test_an_echo_without_a_reply_shows_the_echo(line: LineDriver) -> None:
     """No reply to a read is a copy of its request: the drive is dead."""
     ask(line)
     answer(line, rtu("01 03 00 00 00 01"))

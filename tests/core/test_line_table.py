@@ -1,4 +1,4 @@
-"""The table of a line's states: what it says, that the line keeps to it, and its picture."""
+"""The table of a line's states: its content, the line's use of it, and its picture."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def test_an_exchange_can_end_in_every_state_but_where_there_is_none() -> None:
     assert all(TABLE[state, EVENTS["MD_ENDED"]] == STATES["MD_IDLE"] for state in ending)
 
 
-def test_nothing_is_written_but_on_a_line_that_was_found_silent() -> None:
+def test_the_request_is_written_only_after_a_check_for_silence() -> None:
     before = {state for (state, _), following in TABLE.items() if following == STATES["MD_READY"]}
     assert before == {STATES["MD_CHECK"]}
     leaving = {state for state, event in TABLE if event in (EVENTS["MD_PART_LEFT"], EVENTS["MD_ALL_LEFT"])}

@@ -1,4 +1,4 @@
-"""Memory of what the core touches at every exchange."""
+"""Memory of the structs that the core uses at every exchange."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def new_chunk(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(memory, "_chunks", memory.Chunks())
 
 
-def test_what_is_made_together_is_side_by_side_in_whole_cache_lines() -> None:
+def test_structs_made_together_are_adjacent_in_whole_cache_lines() -> None:
     first, second = new_drive(1), new_drive(2)
     block = new_beside("struct md_block", {"count": 3})
     assert place(first) % CACHE_LINE == 0
@@ -68,7 +68,7 @@ def test_threads_get_memory_of_their_own() -> None:
     assert numbers(*made) == list(range(4000))
 
 
-def test_what_interrupts_it_gets_memory_of_its_own() -> None:
+def test_a_signal_handler_gets_separate_memory() -> None:
     """A signal's handler may stop a motor, in the midst of this."""
     before = new_drive(1)
     with memory._chunks._lock:
@@ -85,13 +85,13 @@ def test_a_struct_larger_than_a_chunk_has_room(monkeypatch: pytest.MonkeyPatch) 
 
 
 def last_line(struct: str, *fields: str) -> int:
-    """Return in which cache line of the struct the last of these fields ends, from 1 on."""
+    """Return the number of the struct's cache line in which the last field ends, from 1 on."""
     places = dict(ffi.typeof(f"struct {struct}").fields)
     end = max(places[field].offset + ffi.sizeof(places[field].type) for field in fields)
     return -(-end // CACHE_LINE)
 
 
-def test_what_every_exchange_touches_is_in_few_cache_lines() -> None:
+def test_the_fields_of_every_exchange_are_in_few_cache_lines() -> None:
     """Two of its drive and two of itself; one of a drive that is to be asked next."""
     assert last_line("md_drive", "most_timeout_ns", "ready_ns", "failures", "owed_count", "is_doubted") == 1
     assert last_line("md_drive", "counters", "answered_ns") == 2
@@ -99,8 +99,8 @@ def test_what_every_exchange_touches_is_in_few_cache_lines() -> None:
     assert ffi.offsetof("struct md_exchange", "request", "data") <= 2 * CACHE_LINE
 
 
-def test_what_is_polled_of_a_drive_is_side_by_side() -> None:
-    """Proofs, and what is read by hand, have no part in its exchanges."""
+def test_polled_exchanges_of_a_drive_are_adjacent() -> None:
+    """Proofs, and reads outside of a poll, are elsewhere."""
     peer = Peer(least_timeout=0.02, most_timeout=1.0)
     peer.prove_by([read_of(peer, None), read_of(peer, None)])
     rows = RowLayout(0, [Field(0, NumberFormat.U16, 0, 1, 1)])

@@ -48,7 +48,9 @@ def test_any_baud_rate(pty: int, baudrate: int) -> None:
         ("7E1", {"data bits", "parity"}, "8N1"),
     ],
 )
-def test_what_a_pty_does_not_take_is_told(pty: int, format: str, not_taken: set[str], taken: str) -> None:
+def test_settings_refused_by_a_pty_are_reported(
+    pty: int, format: str, not_taken: set[str], taken: str
+) -> None:
     assert refused(pty, 9600, format) == not_taken
     assert get_settings(pty) == (9600, taken)
 
@@ -94,7 +96,7 @@ def test_parity_errors_are_dropped(pty: int) -> None:
     assert termios.tcgetattr(pty)[0] == termios.INPCK | termios.IGNPAR
 
 
-def test_what_has_no_settings_says_so() -> None:
+def test_a_descriptor_without_settings_raises() -> None:
     reader, writer = os.pipe()
     try:
         with pytest.raises(OSError, match="no serial settings") as failed:
@@ -111,8 +113,8 @@ def test_what_has_no_settings_says_so() -> None:
 
 
 @pytest.mark.slow
-def test_ports_that_are_opened_beside_each_other_have_one_thread(monkeypatch: pytest.MonkeyPatch) -> None:
-    """While it is started for one of them the others wait: the core would run lines on several threads."""
+def test_ports_opened_concurrently_share_one_thread(monkeypatch: pytest.MonkeyPatch) -> None:
+    """While one port starts the thread the others wait; otherwise there would be several threads."""
     started: list[str] = []
     is_second = threading.Event()
 

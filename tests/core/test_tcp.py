@@ -66,7 +66,7 @@ def test_printed_frames_are_built_and_understood() -> None:
 
 
 @pytest.mark.parametrize("replies", [False, True])
-def test_bodies_mean_what_they_mean_over_rtu(replies: bool) -> None:
+def test_bodies_are_the_same_as_over_rtu(replies: bool) -> None:
     """Whole ones and damaged ones; only a wrong length shows sooner, because the header has it."""
     seen = set()
     for number, said in enumerate(frames(11, Framing.RTU, NUMBER, replies=replies)):
@@ -299,7 +299,7 @@ def test_a_late_exception_of_a_gateway_is_no_sign_of_life(line: LineDriver, driv
         (bytes([1, 3, 2, 0, 7, 0]), FrameFault.BAD_LENGTH),
     ],
 )
-def test_a_wrong_reply_with_the_right_id_is_told_at_the_time_out(
+def test_a_wrong_reply_with_the_right_id_ends_at_the_timeout(
     line: LineDriver, drive: Peer, body: bytes, result: FrameFault
 ) -> None:
     transaction = ask(line, drive)
@@ -366,7 +366,7 @@ def test_a_reply_whose_end_never_comes_ends_one_exchange(
     assert not line.is_out_of_step
 
 
-def test_what_began_to_come_before_a_request_is_no_reply_to_it(line: LineDriver, drive: Peer) -> None:
+def test_a_frame_that_started_before_a_request_is_not_its_reply(line: LineDriver, drive: Peer) -> None:
     following = ask(line, drive) + 1
     line.receive(value(following - 1, 1))
     assert line.want == "done"
@@ -408,7 +408,7 @@ def test_a_write_is_confirmed_by_its_copy(line: LineDriver, drive: Peer) -> None
 @pytest.mark.parametrize(
     "header", ["00 01 00 01", "01 03 02 00 07 F9 86", "00 00 00 00 00 01", "3A 30 31 30"]
 )
-def test_what_is_no_header_ends_the_connection(line: LineDriver, drive: Peer, header: str) -> None:
+def test_bytes_that_are_not_a_header_end_the_connection(line: LineDriver, drive: Peer, header: str) -> None:
     ask(line, drive)
     assert not line.is_out_of_step
     line.receive(bytes.fromhex(header))
@@ -435,7 +435,7 @@ def test_foreign_frames_without_end_fill_no_memory(line: LineDriver, drive: Peer
 
 
 @given(st.lists(st.binary(max_size=40), max_size=20), st.sampled_from(list(Transactions)[1:]))
-def test_anything_may_come_at_any_time(pieces: list[bytes], transactions: Transactions) -> None:
+def test_random_bytes_at_any_time_break_no_rule(pieces: list[bytes], transactions: Transactions) -> None:
     line, drive = LineDriver(transactions), Peer(least_timeout=LEAST / 1e9, most_timeout=MOST / 1e9)
     for piece in pieces:
         line.begin(exchange(READ, drive))
@@ -466,7 +466,7 @@ def test_a_gateway_may_have_ids_of_its_own(gateway: LineDriver, drive: Peer) -> 
         assert line.completion.reply.data == words(raw)
 
 
-def test_then_a_late_reply_holds_the_next_request_back(gateway: LineDriver, drive: Peer) -> None:
+def test_without_ids_a_late_reply_delays_the_next_request(gateway: LineDriver, drive: Peer) -> None:
     miss(gateway, drive)
     gateway.begin(exchange(READ, drive))
     assert gateway.completion.result == Failure.LATE_ANSWER_DUE
@@ -478,7 +478,9 @@ def test_then_a_late_reply_holds_the_next_request_back(gateway: LineDriver, driv
     assert gateway.completion.reply.data == words(2)
 
 
-def test_then_an_exception_of_the_gateway_leaves_its_answer_due(gateway: LineDriver, drive: Peer) -> None:
+def test_without_ids_the_drive_may_answer_after_a_gateway_s_exception(
+    gateway: LineDriver, drive: Peer
+) -> None:
     gateway.receive(tcp(ask(gateway, drive), bytes([1, 0x83, 0x0B])))
     assert gateway.completion.result == Failure.NO_REPLY
     assert drive.late_until_ns > gateway.now

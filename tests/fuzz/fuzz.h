@@ -1,7 +1,7 @@
-/* What the C fuzz harnesses share: how a harness says where on a line bytes lie, and what must hold.
+/* Shared by the C fuzz harnesses: the place of a line's bytes within an input, and assertions.
  *
- * A harness has LLVMFuzzerTestOneInput and find_wire; mutator.c mutates, and makes frames of what
- * lies there: without it nothing would ever get past a byte count or a checksum. */
+ * A harness has LLVMFuzzerTestOneInput and find_wire; mutator.c mutates inputs and repairs frames at that
+ * place. Without that, inputs would not pass byte counts and checksums. */
 #ifndef FUZZ_H
 #define FUZZ_H
 
@@ -19,7 +19,7 @@
 struct wire {
     size_t at, len;
     size_t length_at;           /* of the byte that has their length; SIZE_MAX: none has */
-    int is_fixed;               /* their number stays what it is */
+    int is_fixed;               /* their number must not change */
     int framing;                /* -1: any */
     int is_reply;               /* to `request` */
     struct md_message request;
@@ -27,11 +27,11 @@ struct wire {
 
 int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size);
 
-/* Some place in the input where bytes of a line lie; 0 where there is none. The harness may mend what
- * stands around it, lengths above all. */
+/* Find a place in the input with bytes of a line; 0: none. The harness may repair the bytes around it,
+ * such as lengths. */
 int find_wire(uint8_t *data, size_t size, unsigned seed, struct wire *wire);
 
-/* A copy that ends where its memory ends, so that over-reads are seen; free() it. */
+/* Return a copy that ends with its memory, so that sanitizers see over-reads; free() it. */
 static inline uint8_t *exact_copy(const uint8_t *bytes, size_t len)
 {
     uint8_t *copy = malloc(len ? len : 1);

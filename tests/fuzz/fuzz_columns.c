@@ -17,7 +17,7 @@ static const struct {
     [MD_BCD32] = {4, 0, 0, 1}, [MD_F16] = {2, 0, 1, 0},
 };
 
-/* What a value is, by the book: byte by byte and digit by digit, in another way than the core's. */
+/* An independent implementation of values: byte by byte and digit by digit. */
 static double expected(const uint8_t *data, size_t len, size_t at, int wire)
 {
     if (wire == MD_BIT)
@@ -176,7 +176,7 @@ static void check_rows(const uint8_t *head, const struct md_block *block,
     free(rows.reg), free(rows.status), free(rows.value), free(rows.valid);
 }
 
-/* The names of the codes, one after another; what has no name, or no room, is refused. */
+/* The names of the codes in sequence; a code without a name, or names without room, are errors. */
 static void check_spelling(const uint8_t *head, const uint8_t *text, size_t len)
 {
     int32_t offsets[5] = {0};

@@ -15,7 +15,7 @@ static int parse_request(int framing, const uint8_t *bytes, size_t len, const st
     return md_parse_request(framing, bytes, len, out);
 }
 
-/* Byte by byte: incomplete until it is decided, and then decided for good. What it comes to in the end. */
+/* Parse byte by byte: the result is "incomplete" until it is final. Return it. */
 static int check_prefixes(parser *parse, int framing, const uint8_t *bytes, size_t len,
                           const struct md_message *request)
 {
@@ -34,7 +34,7 @@ static int check_prefixes(parser *parse, int framing, const uint8_t *bytes, size
     return decided;
 }
 
-/* What is accepted as a request and can be said at all is, said again, the same bytes. */
+/* An accepted request, built again, gives the same bytes, if its fields are within bounds. */
 static void check_request(int framing, const uint8_t *bytes, size_t len)
 {
     struct md_message found;
@@ -44,7 +44,7 @@ static void check_request(int framing, const uint8_t *bytes, size_t len)
         return;
     must(md_parse_request(framing, bytes, len, &found) == used && found.data_len <= MD_MOST_DATA);
     int length = md_build_request(framing, &found, built, sizeof built);
-    if (length < 0) { /* a drive may be asked for what cannot be answered, or by somebody who must not */
+    if (length < 0) { /* a drive may receive requests that the core would not build */
         must(length == MD_BAD_REQUEST);
         return;
     }
@@ -67,13 +67,13 @@ static void check_reply(int framing, const uint8_t *bytes, size_t len, const str
     must(found.address == request->address && found.function == request->function);
     must(found.exception || used == md_reply_length(framing, request));
     if (md_build_request(framing, request, asked, sizeof asked) < 0)
-        return; /* what was never asked need not be answered well */
+        return; /* replies to impossible requests may be wrong */
     int length = md_build_reply(framing, &found, built, sizeof built);
     must(length == used);
     if (framing == MD_DELIXI && (found.exception || found.function == 3))
         return; /* a refusal's other digits have no meaning; a state is shown as data too */
     if (framing != MD_DELIXI && found.exception && found.function == 8)
-        return; /* 89H stands for 88H */
+        return; /* 89H is accepted for 88H */
     must(memcmp(built, bytes, (size_t)used) == 0);
     if (md_parse_reply(framing, bytes, len, other, &again) > 0) /* line.c waits before it asks that */
         must(request->address == other->address &&

@@ -13,7 +13,7 @@ enum { HEADER = 4, MOST = 4096, DRIVES = 4, HEARD = 1 << 15, ANSWERS = 16, MOST_
 
 enum step { BEGIN, PASS, WAKE, TAKE, NOISE_COMES, ANSWER_COMES, PIECE_COMES, PORT_FAILS, STEPS };
 
-/* What a drive has to say, and has not said yet. */
+/* A pending reply of a drive. */
 struct answer {
     int exchange;     /* its number */
     int64_t until_ns; /* so long it may come late */
@@ -57,7 +57,7 @@ static struct answer *answer_to(int number)
     return NULL;
 }
 
-/* ---- what must hold ---- */
+/* ---- invariants ---- */
 
 static void check_line(void)
 {
@@ -95,7 +95,7 @@ static void check_completion(void)
     const struct md_exchange *exchange = &scene.exchange;
     size_t used = done->result > 0 ? (size_t)done->result : 0;
     must(done->begun_ns == scene.begun && done->raw_len <= sizeof done->raw);
-    /* Every byte is the reply's, or counted; what came while the request was leaving may be its echo. */
+    /* Every byte is part of the reply, or counted; bytes that came while the request left may be its echo. */
     must(done->stale + done->skipped + used == scene.left_over + scene.before + scene.after);
     must(done->skipped + used >= scene.after && done->skipped + used <= scene.after + scene.line.tx_len);
     must((done->sent_ns != 0) == scene.has_asked || done->result == MD_LINE_LOST);
@@ -115,7 +115,7 @@ static void check_completion(void)
         must(exchange->request.address == 0 && scene.after == 0);
     else
         must((done->result >= MD_EXPIRED || done->result == MD_MAYBE_ECHO) && done->reply.address == 0);
-    if (done->result == MD_NO_REPLY) /* nothing, or the request's own echo; others' answers do not count */
+    if (done->result == MD_NO_REPLY) /* no byte, or the request's echo; other drives' replies do not count */
         must(done->raw_len == 0 || done->raw_len == scene.line.tx_len);
 }
 
@@ -145,7 +145,7 @@ static uint32_t number(const uint8_t *at)
     return at[0] | (uint32_t)at[1] << 8 | (uint32_t)at[2] << 16 | (uint32_t)at[3] << 24;
 }
 
-/* The tap was told of every byte that was sent or heard, whatever it was, in whole packets. */
+/* The tap has every byte sent or received, in whole packets. */
 static void check_tap(void)
 {
     enum { LEN_AT = 20, BYTES_AT = 28 };
@@ -219,7 +219,7 @@ static int want(void)
             end();
         return wanted;
     }
-    must(wanted == MD_DONE); /* it looks at the empty port for ever */
+    must(wanted == MD_DONE); /* it reads the empty port forever */
     return wanted;
 }
 
@@ -351,13 +351,13 @@ static void fail(int error)
         must(md_line_want(&scene.line, scene.now) == MD_DONE);
         end();
     }
-    memset(scene.answers, 0, sizeof scene.answers); /* what was under way is lost with the port */
+    memset(scene.answers, 0, sizeof scene.answers); /* the exchange in flight is lost with the port */
 }
 
 /* One step; how many bytes of the input it took, 0 at the end. */
 static size_t act(const uint8_t *step, size_t left)
 {
-    static const uint8_t flood[FLOOD]; /* more than half of what a line keeps */
+    static const uint8_t flood[FLOOD]; /* more than half of a line's buffer */
     size_t len;
     switch (step[0] % STEPS) {
     case BEGIN:
@@ -422,7 +422,7 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size)
     for (size_t at = HEADER; at < size; at += used)
         if ((used = act(data + at, size - at)) == 0)
             break;
-    for (int steps = 0; want() != MD_DONE; steps++) { /* and nothing comes any more */
+    for (int steps = 0; want() != MD_DONE; steps++) { /* and no further byte comes */
         must(steps < 16);
         if (md_line_want(&scene.line, scene.now) == MD_WRITE)
             take(MD_MOST_FRAME);

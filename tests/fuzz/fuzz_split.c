@@ -1,4 +1,4 @@
-/* Hostile bytes as they are sniffed on a line, in pieces, for the splitter.
+/* The splitter with hostile bytes of a line, in pieces.
  *
  * An input is pieces: a byte with its side and pause, one with its length, and its bytes. */
 #include "fuzz.h"
@@ -8,7 +8,7 @@ enum { MOST = 4096, HEAD = 2 };
 struct ear {
     struct md_stream stream;
     struct md_splitter splitter;
-    size_t passed; /* bytes told so far, of all that was stream */
+    size_t passed; /* bytes reported so far */
 };
 
 static void open_ear(struct ear *ear, size_t room)
@@ -24,7 +24,7 @@ static void close_ear(struct ear *ear)
     free(ear->stream.pieces);
 }
 
-/* Spans follow each other without gaps, and frames are what they are said to be. */
+/* Spans have no gaps, and frames are valid. */
 static int next(struct ear *ear, struct md_span *span)
 {
     memset(span, 0xAA, sizeof *span);
@@ -106,7 +106,7 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size)
              parts.stream.count <= parts.stream.len);
     }
     must(!next_frame(&whole, &expected, &whole_at));
-    must(whole.passed == total && parts.passed == total); /* what was skipped was told too */
+    must(whole.passed == total && parts.passed == total); /* skipped bytes were reported too */
     close_ear(&whole);
     close_ear(&parts);
     return 0;

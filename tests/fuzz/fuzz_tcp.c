@@ -151,7 +151,7 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size)
         if (used == 0)
             break;
     }
-    for (int steps = 0; scene.is_under_way; steps++) { /* and nothing comes any more */
+    for (int steps = 0; scene.is_under_way; steps++) { /* and no further byte comes */
         must(steps < 16);
         scene.now = later(scene.now, scene.line.wake_ns);
         want();

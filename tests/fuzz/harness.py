@@ -1,4 +1,4 @@
-"""Builds a C harness, to fuzz it or to replay what was kept."""
+"""Build a C harness for fuzzing, or for replaying its corpus."""
 
 from __future__ import annotations
 

@@ -47,7 +47,7 @@ def read_requests(path: Path) -> None:
 
 
 def taken(stream: bytes, size: int) -> list[MbapRequest]:
-    """Return the requests of a stream, up to what is garbage."""
+    """Return the requests of a stream, up to the first garbage."""
     buffer, found = bytearray(), []
     for at in range(0, len(stream), size):
         buffer += stream[at : at + size]
@@ -86,7 +86,7 @@ def served() -> tuple[ModbusServer, FakeCommands]:
 
 
 async def answered(requests: list[MbapRequest]) -> None:
-    """Let a server answer all of them."""
+    """Let a server answer the requests."""
     server, commands = served()
     commands.written.clear()
     commands.stopped.clear()
@@ -109,7 +109,7 @@ async def answered(requests: list[MbapRequest]) -> None:
 
 
 def check(request: MbapRequest, answer: bytes) -> None:
-    """Check the answer's header against its request, and its length against what it says."""
+    """Check the answer's header against its request, and its length against its header."""
     transaction, protocol, length, unit, function = struct.unpack(">HHHBB", answer[:8])
     assert (transaction, protocol, unit) == (request.transaction, 0, request.unit)
     assert len(answer) == 6 + length <= MOST

@@ -1,7 +1,7 @@
-"""Files that others may have written or damaged, read: each is taken, or refused in one sentence.
+"""Read foreign or damaged files: each is accepted, or rejected with one sentence.
 
-Nothing else may happen: no other exception, no hang, no memory without bound. What is taken is
-written and read again, and must be the same.
+Other exceptions, hangs and unbounded memory are failures. Accepted content, written and read again, must stay
+the same.
 """
 
 from __future__ import annotations
@@ -155,7 +155,7 @@ def read_capture(path: Path) -> None:
 
 
 def read_samples(path: Path) -> None:
-    """Read a message of a fleet's samples; what is wrong with it need not name the file."""
+    """Read a message of a fleet's samples; its errors need not name the file."""
     with suppress(MessageError):
         rows = unpack(path.read_bytes())
         assert rows.schema == ROWS
@@ -164,7 +164,7 @@ def read_samples(path: Path) -> None:
 
 
 def _pair(capture: Capture) -> None:
-    """The report is what the spans hold, and every byte of junk is counted."""
+    """Check that a report matches the spans, and that every byte of junk is counted."""
     pairings: list[Pairing] = []
     splitters: list[Splitter] = []
     junk = exchanges = 0
@@ -185,7 +185,7 @@ def _pair(capture: Capture) -> None:
 
 
 def _comparable(batches: Iterable[Rows]) -> list[Row]:
-    """All rows; a value that is no number is told by its name, because it equals nothing."""
+    """Return all rows; NaN is replaced by a status, because it equals no value."""
     rows = [row for batch in batches for row in batch]
     return [
         row._replace(value=None, status=f"nan {row.status}") if row.value != row.value else row
@@ -225,7 +225,7 @@ READERS: dict[str, tuple[str, Callable[[Path], None]]] = {  # the file's suffix,
 
 
 def read(name: str, data: bytes, folder: Path) -> None:
-    """Let one of the readers have a file of these bytes."""
+    """Pass a file with these bytes to the reader."""
     suffix, reader = READERS[name]
     path = folder / f"fuzzed{suffix}"
     path.write_bytes(data)

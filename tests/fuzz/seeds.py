@@ -1,6 +1,6 @@
-"""Seeds of the fuzzers: the documents' own frames, captures of them, and files that are right.
+"""Seeds of the fuzzers: frames from the documents, captures with them, and valid files.
 
-python tests/fuzz/seeds.py DIRECTORY HARNESS...    into HARNESS-seeds in the directory, for each of them
+python tests/fuzz/seeds.py DIRECTORY HARNESS...    write each harness's seeds to DIRECTORY/HARNESS-seeds
 """
 
 from __future__ import annotations
@@ -107,7 +107,7 @@ def pcap(packets: list[bytes]) -> bytes:
 
 
 def ours() -> tuple[bytes, int]:
-    """A capture as we write it, and where its packets begin."""
+    """Return a capture from CaptureWriter, and the offset of its packets."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "a.pcapng"
         with CaptureWriter(path) as capture:

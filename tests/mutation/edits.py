@@ -126,7 +126,7 @@ def _blank(source: str, spans: list[tuple[int, int]]) -> str:
 
 
 def _c(source: str) -> tuple[str, list[Edit]]:
-    """The source without what is not mutated, and the edits that take more than a look at one word."""
+    """Return the source without its immutable parts, and the edits that need more context than a word."""
     outside = r'/\*.*?\*/|"(?:\\.|[^"])*"|^#[^\n]*'
     bare = _blank(source, [match.span() for match in re.finditer(outside, source, re.DOTALL | re.MULTILINE)])
     return bare, [*_c_conditions(bare), *_c_statements(bare)]

@@ -1,7 +1,7 @@
 """Does a test fail for every small mistake in these files? `python tests/mutation/run.py [FILE...]`
 
-Mutants that no test can tell from the original are in explained.toml, each with the reason. Fails on
-a survivor that is not there, and on a row there that is no survivor any more.
+explained.toml lists the mutants that behave as the original, with reasons. Fails on a survivor that is
+not listed, and on a listed mutant that is killed.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ def ends(path: str) -> Iterator[tuple[Mutant, str | None]]:
 
 
 def report(path: str) -> int:
-    """Print what survives, and a line of figures; how much of it is not explained."""
+    """Print the survivors and a line of figures; return the number of unexplained ones."""
     reasons = {name: why for name, why in explained().items() if name[0] == path}
     alive: set[Name] = set()
     count: Counter[str] = Counter()

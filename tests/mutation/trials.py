@@ -49,7 +49,7 @@ def by_test_core(tree: Path, path: str) -> str | None:
 
 
 def by_compiler(tree: Path, path: str) -> str | None:
-    """Nothing to find: the optimiser makes the same code of it."""
+    """An equivalent mutant: the compiler emits the same code."""
     compiled = f"{Path(path).stem}.o"
     _must(tree, CC, *MODULE, "-c", path, "-o", f"module/{compiled}")
     same = (tree / "module" / compiled).read_bytes() == (tree / "original" / compiled).read_bytes()
@@ -60,7 +60,7 @@ def by_test_frame(tree: Path, path: str) -> str | None:
     """The Python tests of frames and of a line; by_compiler has compiled the mutant for the module."""
     _must(tree, CC, "-shared", *_objects(tree, "module", "_core"), "-o", "src/multidrop/_core.abi3.so")
     return _pytest(
-        tree, *(f"tests/core/test_{name}.py" for name in ("frame", "split", "learning", "line", "tcp"))
+        tree, *(f"tests/core/test_{name}.py" for name in ("frame", "capture", "learning", "line", "tcp"))
     )
 
 
@@ -137,7 +137,7 @@ def scratch() -> Iterator[Path]:
 
 
 def attempt(tree: Path, path: str, text: str) -> str | None:
-    """Try the file with this text; the tree is as before afterwards, but for what is built."""
+    """Try the file with this text; afterwards the tree is as before, except for build results."""
     original = (tree / path).read_text()
     (tree / path).write_text(text)
     try:

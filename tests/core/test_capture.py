@@ -89,7 +89,7 @@ def test_a_mixed_line_is_cut_alike_however_its_bytes_come(line: list[Printed], d
         st.binary(min_size=1, max_size=40) | st.sampled_from([reply.frame for reply in REPLIES]), max_size=30
     )
 )
-def test_no_byte_is_lost_or_told_twice(pieces: list[bytes]) -> None:
+def test_every_byte_is_reported_exactly_once(pieces: list[bytes]) -> None:
     assert b"".join(span.raw for span in split(*pieces)) == b"".join(pieces)
 
 
@@ -98,7 +98,7 @@ def test_a_time_is_that_of_the_piece_in_which_a_frame_begins() -> None:
     assert [span.time_ns for span in spans] == [0, 1, 3]
 
 
-def test_copies_that_confirm_are_told_from_requests_by_their_order() -> None:
+def test_confirming_copies_differ_from_requests_by_their_order() -> None:
     assert kinds(split(READ, ANSWER, *[WRITE] * 6)) == [Kind.REQUEST, Kind.REPLY] * 4
 
 
@@ -119,7 +119,7 @@ def test_an_answered_query_is_no_request_though_it_looks_like_one() -> None:
     ]
 
 
-def test_a_side_that_is_known_tells_a_copy_from_a_request() -> None:
+def test_a_known_sender_separates_copies_from_requests() -> None:
     stream = Stream()
     stream.put(WRITE, 0, side=Side.ANSWERING)
     stream.put(WRITE, 1, side=Side.ASKING)
@@ -136,7 +136,7 @@ def test_a_reply_is_not_given_to_an_earlier_request_than_its_own() -> None:
     assert kinds(split(READ, damaged, ALSO_ANSWER)) == [Kind.REQUEST, Kind.JUNK, Kind.STRAY]
 
 
-def test_what_was_lost_is_not_forgotten_when_a_stray_reply_comes() -> None:
+def test_a_stray_reply_does_not_hide_a_lost_request() -> None:
     lost = OTHER_READ[:-1]
     assert kinds(split(READ, ANSWER, WRITE, lost, ALSO_ANSWER, WRITE, WRITE)) == [
         *(Kind.REQUEST, Kind.REPLY, Kind.REQUEST, Kind.JUNK, Kind.STRAY, Kind.REQUEST, Kind.REPLY)
@@ -161,7 +161,7 @@ def test_noise_between_a_request_and_its_reply_does_no_harm() -> None:
 
 
 @pytest.mark.parametrize("first", ["", "FF"])
-def test_a_pause_ends_what_begins_amid_junk(first: str) -> None:
+def test_a_pause_ends_a_frame_that_starts_in_junk(first: str) -> None:
     """The junk looks like the begin of a long write, which the next frames would fill up."""
     junk = bytes.fromhex(first + "01 10 00 00 00 7B F6")
     stream, splitter = Stream(), Splitter()
@@ -182,13 +182,13 @@ def test_without_pauses_it_waits_until_the_long_frame_could_be_whole() -> None:
     assert kinds(splitter.spans(stream)) == [Kind.JUNK, Kind.REQUEST]
 
 
-def test_what_cannot_be_a_frame_is_junk_at_once() -> None:
+def test_bytes_that_cannot_be_a_frame_are_junk_at_once() -> None:
     stream, splitter = Stream(), Splitter()
     stream.put(b"\xff" * 1000, 0)
     assert sum(len(span.raw) for span in splitter.spans(stream)) > 990
 
 
-def test_more_than_fits_is_refused() -> None:
+def test_a_full_stream_raises() -> None:
     stream = Stream()
     stream.put(bytes(STREAM_ROOM), 0)
     with pytest.raises(BufferError, match="split it first"):

@@ -84,7 +84,7 @@ def test_a_deadline_never_goes_backwards() -> None:
     mastership.end()
 
 
-def test_it_holds_anew_after_its_end() -> None:
+def test_it_can_be_extended_after_its_end() -> None:
     mastership = Mastership()
     mastership.extend(now_ns() + 200 * S)
     mastership.end()
@@ -109,7 +109,7 @@ def test_threads_that_extend_at_once_leave_the_latest_deadline() -> None:
     mastership.end()
 
 
-def test_a_time_that_is_past_is_refused_and_arms_nothing() -> None:
+def test_a_past_deadline_raises_and_arms_no_timer() -> None:
     """A timer that is set to the past kills at once."""
     mastership = Mastership(guard_s=1e-6)
     with pytest.raises(ValueError, match=r"^until_ns = \d+ is past by 1\.\d+ s of CLOCK_BOOTTIME: "):
@@ -174,7 +174,7 @@ def test_a_process_that_ended_it_is_not_killed(end: str) -> None:
         assert process.poll() is None
 
 
-def test_a_child_of_a_fork_is_no_master() -> None:
+def test_a_forked_child_is_not_master() -> None:
     mastership = Mastership()
     mastership.extend(now_ns() + 100 * S)
     if (child := os.fork()) == 0:
