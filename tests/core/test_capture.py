@@ -109,7 +109,7 @@ def test_a_copy_is_neither_where_its_order_is_lost() -> None:
     ]
 
 
-def test_an_answered_query_is_no_request_though_it_looks_like_one() -> None:
+def test_an_answered_delixi_query_is_not_a_request() -> None:
     (query,) = {reply for reply in REPLIES if reply.request_frame.startswith(b":0107")}
     assert raw(split(query.request_frame[:-3], query.frame, query.request_frame, query.frame)) == [
         (Kind.JUNK, query.request_frame[:-3]),

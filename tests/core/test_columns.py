@@ -309,7 +309,7 @@ def as_float32(bits: int) -> Fraction:
 
 
 @given(st.lists(st.one_of(st.integers(-(2**63), 2**63 - 1), st.sampled_from(EDGES)), max_size=9))
-def test_a_bound_is_the_least_float_that_is_no_less(numbers: list[int]) -> None:
+def test_a_bound_is_rounded_up_to_the_next_float(numbers: list[int]) -> None:
     """Neighbours of a float are those of its bits (IEEE 754)."""
     narrow = bytes(narrow_up(memoryview(array("q", numbers))))
     for number, bits in zip(numbers, struct.unpack(f"<{len(numbers)}I", narrow), strict=True):

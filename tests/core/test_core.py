@@ -795,12 +795,12 @@ def test_port_that_should_have_settings_and_has_none(drive: Drive) -> None:
         assert (found.result, found.error) == (Failure.LINE_LOST, errno.ENOTTY)
 
 
-def test_a_descriptor_that_is_none_is_refused() -> None:
+def test_an_invalid_descriptor_raises() -> None:
     with pytest.raises(OSError, match="cannot be waited for"):
         Port(-1, NO_SETTINGS)
 
 
-def test_whoever_waits_for_an_exchange_is_told_when_the_port_is_closed(drive: Drive) -> None:
+def test_closing_a_port_ends_the_wait_of_its_clients(drive: Drive) -> None:
     requested = threading.Event()
 
     def answer(_: Message) -> bytes:
@@ -817,7 +817,7 @@ def test_whoever_waits_for_an_exchange_is_told_when_the_port_is_closed(drive: Dr
     assert found == [Failure.LINE_LOST]
 
 
-def test_what_a_port_is_asking_is_told() -> None:
+def test_a_port_reports_the_drives_that_it_asks() -> None:
     """Queued, repeated, urgent and under way; and nothing of another peer."""
     near, far = socket.socketpair()
     with near, far:

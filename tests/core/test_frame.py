@@ -81,7 +81,7 @@ def test_all_printed_frames_have_a_meaning() -> None:
     assert len(GOOD_REQUESTS) + len(GOOD_REPLIES) + len(REFUSED) == len(PRINTED)
 
 
-def test_printed_frame_means_what_the_document_says() -> None:
+def test_printed_frames_have_their_documented_meaning() -> None:
     for printed in GOOD_REQUESTS + GOOD_REPLIES:
         assert parse(printed, printed.frame) == (len(printed.frame), printed.says)
 
@@ -118,7 +118,7 @@ def test_part_of_a_frame_is_incomplete() -> None:
             assert parse(printed, printed.frame[:length]) == (FrameFault.INCOMPLETE, None)
 
 
-def test_what_follows_a_frame_is_left_alone() -> None:
+def test_bytes_after_a_frame_are_ignored() -> None:
     for printed in GOOD_REQUESTS + GOOD_REPLIES:
         for after in (b"\x00", b":", b"\x01\x03\x02", b"\xff" * 300):
             assert parse(printed, printed.frame + after) == (len(printed.frame), printed.says)
@@ -311,7 +311,7 @@ def test_the_last_address_and_the_one_behind_it() -> None:
 
 
 @table("function", [0x00, 0x07, 0x2B, 0xFF])
-def test_nobody_replies_to_what_is_no_function(function: int) -> None:
+def test_a_reply_to_an_unknown_function_is_a_fault(function: int) -> None:
     reply = Message(1, function, data=words(7))
     with pytest.raises(ValueError, match=re.escape(f"out of bounds for a rtu frame: {reply}")):
         build_reply(RTU, reply)
@@ -338,7 +338,7 @@ def test_drive_s_side_hears_of_a_count_that_it_cannot_answer() -> None:
 
 @table("function", [0x83, 0xFF, 0x2B])
 @table("framing", [RTU, ASCII])
-def test_nothing_answers_what_is_no_function(framing: Framing, function: int) -> None:
+def test_no_reply_fits_an_unknown_function(framing: Framing, function: int) -> None:
     body = bytes([1, function, 1])
     frames = {
         RTU: rtu(body.hex()),

@@ -159,7 +159,7 @@ def test_a_late_answer_is_counted_once(line: LineDriver, drive: Peer) -> None:
 
 
 @pytest.mark.usefixtures("proof")
-def test_a_reply_is_found_behind_a_late_one_amid_its_request(line: LineDriver, drive: Peer) -> None:
+def test_a_reply_is_found_after_a_late_one_that_interrupts_its_request(line: LineDriver, drive: Peer) -> None:
     """The port took the request in two parts, and the late answer came between them."""
     line.begin(exchange(Message(1, 4, 50, 1), drive))
     while line.want != "write":
@@ -199,9 +199,7 @@ def is_in_doubt(line: LineDriver) -> bool:
     return line.want == "done" and line.completion.result == Failure.LATE_ANSWER_DUE
 
 
-def test_the_first_reply_may_answer_what_another_process_asked(
-    line: LineDriver, drive: Peer, first: Exchange
-) -> None:
+def test_the_first_reply_may_answer_another_process(line: LineDriver, drive: Peer, first: Exchange) -> None:
     ask(line, drive, READ)
     line.receive(reply(7777))  # of the other's register
     assert is_in_doubt(line)
@@ -251,9 +249,7 @@ def test_without_proofs_the_first_reply_is_accepted(line: LineDriver, drive: Pee
 
 
 @pytest.mark.parametrize("least", [0, 1, 0xFFFF])
-def test_a_known_count_of_any_size_tells_a_reply_from_another(
-    line: LineDriver, drive: Peer, least: int
-) -> None:
+def test_a_known_value_of_any_size_identifies_a_reply(line: LineDriver, drive: Peer, least: int) -> None:
     """Delixi's P04.28 is 0 at 1200 baud: taken for "any count", it would bar all of the drive's reads."""
     known = exchange(READ, drive, answer=(least, least))
     drive.prove_by([known, exchange(OTHER, drive, answer=(7, 7))])

@@ -201,7 +201,7 @@ def test_a_drive_that_has_just_failed_is_given_all_its_time(line: LineDriver, dr
     assert given_up(line, drive) == MOST + 7 * CHARACTER
 
 
-def test_the_adapter_s_echo_is_no_beginning(line: LineDriver, drive: Peer) -> None:
+def test_an_echo_does_not_count_as_the_start_of_a_reply(line: LineDriver, drive: Peer) -> None:
     answer(line, drive, 2 * MS)
     left = ask(line, drive)
     line.receive(build_request(Framing.RTU, READ))
@@ -217,7 +217,7 @@ def test_an_adapter_that_gathers_replies_is_waited_for(line: LineDriver, drive: 
     assert given_up(line, drive, LONG) >= LEAST + 205 * CHARACTER
 
 
-def test_noise_does_not_tell_of_the_adapter(line: LineDriver, drive: Peer) -> None:
+def test_noise_teaches_nothing_about_the_adapter(line: LineDriver, drive: Peer) -> None:
     ask(line, drive)
     line.receive(b"\x01")
     line.receive(b"\x03\x07")
@@ -493,7 +493,7 @@ def test_a_late_answer_of_the_drive_that_is_asked_something_else(line: LineDrive
     assert line.completion.result == 8
 
 
-def test_a_late_answer_is_no_reply_from_another_address(line: LineDriver, drive: Peer) -> None:
+def test_a_late_reply_is_not_reported_as_another_address(line: LineDriver, drive: Peer) -> None:
     time_out(line, drive)
     ask(line, other := peer(), Message(2, 3, 0, 1))
     line.receive(reply(1111))

@@ -90,7 +90,7 @@ def test_the_time_of_a_value_is_never_after_its_reply(line: LineDriver) -> None:
     assert (line.completion.sent_ns, line.completion.first_ns) == (begun, begun + 10 * MS)
 
 
-def test_a_port_that_was_quicker_than_its_settings_tells_the_time_of_no_first_character(
+def test_a_port_faster_than_its_settings_does_not_date_first_characters(
     line: LineDriver,
 ) -> None:
     """A pseudo-terminal's replies come at once: its drive may have made the value just before."""
@@ -140,7 +140,7 @@ def test_silence_is_the_longer_of_after_one_and_before_the_next(
     assert line.now == ended + max(before, after) * MS
 
 
-def test_silence_counts_from_the_end_of_what_was_heard_last(line: LineDriver) -> None:
+def test_silence_counts_from_the_last_byte_received(line: LineDriver) -> None:
     opened = line.now
     line.begin(exchange(READ))
     line.now = opened + 3 * MS
@@ -177,7 +177,7 @@ def test_babbling_line_does_not_hold_a_request_up_for_ever(line: LineDriver) -> 
     assert (line.completion.reply.data, line.completion.stale) == (words(7), reads)
 
 
-def test_flooded_line_is_given_up_even_when_time_stands_still(line: LineDriver) -> None:
+def test_flooded_line_is_given_up_even_if_the_clock_stops(line: LineDriver) -> None:
     line.begin(exchange(READ))
     line.now += SILENCE + TIMEOUT
     for _ in range(3):
@@ -225,7 +225,7 @@ def test_port_that_takes_a_few_bytes_at_a_time(line: LineDriver) -> None:
     assert line.completion.sent_ns == sent
 
 
-def test_port_that_takes_nothing_is_lost(line: LineDriver) -> None:
+def test_port_that_takes_no_bytes_is_lost(line: LineDriver) -> None:
     line.begin(exchange(READ))
     line.now += SILENCE
     assert [line.want, line.want] == ["read", "write"]
@@ -238,7 +238,7 @@ def test_port_that_takes_nothing_is_lost(line: LineDriver) -> None:
     assert (found.result, found.error, found.sent_ns) == (Failure.LINE_LOST, ETIMEDOUT, 0)
 
 
-def test_noise_while_the_port_takes_nothing_renews_the_silence(line: LineDriver) -> None:
+def test_noise_before_the_first_byte_leaves_restarts_the_silence(line: LineDriver) -> None:
     line.begin(exchange(READ))
     line.now += SILENCE
     assert [line.want, line.want] == ["read", "write"]
@@ -613,7 +613,7 @@ def test_line_that_no_longer_echoes_is_believed_again(line: LineDriver) -> None:
 
 
 @pytest.mark.parametrize("piece", [4096, 1], ids=["whole", "byte by byte"])
-def test_the_beginning_of_an_echo_is_no_reply(line: LineDriver, piece: int) -> None:
+def test_the_start_of_an_echo_is_not_a_reply(line: LineDriver, piece: int) -> None:
     """Seven of its eight bytes are a good reply with one register."""
     echo = rtu("06 03 02 11 00 01")
     assert echo[:7] == rtu("06 03 02 11 00")
@@ -727,7 +727,7 @@ def query(line: LineDriver) -> None:
 
 @pytest.mark.parametrize("piece", [4096, 1], ids=["whole", "byte by byte"])
 @pytest.mark.parametrize("gap", [0, 5 * MS, TIMEOUT // 2])
-def test_the_first_echo_of_a_line_that_had_none_is_no_value_of_0(
+def test_the_first_echo_of_a_line_without_echo_is_not_a_value_of_0(
     line: LineDriver, gap: int, piece: int
 ) -> None:
     query(line)
@@ -827,7 +827,7 @@ def test_a_copy_that_may_be_an_echo_waits_for_the_whole_time_out(
 
 
 @pytest.mark.parametrize("later", [0, 10 * MS, TIMEOUT // 2])
-def test_the_first_echo_of_a_steady_drive_s_line_is_no_value_of_0(
+def test_the_first_echo_on_a_steady_drive_s_line_is_not_a_value_of_0(
     line: LineDriver, steady: Peer, later: int
 ) -> None:
     make_steady(line, steady)
@@ -845,7 +845,7 @@ def test_a_value_of_0_that_comes_twice_leaves_the_echo_open(line: LineDriver) ->
     assert line.echo == lib.MD_ECHO_UNKNOWN
 
 
-def test_coils_that_are_a_copy_of_their_request_are_taken_when_nothing_follows(line: LineDriver) -> None:
+def test_coils_equal_to_their_request_are_accepted_at_the_timeout(line: LineDriver) -> None:
     """A read of 17 coils from 03xxH has a reply of its own request's length and first three bytes."""
     copy = rtu("01 01 03 20 00 11")
     ask(line)

@@ -270,7 +270,7 @@ def test_how_late_a_reply_is_is_learnt_to_the_nanosecond(line: LineDriver, drive
 
 
 @pytest.mark.parametrize("code", [0x0A, 0x0B])
-def test_a_gateway_s_exception_is_no_reply(line: LineDriver, drive: Peer, code: int) -> None:
+def test_a_gateway_s_exception_is_not_a_reply(line: LineDriver, drive: Peer, code: int) -> None:
     for number in (1, 2):
         line.receive(tcp(ask(line, drive), bytes([1, 0x83, code])))
         assert line.want == "done"
@@ -283,7 +283,9 @@ def test_a_gateway_s_exception_is_no_reply(line: LineDriver, drive: Peer, code: 
     assert drive.failures == 0
 
 
-def test_a_late_exception_of_a_gateway_is_no_sign_of_life(line: LineDriver, drive: Peer) -> None:
+def test_a_late_exception_of_a_gateway_does_not_show_that_the_drive_lives(
+    line: LineDriver, drive: Peer
+) -> None:
     late = miss(line, drive)
     line.receive(tcp(late, bytes([1, 0x83, 0x0B])))
     assert drive.failures == 1
@@ -326,7 +328,7 @@ def is_read(line: LineDriver, drive: Peer, raw: int, piece: int = 4096) -> bool:
 @pytest.mark.parametrize("piece", [1, 4096])
 @pytest.mark.parametrize("more", [b"", b"\0", b"\1\2\3"], ids=["short", "a byte more", "three bytes more"])
 @pytest.mark.parametrize("length", [0, 1, 2, 4, 6, 9, 254, 255, 0xFFFF])
-def test_an_exception_is_two_bytes_whatever_its_header_says(
+def test_an_exception_has_two_bytes_even_if_its_header_differs(
     line: LineDriver, drive: Peer, length: int, more: bytes, piece: int
 ) -> None:
     assert is_read(line, drive, 1)

@@ -168,7 +168,7 @@ def test_a_pseudo_terminal_goes_without() -> None:
 def test_the_word_is_one_of_four_and_the_port_a_device() -> None:
     with pytest.raises(ValueError, match='rs485 \'on\' is none of "off", "kernel", "rts-up" and "rts-down"'):
         Bus("/dev/null", rs485="on")
-    with pytest.raises(ValueError, match="a fact of serial devices, and tcp://h is none; leave it out"):
+    with pytest.raises(ValueError, match="serial devices only, and tcp://h is not one; remove it"):
         Bus("tcp://h", rs485="kernel")
 
 
@@ -198,7 +198,7 @@ def test_a_plant_file_says_it_of_a_line(tmp_path: Path) -> None:
     [
         ("/dev/ttyS0", '"rts"', 'rs485 \'rts\' is none of "off", "kernel", "rts-up" and "rts-down"'),
         ("/dev/ttyS0", "true", 'rs485 = "kernel"'),
-        ("socket://10.0.0.7:4001", '"kernel"', "socket://10.0.0.7:4001 is none; leave it out"),
+        ("socket://10.0.0.7:4001", '"kernel"', "socket://10.0.0.7:4001 is not one; remove it"),
     ],
 )
 def test_what_no_line_can_be_told_is_one_mistake(
