@@ -1,4 +1,4 @@
-"""Bus: one line with its drives, by hand: reads, writes, broadcasts, stops, and the drives' verbs."""
+"""Bus: one line with its drives: attaching, broadcasts, stops and statistics."""
 
 from __future__ import annotations
 
@@ -52,28 +52,28 @@ class Bus:
     """A line and the drives on it, which may differ in family, baud rate and format.
 
     `port` is a device such as /dev/ttyUSB0, a URL of socket:// or rfc2217://, or tcp://10.0.0.7:502 for
-    Modbus TCP, which all drives on such a port then speak; `transaction` is "ignore" where its gateway
-    replies with transaction ids of its own. `baudrate` and `format` replace the families' defaults for
-    drives that are attached without their own, and `silence`, in s, the standard's t3.5 between frames,
-    if all of them bear it. `echo` says that the adapter repeats what it sends: "on", "off" (until it
-    does), or "auto", to find out. `rs485` is who switches between sending and receiving where the adapter
-    does not: "kernel", the driver, or "rts-up" or "rts-down", the core, by RTS being on or off while a
-    request leaves. Devices that are deaf after the port opens, such as an Arduino that this resets, are sent
-    nothing for `settle` seconds, at most 10. Raises LineError when the port cannot be opened. Writes that may
-    wear an EEPROM are counted in `ledger`, a file that all processes share, and all writes are noted in the
-    file `audit`.
+    Modbus TCP. `baudrate` and `format` replace the families' defaults for drives that are attached without
+    their own. `silence`, in s, replaces the standard's t3.5 between frames, if all drives tolerate it.
 
-    A write is not sent when it is late by `expiry` seconds: since the verb was called, but for the time that
-    its own steps may take. It is not sent either once a stop was called: that ends all that may move a motor
-    and was called before it, on any thread, with CancelledByStop. A drive is on one bus at a time. Leaving
-    the `with` block, or closing, waits for the stops that are under way and closes the port; it sends
-    nothing, unless `stop_on_exit` was called, and nothing that moves a motor is sent after it.
+    - `echo`: whether the adapter repeats what it sends: "on", "off" (until it does), or "auto", to find out.
+    - `transaction`: "ignore" if a Modbus TCP gateway replies with transaction ids of its own.
+    - `rs485`: the driver ("kernel") or the core ("rts-up", "rts-down", by RTS) switches between sending and
+      receiving, if the adapter does not.
+    - `settle`: seconds without requests after the port opens, at most 10, for devices that restart then.
+    - `ledger`: the file that counts writes to EEPROM, shared by all processes. `audit`: the log of all
+      writes.
+    - `expiry`: seconds. A write that cannot be sent within this time of the call, not counting the verb's own
+      waits, raises Expired.
+    - `stop_on_exit`: stop all drives when the bus or the program ends; see the method.
+    - `mastership`: if other processes may be masters of the line too, requests without it raise NotMaster,
+      stops included, and the port is not opened.
 
-    Where other processes may be masters of the line too, `mastership` holds requests back: what is too late
-    is not sent, a stop neither, and raises NotMaster. Nor is the port opened unless it holds.
+    A stop cancels each earlier call that may move a motor, on any thread, with CancelledByStop. A drive is on
+    one bus at a time. Leaving the `with` block waits for pending stops and closes the port. It stops no drive
+    unless `stop_on_exit` is set. Raises LineError if the port cannot be opened.
 
-    The logger `multidrop.line` has the port's coming and going, and at DEBUG the frames; `multidrop.control`
-    has writes, refusals and stops.
+    The logger `multidrop.line` reports the port's coming and going, and frames at DEBUG. `multidrop.control`
+    reports writes, refusals and stops.
     """
 
     def __init__(
@@ -124,7 +124,7 @@ class Bus:
         audit: Path | str | None = None,
         mastership: Mastership | None = None,
     ) -> Bus:
-        """Return a bus whose port is not there yet: the poller that has it opens it, and so do stops."""
+        """Return a bus whose port is not open yet: its poller opens it, and so do stops."""
         bus = cls.__new__(cls)
         bus.baudrate = bus.format = bus.silence = None
         facts = _facts(port, echo, transaction, rs485)
@@ -152,7 +152,7 @@ class Bus:
         register_at_fork(self)
 
     def forked(self) -> None:
-        """Be closed in the child, where nobody stops drives."""
+        """Mark the bus closed in a forked child."""
         self._is_closed = True
         self._closing = threading.Lock()
         self._latches.forked()
@@ -173,7 +173,7 @@ class Bus:
 
     @property
     def why_lost(self) -> str | None:
-        """Why its port does not come back: "/dev/ttyUSB0: there is no such port"; None while it is there."""
+        """Why the port is still lost: "/dev/ttyUSB0: there is no such port". None while it is open."""
         return self.line.why_lost
 
     def __enter__(self) -> Bus:
@@ -189,17 +189,17 @@ class Bus:
             raise
 
     def leave(self) -> None:
-        """End all that moves a motor, and begin to stop the drives if `stop_on_exit` was called."""
+        """Cancel all calls that move a motor, and start to stop the drives if `stop_on_exit` is set."""
         self._leaving.begin()
 
     def part(self) -> None:
-        """Leave, and wait for all stops under way; the port stays open."""
+        """Leave, and wait for all pending stops; the port stays open."""
         self._leaving.finish()
 
     def close(self) -> None:
         """Leave the line and close the port. A write that was sent and is not answered yet is Unconfirmed.
 
-        Where a signal interrupts the wait for that, it is done all the same; called again, this waits again.
+        If a signal interrupts the wait, the closing still completes; a second call waits for it.
         """
         self._close()
         if self.stops_on_exit:
@@ -219,7 +219,7 @@ class Bus:
                 self._attached.free()
 
     def tended(self, is_tended: bool) -> None:
-        """Note that a poller opens a lost port again: a stop waits for that, or else does it itself."""
+        """Set whether a poller reopens a lost port; if not, stops reopen it."""
         self._stopper.is_tended = is_tended
 
     # ---- the drives ----
@@ -230,11 +230,11 @@ class Bus:
         return self._attached.drives
 
     def attach(self, drive: D | type[D], address: int | None = None, **details: Any) -> D:
-        """Put a drive on the bus: a family with address, name and so on, or a drive made before.
+        """Put a drive on the bus, and return it: a family with its arguments, or a drive made before.
 
-        Nothing is sent: its watchdog is read and logged when its identity is checked first. Any thread may
-        call this. Raises ValueError for what the family does not allow, an address taken, or a drive that is
-        on another bus.
+        No request is sent; the identity of the drive is checked before its first write. Any thread may call
+        this. Raises ValueError for an argument that the family does not allow, a taken address, or a drive on
+        another bus.
         """
         line = {"baudrate": self.baudrate, "format": self.format, "silence": self.silence}
         attached = made(drive, address, line, details)
@@ -243,10 +243,10 @@ class Bus:
         return attached
 
     def detach(self, drive: Drive) -> None:
-        """Take a drive off the bus: nothing is asked of it any more, and its verbs raise ValueError.
+        """Take a drive off the bus: its reads, writes and verbs raise NotAttached from then on.
 
-        Nothing is sent: its motor goes on as it is. Ends what would move it with CancelledByStop, or
-        Unconfirmed where it was sent, and waits until its stops that are under way are done.
+        Its motor goes on. Cancels its verbs with CancelledByStop, or with Unconfirmed if they were sent, and
+        waits for its pending stops.
         """
         self._latches.remove(drive)
         with self._attached.lock:
@@ -254,67 +254,66 @@ class Bus:
             self._writer.identity_check.forget(drive)
 
     def remember(self, before: Bus) -> None:
-        """Take over what another bus, which is closed, learnt of the drives on the same serial line.
+        """Take over what a closed bus has learned about the drives of the same serial line.
 
-        The drives' answers to requests of that bus may still come.
+        Late replies to requests of that bus may still come.
         """
         self._exchanges.remember(before._exchanges)
 
     def peer(self, drive: Drive) -> Peer:
-        """Return what is learnt of this drive's answers; ValueError for a drive that is not on this bus."""
+        """Return what is known about the replies of a drive. Raises NotAttached."""
         return self._exchanges.peer(drive)
 
     def is_asking(self, peer: Peer) -> bool:
-        """Return True while an exchange with this peer is queued, under way or about to be."""
+        """Return True while an exchange with this peer is queued, in flight or about to be."""
         return self._exchanges.is_asking(peer)
 
     @property
     def peers(self) -> dict[Drive, Peer]:
-        """Learnt answers of each drive that is on this bus now."""
+        """Known reply behaviour of each drive that is on this bus now."""
         return self._exchanges.peers
 
     # ---- commands ----
 
     def check_identity(self, drive: Drive) -> None:
-        """Check that the drive at this address is of its declared family, as far as the family can tell.
+        """Check that the drive at this address is of its declared family, as far as the family can.
 
-        It only reads, and does so once until the port is opened again. The first write does this by itself.
-        The first check also logs what the drive's watchdog does. Raises WriteForbidden when it is another
-        drive, NoReply when it does not answer.
+        Only reads, and only once until the port is opened again; the first write does it too. The first check
+        also logs the drive's watchdog. Raises WriteForbidden for another drive, and NoReply.
         """
         check_drive(drive)
         self._performer.check_identity(drive)
 
     def knows_identity(self, drive: Drive) -> bool:
-        """Return True where `check_identity` would read nothing: the drive was of its family on this port."""
+        """Return True if `check_identity` has already passed on this port."""
         check_drive(drive)
         return self._writer.identity_check.is_known(drive)
 
     def watchdog(self, drive: Drive) -> str:
-        """Say what the motor does when this client dies, as far as the drive can tell."""
+        """Return a sentence about the motor if this client dies, as far as the drive reports it."""
         check_drive(drive)
         return self._performer.watchdog(drive)
 
     # ---- all drives at once ----
 
     def broadcast(self, register: Register[Any] | str, value: Any) -> dict[str, State | BusError]:
-        """Write to every drive on the line at once; nobody answers, so each drive is asked afterwards.
+        """Write to all drives of the line at once, and return each drive's state or error by name.
 
-        The same address means different things to different families. So all drives on the line must be of
-        one family and share their settings and framing, and its document must have this broadcast. Returns
-        each drive's state, or why it says none, by name. Raises WriteForbidden.
+        Drives do not answer a broadcast, so each state is read afterwards. All drives must be of one family
+        and share their settings, because an address means different things to different families; the
+        family's document must have this broadcast. Raises WriteForbidden.
         """
         return self._broadcaster.write(self.drives, register, value)
 
     def stop_all(self, seconds: float | None = None) -> dict[str, Stopped]:
-        """Stop every drive, ahead of all that is queued; by drive's name, what is known of it.
+        """Stop every drive, ahead of all queued requests, and return each result by the drive's name.
 
-        First by broadcast, where all drives are known to be of one family that has it. Then each drive is
-        sent its stop, in turns, until it is seen to stand: for `seconds` s, or without that for 30 s at
-        least, and for as long as the motor's ramp may take; what is no time is logged, and is as none. Never
-        raises for one drive: the others go on. A call that would move a motor ends with CancelledByStop, if
-        it came before this or comes while it lasts.
-        After an interruption each drive that does not stand yet is sent its stop once more.
+        If all drives are known to be of one family with a stop broadcast, that is sent first. Then each drive
+        is sent its stop in turns until its motor is seen to stand: for `seconds`, or by default for at least
+        30 s and as long as its ramp may take. An invalid `seconds` is logged and ignored. A failure of one
+        drive is in its result and never ends the others. Calls that move a motor end with CancelledByStop if
+        they came before, or during this call. If interrupted, send the stop once more to each drive that is
+        not seen to stand.
         """
         run: StopRun | None = None
         tried = 0
@@ -338,36 +337,36 @@ class Bus:
         return self._stopper.stop_all(in_turn, lambda: self._broadcaster.stop(self.drives), seconds)
 
     def stops_under_way(self) -> dict[str, str]:
-        """Return, by drive's name, a sentence of what is known so far of its stop, while one is under way.
+        """Return the state of each pending stop in a sentence, by the drive's name.
 
-        It says whether the stop was sent and confirmed, and why it goes on; it is the same as long as nothing
-        changes. Any thread may ask; nothing is sent, and nobody is waited for.
+        It says whether the stop was sent and confirmed, and why it is repeated. Any thread may call this; it
+        does not wait.
         """
         return self._stopper.so_far()
 
     def stop_on_exit(self) -> None:
         """From now on, stop all drives when the `with` block is left or the process ends.
 
-        Also on SIGINT and SIGTERM, at once, together with the drives of all other buses that asked for it;
-        and on SIGHUP, of a terminal that is closed, unless the program handles or ignores that one.
-        Standard error then says which drives are being stopped. The signal is held until that is done, and
-        then does what it did before: Ctrl-C raises KeyboardInterrupt. Three within a second cut it short.
-        From the signal on nothing that moves a motor is sent: a verb that would waits for its effect.
-        Python handles it in the main thread: where that waits for a reply, when it has come or timed out.
-        A handler that the program installs later replaces this, until another bus calls `stop_on_exit`.
-        Without this call leaving sends nothing: the motors go on as they are. Call it from the main thread.
+        Also on SIGINT and SIGTERM, at once, with the drives of all other buses that asked for it; and on
+        SIGHUP of a closed terminal, unless the program handles or ignores it. Standard error names the drives
+        that are being stopped. The signal is held until they are, and then has its previous effect: Ctrl-C
+        raises KeyboardInterrupt. Three signals within a second cut the stops short. From the signal on, no
+        call that moves a motor is sent: it waits for the signal's effect. Python handles signals in the main
+        thread: if that waits for a reply, the stops start when the reply has come or timed out. A handler
+        that the program installs later replaces this one, until another bus calls `stop_on_exit`. Call it
+        from the main thread; raises ValueError on any other.
         """
         self._leaving.stop_on_exit()
 
     @property
     def stops_on_exit(self) -> bool:
-        """True once `stop_on_exit` was called."""
+        """True if `stop_on_exit` is set."""
         return self._leaving.stops
 
     def part_with(self, drives: Sequence[Drive], to_stop: Sequence[Drive]) -> None:
-        """End all that moves these drives, which are about to be detached, and wait for their stops.
+        """Cancel all calls that move drives that are about to be detached, and wait for their stops.
 
-        Those `to_stop` are stopped if `stop_on_exit` was called: once they are detached, nobody would.
+        Stop those in `to_stop` first if `stop_on_exit` is set, because detached drives are not stopped later.
         """
         self._leaving.part_with(drives, to_stop)
 
@@ -375,16 +374,17 @@ class Bus:
 
     @property
     def audit_trouble(self) -> str:
-        """Return why the newest write is not in the audit log; "" where it is, or there is no log."""
+        """Why the newest write is not in the audit log; "" if it is, or if there is no log."""
         return self._records.audit_trouble
 
     def statistics(self) -> LineStatistics:
-        """Return the statistics of all exchanges since the bus was opened, or reset, also per drive.
+        """Return the statistics of all exchanges since the bus was opened or `reset_statistics`, also per
+        drive.
 
-        Any thread may call it, as often as wanted: it costs the line nothing.
+        Any thread may call this at any time; it takes no line time.
         """
         return self._meter.read()
 
     def reset_statistics(self) -> None:
-        """Begin the statistics anew."""
+        """Start the statistics again from zero."""
         self._meter.reset()

@@ -23,7 +23,7 @@ class LineError(BusError, OSError):
         super().__init__(f"{port}: {reason}")
         self.port = port
         self.reason = reason
-        self.is_sent = False  # a request had begun to leave
+        self.is_sent = False  # part of a request had left
 
 
 class PortLost(LineError):
@@ -35,7 +35,7 @@ class NoSuchPort(LineError, ValueError):
 
 
 class NoReply(BusError, TimeoutError):
-    """The drive said nothing within its time-out."""
+    """No byte came within the drive's timeout."""
 
     def __init__(self, drive: str, where: str = "", hint: str = "") -> None:
         super().__init__(
@@ -56,9 +56,9 @@ class BadReply(BusError):
 
 
 class NoValue(BadReply):
-    """A good reply holds what means "no value" in place of a value: a NaN, or a count declared as invalid.
+    """A good reply holds a NaN, or a count that is declared as "no value".
 
-    `values` has those of the registers that were read with it and have one.
+    `values` has the registers of the same read that have a value.
     """
 
     def __init__(self, drive: str, register: str, values: Mapping[str, Any] = _NONE) -> None:
@@ -69,9 +69,9 @@ class NoValue(BadReply):
 
 
 class DriveException(BusError):
-    """The drive answered with an exception: it did not do what the request asked.
+    """The drive answered with an exception: it did not carry out the request.
 
-    `register` is the name of the one that could not be read, where it was asked for by itself.
+    `register` is the name of the register that could not be read, if the request had only one.
     """
 
     def __init__(self, drive: str, code: int, meaning: str, register: str | None = None) -> None:
@@ -84,7 +84,7 @@ class DriveException(BusError):
 
 
 class Unconfirmed(BusError):
-    """A write whose effect is not known: it may have happened."""
+    """The effect of a write is not known: it may have happened."""
 
     def __init__(self, drive: str, what: str, reason: str) -> None:
         super().__init__(f"{drive}: it is not known whether {what} took effect: {reason}")
@@ -108,7 +108,7 @@ class NotVerified(BusError):
 
 
 class Expired(BusError):
-    """Never sent: its turn on the line did not come within its time."""
+    """Not sent: the line stayed busy until the write expired."""
 
     def __init__(self, drive: str, what: str, seconds: float) -> None:
         super().__init__(f"{drive}: {what} was not sent: its turn did not come within {seconds:g} s")
@@ -118,7 +118,7 @@ class Expired(BusError):
 
 
 class CancelledByStop(BusError):
-    """Ended before it was sent: a stop was called, the bus was left, or the drive taken off it."""
+    """Cancelled before it was sent: by a stop, or because the bus was left or the drive detached."""
 
     def __init__(self, drive: str, what: str, why: str) -> None:
         super().__init__(f"{drive}: {what} was not sent: {why}; nothing more was sent")
@@ -128,10 +128,10 @@ class CancelledByStop(BusError):
 
 
 class NotMaster(BusError):
-    """Not sent: this process is not, or no more, the master of the line, or it hears another one there.
+    """Not sent: this process is not the master of the line, or it hears another master.
 
-    `heard` is what was received, where that is why. `is_sent`: a part of the request had left before, as on a
-    port that takes a few bytes at a time; no drive takes a part for a request.
+    `heard` has the bytes of another master. `is_sent`: part of the request had left, as on a port that takes
+    a few bytes at a time; no drive takes a part for a request.
     """
 
     def __init__(self, drive: str, port: str, *, heard: bytes = b"", is_sent: bool = False) -> None:
@@ -147,7 +147,7 @@ class NotMaster(BusError):
         self.is_sent = is_sent
 
     def of_a_stop(self) -> NotMaster:
-        """Return the same of a motor's stop: whoever reads it must know what to do now."""
+        """Return the same error with the advice that a failed stop needs."""
         self.args = (
             f"{self.drive}: the stop was NOT sent, and its motor goes on as it is: {self.reason}. Stop it "
             "through the process that is master of its line now, or at the drive itself",
@@ -156,17 +156,17 @@ class NotMaster(BusError):
 
 
 class PollingFailed(BusError):
-    """A poller has ended by itself: its own thread failed, on all lines. The cause is `__cause__`."""
+    """The poller's own thread failed, on all lines; `__cause__` says why."""
 
 
 class NotAttached(ValueError):
-    """The drive is not, or no more, on this bus: a mistake of the caller."""
+    """The drive is not on this bus: a mistake of the caller."""
 
 
 class Advice(NamedTuple):
-    """The advice in a refusal's sentence: for a program, and for the command line instead.
+    """The advice in a refusal: for a program, for the command line, and for a drive of a plant file.
 
-    `plant` is for a drive of a plant file, where that is not what is typed for one by hand.
+    `plant` is empty if it is the same as `command`.
     """
 
     program: str
@@ -192,9 +192,9 @@ ANOTHER_FAMILY = "another family is at its address"  # the rule of a WriteForbid
 
 
 class WriteForbidden(BusError, ValueError):
-    """The library itself did not send it; with the register, the rule, and its place in the manual.
+    """The library did not send the write; with the register, the rule, and its place in the manual.
 
-    `is_budget` says that the register's memory wears: the same may be sent at another time.
+    `is_budget`: the register's memory wears out; the same write may be sent later.
     """
 
     def __init__(
@@ -215,7 +215,7 @@ class WriteForbidden(BusError, ValueError):
         self.is_budget = is_budget
 
     def for_command_line(self, *, in_plant: bool = False) -> str:
-        """Return the sentence with what to type in place of what a program would call or declare."""
+        """Return the sentence with the command-line form of its advice."""
         if self.advice is None:
             return str(self)
         typed = (in_plant and self.advice.plant) or self.advice.command
@@ -223,4 +223,4 @@ class WriteForbidden(BusError, ValueError):
 
 
 class CheckAgain(Exception):
-    """A drive answered once as another would: its identity is checked again, after the stops of others."""
+    """A drive answered once as another family's would: check its identity again, after other stops."""

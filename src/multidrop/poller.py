@@ -31,9 +31,9 @@ from multidrop.transport import clock
 from multidrop.transport.aside_log import log_aside, traceback_of, words_of
 from multidrop.transport.statistics import LineStatistics
 
-LOOK_NS = 50_000_000  # between looks at the lines, while one of them or a reader of `fileno` needs them
-BUSY_NS = 100_000_000  # the same, where they only have to be kept busy: a third of what is queued ahead
-REST_NS = 500_000_000  # the same, where nothing is to be done
+LOOK_NS = 50_000_000  # between checks of the lines, while a line or a reader of `fileno` needs them
+BUSY_NS = 100_000_000  # while lines only have to be kept busy: a third of the time queued ahead
+REST_NS = 500_000_000  # while the lines need no work
 MOST_FAILURES = 8  # of the thread itself, in a row, before it gives up
 FAILED_NS = 50_000_000  # between its attempts
 
@@ -51,18 +51,20 @@ def _plant_of(plant: Plant | Path | str) -> Plant:
 
 
 class Poller(RowSource):
-    """Polls a plant as its file says, from `with` on until the block is left.
+    """Polls a plant, or the plant of a file, from `with` on until the block is left.
 
-    Raises LineError when a port cannot be opened; later failures are rows that say why a value is
-    missing. An exception on one line, such as one of a user's own class, is logged, and that line is tried
-    again later: `line_failures`. If polling itself fails, `take`, `batches` and `close` raise PollingFailed:
-    `failure`. Any thread may take batches, and add or remove drives; commands go through `bus(line)`, ahead
-    of the polling, and are counted in `ledger` and noted in `audit`, as Bus says. With a `mastership` nothing
-    is sent on any line, and no port opened, unless that holds: each value that is due meanwhile has a row
-    that says so.
+    Iterate over it for batches of rows, in `for` or `async for`; `poller["pump-1"]` is a drive. Any thread
+    may take batches, and add or remove drives. Reads, writes and verbs of its drives go ahead of polling;
+    `ledger`, `audit`, `stop_on_exit` and `mastership` are as in Bus.
 
-    The logger `multidrop.line` has no polled frames: they never enter Python. `multidrop poll --capture`
-    writes them to a file for Wireshark.
+    Raises LineError if a port cannot be opened. Later failures are rows that say why a value is missing. If
+    an exception occurs on one line, such as one of a user's own class, it is logged, and the line is tried
+    again: `line_failures`. If polling itself fails, `take`, `batches` and `close` raise PollingFailed:
+    `failure`. Without its mastership the poller sends no request and opens no port; each value that is due
+    has a row that says so.
+
+    The logger `multidrop.line` has no polled frames. `multidrop poll --capture` writes them to a file for
+    Wireshark.
     """
 
     def __init__(
@@ -80,7 +82,7 @@ class Poller(RowSource):
         super().__init__(row_queue, self._lines.names)
         self._path = plant.path
         self._thread = threading.Thread(target=self._run, name="multidrop poller", daemon=True)
-        self._look_ns = 0  # when lines that have not called are looked at again: each look costs them all
+        self._look_ns = 0  # when to check lines that have not called
         self._is_failure_raised = False
         self._ending = threading.Lock()
         register_at_fork(self)
@@ -95,11 +97,11 @@ class Poller(RowSource):
     @undisturbed
     def _fill(self, plant: Plant) -> None:
         with self._changing:
-            self._check_polling()  # whoever makes it may have been interrupted, and have closed it
+            self._check_polling()  # an interruption may have closed it already
             self._lines.fill(plant.lines)
 
     def forked(self) -> None:
-        """Be closed in the child, without rows."""
+        """Mark the poller closed in a forked child, without rows."""
         self._closing = True
         self._over, self._caller = threading.Event(), None
         self._over.set()
@@ -123,7 +125,7 @@ class Poller(RowSource):
     def __enter__(self) -> Poller:
         try:
             self._start()
-        except BaseException:  # then nobody leaves the block
+        except BaseException:  # __exit__ is not called then
             self._end()
             raise
         return self
@@ -147,10 +149,10 @@ class Poller(RowSource):
     def close(self) -> None:
         """Stop polling and close the ports; rows not yet taken can still be.
 
-        Exchanges under way are waited for, for a second at most; every slot that is over by now has a row.
-        Where a signal interrupts the wait for that, it is done all the same; called again, this waits again.
-        A function that `on_batch` calls gets its last batches first. Raises its failure, if it had one, and
-        PollingFailed if polling had failed; each once.
+        Waits up to a second for exchanges in flight; every slot that is over by then has a row. If a signal
+        interrupts the wait, the closing still completes; a second call waits for it. A function of `on_batch`
+        gets its last batches first. Raises that function's failure, and PollingFailed if polling had failed;
+        each once.
         """
         self._end()
         give_signals_back()
@@ -171,7 +173,7 @@ class Poller(RowSource):
     def _end_lines(self) -> None:
         self._closing = True
         for line in self._lines:
-            line.bus.leave()  # all of them at once
+            line.bus.leave()  # all lines at once
         with self._changing:  # an adoption that is under way is waited for
             if self._thread.is_alive():
                 self._call_thread()
@@ -194,7 +196,7 @@ class Poller(RowSource):
     def _poll(self) -> None:
         """Tend the lines until the poller is closed.
 
-        Raises what goes wrong MOST_FAILURES times in a row: memory may be short for a moment.
+        Raises a failure that occurs MOST_FAILURES times in a row: memory may be short for a moment.
         """
         failures = 0
         while not self._closing:
@@ -208,7 +210,7 @@ class Poller(RowSource):
                 clock.sleep(FAILED_NS / 1e9)
 
     def _tend_lines(self) -> None:
-        """Wait until lines call or are to be looked at, and tend them."""
+        """Wait until lines call or are due, and tend them."""
         seconds = max(0, self._look_ns - clock.now_ns()) / 1e9
         called = self._lines.called(self._row_queue.await_calls(seconds))
         now = clock.now_ns()
@@ -236,23 +238,21 @@ class Poller(RowSource):
         return {name: since_ns for line in self._lines for name, since_ns in line.since_ns.items()}
 
     def adopt(self, plant: Plant | Path | str) -> dict[str, LineError]:
-        """Poll another plant from now on; return the lines whose port is not there, by name, and why.
+        """Poll another plant from now on; return the error of each line whose port cannot be opened, by name.
 
-        Every mistake in it raises ValueError (PlantError with all of them, NoSuchPort for a name that no port
-        can have, OSError for an audit log that cannot be opened), and all stays as it was.
+        A mistake in the plant raises ValueError and changes nothing: PlantError with all mistakes, NoSuchPort
+        for an invalid port name, OSError for an audit log that cannot be opened.
 
-        A line whose description is the same goes on as if nothing had happened, and so does each drive of
-        which nothing changes: it stays the same object, which `plant` has and `buses`, and what is known of
-        its identity and its late replies is kept. Changed registers, rates and drives of a line with the same
-        port take effect on the open port; a line with a new name keeps its port too. All else is let go of
-        and opened anew. A port that is not there is tried again and again, as a lost one is, and its values
-        are missed. What `add` and `set_rate` changed is as in the plant.
+        An unchanged line keeps its slots, and an unchanged drive stays the same object, with its known
+        identity and late replies. Changed registers, rates and drives take effect on the open port, if the
+        line keeps its port. All other lines are closed and opened again. A port that cannot be opened is
+        tried again like a lost one. The plant overrides earlier calls of `add` and `set_rate`.
 
-        What leaves: requests under way are ended, and their rows come; other calls that use the line fail
-        with LineError, those of a drive with NotAttached, and what would move its motor with CancelledByStop.
-        Stops under way are waited for. Motors go on as they are, unless `stop_on_exit` was called: then they
-        are stopped before they leave, for nobody would later. One whose address is another family's now is
-        not: the old family's stop may mean something else there.
+        For lines and drives that leave: requests in flight end, and their rows come. Other calls on such a
+        line raise LineError; those of a drive NotAttached, or CancelledByStop if they move its motor. Pending
+        stops are waited for. Motors go on, unless `stop_on_exit` is set: then the drives are stopped before
+        they leave. A drive whose address becomes another family's is not stopped, because its stop may mean
+        something else there.
 
         Names in batches keep their codes. Returns when all is done; other lines are polled meanwhile. Any
         thread may call this, one at a time.
@@ -270,10 +270,10 @@ class Poller(RowSource):
             return adoption.carry_out(start=self._thread.is_alive())
 
     def add_line(self, line: PlantLine) -> None:
-        """Open one more line and poll it, from now on.
+        """Open one more line and poll it from now on.
 
-        Raises LineError when its port is not there, and ValueError where the plant with it would be wrong;
-        then nothing has changed.
+        Raises LineError if its port cannot be opened, and ValueError if the plant with it would be wrong;
+        then the poller is unchanged.
         """
         self._take_signals()
         self._add_line(line)
@@ -301,9 +301,9 @@ class Poller(RowSource):
 
     @undisturbed
     def remove_line(self, name: str) -> None:
-        """Poll a line no more, and close its port, as `adopt` does. Raises ValueError when there is none.
+        """Stop polling a line and close its port, as `adopt` does. Raises ValueError for an unknown line.
 
-        While its stops, and what is under way, are waited for other lines come and go.
+        Other lines may come and go while this waits for stops and requests in flight.
         """
         with self._changing:
             self._check_polling()
@@ -358,10 +358,10 @@ class Poller(RowSource):
 
     @undisturbed
     def remove(self, line: str, drive: str) -> None:
-        """Poll the drive of this name no more; its motor goes on as it is.
+        """Stop polling the drive of this name; its motor goes on.
 
-        What is queued of it is still asked. What is known of it stays in memory until polling ends, for
-        when the same PolledDrive is added again. Raises ValueError when there is none.
+        Queued requests are still sent. What is known about the drive stays in memory for the case that the
+        same PolledDrive is added again. Raises ValueError for an unknown drive.
         """
         with self._changing:
             polled = self._lines.find(line)
@@ -372,12 +372,12 @@ class Poller(RowSource):
 
     @undisturbed
     def set_rate(self, drive: Drive | str, register: Register[Any] | str | None, every: float | None) -> None:
-        """Read a register of a drive every so many seconds from now on; with None all that are polled of it.
+        """Read a register of a drive every so many seconds from now on; with None, all its polled registers.
 
-        `every` None is as fast as the line allows. Requests are planned anew; those under way are finished,
-        registers whose rate stays keep their slots, and each changed one has its first slot now. The drive
-        and the register may be given by their names. A recording's metadata keeps the rates that its plant
-        began with. Raises ValueError for a drive or register that is not polled, and for no such time.
+        `every` None is as fast as the line allows. Requests in flight are finished; registers whose rate
+        stays keep their slots, and each changed one has its first slot now. The drive and the register may be
+        given by name. The metadata of a recording keeps the rates of its start. Raises ValueError for a drive
+        or register that is not polled, and for an invalid period.
         """
         if every is not None:
             check_period(every)
@@ -404,9 +404,9 @@ class Poller(RowSource):
         return self._lines.find(line).bus
 
     def stop_on_exit(self) -> None:
-        """Stop the drives of all lines, at once, when polling ends or the process does; see Bus.
+        """Stop the drives of all lines when polling or the process ends; see `Bus.stop_on_exit`.
 
-        Also those of lines that come later, and of lines and drives that leave by `adopt` or `remove_line`.
+        Also those of later lines, and of lines and drives that leave by `adopt` or `remove_line`.
         """
         exit_hook().take_signals()
         self._lines.stops_on_exit = True
@@ -417,24 +417,24 @@ class Poller(RowSource):
 
     @property
     def line_failures(self) -> dict[str, str]:
-        """By name, the lines on which polling raised an exception lately, and which; {}: none.
+        """The exception of each line that polling failed on recently, by the line's name.
 
-        Such a line is tried again, at most 30 s later. It counts as sound after 10 s without another one.
+        Such a line is tried again within 30 s, and counts as sound after 10 s without another exception.
         """
         return {line.name: line.failure for line in self._lines if line.failure}
 
     def statistics(self) -> dict[str, LineStatistics]:
-        """Return statistics by line and drive since polling began, or `reset_statistics`; cheap."""
+        """Return statistics by line and drive since polling started or `reset_statistics`; cheap."""
         return {line.name: line.bus.statistics() for line in self._lines}
 
     def reset_statistics(self) -> None:
-        """Count from here on; `summary` is always since the beginning."""
+        """Start the statistics again from zero; `summary` always counts from the start."""
         for line in self._lines:
             line.bus.reset_statistics()
 
     @property
     def dropped(self) -> int:
-        """The rows that came too fast for who takes them, so far."""
+        """The number of rows that were dropped because they were not taken in time."""
         return self._row_queue.dropped
 
     def summary(self) -> dict[str, Any]:
