@@ -19,7 +19,6 @@ from multidrop.errors import DriveException as DriveException
 from multidrop.errors import Expired as Expired
 from multidrop.errors import LineError as LineError
 from multidrop.errors import NoReply as NoReply
-from multidrop.errors import NotAttached as NotAttached
 from multidrop.errors import NotMaster as NotMaster
 from multidrop.errors import NotVerified as NotVerified
 from multidrop.errors import NoValue as NoValue

@@ -6,7 +6,10 @@ import subprocess
 import sys
 from importlib import import_module
 from importlib.metadata import version
+from inspect import signature
 from pathlib import Path
+from pydoc import plaintext, render_doc
+from traceback import format_exception
 
 import pytest
 from batches import example
@@ -92,3 +95,25 @@ def test_a_poller() -> None:
     assert repr(poller) == "<Poller not started; no lines>"
     poller.close()
     assert repr(poller) == "<Poller closed; no lines>"
+
+
+# ---- at a prompt ----
+
+
+def test_the_top_has_few_names_and_shows_no_others() -> None:
+    assert len(NAMES) <= 45
+    assert dir(multidrop) == sorted(multidrop.__all__)
+
+
+def test_help_of_a_verb_has_its_signature() -> None:
+    shown = render_doc(multidrop.YD1000.start, renderer=plaintext)
+    assert "start(self, direction: " in shown
+    assert str(signature(Toy(1).stop)) == "()"
+
+
+def test_a_missing_port_is_one_sentence() -> None:
+    with pytest.raises(multidrop.LineError, match="/dev/ttyUSB77: there is no such port") as caught:
+        Bus("/dev/ttyUSB77")
+    lines = "".join(format_exception(caught.value))
+    assert "The above exception" not in lines
+    assert "During handling" not in lines

@@ -23,3 +23,4 @@ from multidrop.control.outcome import Outcome as Outcome
 from multidrop.control.outcome import Seen as Seen
 from multidrop.control.ramp import start_staggered as start_staggered
 from multidrop.control.time_limit import written_before as written_before
+from multidrop.errors import NotAttached as NotAttached

@@ -18,13 +18,13 @@ from multidrop import (
     Expired,
     LineError,
     NoReply,
-    NotAttached,
     NotMaster,
     NotVerified,
     Unconfirmed,
     Unsupported,
     WriteForbidden,
 )
+from multidrop.control import NotAttached
 from multidrop.drive import Carrier
 from multidrop.gateway.commands import BUSY
 from multidrop.gateway.http.rights import NOT_ALLOWED, NOT_LISTED
