@@ -218,7 +218,7 @@ PURE = ("body", "frame", "line", "reply", "tcp", "late", "stats", "capture")
 
 
 def calls(code: dict[str, str]) -> dict[str, set[str]]:
-    """Return the files that each file of C calls; a function is the first one's that defines it."""
+    """Return the files that each C file calls; a function belongs to the first file that defines it."""
     homes: dict[str, str] = {}
     for name, text in code.items():
         for function in DEFINED.findall(text):
@@ -242,13 +242,13 @@ def test_calls_of_the_core_run_one_way() -> None:
     TopologicalSorter(graph).prepare()
 
 
-def test_a_circle_is_found() -> None:
+def test_a_cycle_of_calls_is_detected() -> None:
     graph = calls({"a": "int md_a(void)\n{\n    md_b();\n}", "b": "void md_b(void)\n{\n    md_a();\n}"})
     with pytest.raises(CycleError):
         TopologicalSorter(graph).prepare()
 
 
-def test_framing_and_a_line_know_no_system() -> None:
+def test_pure_files_of_the_core_use_no_system() -> None:
     code = core()
     engine = {"engine", "clock", "wakeup", "port", "rs485", "api", "row_queue", "mastership"}
     graph = calls(code)
