@@ -44,7 +44,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _check_web(arguments: argparse.Namespace) -> None:
-    """Raise ValueError for options that --web ignores: it serves until Ctrl-C and records nothing."""
+    """Raise ValueError for options that --web ignores: it serves until Ctrl-C without recording."""
     given = {
         "--seconds": arguments.seconds != SECONDS,
         "--out": str(arguments.out) != OUT,

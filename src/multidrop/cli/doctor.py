@@ -193,7 +193,7 @@ def _findings(target: _Target) -> Iterator[Finding]:
     block = first_block(target.drives[0]) if target.drives else None
     if block:
         yield other_way_finding(port, block.request, settings)
-    elif not speaks_tcp(port):  # without drives, silence in the other framing proves nothing
+    elif not speaks_tcp(port):  # without drives, silence in the other framing is not conclusive
         yield other_way_finding(port, nobody, settings)
 
 
@@ -407,7 +407,7 @@ def other_way_finding(port: str, request: Message, settings: Settings) -> Findin
         found = ask_once(other, request, settings)
     except LineError as failure:
         return Finding("other framing", f"{way} was not tested: {failure.reason}")
-    if found.result > 0 or mixed_up(port, found.raw):  # other bytes are no proof
+    if found.result > 0 or mixed_up(port, found.raw):  # other bytes are not conclusive
         return Finding(
             "other framing",
             f"the far end speaks {way}, not {spoken_on(port)}",

@@ -226,7 +226,7 @@ def find_adapter(device: str, sysfs: Path = SYSFS) -> Adapter:
 
 def com_description(port: str) -> str:
     """Return Windows' description of a COM port's adapter, "" if it lists none."""
-    with suppress(ImportError, AttributeError, OSError):  # Wine lacks some of these calls
+    with suppress(ImportError, AttributeError, OSError):  # incomplete in Wine
         from serial.tools.list_ports import comports
 
         return next((found.description for found in comports() if of_name(found.device) == of_name(port)), "")

@@ -40,7 +40,7 @@ MOST_MERGED = 200_000_000  # bytes of files of rows that become one
 
 
 def main(words: list[str] | None = None) -> int:
-    """Compact a folder; return 0. Do nothing if another process does so already."""
+    """Compact a folder, unless another process does so already; return 0."""
     parser = argparse.ArgumentParser(prog="multidrop.history.compact", description=__doc__)
     parser.add_argument("folder", type=Path)
     parser.add_argument("--below", type=int, required=True, help="segments with a lower number are closed")

@@ -49,7 +49,7 @@ def _second(text: str) -> int:
 
 
 def parquet_files(directory: Path) -> list[HistoryFile]:
-    """Return a directory's Parquet files, the oldest first; [] if there is no directory."""
+    """Return a directory's Parquet files, the oldest first; [] without a directory."""
     found = []
     with suppress(FileNotFoundError, NotADirectoryError):
         for path in directory.iterdir():

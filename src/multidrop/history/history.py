@@ -88,11 +88,11 @@ class History:
         begin: Moment | None = None,
         end: Moment | None = None,
     ) -> HistoryRows:
-        """Return all rows, or those of these series, from `begin` to before `end`; None is no limit.
+        """Return the rows of the series, or of all, with begin <= time < end; None means unlimited.
 
         They come in the order of recording. Where a name was another register's in a part of the range, with
         another unit or other names of its numbers, those rows are in a column of their own, such as
-        "motor_load [A]", and `metadata` describes both. What it returns is a recording like
+        "motor_load [A]", and `metadata` describes both. The result is a recording like
         `multidrop.open_recording` gives: `to_pandas()`, `to_polars()`, `wide()`, batches of rows, Arrow.
         """
         first = ALWAYS[0] if begin is None else ns_of(begin)
@@ -166,12 +166,12 @@ class History:
     ) -> dict[str, Buckets]:
         """Return least, mean and most of each series in at most `points` equal times that cover the range.
 
-        `end` None is now. Nothing is hidden: a value that stood out for one row is in `most` or `least`.
+        `end` None is now. Single extreme values are kept, in `most` or `least`.
         Times of 2 s and more become whole tens of seconds, minutes, hours or days of UTC, so that the first
         may begin before `begin` and the last end after `end`.
 
         Where a name was another register's in a part of the range, with another unit or other names of its
-        numbers, only what is of the newest quantity is in it; `unit` and `left_out` say so.
+        numbers, only values of the newest quantity are included: see `unit` and `left_out`.
         """
         names = parsed_series(series)
         if not names:
@@ -268,7 +268,7 @@ class History:
             of = rows.series, (rows.begin, rows.end), rows.metadata, renamed
             return write_parquet(self._sources, target, batches, files, *of)
 
-        self._sources.cursor().close()  # without DuckDB there is no file yet
+        self._sources.cursor().close()  # raises without DuckDB, before a file exists
         new_file(target).close()
         try:
             return self._sources.again(write)

@@ -66,7 +66,7 @@ class HistoryWriter:
         self._waiting_rows = 0
         self._ended: list[
             tuple[list[GatheredRows], Metadata]
-        ] = []  # rows, and the metadata of those after them
+        ] = []  # rows, and the metadata that replaces theirs
         self._changing = threading.Lock()
         self._dropped = 0
         self._trouble: str | None = None

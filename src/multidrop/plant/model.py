@@ -168,6 +168,14 @@ class Plant:
         return _metadata(self)
 
 
+def current_for(period: float) -> float:
+    """Return how long, in s, a value that is polled with this period in s counts as current.
+
+    `period` is the larger of the register's own and its line's bus cycle.
+    """
+    return max(1.0, 3 * period)
+
+
 def planned_on(line: PlantLine, delays: Mapping[Drive, float] | None = None) -> list[Planned]:
     """Return all that is polled on a line; `delays` are response delays in s that were measured."""
     known = delays or {}

@@ -14,7 +14,7 @@ GUESS = "it only reads like one: look at its name plate"
 class Found:
     """A drive that answers: `models` fit equally well; it is empty if no family fits.
 
-    The settings are the first of these families' that it answered: a drive with another number of stop
+    The settings are the first ones of its families that it answered: a drive with another number of stop
     bits answers too.
     """
 
@@ -60,7 +60,7 @@ class Untried:
 
 @dataclass(frozen=True)
 class Progress:
-    """One more address is done; `left` is the time in s until the end if no more drives answer."""
+    """One more address is done; `left` is the time in s until the end if the rest stays silent."""
 
     settings: Settings
     framing: Framing

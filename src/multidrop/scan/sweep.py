@@ -157,7 +157,7 @@ def _sweeps(
 
 
 def _best(families: Collection[type[Drive]]) -> Register[Any] | None:
-    """Return the register that most families answer; among several, the one that most of them have."""
+    """Return the register that most families answer; among several, the most common one."""
     registers = (one for family in families for one in family.registers.values() if one.readable)
     return max(
         registers,

@@ -61,9 +61,9 @@ class SimulatedDelixiNative(MotorDrive):
     """Delixi by its own protocol: a set is answered with its copy, a query with the value.
 
     While `locked` is set, no parameter may be written: FEH. F0H refuses a start in a fault, and any run
-    command where P00.00 is not 2, of which the document says nothing. Nor does it say what P00.01 does to
-    K = 04: here the setpoint that was written last counts. Faults from 10 on are shown in decimal digits,
-    as they are printed, in their records too.
+    command unless P00.00 is 2; the manual does not describe that case, nor the effect of P00.01 on K = 04:
+    here the setpoint that was written last counts. Faults from 10 on are shown in decimal digits, as they
+    are printed, in their records too.
     """
 
     begins = BY_LINE

@@ -22,9 +22,9 @@ FORMATS = ("8N1", "8E1", "8O1")
 class SimulatedIBD(MotorDrive):
     """INNOVERT IBD, set up for RS-485 (Prb.01 = 5, Prb.02 = 2), with the outputs of the manual's example.
 
-    The manual has no exceptions: what cannot be done is not answered. A value above the largest is
+    The manual has no exceptions: a request that fails gets no answer. A value above the largest is
     stored as the largest, and the echo shows the value that was written. A run while it jogs changes
-    nothing: a jog is left by a stop and a new run (table 3).
+    no mode: a stop and a new run end a jog (table 3).
 
     Not in the manual: a command is confirmed and has no effect unless Prb.02 = 2; the setpoint is 0
     where Prb.01 is neither 5 nor 0; Prb.00 counts 0.01 Hz, as 2001H does.

@@ -61,7 +61,7 @@ def logging_to(show: Callable[[str], object], logger_name: str, level: int) -> I
 
 @contextmanager
 def logging_by(handler: logging.Handler, levels: Mapping[str, int]) -> Iterator[None]:
-    """Pass the messages of these loggers, from these levels up, to a handler; close it at the end."""
+    """Pass the loggers' messages, from the given levels up, to a handler; close it at the end."""
     loggers = {logging.getLogger(name): level for name, level in levels.items()}
     before = {logger: logger.level for logger in loggers}
     for logger, level in loggers.items():

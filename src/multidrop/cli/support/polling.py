@@ -17,7 +17,7 @@ from multidrop.cli.support.signals import Interruption, noting_signals
 from multidrop.cli.support.values import value_text
 from multidrop.core import UNASKED, Counters
 from multidrop.errors import BusError
-from multidrop.plant.model import Plant, PlantLine, PolledDrive
+from multidrop.plant.model import Plant, PlantLine, PolledDrive, current_for
 from multidrop.poller import Poller
 from multidrop.polling.batch import Row, Rows
 from multidrop.recording import open_writer
@@ -74,9 +74,7 @@ def polling_session(
 
 HISTORY = 240  # points, one a second
 RECENT = 5.0  # s over which rates are measured
-OLD = 5.0  # s, or so many periods of a register, or bus cycles of its line, if they are longer:
-PERIODS = 3  # a value is old then,
-MISSED = 1.0  # s: and where it was missed since, after so long
+MISSED = 1.0  # s after which a value is old if the register was missed since
 FREQUENCY, CURRENT, FAULT, STATE = "output_frequency", "output_current", "fault", "status"
 
 _NOTHING = Statistics(1.0, Counters())
@@ -123,15 +121,11 @@ class LiveDrive:
         return None if newest is None else max(0.0, (now_ns - newest) / 1e9)
 
     def is_old(self, name: str, now_ns: int) -> bool:
-        """Return True where a register's newest value is not the present one any more."""
+        """Return True if a register's newest value is no longer current."""
         row = self.newest.get(name)
         age = 0.0 if row is None else (now_ns - row.time_ns) / 1e9
-        return age > (MISSED if name in self.missed else self._holds(name))
-
-    def _holds(self, name: str) -> float:
-        """Return for how long a value of this register is the present one."""
         every = next((poll.every for poll in self.polled.polls if poll.register.name == name), None)
-        return max(OLD, PERIODS * max(every or 0.0, self.cycle))
+        return age > (MISSED if name in self.missed else current_for(max(every or 0.0, self.cycle)))
 
     @property
     def why_silent(self) -> str:
