@@ -172,7 +172,7 @@ def test_a_clock_of_any_resolution_is_read(tmp_path: Path, resolution: bytes, ti
 # ---- what cannot be written ----
 
 
-def test_a_capture_that_finds_no_room_is_told_in_a_sentence(tmp_path: Path) -> None:
+def test_a_capture_on_a_full_disk_is_one_sentence(tmp_path: Path) -> None:
     if not Path("/dev/full").exists():
         pytest.skip("needs /dev/full")
     path = tmp_path / "a.pcapng"
@@ -184,7 +184,7 @@ def test_a_capture_that_finds_no_room_is_told_in_a_sentence(tmp_path: Path) -> N
     assert sorted(Path("/proc/self/fd").iterdir()) == files
 
 
-def test_a_capture_in_a_directory_that_is_not_there_is_told_in_a_sentence(tmp_path: Path) -> None:
+def test_a_capture_in_a_missing_directory_is_one_sentence(tmp_path: Path) -> None:
     path = tmp_path / "none" / "a.pcapng"
     with pytest.raises(RecordingError) as failure:
         CaptureWriter(path)

@@ -41,9 +41,7 @@ READ = bytes.fromhex("01 03 00 16 00 01 65 CE")
         ),
     ],
 )
-def test_what_is_no_capture_of_a_line_is_told_in_a_sentence(
-    tmp_path: Path, content: bytes, sentence: str
-) -> None:
+def test_a_capture_of_something_else_is_one_sentence(tmp_path: Path, content: bytes, sentence: str) -> None:
     path = tmp_path / "a.pcap"
     path.write_bytes(content)
     with pytest.raises(CaptureError) as mistake:
@@ -64,7 +62,7 @@ def described(*options: tuple[int, bytes]) -> bytes:
     return section + struct.pack("<II", 1, size) + interface + struct.pack("<I", size)
 
 
-def test_a_resolution_that_says_nothing_is_the_usual_one(tmp_path: Path) -> None:
+def test_an_empty_resolution_is_the_default(tmp_path: Path) -> None:
     (tmp_path / "a.pcapng").write_bytes(described((9, b"")))
     assert spans(tmp_path / "a.pcapng") == {"a-0": []}
 
@@ -113,9 +111,7 @@ BIG_ENDIAN_SECTION = struct.pack(">IIIHHqI", 0x0A0D0D0A, 28, 0x1A2B3C4D, 1, 0, -
         ),
     ],
 )
-def test_a_pcapng_file_that_cannot_be_read_is_told_in_a_sentence(
-    tmp_path: Path, content: bytes, sentence: str
-) -> None:
+def test_an_unreadable_pcapng_file_is_one_sentence(tmp_path: Path, content: bytes, sentence: str) -> None:
     path = tmp_path / "a.pcapng"
     path.write_bytes(content)
     with pytest.raises(CaptureError) as mistake:
@@ -134,7 +130,7 @@ def test_a_capture_that_is_cut_within_a_description_is_read_as_far_as_it_goes(tm
 @pytest.mark.parametrize(
     "tags", [b"\0\x0c\0\x05mb", b"\0\x0c\0\x05mbrtu", b"\0\x0c\xff\xff", b"\0\0\0\0", b"\0"]
 )
-def test_a_packet_that_ends_within_its_tags_holds_nothing(tmp_path: Path, tags: bytes) -> None:
+def test_a_packet_that_ends_within_its_tags_is_empty(tmp_path: Path, tags: bytes) -> None:
     """A frame that somebody exported begins behind tags that say what it is; here none does."""
     path = tmp_path / "a.pcapng"
     interface = block(1, struct.pack("<HHI", 252, 0, 0))

@@ -154,7 +154,7 @@ def test_more_requests_than_are_remembered_are_decoded_all_the_same(
     ]
 
 
-def test_a_request_for_more_than_a_reply_can_hold_is_rows_of_what_it_can(tmp_path: Path) -> None:
+def test_an_oversized_request_has_rows_for_a_reply_s_registers(tmp_path: Path) -> None:
     """Noise or a mistaken master asks for all there is, of every kind."""
     path = tmp_path / "a.pcapng"
     with CaptureWriter(path) as capture:

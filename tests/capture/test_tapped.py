@@ -154,14 +154,14 @@ def mixed(tmp_path_factory: pytest.TempPathFactory) -> Mixed:
 
 @pytest.mark.long
 @pytest.mark.slow
-def test_a_capture_of_all_variants_says_what_was_recorded(mixed: Mixed) -> None:
+def test_a_capture_of_all_variants_decodes_to_the_recording(mixed: Mixed) -> None:
     check(mixed.rows, mixed.decoded)
     samples = {row.drive for row in mixed.decoded if row.value is not None}
     assert samples == {polled.drive.name for polled in mixed.drives}
 
 
 @pytest.mark.long
-def test_wireshark_reads_what_was_recorded(mixed: Mixed) -> None:
+def test_wireshark_reads_the_capture(mixed: Mixed) -> None:
     """Each value of an RTU drive: who was asked for what and when, and the registers in the reply."""
     packets = tshark(mixed.capture)
     by_time = {each["frame.time_epoch"]: (number, each) for number, each in enumerate(packets, 1)}
@@ -210,7 +210,7 @@ def epoch(time_ns: int) -> str:
         pytest.param(echoing_wires, id="echoing"),
     ],
 )
-def test_noise_echo_damage_and_late_replies_are_told_as_the_poll_took_them(
+def test_noise_echo_damage_and_late_replies_decode_as_in_the_poll(
     tmp_path: Path, make: Callable[[], list[Wire]]
 ) -> None:
     drives = [polled(drive, drive.readings()) for drive in fast_drives()]
@@ -229,7 +229,7 @@ def test_a_damaged_reply_is_modbus_with_a_bad_checksum_in_wireshark(tmp_path: Pa
     assert noise["data.data"] == frame.hex()
 
 
-def test_what_is_not_collected_in_time_is_counted() -> None:
+def test_uncollected_bytes_are_counted() -> None:
     """Noise that goes on for as long as there is room, and longer."""
     driver, tap, told = LineDriver(), Tap(), 0
     peer = Peer(least_timeout=0.02, most_timeout=0.2)
@@ -247,7 +247,7 @@ def test_what_is_not_collected_in_time_is_counted() -> None:
     ]
 
 
-def test_a_capture_has_what_comes_behind_a_reply_amid_much_noise() -> None:
+def test_a_capture_has_the_bytes_behind_a_reply_in_noise() -> None:
     """More than the line keeps: noise, the reply, and noise again in one piece with that."""
     driver, tap = LineDriver(), Tap()
     peer = Peer(least_timeout=0.02, most_timeout=0.2)
@@ -326,7 +326,7 @@ def seconds_in(path: Path) -> list[int]:
         ]
 
 
-def test_the_last_minutes_and_what_follows_are_written_when_something_goes_wrong(
+def test_an_anomaly_writes_the_minutes_before_and_after_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     one_flight = Flight(tmp_path / "flights", monkeypatch, seconds=20)
@@ -372,7 +372,7 @@ def test_a_recorder_that_may_keep_no_file_is_refused(tmp_path: Path, most_files:
         FlightRecorder(tmp_path, ["hall-1"], most_files=most_files)
 
 
-def test_no_more_is_kept_in_memory_than_allowed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_memory_stays_within_its_limit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     one_flight = Flight(tmp_path, monkeypatch, most_bytes=1000)
     one_flight.pass_(200, "hall-1: the port was lost")
     one_flight.recorder.close()
@@ -394,7 +394,7 @@ def test_trouble_that_is_not_written_yet_is_written_at_the_end(
     assert [seconds_in(path) for path in one_flight.recorder.written] == [list(range(1001, 1007))]
 
 
-def test_a_directory_that_cannot_be_made_is_told_in_a_sentence(tmp_path: Path) -> None:
+def test_a_directory_that_cannot_be_made_is_one_sentence(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(RecordingError, match="cannot be written"):
         FlightRecorder(tmp_path / "file" / "flights", [])

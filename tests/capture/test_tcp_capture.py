@@ -21,7 +21,7 @@ FIELDS = ("mbtcp.trans_id", "mbtcp.unit_id", "modbus.func_code", "modbus.referen
 POLLED = ("output_current", "motor_speed")
 
 
-def test_unit_id_0_of_modbus_tcp_is_no_broadcast() -> None:
+def test_unit_id_0_of_modbus_tcp_is_not_a_broadcast() -> None:
     request, reply = Message(0, 0x03, 1, 1), Message(0, 0x03, data=b"\0\7")
     spans = {
         framing: [

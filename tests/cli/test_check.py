@@ -39,7 +39,7 @@ def fan(tmp_path: Path) -> Path:
     return path
 
 
-def test_check_tells_what_it_understood_and_what_it_does_not_know(run: Run, fan: Path) -> None:
+def test_check_lists_contents_gaps_and_refusals(run: Run, fan: Path) -> None:
     status, out, err = run("check", fan)
     shown = words(out)
     assert (status, err) == (0, "")
@@ -67,7 +67,7 @@ def test_check_tells_what_it_understood_and_what_it_does_not_know(run: Run, fan:
         assert told in refused
 
 
-def test_an_address_in_place_of_a_file_is_told_as_one(run: Run) -> None:
+def test_an_address_instead_of_a_file_is_one_sentence(run: Run) -> None:
     told = "http://10.0.0.7:8750 is an address, and no plant file; a gateway's page is for a browser: "
     for command in ("check", "plan", "poll", "simulate"):
         assert run(command, "http://10.0.0.7:8750") == (2, "", f"multidrop: {told}open it there\n")
@@ -80,7 +80,7 @@ def test_a_family_that_ships_as_a_file_is_checked_by_its_name(run: Run) -> None:
     assert max(map(len, out.splitlines())) <= 80
 
 
-def test_a_name_that_is_no_file_is_told_what_to_do(run: Run, tmp_path: Path) -> None:
+def test_an_unknown_file_name_gets_a_hint(run: Run, tmp_path: Path) -> None:
     assert "see `multidrop models innovert-ibd`" in run("check", "innovert-ibd")[2]
     assert "did you mean abb-acs355" in run("check", "abb-acs35")[2]
     (tmp_path / "plant.toml").write_text('[[line]]\nname = "L"\n')
@@ -116,7 +116,7 @@ def test_check_prints_json(run: Run, fan: Path) -> None:
     assert ["identify", "how to recognise this device; read its name plate"] in found["not_known"]
 
 
-def test_all_mistakes_are_told_with_status_1(run: Run, tmp_path: Path) -> None:
+def test_all_mistakes_are_printed_with_status_1(run: Run, tmp_path: Path) -> None:
     path = tmp_path / "fan.toml"
     path.write_text(FAN.replace("0x0010", '"8192"').replace("0x0020", "-1"))
     status, out, err = run("check", path)
@@ -146,7 +146,7 @@ def test_a_model_s_file_with_mistakes_is_a_mistaken_call(run: Run, tmp_path: Pat
     assert "'manual' is missing" in err
 
 
-def test_a_line_with_more_drives_than_a_manual_allows_is_told(run: Run, tmp_path: Path) -> None:
+def test_a_line_with_too_many_drives_is_warned_of(run: Run, tmp_path: Path) -> None:
     """ERMAN, section 1: at most 31 devices, the drive included."""
     plant = tmp_path / "plant.toml"
 

@@ -46,7 +46,7 @@ def test_every_command_has_help_within_80_columns(
 
 
 @pytest.mark.parametrize("name", ["read", "write", "state", "start"])
-def test_the_help_says_of_each_word_what_it_is(run: Run, name: str) -> None:
+def test_the_help_describes_each_argument(run: Run, name: str) -> None:
     words = " ".join(run(name, "--help")[1].split())
     for word in ("PORT: a device", "MODEL: one of", "ADDRESS: the drive's", "PLANT.toml DRIVE: a plant file"):
         assert word in words
@@ -68,7 +68,7 @@ def test_the_help_says_of_each_word_what_it_is(run: Run, name: str) -> None:
         ("fleet stop", "what was asked for; else commands.jsonl in ~/.local/state/multidrop/fleet"),
     ],
 )
-def test_the_help_says_what_holds_where_an_option_is_not_given(run: Run, name: str, told: str) -> None:
+def test_the_help_names_the_defaults_of_options(run: Run, name: str, told: str) -> None:
     assert told in " ".join(run(*name.split(), "--help")[1].split())
 
 
@@ -161,7 +161,7 @@ def test_its_version_is_the_package_s(run: Run) -> None:
 
 
 @pytest.mark.parametrize("seconds", ["ten", "0", "-1", "nan", "inf"])
-def test_what_is_no_time_to_poll_for_is_a_sentence(run: Run, seconds: str) -> None:
+def test_an_invalid_polling_time_is_one_sentence(run: Run, seconds: str) -> None:
     status, out, err = run("poll", "plant.toml", f"--seconds={seconds}")
     assert (status, out) == (2, "")
     assert f"argument --seconds: '{seconds}' is not a number of seconds above 0" in err
@@ -185,7 +185,7 @@ def test_a_line_that_no_link_can_be_named_after_is_not_simulated(run: Run, tmp_p
     )
 
 
-def test_a_file_is_no_directory_of_ports(run: Run, tmp_path: Path) -> None:
+def test_a_file_is_refused_as_directory_of_ports(run: Run, tmp_path: Path) -> None:
     plant = tmp_path / "plant.toml"
     plant.write_text(
         '[[line]]\nname = "a"\nport = "x"\n[[line.drive]]\nname = "a"\naddress = 1\nmodel = "yd1000"\n'
@@ -205,7 +205,7 @@ def test_a_ledger_that_is_named_must_be_there(
     assert run("wear", "--ledger", tmp_path / "none") == (2, "", f"multidrop: {sentence}\n")
 
 
-def test_a_sheet_says_where_a_register_is_written_without_wear(run: Run, tmp_path: Path) -> None:
+def test_a_sheet_shows_addresses_without_wear(run: Run, tmp_path: Path) -> None:
     (tmp_path / "mine.py").write_text(
         "from multidrop.families.invt_che import InvtCHE, parameter\n\n\n"
         'class Mine(InvtCHE):\n    """With a parameter."""\n\n'
@@ -216,7 +216,7 @@ def test_a_sheet_says_where_a_register_is_written_without_wear(run: Run, tmp_pat
     assert "        kept: EEPROM; written at 800BH, in RAM" in out
 
 
-def test_a_sheet_says_what_its_class_says_of_moving_the_motor(run: Run, tmp_path: Path) -> None:
+def test_a_sheet_shows_which_writes_may_move_the_motor(run: Run, tmp_path: Path) -> None:
     (tmp_path / "moved.py").write_text(
         "from multidrop import Drive, command, setting\n\n\n"
         'class Moved(Drive):\n    """Moved."""\n\n'
@@ -267,7 +267,7 @@ def test_a_sheet_says_what_its_class_says_of_moving_the_motor(run: Run, tmp_path
         ),
     ],
 )
-def test_what_a_rule_forbids_is_a_sentence_and_status_1(run: Run, words: list[str], sentence: str) -> None:
+def test_a_forbidden_write_is_a_sentence_with_status_1(run: Run, words: list[str], sentence: str) -> None:
     assert run(*words) == (1, "", f"multidrop: {sentence}\n")
 
 
@@ -285,13 +285,13 @@ def test_what_a_rule_forbids_is_a_sentence_and_status_1(run: Run, words: list[st
         ),
     ],
 )
-def test_what_a_rule_forbids_comes_with_what_is_to_be_typed(run: Run, words: list[str], advice: str) -> None:
+def test_a_forbidden_write_shows_the_command_to_type(run: Run, words: list[str], advice: str) -> None:
     status, out, err = run(*words)
     assert (status, out) == (1, "")
     assert advice in err
 
 
-def test_advice_for_a_drive_of_a_plant_file_is_what_its_command_takes(run: Run, tmp_path: Path) -> None:
+def test_advice_for_a_plant_s_drive_uses_its_command(run: Run, tmp_path: Path) -> None:
     plant = tmp_path / "plant.toml"
     plant.write_text(
         '[[line]]\nname = "hall"\nport = "/dev/ttyX"\n'
@@ -441,9 +441,7 @@ def test_a_family_s_json_has_every_register(run: Run) -> None:
         ),
     ],
 )
-def test_a_sheet_has_what_is_to_be_set_on_the_drive_and_what_bounds_a_value(
-    run: Run, name: str, facts: list[str]
-) -> None:
+def test_a_sheet_has_drive_settings_and_limits_of_values(run: Run, name: str, facts: list[str]) -> None:
     """In a family's own words (section 3 of ERMAN's manual, 4.3 and 6.1 of the YD1000's notes)."""
     _, out, _ = run("models", name)
     shown = " ".join(out.split())
@@ -451,7 +449,7 @@ def test_a_sheet_has_what_is_to_be_set_on_the_drive_and_what_bounds_a_value(
     assert "3.5 characters" not in shown or name in ("erman-er-g-220", "invt-che", "delixi-modbus")
 
 
-def test_a_family_s_json_has_what_bounds_a_value(run: Run) -> None:
+def test_a_family_s_json_has_the_limits_of_values(run: Run) -> None:
     _, out, _ = run("models", "yd1000", "--json")
     sheet = json.loads(out)
     by_name = {register["name"]: register for register in sheet["registers"]}
@@ -550,7 +548,7 @@ def test_a_full_disk_under_the_output_is_a_sentence(words: list[str]) -> None:
 
 @pytest.mark.long
 @table("words", PRINTING)
-def test_a_reader_who_has_seen_enough_is_no_failure(words: list[str]) -> None:
+def test_a_closed_pipe_is_not_a_failure(words: list[str]) -> None:
     with BoundProcess(in_a_process(words), stdout=subprocess.PIPE, stderr=subprocess.PIPE) as command:
         assert command.stdout is not None
         command.stdout.close()
@@ -568,9 +566,7 @@ def test_a_reader_who_has_seen_enough_is_no_failure(words: list[str]) -> None:
         (2, ["models", "zzz"], 2),
     ],
 )
-def test_a_stream_that_the_caller_has_closed_is_no_failure(
-    closed: int, words: list[str], status: int
-) -> None:
+def test_a_closed_standard_stream_is_not_a_failure(closed: int, words: list[str], status: int) -> None:
     done = subprocess.run(
         in_a_process(words), capture_output=True, text=True, preexec_fn=lambda: os.close(closed)
     )

@@ -89,7 +89,7 @@ def test_read_prints_all_readings_and_settings_with_units(run: Run, port: str) -
     )
 
 
-def test_read_prints_what_was_named_in_that_order(run: Run, port: str) -> None:
+def test_read_prints_registers_in_the_given_order(run: Run, port: str) -> None:
     status, out, _ = run("read", port, TOY, 1, "output_current", "output_frequency")
     assert (status, out) == (0, "output_current    3.25  A\noutput_frequency  49.9  Hz\n")
 
@@ -131,7 +131,7 @@ def test_a_bit_that_the_document_does_not_name_is_shown_by_its_number(
     }
 
 
-def test_what_a_drive_refuses_to_tell_does_not_hide_the_rest(run: Run, port: str) -> None:
+def test_a_refused_register_does_not_hide_the_others(run: Run, port: str) -> None:
     status, out, err = run("read", port, TOY, 2, "status", "fault")
     assert (status, out) == (1, "status  none\nfault         refused: code 02H, illegal address\n")
     assert err == ""
@@ -171,7 +171,7 @@ def test_a_family_that_cannot_say_its_state_is_stopped_all_the_same(
     assert set(writes) == {(0x14, 0)}
 
 
-def test_write_says_in_one_line_what_became_of_it(run: Run, port: str, toy: SimulatedDrive) -> None:
+def test_write_prints_its_outcome_in_one_line(run: Run, port: str, toy: SimulatedDrive) -> None:
     toy["status"] = Status(0)
     assert run("write", port, TOY, 1, "acceleration_time", "12.5", "--yes") == (
         0,
@@ -187,7 +187,7 @@ def test_write_says_in_one_line_what_became_of_it(run: Run, port: str, toy: Simu
     assert toy["frequency"] == 25
 
 
-def test_what_changes_only_while_the_motor_stands_is_refused_while_it_runs(
+def test_a_write_for_a_stopped_motor_is_refused_while_it_runs(
     run: Run, port: str, toy: SimulatedDrive
 ) -> None:
     status, out, err = run("write", port, TOY, 1, "acceleration_time", "12.5", "--yes")
@@ -207,7 +207,7 @@ def test_write_as_json(run: Run, port: str) -> None:
     }
 
 
-def test_a_drive_that_clamps_is_told_and_status_1(run: Run, port: str) -> None:
+def test_a_clamped_value_is_reported_with_status_1(run: Run, port: str) -> None:
     assert run("write", port, TOY, 2, "acceleration_time", "30", "--yes") == (
         1,
         "",
@@ -215,7 +215,9 @@ def test_a_drive_that_clamps_is_told_and_status_1(run: Run, port: str) -> None:
     )
 
 
-def test_a_value_between_two_steps_is_told_as_it_is_taken(run: Run, port: str, toy: SimulatedDrive) -> None:
+def test_a_value_between_two_steps_is_rounded_with_a_warning(
+    run: Run, port: str, toy: SimulatedDrive
+) -> None:
     """Before it is sent, and in what is said to be done."""
     note = "multidrop: frequency has steps of 0.01 Hz: 12.345 becomes 12.34 Hz\n"
     assert run("write", port, TOY, 1, "frequency", "12.345", "--yes") == (
@@ -237,7 +239,7 @@ def test_a_value_between_two_steps_is_told_as_it_is_taken(run: Run, port: str, t
     assert f"{note}multidrop: Write frequency = 12.34 Hz to toy@1" in err
 
 
-def test_a_percentage_that_stands_for_a_frequency_is_told(run: Run) -> None:
+def test_a_percentage_of_a_frequency_is_shown(run: Run) -> None:
     che = InvtCHE(1, maximum_frequency=50)
     with Simulator([Wire([simulated(che)], unpaced=True)]) as simulator:
         words = ("invt-che", 1, "12.3456", "--option", "maximum_frequency=50", "--yes")
@@ -294,7 +296,7 @@ def test_a_person_at_a_terminal_is_asked(
     assert len(toy.counters.writes) == writes
 
 
-def test_what_was_typed_before_the_question_does_not_answer_it(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_input_typed_before_the_question_does_not_answer_it(monkeypatch: pytest.MonkeyPatch) -> None:
     """The second "y" of an impatient person belongs to the question before."""
     terminal, program = os.openpty()
 
@@ -345,7 +347,7 @@ def test_no_log_that_cannot_be_opened_keeps_a_stop_back(
     assert (status, out) == (2, "")
 
 
-def test_ctrl_c_at_a_question_sends_nothing(
+def test_ctrl_c_at_a_question_sends_no_request(
     run: Run, port: str, toy: SimulatedDrive, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def interrupted() -> str:
@@ -379,7 +381,7 @@ def test_wear_shows_the_ledger(run: Run, port: str, toy: SimulatedDrive) -> None
     assert (wear["register"], wear["writes"], wear["left"]) == ("acceleration_time", 1, 999)
 
 
-def test_nothing_but_start_writes_to_a_drive(run: Run, port: str, toy: SimulatedDrive) -> None:
+def test_only_start_writes_to_a_drive(run: Run, port: str, toy: SimulatedDrive) -> None:
     run("state", port, TOY, 1)
     run("read", port, TOY, 1)
     assert not toy.counters.writes
@@ -393,9 +395,7 @@ def test_state_in_words_and_as_json(run: Run, port: str) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("words", [(9,), (1, "--baudrate", 19200)], ids=["no drive", "wrong baud rate"])
-def test_silence_is_a_sentence_that_says_what_to_check(
-    run: Run, port: str, words: tuple[object, ...]
-) -> None:
+def test_silence_is_a_sentence_with_advice(run: Run, port: str, words: tuple[object, ...]) -> None:
     sentence = "does not answer: check its address, baud rate, format, wiring, and that it has power"
     assert run("read", port, TOY, *words, "status") == (1, "", f"multidrop: toy@{words[0]} {sentence}\n")
 
@@ -457,7 +457,7 @@ def pressing(when: Callable[[Message], bool]) -> Callable[[Message], bool]:
 
 
 @patient
-def test_a_start_that_is_interrupted_says_what_was_sent_and_how_to_stop_it(run: Run, che: Che) -> None:
+def test_an_interrupted_start_reports_requests_and_the_stop_command(run: Run, che: Che) -> None:
     received, words = che
     received.loses = pressing(lambda request: request in received.starts)
     status, _, err = run("start", *words, "--frequency", 20, "--yes")
@@ -483,7 +483,7 @@ def pressed_at(place: str, monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize(
     ("place", "told"), [("__init__", "the start was not sent"), ("close", "start is done")]
 )
-def test_an_interruption_at_either_end_of_the_port_says_what_was_sent(
+def test_an_interruption_while_opening_or_closing_reports_requests(
     run: Run, che: Che, monkeypatch: pytest.MonkeyPatch, place: str, told: str
 ) -> None:
     received, words = che
@@ -506,7 +506,7 @@ def test_an_interruption_at_either_end_of_the_port_says_what_was_sent(
         ),
     ],
 )
-def test_a_write_that_is_interrupted_at_either_end_of_the_port_says_what_was_sent(
+def test_a_write_interrupted_while_opening_or_closing_reports_requests(
     run: Run,
     port: str,
     toy: SimulatedDrive,
@@ -540,7 +540,7 @@ def test_a_stop_that_is_interrupted_is_sent_once_more(run: Run, che: Che) -> Non
 @pytest.mark.slow
 @patient
 @pytest.mark.parametrize("verb", usually("stop", "coast"))
-def test_a_stop_goes_on_until_its_end_where_the_terminal_is_closed(run: Run, che: Che, verb: str) -> None:
+def test_a_stop_continues_after_its_terminal_is_closed(run: Run, che: Che, verb: str) -> None:
     received, words = che
     assert run("start", *words, "--frequency", 20, "--yes")[0] == 0
     begun = len(received.writes)
@@ -570,7 +570,7 @@ def test_a_stop_goes_on_until_its_end_where_the_terminal_is_closed(run: Run, che
         (["pump-2"], ["stop takes one drive, which is invt-che@1: ignored pump-2"]),
     ],
 )
-def test_a_mistake_beside_its_drive_keeps_no_stop_back(
+def test_a_mistake_beside_the_drive_does_not_prevent_a_stop(
     run: Run, che: Che, mistake: list[str], told: list[str]
 ) -> None:
     received, words = che
@@ -627,9 +627,7 @@ def test_a_stop_whose_terminal_is_closed_before_it_begins_is_sent(
     "words",
     [["nowhere", "invt-che"], ["nowhere", "invt-che", "one"], ["nowhere", "invt-che", 1, "--baudrate"]],
 )
-def test_a_stop_of_which_nobody_can_tell_whose_it_is_says_that_it_was_not_sent(
-    run: Run, words: list[object]
-) -> None:
+def test_a_stop_without_a_known_drive_reports_that_it_was_not_sent(run: Run, words: list[object]) -> None:
     status, _, err = run("emergency-stop", *words)
     assert status == 2
     assert err.startswith("multidrop: the emergency-stop was NOT sent: ")
@@ -646,7 +644,7 @@ def plant_of(port: object, folder: Path) -> Path:
 @pytest.mark.long
 @patient
 @pytest.mark.parametrize("keys", usually(b"sy", b"Sy"))
-def test_a_stop_by_a_key_goes_on_until_its_end_where_the_terminal_is_closed(
+def test_a_stop_by_a_key_continues_after_its_terminal_is_closed(
     run: Run, che: Che, tmp_path: Path, keys: bytes
 ) -> None:
     received, words = che
@@ -669,7 +667,7 @@ def test_a_stop_by_a_key_goes_on_until_its_end_where_the_terminal_is_closed(
 
 @pytest.mark.long
 @patient
-def test_a_monitor_ends_where_its_terminal_is_closed(che: Che, tmp_path: Path) -> None:
+def test_a_monitor_ends_when_its_terminal_is_closed(che: Che, tmp_path: Path) -> None:
     received, words = che
     plant = plant_of(words[0], tmp_path)
     with closing_terminal("monitor", plant) as terminal:
@@ -680,7 +678,7 @@ def test_a_monitor_ends_where_its_terminal_is_closed(che: Che, tmp_path: Path) -
 
 
 @patient
-def test_a_stop_goes_where_nobody_can_be_told_of_the_audit_log(
+def test_a_stop_is_sent_though_no_warning_can_be_printed(
     run: Run, che: Che, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     class Gone(io.StringIO):
@@ -695,7 +693,7 @@ def test_a_stop_goes_where_nobody_can_be_told_of_the_audit_log(
 
 @pytest.mark.parametrize("seconds", ["-1", "0", "nan", "inf", "ten", ""])
 @pytest.mark.parametrize("verb", ["stop", "coast"])
-def test_a_senseless_time_keeps_no_stop_back(run: Run, che: Che, verb: str, seconds: str) -> None:
+def test_an_invalid_time_does_not_prevent_a_stop(run: Run, che: Che, verb: str, seconds: str) -> None:
     received, words = che
     status, _, err = run(verb, *words, "--seconds", seconds)
     assert status == 0

@@ -41,7 +41,7 @@ def crowded(tmp_path: Path) -> Path:
     return path
 
 
-def test_what_fits_is_status_0_and_its_rates_are_told(run: Run, fitting: Path) -> None:
+def test_a_fitting_plan_is_status_0_with_its_rates(run: Run, fitting: Path) -> None:
     status, out, err = run("plan", fitting)
     assert (status, err) == (0, "")
     lines = out.splitlines()
@@ -100,7 +100,7 @@ def test_json_has_the_figures(run: Run, fitting: Path) -> None:
 
 
 @pytest.mark.slow
-def test_what_does_not_fit_is_status_1_and_says_what_would_help(run: Run, crowded: Path) -> None:
+def test_a_plan_that_does_not_fit_is_status_1_with_suggestions(run: Run, crowded: Path) -> None:
     status, out, err = run("plan", crowded)
     assert (status, err) == (1, "")
     assert max(map(len, out.splitlines())) <= 80
@@ -170,7 +170,7 @@ def test_long_names_stay_within_80_columns(run: Run, tmp_path: Path) -> None:
     assert max(map(len, out.splitlines())) <= 80
 
 
-def test_mistakes_in_the_file_are_status_2_and_all_told(run: Run, fitting: Path) -> None:
+def test_all_mistakes_in_the_file_are_printed_with_status_2(run: Run, fitting: Path) -> None:
     text = fitting.read_text().replace("port =", "prot =").replace('"1 s"', '"soon"')
     fitting.write_text(text)
     status, out, err = run("plan", fitting)
@@ -221,14 +221,14 @@ def test_poll_shows_them_to_a_person(run: Run, plant: Path) -> None:
 
 
 @pytest.mark.slow
-def test_what_switching_took_is_told_where_drives_differ(run: Run, plant: Path) -> None:
+def test_the_time_of_switching_is_printed_if_settings_differ(run: Run, plant: Path) -> None:
     plant.write_text(plant.read_text().replace("address = 9\n", "address = 9\nbaudrate = 19200\n"))
     told = run("poll", plant, "--seconds", 1)[1]
     assert re.search(r"\n  and the measured \d+\.\d\d ms to change the port's settings\n", told)
 
 
 @pytest.mark.slow
-def test_where_drives_wait_to_be_due_no_cycle_is_measured(run: Run, plant: Path) -> None:
+def test_no_cycle_is_measured_for_timed_polls(run: Run, plant: Path) -> None:
     plant.write_text(plant.read_text().replace("address = 1\n", 'address = 1\nevery = "200 ms"\n'))
     found = json.loads(run("poll", plant, "--seconds", 1, "--json")[1])["lines"]["hall-1"]["comparison"]
     assert found["measured"]["cycle_ms"] is None

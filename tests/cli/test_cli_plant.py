@@ -69,7 +69,7 @@ def one_line(directory: Path, port: str, name: str = "one.toml") -> Path:
 # ---- reading and writing ----
 
 
-def test_read_takes_a_plant_file_and_a_drive_of_it(run: Run, port: str, tmp_path: Path) -> None:
+def test_read_takes_a_plant_file_and_a_drive_name(run: Run, port: str, tmp_path: Path) -> None:
     plant = one_line(tmp_path, port)
     shown = "output_current    3.25  A\noutput_frequency  49.9  Hz\n"
     assert run("read", plant, "pump-1", *READINGS) == (0, shown, "")
@@ -87,7 +87,7 @@ def test_a_line_s_port_is_replaced(run: Run, plant: Path, at: str) -> None:
 
 
 @pytest.mark.slow
-def test_what_a_plant_says_of_a_drive_holds_for_a_command(run: Run, plant: Path, at: str) -> None:
+def test_a_command_uses_the_plant_file_s_settings(run: Run, plant: Path, at: str) -> None:
     text = plant.read_text().replace("address = 1\n", 'address = 1\nframing = "ascii"\nbaudrate = 19200\n')
     plant.write_text(text)
     status, _, err = run("read", plant, "pump-1", "output_current", at)
@@ -125,13 +125,13 @@ def test_a_mistake_is_a_sentence(run: Run, plant: Path, words: list[str], senten
     assert err.count("\n") == 1
 
 
-def test_what_belongs_to_a_plant_file_is_refused_without_one(run: Run) -> None:
+def test_options_of_plant_files_are_refused_without_one(run: Run) -> None:
     sentence = "multidrop: --port is for the lines of a plant file: write the port in place of PORT\n"
     for words in (("read", "/dev/none", TOY, 1), ("scan", "/dev/none"), ("doctor", "/dev/none")):
         assert run(*words, "--port=a=b") == (2, "", sentence)
 
 
-def test_a_plant_file_with_mistakes_is_told_as_plan_tells_them(run: Run, plant: Path) -> None:
+def test_a_plant_file_s_mistakes_are_the_same_as_in_plan(run: Run, plant: Path) -> None:
     plant.write_text(
         plant.read_text().replace('"pump-1"', '"fan-1"').replace("address = 4", "address = 4000")
     )
@@ -210,7 +210,7 @@ def test_a_drive_that_cannot_identify_itself_is_commanded_only_when_the_plant_sa
 
 
 @pytest.mark.parametrize(("there", "is_started"), [(Toy(4), False), (InvtCHE(4, maximum_frequency=50), True)])
-def test_a_drive_of_another_family_than_the_plant_says_is_sent_nothing(
+def test_a_drive_of_another_family_is_sent_no_write(
     run: Run, plant: Path, there: Drive, is_started: bool
 ) -> None:
     plant.write_text(plant.read_text().replace("address = 4\n", "address = 4\nmaximum_frequency = 50\n"))
@@ -357,7 +357,7 @@ def test_a_family_s_file_beside_the_plant_file_is_a_model(run: Run, port: str, t
     assert run("models", plant, "meter-1")[1] == run("models", tmp_path / "room" / "meter.toml")[1]
 
 
-def test_a_family_s_file_in_place_of_a_plant_file_is_told(run: Run, tmp_path: Path) -> None:
+def test_a_family_file_instead_of_a_plant_file_is_one_sentence(run: Run, tmp_path: Path) -> None:
     (tmp_path / "meter.toml").write_text(METER)
     status, out, err = run("read", tmp_path / "meter.toml", "meter-1")
     assert (status, out) == (2, "")
@@ -416,7 +416,7 @@ def test_mistaken_stop_of_a_plant_says_that_it_was_not_sent(
     assert not toy.counters.writes
 
 
-def test_interrupted_stop_of_a_plant_says_what_is_known_of_each_drive(
+def test_an_interrupted_stop_of_a_plant_reports_each_drive(
     run: Run, plant: Path, at: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def interrupt(*arguments: object) -> None:

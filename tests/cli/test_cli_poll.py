@@ -63,7 +63,7 @@ def test_simulate_does_not_replace_a_file_in_its_way(run: Run, tmp_path: Path) -
 
 @pytest.mark.long
 @pytest.mark.slow
-def test_simulate_brings_the_faults_of_its_file(tmp_path: Path) -> None:
+def test_simulate_applies_the_faults_of_its_file(tmp_path: Path) -> None:
     faults, ports = tmp_path / "faults.toml", tmp_path / "ports"
     faults.write_text("drop = 1\n")
     words = ["simulate", plant_file(tmp_path), "--ports", ports, "--unpaced", "--faults", faults]
@@ -91,7 +91,7 @@ def test_poll_in_segments(plant: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("_unpainted")
-def test_a_segment_is_to_be_named_where_there_is_no_whole_recording(run: Run, tmp_path: Path) -> None:
+def test_a_recording_in_segments_needs_a_segment_s_name(run: Run, tmp_path: Path) -> None:
     for number in (1, 2):
         with open_writer(tmp_path / f"run.0000000{number}.arrows", METADATA) as writer:
             writer.write(counting(100, 0))
@@ -121,7 +121,7 @@ LATE_OR_SILENT = {str(each) for each in (Status.NO_REPLY, Status.LATE_ANSWER_DUE
 
 
 @pytest.mark.slow
-def test_poll_records_what_its_summary_counts(run: Run, plant: Path, tmp_path: Path) -> None:
+def test_poll_records_as_many_rows_as_its_summary_counts(run: Run, plant: Path, tmp_path: Path) -> None:
     out = tmp_path / "out.arrows"
     status, told, err = run("poll", plant, "--seconds", 1.5, "--out", out, "--json")
     assert (status, err) == (0, "")
@@ -140,7 +140,7 @@ def test_poll_records_what_its_summary_counts(run: Run, plant: Path, tmp_path: P
     assert summary["lines"]["hall-1"]["utilisation"] > 0
 
 
-def test_a_recording_says_what_its_registers_are(run: Run, plant: Path, tmp_path: Path) -> None:
+def test_a_recording_describes_its_registers(run: Run, plant: Path, tmp_path: Path) -> None:
     out = tmp_path / "out.arrows"
     run("poll", plant, "--seconds", 0.1, "--out", out)
     drive = open_recording(out).metadata["drives"]["pump-1"]
@@ -171,7 +171,7 @@ def test_a_recording_says_what_its_registers_are(run: Run, plant: Path, tmp_path
 @pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize("number", usually(signal.SIGINT, signal.SIGTERM))
-def test_poll_ended_by_a_signal_keeps_what_it_recorded(plant: Path, tmp_path: Path, number: int) -> None:
+def test_poll_ended_by_a_signal_keeps_its_recording(plant: Path, tmp_path: Path, number: int) -> None:
     out = tmp_path / "out.csv"
     with running("poll", plant, "--out", out, "--json") as (process, printed):
         while not out.exists() or out.stat().st_size < 2000:
@@ -195,14 +195,14 @@ def test_poll_tells_a_person_the_same(run: Run, plant: Path) -> None:
 
 
 @pytest.mark.slow
-def test_nothing_read_at_all_is_status_1(run: Run, plant: Path) -> None:
+def test_no_sample_at_all_is_status_1(run: Run, plant: Path) -> None:
     text = plant.read_text().replace("address = 1\n", "address = 8\n")
     plant.write_text(text)
     status, out, _ = run("poll", plant, "--seconds", 0.5, "--json")
     assert (status, json.loads(out)["samples"]) == (1, 0)
 
 
-def test_a_plant_file_s_mistakes_are_all_told(run: Run, tmp_path: Path) -> None:
+def test_all_mistakes_of_a_plant_file_are_printed(run: Run, tmp_path: Path) -> None:
     path = plant_file(tmp_path)
     path.write_text(
         path.read_text().replace("port =", "prot =").replace("address = 1", "address = 99\nevery = 5\n")
@@ -279,7 +279,7 @@ def test_convert_keeps_every_row(run: Run, plant: Path, tmp_path: Path) -> None:
 @pytest.mark.long
 @pytest.mark.usefixtures("_unpainted")
 @pytest.mark.parametrize("suffix", usually(".arrows", ".csv"))
-def test_that_the_end_of_a_recording_is_missing_is_told(run: Run, tmp_path: Path, suffix: str) -> None:
+def test_a_recording_with_a_missing_end_is_warned_of(run: Run, tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"a{suffix}"
     with open_writer(path, METADATA) as writer:
         for at in range(3):

@@ -46,7 +46,7 @@ def port(request: pytest.FixtureRequest) -> Iterator[str]:
 
 
 @pytest.mark.slow
-def test_it_says_what_it_finds(run: Run, port: str) -> None:
+def test_findings_are_printed(run: Run, port: str) -> None:
     status, out, err = run("scan", port, *PATIENTLY)
     assert status == 0
     *told, summary = out.splitlines()
@@ -103,7 +103,7 @@ def test_the_plant_file_can_be_used_as_it_is(run: Run, port: str, tmp_path: Path
     assert "exists already" in err
 
 
-def test_nobody_there_is_a_failure(run: Run, port: str, tmp_path: Path) -> None:
+def test_no_drives_is_a_failure(run: Run, port: str, tmp_path: Path) -> None:
     out = tmp_path / "none.toml"
     words = ("--baudrates", "19200", "--formats", "8O2", "--addresses", "9", "--quick", "--out", out)
     status, text, _ = run("scan", port, *words)
@@ -165,9 +165,7 @@ def test_mistakes_are_one_sentence(run: Run, words: tuple[str, ...], sentence: s
     assert len(err.splitlines()) == 1
 
 
-def test_a_plant_file_that_cannot_be_written_is_told_before_the_port_is_opened(
-    run: Run, tmp_path: Path
-) -> None:
+def test_an_unwritable_plant_file_fails_before_the_port_is_opened(run: Run, tmp_path: Path) -> None:
     for out, status, reason in (
         (tmp_path / "none" / "found.toml", 2, "No such file or directory"),
         (tmp_path, 2, "Is a directory"),
@@ -201,7 +199,7 @@ def test_every_finding_is_a_sentence() -> None:
     assert sentence(Untried(USUAL, Framing.RTU, "no parity")) == "not asked at 9600 8N1 rtu: no parity"
 
 
-def test_what_is_doubtful_stands_in_comments(tmp_path: Path) -> None:
+def test_doubts_are_comments_of_the_plant_file(tmp_path: Path) -> None:
     families = {each.model: each for each in (InvtCHE, InnovertIBD, DelixiModbus)}
     found = [
         Found(4, USUAL, Framing.RTU, (), 0.005),
@@ -235,7 +233,7 @@ def test_a_plant_file_needs_a_drive() -> None:
 
 
 @pytest.mark.parametrize("words", [(), ("--json",)])
-def test_what_was_found_is_kept_when_it_is_interrupted(
+def test_an_interrupted_scan_keeps_its_findings(
     run: Run, port: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: tuple[str, ...]
 ) -> None:
     def interrupted(*_: object) -> Iterator[Finding]:
@@ -250,7 +248,7 @@ def test_what_was_found_is_kept_when_it_is_interrupted(
     assert json.loads(out)["finished"] is False if words else "1 drive found" in out
 
 
-def test_quickly_nobody_is_asked_again(run: Run, port: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_quick_skips_the_second_pass(run: Run, port: str, monkeypatch: pytest.MonkeyPatch) -> None:
     planned: list[list[Sweep]] = []
 
     def noted(_: object, sweeps: Sequence[Sweep], *__: object) -> Iterator[Finding]:
@@ -285,7 +283,7 @@ class TerminalText(StringIO):
         return True
 
 
-def test_an_interruption_leaves_no_progress_before_what_is_said_next(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_interruption_clears_the_progress_line(monkeypatch: pytest.MonkeyPatch) -> None:
     def interrupted() -> Iterator[Finding]:
         yield Progress(USUAL, Framing.RTU, 3, 12.0)
         raise KeyboardInterrupt

@@ -113,7 +113,7 @@ def test_the_listener_cannot_send(line: tuple[str, str]) -> None:
 
 @pytest.mark.long
 @pytest.mark.slow
-def test_a_request_that_nobody_answers_is_told_while_the_line_is_silent() -> None:
+def test_an_unanswered_request_is_printed_during_silence() -> None:
     master, slave = pty.openpty()
     with sniffing(os.ttyname(slave)) as sniffer:
         os.write(master, READ.request_frame)
@@ -186,7 +186,7 @@ class ResponderLine:
 @pytest.mark.long
 @pytest.mark.parametrize("kind", ["socket", "rfc2217"])
 @pyserials_own
-def test_a_line_behind_a_network_is_heard_and_told_nothing(run: Run, kind: str) -> None:
+def test_a_network_line_is_sniffed_without_sending(run: Run, kind: str) -> None:
     far = ResponderLine(READ.request_frame + READ.frame + WRITE.request_frame + WRITE.frame)
     server = SerialServer(far.url) if kind == "rfc2217" else None
     url = server.url if server else far.url
@@ -249,7 +249,7 @@ def delixi_plant(directory: Path) -> Path:
 
 
 @pytest.mark.parametrize("command", [["decode"], ["sniff", "--replay"]])
-def test_a_capture_is_told_in_engineering_units(run: Run, capture: Path, command: list[str]) -> None:
+def test_a_capture_is_printed_in_engineering_units(run: Run, capture: Path, command: list[str]) -> None:
     status, out, err = run(*command, capture, "--plant", delixi_plant(capture.parent))
     assert (status, err) == (0, "")
     assert [line.partition("  ")[2] for line in out.splitlines()[:4]] == [
@@ -261,7 +261,7 @@ def test_a_capture_is_told_in_engineering_units(run: Run, capture: Path, command
     assert out.splitlines()[4:] == ["2 exchanges, 1 request without a reply, 2 unknown bytes"]
 
 
-def test_without_a_plant_raw_registers_are_told(run: Run, capture: Path) -> None:
+def test_without_a_plant_raw_registers_are_printed(run: Run, capture: Path) -> None:
     out = run("decode", capture)[1]
     assert "  address 1  reads holding_register_500 = 5000  " in out
     objects = [json.loads(line) for line in run("decode", capture, "--json")[1].splitlines()]
@@ -297,7 +297,7 @@ def told(run: Run, path: Path, frames: Iterable[tuple[bytes, Side]], *words: obj
     return [line.partition("  ")[2] or line for line in out.splitlines()]
 
 
-def test_what_is_no_ordinary_read_is_told_too(run: Run, tmp_path: Path) -> None:
+def test_other_requests_than_reads_are_printed_too(run: Run, tmp_path: Path) -> None:
     delixi = (4, 0x02, 1, 0, bytes(4))
     frames = [
         frame(False, 1, 0x03, 0, 0, b"\x13\x88"),
@@ -318,7 +318,7 @@ def test_what_is_no_ordinary_read_is_told_too(run: Run, tmp_path: Path) -> None:
     ]
 
 
-def test_noise_is_told_though_it_does_not_end() -> None:
+def test_endless_noise_is_printed() -> None:
     stream, splitter, pairing, told = Stream(), Splitter(), Pairing(), []
     for time in range(4):
         stream.put(b"\xff" * 1500, time)
@@ -340,7 +340,7 @@ class Meter(Drive):
 """
 
 
-def test_a_drive_s_not_a_number_is_told_as_such(run: Run, tmp_path: Path) -> None:
+def test_a_drive_s_not_a_number_is_printed(run: Run, tmp_path: Path) -> None:
     """The floating-point format's own, as a meter without a sensor says it."""
     (tmp_path / "meter.py").write_text(METER)
     drive = 'name = "meter"\nmodel = "meter.py:Meter"\naddress = 1\n'
@@ -360,7 +360,7 @@ def test_a_drive_s_not_a_number_is_told_as_such(run: Run, tmp_path: Path) -> Non
     ]
 
 
-def test_a_replay_can_be_written_anew(run: Run, capture: Path) -> None:
+def test_a_replay_can_be_captured_again(run: Run, capture: Path) -> None:
     again = capture.parent / "again.pcapng"
     first = run("sniff", "--replay", capture, "--out", again)
     assert first[0] == 0
@@ -380,7 +380,7 @@ def test_columns_of_a_capture_are_counted(run: Run, capture: Path) -> None:
 # ---- what goes wrong gets one sentence ----
 
 
-def test_what_cannot_be_listened_to_is_told_in_a_sentence(run: Run, tmp_path: Path) -> None:
+def test_a_port_that_cannot_be_sniffed_is_one_sentence(run: Run, tmp_path: Path) -> None:
     ordinary = tmp_path / "file"
     ordinary.write_text("hello")
     for port, sentence in (
@@ -394,7 +394,7 @@ def test_what_cannot_be_listened_to_is_told_in_a_sentence(run: Run, tmp_path: Pa
     assert run("sniff", port) == (2, "", f"multidrop: {port}: {sentence}\n")
 
 
-def test_a_port_in_use_is_told_in_a_sentence(run: Run) -> None:
+def test_a_port_in_use_is_one_sentence(run: Run) -> None:
     master, slave = pty.openpty()
     fcntl.flock(slave, fcntl.LOCK_EX)
     port = os.ttyname(slave)
@@ -403,7 +403,7 @@ def test_a_port_in_use_is_told_in_a_sentence(run: Run) -> None:
     os.close(slave)
 
 
-def test_no_permission_is_told_in_a_sentence(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_permission_is_one_sentence(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     """Whoever is root has every permission: the system's refusal is played."""
 
     def refuse(path: str, flags: int) -> int:
@@ -417,7 +417,7 @@ def test_no_permission_is_told_in_a_sentence(run: Run, monkeypatch: pytest.Monke
     )
 
 
-def test_mistaken_calls_are_told_in_a_sentence(
+def test_invalid_arguments_are_one_sentence(
     run: Run, tmp_path: Path, capture: Path, request: pytest.FixtureRequest
 ) -> None:
     none, text = tmp_path / "none.pcapng", tmp_path / "text"

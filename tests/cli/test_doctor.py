@@ -107,7 +107,7 @@ def test_a_link_is_followed_to_its_device(sysfs: Path) -> None:
     assert find_adapter(str(link), sysfs).driver == "ftdi_sio"
 
 
-def test_a_port_of_which_nothing_is_known(sysfs: Path) -> None:
+def test_a_port_without_known_facts(sysfs: Path) -> None:
     assert find_adapter("/dev/ttyS7", sysfs) == Adapter("ttyS7")
 
 
@@ -220,14 +220,12 @@ def test_a_long_latency_timer_is_to_be_changed(sysfs: Path) -> None:
         ),
     ],
 )
-def test_each_is_a_sentence_and_advice_only_where_there_is_something_to_do(
-    finding: object, what: str, advised: bool
-) -> None:
+def test_each_finding_is_a_sentence_with_advice_if_needed(finding: object, what: str, advised: bool) -> None:
     assert finding.what == what
     assert bool(finding.advice) == advised
 
 
-def test_a_slow_round_trip_is_told_apart_from_a_usual_one() -> None:
+def test_a_slow_round_trip_gets_advice() -> None:
     drive = InvtCHE(1)
     usual = round_trip_finding(drive, [0.005] * ROUNDS, ROUNDS)
     assert usual.what.endswith("answers in 5.0 ms (median; 5.0 to 5.0 ms)")
@@ -246,7 +244,7 @@ def test_lost_requests_are_a_failure_with_advice() -> None:
     assert lost.is_failure
 
 
-def test_what_came_in_place_of_good_replies_is_told() -> None:
+def test_invalid_replies_are_reported() -> None:
     came = "reply from another address (received 63 03 02 00 00)"
     nothing_good = round_trip_finding(InvtCHE(1), [], 4, came=came).what
     assert nothing_good == f"invt-che@1 gave no valid reply to 4 requests; received: {came}"
@@ -267,7 +265,7 @@ def test_a_network_s_round_trip_has_the_wire_in_it() -> None:
 # ---- the command ----
 
 
-def test_on_a_pty_it_says_what_does_not_apply(run: Run, port: str) -> None:
+def test_a_pty_lacks_the_adapter_s_findings(run: Run, port: str) -> None:
     status, out, err = run("doctor", port)
     assert (status, err) == (0, "")
     told = " ".join(out.split())
@@ -281,7 +279,7 @@ def test_on_a_pty_it_says_what_does_not_apply(run: Run, port: str) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("port", ["socket://127.0.0.1:0"], indirect=True)
-def test_on_a_socket_it_says_what_does_not_apply(run: Run, port: str) -> None:
+def test_a_socket_lacks_the_adapter_s_findings(run: Run, port: str) -> None:
     status, out, _ = run("doctor", port)
     told = " ".join(out.split())
     assert status == 0
@@ -304,7 +302,7 @@ def test_who_switches_the_transceiver_is_said_of_a_device_only(run: Run, port: s
 @pytest.mark.slow
 @pyserials_own
 @pytest.mark.parametrize("port", ["socket://127.0.0.1:0"], indirect=True)
-def test_on_a_port_of_pyserial_s_it_says_what_does_not_apply(run: Run, port: str) -> None:
+def test_a_pyserial_port_lacks_the_adapter_s_findings(run: Run, port: str) -> None:
     server = SerialServer(port)
     status, out, _ = run("doctor", server.url)
     server.close()
@@ -314,7 +312,7 @@ def test_on_a_port_of_pyserial_s_it_says_what_does_not_apply(run: Run, port: str
     assert "at the far end" in told
 
 
-def test_a_port_that_is_lost_under_the_look_for_an_echo_is_told(run: Run) -> None:
+def test_a_port_lost_during_the_echo_test_is_reported(run: Run) -> None:
     port, hang_up = vanishing_pty()
     thread = threading.Thread(target=hang_up)
     thread.start()
@@ -323,7 +321,7 @@ def test_a_port_that_is_lost_under_the_look_for_an_echo_is_told(run: Run) -> Non
     assert "not tested: the port was lost (" in " ".join(out.split())
 
 
-def test_what_asks_a_driver_tells_a_port_that_is_gone_from_one_that_lacks_it() -> None:
+def test_a_lost_port_differs_from_a_driver_without_the_feature() -> None:
     master, slave = os.openpty()
     os.close(master)
     os.close(slave)
@@ -371,7 +369,7 @@ def test_a_silent_drive_gets_few_requests(run: Run, port: str) -> None:
 
 
 @pytest.mark.parametrize("port", ["pty", "socket://127.0.0.1:0"], indirect=True)
-def test_no_delay_is_negative_where_nothing_tells_of_bits(run: Run, port: str) -> None:
+def test_no_delay_is_negative_on_ports_without_bits(run: Run, port: str) -> None:
     """The far end answers at once: sooner than a wire could have brought the request."""
     status, out, _ = run("doctor", port, "--model", "invt-che", "--address", "1")
     told = " ".join(out.split())
@@ -448,7 +446,7 @@ def responder() -> Iterator[Callable[[Callable[[bytes], bytes]], Responder]]:
 
 
 @pytest.mark.slow
-def test_an_exception_to_the_look_for_an_echo_is_no_foreign_traffic(
+def test_an_exception_in_the_echo_test_is_not_foreign_traffic(
     run: Run, responder: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A server may answer for every address."""
@@ -461,7 +459,7 @@ def test_an_exception_to_the_look_for_an_echo_is_no_foreign_traffic(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("code", [0x0A, 0x0B])
-def test_a_gateway_s_exception_is_no_answer_of_the_drive(run: Run, responder: Any, code: int) -> None:
+def test_a_gateway_s_exception_is_not_the_drive_s_answer(run: Run, responder: Any, code: int) -> None:
     """It means that the device is not reached (application protocol V1.1b3, section 7)."""
     end = responder(lambda request: build_reply(Framing.RTU, Message(request[0], request[1], exception=code)))
     status, out, _ = run("doctor", end.path, "--model", "invt-che", "--address", "9")
@@ -492,7 +490,7 @@ def test_a_gateway_that_says_that_a_drive_is_silent_speaks_its_framing(run: Run)
 
 
 @pytest.mark.slow
-def test_a_drive_that_refuses_is_there_and_its_code_is_told(run: Run, responder: Any) -> None:
+def test_a_refusing_drive_is_present_and_its_code_is_printed(run: Run, responder: Any) -> None:
     end = responder(lambda request: build_reply(Framing.RTU, Message(request[0], request[1], exception=6)))
     status, out, _ = run("doctor", end.path, "--model", "invt-che", "--address", "9")
     told = " ".join(out.split())
@@ -501,7 +499,7 @@ def test_a_drive_that_refuses_is_there_and_its_code_is_told(run: Run, responder:
 
 
 @pytest.mark.slow
-def test_only_what_was_sent_is_counted(run: Run, responder: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_only_sent_requests_are_counted(run: Run, responder: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """A silent drive is not asked again while its late answer may come; that was no request."""
     end = responder(lambda request: b"")
     monkeypatch.setattr("multidrop.cli.doctor.MOST_S", 1.0)
@@ -555,7 +553,7 @@ def test_a_drive_on_modbus_tcp_is_measured(port: str, run: Run) -> None:
     ),
     indirect=["port"],
 )
-def test_what_was_mixed_up_is_told(port: str, asked: str, spoken: str, other: str, run: Run) -> None:
+def test_a_mixed_up_framing_is_reported(port: str, asked: str, spoken: str, other: str, run: Run) -> None:
     place = port.partition("://")[2]
     status, said, _ = run("doctor", f"{asked}://{place}", "--model", "invt-che", "--address", "1")
     assert status == 1
@@ -565,7 +563,7 @@ def test_what_was_mixed_up_is_told(port: str, asked: str, spoken: str, other: st
 
 
 @pytest.mark.parametrize("table_of", ["setting", "command"], ids=["readable", "unreadable"])
-def test_a_family_without_readings_is_measured_by_what_can_be_read(
+def test_a_family_without_readings_is_measured_by_any_readable_register(
     run: Run, tmp_path: Path, table_of: str
 ) -> None:
     family = tmp_path / "relay.toml"

@@ -42,7 +42,7 @@ def drawings(tmp_path: Path, encoding: str, size: list[int], *widths: int) -> li
     return found
 
 
-def test_what_does_not_fit_is_seen_to_be_cut(tmp_path: Path, size: list[int]) -> None:
+def test_a_cut_line_ends_with_a_mark(tmp_path: Path, size: list[int]) -> None:
     whole, narrow = drawings(tmp_path, "utf-8", size, 80, 40)
     head = "DRIVE   SAMPLES  MISSES  NEWEST VALUES\n"
     assert whole == f"{head}{WIDE_NAME}        1       0  output_frequency 42.50 Hz\n"

@@ -37,7 +37,7 @@ def fill(pipe: int) -> None:
     os.set_blocking(pipe, True)
 
 
-def test_what_is_lost_while_nobody_reads_is_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_lines_lost_by_a_slow_reader_are_counted(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(log_thread, "MOST_WAITING", 3)
     unread, log = os.pipe()
     with os.fdopen(unread) as reader, os.fdopen(log, "w") as stream:
@@ -54,7 +54,7 @@ def test_what_is_lost_while_nobody_reads_is_counted(monkeypatch: pytest.MonkeyPa
     assert told == ["first", lost, "line 0", "line 1", "line 2"]
 
 
-def test_all_lines_are_there_when_it_is_closed_and_a_reader_that_goes_harms_nobody() -> None:
+def test_closing_writes_all_lines_and_ignores_a_closed_reader() -> None:
     unread, log = os.pipe()
     with os.fdopen(log, "w") as stream:
         handler = LogThread(stream, FORMAT)
@@ -71,7 +71,7 @@ def test_all_lines_are_there_when_it_is_closed_and_a_reader_that_goes_harms_nobo
         assert not handler._thread.is_alive()
 
 
-def test_a_gateway_of_a_fleet_waits_for_nobody_who_reads_its_log(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_fleet_s_gateway_never_waits_for_its_log(monkeypatch: pytest.MonkeyPatch) -> None:
     async def work(*_: object) -> int:
         logging.getLogger("multidrop.fleet").warning("a stop of pump-1")
         return 7

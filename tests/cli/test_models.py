@@ -68,7 +68,7 @@ def test_a_file_is_loaded_once_so_that_its_drives_share_a_class(fan: Path) -> No
     assert find_model("fan.py:Fan", fan.parent) is find_model(f"{fan}:Fan")
 
 
-def test_what_a_file_lacks_is_said(fan: Path) -> None:
+def test_a_missing_class_in_a_file_is_reported(fan: Path) -> None:
     here = fan.parent
     assert refused("fun.py:Fan", here) == f"there is no file {here}/fun.py to take a model from"
     assert refused("fan.py", here) == "fan.py names no class; write fan.py:Fan"
@@ -78,7 +78,7 @@ def test_what_a_file_lacks_is_said(fan: Path) -> None:
         assert refused(f"fan.py:{name}", here) == expected
 
 
-def test_a_link_to_what_is_no_python_file_is_said(tmp_path: Path) -> None:
+def test_a_link_to_another_file_type_is_reported(tmp_path: Path) -> None:
     (tmp_path / "fan.txt").write_text(FAN)
     (tmp_path / "fan.py").symlink_to("fan.txt")
     assert refused("fan.py:Fan", tmp_path) == f"{tmp_path}/fan.txt cannot be loaded as Python"
@@ -104,7 +104,7 @@ def test_a_file_that_fails_is_a_sentence_with_its_line(tmp_path: Path, source: s
     assert sentence.endswith(ending)
 
 
-def test_a_file_that_failed_is_read_anew(tmp_path: Path) -> None:
+def test_a_failed_file_is_read_again(tmp_path: Path) -> None:
     path = tmp_path / "later.py"
     path.write_text("1 / 0\n")
     assert "ZeroDivisionError" in refused("later.py:Fan", tmp_path)
@@ -162,7 +162,7 @@ def test_modules_beside_a_file_may_import_each_other(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["json", "multidrop"])
-def test_no_file_stands_in_for_a_module_of_python_s_own_or_ours(tmp_path: Path, name: str) -> None:
+def test_no_file_replaces_a_module_of_python_or_multidrop(tmp_path: Path, name: str) -> None:
     source = f"import {name}\nOURS = {name}\n{FAN}"
     (tmp_path / "fan.py").write_text(source)
     (tmp_path / f"{name}.py").write_text("1 / 0\n")
@@ -171,7 +171,7 @@ def test_no_file_stands_in_for_a_module_of_python_s_own_or_ours(tmp_path: Path, 
     assert sys.modules[name] in [module.OURS for module in loaded]
 
 
-def test_what_the_program_has_imported_from_there_is_taken(
+def test_modules_that_the_program_imported_are_reused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     directory = with_scales(tmp_path / "plant", 0.1)
@@ -188,7 +188,7 @@ def test_what_the_program_has_imported_from_there_is_taken(
     }
 
 
-def test_a_module_beside_a_file_that_fails_is_told_with_its_line_and_read_anew(tmp_path: Path) -> None:
+def test_a_failing_neighbour_module_is_reported_with_its_line(tmp_path: Path) -> None:
     directory = with_scales(tmp_path / "plant", 0.1)
     (directory / "scales.py").write_text("\n1 / 0\n")
     sentence = f"{directory}/scales.py, line 2: ZeroDivisionError: division by zero"
@@ -197,7 +197,7 @@ def test_a_module_beside_a_file_that_fails_is_told_with_its_line_and_read_anew(t
     assert find_model("fan.py:Fan", directory).registers["speed"].step == 2.0
 
 
-def test_a_module_that_is_nowhere_is_told(tmp_path: Path) -> None:
+def test_a_missing_module_is_reported(tmp_path: Path) -> None:
     directory = with_scales(tmp_path / "plant", 0.1)
     (directory / "scales.py").unlink()
     ending = "fan.py, line 2: ModuleNotFoundError: No module named 'scales'"

@@ -123,7 +123,7 @@ def texts(lines: list[Any]) -> list[str]:
 # ---- what it knows ----
 
 
-def test_states_are_what_is_polled_anyway(watched: LivePlant) -> None:
+def test_states_come_from_polled_registers(watched: LivePlant) -> None:
     assert [(drive.state, drive.fault, drive.why_silent) for drive in watched.drives] == [
         ("forward", "", ""),
         ("fault", "oc1_overcurrent_accelerating", ""),
@@ -169,7 +169,7 @@ def test_rates_are_those_of_the_last_seconds(watched: LivePlant) -> None:
     assert watched.drives[0].recent.exchanges == 0
 
 
-def test_history_has_a_gap_where_a_value_was_missed(watched: LivePlant) -> None:
+def test_history_has_a_gap_for_a_miss(watched: LivePlant) -> None:
     assert [list(drive.history) for drive in watched.drives] == [[42.5, 42.5], [None, None], [None, None]]
     assert sparkline([0, 1, 2, None, 7], 10) == "▁▂▃ █"
     assert sparkline([50, 50, 50], 2) == "██"
@@ -211,7 +211,7 @@ def test_one_old_value_among_new_ones_is_marked(watched: LivePlant) -> None:
     assert shown[1].split()[1:8] == ["forward", "?42.50", "Hz", "2.5", "A", "1.5", "s"]
 
 
-def test_what_is_asked_seldom_is_not_old_before_it_is_due_again(tmp_path: Path) -> None:
+def test_a_slowly_polled_value_is_current_for_three_periods(tmp_path: Path) -> None:
     path = tmp_path / "hall.toml"
     a_plant(tmp_path, 1)
     path.write_text(path.read_text().replace("address = 1\n", 'address = 1\nevery = "1 min"\n'))
@@ -238,7 +238,7 @@ def test_side_reads_take_spare_time_and_hardly_any_of_a_full_line(tmp_path: Path
     assert drive.line_utilisation == 1.0  # polled as fast as the line allows
 
 
-def test_what_a_terminal_cannot_show_takes_the_same_columns() -> None:
+def test_unencodable_characters_take_the_same_columns() -> None:
     lines = [Text("pump"), Text("Июль 主 26 °C", style="reverse")]
     picture = joined(lines, "ascii")
     assert picture.plain == "pump\n???? ?? 26 ?C"
@@ -248,7 +248,7 @@ def test_what_a_terminal_cannot_show_takes_the_same_columns() -> None:
 
 @pytest.mark.parametrize("size", [(60, 12), (80, 24), (200, 50), (500, 100)])
 @pytest.mark.parametrize("drives", [1, 31, 247])
-def test_it_fills_every_size_and_no_more(tmp_path: Path, size: tuple[int, int], drives: int) -> None:
+def test_it_fills_every_size_exactly(tmp_path: Path, size: tuple[int, int], drives: int) -> None:
     live = LivePlant(a_plant(tmp_path, min(drives, 247)))
     live.add(from_rows([row("drive-1", register, 4.0) for register in CHE]))
     live.tick(1.0, told(1, 1, 1.0, drives))
@@ -321,7 +321,7 @@ def test_a_page_has_whole_reasons_beside_short_values(watched: LivePlant) -> Non
 @pytest.mark.parametrize(
     ("seconds", "age"), [(9, "9.5 s"), (50, "50 s"), (600, "10 min"), (7199, "120 min"), (36000, "10 h")]
 )
-def test_an_age_is_told_as_people_do(watched: LivePlant, seconds: int, age: str) -> None:
+def test_ages_have_readable_units(watched: LivePlant, seconds: int, age: str) -> None:
     lines = texts(overview(watched, Position(), (80, 24), NOW + seconds * SECOND, BLOCKS))
     assert " ".join(lines[3].split()[6:8]) == age
 
@@ -365,7 +365,7 @@ def test_the_page_scrolls_as_far_as_there_is_something(watched: LivePlant) -> No
         (b"\x1bOSy\x1b[1;2S\x1b[[As\x1b[a\x1bOq", [UNKNOWN, "y", UNKNOWN, UNKNOWN, "s", UNKNOWN, UNKNOWN]),
     ],
 )
-def test_keys_that_come_together_are_told_apart(pressed: bytes, told: list[str]) -> None:
+def test_keys_that_come_together_are_separated(pressed: bytes, told: list[str]) -> None:
     found = []
     while pressed:
         key, pressed = next_key(pressed)
@@ -525,9 +525,7 @@ def test_a_failure_stays_until_it_is_acknowledged(tmp_path: Path, monkeypatch: p
     assert monitor.await_stops() == []
 
 
-def test_all_lines_stand_in_what_a_stop_of_all_came_to(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_result_of_a_stop_of_all_names_all_lines(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monitor, _ = a_monitor(tmp_path, monkeypatch)
     (line,) = monitor._plant.plant.lines
     both = (line, replace(line, name="hall-2"))
@@ -536,7 +534,7 @@ def test_all_lines_stand_in_what_a_stop_of_all_came_to(
     assert messages == ["1 of 2 drives stopped, on 1 of 2 lines so far", "2 of 4 drives stopped"]
 
 
-def test_what_had_no_room_is_shown_once_the_first_are_acknowledged(watched: LivePlant) -> None:
+def test_hidden_failures_are_shown_after_the_first_are_acknowledged(watched: LivePlant) -> None:
     at = Position(failures=[f"drive-{number}: no reply" for number in range(31)])
     shown: list[str] = []
     for more in (24, 17, 10, 3, 0):
@@ -679,7 +677,7 @@ def test_each_picture_is_drawn_over_the_last_one(plant: Path) -> None:
 
 
 @pytest.mark.long
-def test_a_stop_is_carried_out_and_told(plant: Path) -> None:
+def test_a_stop_is_carried_out_and_reported(plant: Path) -> None:
     with on_terminal("monitor", plant) as terminal:
         await_both(terminal)
         terminal.press(b"sy")
@@ -689,7 +687,7 @@ def test_a_stop_is_carried_out_and_told(plant: Path) -> None:
 
 
 @pytest.mark.long
-def test_the_page_says_why_what_is_not_polled_is_not_known(plant: Path) -> None:
+def test_the_page_shows_why_an_unpolled_value_is_missing(plant: Path) -> None:
     with on_terminal("monitor", plant) as terminal:
         await_both(terminal)
         terminal.press(b"\x1b[B\r")
@@ -700,7 +698,7 @@ def test_the_page_says_why_what_is_not_polled_is_not_known(plant: Path) -> None:
 
 
 @pytest.mark.long
-def test_what_it_shows_is_recorded(plant: Path, tmp_path: Path) -> None:
+def test_the_monitor_records_what_it_shows(plant: Path, tmp_path: Path) -> None:
     out = tmp_path / "seen.arrows"
     with on_terminal("monitor", plant, "--out", out) as terminal:
         await_both(terminal)
@@ -714,7 +712,7 @@ def test_what_it_shows_is_recorded(plant: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-def test_where_no_port_opens_nothing_is_recorded(tmp_path: Path) -> None:
+def test_without_an_open_port_no_recording_is_made(tmp_path: Path) -> None:
     plant, out = tmp_path / "hall.toml", tmp_path / "seen.arrows"
     plant.write_text(
         '[[line]]\nname = "hall"\nport = "/dev/not-there"\n'
@@ -739,7 +737,7 @@ def test_without_colour_and_without_utf_8_it_is_complete(plant: Path) -> None:
 
 
 @pytest.mark.long
-def test_where_the_cursor_cannot_go_back_it_scrolls(plant: Path) -> None:
+def test_a_dumb_terminal_scrolls(plant: Path) -> None:
     with on_terminal("monitor", plant, TERM="dumb") as terminal:
         terminal.wait_for(">pump-1")
         terminal.wait_for("q quit")

@@ -87,7 +87,7 @@ def test_a_service_ends_once_when_its_terminal_is_closed(hangup_is_deadly: None)
     assert ends == [1]
 
 
-def test_a_second_signal_breaks_off_what_the_first_one_asked_to_end() -> None:
+def test_a_second_signal_interrupts_at_once() -> None:
     with noting_signals() as interruption:
         assert not interruption.came
         signal.raise_signal(signal.SIGINT)
@@ -98,7 +98,7 @@ def test_a_second_signal_breaks_off_what_the_first_one_asked_to_end() -> None:
 
 @pytest.mark.long
 @pytest.mark.slow
-def test_poll_keeps_what_it_recorded_where_its_terminal_is_closed(plant: Path, tmp_path: Path) -> None:
+def test_poll_keeps_its_recording_when_its_terminal_is_closed(plant: Path, tmp_path: Path) -> None:
     require_module("pyarrow")
     out = tmp_path / "out.parquet"  # which cannot be read unless it was closed
     with closing_terminal("poll", plant, "--out", out) as terminal:
@@ -109,7 +109,7 @@ def test_poll_keeps_what_it_recorded_where_its_terminal_is_closed(plant: Path, t
 
 
 @pytest.mark.long
-def test_simulate_removes_its_links_where_its_terminal_is_closed(tmp_path: Path) -> None:
+def test_simulate_removes_its_links_when_its_terminal_is_closed(tmp_path: Path) -> None:
     link = tmp_path / "ports" / "hall-1"
     words = ["simulate", plant_file(tmp_path), "--ports", tmp_path / "ports"]
     with closing_terminal(*words) as terminal:
@@ -122,7 +122,7 @@ def test_simulate_removes_its_links_where_its_terminal_is_closed(tmp_path: Path)
 
 @pytest.mark.long
 @pytest.mark.slow
-def test_the_demo_of_serve_ends_where_its_terminal_is_closed() -> None:
+def test_the_demo_of_serve_ends_when_its_terminal_is_closed() -> None:
     """It has no plant file that could be read again."""
     require_module("uvicorn")
     with closing_terminal("serve", "--demo", "--no-browser") as terminal:
@@ -151,7 +151,7 @@ def test_a_gateway_ends_with_its_terminal(tmp_path: Path) -> None:
     [(signal.SIG_DFL, os.getpgrp(), 1), (signal.SIG_DFL, 1, 2), (signal.SIG_IGN, os.getpgrp(), 2)],
     ids=["before a terminal", "in the background", "by nohup"],
 )
-def test_a_closed_terminal_ends_what_stood_on_it(
+def test_a_closed_terminal_ends_its_foreground_command(
     monkeypatch: pytest.MonkeyPatch, before: signal.Handlers, group: int, reloads: int
 ) -> None:
     came: list[str] = []

@@ -34,7 +34,7 @@ def is_harmless(text: str) -> bool:
     return all(line.isprintable() for line in text.split("\n"))
 
 
-def test_what_prints_stays_as_it_is() -> None:
+def test_printable_text_stays_unchanged() -> None:
     assert printable("pump-1 насос 泵 é '\"\\") == "pump-1 насос 泵 é '\"\\"
     assert printable("\x1b[2J") == r"\x1b[2J"
     assert all(printable(trap).isprintable() for trap in TRAPS)
@@ -54,7 +54,7 @@ def test_a_gateway_s_log_has_one_line_for_whoever_asks(capfd: pytest.CaptureFixt
 SECRET = "S3C@R:ET"  # users write such passwords as they are, though an @ should be escaped
 
 
-def test_a_url_is_told_without_its_login() -> None:
+def test_a_url_is_printed_without_its_login() -> None:
     given = f"no server at nats://bob:{SECRET}@a:4222, tls://{SECRET}@b, nats://c; by anna@hall"
     assert masked(given) == "no server at nats://a:4222, tls://b, nats://c; by anna@hall"
 
@@ -163,7 +163,7 @@ def test_a_plant_file_has_no_names_and_ports_that_do_not_print(tmp_path: Path, t
         ("models", TRAP, TRAP),
     ],
 )
-def test_arguments_are_told_without_their_commands(run: Run, words: tuple[object, ...]) -> None:
+def test_arguments_are_printed_without_control_characters(run: Run, words: tuple[object, ...]) -> None:
     status, out, err = run(*(str(word).replace("\0", "") for word in words))
     assert status in (1, 2)
     assert err.startswith("multidrop: ")
@@ -172,7 +172,7 @@ def test_arguments_are_told_without_their_commands(run: Run, words: tuple[object
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("_unpainted")
-def test_the_names_in_a_recording_are_told_without_their_commands(run: Run, tmp_path: Path) -> None:
+def test_names_in_a_recording_are_printed_without_control_characters(run: Run, tmp_path: Path) -> None:
     rows = [row(at, TRAP, f"{TRAP}{number}", at) for at in range(3) for number in range(4)]
     rows.append(row(3, TRAP, TRAP, None, TRAP))
     drive = dict.fromkeys(("line", "model", "settings", "address", "framing"), TRAP)
@@ -217,9 +217,7 @@ def test_names_in_a_picture_are_no_mathematics_and_in_its_legend(tmp_path: Path,
     assert plot_page(look, figure)
 
 
-def test_the_interfaces_and_comments_of_a_capture_are_told_without_their_commands(
-    run: Run, tmp_path: Path
-) -> None:
+def test_texts_of_a_capture_are_printed_without_control_characters(run: Run, tmp_path: Path) -> None:
     exchanges = [each for each in PRINTED if each.framing is Framing.RTU and isinstance(each.says, Message)]
     path = write(
         tmp_path / "it.pcapng",
@@ -247,7 +245,7 @@ def section_length(path: Path) -> int:
 
 
 @pytest.mark.slow
-def test_commands_print_through_what_spells_out() -> None:
+def test_commands_print_through_the_escaping_function() -> None:
     """Commands `print` only help, drawings and questions directly; other text is escaped."""
     ours = {"__init__.py", "support/output.py", "support/writing.py", "poll.py", "scan.py"}
     root = Path(multidrop.cli.__file__).parent

@@ -66,7 +66,7 @@ def test_a_parquet_file_has_the_rows_of_its_segment_by_drive_and_time(tmp_path: 
 
 
 @pytest.mark.slow
-def test_tens_are_what_plain_python_reckons(tmp_path: Path) -> None:
+def test_tens_equal_those_of_plain_python(tmp_path: Path) -> None:
     rows = random_rows(1, NOON, 500)
     record(tmp_path, [rows])
     compact(tmp_path, 2)
@@ -114,7 +114,7 @@ def test_days_that_are_over_become_one_file_of_tens(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-def test_one_database_compacts_all_and_none_where_there_is_nothing_to_do(
+def test_one_database_compacts_all_and_none_is_opened_without_work(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     opened: list[str] = []
@@ -293,7 +293,7 @@ def test_it_asks_for_the_lowest_priority_and_needs_none(monkeypatch: pytest.Monk
 
 
 @pytest.mark.slow
-def test_it_leaves_the_real_time_of_its_recorder() -> None:
+def test_compaction_leaves_its_recorder_s_real_time_scheduling() -> None:
     """A process that may not run by SCHED_RR leaves the usual scheduling all the same."""
     lines = (
         "import contextlib, os",

@@ -101,7 +101,7 @@ def test_no_export_is_begun_in_the_loop(tmp_path: Path, kind: str) -> None:
     asyncio.run(live())
 
 
-def test_what_a_killed_process_left_of_its_exports_goes(tmp_path: Path) -> None:
+def test_unfinished_exports_of_a_killed_process_are_removed(tmp_path: Path) -> None:
     left = tmp_path / "history" / ".export-x1y2"
     left.mkdir(parents=True)
     (left / "export.parquet").write_bytes(b"PAR1")

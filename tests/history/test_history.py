@@ -84,7 +84,7 @@ def test_a_series_in_a_range(folder: Path, rows: list[list[Row]]) -> None:
 
 @pytest.mark.long
 @COMPACTED
-def test_buckets_are_what_plain_python_reckons(folder: Path, rows: list[list[Row]]) -> None:
+def test_buckets_equal_those_of_plain_python(folder: Path, rows: list[list[Row]]) -> None:
     dice = random.Random(6)
     times = [row.time_ns for row in flat(rows)]
     with History(folder) as history:
@@ -115,7 +115,7 @@ def test_gaps_are_gaps(folder: Path) -> None:
 
 @pytest.mark.slow
 @COMPACTED
-def test_an_export_is_what_is_read(folder: Path, rows: list[list[Row]]) -> None:
+def test_an_export_equals_the_rows_read(folder: Path, rows: list[list[Row]]) -> None:
     begin, end = NOON + 20 * SECOND, NOON + 320 * SECOND
     wanted = [row for row in flat(rows) if begin <= row.time_ns < end and row.drive == "pump-1"]
     names = ["pump-1.speed", "pump-1.current"]
@@ -203,7 +203,7 @@ def test_an_hour_is_made_of_tens_from_2_s_a_point_on() -> None:
 
 
 @pytest.mark.long
-def test_a_reader_sees_what_comes_and_each_row_once(tmp_path: Path) -> None:
+def test_a_reader_sees_new_rows_exactly_once(tmp_path: Path) -> None:
     pytest.importorskip("duckdb", reason="needs duckdb")
     rows: list[Row] = []
     with SegmentWriter(tmp_path / "rows.arrows", METADATA, every=1e9) as writer, History(tmp_path) as history:
@@ -289,7 +289,7 @@ def test_damage_anywhere_hides_no_other_segment(tmp_path: Path) -> None:
     assert damaged
 
 
-def test_an_end_that_is_no_batch_is_told_where_the_segment_is_closed(tmp_path: Path) -> None:
+def test_an_incomplete_end_of_a_closed_segment_is_reported(tmp_path: Path) -> None:
     rows = [random_rows(number, NOON + number * 60 * SECOND, 120) for number in range(2)]
     record(tmp_path, rows)
     for number in (2, 1):  # the newest may still be written
@@ -348,7 +348,7 @@ def test_plots_of_a_segment_that_grows_are_of_all_its_rows(
                 assert end - begin < 8 * SECOND or grid_of(begin, end, 4).is_of_tens
 
 
-def test_names_of_nothing_fill_no_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_unknown_names_fill_no_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(growing, "MOST_SERIES", 3)
     with SegmentWriter(tmp_path / "rows.arrows", METADATA, every=1e9) as writer, History(tmp_path) as history:
         writer.write(from_rows(random_rows(1, NOON, 200)))
@@ -359,7 +359,7 @@ def test_names_of_nothing_fill_no_memory(tmp_path: Path, monkeypatch: pytest.Mon
             assert len(segment._kept._kept) == min(at + 1, 3)
 
 
-def test_no_tens_are_reckoned_of_what_nobody_asked_for(tmp_path: Path) -> None:
+def test_tens_are_computed_for_requested_series_only(tmp_path: Path) -> None:
     with SegmentWriter(tmp_path / "rows.arrows", METADATA, every=1e9) as writer, History(tmp_path) as history:
         for number, name in enumerate(SERIES[:2]):
             writer.write(from_rows(random_rows(number, NOON + number * 60 * SECOND, 200)))
@@ -368,9 +368,7 @@ def test_no_tens_are_reckoned_of_what_nobody_asked_for(tmp_path: Path) -> None:
             assert [".".join(one) for one in segment._tens] == SERIES[: number + 1][::-1]
 
 
-def test_what_duckdb_spills_goes_where_nobody_else_can_look(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_duckdb_spills_into_a_private_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("duckdb", reason="needs duckdb")
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     database = Database("100MB")

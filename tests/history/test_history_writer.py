@@ -87,7 +87,9 @@ def test_batches_of_two_pollers(tmp_path: Path, writers: Callable[..., HistoryWr
         assert rows_in(history) == [row for one in taken for row in one]
 
 
-def test_it_keeps_no_memory_of_the_core(tmp_path: Path, writers: Callable[..., HistoryWriter]) -> None:
+def test_the_writer_keeps_no_memory_of_the_core(
+    tmp_path: Path, writers: Callable[..., HistoryWriter]
+) -> None:
     """It takes a copy: the core may use a batch's memory again."""
     writer = writers(tmp_path)
     one = some(0)
@@ -116,7 +118,7 @@ def test_another_plant_begins_a_segment(tmp_path: Path, writers: Callable[..., H
 # ---- a disk that is full, slow, or gone ----
 
 
-def test_a_full_disk_is_told_and_counted_and_it_goes_on(
+def test_a_full_disk_is_reported_and_recording_continues(
     tmp_path: Path,
     writers: Callable[..., HistoryWriter],
     caplog: pytest.LogCaptureFixture,
@@ -145,7 +147,7 @@ def test_a_full_disk_is_told_and_counted_and_it_goes_on(
         assert history.damage == []
 
 
-def test_a_disk_that_hangs_holds_nobody_up(
+def test_a_hanging_disk_delays_no_polling(
     tmp_path: Path, writers: Callable[..., HistoryWriter], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(writer_module, "MOST_WAITING", 200)
@@ -188,7 +190,7 @@ def test_polling_and_stops_go_on_beside_a_full_disk(
     assert writer.state().trouble
 
 
-def test_a_folder_that_cannot_be_written_is_told_at_once() -> None:
+def test_an_unwritable_folder_fails_at_once() -> None:
     with read_only_directory() as directory, pytest.raises(PermissionError):
         HistoryWriter(directory / "history", METADATA)
 
@@ -219,7 +221,7 @@ def test_a_mistake_of_ours_does_not_end_the_recording(
 
 
 @pytest.mark.long
-def test_closed_segments_are_compacted_and_what_is_too_old_goes(
+def test_closed_segments_are_compacted_and_old_files_removed(
     tmp_path: Path, writers: Callable[..., HistoryWriter]
 ) -> None:
     pytest.importorskip("duckdb", reason="needs duckdb")
@@ -256,7 +258,7 @@ def test_the_oldest_of_all_kinds_go_when_all_take_too_much(
 
 
 @pytest.mark.long
-def test_a_child_that_fails_is_told_and_tried_again(
+def test_a_failed_child_is_reported_and_started_again(
     tmp_path: Path,
     writers: Callable[..., HistoryWriter],
     monkeypatch: pytest.MonkeyPatch,
@@ -298,7 +300,7 @@ def test_names_of_files() -> None:
     assert file_name(7, 9, 0, 1) == "00000007-00000009.19700101T000000Z-19700101T000001Z.parquet"
 
 
-def test_the_widest_file_hides_what_is_in_it() -> None:
+def test_the_widest_file_hides_the_files_it_contains() -> None:
     def file(first: int, last: int) -> HistoryFile:
         return HistoryFile(Path(f"{first}-{last}"), first, last, 0, 0)
 

@@ -112,7 +112,7 @@ def test_what_is_one_quantity(
     assert (found.unit, sum(found.n), found.left_out) == told
 
 
-def test_metadata_that_says_nothing_parts_nothing() -> None:
+def test_empty_metadata_separates_no_quantities() -> None:
     for strange in (
         None,
         [],
@@ -179,7 +179,7 @@ def test_two_units_are_no_column(tmp_path: Path, how: str) -> None:
                 assert found.metadata["drives"]["pump-1"]["registers"]["load [A]"]["unit"] == "A"
 
 
-def test_columns_stay_what_they_are_while_the_history_grows(tmp_path: Path) -> None:
+def test_columns_keep_their_quantity_while_the_history_grows(tmp_path: Path) -> None:
     recorded(tmp_path, AMPERE)
     with History(tmp_path) as history:
         rows = history.read(SERIES)

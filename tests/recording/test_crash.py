@@ -157,7 +157,7 @@ def check_audit(directory: Path, numbers: Sequence[int], acknowledged: Sequence[
 
 @pytest.mark.long
 @pytest.mark.slow
-def test_what_a_killed_client_told_of_is_there_once(
+def test_reported_rows_of_a_killed_client_are_recorded_once(
     request: pytest.FixtureRequest, nursery: Nursery, counting: Counting, tmp_path: Path
 ) -> None:
     chance = random.Random(SEED)

@@ -57,7 +57,7 @@ def test_pandas_and_polars_get_times_with_their_type(path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_the_wide_form_joins_what_is_in_several_batches(path: Path) -> None:
+def test_the_wide_form_joins_rows_of_several_batches(path: Path) -> None:
     wide = multidrop.open_recording(path).wide("pump-1.output_frequency", "pump-1.motor_speed")
     table = pa.table(wide).drop(["time"]).to_pydict()
     expected = {
@@ -81,7 +81,7 @@ def test_columns_that_are_in_the_metadata_may_have_no_row(tmp_path: Path) -> Non
 @pytest.mark.parametrize(
     "about", [{}, {"drives": 3}, {"drives": {"a": 3}}, {"drives": {"a": {"registers": 1}}}]
 )
-def test_metadata_of_any_kind_harms_nothing(tmp_path: Path, about: dict[str, object]) -> None:
+def test_any_metadata_is_tolerated(tmp_path: Path, about: dict[str, object]) -> None:
     path = record(tmp_path / "run.csv", [row(1, "pump", "output_frequency", 50.0)], about)
     assert pa.table(multidrop.open_recording(path).wide(PUMP)).column(PUMP).to_pylist() == [50.0]
 
@@ -99,7 +99,7 @@ def test_a_truncated_end_is_left_out_and_counted(tmp_path: Path, suffix: str) ->
     assert len(found.wide()) == len(kept)
 
 
-def test_a_damaged_recording_is_told_as_its_reader_does(tmp_path: Path) -> None:
+def test_a_damaged_recording_raises_its_reader_s_error(tmp_path: Path) -> None:
     path = record(tmp_path / "run.csv", [row(at, "pump", "output_frequency", 50.0) for at in range(4)])
     path.write_text(path.read_text().replace("pump,", "pump;", 1))
     for take, library in (("to_pandas", "pandas"), ("to_polars", "polars"), ("wide", "json")):
@@ -109,7 +109,7 @@ def test_a_damaged_recording_is_told_as_its_reader_does(tmp_path: Path) -> None:
             getattr(multidrop.open_recording(path), take)()
 
 
-def test_what_is_no_recording_is_told(tmp_path: Path) -> None:
+def test_a_file_that_is_not_a_recording_is_an_error(tmp_path: Path) -> None:
     (tmp_path / "run.txt").write_text("")
     with pytest.raises(ValueError, match=r"a recording's name must end in \.arrows, \.csv, \.parquet"):
         multidrop.open_recording(tmp_path / "run.txt")

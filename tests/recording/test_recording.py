@@ -111,7 +111,7 @@ def test_every_batch_can_be_read_before_the_recording_is_closed(tmp_path: Path, 
 
 
 @pytest.mark.parametrize("suffix", [".arrows", ".csv"])
-def test_reader_keeps_to_what_was_there_when_it_was_opened(tmp_path: Path, suffix: str) -> None:
+def test_a_reader_ends_at_the_size_when_it_was_opened(tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"a{suffix}"
     with open_writer(path, METADATA) as writer:
         writer.write(counting(10))
@@ -187,7 +187,7 @@ def test_a_name_that_ends_within_a_character_is_damage(tmp_path: Path, is_before
 
 @pytest.mark.parametrize("name", ["monotonic_ns", "drive", "status"])
 @pytest.mark.parametrize("suffix", [".arrows", ".parquet"])
-def test_a_row_without_what_every_row_has_is_damage(tmp_path: Path, suffix: str, name: str) -> None:
+def test_a_null_in_a_required_column_is_damage(tmp_path: Path, suffix: str, name: str) -> None:
     whole, path = record(tmp_path / f"whole{suffix}"), tmp_path / f"a{suffix}"
     is_parquet = suffix == ".parquet"
     with whole.open("rb") as file:
@@ -221,7 +221,7 @@ def test_names_are_dictionaries_in_parquet(tmp_path: Path) -> None:
     assert all("RLE_DICTIONARY" in encodings[name] for name in ("drive", "register", "status"))
 
 
-def test_csv_as_it_stands(tmp_path: Path) -> None:
+def test_csv_text_is_exact(tmp_path: Path) -> None:
     with open_writer(tmp_path / "a.csv", METADATA) as writer:
         writer.write(example())
     assert (tmp_path / "a.csv").read_text(encoding="utf-8").splitlines() == [
@@ -356,7 +356,7 @@ def test_converting_does_not_gather_the_recording_in_memory(tmp_path: Path) -> N
     assert peak < size / 2
 
 
-def test_nothing_is_converted_into_itself(tmp_path: Path) -> None:
+def test_a_recording_is_not_converted_into_itself(tmp_path: Path) -> None:
     path = record(tmp_path / "a.arrows")
     (tmp_path / "link.arrows").symlink_to(path)
     for target in (path, tmp_path / "link.arrows"):
@@ -396,7 +396,7 @@ def test_half_a_conversion_is_left_nowhere(tmp_path: Path, suffix: str, target: 
 
 
 @every_format
-def test_a_conversion_that_is_broken_off_leaves_nothing(
+def test_an_interrupted_conversion_leaves_no_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, suffix: str
 ) -> None:
     path = record(tmp_path / "a.csv")
@@ -433,7 +433,7 @@ def test_metadata_that_json_cannot_hold(tmp_path: Path, suffix: str) -> None:
 
 
 @every_format
-def test_closing_twice_is_harmless_and_nothing_is_written_afterwards(tmp_path: Path, suffix: str) -> None:
+def test_closing_twice_is_harmless_and_later_writes_fail(tmp_path: Path, suffix: str) -> None:
     writer: RecordingWriter = open_writer(tmp_path / f"a{suffix}", {})
     writer.write(example())
     writer.close()
@@ -525,7 +525,7 @@ def test_drives_that_come_later_have_their_names_for_every_reader(tmp_path: Path
         assert [name for part in stream for name in part.child(3).iter_py()] == names
 
 
-def test_a_stream_that_another_program_wrote_anew_is_read(tmp_path: Path) -> None:
+def test_a_stream_rewritten_by_another_program_is_read(tmp_path: Path) -> None:
     """Its dictionaries have other ids, and come as deltas where it likes."""
     path, grown = record(tmp_path / "a.arrows"), Grown()
     table = pa.ipc.open_stream(path.read_bytes()).read_all()

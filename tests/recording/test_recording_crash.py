@@ -63,7 +63,7 @@ def record(path: Path, batches: int) -> list[int]:
 
 
 @pytest.mark.long
-def test_random_cuts_of_arrows_lose_only_what_is_not_whole(tmp_path: Path) -> None:
+def test_random_cuts_of_arrows_lose_only_incomplete_batches(tmp_path: Path) -> None:
     path = tmp_path / "a.arrows"
     lengths = record(path, 12)
     whole = path.read_bytes()
@@ -79,7 +79,7 @@ def test_random_cuts_of_arrows_lose_only_what_is_not_whole(tmp_path: Path) -> No
 
 
 @pytest.mark.long
-def test_a_cut_between_names_and_their_rows_leaves_what_all_can_read(tmp_path: Path) -> None:
+def test_a_cut_between_dictionary_and_rows_is_readable_by_all(tmp_path: Path) -> None:
     """Dictionaries go before their batch, and a cut may leave some of them, and no batch."""
     polars = pytest.importorskip("polars", reason="needs polars")
     path = tmp_path / "a.arrows"
@@ -372,7 +372,7 @@ def _fail(file: AppendFile) -> None:
 
 
 @growing
-def test_a_write_that_a_signal_breaks_off_leaves_nothing(tmp_path: Path, suffix: str) -> None:
+def test_an_interrupted_write_leaves_the_file_unchanged(tmp_path: Path, suffix: str) -> None:
     """Ctrl-C between the two halves of a piece that the system takes in two."""
     path = tmp_path / f"a{suffix}"
     with open_writer(path, METADATA) as writer:
@@ -526,7 +526,7 @@ def test_damaged_metadata_of_csv_is_named(tmp_path: Path) -> None:
 @pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize("suffix", FORMATS)
-def test_damage_anywhere_ends_in_a_sentence(tmp_path: Path, suffix: str) -> None:
+def test_damage_anywhere_raises_one_sentence(tmp_path: Path, suffix: str) -> None:
     """Some bytes are overwritten: it is read with other values, cut short, or refused; never a crash."""
     path = tmp_path / f"a{suffix}"
     record(path, 2)

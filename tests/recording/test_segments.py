@@ -143,7 +143,7 @@ def test_more_than_a_batch_is_never_cut_off(tmp_path: Path, monkeypatch: pytest.
     assert segment.stat().st_size == size
 
 
-def test_a_full_disk_is_told_and_the_segment_goes_on_afterwards(tmp_path: Path) -> None:
+def test_a_full_disk_is_reported_and_the_segment_continues(tmp_path: Path) -> None:
     with SegmentWriter(tmp_path / "run.arrows", ABOUT, every=60) as writer:
         writer.write(rows(0))
         (path,) = writer.files
@@ -168,7 +168,7 @@ def test_a_segment_that_could_not_begin_leaves_no_file_and_its_number_is_not_giv
 # ---- what is kept ----
 
 
-def test_what_is_older_is_removed_when_a_segment_begins(tmp_path: Path, hand: Hand) -> None:
+def test_old_segments_are_removed_when_a_segment_starts(tmp_path: Path, hand: Hand) -> None:
     with SegmentWriter(tmp_path / "run.arrows", ABOUT, every=DAY, keep=3 * DAY) as writer:
         for number in range(8):
             writer.write(rows(number))
@@ -216,7 +216,7 @@ def test_outlived() -> None:
     assert gone(5.0, 1.0, None) == []  # the clock was set back: nothing is old
 
 
-def test_a_clock_that_jumps_empties_nothing() -> None:
+def test_a_clock_that_jumps_removes_no_segment() -> None:
     week = [StoredFile(Path(str(number)), number, number * DAY, 100) for number in range(1, 8)]
 
     def left(now: float, files: list[StoredFile]) -> list[int]:

@@ -36,7 +36,7 @@ def test_it_records_as_text(tmp_path: Path) -> None:
 
 @pytest.mark.long
 @pytest.mark.slow
-def test_what_reads_a_recording_says_what_is_missing(tmp_path: Path) -> None:
+def test_reading_without_nanoarrow_names_the_missing_library(tmp_path: Path) -> None:
     multidrop("demo", "--seconds", "1", "--out", "run.arrows", folder=tmp_path)
     for words in (("report", "run.arrows"), ("convert", "run.arrows", "run.csv")):
         ran = multidrop(*words, folder=tmp_path)

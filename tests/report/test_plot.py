@@ -140,7 +140,7 @@ def test_a_fault_is_a_span_that_misses_do_not_end(look: Recording) -> None:
     assert (span.begin - UTC_0, span.end - UTC_0) == (40 * SECOND, 50 * SECOND)
 
 
-def test_a_fault_without_a_name_and_one_of_flags_are_told(tmp_path: Path) -> None:
+def test_a_fault_without_a_name_and_one_of_flags_are_shown(tmp_path: Path) -> None:
     flags = {"LOW": 1, "HIGH": 2, "HOT": 64}
     about = {"drives": {"pump": {"registers": {"fault": {"unit": "", "values": flags, "bits": True}}}}}
     rows = [row(at, "pump", "fault", value) for at, value in enumerate([0, 66, 66, 128, 0])]
@@ -238,7 +238,7 @@ def turns() -> list[Row]:
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("_unpainted")
-def test_what_was_used_of_a_line(tmp_path: Path) -> None:
+def test_utilisation_of_a_line(tmp_path: Path) -> None:
     look = load(record(tmp_path / "it.arrows", turns(), ABOUT | {"planned": PLANNED}))
     (line,) = line_uses(look)
     # pump: 14 ms to the reply's first character, 8 more; fan: 13 and 6; the silence is the longer of two.
@@ -253,7 +253,7 @@ def test_what_was_used_of_a_line(tmp_path: Path) -> None:
     assert re.search(r"bus cycle, ms</td><td[^>]*>70\.0</td><td[^>]*>119\.\d</td>", page)
 
 
-def test_no_more_is_used_of_a_port_without_a_wire_than_there_is(tmp_path: Path) -> None:
+def test_utilisation_of_a_port_without_a_wire_is_at_most_1(tmp_path: Path) -> None:
     """Requests follow each other by 2 ms, where a wire would take 32."""
     rows = [row(tick / 500, "fan", "output_current", 1.0, ms=0.5) for tick in range(1000)]
     planned = {"hall-1": PLANNED["hall-1"] | {"drives": {"fan": PLANNED["hall-1"]["drives"]["fan"]}}}
@@ -261,7 +261,7 @@ def test_no_more_is_used_of_a_port_without_a_wire_than_there_is(tmp_path: Path) 
     assert 0.9 < line.utilisation <= 1.0 + 1e-9
 
 
-def test_what_was_used_of_blocks_that_were_chosen_anew(tmp_path: Path) -> None:
+def test_utilisation_of_blocks_that_differ_from_the_plan(tmp_path: Path) -> None:
     """In the first half the pump's two registers are read singly, each with a reply of 7 characters."""
     rows = [
         row(tick / 10 + (0.05 if name == "fault" and tick < 50 else 0), "pump", name, 1.0, ms=14.0)
@@ -276,18 +276,18 @@ def test_what_was_used_of_blocks_that_were_chosen_anew(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("planned", [None, [], "hall", {"hall-1": 7}, {"hall-1": {"drives": {"pump": {}}}}])
-def test_a_plan_that_makes_no_sense_is_none(tmp_path: Path, planned: Any) -> None:
+def test_an_invalid_plan_is_ignored(tmp_path: Path, planned: Any) -> None:
     look = load(record(tmp_path / "it.arrows", turns(), ABOUT | {"planned": planned}))
     assert line_uses(look) == []
 
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("_unpainted")
-def test_a_report_says_that_there_is_no_plan(tmp_path: Path) -> None:
+def test_a_report_without_a_plan_says_so(tmp_path: Path) -> None:
     assert "does not carry a plan" in report_page(load(record(tmp_path / "it.arrows", turns())))
 
 
-def test_the_plan_is_what_polling_carries(tmp_path: Path) -> None:
+def test_the_plan_equals_the_polled_blocks(tmp_path: Path) -> None:
     path = tmp_path / "hall.toml"
     path.write_text(
         '[[line]]\nname = "hall-1"\nport = "x"\n[[line.drive]]\nname = "pump"\naddress = 1\nevery = "1 s"\n'
@@ -315,7 +315,7 @@ def test_a_line_polled_at_rates_has_no_bus_cycle(tmp_path: Path) -> None:
 
 @pytest.mark.usefixtures("_unpainted")
 @pytest.mark.long
-def test_nothing_is_used_of_a_line_without_drives(tmp_path: Path) -> None:
+def test_a_line_without_drives_has_no_utilisation(tmp_path: Path) -> None:
     planned = {"hall-2": {"utilisation": 0.0, "cycle_ms": 0.0, "drives": {}}}
     look = load(record(tmp_path / "it.arrows", turns(), ABOUT | {"planned": planned}))
     (line,) = line_uses(look)
@@ -323,13 +323,13 @@ def test_nothing_is_used_of_a_line_without_drives(tmp_path: Path) -> None:
     assert "hall-2" in report_page(look)
 
 
-def test_a_motor_that_keeps_its_speed_tells_nothing_of_noise_that_comes_with_it(tmp_path: Path) -> None:
+def test_misses_by_frequency_need_a_varying_speed(tmp_path: Path) -> None:
     rows = [row(at, "pump", "output_frequency", 50.0) for at in range(50)]
     rows.append(row(50, "pump", "output_frequency", None, "bad checksum"))
     assert miss_shares(load(record(tmp_path / "it.arrows", rows)), "pump") is None
 
 
-def test_misses_are_told_by_reason(look: Recording) -> None:
+def test_misses_are_listed_by_reason(look: Recording) -> None:
     assert reasons_of(look, "pump") == {"bad checksum": 200}
     assert reasons_of(look, "fan") == {"no reply": 1}
 
@@ -376,7 +376,7 @@ def test_drives_without_a_fault_take_no_room(tmp_path: Path) -> None:
     assert titles(["fault"]) == ["faults: none"]
 
 
-def test_a_fault_is_shaded_where_its_drive_is_drawn_alone(tmp_path: Path) -> None:
+def test_a_fault_is_shaded_if_its_drive_is_plotted_alone(tmp_path: Path) -> None:
     units = {"output_frequency": "Hz", "output_current": "A", "output_torque": "%"}
     meanings = {name: {"unit": unit} for name, unit in units.items()}
     status = {"status": {"unit": "", "values": {"RUN": 1}, "bits": False}}
@@ -433,7 +433,7 @@ def test_a_long_legend_takes_no_room_from_the_plot(tmp_path: Path, drives: int, 
     assert shown.x1 <= figure.bbox.width
 
 
-def test_a_value_that_never_changes_is_no_tiny_span(tmp_path: Path) -> None:
+def test_a_constant_value_has_a_wide_axis(tmp_path: Path) -> None:
     rows = [row(at, "pump", "output_frequency", 50.0) for at in range(3)]
     (axes,) = plot(load(record(tmp_path / "it.arrows", rows)))[0].axes
     low, high = axes.get_ylim()
@@ -534,7 +534,7 @@ def test_bits_are_a_lane_each_and_not_a_sum(tmp_path: Path) -> None:
     assert axes.get_legend() is None
 
 
-def test_a_number_without_a_name_is_no_sum_of_others(tmp_path: Path) -> None:
+def test_an_unnamed_number_is_not_a_sum_of_names(tmp_path: Path) -> None:
     """A fault that is not in the enumeration is not several others at once."""
     series = load(record(tmp_path / "it.arrows", [row(0, "pump", "fault", 9 + 2)], ABOUT)).series[0]
     assert [series.name_of(count) for count in (8.0, 9.0, 24.0, 1e308, -1.0, 0.5)] == [
@@ -598,7 +598,7 @@ def test_states_that_change_faster_than_can_be_drawn_hide_none(tmp_path: Path) -
     assert order == ["fault"]
 
 
-def test_reasons_for_which_there_is_no_room_are_one(tmp_path: Path) -> None:
+def test_excess_reasons_are_combined(tmp_path: Path) -> None:
     rows = [row(at, "pump", "output_frequency", None, f"reason {at % 8}") for at in range(80)]
     rows += [row(at, "pump", "output_frequency", None, "no reply") for at in range(80)]
     (_, misses) = draw_rates(load(record(tmp_path / "it.arrows", rows))).axes
@@ -609,7 +609,7 @@ def test_reasons_for_which_there_is_no_room_are_one(tmp_path: Path) -> None:
 @pytest.mark.usefixtures("_unpainted")
 @pytest.mark.slow
 @pytest.mark.long
-def test_what_has_no_room_is_named(run: Run, tmp_path: Path) -> None:
+def test_series_without_room_are_named(run: Run, tmp_path: Path) -> None:
     rows = [row(at, "pump", f"r{number}", at) for at in range(3) for number in range(MOST_PANELS + 2)]
     look = load(record(tmp_path / "it.arrows", rows))
     figure, left = plot(look)
@@ -626,7 +626,7 @@ def test_what_has_no_room_is_named(run: Run, tmp_path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("_unpainted")
-def test_what_has_no_room_is_named_once(tmp_path: Path) -> None:
+def test_series_without_room_are_named_once(tmp_path: Path) -> None:
     """Numbers and states of one name are two panels."""
     rows = [row(0, "pump", f"r{number}", 1) for number in range(MOST_PANELS)]
     rows += [row(0, drive, "status", 1) for drive in ("pump", "che")]
@@ -635,7 +635,7 @@ def test_what_has_no_room_is_named_once(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("_unpainted")
-def test_the_report_is_one_page_that_needs_nothing_else(look: Recording) -> None:
+def test_the_report_is_one_self_contained_page(look: Recording) -> None:
     page = report_page(look)
     assert page.startswith("<!DOCTYPE html>")
     images = re.findall(r'src="data:image/png;base64,([^"]+)"', page)
@@ -657,7 +657,7 @@ def test_names_cannot_break_the_page(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-def test_a_recording_of_nothing_but_misses_has_a_report(tmp_path: Path) -> None:
+def test_a_recording_of_misses_only_has_a_report(tmp_path: Path) -> None:
     rows = [row(at, "pump", "output_frequency", None, "no reply") for at in range(3)]
     look = load(record(tmp_path / "it.arrows", rows))
     page = report_page(look)
@@ -675,13 +675,13 @@ def test_a_report_without_a_fault_says_so(tmp_path: Path, value: float | None, s
 
 
 @pytest.mark.usefixtures("_unpainted")
-def test_a_long_recording_is_told_in_hours(tmp_path: Path) -> None:
+def test_a_long_recording_s_length_is_in_hours(tmp_path: Path) -> None:
     rows = [row(second, "pump", "output_frequency", 50.0) for second in (0, 7384)]
     assert "UTC, 2 h 03 min; 1 drive; 2 values" in report_page(load(record(tmp_path / "it.arrows", rows)))
 
 
 @pytest.mark.usefixtures("_unpainted")
-def test_what_has_no_values_is_not_drawn(run: Run, tmp_path: Path) -> None:
+def test_series_without_values_are_not_plotted(run: Run, tmp_path: Path) -> None:
     rows = [row(at, "pump", "output_frequency", None, "no reply") for at in range(3)]
     rows += [row(at, "fan", "output_frequency", 5.0) for at in range(3)]
     path = record(tmp_path / "it.arrows", rows)
@@ -789,7 +789,7 @@ def test_metadata_that_is_nested_too_deeply_is_a_sentence(run: Run, tmp_path: Pa
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("_unpainted")
-def test_plot_and_report_need_nothing_but_the_file(run: Run, ramp: Path, tmp_path: Path) -> None:
+def test_plot_and_report_need_only_the_file(run: Run, ramp: Path, tmp_path: Path) -> None:
     here = tmp_path / "ramp.arrows"
     here.write_bytes(ramp.read_bytes())
     assert run("plot", here) == (0, f"{tmp_path}/ramp.png\n", "")
@@ -823,7 +823,7 @@ def test_mistakes_are_one_sentence(
 
 
 @pytest.mark.parametrize("command", ["plot", "report", "convert"])
-def test_a_folder_of_a_history_is_told_as_one(run: Run, tmp_path: Path, command: str) -> None:
+def test_a_folder_of_a_history_is_one_sentence(run: Run, tmp_path: Path, command: str) -> None:
     out = () if command != "convert" else (tmp_path / "all.csv",)
     folder = f"multidrop: {tmp_path} is the folder of a history: name one of its files, such as"
     by_program = "or read it from Python with `multidrop.History`\n"
@@ -840,7 +840,7 @@ def test_a_folder_of_a_history_is_told_as_one(run: Run, tmp_path: Path, command:
 
 
 @pytest.mark.parametrize("command", ["plot", "report"])
-def test_what_is_no_recording_or_has_no_rows_is_one_sentence(run: Run, tmp_path: Path, command: str) -> None:
+def test_no_recording_or_no_rows_is_one_sentence(run: Run, tmp_path: Path, command: str) -> None:
     assert run(command, ".")[::2] == (2, "multidrop: . is a folder: name the recording in it\n")
     text = tmp_path / "letter.arrows"
     text.write_text("Dear Sir")

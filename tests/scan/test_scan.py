@@ -135,7 +135,7 @@ def whole_scan() -> tuple[Line, list[object]]:
 
 @pytest.mark.long
 @pytest.mark.story
-def test_all_eight_are_found_at_their_settings_and_nothing_else(
+def test_all_eight_drives_are_found_at_their_settings(
     whole_scan: tuple[Line, list[object]],
 ) -> None:
     _, findings = whole_scan
@@ -177,7 +177,7 @@ def test_a_sweep_takes_little_more_than_its_silences_and_time_outs(format: str) 
     assert line.seconds <= 1.02 * sum(sweep.needed for sweep in plan)
 
 
-def test_what_a_sweep_needs_is_its_silences_requests_and_time_outs() -> None:
+def test_a_sweep_s_time_is_its_silences_requests_and_timeouts() -> None:
     (sweep, patient) = sweeps([InvtCHE], addresses=[1, 2], baudrates=[9600], formats=["8N1"])
     character = 10 / 9600
     each = 3.5 * character + 1 / 9600 + 8 * character
@@ -185,7 +185,7 @@ def test_what_a_sweep_needs_is_its_silences_requests_and_time_outs() -> None:
     assert patient.needed == pytest.approx(2 * (each + InvtCHE.response_timeout))
 
 
-def test_the_progress_counts_down_to_nothing() -> None:
+def test_the_progress_counts_down_to_zero() -> None:
     line = Line(Pair([simulated(InvtCHE(3))]))
     plan = sweeps([InvtCHE], addresses=range(1, 5), baudrates=[9600], formats=["8N1"])
     left = [each.left for each in scan(line.carry_out, plan, [InvtCHE]) if isinstance(each, Progress)]
@@ -203,7 +203,7 @@ class Echo(Line):
 
 @pytest.mark.long
 @pytest.mark.parametrize("families", [FAMILIES, [DelixiNative]], ids=["all", "own protocol"])
-def test_an_echo_is_no_drive_and_hides_none(families: list[type]) -> None:
+def test_an_echo_is_not_a_drive_and_hides_none(families: list[type]) -> None:
     there = [each for each in ALL_EIGHT if type(each) in families and each.settings.baudrate in (9600, 19200)]
     line = Echo(Pair([simulated(each) for each in ALL_EIGHT]))
     plan = sweeps(families, addresses=range(1, 12), baudrates=[9600, 19200])
@@ -286,7 +286,7 @@ class Misaddressed(Pair):
         return checksums.rtu(b"\x63" + reply[1:-2])
 
 
-def test_whole_frames_that_are_no_reply_are_told_as_they_came() -> None:
+def test_valid_frames_that_match_no_request_are_reported() -> None:
     findings = found(Line(Misaddressed([simulated(InvtCHE(1))])), sweeps([InvtCHE], baudrates=[9600]))
     (crowd, *_) = [finding for finding in findings if isinstance(finding, Crowd)]
     assert crowd.reply.startswith("reply from another address (received 63 ")
@@ -298,7 +298,7 @@ class Everything(Echo, Junk):
 
 @pytest.mark.story
 @pytest.mark.long
-def test_all_eight_are_found_amid_echo_and_noise_with_two_drives_at_one_address() -> None:
+def test_all_eight_drives_are_found_with_echo_noise_and_a_crowd() -> None:
     one, twin = simulated(InnovertIBD(9)), simulated(InnovertIBD(9))
     one["output_current"], twin["output_current"] = 41.1, 77.7
     line = Everything(Shared([*map(simulated, ALL_EIGHT), one], twin))
@@ -424,7 +424,7 @@ class Meddler(Toy):
         return True
 
 
-def test_a_look_that_would_write_names_nobody_and_writes_nothing() -> None:
+def test_an_identification_that_would_write_is_skipped() -> None:
     drive = SimulatedDrive(Meddler(7))
     plan = sweeps([Meddler], baudrates=[9600], formats=["8N1"])
     findings = found(Line(Pair([drive])), plan, [Meddler])
@@ -439,7 +439,7 @@ class Commanded(Drive):
     speed = command(1, "rpm")
 
 
-def test_a_family_of_which_nothing_can_be_read_is_not_asked() -> None:
+def test_a_family_without_readable_registers_is_skipped() -> None:
     plan = sweeps([InvtCHE, Commanded], baudrates=[9600], formats=["8N1"])
     assert {family for sweep in plan for family in sweep.families} == {InvtCHE}
 
@@ -459,7 +459,7 @@ class Stubborn(Line):
         return super().carry_out(exchange, not_before_ns=not_before_ns)
 
 
-def test_settings_that_the_port_refuses_are_passed_over_and_told() -> None:
+def test_unsupported_settings_are_skipped_and_reported() -> None:
     line = Stubborn(Pair([simulated(InvtCHE(2))]))
     findings = found(line, sweeps([InvtCHE], baudrates=[9600]), [InvtCHE])
     assert drives(findings) == declared(InvtCHE(2))
@@ -476,7 +476,7 @@ class Vanishing(Line):
         return super().carry_out(exchange, not_before_ns=not_before_ns)
 
 
-def test_a_port_that_is_lost_ends_the_scan_after_what_was_found() -> None:
+def test_a_lost_port_ends_the_scan_after_its_findings() -> None:
     line = Vanishing(Pair([simulated(InvtCHE(2))]))
     findings = scan(line.carry_out, sweeps([InvtCHE], baudrates=[9600], formats=["8N1"]), [InvtCHE])
     assert drives([next(finding for finding in findings if isinstance(finding, Found))]) == declared(
@@ -486,7 +486,7 @@ def test_a_port_that_is_lost_ends_the_scan_after_what_was_found() -> None:
         list(findings)
 
 
-def test_a_port_that_takes_nothing_is_an_error() -> None:
+def test_a_port_without_supported_settings_is_an_error() -> None:
     line = Stubborn(Pair([simulated(InvtCHE(2))]))
     with pytest.raises(LineError, match="parity"):
         found(line, sweeps([InvtCHE], baudrates=[9600], formats=["8E1"]))
@@ -501,7 +501,7 @@ def test_a_port_that_takes_nothing_is_an_error() -> None:
         ({"baudrates": [1200], "formats": ["7E1"], "addresses": [40]}, "no family has such an address"),
     ],
 )
-def test_what_nobody_can_answer_is_a_mistake(asked: dict[str, list[object]], sentence: str) -> None:
+def test_a_request_that_no_family_answers_is_a_mistake(asked: dict[str, list[object]], sentence: str) -> None:
     with pytest.raises(ValueError, match=sentence):
         sweeps(FAMILIES, **asked)
 
@@ -544,7 +544,7 @@ def test_an_ibd_that_does_not_show_its_line_is_named_in_doubt() -> None:
 
 
 @pytest.mark.long
-def test_what_has_other_bits_than_an_ibd_s_terminals_is_none() -> None:
+def test_other_bits_than_an_ibd_s_terminals_exclude_it() -> None:
     for bits in (0x0000, 0x0800, 0x1000, 0x9800, 0xFFFF):
         drive = Bare(InnovertIBD(3))
         drive.shows = {(0x03, 22): lambda self, bits=bits: bits}

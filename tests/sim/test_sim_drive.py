@@ -81,7 +81,7 @@ def exception_of(reply: Message | None) -> int:
         ("relay", 1, 1, 4, 3, "02"),
     ],
 )
-def test_a_value_that_is_set_is_what_is_read(
+def test_a_value_that_is_set_is_read(
     sim: SimulatedDrive, name: str, value: float, function: int, start: int, count: int, words: str
 ) -> None:
     if name == "relay":
@@ -226,7 +226,7 @@ def every_register() -> list[tuple[Register[float], int]]:
 
 
 @table(("register", "at"), every_register())
-def test_an_encoded_drive_says_who_and_where_it_is(register: Register[float], at: int) -> None:
+def test_an_encoded_drive_s_values_name_their_source(register: Register[float], at: int) -> None:
     sim = EncodedDrive(Own(7))
     table, where = register.table, register.address + at
     numbers = {COIL: 1, DISCRETE: 2, HOLDING: 3, INPUT: 4}

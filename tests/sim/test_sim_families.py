@@ -167,7 +167,7 @@ def test_erman_runs_a_motor(erman: Bench) -> None:
     assert (erman.ask(4, 0x400, 2), erman.ask(4, 0x01)) == ([0, 0], [0])
 
 
-def test_erman_start_waits_for_stop_to_be_off_and_taking_it_off_starts_nothing(erman: Bench) -> None:
+def test_erman_starts_only_while_stop_is_off_and_not_by_clearing_it(erman: Bench) -> None:
     erman.say("01 06 00 02 01 1D E9 93")
     erman.say("01 05 00 01 FF 00 DD FA")  # stop on
     erman.say("01 05 00 00 FF 00 8C 3A")  # start on
@@ -362,7 +362,7 @@ def test_ibd_shows_its_terminals(ibd: Bench) -> None:
     assert ibd.say("01 03 00 16 00 01 65 CE") == "01 03 02 18 00 B2 44"
 
 
-def test_ibd_its_outputs_say_what_the_motor_does_if_they_are_programmed(ibd: Bench) -> None:
+def test_ibd_programmed_outputs_show_the_motor_s_state(ibd: Bench) -> None:
     ibd.say("01 06 20 01 13 88 DE 9C")
     ibd.say("01 06 20 00 00 02 03 CB")
     ibd.wait(1)
@@ -378,7 +378,7 @@ def test_ibd_its_outputs_say_what_the_motor_does_if_they_are_programmed(ibd: Ben
     assert ibd.ask(3, 22) == [0x1800]
 
 
-def test_ibd_turns_the_other_way_without_being_told_to_run(ibd: Bench) -> None:
+def test_ibd_reverses_without_a_run_command(ibd: Bench) -> None:
     assert ibd.write(0x2001, 2000) == 0
     for bits, direction in ((0x06, -1), (0x08, 1), (0x0C, -1)):  # run reverse; forward; the other way
         assert ibd.write(0x2000, bits) == 0
@@ -439,7 +439,7 @@ def test_ibd_clamps_silently(ibd: Bench) -> None:
 @pytest.mark.parametrize(
     ("function", "start", "count"), [(3, 107, 5), (3, 0x2000, 1), (3, 50, 1), (4, 3, 1), (0x10, 107, 1)]
 )
-def test_ibd_does_not_answer_what_it_cannot_do(ibd: Bench, function: int, start: int, count: int) -> None:
+def test_ibd_does_not_answer_impossible_requests(ibd: Bench, function: int, start: int, count: int) -> None:
     data = b"\0\1" if function == 0x10 else b""
     assert ibd.sim.answer(Message(1, function, start, count, data), 0.0) is None
 
@@ -519,7 +519,7 @@ def test_delixi_turns_backwards(delixi: Bench) -> None:
 
 
 @pytest.mark.parametrize(("function", "start", "count"), [(3, 0x01F4, 2), (3, 0x9999, 1), (4, 0x01F4, 1)])
-def test_delixi_does_not_answer_what_it_cannot_do(
+def test_delixi_does_not_answer_impossible_requests(
     delixi: Bench, function: int, start: int, count: int
 ) -> None:
     assert delixi.sim.answer(Message(1, function, start, count), 0.0) is None
@@ -625,7 +625,7 @@ def test_native_a_locked_parameter(native: Bench) -> None:
     assert native.say(":0106000200001388A4") == ":0106000200001388A4"
 
 
-def test_native_cannot_be_commanded_where_the_line_does_not_command_it(native: Bench) -> None:
+def test_native_refuses_commands_without_line_control(native: Bench) -> None:
     native.sim["run_source"] = 0  # P00.00
     assert native.say(":010200020000000005") == ":01F0000000000000F1"
     assert not native.motor.energised
@@ -716,7 +716,7 @@ def test_yd_without_bit_15_the_panel_is_in_command(yd: Bench) -> None:
     assert yd.motor.frequency == 30
 
 
-def test_yd_freezes_what_it_shows_in_a_trip(yd: Bench) -> None:
+def test_yd_freezes_its_monitors_in_a_trip(yd: Bench) -> None:
     yd.write(0x1001, 5000)
     yd.write(0x1000, FORWARD)
     yd.wait(60)
@@ -767,7 +767,7 @@ def test_yd_no_command_works_without_bit_15(yd: Bench, bit: int) -> None:
         (0xC000, 0),
     ],
 )
-def test_yd_shows_what_it_does(yd: Bench, word: int, state: int) -> None:
+def test_yd_shows_the_motor_s_state(yd: Bench, word: int, state: int) -> None:
     yd.write(0x1001, 3000)
     yd.write(0x1000, word)
     yd.wait(60)
@@ -777,7 +777,7 @@ def test_yd_shows_what_it_does(yd: Bench, word: int, state: int) -> None:
     assert not yd.motor.energised
 
 
-def test_yd_brakes_by_direct_current_until_it_is_told_to_stop(yd: Bench) -> None:
+def test_yd_brakes_by_direct_current_until_a_stop(yd: Bench) -> None:
     yd.write(0x1001, 3000)
     yd.write(0x1000, FORWARD)
     yd.wait(60)
@@ -813,7 +813,7 @@ def test_yd_preset_speeds(yd: Bench, bits: int, speed: int) -> None:
     ],
     ids=lambda each: f"{each:04X}",
 )
-def test_yd_refuses_what_is_beyond_its_limits(yd: Bench, address: int, value: int) -> None:
+def test_yd_refuses_values_beyond_its_limits(yd: Bench, address: int, value: int) -> None:
     before = yd.ask(3, address)
     assert yd.write(address, value) == 3
     assert yd.ask(3, address) == before
@@ -827,13 +827,13 @@ def test_yd_its_limits_are_those_that_it_holds(yd: Bench) -> None:
 
 
 @pytest.mark.parametrize("address", [0x0001, 0x0007, 0x0015])
-def test_yd_what_is_the_panel_s_is_not_kept(yd: Bench, address: int) -> None:
+def test_yd_does_not_store_the_panel_s_setpoint(yd: Bench, address: int) -> None:
     assert yd.write(address, 1) == 0
     assert yd.ask(3, address) == [0]
     assert not yd.sim.counters.eeprom_writes
 
 
-def test_yd_its_watch_begins_anew_after_a_reset(yd: Bench) -> None:
+def test_yd_its_watchdog_restarts_after_a_reset(yd: Bench) -> None:
     yd.write(0x0803, 1)
     yd.write(0x1000, RESET)
     yd.now += 5
@@ -862,7 +862,7 @@ def test_yd_locks_some_parameters_while_it_runs(yd: Bench) -> None:
     assert yd.write(0x0011, 8000) == 4
 
 
-def test_yd_watches_the_line_if_it_is_told_to(yd: Bench) -> None:
+def test_yd_watches_the_line_if_set_to(yd: Bench) -> None:
     yd.write(0x0803, 5)
     yd.write(0x1001, 5000)
     yd.write(0x1000, FORWARD)

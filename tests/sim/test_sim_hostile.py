@@ -138,7 +138,7 @@ def test_noise_comes_with_a_motor_s_start() -> None:
 
 
 @pytest.mark.parametrize("port", ["link", "socket://127.0.0.1:0"])
-def test_a_port_hangs_up_and_is_back_where_it_was(port: str, tmp_path: Path) -> None:
+def test_a_port_hangs_up_and_returns_at_its_path(port: str, tmp_path: Path) -> None:
     where = str(tmp_path / port) if port == "link" else port
     wire = FaultyWire([simulated(Toy(1))], Faults(hang_up=1, away=0.1, rename=1), port=where, unpaced=True)
     with Simulator([wire]) as sim:
@@ -198,7 +198,7 @@ def test_all_that_a_file_says(tmp_path: Path) -> None:
     assert load_faults(path) == Faults(**dict.fromkeys(RATES, 0.25), late=2.0, seed=3)
 
 
-def test_every_mistake_is_told_at_once(tmp_path: Path) -> None:
+def test_every_mistake_is_reported_at_once(tmp_path: Path) -> None:
     path = tmp_path / "faults.toml"
     path.write_text('drop = 1.5\nflips = 0.1\nlate = "soon"\nburst = 0\nseed = "x"\naway = 3\ndelay = true\n')
     with pytest.raises(ValueError, match=re.escape(str(path))) as mistake:
@@ -223,7 +223,7 @@ def test_every_mistake_is_told_at_once(tmp_path: Path) -> None:
     ("text", "sentence"),
     [(None, r"the faults' file cannot be read: No such file"), ("drop =", "is not TOML: ")],
 )
-def test_what_is_no_faults_file(text: str | None, sentence: str, tmp_path: Path) -> None:
+def test_an_invalid_faults_file_is_refused(text: str | None, sentence: str, tmp_path: Path) -> None:
     path = tmp_path / "faults.toml"
     if text is not None:
         path.write_text(text)
@@ -231,7 +231,7 @@ def test_what_is_no_faults_file(text: str | None, sentence: str, tmp_path: Path)
         load_faults(path)
 
 
-def test_the_command_says_what_the_file_may_hold(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_help_lists_the_keys_of_a_faults_file(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["simulate", "--help"]) == 0
     told = capsys.readouterr().out
     assert all(re.search(rf"^  {name} = ", told, re.MULTILINE) for name in (*RATES, "seed", "late"))

@@ -120,7 +120,7 @@ def ask_in_vain(broken: Wire) -> None:
         sim._thread.join(PATIENCE)
 
 
-def test_what_fails_in_the_simulator_s_thread_is_raised_where_it_is_left() -> None:
+def test_a_failure_in_the_simulator_s_thread_is_raised_on_exit() -> None:
     with pytest.raises(ZeroDivisionError, match="a mistake of the test's own"):
         ask_in_vain(Broken([EncodedDrive(InvtCHE(1))], unpaced=True))
 

@@ -18,7 +18,7 @@ def motor() -> Motor:
     return motor
 
 
-def test_it_stands_until_it_is_told_to_run(motor: Motor) -> None:
+def test_the_motor_is_off_until_a_run(motor: Motor) -> None:
     motor.run_to(1000)
     assert (motor.frequency, motor.current, motor.voltage, motor.phase) == (0, 0, 0, Phase.STOPPED)
 
@@ -132,7 +132,7 @@ def test_the_heatsink_warms_slowly_and_cools_again(motor: Motor) -> None:
     assert motor.heatsink == pytest.approx(25, abs=0.01)
 
 
-def test_a_fault_keeps_it_off_until_it_is_reset_and_a_reset_starts_nothing(motor: Motor) -> None:
+def test_a_fault_keeps_the_motor_off_and_a_reset_does_not_start_it(motor: Motor) -> None:
     motor.run()
     motor.run_to(100)
     motor.trip(7)

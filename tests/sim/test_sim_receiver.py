@@ -69,7 +69,7 @@ def test_two_frames_at_once() -> None:
 
 
 @table("extra", [b"\x00", b"\x01", b"\x00\x00", b"\x01\x03", b"\xff" * 5, READ[:-1], READ[:-1] + b"\x00"])
-def test_a_good_frame_with_more_bytes_behind_it_is_no_request(extra: bytes) -> None:
+def test_a_good_frame_followed_by_other_bytes_is_not_a_request(extra: bytes) -> None:
     """ERMAN, section 5 (wrong length); YD1000, section 5 (nothing may follow the checksum); CHE, 11.5."""
     receiver = receiver_rtu()
     assert receiver.feed(READ + extra, 0.0) == []
@@ -118,7 +118,7 @@ def test_text_frames(framing: Framing, text: bytes) -> None:
     assert frame.address == 1
 
 
-def test_a_colon_begins_anew() -> None:
+def test_a_colon_starts_a_new_frame() -> None:
     assert functions(Receiver(Framing.ASCII, CHARACTER, 1.0).feed(b"\xff:0106:01" + RUN, 0.0)) == [6]
 
 
@@ -128,7 +128,7 @@ def test_text_with_a_wrong_checksum_is_a_damaged_frame() -> None:
 
 
 @table("text", [b":\r\n", b":0\r\n", b":01\r\n", b":0101\n", b"\n", b":XX0620\r\n", b"::\n"])
-def test_scraps_of_text_are_nothing(text: bytes) -> None:
+def test_scraps_of_text_are_ignored(text: bytes) -> None:
     assert Receiver(Framing.ASCII, CHARACTER, 1.0).feed(text, 0.0) == []
 
 

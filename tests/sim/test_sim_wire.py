@@ -121,7 +121,7 @@ def test_a_request_that_begins_while_a_reply_is_under_way_is_not_understood() ->
     assert sim.counters.requests == 1
 
 
-def test_where_no_document_demands_it_a_missing_silence_is_only_counted() -> None:
+def test_a_missing_silence_is_only_counted_unless_the_manual_demands_it() -> None:
     sim = SimulatedDrive(Own(1), response_delay=0.02)
     wire = Wire([sim])
     wire.receive(READ, 0.0)
@@ -191,7 +191,7 @@ def test_a_drive_hears_its_own_baud_rate_only() -> None:
     assert exchange(wire, READ, 40.0, None) != b""  # where it cannot be seen, everything is heard
 
 
-def test_what_was_begun_at_another_baud_rate_is_forgotten() -> None:
+def test_a_frame_started_at_another_baud_rate_is_dropped() -> None:
     wire = Wire([simulated(Own(1, baudrate=9600))])
     wire.receive(READ[:4], 0.0, 9600)
     wire.receive(b"", 0.001, 19200)
@@ -228,7 +228,7 @@ def test_noise_can_be_put_on_replies() -> None:
     assert exchange(Noisy([simulated(Own(1))]), READ, 0.0) == b"\x00" + checksums.rtu("01 03 02 00 00")
 
 
-def test_a_wire_that_nothing_happens_on_needs_no_waking() -> None:
+def test_an_idle_wire_needs_no_wake_up() -> None:
     wire = Wire([simulated(each) for each in (ErmanERG220(1), InvtCHE(2), DelixiModbus(3))])
     assert wire.wake is None
     wire.receive(b"\x01", 0.0)
