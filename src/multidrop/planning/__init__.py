@@ -1,1 +1,1 @@
-"""Planning: requests, their order and rates, and what a line will reach. No I/O, no clock."""
+"""Planning: requests, their order and rates, and a line's predicted performance. No I/O, no clock."""

@@ -24,17 +24,17 @@ class Health:
     """One drive's failures and rest."""
 
     is_new: bool = False  # it has never answered
-    is_pending: bool = False  # the outcome of its request is not known yet; only where it is new
+    is_pending: bool = False  # only of a new drive: its request has no outcome yet
     failures: int = 0
     late_until_ns: int = 0
     rest_ns: int = 0
     asleep_until_ns: int = 0
-    cost_ns: int = 0  # of a request in vain
+    cost_ns: int = 0  # of a request without a reply
 
 
 @dataclass
 class BackOff:
-    """The health of all drives on a line, by address; `begin_rest` is called with each rest that begins."""
+    """The health of all drives on a line, by address; `begin_rest` is called at the start of each rest."""
 
     begin_rest: Callable[[int, int], None]  # with drive and time
     health: dict[int, Health] = field(default_factory=dict)
@@ -50,7 +50,7 @@ class BackOff:
         self.health.pop(drive, None)
 
     def conclude(self, drive: int) -> None:
-        """Note that a request to this drive is over, whatever became of it."""
+        """Note that a request to this drive has ended, with any outcome."""
         if drive in self.health:
             self.health[drive].is_pending = False
 
@@ -80,7 +80,7 @@ class BackOff:
         cost_ns: int,
         has_answered: bool = True,
     ) -> None:
-        """Note how often in a row a drive has failed by now, and what its next request in vain costs.
+        """Note a drive's failures in a row, and the cost of its next request without a reply.
 
         Until `late_until_ns` its reply to an earlier request may come, so it gets none, even if it has
         answered since. When that reply has come, late as it is, the drive can be tried at once.
@@ -113,7 +113,7 @@ class BackOff:
             self.begin_rest(drive, now_ns)
 
     def _fair_rest_ns(self) -> int:
-        """Return a rest after which all silent drives together cost no more than their share."""
+        """Return the rest that keeps all silent drives together within their share."""
         return round(sum(health.cost_ns for health in self.health.values() if health.rest_ns) / SILENT_SHARE)
 
     def _wake_next(self, drive: int, now_ns: int) -> None:
@@ -124,7 +124,7 @@ class BackOff:
             first.asleep_until_ns = min(first.asleep_until_ns, max(now_ns, first.late_until_ns))
 
     def _try_new_again(self, now_ns: int) -> None:
-        """End the rest of new drives after their first request, where all had theirs and few are silent."""
+        """End the rest of new drives once each has had its first request and few are silent."""
         new = [health for health in self.health.values() if health.is_new]
         silent = [health for health in new if health.failures == 1]
         if all(health.failures for health in new) and sum(each.cost_ns for each in silent) <= SECOND_COST_NS:

@@ -58,19 +58,19 @@ class Plan:
     most: float  # with a longer one, fewer requests of more characters
 
     def suits(self, delay: float, margin: float = 0.0) -> bool:
-        """Return True where no other plan is quicker at this response delay, or within `margin` of it."""
+        """Return True if no other plan is quicker at this response delay, within a relative `margin`."""
         return self.least * (1 - margin) <= delay <= self.most * (1 + margin)
 
 
 def plan(
     drive: Drive, wanted: Iterable[tuple[Register[Any], float | None]], delay: float | None = None
 ) -> Plan:
-    """Return the quickest plan that reads each of these registers every so many seconds.
+    """Return the quickest plan that reads these registers, each with its period in seconds.
 
-    `delay` is the drive's response delay in s, where it was measured. Registers that one function reads share
-    a request where that is quicker: up to the family's limit, else the standard's, across other registers
-    that can be read, and across reserved addresses where the family's document allows that. Registers of
-    different rates never share one: some would be read more often than they are wanted. Those of a group in
+    `delay` is the drive's measured response delay in s, or None. Registers of one function share a request if
+    that is quicker: up to the family's limit, else the standard's, across other readable registers, and
+    across reserved addresses if the family's document allows that. Registers of different rates never share
+    a request: some would be read too often. Those of a group in
     `read_together` that have the same rate always do, and the blocks are in the groups' order. Raises
     ValueError for a register that cannot be read.
     """
@@ -127,8 +127,7 @@ def all_requests(
 ) -> Iterator[tuple[int, tuple[Register[Any], ...], int, int]]:
     """Yield every request that may read neighbours among these registers.
 
-    Each is a number of addresses, all registers by rising address, and of these the first, and the first that
-    it does not read.
+    Each is a number of addresses, all registers by rising address, and the slice (begin, end) that it reads.
     """
     for neighbours in _neighbours(drive, registers):
         for end in range(1, len(neighbours.registers) + 1):
@@ -156,7 +155,7 @@ def sending(drive: Drive, block: Block) -> float:
 
 @dataclass(frozen=True)
 class _Neighbours:
-    """Registers of one read space by rising address, and which of them one request may read.
+    """Registers of one read space by rising address, with the limits of a request.
 
     They may overlap: several may be parts of one word.
     """
@@ -236,7 +235,7 @@ class _Way:
 def _ways(framing: Framing, neighbours: _Neighbours) -> tuple[_Way, ...]:
     """Return each way that is the quickest at some response delay, maybe others too; fewest requests first.
 
-    By dynamic programming over where the last request begins.
+    Dynamic programming over the first register of the last request.
     """
     fronts: list[list[_Way]] = [[_Way(0, ())]]  # for the first so many registers
     for end in range(1, len(neighbours.registers) + 1):
@@ -268,7 +267,7 @@ def _even(drive: Drive, few: _Way, many: _Way) -> float:
 
 
 def halves(drive: Drive, block: Block) -> tuple[Block, ...]:
-    """Return two blocks that read these registers between them; none where one would still read them all.
+    """Return two blocks that read these registers between them, or () if one would still read them all.
 
     Registers at the same addresses stay together, and so do those of a group in `read_together`. Splitting
     again and again ends: of n registers there are at most 2 n - 1 blocks, the whole included.
@@ -282,7 +281,7 @@ def halves(drive: Drive, block: Block) -> tuple[Block, ...]:
 
 
 def _units(drive: Drive, block: Block) -> list[list[Register[Any]]]:
-    """Return the registers that no request can tell apart, by rising address."""
+    """Return groups of registers that are always read together, by rising address."""
     groups = {name: place for place, group in enumerate(drive.read_together) for name in group}
     found: dict[object, list[Register[Any]]] = {}
     for register in block.registers:
@@ -292,10 +291,10 @@ def _units(drive: Drive, block: Block) -> list[list[Register[Any]]]:
 
 
 def may_be_too_long(drive: Drive, block: Block) -> bool:
-    """Return True where a drive may be silent because so much was asked: its class states no limit."""
+    """Return True if the request may be too long for the drive: its class states no limit."""
     return stated_limit(drive, block.table) is None and len(_units(drive, block)) > 1
 
 
 def least(drive: Drive, block: Block) -> Block:
-    """Return the block that reads the first of these registers, and what cannot be told apart from it."""
+    """Return the block that reads the first group of registers that are always read together."""
     return Block.of(drive, _units(drive, block)[0])

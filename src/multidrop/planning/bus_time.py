@@ -19,7 +19,7 @@ _FRAMES = {
 
 
 def silence(drive: Drive) -> float:
-    """Return the seconds of silence around a drive's exchanges: one bit more than it needs, for a stop bit.
+    """Return the seconds of silence around a drive's exchanges: its needs plus one stop bit.
 
     ASCII frames need none. They get 1.5 characters, time enough to see whether more comes, such as a second
     copy of the reply, which could otherwise be taken for the next one. Modbus TCP has none.
@@ -47,7 +47,7 @@ def gap(before: Drive, after: Drive, switching: float = 0.0) -> float:
 
 
 def switches(before: Drive, after: Drive) -> bool:
-    """Return True where the port changes baud rate or format between them; a network port has none."""
+    """Return True if the port changes baud rate or format between them; a network port has neither."""
     return before.settings != after.settings and Framing.TCP not in (before.framing, after.framing)
 
 
@@ -57,11 +57,11 @@ def kind(drive: Drive) -> tuple[float, str]:
 
 
 def in_order(drives: Iterable[Drive], switching: float = 0.0) -> list[Drive]:
-    """Return the bus cycle with the least silence, and of those as short one with the fewest switches.
+    """Return the bus cycle with the least silence, and the fewest switches among equals.
 
-    The longer of two neighbours' silences is kept, so drives of like silence and settings stand side
-    by side. They are put into the cycle by rising silence, each kind where it costs least; where
-    switching costs nothing, no order is shorter.
+    The line keeps the longer of two neighbours' silences, so drives of equal silence and settings are
+    neighbours. Kinds are inserted by rising silence, each at its cheapest place; if switching is free,
+    no order is shorter.
     """
     kinds: dict[tuple[float, str], list[Drive]] = {}
     for drive in drives:

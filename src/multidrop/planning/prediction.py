@@ -1,4 +1,4 @@
-"""Predict what a line will reach before its port is opened: bus cycle, utilisation, each drive's rate.
+"""Predict a line's bus cycle, utilisation and rates before its port is opened.
 
 Every exchange is taken to succeed at once, and the host to be late by the usual time. The schedule itself
 says which exchange follows which, on a simulated clock.
@@ -91,18 +91,18 @@ def predict(
     switching: float = 0.0,
     lateness: float = LATENESS,
 ) -> Prediction:
-    """Return what a line reaches when these are polled on it.
+    """Return the bus cycle, utilisation and rates of a line with these exchanges.
 
     `delays` are the response delays in s that were measured, of drives that have any; `switching` is the
     time in s that the port takes to change baud rate or format, as a poll has measured it; `lateness` is
-    what the host adds to each exchange: 0 for what the line alone would reach.
+    the host's share of each exchange in s, 0 to predict the line alone.
     """
     jobs = _jobs(exchanges, delays or {}, switching, lateness)
     _run(jobs, switching)
     turn = [job for job in jobs if job.planned.every is None]
     load = sum(job.cost / job.planned.every for job in jobs if job.planned.every)
     turns = max(TURN_SHARE, 1 - load) / sum(job.cost for job in turn) if turn else 0.0
-    has_rests = any(job.interval_ns for job in jobs)  # in which the line may have nothing to do
+    has_rests = any(job.interval_ns for job in jobs)  # the line may idle then
     if has_rests:
         load += sum(job.cost * job.reached for job in turn)
     groups: dict[tuple[Drive, float | None], list[_PredictedJob]] = {}
@@ -163,7 +163,7 @@ def _jobs(
 
 
 def _run(jobs: Sequence[_PredictedJob], switching: float) -> None:
-    """Note of each job what becomes of it."""
+    """Run the jobs on a simulated clock, and note the results in them."""
     ends = {job.kind: job.planned.drive for job in jobs}  # drives of one kind are alike to their neighbours
     numbers = {kind: number for number, kind in enumerate(ends)}
     gaps = tuple(tuple(gap(before, after, switching) for after in ends.values()) for before in ends.values())
@@ -179,7 +179,7 @@ def _run(jobs: Sequence[_PredictedJob], switching: float) -> None:
 
 
 class _Slots(NamedTuple):
-    """All that the schedule and the clock are told of a job."""
+    """The facts of a job that decide its schedule: the key of the cache."""
 
     drive: int
     kind: int
@@ -240,10 +240,10 @@ def _carried_out(slots: tuple[_Slots, ...], gaps: tuple[tuple[float, ...], ...])
 
 
 def prediction_metadata(exchanges: Sequence[Planned], switching: float = 0.0) -> dict[str, Any]:
-    """Return the prediction for a line, and what each drive's blocks take of it, as plain numbers.
+    """Return the prediction for a line and its drives' blocks, as plain numbers.
 
-    A reader of a recording compares it with what was measured. Characters are those on the wire; those of a
-    reply are those of a good one.
+    A reader of a recording compares it with the measurement. Characters are those on the wire, of a good
+    reply.
     """
     prediction = predict(exchanges, switching=switching)
     drives = dict.fromkeys(planned.drive for planned in exchanges)

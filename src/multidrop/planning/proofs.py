@@ -1,8 +1,8 @@
 """Choose proofs: requests to a drive whose replies cannot be taken for each other's.
 
-After a time-out a reply may still come, at any time and to any request that is outstanding. A proof is a
-request for whose reply none of those could be taken: when that has come, all others have come too, or never
-will, because a line and the path to it keep the order. Replies differ by function, by length, in Delixi's
+After a time-out a reply may still come, at any time and to any outstanding request. A late reply can never
+be mistaken for the reply to a proof. When that has come, all late replies have come too, or never will,
+because a line and the path to it keep the order. Replies differ by function, by length, in Delixi's
 own protocol by parameter, and otherwise by the values that two registers are known to hold.
 """
 
@@ -24,7 +24,7 @@ RawRange = tuple[int, int]  # the least and the most that the one register of a 
 def proofs(drive: Drive) -> list[tuple[Block, RawRange | None]]:
     """Return blocks to read from this drive, with the raw counts that the reply is known to hold.
 
-    The last one is the least likely to be polled. There are none for a family no two of whose replies differ.
+    The last one is the least likely to be polled. A family whose replies are all alike has none.
     """
     known = [(Block.of(drive, [register]), counts) for register, counts in drive.known_counts().items()]
     family: Any = type(drive)
@@ -33,7 +33,7 @@ def proofs(drive: Drive) -> list[tuple[Block, RawRange | None]]:
     ]
     if known:
         found = [*known, *found[1:]]
-    if probe := drive.echo_probe:  # a reply that may be the adapter's echo proves nothing
+    if probe := drive.echo_probe:  # a possible echo proves too little
         found = [(Block.of(drive, [probe]), None), *found]
     if len(found) >= MOST_PROOFS:
         return [*found[: MOST_PROOFS - 1], found[-1]]
@@ -42,9 +42,9 @@ def proofs(drive: Drive) -> list[tuple[Block, RawRange | None]]:
 
 @lru_cache(maxsize=256)
 def _told_apart(family: Any) -> tuple[tuple[Register[Any], ...], ...]:
-    """Return registers whose requests differ in what their replies show: some of them, and the last one.
+    """Return registers whose replies differ in shape: the first few, and the last one.
 
-    First come those that are polled anyway, and of those the shortest requests.
+    Readings come first, because they are polled anyway, the shortest requests before others.
     """
     readable: list[Register[Any]] = [register for register in family.registers.values() if register.readable]
     readings = [register for register in readable if register.access is Access.READING]
@@ -59,7 +59,7 @@ def _told_apart(family: Any) -> tuple[tuple[Register[Any], ...], ...]:
 
 
 def _shape(first: Register[Any], count: int) -> Hashable:
-    """Return what a reply shows of its request."""
+    """Return the properties of a request that its reply shows."""
     if first.table.carrier is Carrier.LONG:
         return first.table.read, first.address
     if first.table.carrier is Carrier.BIT:

@@ -1,12 +1,12 @@
 """Decide which exchange of a line comes next. Time comes in, in ns.
 
 The line is planned ahead, up to a horizon, so that it never waits for Python. A job with a period
-has slots on its own grid, which never drifts. Of the slots that have begun, the one that ends first
-goes first; where there is time for all of them, those of one kind go together. A slot that is over
-when its turn comes is counted and left out, never made up for in a burst. From then on, until the
+has slots on its own grid, which never drifts. Of the started slots, the one that ends first
+goes first; if there is time for all, those of one kind go together. A slot that is over
+when its turn comes is counted and skipped, never made up for in a burst. From then on, until the
 line has caught up, the job that has waited longest goes first, so that each gets a part. Jobs without
-a period fill what is left, each once in a round; a share of the line is theirs even where nothing is
-left. Drives that stay silent are left to `BackOff`.
+a period take turns in the remaining time, and have a minimum share of the line. `BackOff` handles silent
+drives.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ class Job:
     drive: int
     period_ns: int | None
     duration_ns: int
-    silence_ns: int = 0  # a part of its duration, which passes also while the line has nothing to do
+    silence_ns: int = 0  # the part of its duration that can pass while the line idles
     interval_ns: int = 0  # from the end of an exchange to the next request to its drive
     kind: Hashable = None
     due_ns: int = 0
@@ -65,17 +65,17 @@ class Schedule(Generic[J]):
         self.clear()
 
     def clear(self) -> None:
-        """Forget all jobs, and what is known of their drives."""
+        """Forget all jobs, and their drives' health."""
         self.jobs: list[J] = []
         self.unasked: list[tuple[J, int]] = []  # slots that passed, with the time at which each was due
         self.back_off = BackOff(self._begin_rest)
         self._health: dict[int, Health] = self.back_off.health
         self._waiting: list[tuple[int, int, J]] = []  # a heap of (due, number, job)
-        self._begun: list[J] = []  # their slot has begun
+        self._begun: list[J] = []  # their slot has started
         self._ready: dict[int, int] = {}  # of drives with an interval: when each may be asked again
         self._held: list[J] = []  # jobs without a period whose turn came before their drive was ready
         self._round: list[J] = []  # jobs without a period
-        self._next = 0  # of them
+        self._next = 0  # index in the round
         self._owed_ns = -CREDIT_NS  # to them
         self._is_late = False  # a slot had to be left out since the line last had done all that was due
         self._kind: Hashable = None  # of the job that was taken last
@@ -94,7 +94,7 @@ class Schedule(Generic[J]):
             self._await(job)
 
     def remove(self, job: J) -> None:
-        """Remove a job; what is queued of it is still carried out."""
+        """Remove a job; its queued exchanges are still carried out."""
         self.jobs.remove(job)
         self._held = [held for held in self._held if held is not job]
         if job.interval_ns and all(other.drive != job.drive for other in self.jobs):
@@ -119,7 +119,7 @@ class Schedule(Generic[J]):
             self.remove(job)
 
     def put_in_order(self, drives: Sequence[int]) -> None:
-        """Put the jobs of the round in the order of their drives here, and begin it anew."""
+        """Sort the round by the order of its drives here, and restart it."""
         places = {drive: place for place, drive in enumerate(drives)}
         self._round.sort(key=lambda job: places[job.drive])
         self._next = 0
@@ -130,7 +130,7 @@ class Schedule(Generic[J]):
     # ---- the next jobs ----
 
     def cycle(self, now_ns: int) -> list[J]:
-        """Return the round where nothing else is to be done: there are no slots, and all drives answer."""
+        """Return the round if it is all there is to do: no slots, and all drives answer; else []."""
         if self.back_off.may_sleep(now_ns) or self._waiting or self._begun or self._ready:
             return []
         return self._round[self._next :] + self._round[: self._next]
@@ -165,13 +165,13 @@ class Schedule(Generic[J]):
         return not self._ready or at_ns >= self._ready.get(job.drive, 0)
 
     def _next_ns(self, at_ns: int) -> int:
-        """Return when there may be something to do again, after a time at which there is nothing."""
+        """Return the next time at which a job may be due or ready."""
         times = [max(at_ns, self._waiting[0][0])] if self._waiting else []
         times += [ready_ns for ready_ns in self._ready.values() if ready_ns > at_ns]
         return min(times, default=NEVER_NS)
 
     def _begin_slots(self, by_ns: int) -> None:
-        """Begin all slots that are due; those of drives at rest pass."""
+        """Start all slots that are due; skip those of drives at rest."""
         while self._waiting and self._waiting[0][0] <= by_ns:
             job = heapq.heappop(self._waiting)[2]
             if self.back_off.is_asleep(job.drive, by_ns):
@@ -185,7 +185,7 @@ class Schedule(Generic[J]):
         self._await(job)
 
     def _due(self, at_ns: int) -> J | None:
-        """Return the job whose slot ends first, or one of the last kind where all can wait for it."""
+        """Return the job whose slot ends first, or one of the last kind if all others can wait."""
         if self.back_off.may_sleep(at_ns):
             for job in [job for job in self._begun if self.back_off.is_asleep(job.drive, at_ns)]:
                 self._begun.remove(job)
@@ -234,7 +234,7 @@ class Schedule(Generic[J]):
         return not self.back_off.is_asleep(job.drive, at_ns) and not self._health[job.drive].is_pending
 
     def _take(self, job: J, at_ns: int) -> Turn[J]:
-        """Take a job for its present slot; slots of it that are over are counted and left out."""
+        """Take a job for its present slot; count and skip its slots that are over."""
         health = self._health[job.drive]
         health.is_pending = health.is_new
         ready_ns = self._ready.get(job.drive, 0)
@@ -256,7 +256,7 @@ class Schedule(Generic[J]):
         return max(job.duration_ns, health.cost_ns) if health.rest_ns else job.duration_ns
 
     def _put_off(self) -> None:
-        """Put back slots of drives whose first reply is waited for: some of them begin later than now."""
+        """Put back slots of drives whose first reply is pending: their slots may start later than now."""
         for job in [job for job in self._begun if self._health[job.drive].is_pending]:
             self._begun.remove(job)
             self._await(job)
@@ -280,11 +280,11 @@ class Schedule(Generic[J]):
     # ---- slots without a request ----
 
     def _begin_rest(self, drive: int, now_ns: int) -> None:
-        """Note one row for each job without slots: it says why there is no value."""
+        """Note one row for each job without slots, which will say why it has no value."""
         self.unasked += [(job, now_ns) for job in self._round if job.drive == drive]
 
     def pass_slots(self, now_ns: int) -> list[tuple[J, int]]:
-        """Let every slot that begins by now pass; return each with the time at which it was due."""
+        """Skip every slot that starts by now; return each with its due time."""
         while self._begun:
             self._await(self._begun.pop())
         passed = []
@@ -296,5 +296,5 @@ class Schedule(Generic[J]):
         return passed
 
     def pass_all(self, now_ns: int) -> list[tuple[J, int]]:
-        """Let pass what `pass_slots` does, and one slot now of each job without a period."""
+        """Skip all due slots, and one slot of each job without a period; return them."""
         return [*((job, now_ns) for job in self._round), *self.pass_slots(now_ns)]

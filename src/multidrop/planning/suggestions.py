@@ -27,16 +27,16 @@ _NAMES = {
 }
 
 
-SLOWER = 1.05  # by so much the periods grow
+SLOWER = 1.05  # factor between attempts
 
 
 @dataclass(frozen=True)
 class Suggestions:
-    """Three changes, each of which makes the line fit by itself; None where it cannot."""
+    """Three changes that each make the line fit; None if it cannot."""
 
     every: tuple[tuple[float, float], ...]  # periods in s that are wanted, and what fits instead
     baudrate: tuple[int, tuple[Drive, ...]] | None  # and the drives that are to have it
-    registers: int | None  # at most so many of each drive that does not fit
+    registers: int | None  # register limit per overloaded drive
 
     def __str__(self) -> str:
         pairs = (f'every = "{duration_text(new)}" instead of {duration_text(old)}' for old, new in self.every)
@@ -56,7 +56,7 @@ def duration_text(seconds: float) -> str:
 
 
 def suggest(exchanges: Sequence[Planned], prediction: Prediction, switching: float = 0.0) -> Suggestions:
-    """Return what would make these exchanges fit, of which `prediction` says that they do not.
+    """Return changes that would make exchanges fit that do not fit by `prediction`.
 
     `switching` is as for `predict`.
     """
@@ -171,7 +171,7 @@ class ReadingGain:
 
 
 def reading_gain(drive: Drive, wanted: Iterable[tuple[Register[Any], float | None]]) -> ReadingGain | None:
-    """Return what stated gaps would save where the class states none; None where that is next to nothing."""
+    """Return the gain of stating readable gaps if the class states none; None if it is negligible."""
     wanted = list(wanted)
     before = planned(drive, wanted)
     unstated = {

@@ -1,4 +1,4 @@
-"""Names of drives and lines: which are reserved, and which one is meant however its letters are spelt."""
+"""Names of drives and lines: reserved names, and equal names in different Unicode forms."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping
 from typing import Final
 from unicodedata import normalize
 
-# Names that would be taken for a topic, path, file or key of ours, and what each of them is.
+# Names that would collide with a topic, path, file or key, and what each is used for.
 RESERVED_NAMES: Final[Mapping[str, str]] = {
     "gateway": "the MQTT topic PREFIX/gateway",
     "stop": "the MQTT topic PREFIX/stop, which stops all drives",
@@ -30,9 +30,9 @@ def check_drive_name(name: str) -> bool:
 
 
 def drive_meant(name: str, names: Iterable[str]) -> str:
-    """Return which of the names is meant: this one, else the only one of the same normal form; else `name`.
+    """Return this name if it is listed, else the only listed name of the same normal form, else `name`.
 
-    For stops and looks alone: what moves a motor names it exactly.
+    For stops and reads only: a command that moves a motor must name it exactly.
     """
     names = [*names]
     if name in names:

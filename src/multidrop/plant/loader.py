@@ -23,7 +23,7 @@ from multidrop.toml_check import Key, TomlPlace, duration_of, read_document
 class PlantError(ValueError):
     """All errors of a plant file; `mistakes` has a sentence for each: its place, and what would be right.
 
-    `rest` is the plant without its lines, where they have mistakes and the file is TOML.
+    `rest` is the plant without its lines, if the file is valid TOML.
     """
 
     def __init__(self, mistakes: tuple[str, ...], rest: Plant | None = None) -> None:
@@ -48,7 +48,7 @@ def load_plant(path: Path | str) -> Plant:
 
 
 def port_or_address(name: Path | str) -> str:
-    """Return a sentence for a URL or a device where a plant file is wanted; "" for what may be a file."""
+    """Return an error sentence for a URL or a device given as a plant file; "" for a possible file."""
     url = _URL.match(str(name))
     if url is None and not str(name).startswith("/dev/tty"):
         return ""
@@ -194,7 +194,7 @@ def _model(table: Any, place: TomlPlace) -> type[Drive] | None:
 
 
 def _option_keys(model: type[Drive] | None) -> dict[str, Key]:
-    """Return keys for the family's options, or for those of all families where it is not known."""
+    """Return keys for the family's options, or for those of all families if it is unknown."""
     families = [model] if model else list(MODELS.values())
     return {
         name: Key((int, float), f"{name} = {option.span[1]:g}")

@@ -1,4 +1,4 @@
-"""Plant: the drives on each line, and what is polled of them. Data alone."""
+"""Plant: the lines, their drives and the polled registers, as plain data."""
 
 from __future__ import annotations
 
@@ -104,7 +104,7 @@ class PlantLine:
     echo: Echo = Echo.AUTO
     ids: TransactionIds = TransactionIds.MATCH
     rs485: RS485 = RS485.OFF
-    settle: float = 0.0  # s after the port is opened, in which nothing is sent
+    settle: float = 0.0  # s of silence after the port is opened
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "drives", tuple(self.drives))
@@ -164,7 +164,7 @@ class Plant:
         return replace(self, lines=lines)
 
     def metadata(self) -> dict[str, Any]:
-        """Return what a reader of a recording must know that its rows do not say."""
+        """Return the metadata of a recording: versions, drives, registers, predictions."""
         return _metadata(self)
 
 
@@ -227,7 +227,7 @@ def _of_register(register: Register[Any]) -> dict[str, Any]:
 def check_listed(plant: Plant, key: str, entry: object) -> bool:
     """Check an entry of a list: a register that can be written, or a verb that its drive has.
 
-    `stop` is no verb of a list: it needs none. Returns True. Raises ValueError.
+    `stop` is never listed: it is always allowed. Returns True. Raises ValueError.
     """
     name, dot, rest = entry.rpartition(".") if isinstance(entry, str) else ("", "", "")
     if not dot:

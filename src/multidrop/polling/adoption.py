@@ -1,7 +1,7 @@
 """Adoption: how the lines of a poller become those of another plant, while they are polled.
 
-All that can be known to be wrong is found before anything changes. Then what goes leaves, the lines that stay
-change, and ports are opened. A line that stays is not touched where nothing of it changes.
+All mistakes are found before anything changes. Then lines and drives leave, staying lines change, and new
+ports are opened. Lines without changes are not touched.
 """
 
 from __future__ import annotations
@@ -24,16 +24,16 @@ GONE = "its line is polled no more"
 
 @dataclass(frozen=True)
 class Staying:
-    """A line whose port stays open, and what it is to be."""
+    """A line whose port stays open, and its new description."""
 
     line: PolledLine
     wanted: PlantLine
     drives: DriveChanges
 
     def await_stops(self) -> None:
-        """End what moves the drives that are not wanted any more, and wait for their stops.
+        """End all motion commands of the leaving drives, and wait for their stops.
 
-        Those whose address nobody takes are stopped first, where the bus has `stop_on_exit`. At an address
+        With `stop_on_exit`, drives whose address stays free are stopped first. At an address
         that is declared as another drive now, the old family's stop may mean something else. All stops of
         theirs are waited for before one leaves: else it could not be stopped while another's motor runs out.
         """
@@ -42,7 +42,7 @@ class Staying:
         self.line.bus.part_with(leaving, [drive for drive in leaving if drive.address not in taken])
 
     def let_leave(self, names: Collection[str]) -> None:
-        """Let them go; none is asked yet whose name is among these."""
+        """Remove the leaving drives; wait for the last exchange of those whose name is among `names`."""
         leaving = [polled.drive for polled in self.drives.leaving]
         for drive in leaving:
             self.line.remove(drive)
@@ -58,7 +58,7 @@ class Staying:
 
     @property
     def moves(self) -> bool:
-        """Say whether drives leave or join."""
+        """True if drives leave or join."""
         return bool(self.drives.leaving or self.drives.joining)
 
     def is_free(self, leaving: Mapping[str, Staying]) -> bool:
@@ -66,7 +66,7 @@ class Staying:
         return all(leaving.get(polled.drive.name, self) is self for polled in self.drives.joining)
 
     def take_in(self) -> None:
-        """Poll what is new. Raises LineError where the port cannot have a drive's settings."""
+        """Poll the new drives and registers. Raises LineError if the port cannot have a drive's settings."""
         self.line.declared, self.line.switching = self.wanted, self.wanted.switching
         for polled in self.drives.repolled:
             self.line.set_polls(polled)
@@ -78,14 +78,14 @@ class Staying:
 
 @dataclass(frozen=True)
 class Coming:
-    """A line that is to be opened, and the one that has its port now, if any."""
+    """A line to be opened, and the line that has its port now, or None."""
 
     wanted: PlantLine
     before: PolledLine | None
 
 
 class Adoption:
-    """A plant that a poller's lines are to become. Raises ValueError where that cannot be."""
+    """The change of a poller's lines to another plant. Raises ValueError for a mistake in that plant."""
 
     def __init__(self, lines: LineSet, plant: Plant) -> None:
         self._lines = lines
@@ -96,7 +96,7 @@ class Adoption:
         self._check()
 
     def _pair(self) -> None:
-        """Find the line of each that is wanted: by its name, or else by its port, which has a new name."""
+        """Match each wanted line with a present one: by its name, or else by its port."""
         named = {line.name: line for line in self._lines}
         found = {
             wanted.name: line
@@ -144,7 +144,7 @@ class Adoption:
     # ---- carrying it out ----
 
     def carry_out(self, *, start: bool) -> dict[str, LineError]:
-        """Change the lines; by name, those whose port is not there, and why."""
+        """Change the lines; return the failures of absent ports, by line name."""
         self._let_go()
         failures = self._change() | self._open(start)
         self._lines.put_in_order([line.name for line in self._plant.lines])
@@ -187,7 +187,7 @@ class Adoption:
         return failures
 
     def _open(self, start: bool) -> dict[str, LineError]:
-        """Open the lines that are new; those whose port is not there wait for it, as lost ones do."""
+        """Open the new lines; those with an absent port wait for it like lost ones."""
         failures: dict[str, LineError] = {}
         for place, bus in self._lines.open([coming.wanted for coming in self._coming]):
             coming = self._coming[place]
@@ -203,7 +203,7 @@ class Adoption:
         return failures
 
     def _put(self, coming: Coming, bus: Bus, start: bool) -> None:
-        """Poll a line on this bus. Raises LineError where the port cannot have a drive's settings."""
+        """Poll a line on this bus. Raises LineError if the port cannot have a drive's settings."""
         if coming.before:
             bus.remember(coming.before.bus)
         line = self._lines.add(replace(coming.wanted, drives=()), bus)
@@ -220,13 +220,13 @@ def _is_free(drive: Drive, buses: set[Bus]) -> bool:
 
 
 def _can_become(line: PolledLine, wanted: PlantLine) -> bool:
-    """Return True where a line can be what is wanted without its port being opened anew."""
+    """Return True if a line can change without reopening its port."""
     settings = line.bus.line.only_settings
     wanted_settings = {(at.baudrate, at.format) for at in (polled.drive.settings for polled in wanted.drives)}
     return has_same_port(line.declared, wanted) and (settings is None or wanted_settings <= {settings})
 
 
 def _is_another(drive: Drive, wanted: PlantLine) -> bool:
-    """Return True where the drive's address is declared as another family's now."""
+    """Return True if another family is declared at the drive's address."""
     others = [polled.drive for polled in wanted.drives if polled.drive.address == drive.address]
     return any(type(other) is not type(drive) for other in others)

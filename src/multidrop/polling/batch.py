@@ -1,7 +1,7 @@
 """Rows of samples and misses: columns for Arrow's users, and single rows for people.
 
 `batch.to_pandas()`, `batch.to_polars()` and `batch.wide()` make tables. Any library that speaks the Arrow
-PyCapsule interface takes a batch as it is, and none of them is needed here: `pyarrow.record_batch(batch)`,
+PyCapsule interface takes a batch as it is, though multidrop needs none: `pyarrow.record_batch(batch)`,
 `duckdb.sql("from batch")`. `pandas.DataFrame(batch)` does not know the interface, and would go through the
 rows with times as plain integers: that is refused. For NumPy, with NaN for every miss:
 `nanoarrow.Array(batch).child(5).to_pysequence(handle_nulls=nanoarrow.nulls_as_sentinel())`.
@@ -60,8 +60,8 @@ def shown_span(rows: Sequence[Row]) -> str:
 class BatchColumns(NamedTuple):
     """Columns of a batch as they lie in memory: read-only one-dimensional memoryviews, without a copy.
 
-    All have a number for each row (shape `(len(batch),)`), but for `valid`. A view, and what is made of it
-    without a copy, such as `numpy.asarray(view)`, stays as it is for as long as it is held, also when the
+    All have a number for each row (shape `(len(batch),)`), but for `valid`. A view, and any object made
+    from it without a copy, such as `numpy.asarray(view)`, stays as it is while it is held, also when the
     batch is gone and the poller closed: only then is its memory used again. The names are tuples; a code is
     the place of its name in them. A name's code stays the same for all batches of one poller, in which later
     batches may know more names.
@@ -81,7 +81,7 @@ class BatchColumns(NamedTuple):
 
 
 class Rows(ArrowTable):
-    """Rows, wherever they are kept: their number, each one, Arrow's capsules, and tables of them."""
+    """Rows as a sequence, as Arrow capsules, and as tables of other libraries."""
 
     @abstractmethod
     def __len__(self) -> int: ...
@@ -96,8 +96,8 @@ class Rows(ArrowTable):
     def wide(self, *columns: str) -> WideRows:
         """Return a column for each `drive.register`, or for these alone, and a row for each time.
 
-        Registers that were asked in one request share a row; nothing else is joined, and a miss is null, as
-        `WideRows` says. Raises ValueError for a column that cannot be there.
+        The registers of one request share a row, and a miss is null: see `WideRows`. Raises ValueError for
+        a column that cannot be there.
         """
         return WideRows(self, columns, self._may_have() if columns else ())
 
@@ -143,9 +143,9 @@ class Batch(Rows):
             yield Row(time, sent, sample[0], drives[drive], registers[register], sample[1], STATUSES[status])
 
     def columns(self) -> BatchColumns:
-        """Return the columns as they lie in memory, and the names that their codes stand for.
+        """Return the columns as they lie in memory, and the names of their codes.
 
-        Nothing is copied. For programs that go through many rows: one costs a fraction of what a Row costs.
+        Without a copy: much cheaper than a Row for programs that go through many rows.
         """
         time, sent, uncertainty, drive, register, value, status, valid = (
             self._columns.array(name).toreadonly()
@@ -159,7 +159,7 @@ class Batch(Rows):
         return Batch(PickedColumns(self._columns, places), self._drives, self._registers)
 
     def parts(self) -> tuple[Columns, Names, Names]:
-        """Return the core's columns, and the names of drives and registers, for what copies them."""
+        """Return the core's columns, and the names of drives and registers."""
         return self._columns, self._drives, self._registers
 
     def _may_have(self) -> Collection[str]:
@@ -201,7 +201,7 @@ class PickedColumns(Columns):
 
 
 def bitmap_of(statuses: memoryview[Any]) -> memoryview[Any]:
-    """Return a bit for each row, the least significant first: 1 where its status is 0."""
+    """Return a bit for each row, the least significant first: 1 if its status is 0."""
     bits = "".join("0" if code else "1" for code in reversed(statuses))
     return memoryview(int(bits or "0", 2).to_bytes((len(statuses) + 7) // 8, "little"))
 
@@ -227,7 +227,7 @@ def schema() -> Any:
 
 
 def assemble(rows: int, *columns: tuple[Any, ...]) -> Any:
-    """Return an array of the schema from each column's buffers, in Arrow's layout; nothing is copied.
+    """Return an array of the schema from each column's buffers in Arrow's layout, without copying.
 
     Raises ValueError or RuntimeError when the buffers are not those of so many rows.
     """
@@ -251,7 +251,7 @@ class GatheredRows(Columns):
         return self._rows
 
     def add(self, batch: Batch) -> bool:
-        """Copy the rows; False for those of another poller, whose codes stand for other names."""
+        """Copy the rows; return False for rows of another poller, whose codes mean other names."""
         columns, drives, registers = batch.parts()
         if drives is not self._drives or registers is not self._registers:
             return False
@@ -274,7 +274,7 @@ class GatheredRows(Columns):
 
 
 def gather(gathered: list[GatheredRows], batch: Batch) -> None:
-    """Copy the rows to the last of these, or to a new one where its codes are others."""
+    """Append the rows to the last element, or to a new one if their codes differ."""
     if not gathered or not gathered[-1].add(batch):
         _, drives, registers = batch.parts()
         gathered.append(GatheredRows(drives, registers))

@@ -1,4 +1,4 @@
-"""Compare plants: whether a plant can be polled as it is written, and what stays of it in another."""
+"""Compare plants: check a plant built by a program, and find the changes to a line's drives."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ class DriveChanges(NamedTuple):
 
     leaving: list[PolledDrive]
     joining: list[PolledDrive]
-    repolled: list[PolledDrive]  # drives that stay, of which other registers are polled, or at other rates
+    repolled: list[PolledDrive]  # staying drives with changed registers or rates
 
 
 def check_plant(plant: Plant, *, is_free: Callable[[Drive], bool]) -> None:
-    """Raise PlantError with all mistakes of a plant that a program may have made.
+    """Raise PlantError with all mistakes of a plant, which a program may have built.
 
-    `is_free` returns False for a drive that somebody else has on a bus. Drives take their ports' framing.
+    `is_free` returns False for a drive that is on another bus. Drives take their ports' framing.
     """
     found: list[str] = []
     names: dict[tuple[str, object], str] = {}
@@ -71,7 +71,7 @@ def _mistakes(place: str, check: Callable[[], object]) -> list[str]:
 
 
 def has_same_port(line: PlantLine, other: PlantLine) -> bool:
-    """Return True where a port that is open for one serves the other."""
+    """Return True if both lines can use the same open port."""
     facts, others = ((each.port, each.echo, each.ids, each.rs485, each.settle) for each in (line, other))
     return facts == others
 
@@ -97,7 +97,7 @@ def _description(drive: Drive) -> tuple[object, ...]:
 
 
 def drive_changes(present: Iterable[PolledDrive], wanted: Iterable[PolledDrive]) -> DriveChanges:
-    """Return what has to be done to a line's drives; those that stay are the same objects as before."""
+    """Return the changes to a line's drives; staying drives remain the same objects."""
     left = list(present)
     changes = DriveChanges(left, [], [])
     for polled in wanted:

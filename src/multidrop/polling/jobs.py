@@ -15,18 +15,18 @@ from multidrop.planning.schedule import Job
 from multidrop.plant.model import PolledDrive
 from multidrop.transport.prepared import make_read
 
-MOST_NAMES = 1 << 16  # that a column of a batch can number
+MOST_NAMES = 1 << 16  # limit of the uint16 name codes
 
 
 class RowNames:
-    """Names of drives and registers, of which rows hold the numbers."""
+    """Names of drives and registers; rows hold their numbers."""
 
     def __init__(self) -> None:
         self.drives = Names()
         self.registers = Names()
 
     def check_room(self, drives: Iterable[PolledDrive]) -> None:
-        """Raise ValueError where there are no numbers left for the names of these drives or registers."""
+        """Raise ValueError if the names of these drives or registers exceed the number codes."""
         wanted = list(drives)
         of_drives = {*self.drives.listed, *(polled.drive.name for polled in wanted)}
         of_registers = {*self.registers.listed, *(poll.register.name for d in wanted for poll in d.polls)}
@@ -50,7 +50,7 @@ class RowNames:
 
 @dataclass(eq=False, kw_only=True)
 class PolledJob(Job):
-    """A job of the schedule, with the exchange that does it and the rows that come of it."""
+    """A job of the schedule, with its exchange and the layout of its rows."""
 
     owner: Drive
     block: Block
@@ -80,7 +80,7 @@ class JobMaker:
         self._bus = bus
         self._names = names
         self._made: dict[tuple[Drive, Block, int | None], PolledJob] = {}
-        self._rows: dict[tuple[Drive, Block], RowLayout] = {}  # what was refused stays known at any rate
+        self._rows: dict[tuple[Drive, Block], RowLayout] = {}  # shared by rates: a refusal stays known
         self._skipped = 0  # of jobs that were forgotten
 
     def plan(self, polled: PolledDrive, delay: float) -> PlannedJobs:
@@ -106,7 +106,7 @@ class JobMaker:
     def forget(self, jobs: Iterable[PolledJob]) -> None:
         """Keep jobs with a period no longer: rates come and go without number.
 
-        Those without one are kept: the core may hold what it repeats until the port is closed.
+        Jobs without a period are kept: the core may repeat them until the port is closed.
         """
         for job in jobs:
             key = job.owner, job.block, job.period_ns
@@ -115,7 +115,7 @@ class JobMaker:
                 self._skipped += job.skipped
 
     def forget_drive(self, drive: Drive) -> None:
-        """Keep nothing of a drive that left and does not come back."""
+        """Forget the jobs of a drive that left for good."""
         for key in [key for key in self._made if key[0] is drive]:
             self._skipped += self._made.pop(key).skipped
         self._rows = {key: rows for key, rows in self._rows.items() if key[0] is not drive}

@@ -1,6 +1,6 @@
-"""LineDrives: the drives of one line, the jobs that poll them, and what is learnt of them.
+"""LineDrives: the drives of one line, their jobs, and their measured delays.
 
-Blocks are planned anew when a drive's response delay turns out to be another than its document's.
+Blocks are planned again when a drive's measured response delay differs from its document's.
 """
 
 from __future__ import annotations
@@ -30,19 +30,19 @@ class LineDrives:
         self._refusals = refusals
         self._planned: dict[PolledDrive, PlannedJobs] = {}  # also of drives that were removed
         self._present: dict[Drive, PolledDrive] = {}  # of drives that are here
-        self._since_ns: dict[Drive, int] = {}  # of these: they are polled in this way no longer
+        self._since_ns: dict[Drive, int] = {}  # when the present way of polling each started
         self._gone: dict[int, Peer] = {}  # of drives that left, by address: it may be asked yet
         self._polled: list[tuple[Drive, Peer]] = []
         self._observed: list[tuple[int, int, bool]] = []  # of each: failures, late until, has answered
 
     @property
     def polled(self) -> tuple[PolledDrive, ...]:
-        """Drives that are here, with what is polled of each now."""
+        """The present drives with their polled registers."""
         return tuple(self._present.values())
 
     @property
     def since_ns(self) -> dict[str, int]:
-        """By name, the time since which each drive that is here is polled as it is now."""
+        """By name, the time in ns since which each present drive is polled as it is now."""
         return {drive.name: since_ns for drive, since_ns in self._since_ns.copy().items()}
 
     def polled_of(self, drive: Drive) -> PolledDrive:
@@ -77,7 +77,7 @@ class LineDrives:
             self.schedule.back_off.meet(drive.address)
 
     def begin_anew(self, now_ns: int) -> None:
-        """Schedule the jobs of all drives as at the beginning, after a failure amid their planning."""
+        """Reschedule the jobs of all drives after a failure during planning."""
         self.schedule.clear()
         self._observed = []
         for drive in self._present:
@@ -89,7 +89,7 @@ class LineDrives:
         return [(job, job.due_ns) for job in self._jobs(drive) if job.period_ns]
 
     def remove(self, drive: Drive) -> None:
-        """Schedule nothing of a drive any more; what is queued of it is still asked."""
+        """Remove a drive's jobs; its queued exchanges are still carried out."""
         for job in self._jobs(drive):
             self.schedule.remove(job)
         self.schedule.back_off.forget(drive.address)
@@ -100,7 +100,7 @@ class LineDrives:
         self._gone[drive.address] = self._bus.peer(drive)
 
     def forget(self, drive: Drive) -> None:
-        """Keep nothing of a drive that was removed and does not come back, but what its answers taught."""
+        """Forget the jobs of a drive that was removed for good, but keep its peer."""
         self._planned = {each: jobs for each, jobs in self._planned.items() if each.drive is not drive}
         self._maker.forget_drive(drive)
 
@@ -110,7 +110,7 @@ class LineDrives:
     # ---- other registers or rates ----
 
     def set_polls(self, after: PolledDrive, *, is_started: bool) -> bool:
-        """Poll other registers of a drive that is here, or at other rates; False where nothing changes."""
+        """Change a drive's polled registers or rates; return False if they are the same."""
         drive = after.drive
         before = self._present[drive]
         if after == before:
@@ -128,9 +128,9 @@ class LineDrives:
         return True
 
     def _change_jobs(self, drive: Drive, wanted: list[PolledJob], now_ns: int) -> None:
-        """Put these jobs in the place of those that a drive has; what is queued of it is still asked.
+        """Replace a drive's jobs by these; its queued exchanges are still carried out.
 
-        Refused registers are asked as all others once more.
+        Refused registers are polled normally again.
         """
         present = self._jobs(drive)
         dues = {job.period_ns: job.due_ns for job in sorted(present, key=_due, reverse=True)}  # the first
@@ -152,7 +152,7 @@ class LineDrives:
     # ---- what their answers show ----
 
     def observe(self, now_ns: int) -> None:
-        """Tell the schedule which drives are silent, and whose answers may come late."""
+        """Report silent drives and late replies to the schedule."""
         seen = [(peer.failures, peer.late_until_ns, peer.has_answered) for _, peer in self._polled]
         if seen == self._observed:
             return
@@ -175,14 +175,14 @@ class LineDrives:
         return delays
 
     def plan_anew(self, delays: Mapping[Drive, float], now_ns: int) -> None:
-        """Plan the drives anew whose measured delays no longer suit their plans."""
+        """Plan drives again whose measured delays no longer suit their plans."""
         for polled in self._present.values():
             planned, delay = self._planned[polled], delays.get(polled.drive)
             if delay and not planned.plan.suits(delay, MARGIN):
                 self._plan_anew(polled, planned, delay, now_ns)
 
     def _plan_anew(self, polled: PolledDrive, before: PlannedJobs, delay: float, now_ns: int) -> None:
-        """Replace a drive's jobs by better ones, unless refused registers are asked in another way."""
+        """Replace a drive's jobs by better ones, unless blocks are split because of refusals."""
         if not set(before.jobs) <= set(self.schedule.jobs):
             return
         anew = self._maker.plan(polled, delay)

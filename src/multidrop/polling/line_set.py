@@ -23,9 +23,9 @@ from multidrop.transport import clock
 from multidrop.transport.open_port import check_port
 
 OPENING = 32  # ports at a time: one that takes its time holds up no other
-ENDING_NS = 1_000_000_000  # for which exchanges under way are waited for
-NOBODY = 0  # the number that no line has
-MOST_LINES = (1 << 16) - 1  # numbers that a row queue calls
+ENDING_NS = 1_000_000_000  # how long to wait for in-flight exchanges
+NOBODY = 0  # reserved: no line's number
+MOST_LINES = (1 << 16) - 1  # limit of a row queue's line numbers
 
 
 class LineSet:
@@ -44,9 +44,9 @@ class LineSet:
         self._audit = audit
         self._mastership = mastership
         self.stops_on_exit = False  # of lines that come, too
-        self._lines: tuple[PolledLine, ...] = ()  # another one when they change: others go through them
+        self._lines: tuple[PolledLine, ...] = ()  # replaced, never mutated: readers iterate without a lock
         self._numbered: dict[int, PolledLine] = {}
-        self._free: list[int] = []  # numbers that lines had
+        self._free: list[int] = []  # numbers numbers of removed lines
 
     def __iter__(self) -> Iterator[PolledLine]:
         return iter(self._lines)
@@ -55,11 +55,11 @@ class LineSet:
         return len(self._lines)
 
     def called(self, numbers: Iterable[int]) -> list[PolledLine]:
-        """Return the lines of these numbers; one that has gone may be called yet."""
+        """Return the lines with these numbers; ignore numbers of removed lines."""
         return [line for number in numbers if (line := self._numbered.get(number))]
 
     def find(self, name: str) -> PolledLine:
-        """Return the line of this name. Raises ValueError where there is none."""
+        """Return the line of this name. Raises ValueError if there is none."""
         for line in self._lines:
             if line.name == name:
                 return line
@@ -67,7 +67,7 @@ class LineSet:
         raise ValueError(f"there is no line {name!r}; there are {names or 'none'}")
 
     def find_drive(self, drive: Drive | str) -> tuple[PolledLine, Drive]:
-        """Return a drive, by itself or by its name, and its line; ValueError where it is not polled."""
+        """Return a drive, given itself or its name, and its line. Raises ValueError if it is not polled."""
         drives = {each.drive.name: (line, each.drive) for line in self._lines for each in line.polled}
         name = drive if isinstance(drive, str) else drive.name
         line, known = drives.get(name, (None, None))
@@ -99,10 +99,10 @@ class LineSet:
             stack.pop_all()
 
     def open(self, declared: Sequence[PlantLine]) -> Iterator[tuple[int, Bus | OSError]]:
-        """Open the ports of these lines side by side.
+        """Open these lines' ports concurrently.
 
-        Yields each line's place here as soon as it is done, with the bus, or why there is none. Where it does
-        not go to the end, those that it has not given are closed.
+        Yields each line's index as soon as it is done, with its bus or its failure. Buses not yielded because
+        the caller stops early are closed.
         """
         if len(declared) < 2:
             yield from enumerate(map(self._opened, declared))
@@ -121,7 +121,7 @@ class LineSet:
             try:
                 for _ in range(min(OPENING, len(declared))):
                     pool.submit(work)
-            except RuntimeError:  # the system gives no more threads, and may have given none
+            except RuntimeError:  # the thread limit is reached
                 work()
             for _ in declared:
                 place, opened = done.get()
@@ -159,14 +159,14 @@ class LineSet:
         )
 
     def add(self, declared: PlantLine, bus: Bus) -> PolledLine:
-        """Make a line that is not polled yet. Raises ValueError where a drive cannot be on it."""
+        """Add a line, not polled yet. Raises ValueError for a drive that cannot be on it."""
         number = self._free[-1] if self._free else len(self._lines) + 1
         line = PolledLine(declared, number, bus, self._row_queue, self.names)
         if self._free:
             self._free.pop()
         self._numbered[number] = line
         self._lines = (*self._lines, line)
-        if self.stops_on_exit:  # looked at afterwards: a thread that sets it later sees this line
+        if self.stops_on_exit:  # checked last: a thread that sets it later sees this line
             bus.stop_on_exit()
         return line
 
@@ -176,11 +176,11 @@ class LineSet:
         self._lines = tuple(sorted(self._lines, key=lambda line: places[line.name]))
 
     def check_port(self, port: str) -> None:
-        """Raise NoSuchPort for a name that no port of these lines can have."""
+        """Raise NoSuchPort for an impossible port name."""
         check_port(port, self._mastership)
 
     def check_audit(self) -> None:
-        """Raise OSError where the audit log of a line that comes cannot be opened."""
+        """Raise OSError if the audit log cannot be opened."""
         if self._audit:
             AuditLog(self._audit).close()
 
@@ -188,7 +188,7 @@ class LineSet:
 
     @contextmanager
     def tended(self) -> Iterator[None]:
-        """Have stops open lost ports by themselves once this ends, however it ends: nobody else does then."""
+        """Let stops reopen lost ports themselves after this block, because the poller no longer does."""
         try:
             yield
         finally:
@@ -196,12 +196,12 @@ class LineSet:
                 line.bus.tended(False)
 
     def end_polling(self) -> None:
-        """Begin nothing more that is polled; commands are still carried out."""
+        """Stop polling; commands are still carried out."""
         for line in self._lines:
             line.bus.line.end()
 
     def let_go(self, lines: Iterable[PolledLine], why: str) -> None:
-        """End these lines, and have them no more."""
+        """End these lines and remove them."""
         going = set(lines)
         self.end(going, why)
         self._lines = tuple(line for line in self._lines if line not in going)
@@ -210,7 +210,7 @@ class LineSet:
             self._free.append(line.number)
 
     def end(self, lines: Iterable[PolledLine], why: str) -> None:
-        """End what is under way on these lines and close their ports; what waits for one is told `why`."""
+        """End the exchanges of these lines and close their ports; waiting calls fail with `why`."""
         going = list(lines)
         with ExitStack() as stack:
             for line in reversed(going):
@@ -218,14 +218,14 @@ class LineSet:
             self.wind_down(going)
 
     def wind_down(self, lines: Sequence[PolledLine]) -> None:
-        """Begin nothing more on these lines, and wait for what is under way; it may take a second.
+        """Stop polling these lines and wait for exchanges under way, a second at most.
 
         Drives whose bus had `stop_on_exit` are stopped first, and stops under way are waited for; exchanges
         under way for ENDING_NS, and not beyond the end of the mastership: half of its guard later the kernel
         ends a process whose ports are still open.
         """
         for line in lines:
-            line.bus.leave()  # all of them at once
+            line.bus.leave()  # concurrently
         for line in lines:
             line.leave()
         for line in lines:

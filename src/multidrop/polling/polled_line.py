@@ -30,7 +30,7 @@ _log = logging.getLogger("multidrop.polling")
 
 
 class Reopening:
-    """Attempts to open the port of a bus again, one at a time."""
+    """Attempts to open a lost port again, one at a time, in a thread: a slow one delays no other line."""
 
     def __init__(self, bus: Bus) -> None:
         self._bus = bus
@@ -41,7 +41,7 @@ class Reopening:
         return self._thread is not None and self._thread.is_alive()
 
     def begin(self) -> None:
-        """Begin an attempt. Where the system gives no thread a stop opens the port, until there is one."""
+        """Start an attempt. Without a free thread, stops open the port themselves."""
         thread = threading.Thread(target=self._attempt, name="multidrop reopening", daemon=True)
         self._thread = None
         with suppress(RuntimeError, MemoryError):
@@ -66,7 +66,7 @@ class Reopening:
 
 
 def line_summary(seconds: float, peers: Mapping[str, Peer]) -> dict[str, Any]:
-    """Return what came of a line's exchanges in so many seconds, in all and by drive."""
+    """Return the summary of a line's exchanges in `seconds` s, in total and by drive."""
     line = line_statistics(seconds, {name: peer.counters() for name, peer in peers.items()}, None)
     return {
         "seconds": round(seconds, 3),
@@ -95,8 +95,8 @@ def _drive_summary(drive: Statistics, response_delay: float) -> dict[str, Any]:
     }
 
 
-LEARN_NS = 1_000_000_000  # between looks at how long exchanges take
-RELEARN_NS = 2_000_000_000  # the same, where the core repeats the bus cycle
+LEARN_NS = 1_000_000_000  # interval of measuring exchange durations
+RELEARN_NS = 2_000_000_000  # the same, while the core repeats the bus cycle
 REOPEN_NS = 500_000_000  # between attempts to open a port that was lost
 STANDBY_NS = 500_000_000  # between rows of a line that is not polled at present
 RETRY_NS = 500_000_000  # after a failure; doubled by each further one
@@ -107,7 +107,7 @@ _log = logging.getLogger("multidrop.polling")
 
 
 class PolledLine:
-    """A line's bus and what is polled on it; the core calls for attention by `number`.
+    """A line's bus, drives and schedule; the core calls for attention by `number`.
 
     Any thread may add and remove drives; the poller's thread calls `tend`.
     """
@@ -120,9 +120,9 @@ class PolledLine:
         self.switching = declared.switching  # s that a change of settings takes; in the end as measured
         self.started_ns = clock.now_ns()
         self.number = number
-        self._is_left = False  # nobody tends it any more
-        self._ended_ns: int | None = None  # nothing is due any more
-        self._over_ns: int | None = None  # nor under way
+        self._is_left = False  # no longer tended
+        self._ended_ns: int | None = None  # when polling ended
+        self._over_ns: int | None = None  # when the last exchange ended
         self._row_queue = row_queue
         self._schedule: Schedule[PolledJob] = Schedule()
         self._maker = JobMaker(bus, names)
@@ -134,10 +134,10 @@ class PolledLine:
         self._reopening = Reopening(bus)
         self._lost_ns = self._reopen_ns = 0
         self._standby_ns = 0
-        self.failure = ""  # of its polling, lately; "": none
+        self.failure = ""  # of its polling since it was last sound; "": none
         self._failures = 0  # in a row
         self._retry_ns = 0  # after the last one
-        self._is_broken = False  # what is planned may be incomplete
+        self._is_broken = False  # the plan may be incomplete
         self._lock = threading.Lock()  # of all above: drives come and go on any thread
         register_at_fork(self)
         try:
@@ -148,7 +148,7 @@ class PolledLine:
             raise
 
     def forked(self) -> None:
-        """Make a new lock in the child, where nobody tends the line."""
+        """Make a new lock in a forked child."""
         self._lock = threading.Lock()
 
     @property
@@ -159,7 +159,7 @@ class PolledLine:
 
     @property
     def polled(self) -> tuple[PolledDrive, ...]:
-        """Drives that are here, with what is polled of each now."""
+        """The present drives with their polled registers."""
         return self._drives.polled
 
     @property
@@ -169,7 +169,7 @@ class PolledLine:
     def add(self, polled: PolledDrive) -> None:
         """Poll one more drive; one that comes back has the jobs that it had.
 
-        Another that left its address is waited for until it is asked no more: what it owes then is known.
+        Wait first for the last exchange of another drive at its address: its late replies are known then.
         """
         self.await_gone(polled.drive.address)
         settings = polled.drive.settings  # here, as the polling must not wait for a port that is being opened
@@ -186,13 +186,13 @@ class PolledLine:
         self._row_queue.call(self.number)
 
     def await_gone(self, address: int) -> None:
-        """Wait until the drive that left this address is asked no more."""
+        """Wait for the last exchange of the drive that left this address."""
         peer = self._drives.take_gone(address)
         while peer and not self._is_left and self.bus.is_asking(peer):
             clock.sleep(GONE_S)
 
     def remove(self, drive: Drive) -> None:
-        """Poll a drive no more; what is queued of it is still asked."""
+        """Stop polling a drive; its queued exchanges are still carried out."""
         with self._lock:
             now = clock.now_ns()
             self._miss(_over(self._drives.slots(drive), now), Status.POLL_ENDED)
@@ -201,15 +201,15 @@ class PolledLine:
         self._row_queue.call(self.number)
 
     def forget(self, drive: Drive) -> None:
-        """Keep nothing of a drive that was removed and does not come back, but what its answers taught."""
+        """Forget the jobs of a drive that was removed for good, but keep its peer."""
         with self._lock:
             self._drives.forget(drive)
 
     def set_rate(self, drive: Drive, register: Register[Any] | None, every: float | None) -> None:
-        """Read a register of a drive, or all that is polled of it, every so many seconds from now on.
+        """Set the period in s of a polled register, or of all of them with None.
 
-        What stays as it was keeps its slots. A rate that is new to the drive begins with a slot now. Raises
-        ValueError for a register that is not polled.
+        Unchanged registers keep their slots. A new rate starts with a slot now. Raises ValueError for a
+        register that is not polled.
         """
         with self._lock:
             after = self._drives.polled_of(drive).at_rate(register, every)
@@ -236,7 +236,7 @@ class PolledLine:
         self._row_queue.call(self.number)
 
     def is_steady(self, now_ns: int) -> bool:
-        """Return True while nothing is to be done for the line unless the core calls."""
+        """Return True while the line needs attention only when the core calls."""
         return self._queue.is_repeating and now_ns - self._learnt_ns < RELEARN_NS
 
     def is_well(self, now_ns: int) -> bool:
@@ -247,9 +247,9 @@ class PolledLine:
         return is_asked and self.bus.line.may_send
 
     def tend(self, now_ns: int) -> None:
-        """Note the results of what was queued, and queue what comes next.
+        """Note the results of queued exchanges, and queue the next ones.
 
-        Raises nothing: a failure, such as one of a user's own class, is logged, the line's values are rows
+        Never raises: a failure, such as one of a user's own class, is logged, the line's values are rows
         with the status POLLING_FAILED, and polling is tried again later.
         """
         if self._is_left:  # its lock may be held until the port is closed
@@ -340,7 +340,7 @@ class PolledLine:
     # ---- not the master, a port that is lost, and the end ----
 
     def _stand_by(self, now_ns: int, why: Status) -> None:
-        """Queue nothing; meanwhile every value that is due is missed."""
+        """Queue no exchange, and make a miss of every value that is due."""
         if now_ns >= self._standby_ns:
             self._standby_ns = now_ns + STANDBY_NS
             self._miss(self._schedule.pass_all(now_ns), why)
@@ -354,7 +354,7 @@ class PolledLine:
     def _regain(self, now_ns: int) -> None:
         """Open the port again in a thread; until it is back every value that is due is missed.
 
-        At the first attempt nothing is missed yet: a port that is back at once goes on where it was lost.
+        The first attempt makes no misses: a port that is back at once continues in the same slot.
         """
         if now_ns < self._reopen_ns or self._reopening.is_under_way:
             return
@@ -364,13 +364,13 @@ class PolledLine:
         self._reopening.begin()
 
     def leave(self) -> None:
-        """Tend the line no more: what stops its motors opens a lost port again by itself."""
+        """Stop tending the line: from now on stops reopen a lost port themselves."""
         with self._lock:
             self._is_left = True
         self.bus.tended(False)
 
     def end(self) -> bool:
-        """Begin nothing more, and open no port again; True while an exchange is still under way."""
+        """Stop polling and reopening; return True while an exchange is still under way."""
         self._reopening.join()
         self._ended_ns = self._ended_ns or clock.now_ns()
         if port := self.bus.line.queue:
@@ -378,7 +378,7 @@ class PolledLine:
         return self.bus.line.end()
 
     def close(self, why: str) -> None:
-        """Close the bus; every slot that is over by now has a row. Who uses the port later is told `why`."""
+        """Close the bus after making rows of all slots that are over; later calls fail with `why`."""
         self.bus.line.why_closing = why
         with self._lock:
             try:
@@ -404,7 +404,7 @@ class PolledLine:
     # ---- how it went ----
 
     def summary(self) -> dict[str, Any]:
-        """Return what came of the line and of each drive since it was started, as plain numbers."""
+        """Return the summary of the line and its drives since the start, as plain numbers."""
         with self._lock:
             seconds = max(((self._over_ns or clock.now_ns()) - self.started_ns) / 1e9, 1e-9)
             line, peers = self.bus.line, {drive.name: peer for drive, peer in self.bus.peers.items()}
@@ -418,5 +418,5 @@ class PolledLine:
 
 
 def _over(slots: list[Slot], ended_ns: int) -> list[Slot]:
-    """Return the slots that are over when polling ends: in one that lasts longer nothing was missed."""
+    """Return the slots that end by `ended_ns`: a longer one has missed no value yet."""
     return [(job, due_ns) for job, due_ns in slots if due_ns + (job.period_ns or 0) <= ended_ns]

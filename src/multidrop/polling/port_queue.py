@@ -26,7 +26,7 @@ class PortQueue:
         self._done = 0  # exchanges on it, when they were counted last
         self._queued: deque[Turn[PolledJob]] = deque()  # that the core has not carried out yet
         self._ahead_ns = 0  # that these will take
-        self._newest: Turn[PolledJob] | None = None  # of those that the core has carried out
+        self._newest: Turn[PolledJob] | None = None  # the last one carried out
         self._cycle: list[PolledJob] = []  # that the core repeats
 
     @property
@@ -34,12 +34,12 @@ class PortQueue:
         return bool(self._cycle)
 
     def move_to(self, port: Port) -> None:
-        """Go on on a port on which nothing is queued now."""
+        """Use another port, whose queue is empty."""
         self.port, self._done = port, port.done
 
     def conclude(self, port: Port) -> None:
         """Tell the schedule which exchanges were carried out."""
-        if port is not self.port:  # it was opened since: nothing is queued on it
+        if port is not self.port:  # reopened since: its queue is empty
             return
         done = port.done
         for _ in range((done - self._done) & 0xFFFF_FFFF):
@@ -50,7 +50,7 @@ class PortQueue:
         self._done = done
 
     def keep_busy(self, port: Port, now_ns: int) -> None:
-        """Have the core repeat the bus cycle, or else queue what comes next."""
+        """Let the core repeat the bus cycle, or else queue the next exchanges."""
         cycle = self._schedule.cycle(now_ns)
         if cycle != self._cycle or port.repeating != bool(cycle):
             self.pause(port)
@@ -61,14 +61,14 @@ class PortQueue:
             self._top_up(port, now_ns)
 
     def pause(self, port: Port) -> None:
-        """Repeat nothing; what is queued is still carried out."""
+        """Stop repeating; queued exchanges are still carried out."""
         following = port.repeat([])
         if self._cycle:
             self._schedule.go_on(self._cycle[following])
             self._cycle = []
 
     def abandon(self) -> None:
-        """Forget the port; it repeats nothing, and still carries out what is queued."""
+        """Forget the port and stop its repeating; queued exchanges are still carried out."""
         port, self.port = self.port, None
         self._queued.clear()
         self._cycle = []
@@ -94,10 +94,10 @@ class PortQueue:
         return [(turn.job, turn.due_ns) for turn in self._queued if turn.due_ns is not None]
 
     def give_back(self) -> None:
-        """Give the schedule back what was not carried out: the port failed.
+        """Return unsent exchanges to the schedule, because the port failed.
 
-        What was cut off in the middle comes first, and is asked again. If it was the first exchange on its
-        port it is not: a device may end the connection at each request that it does not like.
+        An exchange that the failure cut off is retried first, unless it was the first one on its port: a
+        device may end the connection at each request that it rejects.
         """
         if self.port is not None:
             self.conclude(self.port)

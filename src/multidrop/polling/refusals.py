@@ -1,9 +1,9 @@
-"""Refusals: what a drive does not answer as a whole is asked in halves, and a refused register rarely.
+"""Refusals: split blocks that a drive does not answer as a whole, and poll refused registers rarely.
 
 So no register is lost because of its neighbours. A register that is answered after all is polled as before,
 and so is a whole that was split: now and then it is tried again, without rows. A block may also be too long
-for its drive, which then keeps silent. That is split as well, where the class states no limit, the block was
-never answered, and the drive answers other requests meanwhile; a silent drive is asked for one register.
+for its drive, which then keeps silent. It is split too, if the class states no limit, the block was
+never answered, and the drive answers other requests; a silent drive gets a request for one register.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from multidrop.planning.schedule import Schedule
 from multidrop.polling.jobs import JobMaker, PolledJob
 from multidrop.transport.aside_log import log_aside
 
-REFUSALS = 3  # exceptions in a row after which a block or a register is asked for in another way
+REFUSALS = 3  # exceptions in a row before a block is split or a register set aside
 FAILURES = 3  # requests in a row for a block without a reply, while the drive answers others
-SET_ASIDE_NS = 60_000_000_000  # between attempts to read what the drive refuses
+SET_ASIDE_NS = 60_000_000_000  # interval of retrying refused blocks
 
 _log = logging.getLogger("multidrop.polling")
 
@@ -44,7 +44,7 @@ class Refusals:
         ]
 
     def heed(self, now_ns: int) -> None:
-        """Ask for refused registers in another way, and for those that are answered again as before."""
+        """Split or set aside refused blocks, and restore those that are answered again."""
         for trial in [trial for trial in self._trials if trial.rows.is_answered]:
             self._make_whole(trial, now_ns)
         for rare in [rare for rare in self._set_aside if not rare.rows.refusals]:
@@ -63,7 +63,7 @@ class Refusals:
             self._end_probes()
 
     def _is_refused(self, job: PolledJob) -> bool:
-        """Return True where it is to be asked in another way; a part of a refused block at once."""
+        """Return True if a job needs splitting or setting aside; for a part of a refused block at once."""
         count = job.rows.refusals
         if not count or job in self._trials or job is self._probes.get(job.drive):
             return False
@@ -127,7 +127,7 @@ class Refusals:
                 self._schedule.add(probe, now_ns)
 
     def _end_probes(self) -> None:
-        """Ask no more for one register of drives whose blocks are all answered or split."""
+        """End the single-register probes of drives whose blocks are all answered or split."""
         doubtful = {
             job.drive for job in self._schedule.jobs if job.may_be_too_long and not job.rows.is_answered
         }
@@ -135,7 +135,7 @@ class Refusals:
             self._schedule.remove(self._probes.pop(address))
 
     def forget(self, drive: Drive) -> None:
-        """Set nothing of this drive aside any more: it leaves."""
+        """Forget the refusals of a drive that leaves."""
         self._set_aside = {rare: job for rare, job in self._set_aside.items() if rare.owner is not drive}
         self._rare = {job: rare for job, rare in self._rare.items() if job.owner is not drive}
         self._trials = {trial: job for trial, job in self._trials.items() if trial.owner is not drive}

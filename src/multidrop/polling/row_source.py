@@ -28,7 +28,7 @@ _DEFERRED = (inspect.iscoroutinefunction, inspect.isgeneratorfunction, inspect.i
 
 
 def check_function(function: object) -> None:
-    """Raise TypeError unless a call carries it out: that of an async or generator function begins nothing."""
+    """Raise TypeError unless this is a plain function: a call does not run an async or generator function."""
     if not callable(function):
         raise TypeError(f"on_batch takes a function of one batch, not {function!r}")
     while isinstance(function, partial):
@@ -45,7 +45,7 @@ _DEFERS = (
 
 
 def _check_returned(function: object, returned: object) -> None:
-    """Raise TypeError for what is still to be carried out."""
+    """Raise TypeError if the function returned a coroutine or a generator."""
     if isinstance(returned, Awaitable | Generator | AsyncIterator):
         if inspect.iscoroutine(returned):
             returned.close()  # else Python warns, too
@@ -53,7 +53,7 @@ def _check_returned(function: object, returned: object) -> None:
 
 
 class BatchCaller:
-    """Calls a function with one batch after another, on a thread of its own, until there are no more.
+    """Calls a function with each batch on its own thread, until the poller is closed.
 
     The first failure of the function ends that, is logged at once, and is raised by `raise_failure`.
     """
@@ -98,10 +98,10 @@ class RowSource:
         self._row_queue = row_queue
         self._names = names
         self._wakeup = WakeUp()
-        self._is_watched = False  # somebody waits for `fileno`
+        self._is_watched = False  # `fileno` was called
         self._taken_ns = 0  # the newest rows
         self._closing = False
-        self._over = threading.Event()  # all lines are closed, and no row comes any more
+        self._over = threading.Event()  # all lines are closed, and no further row comes
         self._caller: BatchCaller | None = None
         self._changing = threading.Lock()  # one drive or line comes or goes at a time
         self.failure: PollingFailed | None = None
@@ -133,8 +133,8 @@ class RowSource:
     def batches(self, seconds: float | None = None, *, every: float = 0.1) -> Iterator[Batch]:
         """Yield batches as they come, about one in `every` s, for `seconds` s or until the caller stops.
 
-        Once the poller is closed what is left comes at once, and then no more. Raises PollingFailed like
-        `take`.
+        Once the poller is closed, the remaining batches come at once, and the iterator ends. Raises
+        PollingFailed like `take`.
         """
         end_ns = None if seconds is None else clock.now_ns() + round(seconds * 1e9)
         is_over = False
@@ -166,9 +166,9 @@ class RowSource:
     def on_batch(self, function: Callable[[Batch], object], *, every: float = 0.1) -> None:
         """Call `function` with each of `batches()` on a thread of its own, until the poller is closed.
 
-        It holds no line up, however slow it is: rows gather meanwhile, as many as `take` leaves, and further
-        ones are dropped and counted in `summary()`. Closing waits until it has had the last batch. When it
-        raises, that is logged at once, it is called no more, and closing raises the same. A batch goes to
+        A slow function delays no line: rows wait in the core's queue, and further ones
+        are dropped and counted in `summary()`. Closing waits until it has had the last batch. When it
+        raises, that is logged at once, the calls end, and closing raises the same. A batch goes to
         one taker: do not take others beside it. Raises ValueError for a second function, and TypeError for
         an async or generator function, which a call would not carry out.
         """

@@ -1,4 +1,4 @@
-"""WideRows: a column for each register of each drive, a row for each time at which any was asked."""
+"""WideRows: a column for each register of each drive, and a row for each request time."""
 
 from __future__ import annotations
 
@@ -17,23 +17,23 @@ class ArrowTable(ABC):
     def __arrow_c_stream__(self, requested_schema: object = None) -> Any: ...
 
     def to_pandas(self) -> Any:
-        """Return a pandas.DataFrame; its `time` is datetime64[ns, UTC], and what is missing is NaN.
+        """Return a pandas.DataFrame; its `time` is datetime64[ns, UTC], and a miss is NaN.
 
-        Raises ImportError where pandas or pyarrow is not installed.
+        Raises ImportError if pandas or pyarrow is not installed.
         """
         _library("pandas", "pandas", "to_pandas")
         return _library("pyarrow", "pandas", "to_pandas").table(self).to_pandas()
 
     def to_polars(self) -> Any:
-        """Return a polars.DataFrame; its `time` is Datetime("ns", "UTC"), and what is missing is null.
+        """Return a polars.DataFrame; its `time` is Datetime("ns", "UTC"), and a miss is null.
 
-        Raises ImportError where polars is not installed.
+        Raises ImportError if polars is not installed.
         """
         return _library("polars", "polars", "to_polars").DataFrame(self)
 
 
 def nanoarrow() -> Any:
-    """Return the library that holds rows in Arrow's layout; ImportError where it is not installed."""
+    """Return the nanoarrow module. Raises ImportError if it is not installed."""
     try:
         return importlib.import_module("nanoarrow")
     except ImportError as failure:
@@ -67,7 +67,7 @@ class _WideColumn:
         self.values = array("d")
 
     def dense(self, places: Sequence[int]) -> tuple[bytearray, array[float]]:
-        """Return a bit for each row, 1 where there is a value, and the values; rows go to these places."""
+        """Return a bit for each row, 1 if it has a value, and the values, reordered by `places`."""
         valid = bytearray((len(places) + 7) // 8)
         values = array("d", bytes(8 * len(places)))
         for row, value in zip(self.rows, self.values, strict=True):
@@ -81,13 +81,13 @@ class WideRows(ArrowTable):
     """Rows by time: columns `time`, `monotonic_ns`, and `drive.register` for each register of each drive.
 
     Rows of the long form that have the same time to the nanosecond are one row: those of one request are,
-    as its registers share the time at which it was sent. Nothing else is joined, filled or interpolated, so
+    as its registers share the time at which it was sent. Other values are not joined, filled or interpolated:
     a row has values for the registers of one request, and null for all others. A miss is null too; why is
     in the long form alone. Rows are in the order of `monotonic_ns`.
     """
 
     def __init__(self, rows: Iterable[Row], chosen: Sequence[str] = (), known: Collection[str] = ()) -> None:
-        """Take the rows of these columns, or of all.
+        """Take the rows of the `chosen` columns, or all rows.
 
         `known` are columns that may have no row. Raises ValueError for a column that is not known, and where
         two registers would have the same column.
@@ -112,7 +112,7 @@ class WideRows(ArrowTable):
     def _column(
         self, owner: tuple[str, str], owners: dict[str, tuple[str, str]], are_chosen: bool
     ) -> _WideColumn | None:
-        """Return the column of a drive's register; None where it is not chosen."""
+        """Return the column of a drive's register; None if it is not chosen."""
         name = ".".join(owner)
         if owners.setdefault(name, owner) != owner:
             drives = " and ".join(repr(drive) for drive, _ in (owners[name], owner))

@@ -1,4 +1,4 @@
-"""Threads of their own for what may hang, such as a log handler's disk: no stop and no port waits for it."""
+"""A thread for work that may hang, such as a log handler's disk: stops and ports never wait for it."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from queue import Empty, SimpleQueue
 from multidrop.core.fork import register_at_fork
 
 MOST_FRAMES = 30  # of a traceback, the innermost
-MOST_WAITING = 10_000  # pieces of work for what hangs; what comes then is dropped
+MOST_WAITING = 10_000  # queued pieces of work; further ones are dropped
 
 
 class AsideThread:
@@ -27,8 +27,8 @@ class AsideThread:
 
     def forked(self) -> None:
         self._work: SimpleQueue[Callable[[], object]] = SimpleQueue()
-        self._begun = threading.Lock()  # held once the thread has begun
-        # An answer that did not come in time, and for how many s it was waited for.
+        self._begun = threading.Lock()  # held once the thread has started
+        # The queue of a flush that timed out, and its time limit in s.
         self._late: tuple[SimpleQueue[None], float] | None = None
 
     def put(self, work: Callable[[], object]) -> None:
@@ -58,7 +58,7 @@ class AsideThread:
         return True
 
     def hangs(self, seconds: float) -> bool:
-        """Return True if a `flush` of so many s or more was in vain, and still is."""
+        """Return True if a `flush` of at least `seconds` s timed out, and its work is still pending."""
         late = self._late
         return late is not None and late[1] >= seconds and late[0].empty()
 

@@ -29,16 +29,16 @@ _log = logging.getLogger("multidrop.line")
 PORT_FAILURES = (OSError, _terminal_error, serial.SerialException, ValueError, EOFError)
 
 # Both are shorter than WRITE_TIMEOUT: an outcome that a write's caller was given stays true.
-MOST_STALL_MS = 750  # of a network, after which it is sent nothing more
+MOST_STALL_MS = 750  # a network that stalls for longer is disconnected
 MOST_AGE = 0.25  # s, of a request that leaves
 MOST_CHUNK = 1024  # bytes that the core reads at once
-LOOK_EVERY = 0.1  # s, after which a thread looks again whether the bridge is closed
+LOOK_EVERY = 0.1  # s between checks whether the bridge is closed
 CLOSING_TIME = 2.0  # s that closing waits for a thread which the port holds up
 
 # On Linux such a socket keeps requests apart, and stamps each with the time at which the core wrote it.
 _STAMPED = sys.platform == "linux"
 _KIND = socket.SOCK_SEQPACKET if _STAMPED else socket.SOCK_STREAM
-_SO_TIMESTAMPNS = 35  # asm-generic/socket.h; also the type of what it adds, a struct timespec
+_SO_TIMESTAMPNS = 35  # asm-generic/socket.h; the control message is a struct timespec
 _TIMESPEC = struct.Struct("@ll")
 _LINGER = "hh" if sys.platform == "win32" else "ii"  # struct linger
 _TCP_MAXRTMS = 14  # mstcpip.h
@@ -81,7 +81,7 @@ class Bridge:
     """A descriptor for a port that has none: a socket pair, and a thread for each direction.
 
     No request waits in it: the core has given up one that is older than MOST_AGE when its thread takes it,
-    because the process stood still or the port held an earlier one up. Such a request is discarded.
+    because the process was suspended or the port blocked. Such a request is discarded.
     """
 
     def __init__(self, port: serial.SerialBase) -> None:
@@ -101,7 +101,7 @@ class Bridge:
                 )
                 thread.start()
                 self._threads.append(thread)
-        except RuntimeError as failure:  # the system gives no more threads
+        except RuntimeError as failure:  # the system's thread limit is reached
             self.close()
             raise OSError(errno.ENOMEM, str(failure)) from failure
 
@@ -128,7 +128,7 @@ class Bridge:
                 self._port.write(request)
 
     def _take(self) -> tuple[bytes, bool]:
-        """Return what the core sends, and whether it was written just now; Windows has no `recvmsg`."""
+        """Return a request of the core, and whether it was written just now; Windows has no `recvmsg`."""
         if not _STAMPED:
             return self._ours.recv(MOST_CHUNK), True
         request, stamps, _, _ = self._ours.recvmsg(MOST_CHUNK, socket.CMSG_SPACE(_TIMESPEC.size))

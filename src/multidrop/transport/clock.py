@@ -1,6 +1,6 @@
 """The clock of all that is polled and written: CLOCK_MONOTONIC, as the core reads it.
 
-What may be sent until some time has it of CLOCK_BOOTTIME, which runs on while the machine sleeps. Call these
+Deadlines of requests are of CLOCK_BOOTTIME, which runs on while the machine sleeps. Call these functions
 through the module, `clock.now_ns()`: a test then replaces them in one place.
 """
 

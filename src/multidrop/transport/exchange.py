@@ -58,14 +58,14 @@ def no_reply(drive: Drive, completion: Completion) -> NoReply:
 
 
 def check_master(drive: Drive, completion: Completion) -> None:
-    """Raise NotMaster where the request was held back, because another process may be the line's master."""
+    """Raise NotMaster if the request was held back because another process may be the line's master."""
     if completion.result in (Failure.NOT_MASTER, Failure.OTHER_MASTER):
         is_sent = completion.sent_ns > 0
         raise NotMaster(drive.name, _port_of(drive), heard=completion.raw, is_sent=is_sent)
 
 
 def refusal_of(drive: Drive, code: int, register: str | None = None) -> DriveException:
-    """Return the error of an exception, and of the register that was asked for by itself."""
+    """Return the error for an exception code; `register` is set if it alone was requested."""
     return DriveException(drive.name, code, drive.exception(code), register)
 
 
@@ -87,41 +87,41 @@ ILLEGAL_FUNCTION = 1  # a shorter request has the same one
 
 
 class Exchanges:
-    """Exchanges with the drives on one line, and what is learnt of each drive from them."""
+    """Exchanges with the drives on one line, and the timing learnt from each drive's replies."""
 
     def __init__(self, line: Line) -> None:
         self.line = line
         self._peers = Peers(line)
-        self._answered_on: dict[Drive, object] = {}  # the open port on which it answered last
+        self._answered_on: dict[Drive, object] = {}  # the port object on which it last answered
         self._prepared: dict[Drive, PreparedReads] = {}
 
     # ---- the drives ----
 
     def add(self, drive: Drive) -> None:
-        """Begin to know a drive; one that comes back is known from before."""
+        """Add a drive; one that comes back keeps its learnt timing and late replies."""
         self._peers.add(drive)
 
     def close(self) -> None:
-        """Close the line; what its drives owe is left to whoever opens the port again."""
+        """Close the line; late replies still due are remembered for the next opening of the port."""
         self._peers.close()
 
     def remember(self, before: Exchanges) -> None:
-        """Know all drives that were known before on the same line."""
+        """Take over the peers of an earlier bus on the same line."""
         self._peers.remember(before._peers)
 
     def remove(self, drive: Drive) -> None:
-        """Exchange nothing more with this drive."""
+        """Remove a drive: later exchanges with it raise NotAttached."""
         self._peers.remove(drive)
         self._answered_on.pop(drive, None)
         self._prepared.pop(drive, None)
 
     @property
     def peers(self) -> dict[Drive, Peer]:
-        """Peers of the drives that are on the line now; a copy, as any thread may add and remove drives."""
+        """A copy of the present drives' peers: any thread may add and remove drives."""
         return dict(self._peers.present)
 
     def peer(self, drive: Drive) -> Peer:
-        """Return what is learnt of this drive's answers; NotAttached for a drive that is not on this bus."""
+        """Return the drive's peer. Raises NotAttached for a drive that is not on this bus."""
         return self._peers.of(drive)
 
     def is_asking(self, peer: Peer) -> bool:
@@ -129,7 +129,7 @@ class Exchanges:
         return self._peers.is_asking(peer)
 
     def has_answered(self, drive: Drive) -> bool:
-        """Return True where it has answered a read since the port was opened."""
+        """Return True if the drive has answered a read since the port was opened."""
         return self._answered_on.get(drive, self) is self.line.queue
 
     # ---- reading ----
@@ -199,10 +199,10 @@ class Exchanges:
     ) -> dict[str, Any]:
         """Return the values of registers, or of registers' names, by name; try each block `attempts` times.
 
-        A read that insists does not wait for an earlier answer, which may then pass for its own; for its own
-        it waits, where answers are known to be late, up to `timeout` seconds. A block that the drive refuses
-        as a whole, or keeps silent to, is asked for in parts from then on, until the port is opened again.
-        Raises NoValue if a register holds no value, and TextWanted if one of them is a text.
+        With `insists`, send at once even if a late reply could be mistaken for this one; on slow paths wait
+        up to `timeout` seconds. A block that the drive refuses or does not answer as a whole is read in
+        parts until the port is opened again. Raises NoValue if a register holds no value,
+        and TextWanted if one of them is a text.
         """
         prepared = self._prepare(drive)
         plan = prepared.newest
@@ -248,7 +248,7 @@ class Exchanges:
     def _parts(
         self, drive: Drive, prepared: PreparedReads, read: PreparedRead, failure: Exception
     ) -> tuple[Block, ...]:
-        """Return the blocks to ask for instead of one that failed; raise why it did where that is no help."""
+        """Return smaller blocks to read instead of a failed one, or raise its failure if that cannot help."""
         block = read.block
         if isinstance(failure, DriveException):
             helps = failure.code != ILLEGAL_FUNCTION and not drive.is_passing(failure.code)
@@ -263,7 +263,7 @@ class Exchanges:
         raise failure
 
     def _is_there(self, drive: Drive, block: Block) -> bool:
-        """Return True where the drive answers the least part of this block."""
+        """Return True if the drive answers a request for the block's first register."""
         try:
             self._ask(drive, self._prepare(drive).prepare(least(drive, block)).exchange, 1)
         except (NoReply, BadReply):
@@ -295,7 +295,7 @@ class Exchanges:
         return self._ask(drive, make_read(drive, block, self.peer(drive)), READ_ATTEMPTS)
 
     def _prepare(self, drive: Drive) -> PreparedReads:
-        """Return what is prepared for this drive; anew where anything that it depends on has changed."""
+        """Return the drive's prepared reads; rebuild them after a change of port, settings or peer."""
         peer = self._peers.present.get(drive) or self.peer(drive)
         asked_as = (drive.address, drive.framing, drive.settings, drive.agreed_silence, drive.response_delay)
         made_for = (peer, self.line.queue, *asked_as)
@@ -305,7 +305,7 @@ class Exchanges:
         return prepared
 
     def value_as(self, other: Drive, drive: Drive, register: Register[Any] | Text) -> Any:
-        """Return what a drive replies to the request of another family, sent once and without waiting."""
+        """Return the value in this drive's reply to another family's request, sent once without waiting."""
         if isinstance(register, Text):
             peer, blocks_of = self.peer(drive), text_blocks(other, register)
             asked = [make_read(other, block, peer, insists=True) for block in blocks_of]
@@ -343,13 +343,13 @@ class Exchanges:
             self._answered_on[drive] = self.line.queue
 
     def _ask(self, drive: Drive, exchange: Exchange, attempts: int) -> Completion:
-        """Return the good reply to a read, which is sent again where it is lost."""
+        """Return the good reply to a read, which is retried up to `attempts` times."""
         reply = self._good(drive, exchange, attempts, self._carry_out(drive, exchange))
         self._note_answer(drive, reply)
         return reply
 
     def _good(self, drive: Drive, exchange: Exchange, attempts: int, completion: Completion) -> Completion:
-        """Return the good reply to a read that was sent once, and is sent again where it is lost.
+        """Return the good reply to a read that was sent once; retry it if the reply is lost.
 
         Raises BadReply if any bytes came for one of the attempts, even if the others met silence.
         """
@@ -382,12 +382,12 @@ class Exchanges:
         timeout: float = WRITE_TIMEOUT,
         permit: Permit | None = None,
     ) -> Completion:
-        """Write once, ahead of any polling; first wait for an answer that may still come late.
+        """Write once, ahead of any polling, after late replies have come in or expired.
 
         After `expires_ns` (of CLOCK_BOOTTIME; 0: never), and without a good permit, it is not sent. It waits
-        for its answer at least `timeout` seconds. One that insists does not wait for an earlier answer, and
-        for its own, where answers are known to be late, up to `timeout`. Raises NoReply, and nothing was
-        sent, where answers may still come late and the drive is silent.
+        for its answer at least `timeout` seconds. With `insists` it
+        does not wait for late replies, and on slow paths waits up to `timeout` for its own. Raises NoReply
+        without sending if late replies are due and the drive is silent.
         """
         made = make_exchange(
             drive, request, self.peer(drive), NO_ROWS, insists=insists, timeout=timeout, permit=permit
@@ -398,7 +398,7 @@ class Exchanges:
         return completion
 
     def _carry_out(self, drive: Drive, made: Exchange, expires_ns: int = 0) -> Completion:
-        """Carry it out once late answers allow that; see `_settled`. Raises NotMaster."""
+        """Carry the exchange out once late replies allow it; see `_settled`. Raises NotMaster."""
         try:
             completion = self._peers.carry_out(drive, made, expires_ns=expires_ns)
         except PortLost as failure:
@@ -407,14 +407,14 @@ class Exchanges:
         return completion if completion.count >= 0 else self._settled(drive, made, completion, expires_ns)
 
     def _check_held_back(self, drive: Drive, failure: PortLost) -> None:
-        """Raise NotMaster where the port is not opened again because this process is not its master."""
+        """Raise NotMaster if the port is not reopened because this process is not the line's master."""
         if not failure.is_sent and not self.line.may_send:
             raise NotMaster(drive.name, self.line.port) from None
 
     def _settled(
         self, drive: Drive, made: Exchange, completion: Completion, expires_ns: int = 0
     ) -> Completion:
-        """Wait once until late answers come in order, or it expires; then the core asks for a proof.
+        """Wait once for late replies, until the exchange expires; then the core sends a proof first.
 
         Raises NotMaster.
         """

@@ -1,4 +1,4 @@
-"""Former peers: what drives still owe to a port that was closed, for whoever opens it again in this process.
+"""Former peers: late replies still due when a port was closed, kept until this process reopens it.
 
 A reply that comes after its port was closed is thrown away there, but one that comes later, on a slow path,
 meets the next to open that port.
@@ -17,7 +17,7 @@ KEPT_NS = 120_000_000_000  # as late.c remembers requests
 
 
 class FormerPeers(NamedTuple):
-    """Peers that owed something when their port was closed, with their addresses."""
+    """Peers with late replies due when their port was closed, with their addresses."""
 
     closed_ns: int
     peers: tuple[tuple[int, Peer], ...]
@@ -27,7 +27,7 @@ _former: dict[str, FormerPeers] = {}  # by port; each change is one step, so tha
 
 
 def names_of(*names: str) -> set[str]:
-    """Return what a port that is there is known by, of names that it has.
+    """Return the identities of an open port for its names.
 
     The number of a pseudo-terminal that is gone is another's soon, so the time of its making counts.
     """
@@ -43,7 +43,7 @@ def _made_ns(device: str) -> int:
 
 
 def leave(names: Iterable[str], peers: Iterable[tuple[int, Peer]]) -> None:
-    """Remember which of these owe something, with their addresses; their port was closed."""
+    """Remember the peers with late replies due, by address, because their port was closed."""
     now_ns = clock.now_ns()
     for name, former in [*_former.items()]:
         if now_ns - former.closed_ns > KEPT_NS:
@@ -54,7 +54,7 @@ def leave(names: Iterable[str], peers: Iterable[tuple[int, Peer]]) -> None:
 
 
 def left_at(names: Iterable[str], address: int) -> Iterator[Peer]:
-    """Yield the peers at this address that owed something when the port was closed."""
+    """Yield the peers at this address with late replies due when the port was closed."""
     for name in names:
         former = _former.get(name)
         yield from (peer for at, peer in former.peers if at == address) if former else ()

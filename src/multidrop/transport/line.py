@@ -39,13 +39,13 @@ FOREIGN = (
 
 
 class LineLog:
-    """The log of one line, in which each loss stands once, and foreign bytes are counted too."""
+    """The log of one line: reports each loss once, and counts another master's bytes."""
 
     def __init__(self, port: str) -> None:
         self.foreign = 0  # bytes that came while the line was listened to before a request
         self.shows = _log.isEnabledFor  # a level
         self._port = port
-        self._foreign_here = 0  # of these on the port that is open now
+        self._foreign_here = 0  # of the port that is open now
         self._is_lost = False
         self._why_unopened = ""
         self.forked()
@@ -105,13 +105,12 @@ UNOPENED = "it is not opened: this process is not its master, and could end the 
 
 
 class Line:
-    """A port on which exchanges are carried out once it is open, urgent ones ahead of those that are queued.
+    """A port on which exchanges are carried out; urgent ones go ahead of queued ones.
 
     `port` is a device, a URL of socket:// or rfc2217://, or tcp://host:port for Modbus TCP, whose replies
     have their requests' transaction ids unless `ids` says otherwise. `rs485` is who switches the
-    transceiver. For `settle` seconds after each opening nothing is sent, and what comes is discarded. Where
-    it has a `mastership`, requests leave only while that holds. Every failure of the
-    port is a LineError.
+    transceiver. For `settle` seconds after each opening the line stays silent and discards its input. With a
+    `mastership`, requests leave only while that holds. Every failure of the port is a LineError.
     """
 
     def __init__(
@@ -171,7 +170,7 @@ class Line:
     @undisturbed
     def _open_first(self) -> None:
         with self._lock:
-            if self._is_over:  # whoever opens it was interrupted, and has closed it
+            if self._is_over:  # its opening was interrupted, and has closed it
                 raise self._closed()
             self._reopen()
 
@@ -196,7 +195,7 @@ class Line:
             raise LineError(self.port, reason_of(failure)) from None
 
     def drop(self) -> None:
-        """Carry out nothing more; what is queued and not yet sent never will be. `close` closes the port."""
+        """End all exchanges; queued ones are never sent. `close` closes the port."""
         with self._lock:
             core, self.queue = self.queue, None
             if core is None:
@@ -207,7 +206,7 @@ class Line:
 
     @undisturbed
     def close(self) -> None:
-        """Drop the port and close it; no `regain` opens it any more."""
+        """Close the port; `regain` then raises LineError."""
         with self._lock:
             if not self._is_over:
                 self._log.closed()
@@ -216,8 +215,8 @@ class Line:
         flush(LOGGING_S)
 
     def end(self) -> bool:
-        """Begin nothing more of the queue; return True while one of it is under way, False without a port."""
-        with self._lock:  # else another thread may free the port meanwhile
+        """Stop taking queued exchanges; return True while one is under way."""
+        with self._lock:  # another thread could free the port
             return self.queue is not None and self.queue.end()
 
     def _let_go(self) -> None:
@@ -227,7 +226,7 @@ class Line:
 
     @undisturbed
     def reopen(self) -> None:
-        """Close what is left of the port and open it again; LineError when it is not there."""
+        """Close the port and open it again. Raises LineError if it is absent."""
         self._reopen()
 
     def _reopen(self) -> None:
@@ -243,12 +242,12 @@ class Line:
 
     @property
     def why_lost(self) -> str | None:
-        """Why a lost port is not back, with its name; None where it is there, or was not tried yet."""
+        """Why a lost port is not back, with its name; None if it is open, or was not tried yet."""
         return f"{self.port}: {self._why_lost}" if self.is_lost and self._why_lost else None
 
     @undisturbed
     def regain(self) -> None:
-        """Open it again if it is lost; PortLost when it is not there, and LineError once it was closed."""
+        """Open a lost port again. Raises PortLost if it is absent, LineError once it was closed."""
         with self._lock:
             if self._is_over:
                 raise self._closed()
@@ -262,17 +261,17 @@ class Line:
                 self._log.unopened(reason)
                 raise PortLost(self.port, reason) from failure
 
-    # ---- what the port must do ----
+    # ---- taps, settings and peers ----
 
     def tap(self, tap: Tap) -> None:
-        """Give this tap, and no other any more, all bytes that go over the line."""
+        """Give this tap all bytes of the line; it replaces an earlier one."""
         with self._lock:
             self._tap = tap
             if self.queue:
                 self.queue.tap(tap)
 
     def require(self, settings: tuple[int, str]) -> None:
-        """Prepare for these settings. Raises LineError where a bridged port has others, or takes them not."""
+        """Prepare for these settings. Raises LineError if a bridged port has others or rejects them."""
         with self._lock:
             self._opened.require(settings)
 
@@ -282,7 +281,7 @@ class Line:
         return self._opened.settings if self._opened.bridge else None
 
     def inherit(self, peer: Peer, before: Peer) -> None:
-        """Let a drive take the place of another at its address, whose answers may still come."""
+        """Let a drive inherit the late replies of another one at its address."""
         with self._lock:
             if self.queue:
                 self.queue.inherit(peer, before)
@@ -299,9 +298,9 @@ class Line:
         expires_ns: int = 0,
         into: Completion | None = None,
     ) -> Completion:
-        """Carry an exchange out ahead of what is queued, and wait for it; LineError when the port fails.
+        """Carry an exchange out ahead of the queue, and wait for it. Raises LineError if the port fails.
 
-        `into` is the completion to fill in, where nobody looks at it any more.
+        `into` is a completion to reuse.
         """
         if self._opened.bridge and self.queue and self._opened.settings != exchange.settings:
             self.require(exchange.settings)
@@ -320,7 +319,7 @@ class Line:
         return found
 
     def is_asking(self, peer: Peer) -> bool:
-        """Return True while the port has an exchange with this peer, queued or under way."""
+        """Return True while an exchange with this peer is queued or under way on the port."""
         with self._lock:
             return self.queue is not None and self.queue.is_asking(peer)
 
@@ -339,20 +338,20 @@ class Line:
         return (LineError if is_over else PortLost)(self.port, self.why_closing or self._why_closed)
 
     def counted_ns(self, now_ns: int) -> int:
-        """Return until when its time is over and counted: now, or the beginning of what is under way."""
+        """Return the end of the counted time: now, or the start of the exchange under way."""
         return now_ns if (core := self.queue) is None else min(now_ns, core.counted_ns())
 
     def overruns(self) -> int | None:
-        """Return how many characters came too fast since the driver was loaded; None where it is unknown."""
+        """Return the driver's count of overruns since it was loaded; None if unknown."""
         return self._opened.overruns()
 
     @property
     def may_send(self) -> bool:
-        """False where this process is not, or no more, the master of the line."""
+        """False if this process is not the master of the line."""
         return self.mastership is None or self.mastership.holds
 
     def note_foreign(self) -> None:
-        """Log what came while the line was listened to, where it has a mastership."""
+        """Log another master's bytes, on a line with a mastership."""
         core = self.queue
         if self.mastership is not None and core is not None:
             self._log.note_foreign(core)
@@ -364,5 +363,5 @@ class Line:
 
     @property
     def has_echo(self) -> bool:
-        """True where the adapter is known to repeat what is sent."""
+        """True if the adapter is known to echo requests."""
         return self.queue is not None and self.queue.has_echo

@@ -31,7 +31,7 @@ def spoken_on(port: str) -> str:
 
 
 def mixed_up(port: str, received: bytes) -> str:
-    """Return advice where bytes received on this port have the shape of the other of the two; else ""."""
+    """Return advice if bytes received on this port look like the other protocol, else ""."""
     other = other_port(port)
     is_shaped = other and (_is_tcp(received) if other.startswith("tcp") else _is_rtu(received))
     if not is_shaped:
@@ -51,12 +51,12 @@ def silence_hint(port: str) -> str:
 
 
 def _is_tcp(received: bytes) -> bool:
-    """Tell whether one frame of Modbus TCP is all that came."""
+    """Return True if the bytes are exactly one Modbus TCP frame."""
     announced = int.from_bytes(received[4:6])
     return len(received) > _HEAD + 2 and received[2:4] == b"\0\0" and announced == len(received) - _HEAD
 
 
 def _is_rtu(received: bytes) -> bool:
-    """Tell whether an RTU frame stands at the beginning of what came."""
+    """Return True if the bytes start with an RTU frame."""
     ends = range(_LEAST, min(len(received), _MOST_RTU) + 1)
     return any(crc16(received[:end], end) == 0 for end in ends)

@@ -34,7 +34,7 @@ class SocketPort(Serial):
             connection.close()
 
     def reset_input_buffer(self) -> None:
-        """Discard what has come; pyserial asks `select` for it, which bears no descriptor above 1023."""
+        """Discard received bytes; pyserial would use `select`, which fails for descriptors above 1023."""
         with suppress(BlockingIOError):
             while self._socket and self._socket.recv(4096):
                 pass
@@ -53,7 +53,7 @@ class Telnet:
     """Parser of a telnet stream (RFC 854) into data and commands; the stream may come in any pieces."""
 
     def __init__(self) -> None:
-        self._command = b""  # begun and not yet whole
+        self._command = b""  # incomplete command
         self._suboption: bytearray | None = None
 
     def split(self, received: bytes) -> Iterator[tuple[bytes, bytes]]:
@@ -143,7 +143,7 @@ class RFC2217Port(rfc2217.Serial):
             self._telnet_negotiate_option(kind, content)
 
     def write(self, data: Any) -> int:
-        """Send all of it at once; raises SerialException when the network does not take it."""
+        """Send all data at once. Raises SerialException if the network does not take it."""
         self._internal_raw_write(bytes(data).replace(_IAC, _IAC + _IAC))
         return len(data)
 

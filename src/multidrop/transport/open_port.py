@@ -1,4 +1,4 @@
-"""OpenPort: a port as the system has it, and what the core reads from and writes to."""
+"""OpenPort: find and open a port by its name, and give the core its descriptor."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ _OVERRUN, _BUF_OVERRUN = 7, 10
 
 
 def overruns(fd: int) -> int:
-    """Return how many since the driver was loaded; OSError where it does not count them."""
+    """Return the overruns since the driver was loaded. Raises OSError if it does not count them."""
     if sys.platform != "linux":
         raise OSError("Linux alone counts them")
     import fcntl  # which Windows lacks
@@ -63,7 +63,7 @@ _REASONS = {
 # pyserial keeps an error of Windows in its text alone: could not open port 'COM5': PermissionError(13, ...)
 _WINDOWS_ERROR = re.compile(r"Error\((\d+), ")
 _WINDOWS_REASONS = {
-    errno.EACCES: _REASONS[errno.EBUSY],  # a COM port is one program's, whoever asks
+    errno.EACCES: _REASONS[errno.EBUSY],  # only one program can have a COM port
     errno.EBADF: _REASONS[errno.ENOTTY],
 }
 
@@ -89,7 +89,7 @@ def is_lost_by(result: int, port: Port) -> bool:
 
 
 def why_lost(port: str, error: int, received: bytes) -> str:
-    """Return why a port was lost: by the errno of its descriptor, 0 where that hung up."""
+    """Return why a port was lost, from the errno of its descriptor; 0 means that it hung up."""
     if error != errno.EPROTO:
         return os.strerror(error) if error else "hung up"
     shown = received[:16].hex(" ").upper() or "a damaged header"
@@ -130,7 +130,7 @@ def is_bridged(port: serial.SerialBase) -> bool:
 
 
 def check_port(port: str, mastership: Mastership | None) -> None:
-    """Raise NoSuchPort for a name that no port can have, and TypeError for what is no mastership.
+    """Raise NoSuchPort for an impossible port name, and TypeError unless this is a mastership.
 
     With a mastership requests must be held back, and those that a thread has taken leave all the same: then
     NoSuchPort is raised for such a port too.
@@ -152,7 +152,7 @@ def connection_of(port: serial.SerialBase | None) -> socket.socket | None:
 
 
 def descriptor_of(port: serial.SerialBase) -> int:
-    """Return what the core reads from and writes to: a descriptor, or on Windows a handle."""
+    """Return the port's descriptor, or on Windows its handle."""
     return int(getattr(port, "_port_handle", None) or port.fileno())
 
 
@@ -188,7 +188,7 @@ def _refusal(rs485: RS485, failure: OSError) -> str:
 
 
 class OpenPort:
-    """A port of pyserial's, and a bridge where the core cannot read from and write to that itself.
+    """A pyserial port, with a bridge if the core cannot use it directly.
 
     It may be opened and closed again and again, by one thread at a time.
     """
@@ -204,16 +204,16 @@ class OpenPort:
         self.name = name
         self.identity = name  # see port_identity; known once it was open
         self.bridge: Bridge | None = None
-        self.settings: tuple[int, str] | None = None  # that a bridged port must have
+        self.settings: tuple[int, str] | None = None  # required of a bridged port
         self._ids = ids
         self._rs485 = rs485
         self._mastership = mastership
         self._settle = settle
         self._serial: serial.SerialBase | None = None
-        self._adapter: USBAdapter | None = None  # with which it was open first
+        self._adapter: USBAdapter | None = None  # of the first opening
 
     def open(self) -> Port:
-        """Open it for the core, and return it when it has settled: what came until then is discarded.
+        """Open the port and return the core's port after `settle` s; discard earlier input.
 
         Raises LineError, or one of PORT_FAILURES; then close it.
         """
@@ -235,7 +235,7 @@ class OpenPort:
         return core
 
     def _require_same_adapter(self, device: str) -> None:
-        """Raise LineError where another adapter came back under this name: on its line are other motors."""
+        """Raise LineError if another adapter has this name now: its line has other motors."""
         found = adapter_of(device)
         if self._adapter is None:
             self._adapter = found
@@ -274,7 +274,7 @@ class OpenPort:
         return core
 
     def close(self) -> None:
-        """Close it, however much of it is open."""
+        """Close the port, even if it is only partly open."""
         if self.bridge:
             self.bridge.close()
             self.bridge = None
@@ -297,7 +297,7 @@ class OpenPort:
                 port.close()
 
     def require(self, settings: tuple[int, str]) -> None:
-        """Give a bridged port these settings: it can have only one kind of them.
+        """Give a bridged port these settings: it can have only one baud rate and format.
 
         Raises LineError when it has others already, or does not take these.
         """
@@ -317,9 +317,9 @@ class OpenPort:
     def overruns(self) -> int | None:
         """Return how many characters came too fast for the port, since its driver was loaded.
 
-        None while it is closed, and where the driver does not count them.
+        None while it is closed, or if the driver does not count them.
         """
         try:
             return None if self.bridge or not self._serial else overruns(self._serial.fileno())
-        except (*PORT_FAILURES, TypeError, AttributeError):  # it may be closed meanwhile
+        except (*PORT_FAILURES, TypeError, AttributeError):  # another thread may close it
             return None

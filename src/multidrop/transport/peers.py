@@ -1,4 +1,4 @@
-"""Peers: what is learnt of each drive on a line, kept also of drives that leave and come back."""
+"""Peers: each drive's learnt timing and late replies, kept when a drive leaves and comes back."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from multidrop.transport import clock, former_peers
 from multidrop.transport.line import Line
 from multidrop.transport.prepared import NO_ROWS, make_exchange
 
-GONE_S = 0.001  # between looks whether a drive that left is asked yet
-LEAST_TIMEOUT = 0.02  # s: what a host and its adapter may add to a drive's own delay
+GONE_S = 0.001  # polling interval while a drive that left is still in an exchange
+LEAST_TIMEOUT = 0.02  # s; a host and its adapter may add so much to a drive's own delay
 
 
 class Peers:
@@ -22,11 +22,11 @@ class Peers:
         self._line = line
         self.present: dict[Drive, Peer] = {}  # of the drives that are on the line now
         self._asked: dict[object, Peer] = {}  # by threads, each with a key of its own
-        # By address, and what else they are; also of those that left.
+        # By address and description; includes drives that left.
         self._known: dict[tuple[int, *tuple[object, ...]], Peer] = {}
 
     def add(self, drive: Drive) -> None:
-        """Begin to know a drive; one that comes back is known from before.
+        """Add a drive; one that comes back keeps its learnt timing and late replies.
 
         A thread that still asks another, which left its address, is waited for: what that owes then is known.
         """
@@ -39,8 +39,7 @@ class Peers:
         key = drive.address, *asked_as
         if key not in self._known:  # else the core may still be asking for its proofs
             self._known[key] = self._new(drive, least)
-        # A drive that comes back may still owe the answer to what it was asked before it left, and one of
-        # another family at its address would get that.
+        # The late reply to a drive that left could be taken for a reply of the next drive at its address.
         peer = self.present[drive] = self._known[key]
         for other, known in self._known.items():
             if other[0] == drive.address and known is not peer:
@@ -60,7 +59,7 @@ class Peers:
         return peer
 
     def close(self) -> None:
-        """Close the line; what its drives owe is left to whoever opens the port again."""
+        """Close the line; late replies still due are remembered for the next opening of the port."""
         names = self._names()
         self._line.close()
         former_peers.leave(names, [(address, peer) for (address, *_), peer in self._known.items()])
@@ -69,15 +68,15 @@ class Peers:
         return former_peers.names_of(self._line.identity, self._line.port)
 
     def remember(self, before: Peers) -> None:
-        """Know all drives that were known before on the same line."""
+        """Take over the peers of an earlier bus on the same line."""
         self._known.update(before._known)
 
     def remove(self, drive: Drive) -> None:
-        """Take a drive off the line; what is known of it is kept."""
+        """Take a drive off the line, but keep its peer."""
         del self.present[drive]
 
     def of(self, drive: Drive) -> Peer:
-        """Return what is learnt of this drive's answers; NotAttached for a drive that is not on this bus."""
+        """Return the drive's peer. Raises NotAttached for a drive that is not on this bus."""
         peer = self.present.get(drive) if isinstance(drive, Drive) else None
         if peer is None:
             check_drive(drive)
@@ -87,10 +86,12 @@ class Peers:
     def carry_out(
         self, drive: Drive, made: Exchange, *, expires_ns: int = 0, into: Completion | None = None
     ) -> Completion:
-        """Have the line carry it out; NotAttached where the drive has left since the exchange was made."""
+        """Carry an exchange out on the line. Raises NotAttached if the drive has left since it was made."""
         asking = object()
-        try:  # a signal that raises between any two steps leaves none behind, for which `add` waited for ever
-            self._asked[asking] = made.peer  # before the look: what takes the drive's place waits for it
+        try:  # a signal between any two steps must leave no entry: `add` would wait for it forever
+            self._asked[asking] = (
+                made.peer
+            )  # before the check: a drive that takes this one's place waits for it
             if self.present.get(drive) is not made.peer:
                 raise _not_attached(drive)
             return self._line.carry_out(made, expires_ns=expires_ns, into=into)

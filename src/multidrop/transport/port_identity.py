@@ -13,12 +13,12 @@ from urllib.parse import urlsplit
 from multidrop.drive.line_settings import MODBUS_PORT, speaks_tcp
 
 TTYS = Path("/sys/class/tty")
-_INTERFACE = re.compile(r"[\d.-]+:(\d+\.\d+)")  # 1-4.2:1.0: of what is plugged in at 1-4.2
+_INTERFACE = re.compile(r"[\d.-]+:(\d+\.\d+)")  # 1-4.2:1.0 is an interface of the device at 1-4.2
 
 
 @dataclass(frozen=True)
 class USBAdapter:
-    """One port of an adapter: where that is plugged in, and its serial number, if it has one."""
+    """One port of an adapter: its place on the bus, and its serial number, or ""."""
 
     place: str
     serial: str
@@ -33,7 +33,7 @@ class USBAdapter:
 
 
 def adapter_of(device: str) -> USBAdapter | None:
-    """Return the adapter that has this device's name now; None where there is none, or nothing is told."""
+    """Return the adapter behind this device name; None if there is none, or the system does not say."""
     found = (TTYS / Path(device).name / "device").resolve()
     for part in (found, *found.parents):
         if interface := _INTERFACE.fullmatch(part.name):
@@ -60,7 +60,7 @@ def com_name(name: str) -> str:
 
 
 def of_device(path: str) -> str:
-    """Return the link by the adapter's serial number; where there is none, the path with links followed."""
+    """Return the link named after the adapter's serial number, else the path with links resolved."""
     if sys.platform == "win32":
         return com_name(path)
     device = os.path.realpath(path)

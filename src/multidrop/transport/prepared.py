@@ -19,7 +19,7 @@ MOST_EXACT = 1 << 53  # a float holds every whole number up to it
 
 
 def _is_exact(register: Register[Any]) -> bool:
-    """Return True where the core, which reckons in floats, finds the same value as `Register.value_in`."""
+    """Return True if the core's float arithmetic gives the same value as `Register.value_in`."""
     coding = register.coding
     if register.scaled_by is not None:
         return False
@@ -31,12 +31,12 @@ def _is_exact(register: Register[Any]) -> bool:
 
 
 class BlockDecoder:
-    """The places of registers in the reply of a block that begins at this address, found once."""
+    """The places of registers in the reply of a block that starts at this address."""
 
     def __init__(self, registers: tuple[Register[Any], ...], start: int) -> None:
         places = [(register, register.address - start) for register in registers]
         exact = [(register, at) for register, at in places if _is_exact(register)]
-        self.names = tuple(register.name for register, _ in exact)  # of what the core reads
+        self.names = tuple(register.name for register, _ in exact)  # decoded by the core
         self.layout = RowLayout(0, [row_field(register, at, 0) for register, at in exact])
         self.count = len(exact)
         self._named = [(one.name, one.decode) for one, _ in exact if one.values is not None]
@@ -44,7 +44,7 @@ class BlockDecoder:
         self.is_plain = not (self._named or self._others)
 
     def decode(self, reply: Completion) -> dict[str, Any]:
-        """Return the values by the registers' names; None where the drive gave none."""
+        """Return the values by register name; None for a register without a value."""
         found: dict[str, Any] = dict(zip(self.names, reply.values_of(self.layout), strict=True))
         for name, decode in self._named:
             if found[name] is not None:
@@ -92,7 +92,7 @@ def make_exchange(
 def make_read(
     drive: Drive, block: Block, peer: Peer, rows: core.RowLayout = NO_ROWS, **details: Any
 ) -> Exchange:
-    """Return the exchange that reads a block, with the probe for an adapter's echo where it needs one."""
+    """Return the exchange that reads a block, with an echo probe if it needs one."""
     probe, register = None, drive.echo_probe
     if register and register not in block.registers:
         probe = make_exchange(drive, Block.of(drive, [register]).request, peer, NO_ROWS)
@@ -142,7 +142,7 @@ NOTHING = ReadPlan((), (), ())
 
 
 class PreparedReads:
-    """Reads of one drive, made once and kept while nothing that they depend on changes."""
+    """The prepared reads of one drive, for one port and one set of line settings."""
 
     def __init__(self, drive: Drive, peer: Peer, made_for: tuple[object, ...]) -> None:
         self.made_for = made_for
@@ -161,13 +161,13 @@ class PreparedReads:
             return ReadPlan(wanted, registers, tuple(map(prepare, reversed(blocks(drive, registers)))))
 
         self.of = of
-        self.newest = NOTHING  # the plan that was used last: found again without a look at each register
+        self.newest = NOTHING  # the last plan used: found again without hashing the registers
         self.prepare = prepare
         self.parts: dict[Block, tuple[Block, ...]] = {}  # of blocks that the drive does not answer as a whole
         self.answered: set[Block] = set()  # blocks that may have been too long, and are not
 
     def ask_first(self, block: Block) -> None:
-        """Ask for a block that is refused before the other parts of its whole, which are in vain without."""
+        """Read a refused block before the other parts of its whole: the read fails without it anyway."""
         for whole, parts in [*self.parts.items()]:
             if block in parts:
                 self.parts[whole] = (block, *(part for part in parts if part != block))

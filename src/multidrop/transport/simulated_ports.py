@@ -27,7 +27,7 @@ def ledger_of(identity: str, directory: Path) -> Path:
 
 
 class SimulatedPort:
-    """A mark that a port is simulated, until it is closed; the port's ledger begins anew."""
+    """A mark that a port is simulated, until it is closed; it clears the port's ledger."""
 
     def __init__(self, identity: str, directory: Path) -> None:
         self._ledger = ledger_of(identity, directory)

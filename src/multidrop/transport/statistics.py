@@ -1,7 +1,7 @@
 """Statistics of a line and its drives: results of exchanges, response delays, utilisation.
 
-All of it is derived from counters that only grow: the figures of any span of time are the difference of
-two readings, and taking one costs the line nothing.
+All figures derive from counters that only grow: those of a time span are the difference of two readings.
+A reading costs the line no time.
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ _UNNUMBERED: Mapping[str, int] = {}
 class Diagnostics:
     """The eight counters of the MODBUS serial-line guide (V1.02, appendix A), from the client's side.
 
-    In the guide a drive counts what it receives; here the client counts what it sends to and receives
-    from a drive, or all drives of a line.
+    In the guide a drive counts its input; here the client counts its exchanges with a drive, or with all
+    drives of a line.
     """
 
     bus_messages: int
@@ -134,7 +134,7 @@ class Statistics:
 
     @property
     def skipped_bytes(self) -> int:
-        """Bytes that were no part of a reply: noise, late replies, an adapter's echo."""
+        """Bytes outside replies: noise, late replies, an adapter's echo."""
         return self.counters.stray_bytes
 
     @property
@@ -142,8 +142,8 @@ class Statistics:
         """Part of all time that the answered exchanges had to take of the line.
 
         Silence, request, response delay and reply, at the line's settings. A port that is faster than its
-        settings, such as a network's or a pseudo-terminal, needs no more than it took. An exchange counts
-        whole where it ends, and so does its time: see `counted_s`.
+        settings, such as a network's or a pseudo-terminal, needs at most the time it took. An exchange counts
+        when it ends, and so does its time: see `counted_s`.
         """
         return self.used_s / (self.seconds if self.counted_s is None else self.counted_s)
 
@@ -190,7 +190,7 @@ class LineStatistics(Statistics):
     def since(self, earlier: LineStatistics) -> LineStatistics:
         """Return the statistics of the time since an earlier reading of the line of this name.
 
-        What is counted anew since then, because it is another line or drive or was reset, begins at nothing.
+        A line or drive with another epoch counts from zero.
         """
         if self.epoch != earlier.epoch:
             return self
@@ -258,12 +258,12 @@ def _difference(now: Counters, earlier: Counters) -> Counters:
 
 
 def _minus(now: Any, earlier: Any) -> Any:
-    """Return the difference of numbers, or of counts by their keys: mostly nothing was counted earlier."""
+    """Return the difference of numbers, or of counts by their keys."""
     return now - earlier if earlier else now
 
 
 def _quantiles(counters: Counters, parts: Iterable[float]) -> list[float]:
-    """Return the middle of the bucket in which each quantile lies, in s; 0.0 where there are no replies."""
+    """Return the middle of each quantile's bucket, in s; 0.0 without replies."""
     buckets = sorted(counters.delays)
     seen = list(accumulate(counters.delays[bucket] for bucket in buckets))
     if not seen:
@@ -286,7 +286,7 @@ class Count(NamedTuple):
 class LineMeter:
     """Statistics of a line since it was opened, or last reset; frozen when it is closed.
 
-    A name may be another drive's by now: what a drive had counted at the reset is kept by its peer.
+    Counts at the reset are kept by peer, because a name may be another drive's by now.
     """
 
     def __init__(self, exchanges: Exchanges) -> None:
@@ -308,7 +308,7 @@ class LineMeter:
         self._reset_at = _begins(self._now())
 
     def freeze(self, overruns: int | None) -> None:
-        """Count nothing more: the line is closed, and had lost `overruns` characters until then."""
+        """Stop counting, because the line is closed; `overruns` is its final count of lost characters."""
         self._frozen = self._frozen or self._count(overruns)
 
     def _now(self) -> Count:
@@ -321,7 +321,9 @@ class LineMeter:
             now_ns = clock.now_ns()
             counted_ns = self._exchanges.line.counted_ns(now_ns)
             counted = sum(counters.exchanges for counters in counters_by_drive.values())
-            if counted == sum(peer.exchanges for peer in peers.values()):  # none ended meanwhile
+            if counted == sum(
+                peer.exchanges for peer in peers.values()
+            ):  # no exchange ended between the readings
                 break
         seconds, counted_s = ((at_ns - self._opened_ns) / 1e9 for at_ns in (now_ns, counted_ns))
         epochs = {name: peer.number for name, peer in peers.items()}
@@ -329,5 +331,5 @@ class LineMeter:
 
 
 def _begins(reading: Count) -> Count:
-    """Return a reading as the beginning of an epoch of its own."""
+    """Return a reading as the start of a new epoch."""
     return reading._replace(statistics=replace(reading.statistics, epoch=next(_EPOCHS)))
