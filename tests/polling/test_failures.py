@@ -115,6 +115,8 @@ def test_a_failure_on_one_line_is_that_lines_alone(
     method: str,
     failure: BaseException,
 ) -> None:
+    for name in ("RETRY_NS", "LONGEST_RETRY_NS"):  # misses are made at looks before the retry
+        monkeypatch.setattr(polled_line, name, 400_000_000)
     two.until(("ill", "ok"), ("well", "ok"))
     with monkeypatch.context() as broken:
         broken.setattr(kind, method, of_line("ill", getattr(kind, method), failure))

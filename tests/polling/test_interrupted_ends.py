@@ -18,14 +18,14 @@ from typing import Any
 
 import pytest
 from interruptions import every, interrupted
-from lines import line, plant, polled, until
+from lines import line, patient, plant, polled, until
 from toy import Toy
 
 from multidrop import Bus, Poller
 from multidrop.sim import EncodedDrive, Simulator, Wire
 
 # A collection amid the work finalizes what an earlier interruption left, and may be interrupted itself.
-pytestmark = pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+pytestmark = [patient, pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")]
 
 CURRENT = Toy.registers["output_current"]
 STRIDE = 31  # bytecodes from one interruption to the next, unless all are wanted
