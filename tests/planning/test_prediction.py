@@ -1,4 +1,4 @@
-"""Predictions: against frame lengths counted by hand, and what must be true of any line."""
+"""Predictions: against manually counted frame lengths, and invariants of any line."""
 
 from __future__ import annotations
 

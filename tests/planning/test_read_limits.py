@@ -1,4 +1,4 @@
-"""Reading together where a class states no limit, and groups that always share a request."""
+"""Reading together if a class states no limit, and groups that always share a request."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def spans(drive: Drive, *names: str) -> list[tuple[int, int]]:
     return [(block.start, block.count) for block in blocks(drive, wanted)]
 
 
-# ---- nothing stated ----
+# ---- no stated limit ----
 
 
 @pytest.mark.slow

@@ -38,7 +38,7 @@ def take(made: Schedule[Job], now_ms: int, ahead_ms: int, most: int = 1000) -> l
 
 
 def carry_out(made: Schedule[Job], seconds: int) -> list[tuple[Job, int | None, int]]:
-    """On a line that takes what it is given, one job at a time: each with its slot and when it was sent."""
+    """Run one job at a time on a line; return each with its slot and the time of its request."""
     at, done = 0, []
     while at < seconds * 1000 * MS:
         ((chosen, not_before, due),) = made.take(at, at, at + 10_000 * MS, 1)
@@ -68,7 +68,7 @@ def test_after_a_stall_slots_are_counted_and_not_made_up_for() -> None:
 
 
 def test_what_the_line_will_be_too_late_for_is_not_queued() -> None:
-    """It is busy for so long already with what it was given."""
+    """The line is already busy for so long."""
     made = schedule(poll := job(period_ms=20))
     assert made.take(0, 110 * MS, 111 * MS, 9) == [(poll, 100 * MS, 100 * MS)]
     assert poll.skipped == 5
@@ -100,13 +100,11 @@ def test_of_a_line_that_is_asked_for_too_much_everybody_gets_a_part() -> None:
     made = schedule(*turn, *fast, *slow)
     done = carry_out(made, 100)
     counts = {each: sum(1 for other, _, _ in done if other is each) for each in made.jobs}
-    assert [counts[each] for each in slow] == pytest.approx(
-        [100, 100], abs=1
-    )  # those that are asked for little
+    assert [counts[each] for each in slow] == pytest.approx([100, 100], abs=1)  # jobs with few requests
     assert max(counts[each] for each in fast) - min(counts[each] for each in fast) <= 2
     assert sum(counts[each] for each in turn) / len(done) == pytest.approx(TURN_SHARE, abs=0.002)
     assert abs(counts[turn[0]] - counts[turn[1]]) <= 1
-    for each in (*fast, *slow):  # every slot was asked for, or is counted
+    for each in (*fast, *slow):  # every slot was requested, or is counted
         slots = 100_000 * MS // (each.period_ns or 1)
         assert counts[each] + each.skipped == pytest.approx(slots, abs=1)
 
@@ -506,7 +504,7 @@ def test_what_fits_is_kept(kinds: list[tuple[int, int | None, int, int]]) -> Non
 
 
 def test_a_drive_that_has_answered_is_not_asked_while_an_earlier_answer_may_come() -> None:
-    """Two questions between two looks, the first unanswered: else it is asked in vain without end."""
+    """Two requests between two observations, the first unanswered: otherwise it would be retried forever."""
     made = schedule(quick := job(1), timed := job(2, period_ms=10))
     fail(made, 1, 0, now_ms=0, late_until_ms=100)
     fail(made, 2, 0, now_ms=0, late_until_ms=60)
@@ -525,8 +523,8 @@ class Operation(RuleBasedStateMachine):
         self.made: Schedule[Job] = Schedule()
         self.now = self.busy_until = 1000 * MS
         self.added: dict[Job, int] = {}
-        self.slots: dict[Job, list[int]] = {}  # those that were asked
-        self.passed: Counter[Job] = Counter()  # those that were told as not asked
+        self.slots: dict[Job, list[int]] = {}  # carried out
+        self.passed: Counter[Job] = Counter()  # reported as not asked
         self.failures = dict.fromkeys(range(4), 0)
         self.silent_until = dict.fromkeys(range(4), 0)  # a late answer may come so long
 
@@ -573,14 +571,14 @@ class Operation(RuleBasedStateMachine):
         for each, not_before, due in taken:
             at = max(at, not_before)
             assert each in self.made.jobs
-            # Nothing is asked while an answer may still come, not even when the line is ready too soon.
+            # No request leaves while a late reply may come, even if the line is ready too soon.
             assert max(self.now, not_before) >= self.silent_until[each.drive]
             if each.period_ns and due is None:  # asked to see whether its drive answers, in no slot
                 assert self.failures[each.drive] >= 2
             elif each.period_ns:
                 assert (due - self.added[each]) % each.period_ns == 0  # on its grid
                 assert due > max(self.slots[each], default=-1)  # each slot once, in their order
-                assert due > at - each.period_ns  # what was missed is not made up for
+                assert due > at - each.period_ns  # missed slots are not made up for
                 self.slots[each].append(due)
             else:
                 self.slots[each].append(at)
@@ -597,7 +595,7 @@ class Operation(RuleBasedStateMachine):
                 assert slots == len(self.slots[job]) + job.skipped + self.passed[job]
 
     def teardown(self) -> None:
-        """Everything is well again, and is asked, in its turn or at its rate."""
+        """All drives answer again, and are polled in turn or at their rates."""
         for drive in range(4):
             self.wake(drive)
         load = sum(job.duration_ns / job.period_ns for job in self.made.jobs if job.period_ns)
@@ -711,7 +709,7 @@ def test_new_drives_are_asked_again_at_once_where_few_did_not_answer() -> None:
         take(made, 0, 100)
         made.back_off.conclude(lost.drive)
         made.back_off.observe(1, 1, 60 * MS, late_until_ns=200 * MS, cost_ns=cost_ms * MS, has_answered=False)
-        assert lost not in {asked for asked, _ in take(made, 70, 100)}  # nobody knows of the other one yet
+        assert lost not in {asked for asked, _ in take(made, 70, 100)}  # the other one is still unknown
         answer(made, living, 90)
         assert lost not in {asked for asked, _ in take(made, 100, 90)}
         assert {asked for asked, _ in take(made, 200, 20)} - {living} == again

@@ -1,4 +1,4 @@
-"""Names of drives: the normal forms of Unicode, of which keyboards give one or the other; reserved names."""
+"""Names of drives: Unicode normal forms, which differ between keyboards; reserved names."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ SHORT, LONG = "\u0439", "\u0438\u0306"
         (APART, [COMPOSED, APART], APART),  # an exact one goes first
         ("pump", ["pump", "pump-1"], "pump"),
         ("Pump", ["pump"], "Pump"),  # case is not spelling
-        ("\u212b", ["A\u030a", "\u00c5"], "\u212b"),  # three angstroms: two drives are meant, so neither is
+        ("\u212b", ["A\u030a", "\u00c5"], "\u212b"),  # three angstroms: ambiguous between two drives
         ("Lufter", [COMPOSED], "Lufter"),
-        ("\ufb01", ["fi"], "\ufb01"),  # a ligature looks like two letters, and is not the same text
+        ("\ufb01", ["fi"], "\ufb01"),  # a ligature is another text than its two letters
         ("\ud800", [COMPOSED], "\ud800"),
         ("", [], ""),
     ],

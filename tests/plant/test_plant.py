@@ -1,4 +1,4 @@
-"""Plant files: what is read from them, and that every mistake is a sentence of its own."""
+"""Plant files: their contents, and one sentence for every mistake."""
 
 from __future__ import annotations
 
@@ -106,7 +106,7 @@ def load(tmp_path: Path) -> Load:
 
 @pytest.fixture
 def mistakes(load: Load, tmp_path: Path) -> Mistakes:
-    """The sentences without the file's path, which each must begin with."""
+    """The sentences without the file's path, their required prefix."""
 
     def mistakes(text: str) -> list[str]:
         with pytest.raises(PlantError) as refusal:
@@ -460,7 +460,7 @@ def test_an_address_or_a_port_is_told_from_a_plant_file(name: str, told: str) ->
 
 
 def test_a_device_is_not_read_for_a_plant_file() -> None:
-    """A serial port would be waited for, and what is said on its line be lost."""
+    """A serial port would be waited for, and bytes on its line would be lost."""
     with pytest.raises(PlantError, match=r": is a device, and no plant file$"):
         load_plant(os.devnull)
 

@@ -103,11 +103,11 @@ def test_an_untouched_line_loses_no_slot(every: float | None) -> None:
         with clocked(hall(*pumps(every)), yard(*fans(every))) as made:
             rows = made.run(5)
             for others in OTHERS * 2:
-                if adopts:  # of a plant that was loaded anew: its drives are other objects
+                if adopts:  # loaded again: its drives are other objects
                     adopting = made.beside(lambda o=others: made.poller.adopt(plant(hall(*pumps(every)), *o)))
                 rows += made.run(1.7)
                 if adopts:
-                    made.finish(adopting)  # on a busy machine its thread may begin when that time is over
+                    made.finish(adopting)  # on a busy machine its thread may start after that time
             rows += made.run(2)
         return [(row.monotonic_ns, row.register, row.status) for row in rows if row.drive.startswith("pump")]
 
@@ -117,7 +117,7 @@ def test_an_untouched_line_loses_no_slot(every: float | None) -> None:
     assert beside[: len(alone)] == alone
 
 
-def test_what_is_the_same_stays_the_same() -> None:
+def test_unchanged_drives_stay_the_same_objects() -> None:
     with clocked(hall(*pumps()), yard(*fans())) as made:
         made.run(2)
         before = made.poller.plant
@@ -314,7 +314,7 @@ def test_a_line_is_compared_with_each_of_the_others_once() -> None:
     assert calls_to_add_one_to(24) < 2 * calls_to_add_one_to(12)
 
 
-def test_what_was_learnt_on_a_port_is_kept_when_it_is_opened_anew() -> None:
+def test_learnt_timing_survives_a_reopened_port() -> None:
     """A reply that is late may come on the port as it is opened next."""
     wires = {"port of hall": wire(Toy(1))}
     with ClockedLines.of_lines(wires, plant(hall(toy("pump-1", 1), toy("gone", 5)))) as made:
@@ -330,8 +330,8 @@ def test_what_was_learnt_on_a_port_is_kept_when_it_is_opened_anew() -> None:
         assert_rate(made.run(5), "pump-1", 5, 0.1)
 
 
-def test_a_drive_that_takes_another_s_place_knows_what_that_is_asked_yet() -> None:
-    """Requests that are queued yet are made before the next drive comes, which knows what may be late."""
+def test_a_drive_inherits_late_replies_of_the_one_before_at_its_address() -> None:
+    """Queued requests are carried out before the next drive comes, so that it inherits their late replies."""
     wires = {"port of hall": wire(Toy(1))}
     with ClockedLines.of_lines(wires, plant(hall(toy("pump-1", 1), toy("deaf", 5, 0.05)))) as made:
         made.run(0.2)
@@ -353,7 +353,7 @@ def test_a_drive_that_takes_another_s_place_knows_what_that_is_asked_yet() -> No
 
 
 @pytest.mark.slow
-def test_a_port_that_is_not_there_is_told_and_waited_for() -> None:
+def test_an_absent_port_is_reported_and_awaited() -> None:
     with clocked(hall(*pumps())) as made:
         made.run(1)
         del made.wires["port of yard"]
@@ -373,7 +373,7 @@ def test_a_port_that_is_not_there_is_told_and_waited_for() -> None:
         assert_rate(made.run(5), "fan-1", 5, 0.1)
 
 
-def test_one_line_whose_port_is_not_there_is_not_added() -> None:
+def test_a_line_with_an_absent_port_is_not_added() -> None:
     with clocked(hall(*pumps())) as made:
         made.run(1)
         del made.wires["port of yard"]
@@ -385,7 +385,7 @@ def test_one_line_whose_port_is_not_there_is_not_added() -> None:
         assert_rate(rows, "pump-1", 5, 0.1)
 
 
-# ---- what cannot be adopted ----
+# ---- plants that cannot be adopted ----
 
 
 def broken() -> dict[str, tuple[Plant, str]]:
@@ -437,7 +437,7 @@ def test_a_broken_plant_changes_nothing(mistake: str) -> None:
         assert sorted(made.opened) == ["port of hall", "port of yard"]
 
 
-def test_all_mistakes_are_told_at_once() -> None:
+def test_all_mistakes_are_reported_at_once() -> None:
     pump, _ = pumps()
     with clocked(hall(*pumps())) as made, pytest.raises(PlantError) as found:
         made.poller.adopt(plant(hall(pump, toy("pump-1", 1)), hall(toy("v", 3))))
@@ -480,7 +480,7 @@ def test_more_names_than_a_batch_can_number() -> None:
         assert_rate(made.run(5), "pump-2", 5, 0.1)
 
 
-def test_nothing_is_adopted_when_polling_has_ended() -> None:
+def test_adopt_raises_after_polling_has_ended() -> None:
     poller = Poller(plant())
     poller.close()
     for change in (
@@ -492,7 +492,7 @@ def test_nothing_is_adopted_when_polling_has_ended() -> None:
             change()
 
 
-def test_what_is_no_plant() -> None:
+def test_adopt_rejects_other_types() -> None:
     poller = Poller(plant())
     with pytest.raises(TypeError, match=r"Poller takes a Plant or a plant file such as 'plant.toml', not 5"):
         poller.adopt(5)  # type: ignore[arg-type]
@@ -502,7 +502,7 @@ def test_what_is_no_plant() -> None:
 # ---- batches ----
 
 
-def test_rows_under_a_name_are_told_apart_by_their_time() -> None:
+def test_rows_of_a_reused_name_are_distinguished_by_time() -> None:
     """Drives of two addresses, and of two lines, exchange their names; each has a value of its own."""
     wires = {"port of hall": toys(), "port of yard": wire(*(Toy(address) for address in (5, 6)))}
 
@@ -531,7 +531,7 @@ def test_rows_under_a_name_are_told_apart_by_their_time() -> None:
 
 
 @pytest.mark.slow
-def test_what_has_a_name_anew_is_counted_from_its_own_beginning() -> None:
+def test_statistics_of_a_reused_name_start_at_zero() -> None:
     with clocked(hall(*pumps())) as made:
         made.run(20)
         first = made.poller.statistics()["hall"]
@@ -610,7 +610,7 @@ def test_memory_is_bounded_over_many_adoptions() -> None:
         assert all(now <= then + 2 for now, then in zip(after, before, strict=True)), (before, after)
 
 
-def test_drives_that_join_are_asked_in_the_best_order() -> None:
+def test_joining_drives_are_polled_in_the_best_order() -> None:
     """The order is that of a line polled with them from the start: settings are changed as seldom."""
 
     def drives() -> list[PolledDrive]:

@@ -1,4 +1,4 @@
-"""Plants that are adopted while others are polled, on simulated lines: motors, calls, what is left."""
+"""Plants adopted during polling, on simulated lines: motors, calls, leftovers."""
 
 from __future__ import annotations
 
@@ -101,7 +101,7 @@ def test_motors_go_on_when_their_line_goes(both: TwoLines) -> None:
     assert runs(both.fans[1])
 
 
-def test_motors_that_are_to_stop_at_exit_are_stopped_before_they_leave(both: TwoLines) -> None:
+def test_stop_on_exit_stops_drives_before_they_leave(both: TwoLines) -> None:
     with Poller(plant(both.hall(), both.yard())) as poller:
         poller.stop_on_exit()
         for bus in poller.buses.values():
@@ -118,8 +118,8 @@ def test_motors_that_are_to_stop_at_exit_are_stopped_before_they_leave(both: Two
     assert not runs(both.fans[1])
 
 
-def test_a_drive_that_leaves_is_not_started_behind_its_stop(both: TwoLines) -> None:
-    """Nobody would stop it any more."""
+def test_a_leaving_drive_is_not_started_after_its_stop(both: TwoLines) -> None:
+    """No later stop would reach it."""
     with Poller(plant(both.hall())) as poller:
         poller.stop_on_exit()
         bus = poller.bus("hall")
@@ -162,12 +162,12 @@ def test_a_line_that_is_being_opened_has_its_drives_stopped_at_exit_too(
 
 
 class Other(Quick):
-    """Another family, whose manual has a start where the first one has a stop."""
+    """Another family, whose start is the first family's stop."""
 
     model = "other"
 
 
-def test_a_drive_that_is_another_family_s_now_gets_no_stop_of_the_old_one(both: TwoLines) -> None:
+def test_a_drive_of_a_changed_family_gets_no_stop_of_the_old_family(both: TwoLines) -> None:
     with Poller(plant(both.hall(), both.yard())) as poller:
         poller.stop_on_exit()
         for name in ("hall", "yard"):
@@ -206,7 +206,7 @@ def _held_up(
 ) -> tuple[threading.Event, threading.Event]:
     """Hold up each step of stops, of any drive or of this one.
 
-    Return what tells that one has begun, and what lets them go on.
+    Return an event for the first opening, and one that lets all continue.
     """
     begun, go_on = threading.Event(), threading.Event()
     step = bus._stopper.do
@@ -233,7 +233,7 @@ def test_a_stop_goes_on_while_its_line_is_to_go(both: TwoLines, monkeypatch: pyt
         adopting = threading.Thread(target=poller.adopt, args=[plant(both.hall())])
         adopting.start()
         before = samples(poller, "pump-1")
-        until(lambda: samples(poller, "pump-1") > before + 10)  # the other line is polled meanwhile
+        until(lambda: samples(poller, "pump-1") > before + 10)  # the other line is still polled
         assert adopting.is_alive()
         assert "yard" in poller.buses
         go_on.set()
@@ -265,7 +265,7 @@ def test_a_drive_leaves_beside_another_s_stop(both: TwoLines, monkeypatch: pytes
         assert poller.bus("hall").drives == [pump_1]
 
 
-def test_no_drive_is_off_its_line_while_another_is_waited_for(
+def test_drives_stay_attached_while_another_s_stop_is_awaited(
     both: TwoLines, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Both are exchanged for others of the same names: until then the old ones can be stopped."""
@@ -371,8 +371,8 @@ def test_a_stop_on_a_line_that_goes_holds_no_other_line_up(
         assert list(poller.buses) == ["hall"]
 
 
-def test_a_line_that_goes_twice_at_a_time_goes_once(both: TwoLines) -> None:
-    """Two who find it there both wait for its stops, and one of them lets it go."""
+def test_two_removals_of_a_line_remove_it_once(both: TwoLines) -> None:
+    """Two callers wait for its stops, and one of them removes it."""
     with Poller(plant(both.hall(), both.yard())) as poller:
         bus = poller.bus("yard")
         both_wait, part = threading.Barrier(2), bus.part
@@ -393,7 +393,7 @@ def test_a_line_that_goes_twice_at_a_time_goes_once(both: TwoLines) -> None:
         assert list(poller.buses) == ["hall"]
 
 
-def test_calls_on_what_has_gone_say_so(both: TwoLines) -> None:
+def test_calls_on_removed_lines_and_drives_raise(both: TwoLines) -> None:
     with Poller(plant(both.hall(), both.yard())) as poller:
         pump_1, pump_2 = poller.bus("hall").drives
         fan, _ = poller.bus("yard").drives
@@ -469,7 +469,7 @@ def test_closing_waits_for_an_adoption(both: TwoLines, monkeypatch: pytest.Monke
 
 
 def test_connections_are_made_side_by_side(monkeypatch: pytest.MonkeyPatch) -> None:
-    """None is made before all are asked for; and none sleeps when it is closed."""
+    """All are requested before the first is made, and none sleeps when it is closed."""
     with TwoLines("socket://127.0.0.1:0") as both:
         lines = both.hall(), both.yard()
         all_asked = threading.Barrier(2)
@@ -491,9 +491,7 @@ def test_connections_are_made_side_by_side(monkeypatch: pytest.MonkeyPatch) -> N
             until_sampled(poller, "fan-1")
 
 
-def test_a_port_that_takes_its_time_holds_up_no_other_one(
-    both: TwoLines, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_slow_port_delays_no_other_port(both: TwoLines, monkeypatch: pytest.MonkeyPatch) -> None:
     go_on = threading.Event()
     open_bus = Bus.__init__
 
@@ -521,7 +519,7 @@ def test_a_port_that_takes_its_time_holds_up_no_other_one(
     }
 
 
-def test_a_drive_that_is_exchanged_can_be_stopped_while_a_port_takes_its_time(
+def test_an_exchanged_drive_can_be_stopped_while_a_port_opens_slowly(
     both: TwoLines, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     opening, go_on = threading.Event(), threading.Event()
@@ -558,11 +556,11 @@ def until_sampled(poller: Poller, drive: str) -> None:
     raise AssertionError(f"no samples of {drive}")
 
 
-# ---- while somebody looks ----
+# ---- readers during an adoption ----
 
 
 class Dawdling(dict[object, object]):
-    """Lets others change it, if they can, while somebody goes through its values."""
+    """Lets other threads change it while a caller iterates over its values."""
 
     def __init__(self, of: dict[object, object], change: Callable[[], object]) -> None:
         super().__init__(of)
@@ -596,7 +594,7 @@ def test_a_summary_is_of_the_plant_before_or_after(both: TwoLines) -> None:
 
 @pytest.mark.long
 @pytest.mark.slow
-def test_a_hundred_adoptions_leave_nothing_behind(both: TwoLines) -> None:
+def test_a_hundred_adoptions_leave_no_leftovers(both: TwoLines) -> None:
     """With threads that read by hand, look at statistics and take batches; every value is its own."""
     held_by = {"pump-1": 1.0, "pump-2": 2.0, "fan-1": 3.0, "fan-2": 4.0}
     sims = [*both.pumps.values(), *both.fans.values()]

@@ -168,7 +168,7 @@ def test_columns_have_the_types_that_are_promised() -> None:
 
 
 def test_columns_outlive_their_batch() -> None:
-    """Chunks that a queue takes back are filled anew: not while a view of them is held."""
+    """A queue reuses returned chunks, but not while a view of them is held."""
     queue = RowQueue()
     names = Names(["a"])
     kept = []

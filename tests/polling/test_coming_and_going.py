@@ -138,7 +138,7 @@ def test_nothing_is_asked_of_a_drive_that_was_detached(port: str) -> None:
                 do()
         again = bus.attach(Toy, address=1, name="pump-1")
         assert bus.peer(again) is peer  # which knows of answers that may come late
-        assert peer.proofs is proofs  # at one of which the core may look just now
+        assert peer.proofs is proofs  # the core may be reading one of them
 
 
 @pytest.mark.slow
@@ -183,7 +183,7 @@ def test_no_drive_leaves_while_all_are_stopped(port: str, monkeypatch: pytest.Mo
 @pytest.mark.slow
 @pytest.mark.long
 def test_many_threads_do_all_of_it_at_once() -> None:
-    """The program that does so with 64 lines for ten minutes, for a short while."""
+    """A short run of the program that takes ten minutes with 64 lines."""
     program = [
         sys.executable,
         "-m",
@@ -199,7 +199,7 @@ def test_many_threads_do_all_of_it_at_once() -> None:
 
 
 def test_statistics_may_be_looked_at_while_drives_leave(port: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A drive that has left in the middle of a look is no mistake of whoever looks."""
+    """A reader does not fail when a drive leaves during its read."""
     with Bus(port) as bus:
         ours = [bus.attach(Toy, address=address, name=f"pump-{address}") for address in (1, 2)]
         counters = bus.peer(ours[0]).counters

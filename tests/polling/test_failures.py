@@ -49,7 +49,7 @@ class Two:
         )
 
     def until(self, *wanted: tuple[str, str]) -> None:
-        """Take rows until each of these came, as drive and status; what came before does not count."""
+        """Take new rows until each of these (drive, status) pairs has come."""
         self.rows()
         missing = set(wanted)
 
@@ -115,7 +115,7 @@ def test_a_failure_on_one_line_is_that_lines_alone(
     method: str,
     failure: BaseException,
 ) -> None:
-    for name in ("RETRY_NS", "LONGEST_RETRY_NS"):  # misses are made at looks before the retry
+    for name in ("RETRY_NS", "LONGEST_RETRY_NS"):  # only looks before the retry make misses
         monkeypatch.setattr(polled_line, name, 400_000_000)
     two.until(("ill", "ok"), ("well", "ok"))
     with monkeypatch.context() as broken:
@@ -328,11 +328,11 @@ def test_a_log_handler_that_exits_ends_no_log(two: Two, caplog: pytest.LogCaptur
     until(lambda: "second" in caplog.text)
 
 
-# ---- what the function of `on_batch` may be ----
+# ---- valid functions of `on_batch` ----
 
 
 async def wait(batch: object) -> None:
-    """Would be called and never begun."""
+    """A call would return without running it."""
 
 
 def give(batch: object) -> Iterator[object]:
@@ -380,7 +380,7 @@ def test_own_classes_may_fail_later(monkeypatch: pytest.MonkeyPatch) -> None:
 
     assert issubclass(Own, Drive)
     monkeypatch.setattr(polled_line, "LEARN_NS", 10_000_000)
-    monkeypatch.setattr(line_drives, "MARGIN", -1.0)  # planned anew at each look
+    monkeypatch.setattr(line_drives, "MARGIN", -1.0)  # planned again at each look
     with Simulator([Wire([simulated(Toy(1))], unpaced=True) for _ in range(2)]) as simulator:
         ill, well = (wire.path for wire in simulator.wires)
         poller = Poller(

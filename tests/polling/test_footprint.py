@@ -1,4 +1,4 @@
-"""Memory of a process that polls, where a small machine has little of it."""
+"""Memory of a polling process, which a small machine must afford."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""Every fault on a line of every family: nothing is misattributed, every miss is explained, and it ends.
+"""Every fault on a line of every family: no misattribution, a reason for every miss, and recovery.
 
-On a clock of the test's own, so that a seed is a story that can be told again. For hours, with new seeds:
+On the test's own clock, so that a seed reproduces its run. For hours, with new seeds:
 `HOSTILE_HOURS=2 pytest -m '' tests/polling/test_hostile_line.py -k hours`.
 """
 
@@ -82,7 +82,7 @@ def test_an_adapter_that_always_echoes_is_known_for_it(name: str) -> None:
     story = Story(of_one_variant(LINES[name]))
     story.wire.faults = KINDS["echo"]
     with story.clocked:
-        begun = len(story.run(2))  # each drive's first value is asked for again
+        begun = len(story.run(2))  # each drive's first value is read again
         story.run(HEALTHY)
     story.rows += rows_of(story.clocked.poller)
     story.judge()
@@ -93,7 +93,7 @@ def test_an_adapter_that_always_echoes_is_known_for_it(name: str) -> None:
 @table("echo", [0, 1], ids=["no echo", "an echo"])
 @table("register", ["dc_bus_voltage", "output_frequency"], ids=["a value", "a zero"])
 def test_a_delixi_parameter_is_no_echo_of_its_query(register: str, echo: int) -> None:
-    """Nothing else is polled on the line: what is asked for may have the value that its query says."""
+    """The polled register alone may have the value that its request contains."""
     drive = DelixiNative(1, name="drive-1")
     asked = polled(drive, [drive.register(register)])
     with ClockedLines(ClockedWire([simulated(drive)], Faults(echo=echo)), [asked]) as clocked:
@@ -103,7 +103,7 @@ def test_a_delixi_parameter_is_no_echo_of_its_query(register: str, echo: int) ->
 
 
 def test_a_delixi_drive_that_falls_silent_behind_a_new_echo_does_not_read_0_for_long() -> None:
-    """A cut pair may do both at once: after two values of 0 the drive is asked for what is never 0."""
+    """A cut pair may do both at once: after two values of 0 an echo probe follows."""
     drive = DelixiNative(1, name="drive-1")
     asked = polled(drive, [DelixiNative.output_frequency, DelixiNative.output_current])
     wire = ClockedWire([simulated(drive)], Faults())
@@ -122,7 +122,7 @@ def test_a_delixi_drive_that_falls_silent_behind_a_new_echo_does_not_read_0_for_
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", usually(*KINDS))
 def test_a_fault_while_the_core_repeats_the_bus_cycle(kind: str) -> None:
-    """Nothing is polled at a rate: that goes without the poller's thread until something fails."""
+    """Without rates the core polls without the poller's thread until a fault."""
     story = Story(of_one_variant(LINES["innovert-ibd rtu"]), every=None)
     story.tell(KINDS[kind])
     assert any(story.wire.struck[rate] for rate in RATES if getattr(KINDS[kind], rate))
@@ -136,7 +136,7 @@ def all_lines() -> Iterator[list[Drive]]:
 
 @pytest.mark.long
 def test_nothing_grows_for_hours() -> None:
-    """All families on one line; where there are hours, each alone too, with all kinds of faults in turn."""
+    """All families on one line; given hours, each alone too, with all kinds of faults in turn."""
     hours = float(os.environ.get("HOSTILE_HOURS", "0"))
     end = time.monotonic() + 3600 * hours
     seen: list[tuple[int, int, int]] = []

@@ -1,7 +1,7 @@
 """Whatever interrupts the opening or closing of a bus, poller or simulator: closing again finishes the job.
 
 KeyboardInterrupt is raised before each bytecode of the main thread in turn, in the package's own files. This
-is more than a signal's handler can do: that runs between some of them alone.
+is harsher than a signal handler, which runs only between some bytecodes.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from toy import Toy
 from multidrop import Bus, Poller
 from multidrop.sim import EncodedDrive, Simulator, Wire
 
-# A collection amid the work finalizes what an earlier interruption left, and may be interrupted itself.
+# A garbage collection finalizes leftovers of earlier interruptions, and may be interrupted itself.
 pytestmark = [patient, pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")]
 
 CURRENT = Toy.registers["output_current"]
@@ -55,7 +55,7 @@ def hall() -> Iterator[Received]:
 
 
 def falls_silent(hall: Received) -> None:
-    """See that nothing more is sent, once the drive has taken what was: a poll takes a millisecond."""
+    """Check that no further request is sent after the drive has received the last one."""
 
     def has_ended() -> bool:
         before = hall.drive.requests
@@ -70,7 +70,7 @@ def made(hall: Received) -> Poller:
 
 
 def ended(poller: Poller, hall: Received) -> None:
-    """Close again, and see that nothing is left."""
+    """Close again, and check for leftovers."""
     poller.close()
     assert not any(bus.is_open for bus in poller.buses.values())
     falls_silent(hall)
@@ -165,7 +165,7 @@ def test_a_simulator_ends_though_that_is_interrupted(step: int, deed: str) -> No
     assert every(step, act) > 1
 
 
-# ---- what the core may still write to ----
+# ---- memory that the core may still write to ----
 
 LEFT_OPEN = """
 import gc, sys, time
@@ -204,7 +204,7 @@ def test_a_poller_that_is_left_open_harms_no_memory(hall: Received, is_ended: bo
     """The interpreter frees its objects in any order, while the core's thread still runs."""
     path = [each for each in sys.path if each]
     code = LEFT_OPEN.format(path=path, port=hall.path, is_ended=is_ended, end=end)
-    env = {**os.environ, "PYTHONMALLOC": "malloc", "MALLOC_PERTURB_": "165"}  # what is freed is overwritten
+    env = {**os.environ, "PYTHONMALLOC": "malloc", "MALLOC_PERTURB_": "165"}  # freed memory is overwritten
     ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120, env=env)
     assert (ran.returncode, ran.stderr) == (0, "")
     falls_silent(hall)

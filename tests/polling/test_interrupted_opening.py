@@ -1,4 +1,4 @@
-"""An interruption while a poller's ports are opened leaves none of them open."""
+"""An interruption during the opening of a poller's ports leaves no port open."""
 
 from __future__ import annotations
 

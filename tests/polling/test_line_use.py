@@ -1,4 +1,4 @@
-"""The use of a line between any two looks at its statistics, on a clock that only the test lets pass."""
+"""Line utilisation between any two readings of its statistics, on the test's own clock."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ STEPS = 400
 @pytest.mark.long
 @table("seconds", [0.001, 0.003, 0.01, 0.03, 0.1])
 def test_a_line_is_never_used_for_longer_than_there_is(seconds: float) -> None:
-    """An exchange that was under way at a look counts in the time after it, and so does all of its time."""
+    """An exchange under way at a reading counts after it, with all its time."""
     pumps = [Toy(address, name=f"pump-{address}") for address in (1, 2)]
     wire = ClockedWire([EncodedDrive(pump) for pump in pumps], Faults())
     drives = [polled(pump, [Toy.output_frequency, Toy.acceleration_time]) for pump in pumps]

@@ -1,4 +1,4 @@
-"""A poller whose lines other processes may take over: what is polled when, and what its rows say."""
+"""A poller whose lines other processes may take over: its requests and rows over time."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ def lines(every: float | None, port: str = "pty") -> Iterator[tuple[list[Simulat
 
 
 class Rows:
-    """Return what the rows of a poller say, by drive."""
+    """Return the statuses of a poller's rows, by drive."""
 
     def __init__(self, poller: Poller) -> None:
         self._poller = poller
@@ -121,7 +121,7 @@ def test_a_plant_is_polled_while_its_mastership_holds(mastership: Mastership, ev
         hold(mastership)
         rows.settle("pump", "fan")
         mastership.end()
-        rows.settle_unpolled("pump")  # what left before has reached its drive by then
+        rows.settle_unpolled("pump")  # earlier requests have reached their drive by then
         asked = [sim.counters.requests for sim in sims]
         rows_of(poller)
         rows.until("fan", NOT_MASTER)
@@ -139,7 +139,7 @@ def test_a_plant_is_polled_while_its_mastership_holds(mastership: Mastership, ev
 @pytest.mark.slow
 @paces
 def test_rows_of_a_line_without_its_master_are_few(mastership: Mastership, every: float | None) -> None:
-    """Nothing runs round in circles."""
+    """No busy loop runs."""
     with lines(every) as (_, made), Poller(plant(*made), mastership=mastership) as poller:
         Rows(poller).until("pump", NOT_MASTER)
         begun = time.monotonic()
@@ -162,7 +162,7 @@ def test_a_poller_without_a_mastership_says_nothing_of_others() -> None:
 
 @contextmanager
 def seen_line(mastership: Mastership, every: float | None) -> Iterator[tuple[int, Poller]]:
-    """A polled line on which nobody answers, and its far end."""
+    """A polled line of silent drives, and its far end."""
     far, near = os.openpty()
     tty.setraw(near)
     os.set_blocking(far, False)
@@ -241,7 +241,7 @@ def test_another_master_is_told_and_polling_begins_when_it_is_silent(
 
 
 class Listener:
-    """A far end that answers nothing and keeps what comes, by connection."""
+    """A silent far end that keeps received bytes, by connection."""
 
     def __init__(self) -> None:
         self._server = socket.create_server(("127.0.0.1", 0))
@@ -297,7 +297,7 @@ def test_a_line_that_was_removed_is_closed_and_gets_no_byte(mastership: Mastersh
 
 @pytest.mark.slow
 def test_no_port_is_opened_by_who_is_not_the_master(mastership: Mastership, far: Listener) -> None:
-    """Not at first, and not where it was lost: that could cut the master's connection off."""
+    """Neither at first nor after a loss: that could cut the master's connection."""
     yard = line(far.url, quick("fan", 1, None), name="yard")
     with lines(0.02) as (_, (hall, _)), Poller(plant(hall, yard), mastership=mastership) as poller:
         Rows(poller).until("fan", NOT_MASTER)
@@ -380,7 +380,7 @@ def test_a_line_is_listened_to_again_after_a_lapse_in_which_nothing_was_asked(ma
 
 
 def test_many_ports_are_opened_side_by_side_and_closed_at_once(mastership: Mastership) -> None:
-    """pyserial's own sockets sleep for 0.3 s when they are closed: 64 of them for 19 s."""
+    """pyserial's own sockets sleep for 0.3 s at their closing: 64 sockets for 19 s."""
     wires = [Wire([simulated(Quick(1))], unpaced=True, port="socket://127.0.0.1:0") for _ in range(64)]
     with Simulator(wires) as simulator:
         declared = [
@@ -427,7 +427,7 @@ class Busy:
     bus = SimpleNamespace(leave=lambda: None, part=lambda: None)
 
     def leave(self) -> None:
-        """Be tended no more."""
+        """Stop being tended."""
 
     def end(self) -> bool:
         return True

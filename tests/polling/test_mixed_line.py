@@ -16,7 +16,7 @@ from multidrop.polling.batch import Row
 from multidrop.sim import EncodedDrive, Wire
 
 REAL_SECONDS = 4.0
-EVERY = 1.0  # s, of what is polled at a rate
+EVERY = 1.0  # s, the period of the rated registers
 
 FAST_SECONDS = 2.0
 
@@ -59,7 +59,7 @@ def check(rows: list[Row], drives: list[PolledDrive], summary: dict[str, Any]) -
 
 
 def test_values_tell_all_registers_apart() -> None:
-    """Raw counts that any two of these drives could be asked for differ: else they would prove nothing."""
+    """Raw counts of any two drives differ, so that a misattribution shows."""
     for drives in (real_drives(), fast_drives()):
         asked = [polled(drive, drive.readings()) for drive in drives]
         truth = proofs(*asked)

@@ -1,4 +1,4 @@
-"""Registers that hold no valid value, parts, and scales, polled: their rows and what is counted of them."""
+"""Polled registers without a valid value, parts and scales: their rows and counts."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ ANSWERED = ("ok", "no valid value")  # a machine that others load may miss an an
 
 
 class Meter(Drive):
-    """One request reads all of it."""
+    """One request reads all registers."""
 
     most_registers = {INPUT: 40, HOLDING: 40}
 
@@ -46,7 +46,7 @@ def rows_by_register(sim: SimulatedDrive) -> tuple[dict[str, Row], Poller, list[
                 return len({row.register for row in rows if row.status in ANSWERED}) == len(Meter.registers)
 
             until(all_there)
-        rows += rows_of(poller)  # what came until its end
+        rows += rows_of(poller)  # rows until its end
         return {row.register: row for row in rows if row.status in ANSWERED}, poller, rows
 
 
@@ -57,7 +57,7 @@ def test_all_of_a_meter_is_one_request() -> None:
 
 def test_parts_of_a_word_are_one_request_where_nothing_else_may_be() -> None:
     class Single(Drive):
-        """A device of which each register is read alone."""
+        """A device whose registers are read singly."""
 
         most_registers = {INPUT: 1}
         first = reading(7, part=(0, 3), table=INPUT)

@@ -1,4 +1,4 @@
-"""The poller, on simulated lines: rates, rows, faults, and that nothing is left behind."""
+"""The poller, on simulated lines: rates, rows, faults, and no leftovers."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ class Polling:
         until(lambda: self.statuses(drive)[status] >= before + count)
 
     def check_summary(self) -> None:
-        """The summary counts what the rows say, line by line and drive by drive."""
+        """The summary agrees with the rows, line by line and drive by drive."""
         summary = self.poller.summary()
         misses = Counter(row.status for row in self.rows if row.value is None)
         assert summary["samples"] == sum(1 for row in self.rows if row.value is not None)
@@ -259,7 +259,7 @@ def test_many_lines_at_once() -> None:
 
 @pytest.mark.long
 def test_a_call_of_one_line_costs_the_others_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Lines with a rate are looked at every 50 ms, however often any of them calls."""
+    """Lines with a rate are tended every 50 ms, no matter how often they call."""
     looks: list[int] = []
     is_steady = PolledLine.is_steady
 
@@ -297,7 +297,7 @@ def test_commands_go_ahead_while_the_line_is_polled(port: str, pump: SimulatedDr
     polling.check_summary()
 
 
-# ---- what the poll reports of faults ----
+# ---- faults in the poll's rows ----
 
 
 def reply_of(address: int, reply: bytes) -> bytes:
@@ -308,7 +308,7 @@ def reply_of(address: int, reply: bytes) -> bytes:
 OTHER = checksums.rtu("02 03 02 12 34")
 NOISE = bytes(at * 151 % 256 for at in range(4096))
 
-FAULTS = {  # what becomes of a reply, and what the poll then says: of all, or of some and of the others
+FAULTS = {  # the fate of a reply, and the statuses in the rows
     "cut off": (lambda reply: reply[:-1], {"reply cut short"}),
     "damaged": (lambda reply: reply[:-1] + bytes([reply[-1] ^ 1]), {"bad checksum"}),
     "twice": (lambda reply: 2 * reply, {"ok"}),
@@ -322,7 +322,7 @@ FAULTS = {  # what becomes of a reply, and what the poll then says: of all, or o
     "lost": (lambda reply: b"", {"no reply"}),
     "an exception": (lambda reply: checksums.rtu("01 83 02"), {"exception 02"}),
 }
-PIECES = {  # what the beginning says, where this machine brought the rest too late
+PIECES = {  # the status of a prefix, if this machine delivered the rest too late
     "noise before": {"bad checksum", "reply from another address", "reply to another function"},
     "of another drive, then its own": {"reply from another address"},
 }
@@ -334,7 +334,7 @@ def test_what_the_poll_says_of_a_reply(fault: str, pump: SimulatedDrive) -> None
     # A pty would have no room for so much noise.
     wire = Faulty([pump], fate, unpaced=True, port="socket://127.0.0.1:0")
     with Simulator([wire]) as sim, Polling(line(sim.wires[0].path, polled(drive(), ONE))) as polling:
-        # Since the beginning: what is refused three times is asked once a minute, and may have been by now.
+        # Since the start: a block that was refused three times is requested only once a minute.
         until(lambda: all(polling.statuses()[status] >= 2 for status in said))
     assert {row.value for row in polling.rows if row.status == "ok"} == ({3.25} if "ok" in said else set())
     assert polling.statuses().keys() <= said | HOST_LATE | PIECES.get(fault, set())
@@ -418,7 +418,7 @@ def test_a_port_that_vanishes_and_comes_back_under_its_link(tmp_path: Path) -> N
 
 def queued_before_a_stop(hall: PolledLine) -> int:
     """Open the port again as a stop does that comes before the poller; return the slots still queued then."""
-    with hall._lock:  # the poller's thread looks at the line before or after this
+    with hall._lock:  # the poller's thread tends the line before or after this
         core, noted, queued = hall.bus.line.queue, hall._queue._done, len(hall._queue.slots())
         assert core
         until(lambda: core.done >= noted + min(3, queued))
@@ -429,7 +429,7 @@ def queued_before_a_stop(hall: PolledLine) -> int:
 
 @pytest.mark.slow
 def test_polling_goes_on_where_a_stop_has_opened_the_port_again(port: str) -> None:
-    """The poller may never have seen that the port was gone; it asks on the new one what was queued on it."""
+    """The poller may have missed the loss of the port; it repeats the queued requests on the new one."""
     every = 0.01
     with Polling(line(port, polled(drive(), ONE, every))) as polling:
         (hall,) = polling.poller._lines
@@ -442,7 +442,7 @@ def test_polling_goes_on_where_a_stop_has_opened_the_port_again(port: str) -> No
     assert hall._ended_ns
     slots = (hall._ended_ns - hall.started_ns) / 1e9 // every
     left_out = polling.poller.summary()["lines"]["line"]["overrun_slots"]
-    assert len(polling.rows) + left_out >= slots  # none of those that were queued vanished
+    assert len(polling.rows) + left_out >= slots  # no queued exchange vanished
     polling.check_summary()
 
 
@@ -529,7 +529,7 @@ def test_a_plant_without_lines_is_polled_in_peace() -> None:
 
 @pytest.mark.parametrize("end", ["polled", "lost", "never entered"])
 def test_nothing_is_left_behind(port: str, end: str) -> None:
-    Poller(plant(line(port, polled(drive(), ONE)))).close()  # what the process has once is there now
+    Poller(plant(line(port, polled(drive(), ONE)))).close()  # lazily opened descriptors are open now
     before = descriptors(), threads()
     if end == "never entered":
         Poller(plant(line(port, polled(drive(), ONE)))).close()
@@ -582,7 +582,7 @@ def test_what_is_under_way_at_the_end_is_waited_for(
     monkeypatch.setattr(line_set, "ENDING_NS", round(PATIENCE * 1e9))
     with Polling(line(path, patient(every))) as polling:
         assert os.read(master, 1024) == checksums.rtu("01 03 00 04 00 01")
-        monkeypatch.setattr(clock, "sleep", answer)  # when it waits for what is under way
+        monkeypatch.setattr(clock, "sleep", answer)  # when it waits for exchanges under way
     assert [(row.value, row.status) for row in polling.rows] == [(1.0, "ok")]
     polling.check_summary()
 
@@ -648,14 +648,14 @@ def test_a_line_that_cannot_be_opened_is_an_error_and_leaves_nothing(port: str) 
 def test_rows_can_be_taken_when_all_is_closed(port: str) -> None:
     with Poller(plant(line(port, polled(drive(), ONE)))) as poller:
         until(lambda: poller.summary()["samples"])
-    poller.close()  # twice is no mistake
+    poller.close()  # a second call is allowed
     told = poller.summary()
     assert len(rows_of(poller)) == told["samples"] + told["misses"]
     assert poller.take() is None
 
 
 def test_a_line_is_closed_on_a_port_that_was_opened_just_now() -> None:
-    """Nothing was queued on it yet, whatever was carried out on the one before."""
+    """Its queue starts empty, whatever happened on the earlier port."""
     sim = simulated(drive())
     with ClockedLines(ClockedWire([sim], Faults()), [polled(drive(), READINGS, 0.1)]) as clocked:
         clocked.run(1.0)

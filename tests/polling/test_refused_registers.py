@@ -1,4 +1,4 @@
-"""A register that a drive refuses costs its neighbours nothing: it is found, set aside and reported."""
+"""A refused register is found, set aside and reported, and its neighbours are still read."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def test_a_refused_register_is_set_aside_and_its_neighbours_are_read() -> None:
     assert set(seen) == set(POLLED) - {REFUSED.name}
     assert told["set_aside"] == ["pump-1.mystery"]
     queued_ahead = 256 * len(POLLED)
-    assert refused <= 2 * queued_ahead  # it is no longer asked for, but for what was queued
+    assert refused <= 2 * queued_ahead  # only queued requests still read it
 
 
 class Moody(SimulatedDrive):

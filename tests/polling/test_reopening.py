@@ -1,4 +1,4 @@
-"""A lost port of a polled line is opened by a stop where nobody else can: without a thread, or a poller."""
+"""A stop reopens a lost port of a polled line if no thread or poller can."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ START = threading.Thread.start
 
 
 class Plant:
-    """A polled line whose port vanishes and comes back, with a drive whose motor turns meanwhile."""
+    """A polled line whose port vanishes and comes back while its motor turns."""
 
     def __init__(self, path: Path, stack: ExitStack) -> None:
         self.path = path
@@ -86,7 +86,7 @@ def test_without_a_thread_a_stop_opens_the_port_and_polling_goes_on(
 def test_lines_are_opened_though_the_system_gives_few_threads(
     hall: Plant, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, threads: int
 ) -> None:
-    """A reload that ended here would leave motors behind that nobody can stop."""
+    """A reload that ended here would leave motors running without any stop."""
     left = threads
 
     def start(thread: threading.Thread) -> None:

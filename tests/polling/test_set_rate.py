@@ -53,7 +53,7 @@ def only_line(made: ClockedLines) -> PolledLine:
 
 def test_one_register_s_rate_is_changed_and_no_other_s(two: ClockedLines) -> None:
     two.poller.set_rate("pump-1", "output_current", 1.0)
-    two.run(1)  # what was queued is asked
+    two.run(1)  # queued requests are still sent
     counts = values(two.run(10))
     assert counts.pop(("pump-1", "output_current")) in (10, 11)
     assert len(counts) == 7
@@ -105,7 +105,7 @@ def test_registers_that_stay_keep_their_slots() -> None:
 
 @pytest.mark.long
 def test_every_value_is_its_own_register_s_while_rates_change() -> None:
-    """And each change leaves each register with rows: nothing is lost."""
+    """And each register still has rows after each change."""
     chance = random.Random(7)
     drives = [polled(toy(address), ALL, 0.05) for address in (1, 2)]
     with clocked(*drives) as made:
@@ -121,7 +121,7 @@ def test_every_value_is_its_own_register_s_while_rates_change() -> None:
         made.run(1)
         last = made.run(1)
     for row in rows:
-        assert row.status in ("ok", "not sent: expired")  # more is asked for than the line bears
+        assert row.status in ("ok", "not sent: expired")  # more than the line's capacity
         if row.value is not None:
             pump = next(each.drive for each in drives if each.drive.name == row.drive)
             assert row.value == proof(pump, pump.register(row.register))

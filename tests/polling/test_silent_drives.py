@@ -1,4 +1,4 @@
-"""Drives that fall silent, on a test line's clock: what they cost the others, and how soon they are back."""
+"""Drives that fall silent, on the test's clock: their cost to the others, and their return."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from multidrop.polling.polled_line import PolledLine
 from multidrop.sim import Faults, simulated
 
 DRIVES = 31
-FIRST, LATER = 8, 52  # s, for which the rates are promised
+FIRST, LATER = 8, 52  # s, the span of the promised rates
 BACK = 45  # s, in which drives that were dead from the start are back, when all have power
 
 
 def test_a_slot_that_is_not_asked_has_its_row_when_it_has_come() -> None:
-    """The line is planned ahead; what is recorded is not."""
+    """The line is planned ahead; rows are not."""
     toy = Toy(1, name="pump-1")
     silent = simulated(toy)
     silent.deaf_until = float("inf")
@@ -54,7 +54,7 @@ def test_a_line_is_looked_at_more_often_while_a_drive_of_it_is_silent(
         looked.clear()
         rows = clocked.run(2)
         assert len([row for row in rows if row.value is not None]) == (20 if is_silent else 40)
-        assert abs(len(looked) - looks) <= 3  # it is called when a drive answers again, or no more
+        assert abs(len(looked) - looks) <= 3  # it is called when a drive falls silent or answers again
 
 
 @pytest.mark.long
@@ -96,7 +96,7 @@ def test_silent_drives_cost_the_others_little_and_are_soon_back(dead: int, back_
 def test_drives_that_are_dead_from_the_start_cost_the_others_little_at_once(
     count: int, dead: int, every: float | None
 ) -> None:
-    """Every third one, so that most of the living come after one of them."""
+    """Every third one, so that most living drives follow a silent one."""
     gone = {3 * number + 1 for number in range(dead)}
 
     def answered(addresses: list[int]) -> list[int]:

@@ -69,7 +69,7 @@ def test_rows_have_the_time_of_their_exchange(tmp_path: Path) -> None:
             check=False,
         )
     assert ran.returncode == 0, ran.stderr
-    slept_for = {True: set[int](), False: set[int]()}  # hours, by whether it was asked before the sleep
+    slept_for = {True: set[int](), False: set[int]()}  # hours, by whether the request left before the sleep
     before_ns, amid_ns = asked_ns[48], asked_ns[49]  # of that one the clock may be read when it slept
     for time_ns, monotonic_ns in json.loads(ran.stdout):
         if not before_ns < monotonic_ns <= amid_ns:

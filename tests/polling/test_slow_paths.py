@@ -198,7 +198,7 @@ def test_reads_of_a_delixi_have_the_80_ms_of_its_document(
 def test_a_stop_over_a_slow_path_is_seen_to_be_done(
     model: str, seconds: float, path_of: Callable[..., tuple[Bus, PathLine]]
 ) -> None:
-    """Its first frame leaves at once; what it asks then waits for as long as answers are known to take."""
+    """Its first frame leaves at once; its later reads wait as long as replies are known to take."""
     drive = MAKE[model](1)
     sim = simulated(drive)
     assert isinstance(sim, MotorDrive)
@@ -215,11 +215,11 @@ def test_a_stop_over_a_slow_path_is_seen_to_be_done(
 
     received.loses = note
     with opened:
-        line.wire.advance(line.now / S)  # its clock begins
+        line.wire.advance(line.now / S)  # its clock starts
         sim.motor.run(1)
         opened.drives[0].stop()
     assert not sim.motor.energised
-    assert sent_after[0] < 1  # after the looks that are answered, and one that is not
+    assert sent_after[0] < 1  # after the answered reads, and one without an answer
     assert len(sent_after) <= 6
     assert (line.now - begun) / S < 8 * seconds + 3
 

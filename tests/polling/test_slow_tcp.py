@@ -44,7 +44,7 @@ PATHS = [
     for seconds in delays
 ]
 ON_PATHS = every_fourth(FAMILIES, PATHS, [("innovert-ibd", (constant, 0.6))])
-KINDS = ("delay", "twice", "merge")  # what a gateway may do without damage to the stream
+KINDS = ("delay", "twice", "merge")  # faults of a gateway that keep the stream in step
 
 
 class TrueIds(PathWire):
@@ -193,7 +193,7 @@ def test_a_stop_over_a_slow_path_is_seen_to_be_done(
 
     received.loses = note
     with opened:
-        line.wire.advance(line.now / S)  # its clock begins
+        line.wire.advance(line.now / S)  # its clock starts
         sim.motor.run(1)
         opened.drives[0].stop()
     assert not sim.motor.energised

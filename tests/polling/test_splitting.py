@@ -73,7 +73,7 @@ def test_one_refused_register_costs_its_neighbours_a_few_requests_and_no_more(ev
     assert values(rows) == right(set(range(WIDE)) - {7})
     assert told == ["pump-1.r7"]
     asked = {span for span in sim.asked if span != (7, 1)}
-    assert len(asked) <= 5  # log2 of 24, and 24 requests if each were asked singly
+    assert len(asked) <= 5  # log2 of 24, and 24 single requests
     assert all(row.value is not None for row in rows if row.register != "r7")
 
 
@@ -145,7 +145,7 @@ def test_a_device_that_is_silent_to_long_requests_is_read_in_shorter_ones(
 
 @pytest.mark.long
 def test_while_it_is_silent_to_long_requests_it_is_asked_at_its_rate() -> None:
-    """The one register that tells whether it is there is asked for as often as the block was to be."""
+    """The presence probe of one register has the block's period."""
     drive = family(WIDE)(1, name="pump-1")
     sim = Picky(drive, silent_beyond=1)
     with clocked_line_of(drive, sim, every=5.0) as clocked:
@@ -203,7 +203,7 @@ def test_a_noisy_line_splits_nothing_that_was_answered_once() -> None:
 @example({2, 4}, 5, 1)
 @given(st.sets(st.integers(1, 5), max_size=3), st.integers(1, 6), st.integers(1, 6))
 def test_no_register_is_lost_that_can_be_read_by_itself(refused: set[int], most: int, silent: int) -> None:
-    """But for a device that refuses the first one and is silent to all that is longer: nothing proves then
+    """Except a device that refuses the first one and is silent to longer requests: no reply proves then
     that no late answer is due. Otherwise each silence holds the next question up for two minutes."""
     drive = family(6)(1, name="pump-1")
     sim = Picky(drive, refused, most, silent)

@@ -129,7 +129,7 @@ def test_pandas_and_polars_take_the_wide_form() -> None:
 
 
 def test_chosen_columns_come_in_their_order_and_are_always_there() -> None:
-    """Also those of which a batch has no row: each batch has the same columns."""
+    """Also columns without a row in a batch: each batch has the same columns."""
     never = "насос.output_frequency"
     wide = example().wide(never, SPEED, PUMP)
     assert wide.columns == ["time", "monotonic_ns", never, SPEED, PUMP]
@@ -168,7 +168,7 @@ def test_times_are_joined_only_where_they_are_the_same() -> None:
 
 
 def test_a_clock_that_is_set_back_joins_nothing() -> None:
-    """UTC comes twice, and the monotonic clock tells the two apart."""
+    """UTC repeats an hour; the monotonic clock distinguishes the rows."""
     first = row(1.0, "pump", "a", 1.0)
     table = pa.table(from_rows([first._replace(monotonic_ns=2 * SECOND, value=2.0), first]).wide())
     assert table.column("pump.a").to_pylist() == [1.0, 2.0]

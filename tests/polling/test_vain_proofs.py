@@ -1,4 +1,4 @@
-"""Proofs that prove nothing: the device is silent to them, or holds another value than is known."""
+"""Useless proofs: the device is silent to them, or holds an unexpected value."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ POLLED = bytes((1, 3, 0, 1, 0, 1))  # output_frequency
 
 
 class LossyWire(ClockedWire):
-    """It `loses` so many requests of what is polled."""
+    """It `loses` so many polled requests."""
 
     loses = 0
 
@@ -29,7 +29,7 @@ class LossyWire(ClockedWire):
 
 
 class SilentWire(LossyWire):
-    """Its device answers what is polled, and keeps silent to all else."""
+    """Its device answers polled reads only."""
 
     unanswered = 0
 

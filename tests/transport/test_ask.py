@@ -1,4 +1,4 @@
-"""`Drive.read_raw`: a read past the register table, which is no write."""
+"""`Drive.read_raw`: raw reads past the register table, which never write."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ def test_a_copy_of_the_request_is_no_reply(simulated: SimulatedBus) -> None:
     with pytest.raises(BadReply, match="copy of the request"):
         toy.read_raw(1, 0x320, 17)
     assert simulated.frames[0][1] == echo.hex(" ").upper()
-    simulated.has_echo = True  # the line has told the two apart
+    simulated.has_echo = True  # the line distinguishes the two
     assert toy.read_raw(1, 0x320, 17) == bytes.fromhex("20 00 11")
 
 

@@ -1,4 +1,4 @@
-"""A master that stood still sends nothing on lines that another took over, by what their far end saw.
+"""A suspended master sends no byte on lines that another took over, judged by their far end.
 
 `python -m bench.questions.fence` does the same 2,000 times.
 """
@@ -51,7 +51,7 @@ def test_a_master_that_stood_still_sends_nothing_and_is_killed() -> None:
 @pytest.mark.long
 @pytest.mark.slow
 def test_a_master_that_goes_on_sends_nothing() -> None:
-    """Without the kernel's timer, for it is hours away: only the look at the clock holds it back."""
+    """Without the kernel's timer, which is hours away: only the check of the clock holds it back."""
     with fence(timer=3600) as made:
         found = rounds(made, 6)
     assert not any(each.is_killed for each in found)

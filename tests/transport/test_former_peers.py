@@ -57,7 +57,7 @@ def wire(sim: SimulatedDrive) -> Iterator[HoldingWire]:
 
 
 def leave_a_reply_behind(wire: HoldingWire, port: str) -> None:
-    """Close a bus whose drive has yet to answer what it was asked."""
+    """Close a bus with an unanswered request."""
     with Bus(port) as bus:
         pump = bus.attach(Quick, 1)
         assert pump.read(Quick.output_current) == 1.11

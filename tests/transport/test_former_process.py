@@ -12,12 +12,12 @@ from multidrop.drive import Drive
 from multidrop.planning.blocks import blocks
 from multidrop.sim import EncodedDrive, Faults
 
-BEGIN = 1000.0  # s; when the clock of these lines begins
+BEGIN = 1000.0  # s; the start of these lines' clock
 DELAY = 0.1  # s, of the path
 
 
 def answer_to_another(drive: Drive) -> bytes:
-    """Return what a drive says to a read of its second register."""
+    """Return a drive's reply to a read of its second register."""
     wire = PathWire([EncodedDrive(drive)], Faults())
     wire.delay = constant(0.0)
     wire.open()

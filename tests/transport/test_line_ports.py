@@ -1,4 +1,4 @@
-"""Ports of every kind are opened, fail with one sentence each, and leave nothing behind."""
+"""Ports of every kind open, fail with one sentence each, and leave no descriptors."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def test_every_documented_baud_rate_can_be_read(family: type[Drive], baudrate: i
 
 @pytest.mark.skipif(not hasattr(socket, "TCP_USER_TIMEOUT"), reason="this system knows no such time-out")
 def test_a_network_that_stalls_hands_on_nothing_later(monkeypatch: pytest.MonkeyPatch) -> None:
-    """No loopback loses packets: what is looked at is what the kernel is told."""
+    """A loopback loses no packets, so this test reads the socket options."""
     told: list[int] = []
 
     class Watched(Port):
@@ -95,7 +95,7 @@ def test_what_is_told_of_the_echo_is_told_again_when_the_port_is_reopened(
 def test_a_port_settles_after_each_opening_and_what_came_is_discarded(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """A gateway that restarts when its port is opened says so, and hears nothing for a while."""
+    """A gateway that restarts when its port is opened prints that, and is deaf for a while."""
     slept: list[float] = []
     with socket.create_server(("127.0.0.1", 0)) as listener:
         host, number = listener.getsockname()
@@ -134,7 +134,7 @@ def test_a_pty_is_opened_again_and_again() -> None:
 
 
 def test_a_pty_at_settings_that_it_cannot_have() -> None:
-    """It stays at 8 bits without parity whatever it is told, and all bytes pass."""
+    """It stays at 8 bits without parity for any settings, and all bytes pass."""
     drive = simulated(Toy(1, format="8E1"))
     drive["output_current"] = 3.25
     with Simulator([Wire([drive], unpaced=True)]) as sim:
@@ -259,7 +259,7 @@ def test_a_port_is_opened_by_one_at_a_time() -> None:
 
 def test_nothing_is_left_of_a_port_that_was_closed_or_not_opened(tmp_path: Path) -> None:
     with Simulator([wire(), wire("socket://127.0.0.1:0")]) as sim:
-        Line(sim.wires[0].path).open().close()  # what the process has once is there now
+        Line(sim.wires[0].path).open().close()  # lazily opened descriptors are open now
         before = descriptors(), threads()
         for each in sim.wires:
             for _ in range(3):
@@ -367,7 +367,7 @@ def test_a_tapped_port_is_tapped_when_it_is_opened_again(tmp_path: Path) -> None
 
 
 def test_a_bridged_port_has_its_settings_when_it_is_opened_again() -> None:
-    """spy:// is pyserial's own way to watch a port; the drive hears nothing at another baud rate."""
+    """spy:// is pyserial's way to watch a port; the drive ignores another baud rate."""
     with Simulator([Wire([simulated(Toy(1, baudrate=19200))], unpaced=True)]) as sim:
         path = sim.wires[0].path
         with Bus(f"spy://{path}", baudrate=19200) as bus:
@@ -417,14 +417,14 @@ def test_a_closed_bus_says_so() -> None:
     with Simulator([wire()]) as sim:
         with Bus(sim.wires[0].path) as bus:
             toy = bus.attach(Toy, 1)
-        bus.close()  # twice is no mistake
+        bus.close()  # a second call is allowed
         with pytest.raises(LineError) as caught:
             toy.read(toy.output_current)
         assert str(caught.value) == f"{sim.wires[0].path}: it is closed"
 
 
 def test_closing_ends_what_waits_for_a_reply() -> None:
-    """One thread waits for a drive that says nothing, another closes the bus."""
+    """One thread waits for a silent drive, another closes the bus."""
     failures: list[LineError] = []
     master, slave = os.openpty()
     bus = Bus(os.ttyname(slave))

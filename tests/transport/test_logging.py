@@ -53,7 +53,7 @@ def test_a_port_that_never_was_there_is_not_missed_again(
 
 
 def test_a_port_that_is_lost_and_regained(caplog: pytest.LogCaptureFixture, tmp_path: Path) -> None:
-    """Its loss is told once, however often it is asked."""
+    """Its loss is logged once, despite repeated requests."""
     link = tmp_path / "port"
 
     def plugged_in() -> tuple[int, int]:

@@ -1,4 +1,4 @@
-"""Ports behind a network: what a cut or a stall held up never arrives later, and a flood fills no memory."""
+"""Ports behind a network: delayed requests never arrive later, and a flood fills no memory."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def pieces(stream: bytes, cuts: list[int]) -> list[bytes]:
 
 
 def split(chunks: list[bytes]) -> list[tuple[bytes, bytes]]:
-    """Return a stream's commands, its data in one piece where nothing comes between."""
+    """Return a stream's commands, with adjacent data joined."""
     telnet, found = Telnet(), list[tuple[bytes, bytes]]()
     for chunk in chunks:
         for kind, content in telnet.split(chunk):
@@ -106,7 +106,7 @@ def test_a_suboption_without_an_end_fills_no_memory() -> None:
 
 @contextmanager
 def flooding() -> Iterator[tuple[str, threading.Event]]:
-    """The URL of a port that sends without an end, once it is set up, and what tells that it sent 32 MB."""
+    """The URL of a port that sends endlessly, and an event after 32 MB."""
     listener = socket.create_server(("127.0.0.1", 0))
     sent = threading.Event()
 
@@ -155,7 +155,7 @@ def test_a_flood_that_nobody_reads_fills_no_memory() -> None:
 
 
 class HeldUp:
-    """A port that takes nothing until it is let go; what it was given is kept."""
+    """A port that blocks until it is released, and keeps its requests."""
 
     def __init__(self) -> None:
         self.begun, self.free = threading.Event(), threading.Event()
@@ -178,7 +178,7 @@ class HeldUp:
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="this system does not say when a request was written")
 def test_a_request_that_waited_behind_another_is_never_sent() -> None:
-    """It was given up meanwhile, and may be a start."""
+    """It has expired, and may be a start."""
     port = HeldUp()
     bridge = Bridge(port)  # type: ignore[arg-type]
     os.write(bridge.theirs.fileno(), b"first")
@@ -356,9 +356,9 @@ class FarNetwork:
         return False
 
     def all_received(self) -> str:
-        """Return what the server received on its serial line, once the network is joined again."""
+        """Return the bytes on the server's serial line, once the network is restored."""
         self.join()
-        until(lambda: not connections(self.port))  # the kernel repeats nothing any more
+        until(lambda: not connections(self.port))  # the kernel has stopped retransmitting
         until(self._ends)
         taken, _ = self._server.communicate()
         return taken
@@ -387,7 +387,7 @@ START = "010600140001"  # write 1, which starts it, to the control register of d
 
 
 def start_into_the_cut(bus: Bus, toy: Toy, network: FarNetwork) -> None:
-    """Send a START that is given up. What was confirmed before lets it leave: nothing is owed."""
+    """Send a START that expires. Earlier confirmations let it leave: no reply is due."""
     toy.send_raw(6, 0x14, bytes([0, 2]))
     network.cut()
     with pytest.raises(Unconfirmed):
@@ -408,7 +408,7 @@ def test_a_start_into_a_cut_network_never_arrives_after_closing(far_network: Far
 @pyserials_own
 @pytest.mark.skipif(not hasattr(socket, "TCP_USER_TIMEOUT"), reason="this system knows no such time-out")
 def test_a_start_into_a_cut_network_never_arrives_on_an_open_port(far_network: FarNetwork) -> None:
-    """Although the network is joined again as soon as the caller was told."""
+    """Although the network is restored as soon as the call has returned."""
     with Bus(far_network.url, echo="off", expiry=PATIENCE) as bus:
         start_into_the_cut(bus, bus.attach(Toy, 1), far_network)
         far_network.join()
@@ -419,12 +419,12 @@ def test_a_start_into_a_cut_network_never_arrives_on_an_open_port(far_network: F
 
 
 def test_a_network_is_given_up_before_a_write_is() -> None:
-    """Else a write could arrive when its caller was told that it is unconfirmed."""
+    """Otherwise a write could arrive after it was reported as unconfirmed."""
     assert MOST_AGE + MOST_STALL_MS / 1000 <= WRITE_TIMEOUT
 
 
 def test_every_connection_is_told_to_hand_on_nothing_late() -> None:
-    """Without a network to cut: what the kernel is told."""
+    """Without a network to cut: the socket options."""
     with socket.create_server(("127.0.0.1", 0)) as listener:
         near = socket.create_connection(listener.getsockname())
         far, _ = listener.accept()
@@ -437,7 +437,7 @@ def test_every_connection_is_told_to_hand_on_nothing_late() -> None:
 
 
 def test_a_port_that_was_never_opened_is_closed_without_a_word() -> None:
-    """Python 3.13 prints what goes wrong when such a port is thrown away."""
+    """Python 3.13 prints errors of such a port's finalizer."""
     port = SocketPort()
     port.close()
     assert not port.is_open

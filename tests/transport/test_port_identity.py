@@ -23,7 +23,7 @@ USB = "devices/pci0000:00/0000:00:14.0/usb1"
 
 
 class Sysfs:
-    """A folder that tells of ttys as Linux does."""
+    """A folder that describes ttys as Linux does."""
 
     def __init__(self, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         self.folder = folder
@@ -91,7 +91,7 @@ def test_what_is_told_of_a_device(
         (("1-1", "A1"), ("1-1", "A1"), True),
         (("1-1", "A1"), ("1-2", "A1"), True),  # plugged in elsewhere
         (("1-1", "A1"), ("1-2", "B2"), False),  # they came back in another order
-        (("1-1", "A1"), ("1-1", "B2"), False),  # somebody took another, and perhaps its line
+        (("1-1", "A1"), ("1-1", "B2"), False),  # another adapter, and perhaps another line
         (("1-1", ""), ("1-1", ""), True),
         (("1-1", ""), ("1-2", ""), False),
         (("1-1", "A1"), ("1-2", ""), False),
@@ -152,7 +152,7 @@ def test_a_name_by_the_place_is_whatever_is_plugged_in_there(
 def test_another_line_is_not_polled_and_a_stop_is_not_sent_to_its_drive(
     tmp_path: Path, sysfs: Sysfs, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """Its drive would tell that it stands, while the motor that is meant goes on."""
+    """Its drive would report a standstill, while the intended motor goes on."""
     link = tmp_path / "ttyUSB0"
     pump = InnovertIBD(1, name="pump")
     asked = line(str(link), polled(pump, [InnovertIBD.output_current]))

@@ -1,4 +1,4 @@
-"""Reads by hand of what a drive refuses as a whole, or is silent to: in parts, none of which is lost."""
+"""Reads with `Bus` of blocks that a drive refuses or ignores as a whole: in parts, without losses."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def test_a_refused_register_is_refused_by_itself(monkeypatch: pytest.MonkeyPatch
     sim.asked.clear()
     with pytest.raises(DriveException, match=r"^pump-1 refuses r3: "):
         drive.read_many(drive.registers.values())
-    assert sim.asked == [(3, 1)]  # what comes to nothing costs the line no more
+    assert sim.asked == [(3, 1)]  # useless requests are not repeated
     sim.missing.clear()
     assert drive.read_many(drive.registers.values()) == right(range(WIDE))
     others = [register for register in drive.registers.values() if register.address != 3]
@@ -125,7 +125,7 @@ def test_a_dead_drive_costs_one_request_more(monkeypatch: pytest.MonkeyPatch) ->
 
 @pytest.mark.parametrize("silent", [{1}, {1, 2}, {0, 2}])
 def test_bytes_that_came_for_one_attempt_are_told(monkeypatch: pytest.MonkeyPatch, silent: set[int]) -> None:
-    """A read of several is asked in parts, and again: none of that may forget what came at first."""
+    """A read is split and retried: the first values are kept."""
     drive = family(2)(1, name="pump-1")
     bus = SimulatedBus(monkeypatch, Picky(drive))
     bus.attach(drive)

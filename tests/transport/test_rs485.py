@@ -1,4 +1,4 @@
-"""Lines whose transceiver is switched by RTS or by its driver, before a driver that notes what it is told.
+"""Lines whose transceiver is switched by RTS or its driver, with a driver that logs its calls.
 
 No RS-485 hardware is here: the driver is a library put before the system's, and the port a pseudo-terminal.
 tests/c/test_rs485.c has the times to the nanosecond, on a clock of its own.
@@ -73,7 +73,7 @@ def driver(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def play(driver: Path, mode: str, reads: int, **variables: object) -> tuple[list[Any], list[Event]]:
-    """Return what a client read or was told, and what the driver was told."""
+    """Return the client's value or error, and the driver's calls."""
     log = driver.with_name("log")
     log.unlink(missing_ok=True)
     log.touch()
@@ -149,7 +149,7 @@ def test_rts_that_breaks_loses_the_port_and_nothing_more_is_sent(driver: Path) -
 def test_a_poller_is_told_at_once_and_leaves_nothing_behind(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(open_port, "is_pseudo_terminal", lambda device: False)
     with Simulator([Wire([simulated(Toy(1))])]) as sim:
-        Bus(sim.wires[0].path).close()  # the core's thread begins with the first port, and stays
+        Bus(sim.wires[0].path).close()  # the core's thread starts with the first port, and stays
         before = descriptors(), threads()
         drive = polled(Toy(1), [Toy.output_current])
         declared = replace(line(sim.wires[0].path, drive), rs485=RS485.RTS_UP)

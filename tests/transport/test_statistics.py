@@ -87,7 +87,7 @@ def test_a_wire_is_used_for_what_its_settings_say(line: LineDriver, drive: Peer,
 
 
 def test_a_port_without_a_wire_is_not_used_for_longer_than_there_is(line: LineDriver, drive: Peer) -> None:
-    """The whole reply is there after 0.1 ms, where a wire takes 15 characters."""
+    """The whole reply is there after 0.1 ms; a wire takes 15 characters."""
     begun = line.now
     for _ in range(100):
         ask(line, drive)
@@ -226,7 +226,7 @@ def test_a_bus_has_statistics(toy: SimulatedDrive) -> None:
         with pytest.raises(TimeoutError):
             nobody.read(Toy.output_current)
         found = bus.statistics()
-        asked = found.drives["pump"].exchanges  # more than were answered, where the machine was slow
+        asked = found.drives["pump"].exchanges  # more than the replies, if the machine was slow
         assert asked >= found.drives["pump"].delays.replies > 0
         assert found.drives["nobody"].diagnostics.server_no_responses == found.drives["nobody"].exchanges == 3
         assert found.exchanges == asked + 3
@@ -234,7 +234,7 @@ def test_a_bus_has_statistics(toy: SimulatedDrive) -> None:
         assert bus.statistics().exchanges == 0
         pump.read(Toy.output_current)
         assert bus.statistics().delays.replies == 1
-    assert bus.statistics() == bus.statistics()  # it stands still once the bus is closed
+    assert bus.statistics() == bus.statistics()  # it stays the same once the bus is closed
     assert bus.statistics().delays.replies == 1
 
 
@@ -260,7 +260,7 @@ def test_a_poller_counts_what_its_rows_say(toy: SimulatedDrive) -> None:
 
 
 def test_drives_that_were_renamed_or_exchanged_count_from_the_reset_on(toy: SimulatedDrive) -> None:
-    """Else one has what it was asked before, and another less than nothing."""
+    """Otherwise one has earlier counts, and another negative ones."""
     others = [simulated(Toy(address, name=f"toy-{address}")) for address in (2, 3)]
     with Simulator([Wire([toy, *others], unpaced=True)]) as simulator, Bus(simulator.wires[0].path) as bus:
         known = [bus.attach(Toy, address=address, name=name) for address, name in ((1, "a"), (2, "b"))]

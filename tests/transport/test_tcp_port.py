@@ -39,7 +39,7 @@ class Meter(Drive):
 
 @contextmanager
 def responder(answer: bytes | None) -> Iterator[tuple[str, list[bytes]]]:
-    """A server that says these bytes to whatever comes first; its place, and what came."""
+    """A server that answers these bytes to its first input; yields its address and the input."""
     came: list[bytes] = []
     with socket.create_server(("127.0.0.1", 0)) as listener:
 

@@ -1,4 +1,4 @@
-"""Plans: never over a limit, never into what the document forbids, never dearer than brute force."""
+"""Plans: never over a limit, never into forbidden addresses, never slower than brute force."""
 
 import math
 from collections.abc import Iterator
@@ -101,7 +101,7 @@ def test_a_block_takes_its_characters_silence_and_delay() -> None:
 
 def test_other_readable_registers_are_read_across_but_never_a_command() -> None:
     class Sparse(Drive):
-        """Nothing may be read that is not declared."""
+        """Undeclared addresses are never read."""
 
         most_registers = {HOLDING: 10}
         low = reading(1)
@@ -196,7 +196,7 @@ def test_no_other_plan_is_cheaper(pairs: dict[int, bool], baudrate: int, framing
 
 
 class Scattered(Drive):
-    """Registers with gaps of many lengths between them, all of which may be read."""
+    """Registers with readable gaps of many lengths between them."""
 
     framings = (Framing.RTU, Framing.ASCII)
     most_registers = {HOLDING: 90}
@@ -265,7 +265,7 @@ def test_characters_are_counted_as_frames_are_built(framing: Framing, table: Tab
         assert sending(drive, block) == pytest.approx(frames * drive.settings.character)
 
 
-FORBIDDEN = {  # addresses of which the documents do not say that they can be read, within the tables
+FORBIDDEN = {  # addresses within the tables that the documents do not declare readable
     "erman-er-g-220": {"holding register": (89, 0xFFFF), "input register": (0x1000, 0xFFFF)},
     "invt-che": {"holding register": (0x1000, 0x1000, 0x3017, 0x4FFF, 0x5002, 0xFFFF)},
     "innovert-ibd": {"holding register": (0, 2, 5, 21, 0x2000, 0x2001)},

@@ -1,4 +1,4 @@
-"""The saving that a stated gap would bring: told for a class that states none, and never for a family."""
+"""The gain of a stated gap: reported for a class that states none, and never for a shipped family."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Blocks are chosen anew for a drive that answers sooner or later than its document says."""
+"""Blocks are planned again for a drive that answers sooner or later than documented."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ NAMES = (Wide.near.name, Wide.far.name)
 
 
 def asked_together(rows: list[Row]) -> set[bool]:
-    """Return, for each exchange, True where it read both registers."""
+    """Return, for each exchange, True if it read both registers."""
     assert {row.status for row in rows} == {"ok"}
     return {count == len(NAMES) for count in Counter(row.monotonic_ns for row in rows).values()}
 
