@@ -37,7 +37,7 @@ from multidrop.poller import Poller
 from multidrop.polling.batch import Row
 from multidrop.sim import FaultyWire
 from multidrop.sim import wire as wire_of_drives
-from multidrop.transport import clock, former_peers
+from multidrop.transport import clock, peers
 from multidrop.transport.prepared import NO_ROWS, make_exchange
 
 S = 1_000_000_000
@@ -333,7 +333,7 @@ class ClockedLines:
         self._beside: set[threading.Thread] = set()
         patch = self._patch = pytest.MonkeyPatch()
         patch.setattr(bus, "Line", self._line)
-        patch.setattr(former_peers, "_former", {})  # they are another clock's
+        patch.setattr(peers, "_former", {})  # they are another clock's
         patch.setattr(clock, "now_ns", lambda: self.now)
         patch.setattr(clock, "boottime_ns", lambda: self.now)
         patch.setattr(clock, "sleep", self._sleep)

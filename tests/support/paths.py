@@ -19,7 +19,7 @@ from multidrop.drive import Drive
 from multidrop.drive.line_settings import speaks_tcp
 from multidrop.errors import BusError
 from multidrop.sim import SimulatedDrive
-from multidrop.transport import clock, former_peers
+from multidrop.transport import clock, peers
 
 Delay = Callable[[float], float]  # in s, of what enters the path at a time in s
 
@@ -156,7 +156,7 @@ def bus_over(
     wire.open()
     line = PathLine(wire)
     monkeypatch.setattr(bus, "Line", lambda port, *facts: line)
-    monkeypatch.setattr(former_peers, "_former", {})  # they are another clock's
+    monkeypatch.setattr(peers, "_former", {})  # they are another clock's
     monkeypatch.setattr(clock, "now_ns", lambda: line.now)
     monkeypatch.setattr(clock, "boottime_ns", lambda: line.now)
     monkeypatch.setattr(clock, "sleep", line.sleep)

@@ -23,7 +23,7 @@ from multidrop.core import (
 )
 from multidrop.drive import Drive
 from multidrop.sim import MotorDrive, SimulatedDrive, simulated
-from multidrop.transport import clock, former_peers
+from multidrop.transport import clock, peers
 
 EXCHANGE_TIME = 0.02  # s
 TIMEOUT = 0.3
@@ -56,7 +56,7 @@ class SimulatedBus:
         self.has_echo = False
         self.port = self.identity = "hall"
         monkeypatch.setattr(bus, "Line", lambda port, *facts: self)
-        monkeypatch.setattr(former_peers, "_former", {})  # they are another clock's
+        monkeypatch.setattr(peers, "_former", {})  # they are another clock's
         monkeypatch.setattr(clock, "sleep", self.sleep)
         monkeypatch.setattr(clock, "now_ns", lambda: round(self.seconds * 1e9))
         monkeypatch.setattr(clock, "boottime_ns", lambda: round((self.seconds + self.slept) * 1e9))

@@ -12,7 +12,7 @@ from toy import Toy
 
 from multidrop import Bus, NoReply, Poller
 from multidrop.sim import SimulatedDrive, Simulator, Wire, simulated
-from multidrop.transport import former_peers
+from multidrop.transport import peers
 
 
 class Quick(Toy):
@@ -101,7 +101,7 @@ def test_a_pseudo_terminal_of_the_same_number_is_another_port() -> None:
     def made() -> set[str]:
         ours, theirs = os.openpty()
         try:
-            return former_peers.names_of(os.ttyname(theirs))
+            return peers.identities_of(os.ttyname(theirs))
         finally:
             os.close(theirs)
             os.close(ours)
@@ -111,18 +111,18 @@ def test_a_pseudo_terminal_of_the_same_number_is_another_port() -> None:
 
 
 def test_what_nobody_owes_is_not_kept(wire: HoldingWire) -> None:
-    before = dict(former_peers._former)
+    before = dict(peers._former)
     with Bus(wire.path) as bus:
         bus.attach(Quick, 1).read(Quick.output_current)
-    assert former_peers._former == before
+    assert peers._former == before
 
 
 def test_it_is_forgotten_as_the_core_forgets_it(wire: HoldingWire, monkeypatch: pytest.MonkeyPatch) -> None:
     leave_a_reply_behind(wire, wire.path)
-    names = former_peers.names_of(wire.path)
-    assert names <= former_peers._former.keys()
-    now_ns = former_peers.clock.now_ns
-    later: Callable[[], int] = lambda: now_ns() + former_peers.KEPT_NS  # noqa: E731
-    monkeypatch.setattr(former_peers.clock, "now_ns", later)
-    former_peers.leave(["elsewhere"], [])
-    assert not names & former_peers._former.keys()
+    names = peers.identities_of(wire.path)
+    assert names <= peers._former.keys()
+    now_ns = peers.clock.now_ns
+    later: Callable[[], int] = lambda: now_ns() + peers.KEPT_NS  # noqa: E731
+    monkeypatch.setattr(peers.clock, "now_ns", later)
+    peers.remember_owing(["elsewhere"], [])
+    assert not names & peers._former.keys()

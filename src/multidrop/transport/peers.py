@@ -2,14 +2,65 @@
 
 from __future__ import annotations
 
-from multidrop.core import Completion, Exchange, Framing, Peer, TransactionIds
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+from multidrop.core import Completion, Exchange, Framing, Peer, TransactionIds, is_pseudo_terminal
 from multidrop.drive.family import Drive, check_drive
 from multidrop.errors import NotAttached
 from multidrop.planning.bus_time import silence
 from multidrop.planning.proofs import proofs
-from multidrop.transport import clock, former_peers
+from multidrop.transport import clock, port_identity
 from multidrop.transport.line import Line
 from multidrop.transport.prepared import NO_ROWS, make_exchange
+
+KEPT_NS = 120_000_000_000  # as late.c remembers requests
+
+
+class FormerPeers(NamedTuple):
+    """Peers with late replies due when their port was closed, with their addresses."""
+
+    closed_ns: int
+    peers: tuple[tuple[int, Peer], ...]
+
+
+_former: dict[str, FormerPeers] = {}  # by port; each change is one step, so that no thread needs a lock
+
+
+def identities_of(*names: str) -> set[str]:
+    """Return the identities of an open port for its names.
+
+    Pseudo-terminal numbers are reused soon, so the identity of one includes its creation time.
+    """
+    found = {port_identity.of_name(name) for name in names}
+    return {f"{name} of {_made_ns(name)}" if is_pseudo_terminal(name) else name for name in found}
+
+
+def _made_ns(device: str) -> int:
+    try:
+        return Path(device).stat().st_ctime_ns
+    except OSError:  # it is gone, and never comes back
+        return clock.now_ns()
+
+
+def remember_owing(names: Iterable[str], peers: Iterable[tuple[int, Peer]]) -> None:
+    """Remember the peers with late replies due, by address, because their port was closed."""
+    now_ns = clock.now_ns()
+    for name, former in [*_former.items()]:
+        if now_ns - former.closed_ns > KEPT_NS:
+            _former.pop(name, None)
+    owing = tuple((address, peer) for address, peer in peers if peer.owes)
+    if owing:
+        _former.update(dict.fromkeys(names, FormerPeers(now_ns, owing)))
+
+
+def former_at(names: Iterable[str], address: int) -> Iterator[Peer]:
+    """Yield the peers at this address with late replies due when the port was closed."""
+    for name in names:
+        former = _former.get(name)
+        yield from (peer for at, peer in former.peers if at == address) if former else ()
+
 
 GONE_S = 0.001  # polling interval while a drive that left is still in an exchange
 LEAST_TIMEOUT = 0.02  # s; a host and its adapter may add so much to a drive's own delay
@@ -44,7 +95,7 @@ class Peers:
         for other, known in self._known.items():
             if other[0] == drive.address and known is not peer:
                 self._line.inherit(peer, known)
-        for former in former_peers.left_at(self._names(), drive.address):
+        for former in former_at(self._names(), drive.address):
             self._line.inherit(peer, former)
 
     def _new(self, drive: Drive, least: float) -> Peer:
@@ -62,10 +113,10 @@ class Peers:
         """Close the line; late replies still due are remembered for the next opening of the port."""
         names = self._names()
         self._line.close()
-        former_peers.leave(names, [(address, peer) for (address, *_), peer in self._known.items()])
+        remember_owing(names, [(address, peer) for (address, *_), peer in self._known.items()])
 
     def _names(self) -> set[str]:
-        return former_peers.names_of(self._line.identity, self._line.port)
+        return identities_of(self._line.identity, self._line.port)
 
     def remember(self, before: Peers) -> None:
         """Take over the peers of an earlier bus on the same line."""
