@@ -15,11 +15,12 @@ from toy import Toy
 
 from multidrop.bus import Bus
 from multidrop.errors import NoReply
-from multidrop.families import InvtCHE
+from multidrop.families import YD1000, InvtCHE
+from multidrop.plant.loader import load_plant
 from multidrop.plant.model import PolledDrive
 from multidrop.poller import Poller
 from multidrop.polling.port_queue import AHEAD_NS
-from multidrop.sim import EncodedDrive, Simulator, Wire, proof
+from multidrop.sim import EncodedDrive, Simulator, Wire, proof, simulated
 
 ROOT = Path(__file__).parents[2]
 CURRENT = Toy.registers["output_current"]
@@ -212,3 +213,33 @@ def test_statistics_may_be_looked_at_while_drives_leave(port: str, monkeypatch: 
         assert list(bus.statistics().drives) == ["pump-1", "pump-2"]
         monkeypatch.undo()
         assert list(bus.statistics().drives) == ["pump-1"]
+
+
+# ---- drives attached with the bus ----
+
+
+PLANT = """
+[[line]]
+name = "a"
+port = "{port}"
+
+[[line.drive]]
+name = "pump"
+model = "yd1000"
+address = 1
+poll = ["output_frequency"]
+"""
+
+
+@pytest.mark.slow
+def test_it_is_beside_the_polled_ones(tmp_path: Path) -> None:
+    path = tmp_path / "plant.toml"
+    with Simulator([Wire([simulated(YD1000(1)), simulated(YD1000(9))])]) as simulator:
+        path.write_text(PLANT.format(port=simulator.wires[0].path))
+        poller = Poller(load_plant(path))
+        extra = poller.bus("a").attach(YD1000, 9)
+        with poller:
+            assert extra.read(extra.output_frequency) == 0
+            until(lambda: any(row.drive == "pump" for row in poller.take() or ()))
+            with pytest.raises(ValueError, match="is not polled here; there are pump"):
+                poller.set_rate(extra, None, 1.0)

@@ -10,6 +10,7 @@ import gc
 import os
 import subprocess
 import sys
+import threading
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
@@ -18,11 +19,11 @@ from typing import Any
 
 import pytest
 from interruptions import every, interrupted
-from lines import line, patient, plant, polled, until
+from lines import ANY_PORT, PATIENCE, line, patient, plant, polled, until
 from toy import Toy
 
 from multidrop import Bus, Poller
-from multidrop.sim import EncodedDrive, Simulator, Wire
+from multidrop.sim import EncodedDrive, Simulator, Wire, simulated
 
 # A garbage collection finalizes leftovers of earlier interruptions, and may be interrupted itself.
 pytestmark = [patient, pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")]
@@ -208,3 +209,34 @@ def test_a_poller_that_is_left_open_harms_no_memory(hall: Received, is_ended: bo
     ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120, env=env)
     assert (ran.returncode, ran.stderr) == (0, "")
     falls_silent(hall)
+
+
+# ---- openings ----
+
+
+@pytest.mark.parametrize("interrupted", [0, 1, 2])
+def test_no_port_stays_open(monkeypatch: pytest.MonkeyPatch, interrupted: int) -> None:
+    """Neither one that was opened before it, nor one that is opened while it is passed on."""
+    wires = [Wire([simulated(Toy(1))], unpaced=True, port=ANY_PORT) for _ in range(3)]
+    buses: list[Bus] = []
+    open_bus, others_are_open = Bus.__init__, threading.Semaphore(0)
+
+    def opened(bus: Bus, port: str, **details: object) -> None:
+        if port == simulator.wires[interrupted].path:
+            for _ in range(2):
+                assert others_are_open.acquire(timeout=PATIENCE)
+            raise KeyboardInterrupt
+        open_bus(bus, port, **details)  # type: ignore[arg-type]
+        buses.append(bus)
+        others_are_open.release()
+
+    with Simulator(wires) as simulator:
+        declared = [
+            line(wire.path, polled(Toy(1, name=f"fan-{n}"), [Toy.output_current], None), name=f"line-{n}")
+            for n, wire in enumerate(simulator.wires)
+        ]
+        monkeypatch.setattr(Bus, "__init__", opened)
+        with pytest.raises(KeyboardInterrupt):
+            Poller(plant(*declared))
+        assert len(buses) == 2
+        assert not any(bus.is_open for bus in buses)
