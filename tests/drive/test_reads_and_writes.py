@@ -6,7 +6,7 @@ import pytest
 from simulated_bus import SimulatedBus, one
 
 from multidrop.drive import Drive
-from multidrop.drive.register import reading, setting
+from multidrop.drive.register import COIL, DISCRETE, reading, setting
 from multidrop.drive.text import text
 from multidrop.errors import NotAttached
 from multidrop.families import InnovertIBD
@@ -20,6 +20,8 @@ class Meter(Drive):
     flow = reading(1, "l/s")
     limit = setting(5, "m", step=0.1, span=(0, 100), moves=False)
     serial = text(20, 4)
+    door = reading(3, table=DISCRETE)
+    lamp = setting(4, table=COIL, moves=False)
 
 
 @pytest.fixture
@@ -39,7 +41,7 @@ def test_one_register_is_its_value_and_several_a_dict(meter: tuple[SimulatedBus,
     assert tank.read("flow", "level") == {"flow": 7, "level": 2.5}
     assert list(tank.read("flow", "level")) == ["flow", "level"]
     assert tank.read_many(["level"]) == {"level": 2.5}
-    assert tank.read_all() == {"level": 2.5, "flow": 7}
+    assert tank.read_all() == {"level": 2.5, "flow": 7, "door": False}
 
 
 def test_names_are_planned_once(meter: tuple[SimulatedBus, Meter], monkeypatch: pytest.MonkeyPatch) -> None:
@@ -53,6 +55,16 @@ def test_texts_are_read_like_registers(meter: tuple[SimulatedBus, Meter]) -> Non
     _, tank = meter
     assert tank.read(tank.serial) == tank.read("serial") == "AB12"
     assert tank.read("serial", tank.level) == {"serial": "AB12", "level": 2.5}
+
+
+def test_coils_and_discrete_inputs_are_bool(meter: tuple[SimulatedBus, Meter]) -> None:
+    line, tank = meter
+    line.sims[0]["door"] = 1
+    assert tank.read("door") is True
+    assert tank.read("door", "lamp", "flow") == {"door": True, "lamp": False, "flow": 7}
+    assert tank.read("lamp", "door")["lamp"] is False
+    assert tank.write("lamp", True) is True
+    assert line.sims[0]["lamp"] == 1
 
 
 def test_a_setting_is_written_by_its_name(meter: tuple[SimulatedBus, Meter]) -> None:

@@ -191,6 +191,11 @@ class Register(Generic[T]):
         return self.table.carrier is Carrier.WORD and self.number_format in FLOATS
 
     @property
+    def is_bit(self) -> bool:
+        """True for a coil or a discrete input without names: its values are bool."""
+        return self.values is None and self.table.carrier is Carrier.BIT
+
+    @property
     def commands(self) -> bool:
         """True where a write may move the motor: verbs alone send it, but for what is `harmless`."""
         if self.moves is None:
@@ -228,7 +233,7 @@ class Register(Generic[T]):
         number = self.number_in(data, at)
         if number is None:
             return None
-        return cast(T, number) if self.values is None else self.decode(number)
+        return cast(T, number) if self.values is None and not self.is_bit else self.decode(number)
 
     def decode(self, raw: float) -> T:
         """Return the value of a raw count; a number where the enumeration has no name for it."""
@@ -237,7 +242,7 @@ class Register(Generic[T]):
                 return self.values(int(raw))
             except ValueError:
                 return cast(T, int(raw))
-        return cast(T, self.coding.value_of(raw))
+        return cast(T, bool(raw) if self.is_bit else self.coding.value_of(raw))
 
     def encode(self, value: T) -> float:
         """Return the raw count of a value: a whole number, or in a float register the nearest float.
@@ -246,7 +251,7 @@ class Register(Generic[T]):
         """
         if self.values is not None:
             return self._encode_name(value)
-        if isinstance(value, bool) or not isinstance(value, (int, float)):
+        if (isinstance(value, bool) and not self.is_bit) or not isinstance(value, (int, float)):
             raise TypeError(f"{self.name} takes a number, not {value!r}")
         if not abs(value) < math.inf:
             raise ValueError(f"{self.name} takes a finite number, not {value!r}")

@@ -39,7 +39,7 @@ class BlockDecoder:
         self.names = tuple(register.name for register, _ in exact)  # decoded by the core
         self.layout = RowLayout(0, [row_field(register, at, 0) for register, at in exact])
         self.count = len(exact)
-        self._named = [(one.name, one.decode) for one, _ in exact if one.values is not None]
+        self._named = [(one.name, one.decode) for one, _ in exact if one.values is not None or one.is_bit]
         self._others = [(register, at) for register, at in places if not _is_exact(register)]
         self.is_plain = not (self._named or self._others)
 

@@ -21,7 +21,6 @@ from multidrop import (
     DriveException,
     Expired,
     NoReply,
-    NotAttached,
     NotMaster,
     NotVerified,
     Unconfirmed,
@@ -30,7 +29,7 @@ from multidrop import (
     reading,
     setting,
 )
-from multidrop.control import CommandOutcome, CommandResult
+from multidrop.control import CommandOutcome, CommandResult, NotAttached
 from multidrop.core import NumberFormat
 from multidrop.drive import COIL, Kept
 from multidrop.errors import PortLost
